@@ -1,0 +1,129 @@
+"""Planar poses, rigid motions and angles.
+
+`T_a_b` maps coordinates in frame b to coordinates in frame a (`p_a = T_a_b @ p_b`) and is
+also the pose of b in a. Tangent vectors of SE(3) are ordered (translation, rotation), as in
+jaxlie, and perturb from the right: `T * exp(xi)`, so that xi lives in the inner frame.
+"""
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+
+def wrap_angle(angle_rad: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """The same angle in [-pi, pi).
+
+    Units: rad in, rad out. The derivative is 1 everywhere.
+    """
+    return angle_rad - 2 * jnp.pi * jnp.floor((angle_rad + jnp.pi) / (2 * jnp.pi))
+
+
+def T_world_vehicle_from_planar(pose: Float[Array, "*batch 3"]) -> jaxlie.SE3:
+    """Lift (x_m, y_m, psi_rad), the pose of the vehicle in the world, to SE(3).
+
+    Height, roll and pitch are zero.
+
+    Source: Liu, Schofield, Shan (2023), Eq. 12; `f` there returns the inverse,
+    `T_vehicle_world`.
+    """
+    x_m, y_m, psi_rad = jnp.moveaxis(pose, -1, 0)
+    zero = jnp.zeros_like(x_m)
+    return jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3(
+            jnp.stack([jnp.cos(psi_rad / 2), zero, zero, jnp.sin(psi_rad / 2)], axis=-1)
+        ),
+        jnp.stack([x_m, y_m, zero], axis=-1),
+    )
+
+
+def planar_from_T_world_vehicle(T_world_vehicle: jaxlie.SE3) -> Float[Array, "*batch 3"]:
+    """The planar part (x_m, y_m, psi_rad) of a pose: position on the ground and heading.
+
+    The heading is the direction of the vehicle's x axis seen from above. Where that axis is
+    vertical the heading is undefined; 0 is returned, with a zero gradient.
+    """
+    w, x, y, z = jnp.moveaxis(T_world_vehicle.rotation().wxyz, -1, 0)
+    cosine, sine = 1 - 2 * (y**2 + z**2), 2 * (w * z + x * y)
+    position_m = T_world_vehicle.translation()
+    return jnp.concatenate(
+        [position_m[..., :2], safe_atan2(sine, cosine)[..., None]], axis=-1
+    )
+
+
+def planar_covariance(
+    T_world_vehicle: jaxlie.SE3, covariance: Float[Array, "6 6"]
+) -> Float[Array, "3 3"]:
+    """Covariance of (x_m, y_m, psi_rad) from that of a right-perturbed pose.
+
+    Args:
+        T_world_vehicle: the pose the covariance belongs to.
+        covariance: (6, 6), of xi in `T_world_vehicle * exp(xi)`, ordered (translation, rotation).
+    """
+    R_world_vehicle = T_world_vehicle.rotation().as_matrix()
+    # d psi: the rotation vector in world axes, projected on the rate of the heading.
+    c, s = R_world_vehicle[0, 0], R_world_vehicle[1, 0]
+    horizontal = jnp.maximum(c**2 + s**2, jnp.finfo(c.dtype).eps)
+    dpsi_dx_axis = jnp.stack([-s, c, jnp.zeros_like(c)]) / horizontal
+    # d(x axis) = R [0, w_z, -w_y]
+    dpsi_dw = jnp.stack(
+        [
+            jnp.zeros_like(c),
+            -dpsi_dx_axis @ R_world_vehicle[:, 2],
+            dpsi_dx_axis @ R_world_vehicle[:, 1],
+        ]
+    )
+    jacobian = jnp.zeros((3, 6), c.dtype)
+    jacobian = jacobian.at[:2, :3].set(R_world_vehicle[:2]).at[2, 3:].set(dpsi_dw)
+    return jacobian @ covariance @ jacobian.T
+
+
+def safe_norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Euclidean length along the last axis, with a zero gradient at the origin."""
+    squared = jnp.sum(vector**2, axis=-1)
+    return safe_sqrt(squared)
+
+
+def safe_sqrt(value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Square root of max(value, 0), with a zero gradient at and below 0."""
+    positive = value > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1)), 0)
+
+
+def safe_atan2(
+    y: Float[Array, "*batch"], x: Float[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    """atan2 in rad, 0 with a zero gradient at the origin."""
+    defined = x**2 + y**2 > 0
+    return jnp.where(defined, jnp.arctan2(y, jnp.where(defined, x, 1)), 0)
+
+
+def rotation_from_matrix(R: Float[Array, "3 3"]) -> jaxlie.SO3:
+    """The rotation nearest in direction to a nearly orthonormal matrix, at any angle.
+
+    Of the four ways to read a quaternion off a matrix the one with the largest divisor is
+    taken, so half turns are exact and every gradient is finite.
+
+    Source: Shepperd (1978), "Quaternion from rotation matrix".
+    """
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = R.reshape(9)
+    four_squares = jnp.stack(
+        [1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22]
+    )
+    # Row i is 4 q_i q, for q = (w, x, y, z).
+    rows = jnp.stack(
+        [
+            jnp.stack([four_squares[0], m21 - m12, m02 - m20, m10 - m01]),
+            jnp.stack([m21 - m12, four_squares[1], m10 + m01, m02 + m20]),
+            jnp.stack([m02 - m20, m10 + m01, four_squares[2], m21 + m12]),
+            jnp.stack([m10 - m01, m02 + m20, m21 + m12, four_squares[3]]),
+        ]
+    )
+    row = rows[jnp.argmax(four_squares)]
+    return jaxlie.SO3(row / jnp.sqrt(jnp.sum(row**2)))
+
+
+def transform_points(
+    T_a_b: jaxlie.SE3, points_b: Float[Array, "*batch 3"]
+) -> Float[Array, "*batch 3"]:
+    """Points in frame a of one transform applied to a whole array of points in frame b."""
+    return points_b @ T_a_b.rotation().as_matrix().T + T_a_b.translation()

@@ -1,0 +1,41 @@
+"""Square markers at known places in the world.
+
+Corners are counted top-left, top-right, bottom-right, bottom-left, as a reader of the marker
+sees them. The marker frame is x right, y up, z out of the paper towards the reader.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+CORNER_SIGNS = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
+
+
+def corners_marker_m(size_m: Float[Array, "*batch"]) -> Float[Array, "*batch 4 3"]:
+    """Corners of a marker of the given side in its own frame, m."""
+    return size_m[..., None, None] / 2 * jnp.asarray(CORNER_SIGNS, size_m.dtype)
+
+
+class MarkerMap(eqx.Module):
+    """M markers: identity, size and pose of each. The order of the map is the order of every M axis."""
+
+    Ts_world_marker: jaxlie.SE3  # batch axis (M,)
+    size_m: Float[Array, " M"]
+    ids: tuple[int, ...] = eqx.field(static=True)
+    families: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def corners_world_m(self) -> Float[Array, "M 4 3"]:
+        """All corners in the world, m."""
+        corners = corners_marker_m(self.size_m)
+        R = self.Ts_world_marker.rotation().as_matrix()
+        return jnp.einsum("mij,mcj->mci", R, corners) + self.Ts_world_marker.translation()[:, None]
+
+    def index(self, marker_id: int, family: str) -> int | None:
+        """Where a marker stands in the map, None where it is not in it."""
+        for index, key in enumerate(zip(self.ids, self.families, strict=True)):
+            if key == (marker_id, family):
+                return index
+        return None
