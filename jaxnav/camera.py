@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnav.geometry import safe_norm
+from jaxnav.geometry import on_last_axis, safe_norm
 
 LENSES = ("none", "radtan", "equidistant")
 LENS_COEFFICIENTS = {"none": 0, "radtan": 5, "equidistant": 4}
@@ -95,7 +95,10 @@ class Camera(eqx.Module):
         distorted = self._select(
             [_DISTORT[lens](points_camera, self.distortion) for lens in self.lenses]
         )
-        return distorted * self.focal_px + self.center_px
+        focal_px, center_px = (
+            on_last_axis(pair, distorted) for pair in (self.focal_px, self.center_px)
+        )
+        return distorted * focal_px + center_px
 
     def unproject(self, pixels: Float[Array, "*batch 2"]) -> Float[Array, "*batch 3"]:
         """Unit vectors in the camera frame through the given pixels. Of one camera.
@@ -104,7 +107,10 @@ class Camera(eqx.Module):
         reaches gets the outermost ray in its direction (project it to notice). The
         derivative is that of the exact inverse.
         """
-        normalised = (pixels - self.center_px) / self.focal_px
+        focal_px, center_px = (
+            on_last_axis(pair, pixels) for pair in (self.focal_px, self.center_px)
+        )
+        normalised = (pixels - center_px) / focal_px
         return self._select([_UNDISTORT[lens](normalised, self.distortion) for lens in self.lenses])
 
     def in_front(self, points_camera: Float[Array, "*batch 3"]) -> Array:
@@ -212,8 +218,12 @@ def _radtan_bearing(xy_distorted: Array, distortion: Array) -> Array:
         (a, c), (b, d) = jnp.moveaxis(along_x, -1, 0), jnp.moveaxis(along_y, -1, 0)
         residual_x, residual_y = jnp.moveaxis(value - xy_distorted, -1, 0)
         determinant = a * d - b * c
-        inverse = jnp.where(determinant > 1e-6, 1 / jnp.where(determinant > 1e-6, determinant, 1), 0)
-        step = jnp.stack([d * residual_x - b * residual_y, a * residual_y - c * residual_x], axis=-1)
+        inverse = jnp.where(
+            determinant > 1e-6, 1 / jnp.where(determinant > 1e-6, determinant, 1), 0
+        )
+        step = jnp.stack(
+            [d * residual_x - b * residual_y, a * residual_y - c * residual_x], axis=-1
+        )
         step = step * inverse[..., None]
         reachable = safe_norm(step) < 0.2 * (1 + safe_norm(xy))
         return jnp.where(reachable[..., None], xy - step, xy)
@@ -244,7 +254,8 @@ def _invert(profile: Callable[[Array], Array], target: Array, table: np.ndarray)
     values = profile(grid)
     rising = jnp.concatenate([jnp.ones(1, bool), jnp.cumprod(jnp.diff(values) > 0).astype(bool)])
     last = jnp.sum(rising) - 1
-    below = jnp.sum(rising & (values <= target[..., None]), axis=-1) - 1
+    reached = on_last_axis(values, target[..., None]) <= target[..., None]
+    below = jnp.sum(on_last_axis(rising, reached) & reached, axis=-1) - 1
     cell = jnp.clip(below, 0, jnp.maximum(last - 1, 0))
     low, high = grid[cell], grid[jnp.minimum(cell + 1, last)]
     value_low, value_high = values[cell], values[jnp.minimum(cell + 1, last)]

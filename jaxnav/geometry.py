@@ -29,9 +29,7 @@ def T_world_vehicle_from_planar(pose: Float[Array, "*batch 3"]) -> jaxlie.SE3:
     x_m, y_m, psi_rad = jnp.moveaxis(pose, -1, 0)
     zero = jnp.zeros_like(x_m)
     return jaxlie.SE3.from_rotation_and_translation(
-        jaxlie.SO3(
-            jnp.stack([jnp.cos(psi_rad / 2), zero, zero, jnp.sin(psi_rad / 2)], axis=-1)
-        ),
+        jaxlie.SO3(jnp.stack([jnp.cos(psi_rad / 2), zero, zero, jnp.sin(psi_rad / 2)], axis=-1)),
         jnp.stack([x_m, y_m, zero], axis=-1),
     )
 
@@ -45,9 +43,7 @@ def planar_from_T_world_vehicle(T_world_vehicle: jaxlie.SE3) -> Float[Array, "*b
     w, x, y, z = jnp.moveaxis(T_world_vehicle.rotation().wxyz, -1, 0)
     cosine, sine = 1 - 2 * (y**2 + z**2), 2 * (w * z + x * y)
     position_m = T_world_vehicle.translation()
-    return jnp.concatenate(
-        [position_m[..., :2], safe_atan2(sine, cosine)[..., None]], axis=-1
-    )
+    return jnp.concatenate([position_m[..., :2], safe_atan2(sine, cosine)[..., None]], axis=-1)
 
 
 def planar_covariance(
@@ -89,9 +85,7 @@ def safe_sqrt(value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1)), 0)
 
 
-def safe_atan2(
-    y: Float[Array, "*batch"], x: Float[Array, "*batch"]
-) -> Float[Array, "*batch"]:
+def safe_atan2(y: Float[Array, "*batch"], x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """atan2 in rad, 0 with a zero gradient at the origin."""
     defined = x**2 + y**2 > 0
     return jnp.where(defined, jnp.arctan2(y, jnp.where(defined, x, 1)), 0)
@@ -126,4 +120,10 @@ def transform_points(
     T_a_b: jaxlie.SE3, points_b: Float[Array, "*batch 3"]
 ) -> Float[Array, "*batch 3"]:
     """Points in frame a of one transform applied to a whole array of points in frame b."""
-    return points_b @ T_a_b.rotation().as_matrix().T + T_a_b.translation()
+    rotated = points_b @ T_a_b.rotation().as_matrix().T
+    return rotated + on_last_axis(T_a_b.translation(), rotated)
+
+
+def on_last_axis(vector: Float[Array, " n"], like: Float[Array, "*batch n"]) -> Array:
+    """A vector with leading axes of length 1, to meet an array that ends in the same axis."""
+    return vector.reshape((1,) * (like.ndim - 1) + vector.shape)

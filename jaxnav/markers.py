@@ -15,7 +15,8 @@ CORNER_SIGNS = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
 
 def corners_marker_m(size_m: Float[Array, "*batch"]) -> Float[Array, "*batch 4 3"]:
     """Corners of a marker of the given side in its own frame, m."""
-    return size_m[..., None, None] / 2 * jnp.asarray(CORNER_SIGNS, size_m.dtype)
+    signs = jnp.asarray(CORNER_SIGNS, size_m.dtype)
+    return jnp.einsum("...,ci->...ci", size_m / 2, signs)
 
 
 class MarkerMap(eqx.Module):

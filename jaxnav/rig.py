@@ -12,7 +12,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.camera import Camera, stack_cameras
-from jaxnav.geometry import transform_points
+from jaxnav.geometry import on_last_axis, transform_points
 
 
 class CameraRig(eqx.Module):
@@ -65,8 +65,8 @@ class CameraRig(eqx.Module):
         def one(camera: Camera, T_camera_vehicle: jaxlie.SE3, size_px: Array) -> Array:
             points_camera = transform_points(T_camera_vehicle, points_vehicle)
             pixels = camera.project(points_camera)
-            inside = jnp.all((pixels >= -0.5) & (pixels <= size_px - 0.5), axis=-1)
-            return inside & camera.in_front(points_camera)
+            inside = (pixels >= -0.5) & (pixels <= on_last_axis(size_px - 0.5, pixels))
+            return jnp.all(inside, axis=-1) & camera.in_front(points_camera)
 
         sizes = jnp.asarray(self.image_sizes_px, self.cameras.focal_px.dtype)
         return jax.vmap(one)(self.cameras, self.Ts_camera_vehicle, sizes)

@@ -1,0 +1,132 @@
+"""All vehicle poses that one observation admits: both IPPE poses of every sighting, refined.
+
+Source: Liu, Schofield, Shan (2023), Algorithm 1, "get both possible poses using the IPPE method
+and Eq. 3".
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.geometry import safe_norm, transform_points
+from jaxnav.ippe import ippe_from_rays
+from jaxnav.markers import MarkerMap
+from jaxnav.observation import Observation, Sightings, cameras_of, sightings
+from jaxnav.refine import refine_sightings
+from jaxnav.residuals import reprojection_residuals
+from jaxnav.rig import CameraRig
+
+# Two local minima this close are one: 1.1 degrees, and as much of the distance to the markers.
+_SAME_POSE_RAD = 0.02
+
+
+class Candidates(eqx.Module):
+    """N poses of the vehicle, sorted by e1. Lanes that are not `valid` hold finite numbers.
+
+    `cost` is what the refinement minimised, whitened by the corners' sigma; `e1_px2` is the
+    paper's.
+    """
+
+    T_vehicle_world: jaxlie.SE3  # batch axis (N,)
+    e1_px2: Float[Array, " N"]
+    cost: Float[Array, " N"]  # sum of (residual / sigma)^2
+    covariance: Float[Array, "N 6 6"]  # of xi in T_world_vehicle * exp(xi)
+    valid: Bool[Array, " N"]
+    converged: Bool[Array, " N"]
+    steps: Int[Array, " N"]
+
+
+def find_candidates(
+    rig: CameraRig,
+    markers: MarkerMap,
+    obs: Observation,
+    corner_sigma_px: Float[Array, ""] | float = 1.0,
+    max_sightings: int = 16,
+    max_candidates: int = 4,
+    max_steps: int = 12,
+) -> Candidates:
+    """Every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
+
+    One camera that sees one marker gives two; two cameras on one marker give up to four, which
+    the refinement usually draws together into two (DESIGN 3.4). With many markers the
+    `max_candidates` that explain all corners best are refined.
+
+    Args:
+        corner_sigma_px: for observations that bring no sigma of their own.
+        max_sightings: the largest ones are used.
+        max_steps: bound on the LM steps.
+    """
+    sigma_px = corner_sigma_px if obs.corner_sigma_px is None else obs.corner_sigma_px
+    seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, max_sightings)
+    Ts_vehicle_world, owner_visible = _both_poses(rig, markers, seen)
+
+    def joint_e1(T_vehicle_world: jaxlie.SE3) -> Array:
+        corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
+        return jnp.sum(reprojection_residuals(rig, seen, corners_vehicle) ** 2)
+
+    count = min(max_candidates, owner_visible.shape[0])
+    if count < owner_visible.shape[0]:
+        first_guess = jnp.where(owner_visible, jax.vmap(joint_e1)(Ts_vehicle_world), jnp.inf)
+        _, best = jax.lax.top_k(-first_guess, count)
+        Ts_vehicle_world = jaxlie.SE3(Ts_vehicle_world.wxyz_xyz[best])
+        owner_visible = owner_visible[best]
+
+    refined = jax.vmap(lambda T: refine_sightings(rig, markers, seen, T, max_steps))(
+        Ts_vehicle_world
+    )
+    e1_px2 = jax.vmap(joint_e1)(refined.T_vehicle_world)
+    order = jnp.argsort(jnp.where(owner_visible, e1_px2, jnp.inf))
+    refined, e1_px2, valid = jax.tree.map(
+        lambda leaf: leaf[order], (refined, e1_px2, owner_visible)
+    )
+    return Candidates(
+        T_vehicle_world=refined.T_vehicle_world,
+        e1_px2=e1_px2,
+        cost=refined.cost,
+        covariance=refined.covariance,
+        valid=valid & ~_repeats(refined.T_vehicle_world, seen, markers, valid),
+        converged=refined.converged,
+        steps=refined.steps,
+    )
+
+
+def _both_poses(
+    rig: CameraRig, markers: MarkerMap, seen: Sightings
+) -> tuple[jaxlie.SE3, Bool[Array, " 2D"]]:
+    """Two vehicle poses (2D,) from every sighting by itself, and whether it is visible."""
+
+    def one(camera, T_camera_vehicle, T_world_marker, size_m, corners_px):
+        Ts_camera_marker = ippe_from_rays(camera.unproject(corners_px), size_m)
+        return jax.vmap(
+            lambda T_camera_marker: (
+                T_camera_vehicle.inverse() @ T_camera_marker @ T_world_marker.inverse()
+            )
+        )(Ts_camera_marker)
+
+    Ts_vehicle_world = jax.vmap(one)(
+        cameras_of(rig, seen),
+        jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index]),
+        jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[seen.marker_index]),
+        markers.size_m[seen.marker_index],
+        seen.corners_px,
+    )
+    return jaxlie.SE3(Ts_vehicle_world.wxyz_xyz.reshape(-1, 7)), jnp.repeat(seen.visible, 2)
+
+
+def _repeats(
+    T_vehicle_world: jaxlie.SE3, seen: Sightings, markers: MarkerMap, valid: Bool[Array, " N"]
+) -> Bool[Array, " N"]:
+    """Whether an earlier valid lane holds the same pose, as the markers in view tell."""
+    first_seen = seen.marker_index[jnp.argmax(seen.visible)]
+    center_world = markers.Ts_world_marker.translation()[first_seen]
+    centers_vehicle = jax.vmap(lambda T: transform_points(T, center_world))(T_vehicle_world)
+    range_m = jnp.maximum(safe_norm(centers_vehicle), 1e-3)
+    R = T_vehicle_world.rotation().as_matrix()
+    # |R_i - R_j|_F = 2 sqrt(2) sin(angle / 2)
+    turn = safe_norm((R[:, None] - R[None]).reshape(*R.shape[:1], *R.shape[:1], 9)) / jnp.sqrt(2.0)
+    shift = safe_norm(centers_vehicle[:, None] - centers_vehicle[None]) / range_m[:, None]
+    same = (turn < _SAME_POSE_RAD) & (shift < _SAME_POSE_RAD)
+    earlier = jnp.tri(same.shape[0], k=-1, dtype=bool)
+    return jnp.any(same & earlier & valid[None], axis=1)

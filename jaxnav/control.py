@@ -1,0 +1,117 @@
+"""Steering and throttle towards the next waypoint.
+
+Source: Liu, Schofield, Shan (2023), Eqs. 16-19.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.bicycle import Vehicle, sideslip_rad
+from jaxnav.geometry import safe_atan2, safe_norm, wrap_angle
+
+
+class Command(eqx.Module):
+    """What is sent to the vehicle, inside its limits."""
+
+    steering_rad: Float[Array, ""]
+    throttle: Float[Array, ""]  # the driver's unit
+
+
+class ControlLog(eqx.Module):
+    """The quantities between the pose and the command, for records and plots."""
+
+    distance_m: Float[Array, ""]  # L_d
+    alpha_rad: Float[Array, ""]
+    sideslip_rad: Float[Array, ""]  # beta
+    integral_ms: Float[Array, ""]  # of L_d over time, m s
+
+
+class ControlState(eqx.Module):
+    """What the controller remembers."""
+
+    waypoint_index: Int[Array, ""]  # W once the last one is reached
+    integral_ms: Float[Array, ""]
+
+
+class Controller(eqx.Module):
+    """Ackermann arc to the waypoint, PI throttle on the distance to it.
+
+    The paper's sum of distances (Eq. 19) never decreases: here it is an integral over time, held
+    inside `integral_limit_ms`, and starts anew at every waypoint. After the last waypoint the
+    throttle is zero, and so it is before the first pose.
+    """
+
+    waypoints_m: Float[Array, "W 2"]
+    waypoint_radius_m: Float[Array, ""]
+    vehicle: Vehicle
+    proportional_per_m: Float[Array, ""]  # p1, throttle per metre
+    integral_per_ms: Float[Array, ""]  # p2, throttle per metre second
+    integral_limit_ms: Float[Array, ""]
+
+    def init(self) -> ControlState:
+        """At the first waypoint, nothing summed up."""
+        return ControlState(jnp.asarray(0), jnp.zeros_like(self.waypoint_radius_m))
+
+    def __call__(
+        self,
+        state: ControlState,
+        pose: Float[Array, " 3"],
+        located: Bool[Array, ""],
+        steering_rad: Float[Array, ""],
+        dt_s: Float[Array, ""],
+    ) -> tuple[ControlState, Command, Bool[Array, ""], ControlLog]:
+        """One command.
+
+        Args:
+            pose: (x_m, y_m, psi_rad) of the vehicle in the world.
+            located: whether the pose means anything yet.
+            steering_rad: measured steering angle, for the sideslip.
+            dt_s: time since the previous call.
+
+        Returns:
+            The next state, the command, whether the last waypoint is reached, and the log.
+        """
+        count = self.waypoints_m.shape[0]
+        arrived = located & (self._distance(state.waypoint_index, pose) <= self.waypoint_radius_m)
+        index = jnp.minimum(
+            state.waypoint_index + (arrived & (state.waypoint_index < count)), count
+        )
+        done = index >= count
+
+        to_waypoint = self.waypoints_m[jnp.minimum(index, count - 1)] - pose[:2]
+        distance_m = safe_norm(to_waypoint)
+        beta_rad = sideslip_rad(steering_rad)
+        alpha_rad = wrap_angle(safe_atan2(to_waypoint[1], to_waypoint[0]) - pose[2] - beta_rad)
+        drives = located & ~done
+
+        steering = self._steering(alpha_rad, distance_m, beta_rad)
+        integral_ms = jnp.where(arrived, 0, state.integral_ms)
+        integral_ms = integral_ms + jnp.where(drives, distance_m * dt_s, 0)
+        integral_ms = jnp.clip(integral_ms, 0, self.integral_limit_ms)
+        throttle = self.proportional_per_m * distance_m + self.integral_per_ms * integral_ms
+        limit = self.vehicle.throttle_limit
+        command = Command(
+            steering_rad=jnp.where(drives, steering, 0),
+            throttle=jnp.where(drives, jnp.clip(throttle, -limit, limit), 0),
+        )
+        log = ControlLog(distance_m, alpha_rad, beta_rad, integral_ms)
+        return ControlState(index, integral_ms), command, done, log
+
+    def _distance(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
+        waypoint_m = self.waypoints_m[jnp.minimum(index, self.waypoints_m.shape[0] - 1)]
+        return safe_norm(waypoint_m - pose[:2])
+
+    def _steering(
+        self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""], beta_rad: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """atan(2 l sin(alpha) / (L_d cos(beta))) (Eq. 18), within the limit.
+
+        A waypoint behind the axle gets full lock: the arc of Eq. 18 would straighten out there and
+        drive away from it.
+        """
+        reach_m = jnp.maximum(distance_m, 1e-3) * jnp.cos(beta_rad)
+        arc = jnp.arctan(2 * self.vehicle.wheelbase_m * jnp.sin(alpha_rad) / reach_m)
+        limit = self.vehicle.steering_limit_rad
+        lock = jnp.where(alpha_rad >= 0, limit, -limit)
+        return jnp.clip(jnp.where(jnp.abs(alpha_rad) > jnp.pi / 2, lock, arc), -limit, limit)

@@ -1,0 +1,76 @@
+"""The linear Kalman filter: predict and update, nothing about vehicles.
+
+Source: Liu, Schofield, Shan (2023), Eqs. 8-11; the covariance update in the form of Bucy and
+Joseph (1968), since Eq. 11's (I - K H) P loses positive definiteness in float32.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# A variance never falls below this fraction of the largest one.
+_RELATIVE_FLOOR = 1e-12
+
+
+def predict_covariance(
+    P: Float[Array, "n n"], F: Float[Array, "n n"], Q: Float[Array, "n n"]
+) -> Float[Array, "n n"]:
+    """F P F' + Q (Eq. 9), symmetric."""
+    return symmetrise(F @ P @ F.T + Q)
+
+
+def update(
+    P: Float[Array, "n n"],
+    innovation: Float[Array, " m"],
+    H: Float[Array, "m n"],
+    R: Float[Array, "m m"],
+) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, "m m"]]:
+    """Correction of the mean, posterior covariance, and innovation covariance S = H P H' + R.
+
+    A measurement that is missing is a zero row of H with a zero innovation and a unit variance,
+    uncorrelated with the rest: it changes nothing (see `hide_rows`).
+
+    Source: Eqs. 10 and 11; P = (I - K H) P (I - K H)' + K R K'.
+    """
+    S = symmetrise(H @ P @ H.T + R)
+    K = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(S), True), H @ P).T
+    I_KH = jnp.eye(P.shape[0], dtype=P.dtype) - K @ H
+    posterior = symmetrise(I_KH @ P @ I_KH.T + K @ R @ K.T)
+    floor = _RELATIVE_FLOOR * jnp.max(jnp.diagonal(P))
+    return K @ innovation, posterior + floor * jnp.eye(P.shape[0], dtype=P.dtype), S
+
+
+def hide_rows(
+    innovation: Float[Array, " m"],
+    H: Float[Array, "m n"],
+    R: Float[Array, "m m"],
+    present: Float[Array, " m"],
+) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, "m m"]]:
+    """The measurement with the rows that are not `present` (0 or 1) made ineffective."""
+    kept = present[:, None] * present[None, :]
+    return present * innovation, present[:, None] * H, kept * R + jnp.diag(1 - present)
+
+
+def nis(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
+    """Normalised innovation squared, chi-square with m degrees of freedom."""
+    return innovation @ jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(S), True), innovation)
+
+
+def symmetrise(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """(P + P') / 2."""
+    return (P + P.T) / 2
+
+
+def white_acceleration(
+    density: Float[Array, " d"], dt_s: Float[Array, ""] | float
+) -> Float[Array, "2d 2d"]:
+    """Q of a position-velocity state driven by white acceleration.
+
+    Args:
+        density: power spectral density of each axis, (m/s^2)^2/Hz or (rad/s^2)^2/Hz.
+        dt_s: sample period.
+
+    Source: Bar-Shalom, Li, Kirubarajan (2001), Eq. 6.2.2-12.
+    """
+    D = jnp.diag(density)
+    return jnp.block([[D * dt_s**3 / 3, D * dt_s**2 / 2], [D * dt_s**2 / 2, D * dt_s]])

@@ -1,0 +1,167 @@
+"""Algorithm 1: from corners, odometry and a route to a command. Read this first.
+
+Source: Liu, Schofield, Shan (2023), Algorithm 1.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.ambiguity import PaperCost, Selector
+from jaxnav.bicycle import Vehicle
+from jaxnav.candidates import Candidates, find_candidates
+from jaxnav.control import Command, Controller, ControlLog, ControlState
+from jaxnav.geometry import planar_from_T_world_vehicle
+from jaxnav.markers import MarkerMap
+from jaxnav.motion import Belief, BicycleKalman, ConstantVelocity, Motion
+from jaxnav.observation import Observation
+from jaxnav.rig import CameraRig
+
+
+class State(eqx.Module):
+    """Everything `step` carries from one observation to the next."""
+
+    belief: Belief
+    control: ControlState | None  # None without a route
+
+
+class Output(eqx.Module):
+    """Everything `step` knows after one observation."""
+
+    pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
+    covariance: Float[Array, "d d"]  # of the state: (6, 6) for a car, see the motion model
+    T_world_vehicle: jaxlie.SE3
+    located: Bool[Array, ""]  # False until the first pose was taken
+    command: Command | None
+    done: Bool[Array, ""]  # the last waypoint is reached
+    candidates: Candidates
+    costs: Float[Array, " N"]  # of the candidates, in the selector's unit
+    selected: Int[Array, ""]  # the candidate taken, -1: none
+    flip_probability: Float[Array, ""]
+    nis: Float[Array, ""]  # of the pose taken, 0 where none was
+    control_log: ControlLog | None
+
+
+class Navigator(eqx.Module):
+    """A rig that finds its way by markers. Immutable; `init` and `step` are pure.
+
+    With a vehicle and waypoints it drives; without, it only localises (give it the motion model
+    of the body then, `ConstantVelocity()` by default).
+    """
+
+    rig: CameraRig
+    markers: MarkerMap
+    selector: Selector
+    motion: Motion
+    controller: Controller | None
+    corner_sigma_px: Float[Array, ""]
+    max_sightings: int = eqx.field(static=True)
+    max_candidates: int = eqx.field(static=True)
+    max_lm_steps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        markers: MarkerMap,
+        vehicle: Vehicle | None = None,
+        waypoints_m: Sequence[Sequence[float]] | Float[Array, "W 2"] = (),
+        waypoint_radius_m: float = 0.15,
+        selector: Selector | None = None,
+        motion: Motion | None = None,
+        proportional_per_m: float = 0.05,
+        integral_per_ms: float = 0.01,
+        integral_limit_ms: float = 5.0,
+        corner_sigma_px: float = 1.0,
+        max_sightings: int = 16,
+        max_candidates: int = 4,
+        max_lm_steps: int = 12,
+    ):
+        """See the fields of `Controller`, `find_candidates` and the motion models.
+
+        Raises:
+            ValueError: waypoints without a vehicle, or of the wrong shape.
+        """
+        self.rig = rig
+        self.markers = markers
+        self.selector = PaperCost() if selector is None else selector
+        if motion is None:
+            motion = ConstantVelocity() if vehicle is None else BicycleKalman(vehicle)
+        self.motion = motion
+        self.controller = None
+        if len(waypoints_m) > 0:
+            waypoints = jnp.asarray(waypoints_m, float)
+            if vehicle is None:
+                raise ValueError("waypoints_m needs a vehicle to drive")
+            if waypoints.ndim != 2 or waypoints.shape[1] != 2:
+                raise ValueError(f"waypoints_m must be (W, 2), got {waypoints.shape}")
+            self.controller = Controller(
+                waypoints_m=waypoints,
+                waypoint_radius_m=jnp.asarray(waypoint_radius_m, float),
+                vehicle=vehicle,
+                proportional_per_m=jnp.asarray(proportional_per_m, float),
+                integral_per_ms=jnp.asarray(integral_per_ms, float),
+                integral_limit_ms=jnp.asarray(integral_limit_ms, float),
+            )
+        self.corner_sigma_px = jnp.asarray(corner_sigma_px, float)
+        self.max_sightings = max_sightings
+        self.max_candidates = max_candidates
+        self.max_lm_steps = max_lm_steps
+
+    def init(self) -> State:
+        """Nothing seen yet, at the first waypoint."""
+        control = None if self.controller is None else self.controller.init()
+        return State(self.motion.init(), control)
+
+    def step(self, state: State, obs: Observation) -> tuple[State, Output]:
+        """One pass of Algorithm 1."""
+        prior = self.motion.predict(state.belief, obs.dt_s)
+        candidates = self.find_candidates(obs)
+        selection = self.selector(self.motion.poses(prior), candidates, obs, self.markers)
+        belief, nis = self.motion.update(prior, candidates, selection.weights, obs)
+
+        best = jnp.argmax(belief.log_weight)
+        T_world_vehicle = jax.tree.map(
+            lambda leaf: leaf[best], self.motion.poses(belief).T_world_vehicle
+        )
+        pose = planar_from_T_world_vehicle(T_world_vehicle)
+        located = belief.initialised[best]
+        control, command, done, log = self._steer(state.control, pose, located, obs)
+        return State(belief, control), Output(
+            pose=pose,
+            covariance=belief.covariance[best],
+            T_world_vehicle=T_world_vehicle,
+            located=located,
+            command=command,
+            done=done,
+            candidates=candidates,
+            costs=selection.costs,
+            selected=selection.selected,
+            flip_probability=selection.flip_probability,
+            nis=nis[best],
+            control_log=log,
+        )
+
+    def find_candidates(self, obs: Observation) -> Candidates:
+        """Both poses of every marker in view, refined."""
+        return find_candidates(
+            self.rig,
+            self.markers,
+            obs,
+            self.corner_sigma_px,
+            self.max_sightings,
+            self.max_candidates,
+            self.max_lm_steps,
+        )
+
+    def _steer(self, state: ControlState | None, pose: Array, located: Array, obs: Observation):
+        if self.controller is None or state is None:
+            return None, None, jnp.asarray(False), None
+        dt_s, steering_rad = (jnp.asarray(x, pose.dtype) for x in (obs.dt_s, obs.steering_rad))
+        return self.controller(state, pose, located, steering_rad, dt_s)
+
+    # Bound methods hash their owner: by identity, so that `jax.jit(navigator.step)` works.
+    __hash__ = object.__hash__

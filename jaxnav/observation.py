@@ -1,0 +1,93 @@
+"""What the vehicle senses at one instant, and its compact form for the solvers."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.camera import Camera
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+
+
+class Observation(eqx.Module):
+    """One synchronous reading of cameras, odometer and steering sensor.
+
+    Lanes that are not visible hold any finite numbers. A lane with a non-finite corner counts as
+    not visible.
+    """
+
+    corners_px: Float[Array, "C M 4 2"]  # raw pixels, M in the order of the map
+    visible: Bool[Array, "C M"]
+    speed_mps: Float[Array, ""] | float = 0.0
+    steering_rad: Float[Array, ""] | float = 0.0
+    dt_s: Float[Array, ""] | float = 0.0  # since the previous observation
+    corner_sigma_px: Float[Array, "C M 4"] | None = None  # None: the estimator's own figure
+
+
+class Sightings(eqx.Module):
+    """The D largest visible markers, each with the camera that sees it."""
+
+    camera_index: Int[Array, " D"]
+    marker_index: Int[Array, " D"]
+    corners_px: Float[Array, "D 4 2"]
+    sigma_px: Float[Array, "D 4"]
+    visible: Bool[Array, " D"]
+
+
+def sightings(
+    rig: CameraRig,
+    markers: MarkerMap,
+    corners_px: Float[Array, "C M 4 2"],
+    visible: Bool[Array, "C M"],
+    sigma_px: Float[Array, "*sigma"] | float = 1.0,
+    max_count: int | None = None,
+) -> Sightings:
+    """The visible (camera, marker) lanes, largest image first, in a fixed number of slots.
+
+    Args:
+        corners_px: (C, M, 4, 2).
+        visible: (C, M).
+        sigma_px: standard deviation of a corner coordinate, one for all or (C, M, 4).
+        max_count: slots; by default one for each lane. Smaller images beyond it are dropped.
+
+    Raises:
+        ValueError: shapes that do not fit the rig and the map.
+    """
+    lanes = (len(rig), len(markers.ids))
+    if corners_px.shape != (*lanes, 4, 2) or visible.shape != lanes:
+        raise ValueError(
+            f"corners_px (C, M, 4, 2) and visible (C, M) with C, M = {lanes} expected, "
+            f"got {corners_px.shape} and {visible.shape}"
+        )
+    count = lanes[0] * lanes[1]
+    kept = min(count, max_count or count)
+    dtype = rig.cameras.focal_px.dtype
+    corners = corners_px.reshape(count, 4, 2).astype(dtype)
+    seen = visible.reshape(count) & jnp.all(jnp.isfinite(corners), axis=(1, 2))
+    # A hidden lane becomes a plain square near the principal point: every formula stays finite.
+    camera_index = jnp.repeat(jnp.arange(lanes[0]), lanes[1])
+    dummy = jnp.asarray([[-20.0, -20.0], [20.0, -20.0], [20.0, 20.0], [-20.0, 20.0]], dtype)
+    centers = rig.cameras.center_px[camera_index]
+    corners = jnp.where(seen[:, None, None], corners, centers[:, None] + dummy[None])
+    sigma = jnp.broadcast_to(jnp.asarray(sigma_px, dtype), (*lanes, 4)).reshape(count, 4)
+    if kept < count:
+        diagonals = corners[:, :2] - corners[:, 2:]
+        area = jnp.abs(
+            diagonals[:, 0, 0] * diagonals[:, 1, 1] - diagonals[:, 0, 1] * diagonals[:, 1, 0]
+        )
+        _, slots = jax.lax.top_k(jnp.where(seen, area, -1), kept)
+    else:
+        slots = jnp.arange(count)
+    return Sightings(
+        camera_index=camera_index[slots],
+        marker_index=jnp.tile(jnp.arange(lanes[1]), lanes[0])[slots],
+        corners_px=corners[slots],
+        sigma_px=sigma[slots],
+        visible=seen[slots],
+    )
+
+
+def cameras_of(rig: CameraRig, seen: Sightings) -> Camera:
+    """The camera of every sighting, batch axis (D,)."""
+    return jax.tree.map(lambda leaf: leaf[seen.camera_index], rig.cameras)

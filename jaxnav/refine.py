@@ -1,0 +1,218 @@
+"""Poses refined on the corners by Levenberg-Marquardt, which optimistix runs.
+
+Unknowns are local and scaled: a rotation vector about a pivot (the markers in view) and a shift
+in units of the pivot's distance. About the marker's own centre rotation and translation hardly
+interact, and the damping lambda*I treats all six alike.
+
+The paper minimises e1 (Eq. 3) from both IPPE poses; see `candidates.py` for that step.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.geometry import on_last_axis, safe_norm, transform_points
+from jaxnav.ippe import PosePair, ippe_square
+from jaxnav.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.observation import Sightings, sightings
+from jaxnav.residuals import reprojection_residuals
+from jaxnav.rig import CameraRig
+
+# An angle is known to about a radian, and a distance to about itself, before any corner is
+# looked at. Bounds the covariance where the corners say nothing.
+_PRIOR_SIGMA = 1.0
+
+
+class RefinedPose(eqx.Module):
+    """Result of one refinement. A lane that failed says so; its numbers stay finite."""
+
+    T_vehicle_world: jaxlie.SE3
+    cost: Float[Array, ""]  # sum of (residual / sigma)^2: e1 in pixel^2 where sigma is 1 px
+    covariance: Float[Array, "6 6"]  # of xi in T_world_vehicle * exp(xi): vehicle axes, (m, rad)
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def refine_pose(
+    rig: CameraRig,
+    markers: MarkerMap,
+    corners_px: Float[Array, "C M 4 2"],
+    visible: Bool[Array, "C M"],
+    T_vehicle_world: jaxlie.SE3,
+    corner_sigma_px: Float[Array, "*sigma"] | float = 1.0,
+    max_steps: int = 32,
+) -> RefinedPose:
+    """The local minimum of e1 next to a pose: all cameras, all markers, all corners at once.
+
+    Args:
+        corners_px: (C, M, 4, 2) raw pixels.
+        visible: (C, M).
+        T_vehicle_world: where to start.
+        corner_sigma_px: standard deviation of a corner coordinate, a number or (C, M, 4).
+        max_steps: bound on the LM steps; a lane that needs more is not `converged`.
+    """
+    seen = sightings(rig, markers, corners_px, visible, corner_sigma_px)
+    return refine_sightings(rig, markers, seen, T_vehicle_world, max_steps)
+
+
+def refine_sightings(
+    rig: CameraRig,
+    markers: MarkerMap,
+    seen: Sightings,
+    T_vehicle_world: jaxlie.SE3,
+    max_steps: int,
+) -> RefinedPose:
+    """`refine_pose` on sightings that have been gathered already."""
+
+    def residual(corners_vehicle: Array) -> Array:
+        pixels = reprojection_residuals(rig, seen, corners_vehicle)
+        return (pixels / seen.sigma_px[..., None]).reshape(-1)
+
+    any_visible = jnp.any(seen.visible)
+    weight = seen.visible.astype(seen.corners_px.dtype)[:, None]
+    centers_world = markers.Ts_world_marker.translation()[seen.marker_index]
+    center_world = jnp.sum(weight * centers_world, axis=0) / jnp.maximum(jnp.sum(weight), 1)
+    corners_world = markers.corners_world_m
+
+    T, steps, converged = _minimise(
+        residual, T_vehicle_world, corners_world, center_world, any_visible, max_steps
+    )
+    chart = _chart(T, corners_world, center_world)
+    J = jax.jacfwd(lambda y: residual(chart.points(y)))(jnp.zeros(6, chart.pivot.dtype))
+    return RefinedPose(
+        T_vehicle_world=T,
+        cost=jnp.sum(residual(chart.points(jnp.zeros(6, chart.pivot.dtype))) ** 2),
+        covariance=_body_covariance(chart, J),
+        steps=steps,
+        converged=converged & any_visible,
+    )
+
+
+class _Chart(eqx.Module):
+    """Local coordinates around a pose: y = (shift / scale, turn about the pivot).
+
+    The turn is the rotation by the quaternion (1, turn / 2), normalised: equal to the rotation
+    vector to second order, smooth everywhere and free of sin(x) / x.
+    """
+
+    T: jaxlie.SE3
+    pivot: Float[Array, " 3"]  # in the target frame of T
+    arms: Float[Array, "*points 3"]  # from the pivot to the points, at y = 0
+    scale: Float[Array, ""]  # m
+
+    def points(self, y: Float[Array, " 6"]) -> Float[Array, "*points 3"]:
+        """The points in the target frame, moved by y."""
+        turn = on_last_axis(y[3:], self.arms)
+        swing = jnp.cross(turn, self.arms)
+        swing = (swing + jnp.cross(turn / 2, swing)) / (1 + jnp.sum(y[3:] ** 2) / 4)
+        return self.arms + swing + on_last_axis(self.pivot + self.scale * y[:3], self.arms)
+
+    def transform(self, y: Float[Array, " 6"]) -> jaxlie.SE3:
+        """The transform itself, moved by y."""
+        turn = jaxlie.SO3(jnp.append(jnp.ones(1, y.dtype), y[3:] / 2)).normalize()
+        arm = self.T.translation() - self.pivot
+        return jaxlie.SE3.from_rotation_and_translation(
+            (turn @ self.T.rotation()).normalize(), turn @ arm + self.pivot + self.scale * y[:3]
+        )
+
+
+def _chart(T: jaxlie.SE3, points_source: Array, center_source: Array) -> _Chart:
+    pivot = transform_points(T, center_source)
+    points = transform_points(T, points_source)
+    arms = points - on_last_axis(pivot, points)
+    return _Chart(T, pivot, arms, jnp.maximum(safe_norm(pivot), 1e-3))
+
+
+def _minimise(
+    residual: Callable[[Array], Array],
+    T_start: jaxlie.SE3,
+    points_source: Array,
+    center_source: Array,
+    constrained: Array,
+    max_steps: int,
+) -> tuple[jaxlie.SE3, Array, Array]:
+    """LM on residual(points in the target frame), from a pose.
+
+    Gradients are those of the implicit function at the minimum: right only where `converged`, and
+    independent of the start.
+    """
+    chart = _chart(jax.lax.stop_gradient(T_start), points_source, center_source)
+
+    def fn(y, args):
+        # Without a visible corner y itself is the residual: nothing moves, no 0 / 0.
+        return jnp.concatenate([residual(chart.points(y)), jnp.where(constrained, 0, y)])
+
+    dtype = chart.pivot.dtype
+    tolerance = 1e-7 if dtype == jnp.float64 else 1e-4
+    solver = optx.LevenbergMarquardt(
+        rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
+    )
+    solution = optx.least_squares(fn, solver, jnp.zeros(6, dtype), max_steps=max_steps, throw=False)
+    return (
+        chart.transform(solution.value),
+        solution.stats["num_steps"],
+        solution.result == optx.RESULTS.successful,
+    )
+
+
+def _body_covariance(chart: _Chart, J: Array) -> Array:
+    """Covariance of xi in T_world_vehicle * exp(xi) from the whitened Jacobian in the chart.
+
+    Inverted in the chart, where the information matrix is well conditioned, and carried over:
+    y moves T_vehicle_world on the left by (scale * shift + pivot x turn, turn), and xi is minus
+    that.
+    """
+    information = J.T @ J + jnp.eye(6, dtype=J.dtype) / _PRIOR_SIGMA**2
+    factor = jnp.linalg.cholesky(information)
+    px, py, pz = chart.pivot
+    zero = jnp.zeros_like(px)
+    cross = jnp.stack(
+        [jnp.stack([zero, -pz, py]), jnp.stack([pz, zero, -px]), jnp.stack([-py, px, zero])]
+    )
+    eye = jnp.eye(3, dtype=J.dtype)
+    carry = jnp.block([[chart.scale * eye, cross], [jnp.zeros_like(eye), eye]])
+    root = jax.scipy.linalg.solve_triangular(factor, carry.T, lower=True)
+    return root.T @ root
+
+
+def solve_marker(
+    corners_n: Float[Array, "4 2"], size_m: Float[Array, ""] | float, max_steps: int = 32
+) -> PosePair:
+    """Both poses of one marker in one camera, each refined to its local minimum by LM.
+
+    Args and result as `ippe_square`; `reprojection_error` is the refined one.
+    """
+    corners_n = jnp.asarray(corners_n)
+    start = ippe_square(corners_n, size_m)
+    corners_marker = (
+        jnp.asarray(size_m, corners_n.dtype) / 2 * jnp.asarray(CORNER_SIGNS, corners_n.dtype)
+    )
+    spread = safe_norm((corners_n - jnp.mean(corners_n, axis=0)).reshape(-1))
+    unit = jnp.where(spread > 0, spread, 1) / 100  # a hundred "pixels" across, whatever the units
+
+    def residual(points: Array) -> Array:
+        depth = jnp.maximum(points[:, 2:], 1e-3 * safe_norm(points)[:, None])
+        return ((points[:, :2] / depth - corners_n) / unit).reshape(-1)
+
+    def one(T_start: jaxlie.SE3) -> tuple[Array, Array]:
+        origin = jnp.zeros(3, corners_n.dtype)
+        T, _, _ = _minimise(residual, T_start, corners_marker, origin, jnp.asarray(True), max_steps)
+        rms = safe_norm(residual(transform_points(T, corners_marker))) / np.sqrt(8)
+        return T.wxyz_xyz, unit * rms
+
+    wxyz_xyz, errors = jax.vmap(one)(start.T_camera_marker)
+    order = jnp.where(errors[0] <= errors[1], jnp.array([0, 1]), jnp.array([1, 0]))
+    return PosePair(jaxlie.SE3(wxyz_xyz[order]), errors[order])
+
+
+@jax.jit
+def solve_markers(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) -> PosePair:
+    """`solve_marker` for a batch: (B, 4, 2) corners and (B,) sides give batch axes (B, 2)."""
+    return jax.vmap(solve_marker)(corners_n, size_m)
