@@ -1,0 +1,45 @@
+"""Rigs, cameras, markers, vehicles and routes: files in and out.
+
+What a person wrote is validated before anything is built from it; what is wrong is one
+`BadInput` line that names the file and the key. Keys carry their units.
+"""
+
+from pathlib import Path
+
+from jaxnav.errors import BadInput
+from jaxnav.files.cameras import load_camera
+from jaxnav.files.markers import FAMILY_SIZES, load_markers, save_markers
+from jaxnav.files.rigs import load_rig, save_rig
+from jaxnav.files.vehicles import Route, load_route, load_vehicle
+from jaxnav.files.writing import atomic_path, atomic_write, output_folder, write_json, write_tum
+
+__all__ = [
+    "FAMILY_SIZES",
+    "Route",
+    "atomic_path",
+    "atomic_write",
+    "calib_dir",
+    "load_camera",
+    "load_markers",
+    "load_rig",
+    "load_route",
+    "load_vehicle",
+    "output_folder",
+    "save_markers",
+    "save_rig",
+    "write_json",
+    "write_tum",
+]
+
+
+def calib_dir() -> Path:
+    """The shipped calibration data: inside the package when installed, beside it in a checkout.
+
+    Raises:
+        BadInput: an incomplete installation.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "calib", package.parent / "calib"):
+        if (folder / "qcar").is_dir():
+            return folder
+    raise BadInput(package / "calib", "missing: jaxnav is not installed completely")

@@ -1,0 +1,174 @@
+"""Marker maps: YAML, in and out.
+
+    markers:
+      - id: 0
+        family: tag36h11
+        size_m: 0.172
+        corners_world_m: [[...], [...], [...], [...]]   # TL TR BR BL, as its reader sees them
+
+Instead of the corners, `T_world_marker` (4x4 or `{wxyz, xyz_m}`): x right, y up, z towards the
+reader.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from jaxnav.files import poses
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import plain_pose, pose_array, yaml_text
+from jaxnav.files.validation import Count, Entry, Point, Pose, Positive, Text, validate
+from jaxnav.files.writing import atomic_write
+from jaxnav.markers import CORNER_SIGNS, MarkerMap
+
+# How many markers each family has: AprilTag's by AprilTag's names, ArUco's by OpenCV's.
+FAMILY_SIZES = {
+    "tag16h5": 30,
+    "tag25h9": 35,
+    "tag36h10": 2320,
+    "tag36h11": 587,
+    "aruco_original": 1024,
+    "aruco_mip_36h12": 250,
+} | {f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)}
+
+# A corner may lie this far from the best square, as a part of the side: a tape measure's error.
+_MAX_CORNER_ERROR = 0.03
+
+
+class MarkerEntry(Entry):
+    """One marker of a map file."""
+
+    family: Text
+    id: Count
+    size_m: Positive
+    corners_world_m: Annotated[list[Point], Field(min_length=4, max_length=4)] | None = None
+    T_world_marker: Pose | None = None
+
+    @field_validator("family")
+    @classmethod
+    def _known(cls, family: str) -> str:
+        if family not in FAMILY_SIZES:
+            raise ValueError(f"unknown {family!r}: expected one of {', '.join(FAMILY_SIZES)}")
+        return family
+
+    @field_validator("id")
+    @classmethod
+    def _in_family(cls, marker_id: int, info: Any) -> int:
+        family = info.data.get("family")
+        if family and marker_id >= FAMILY_SIZES[family]:
+            raise ValueError(f"{family} has ids 0 to {FAMILY_SIZES[family] - 1}, got {marker_id}")
+        return marker_id
+
+    @field_validator("corners_world_m")
+    @classmethod
+    def _a_square(cls, corners: list[list[float]] | None, info: Any) -> list[list[float]] | None:
+        if corners is not None and "size_m" in info.data:
+            fit_square(np.array(corners), info.data["size_m"])
+        return corners
+
+    @model_validator(mode="after")
+    def _placed_once(self) -> "MarkerEntry":
+        if (self.corners_world_m is None) == (self.T_world_marker is None):
+            raise ValueError("needs exactly one of corners_world_m, T_world_marker")
+        return self
+
+    def pose(self) -> np.ndarray:
+        """(7,) wxyz_xyz of the marker in the world."""
+        if self.corners_world_m is not None:
+            return fit_square(np.array(self.corners_world_m), self.size_m)
+        assert self.T_world_marker is not None  # _placed_once
+        return pose_array(self.T_world_marker)
+
+
+class MarkerFile(Entry):
+    """A map file."""
+
+    markers: Annotated[list[MarkerEntry], Field(min_length=1, max_length=4096)]
+
+    @field_validator("markers")
+    @classmethod
+    def _each_once(cls, markers: list[MarkerEntry]) -> list[MarkerEntry]:
+        seen = set()
+        for marker in markers:
+            key = (marker.family, marker.id)
+            if key in seen:
+                raise ValueError(f"marker {marker.id} of {marker.family} is in the map twice")
+            seen.add(key)
+        return markers
+
+
+def load_markers(path: str | Path) -> MarkerMap:
+    """A marker map.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    path = Path(path)
+    entries = validate(MarkerFile, read_mapping(path), path).markers
+    return marker_map(
+        np.stack([entry.pose() for entry in entries]),
+        [entry.size_m for entry in entries],
+        [entry.id for entry in entries],
+        [entry.family for entry in entries],
+    )
+
+
+def marker_map(
+    Ts_world_marker: np.ndarray, size_m: list[float], ids: list[int], families: list[str]
+) -> MarkerMap:
+    """A map from plain values: (M, 7) wxyz_xyz and M of each of the others."""
+    return MarkerMap(
+        Ts_world_marker=jaxlie.SE3(jnp.asarray(Ts_world_marker, float)),
+        size_m=jnp.asarray(size_m, float),
+        ids=tuple(int(marker_id) for marker_id in ids),
+        families=tuple(families),
+    )
+
+
+def save_markers(path: str | Path, markers: MarkerMap) -> None:
+    """Write a map; `load_markers` gives back the same numbers, bit for bit.
+
+    Raises:
+        BadInput: the file can't be written.
+    """
+    entries: list[dict[str, Any]] = [
+        {
+            "id": marker_id,
+            "family": family,
+            "size_m": float(markers.size_m[index]),
+            "T_world_marker": plain_pose(markers.Ts_world_marker.wxyz_xyz[index]),
+        }
+        for index, (marker_id, family) in enumerate(zip(markers.ids, markers.families, strict=True))
+    ]
+    atomic_write(path, yaml_text({"markers": entries}))
+
+
+def fit_square(corners_m: np.ndarray, size_m: float) -> np.ndarray:
+    """(7,) wxyz_xyz of the square marker that fits its measured corners (4, 3) best.
+
+    Any square of the right side is a marker facing one way or the other; a bow tie, a rectangle
+    or a folded one is none.
+
+    Source: Kabsch (1976), "A solution for the best rotation to relate two sets of vectors".
+
+    Raises:
+        ValueError: they are not the corners of such a square.
+    """
+    model = size_m / 2 * CORNER_SIGNS
+    center = corners_m.mean(axis=0)
+    U, _, Vt = np.linalg.svd((corners_m - center).T @ model)
+    mirrored = np.linalg.det(U @ Vt) < 0
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1, 1, -1 if mirrored else 1]) @ Vt
+    T[:3, 3] = center
+    errors_m = np.linalg.norm(center + model @ T[:3, :3].T - corners_m, axis=1)
+    if errors_m.max() > _MAX_CORNER_ERROR * size_m:
+        raise ValueError(
+            f"TL TR BR BL must be a square with sides of {size_m:g} m: "
+            f"corner [{errors_m.argmax()}] is {errors_m.max():.3g} m off"
+        )
+    return poses.pose_from_matrix(T)

@@ -1,0 +1,131 @@
+"""Rigid transforms as files hold them, in NumPy's float64 whatever JAX's precision is.
+
+A pose is the (7,) array of jaxlie: quaternion w x y z, then translation in m.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+# Rounding in a file is forgiven and repaired up to this; beyond, it is no rotation.
+_MAX_DEVIATION = 1e-3
+
+
+def check_matrix(rows: list[list[float]]) -> list[list[float]]:
+    """The rows, if they are a rigid 4x4 transform.
+
+    Raises:
+        ValueError: a mirror image, not orthonormal, or a wrong last row.
+    """
+    T = np.asarray(rows, float)
+    R = T[:3, :3]
+    if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise ValueError(f"the last row must be 0 0 0 1, got {rows[3]}")
+    deviation = np.abs(R @ R.T - np.eye(3)).max()
+    if deviation > _MAX_DEVIATION:
+        raise ValueError(f"the 3x3 part is not a rotation: R R' is off by {deviation:.2g}")
+    if np.linalg.det(R) < 0:
+        raise ValueError("the 3x3 part has det(R) < 0: a mirror image, not a rotation")
+    return rows
+
+
+def check_quaternion(wxyz: list[float]) -> list[float]:
+    """The quaternion, if its length is 1 but for rounding.
+
+    Raises:
+        ValueError: it isn't.
+    """
+    length = np.linalg.norm(wxyz)
+    if abs(length - 1) > _MAX_DEVIATION:
+        raise ValueError(f"must have length 1, got {length:.6g}")
+    return wxyz
+
+
+def pose_from_matrix(T: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+    """(7,) from a 4x4 that `check_matrix` accepts; R becomes the nearest rotation.
+
+    Source: Shepperd (1978), "Quaternion from rotation matrix".
+    """
+    T = np.asarray(T, float)
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    R = U @ Vt
+    four_squares = np.array(
+        [
+            1 + R[0, 0] + R[1, 1] + R[2, 2],
+            1 + R[0, 0] - R[1, 1] - R[2, 2],
+            1 - R[0, 0] + R[1, 1] - R[2, 2],
+            1 - R[0, 0] - R[1, 1] + R[2, 2],
+        ]
+    )
+    minus = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    plus = np.array([R[2, 1] + R[1, 2], R[0, 2] + R[2, 0], R[1, 0] + R[0, 1]])
+    largest = int(np.argmax(four_squares))
+    # Row i of the symmetric matrix 4 q q'.
+    row = np.array(
+        [
+            [four_squares[0], minus[0], minus[1], minus[2]],
+            [minus[0], four_squares[1], plus[2], plus[1]],
+            [minus[1], plus[2], four_squares[2], plus[0]],
+            [minus[2], plus[1], plus[0], four_squares[3]],
+        ]
+    )[largest]
+    return np.concatenate([row / np.linalg.norm(row), T[:3, 3]])
+
+
+def pose_from_quaternion(wxyz: Sequence[float], xyz_m: Sequence[float]) -> np.ndarray:
+    """(7,); normalised only if the length is off by more than float32 rounds, exact otherwise."""
+    q = np.asarray(wxyz, float)
+    length = np.linalg.norm(q)
+    return np.concatenate([q if abs(length - 1) < 1e-6 else q / length, np.asarray(xyz_m, float)])
+
+
+def pose_from_rotation_vector(rotation_rad: Sequence[float], xyz_m: Sequence[float]) -> np.ndarray:
+    """(7,) from an axis times its angle."""
+    rotation = np.asarray(rotation_rad, float)
+    half = np.linalg.norm(rotation) / 2
+    # sin(half) / (2 half), which tends to 1/2
+    return np.concatenate(
+        [[np.cos(half)], rotation / 2 * np.sinc(half / np.pi), np.asarray(xyz_m, float)]
+    )
+
+
+def matrix(pose: np.ndarray) -> np.ndarray:
+    """4x4 of a pose."""
+    w, x, y, z = pose[:4] / np.linalg.norm(pose[:4])
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = pose[4:]
+    return T
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """The pose T_b_a of T_a_b."""
+    translation = -matrix(pose)[:3, :3].T @ pose[4:]
+    return np.concatenate([pose[:4] * [1, -1, -1, -1], translation])
+
+
+def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
+    """The pose T_a_c."""
+    return pose_from_matrix(matrix(T_a_b) @ matrix(T_b_c))
+
+
+def looking(yaw_deg: float, elevation_deg: float, roll_deg: float) -> np.ndarray:
+    """(3, 3) rotation of a camera in the vehicle frame, R_vehicle_camera.
+
+    Args:
+        yaw_deg: 0 looks forward, 90 to the left.
+        elevation_deg: positive looks up.
+        roll_deg: positive turns the camera clockwise as seen from behind it.
+    """
+    yaw, up, roll = np.deg2rad([yaw_deg, elevation_deg, roll_deg])
+    about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    about_y = np.array([[np.cos(up), 0, -np.sin(up)], [0, 1, 0], [np.sin(up), 0, np.cos(up)]])
+    forward = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # right, down, forward in x y z
+    about_axis = np.array(
+        [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
+    )
+    return about_z @ about_y @ forward @ about_axis

@@ -1,0 +1,175 @@
+"""Text, YAML and JSON from disk, with everything surprising refused.
+
+YAML is read with the scalars of YAML 1.2: `yes` is a word, `010` is ten and `1e-5` is a number.
+Sizes and depths are bounded, duplicate keys and aliases are refused, and OpenCV's matrices
+(`!!opencv-matrix`) are read as the mappings they are.
+"""
+
+import json
+import re
+from collections.abc import Callable, Hashable
+from pathlib import Path
+from typing import Any, ClassVar, NoReturn
+
+import yaml
+
+from jaxnav.errors import BadInput
+
+_MAX_YAML_BYTES = 2 * 2**20  # several thousand markers
+_MAX_JSON_BYTES = 64 * 2**20  # PhotonVision keeps its snapshots inside
+_MAX_DEPTH = 24
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The mapping that a YAML or (`.json`) JSON file holds.
+
+    Raises:
+        BadInput: unreadable, too large, not text, not YAML or JSON, or not a mapping.
+    """
+    is_json = path.suffix.lower() == ".json"
+    text = read_text(path, _MAX_JSON_BYTES if is_json else _MAX_YAML_BYTES)
+    data = _parse_json(path, text) if is_json else _parse_yaml(path, text)
+    if data is None:
+        raise BadInput(path, "the file is empty")
+    if not isinstance(data, dict):
+        raise BadInput(path, f"must be a mapping of keys to values, got a {_kind(data)}")
+    return data
+
+
+def read_text(path: Path, max_bytes: int) -> str:
+    """A UTF-8 file of bounded size.
+
+    Raises:
+        BadInput: it can't be read, is larger than that, or is not UTF-8.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(max_bytes + 1)
+    except IsADirectoryError:
+        raise BadInput(path, "is a folder, not a file") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise BadInput(path, f"can't be read: {_reason(error)}") from None
+    if len(raw) > max_bytes:
+        raise BadInput(path, f"is larger than {max_bytes // 2**20} MiB")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadInput(path, f"is not UTF-8 text (byte {error.start})") from None
+
+
+def _parse_yaml(path: Path, text: str) -> Any:
+    # OpenCV 3 and 4 head their files with "%YAML:1.0", which is not a YAML directive.
+    if text.startswith("%YAML:"):
+        text = "#" + text
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f"line {mark.line + 1}: " if mark else ""
+        raise BadInput(path, f"is not valid YAML: {line}{error.problem or error.context}") from None
+    except yaml.YAMLError as error:  # a character that YAML does not allow
+        raise BadInput(path, f"is not valid YAML: {str(error).splitlines()[0]}") from None
+    except (
+        ValueError,
+        OverflowError,
+    ) as error:  # an escape beyond Unicode, a number of 10 000 digits
+        raise BadInput(path, f"is not valid YAML: {error}") from None
+
+
+def _parse_json(path: Path, text: str) -> Any:
+    try:
+        return json.loads(text, object_pairs_hook=_unique)
+    except (ValueError, RecursionError) as error:
+        raise BadInput(path, f"is not valid JSON: {error}") from None
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"duplicate key {next(key for key in keys if keys.count(key) > 1)!r}")
+    return mapping
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, stricter."""
+
+    # PyYAML's own names, filled below.
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
+    yaml_constructors: ClassVar[dict[Any, Any]] = {
+        tag: construct
+        for tag, construct in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.rpartition(":")[2] in ("map", "seq", "str")
+    }
+
+    def __init__(self, stream: str):
+        yaml.SafeLoader.__init__(self, stream)
+        self._depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            self._refuse("aliases (*name) are not supported", self.peek_event())
+        if self._depth == _MAX_DEPTH:
+            self._refuse(f"nested deeper than {_MAX_DEPTH} levels", self.peek_event())
+        self._depth += 1
+        node = yaml.SafeLoader.compose_node(self, parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
+        if not isinstance(node, yaml.MappingNode):
+            self._refuse("expected a mapping", node)
+        mapping: dict[Hashable, Any] = {}
+        for key_node, value_node in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                self._refuse(f"the key {key!r} must be a word", key_node)
+            if key in mapping:
+                self._refuse(f"duplicate key {key!r}", key_node)
+            mapping[key] = self.construct_object(value_node, deep=deep)
+        return mapping
+
+    def _refuse(self, problem: str, at: Any) -> NoReturn:
+        raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
+
+
+_TAG = "tag:yaml.org,2002:"
+_FLOAT = r"[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
+_SPECIAL_FLOAT = r"[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN|Nan)$"
+
+
+def _scalar(construct: Callable[[str], Any]) -> Callable[[_Loader, Any], Any]:
+    return lambda loader, node: construct(loader.construct_scalar(node))
+
+
+def _matrix(loader: _Loader, node: Any) -> dict[Hashable, Any]:
+    return loader.construct_mapping(node, deep=True)
+
+
+def _to_float(text: str) -> float:
+    return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
+
+
+# The scalars of YAML 1.2: name, pattern, the characters it may start with, and what it makes.
+for _name, _pattern, _first, _construct in (
+    ("null", r"(~|null|Null|NULL|)$", ["~", "n", "N", ""], lambda text: None),
+    (
+        "bool",
+        r"(true|True|TRUE|false|False|FALSE)$",
+        list("tTfF"),
+        lambda text: text[:1] in ("t", "T"),
+    ),
+    ("int", r"[-+]?[0-9]+$", list("-+0123456789"), int),
+    ("float", f"{_FLOAT}|{_SPECIAL_FLOAT}", list("-+.0123456789"), _to_float),
+):
+    _Loader.add_implicit_resolver(_TAG + _name, re.compile(_pattern), _first)
+    _Loader.add_constructor(_TAG + _name, _scalar(_construct))
+_Loader.add_constructor(f"{_TAG}opencv-matrix", _matrix)
+
+
+def _kind(value: Any) -> str:
+    return {list: "list", str: "text", bool: "true/false"}.get(type(value), type(value).__name__)
+
+
+def _reason(error: Exception) -> str:
+    return (getattr(error, "strerror", None) or str(error)).lower()

@@ -1,0 +1,177 @@
+"""What a key may hold, and how a person hears that it doesn't.
+
+Files are validated by frozen pydantic models. `validate` turns the first thing pydantic finds
+into one line with the file and the key: `rig.yaml: cameras.front.focal_px[0]: must be > 0, got 0`.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+)
+
+from jaxnav.errors import BadInput
+from jaxnav.files.poses import check_matrix, check_quaternion
+
+
+class Entry(BaseModel):
+    """A mapping in a file of ours: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ForeignEntry(BaseModel):
+    """A mapping in a file of another tool, which holds more than we read."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+def _not_tiny(value: float) -> float:
+    if value < 1e-6:
+        raise ValueError(f"must be at least 1e-06, got {value:g}")
+    return value
+
+
+# A number is a number: not text, not true/false, finite, and within what float32 can hold.
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
+Positive = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e9), AfterValidator(_not_tiny)
+]
+Pixels = Annotated[int, Field(strict=True, ge=1, le=65536)]
+Count = Annotated[int, Field(strict=True, ge=0, le=2**31)]
+Text = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
+# Starts like a word, so that no YAML reader takes it for a number or for true.
+Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z_/][\w/.\-]{0,99}$")]
+
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
+PositivePair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+ImageSize = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
+
+_Row = Annotated[list[Number], Field(min_length=4, max_length=4)]
+Matrix = Annotated[
+    list[_Row], Field(min_length=4, max_length=4), AfterValidator(check_matrix)
+]  # 4x4, rigid
+
+
+class QuaternionPose(Entry):
+    """A rigid transform as jaxlie stores it; what we write, because it reads back exactly."""
+
+    wxyz: Annotated[
+        list[Number], Field(min_length=4, max_length=4), AfterValidator(check_quaternion)
+    ]
+    xyz_m: Point
+
+
+Pose = Annotated[
+    Annotated[QuaternionPose, Tag("<wxyz>")] | Annotated[Matrix, Tag("<4x4>")],
+    Discriminator(lambda value: "<wxyz>" if isinstance(value, dict | QuaternionPose) else "<4x4>"),
+]
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validate(model: type[Model], data: Any, path: Path, prefix: str = "") -> Model:
+    """The data as the model, or one line about the first thing wrong with it.
+
+    Args:
+        model: a pydantic model.
+        data: what the file holds, or a part of it.
+        path: the file, for the message.
+        prefix: the key of that part in the file.
+
+    Raises:
+        BadInput: naming file, key, what is expected and what was found.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as invalid:
+        errors = invalid.errors(include_url=False)
+    first = errors[0]
+    problem = _problem(first, model)
+    if len(errors) > 1:
+        problem += f" (and {len(errors) - 1} more)"
+    raise BadInput(at(path, prefix, _key(first["loc"], data)), problem)
+
+
+def at(path: Path, *keys: str) -> str:
+    """`file: key.key[0]`, leaving out what is empty."""
+    dotted = "".join(key if key.startswith("[") else f".{key}" for key in keys if key)
+    return f"{path}: {dotted.removeprefix('.')}" if dotted else str(path)
+
+
+def _key(location: tuple[int | str, ...], data: Any) -> str:
+    """The place in the file, with named things under their names: `cameras.front.lens`."""
+    key = ""
+    for part in location:
+        if isinstance(part, str) and part.startswith("<"):
+            continue  # which form of a pose it is
+        inside = None
+        if isinstance(data, dict):
+            inside = data.get(part)
+        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
+            inside = data[part]
+        name = inside.get("name") if isinstance(inside, dict) else None
+        if isinstance(part, int):
+            key += f".{name}" if isinstance(name, str) and name else f"[{part}]"
+        else:
+            key += f".{part}"
+        data = inside
+    return key.removeprefix(".")
+
+
+def _problem(error: Any, model: type[BaseModel]) -> str:
+    kind, context, got = error["type"], error.get("ctx", {}), _shown(error["input"])
+    if kind == "missing":
+        return "missing"
+    if kind == "extra_forbidden":
+        known = f": expected {', '.join(model.model_fields)}" if len(error["loc"]) == 1 else ""
+        return f"unknown key{known}"
+    if kind in ("too_short", "too_long"):
+        least, most = context.get("min_length"), context.get("max_length")
+        bound = f"at least {least}" if kind == "too_short" else f"at most {most}"
+        return f"must have {bound} entries, got {context['actual_length']}"
+    if kind in _EXPECTED:
+        return f"{_EXPECTED[kind]}, got {got}"
+    if kind in _BOUNDS:
+        sign, limit = _BOUNDS[kind]
+        return f"must be {sign} {context[limit]:g}, got {got}"
+    if kind == "literal_error":
+        return f"must be {context['expected']}, got {got}"
+    if kind == "value_error":
+        return str(context["error"])
+    return f"{error['msg']}, got {got}"
+
+
+_EXPECTED = {
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "finite_number": "must be finite",
+    "string_type": "must be text",
+    "string_pattern_mismatch": "must be a name (a letter first, then letters, digits and _ - . /)",
+    "string_too_short": "must not be empty",
+    "string_too_long": "must be shorter",
+    "list_type": "must be a list",
+    "dict_type": "must be a mapping",
+    "model_type": "must be a mapping",
+    "model_attributes_type": "must be a mapping",
+}
+_BOUNDS = {
+    "greater_than": (">", "gt"),
+    "greater_than_equal": (">=", "ge"),
+    "less_than": ("<", "lt"),
+    "less_than_equal": ("<=", "le"),
+}
+
+
+def _shown(value: Any) -> str:
+    shown = repr(value) if not isinstance(value, str) else f"the text {value!r}"
+    return shown if len(shown) <= 60 else f"{shown[:57]}..."

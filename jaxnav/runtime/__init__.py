@@ -1,0 +1,1 @@
+"""What runs on and around the vehicle: recordings in and out."""

@@ -1,0 +1,631 @@
+"""Files in and out: what is right is read exactly, what is wrong is one line with file and key."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxnav import files
+from jaxnav.errors import BadInput
+from jaxnav.files import poses
+
+QCAR = files.calib_dir() / "qcar"
+LOADERS: dict[str, Callable[[Path], Any]] = {
+    "rig.yaml": files.load_rig,
+    "markers.yaml": files.load_markers,
+    "vehicle.yaml": files.load_vehicle,
+    "route.yaml": files.load_route,
+}
+
+
+def problem(call: Callable[..., Any], *args: Any) -> str:
+    """The one line that a person gets."""
+    with pytest.raises(BadInput) as caught:
+        call(*args)
+    line = str(caught.value)
+    assert "\n" not in line
+    return line
+
+
+def leaves_equal(a: Any, b: Any) -> bool:
+    leaves_a, leaves_b = jax.tree.leaves(a), jax.tree.leaves(b)
+    return jax.tree.structure(a) == jax.tree.structure(b) and all(
+        x.dtype == y.dtype and np.array_equal(x, y) for x, y in zip(leaves_a, leaves_b, strict=True)
+    )
+
+
+# --- what is shipped -----------------------------------------------------------------
+
+
+def test_the_qcar_looks_in_four_directions_clockwise():
+    rig = files.load_rig(QCAR / "rig.yaml")
+    assert rig.names == ("front", "right", "rear", "left")
+    assert rig.image_sizes_px == ((820, 410),) * 4
+    assert rig.cameras.lenses == ("equidistant",)
+    Ts_vehicle_camera = rig.Ts_camera_vehicle.inverse()
+    R = np.asarray(Ts_vehicle_camera.rotation().as_matrix())
+    optical_axes = [[1, 0, 0], [0, -1, 0], [-1, 0, 0], [0, 1, 0]]
+    np.testing.assert_allclose(R[:, :, 2], optical_axes, atol=1e-12)
+    np.testing.assert_allclose(R[:, :, 1], [[0, 0, -1]] * 4, atol=1e-12)  # y of the image is down
+    np.testing.assert_allclose(
+        Ts_vehicle_camera.translation(),
+        np.c_[[0.193, 0.014, -0.165, 0.014], [0, -0.0674, 0, 0.0438], [0.0953] * 4],
+        atol=1e-12,
+    )
+
+
+def test_the_paper_s_marker_faces_the_start():
+    markers = files.load_markers(QCAR / "markers.yaml")
+    assert (markers.ids, markers.families) == ((0,), ("tag36h11",))
+    np.testing.assert_allclose(
+        markers.corners_world_m[0],
+        [[-0.086, 1.47, 0.312], [0.086, 1.47, 0.312], [0.086, 1.47, 0.14], [-0.086, 1.47, 0.14]],
+        atol=1e-12,
+    )
+    R_world_marker = np.asarray(markers.Ts_world_marker.rotation().as_matrix())[0]
+    np.testing.assert_allclose(R_world_marker[:, 2], [0, -1, 0], atol=1e-12)
+
+
+def test_the_route_starts_towards_its_first_waypoint():
+    route = files.load_route(QCAR / "route.yaml")
+    assert route.waypoints_m == ((1.30, 0.0), (0.50, 0.65))
+    x, y, psi_rad = route.start_pose
+    assert (x, y) == (2.0, -1.0)
+    assert np.arctan2(0.0 - y, 1.30 - x) == pytest.approx(psi_rad, abs=1e-3)
+
+
+def test_the_vehicle_holds_the_paper_s_figures():
+    vehicle = files.load_vehicle(QCAR / "vehicle.yaml")
+    assert float(vehicle.wheelbase_m) == 0.256
+    assert float(vehicle.steering_limit_rad) == 0.5
+    assert float(vehicle.throttle_limit) == 0.3
+
+
+def test_data_is_found_in_a_wheel_and_in_a_checkout(tmp_path, monkeypatch):
+    package = tmp_path / "site-packages" / "jaxnav"
+    monkeypatch.setattr(files, "__file__", str(package / "files" / "__init__.py"))
+    assert "calib" in problem(files.calib_dir)
+    (tmp_path / "site-packages" / "calib" / "qcar").mkdir(parents=True)
+    assert files.calib_dir() == tmp_path / "site-packages" / "calib"
+    (package / "calib" / "qcar").mkdir(parents=True)
+    assert files.calib_dir() == package / "calib"
+
+
+def test_families_are_opencv_s():
+    for family, count in files.FAMILY_SIZES.items():
+        name = family.replace("tag", "APRILTAG_") if family.startswith("tag") else family
+        name = name if name.startswith("APRILTAG") else _cv2_name(name)
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+        assert len(dictionary.bytesList) == count, family
+
+
+def _cv2_name(family: str) -> str:
+    known = [name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    return next(name for name in known if name.lower() == family)
+
+
+# --- there and back ------------------------------------------------------------------
+
+
+def test_a_saved_rig_reads_back_bit_for_bit(precision, tmp_path):
+    text = yaml.safe_load((QCAR / "rig.yaml").read_text())
+    odd = {"position_m": [0.1, 0.2, 0.3], "yaw_deg": 33.3, "elevation_deg": -7.1, "roll_deg": 1.7}
+    text["cameras"][1] |= odd | {"lens": "radtan", "distortion": [0.1, -0.02, 1e-3, 2e-4]}
+    text["cameras"][2] |= {"lens": "none", "distortion": []}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(text))
+    rig = files.load_rig(tmp_path / "rig.yaml")
+    assert rig.cameras.focal_px.dtype == precision
+    files.save_rig(tmp_path / "again.yaml", rig)
+    again = files.load_rig(tmp_path / "again.yaml")
+    assert leaves_equal(rig, again)
+    assert (again.names, again.image_sizes_px) == (rig.names, rig.image_sizes_px)
+
+
+def test_a_saved_map_reads_back_bit_for_bit(precision, tmp_path):
+    tilted = poses.looking(20.0, 30.0, 40.0)
+    corners = (np.array([1.0, 2.0, 3.0]) + 0.1 * _SQUARE @ tilted.T).tolist()
+    entry = {"id": 5, "family": "4x4_50", "size_m": 0.2, "corners_world_m": corners}
+    entries = [entry, *yaml.safe_load((QCAR / "markers.yaml").read_text())["markers"]]
+    (tmp_path / "markers.yaml").write_text(yaml.safe_dump({"markers": entries}))
+    markers = files.load_markers(tmp_path / "markers.yaml")
+    assert markers.size_m.dtype == precision
+    np.testing.assert_allclose(markers.corners_world_m[0], corners, atol=1e-6)
+    files.save_markers(tmp_path / "again.yaml", markers)
+    again = files.load_markers(tmp_path / "again.yaml")
+    assert leaves_equal(markers, again)
+    assert (again.ids, again.families) == ((5, 0), ("4x4_50", "tag36h11"))
+
+
+_SQUARE = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
+
+
+def test_the_three_ways_to_place_a_camera_agree(tmp_path):
+    T_vehicle_camera = np.eye(4)
+    T_vehicle_camera[:3, :3] = poses.looking(90.0, 30.0, 10.0)
+    T_vehicle_camera[:3, 3] = [0.1, 0.2, 0.3]
+    pose = poses.pose_from_matrix(T_vehicle_camera)
+    places = [
+        {"position_m": [0.1, 0.2, 0.3], "yaw_deg": 90, "elevation_deg": 30, "roll_deg": 10},
+        {"T_vehicle_camera": T_vehicle_camera.tolist()},
+        {"T_vehicle_camera": {"wxyz": pose[:4].tolist(), "xyz_m": pose[4:].tolist()}},
+        {"T_camera_vehicle": np.linalg.inv(T_vehicle_camera).tolist()},
+    ]
+    cameras = [one_camera(f"c{i}") | place for i, place in enumerate(places)]
+    rig = files.load_rig(write(tmp_path, {"cameras": cameras}))
+    matrices = np.asarray(rig.Ts_camera_vehicle.as_matrix())
+    np.testing.assert_allclose(matrices, [np.linalg.inv(T_vehicle_camera)] * 4, atol=1e-12)
+    # Looking left and 30 degrees up; turned clockwise, its x axis dips below the horizon.
+    axis, x_axis = T_vehicle_camera[:3, 2], T_vehicle_camera[:3, 0]
+    np.testing.assert_allclose(axis, [0, np.sqrt(3) / 2, 0.5], atol=1e-12)
+    assert x_axis[0] > 0.9
+    assert x_axis[2] < 0
+
+
+def test_small_rounding_in_a_rotation_is_repaired(tmp_path):
+    T = np.eye(4)
+    T[:3, :3] = np.round(poses.looking(33.0, 0.0, 0.0), 4)
+    rig = files.load_rig(
+        write(tmp_path, {"cameras": [one_camera("c") | {"T_vehicle_camera": T.tolist()}]})
+    )
+    R = np.asarray(rig.Ts_camera_vehicle.rotation().as_matrix())[0]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(R.T, poses.looking(33.0, 0.0, 0.0), atol=1e-4)
+
+
+# --- what a person gets for bad input ------------------------------------------------
+
+
+def one_camera(name: str) -> dict[str, Any]:
+    return {
+        "name": name,
+        "lens": "equidistant",
+        "focal_px": [319.0, 320],
+        "center_px": [401.0, 202.0],
+        "image_size_px": [820, 410],
+    }
+
+
+class _NoAliases(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def write(folder: Path, data: Any, name: str = "rig.yaml") -> Path:
+    path = folder / name
+    path.write_text(data if isinstance(data, str) else yaml.dump(data, Dumper=_NoAliases))
+    return path
+
+
+MIRROR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
+BAD_CAMERAS = [
+    ({"focal_px": [0, 319]}, "cameras.front.focal_px[0]: must be > 0, got 0"),
+    ({"focal_px": [-3.0, 319]}, "cameras.front.focal_px[0]: must be > 0, got -3.0"),
+    ({"focal_px": [1, float("nan")]}, "cameras.front.focal_px[1]: must be finite, got nan"),
+    ({"focal_px": [1, float("inf")]}, "cameras.front.focal_px[1]: must be finite, got inf"),
+    ({"focal_px": [319]}, "cameras.front.focal_px: must have at least 2 entries, got 1"),
+    ({"focal_px": [1, 2, 3]}, "cameras.front.focal_px: must have at most 2 entries, got 3"),
+    ({"focal_px": 319}, "cameras.front.focal_px: must be a list, got 319"),
+    ({"focal_px": ["319", 319]}, "cameras.front.focal_px[0]: must be a number, got the text '319'"),
+    ({"focal_px": [True, 319]}, "cameras.front.focal_px[0]: must be a number, got True"),
+    ({"focal_px": None}, "cameras.front.focal_px: must be a list, got None"),
+    ({"center_px": [1e300, 1]}, "cameras.front.center_px[0]: must be <= 1e+09, got 1e+300"),
+    ({"lens": "fisheye"}, "cameras.front.lens: must be 'none', 'radtan' or 'equidistant', got"),
+    ({"distortion": [1, 2, 3]}, "cameras.front.distortion: must have 4 coefficients"),
+    ({"lens": "radtan", "distortion": [1] * 3}, "front.distortion: must have 4 or 5 coefficients"),
+    ({"lens": "none", "distortion": [1]}, "front.distortion: must have 0 coefficients"),
+    ({"image_size_px": [820.5, 410]}, "front.image_size_px[0]: must be a whole number, got 820.5"),
+    ({"image_size_px": [820, 0]}, "cameras.front.image_size_px[1]: must be >= 1, got 0"),
+    ({"focal": 3}, "cameras.front.focal: unknown key"),
+    ({"name": 3}, "cameras[0].name: must be text, got 3"),
+    ({"name": "1 2"}, "cameras.1 2.name: must be a name"),
+    ({"position_m": None}, "cameras.front: needs exactly one of T_vehicle_camera"),
+    ({"T_camera_vehicle": np.eye(4).tolist()}, "got T_camera_vehicle and position_m"),
+    ({"yaw_deg": None}, "cameras.front: position_m needs yaw_deg"),
+    ({"position_m": [1, 2]}, "cameras.front.position_m: must have at least 3 entries, got 2"),
+    ({"position_m": None, "T_vehicle_camera": MIRROR}, "T_vehicle_camera: the 3x3 part has det(R)"),
+    (
+        {"position_m": None, "T_vehicle_camera": np.diag([1, 1, 1.01, 1]).tolist()},
+        "cameras.front.T_vehicle_camera: the 3x3 part is not a rotation",
+    ),
+    (
+        {"position_m": None, "T_vehicle_camera": np.ones((4, 4)).tolist()},
+        "cameras.front.T_vehicle_camera: the last row must be 0 0 0 1",
+    ),
+    (
+        {"position_m": None, "T_vehicle_camera": np.eye(3).tolist()},
+        "cameras.front.T_vehicle_camera[0]: must have at least 4 entries, got 3",
+    ),
+    (
+        {"position_m": None, "T_vehicle_camera": {"wxyz": [1, 1, 0, 0], "xyz_m": [0, 0, 0]}},
+        "cameras.front.T_vehicle_camera.wxyz: must have length 1, got 1.41421",
+    ),
+]
+
+
+@pytest.mark.parametrize(("change", "expected"), BAD_CAMERAS, ids=lambda v: str(v)[:40])
+def test_a_bad_camera_is_named_with_its_key(tmp_path, change, expected):
+    camera = one_camera("front") | {"position_m": [0, 0, 0], "yaw_deg": 0} | change
+    path = write(
+        tmp_path,
+        {"cameras": [{k: v for k, v in camera.items() if v is not None or k == "focal_px"}]},
+    )
+    line = problem(files.load_rig, path)
+    assert line.startswith(f"{path}: ")
+    assert expected in line
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "the file is empty"),
+        ("# nothing\n", "the file is empty"),
+        ("[1, 2]", "must be a mapping of keys to values, got a list"),
+        ("cameras: []", "cameras: must have at least 1 entries, got 0"),
+        ("cameras: 3", "cameras: must be a list, got 3"),
+        ("cameras: [3]", "cameras[0]: must be a mapping, got 3"),
+        ("cameras:\ncameras:", "line 2: duplicate key 'cameras'"),
+        ("cameras: &a [1]\nb: *a", "aliases (*name) are not supported"),
+        ("a: " + "[" * 60, "nested deeper than 24 levels"),
+        ("a: !!python/object/apply:os.system ['true']", "is not valid YAML"),
+        ("a: !!int four", "is not valid YAML"),
+        ("a: [1, 2", "is not valid YAML: line 1"),
+        ("a: \x01", "is not valid YAML"),
+        ("1: 2", "the key 1 must be a word"),
+        ("camera: 3", "is neither a rig (`cameras:`) nor a Kalibr camchain (`cam0:`)"),
+    ],
+)
+def test_bad_yaml_is_one_line(tmp_path, text, expected):
+    path = write(tmp_path, text)
+    line = problem(files.load_rig, path)
+    assert line.startswith(f"{path}: ")
+    assert expected in line
+
+
+def test_what_is_no_text_file_is_one_line(tmp_path):
+    assert "no such file" in problem(files.load_rig, tmp_path / "none.yaml")
+    assert "is a folder" in problem(files.load_rig, tmp_path)
+    (tmp_path / "b.yaml").write_bytes(b"\x89PNG\r\n\xff\xfe")
+    assert "is not UTF-8 text (byte 0)" in problem(files.load_rig, tmp_path / "b.yaml")
+    (tmp_path / "big.yaml").write_bytes(b"#" * (3 * 2**20))
+    assert "is larger than 2 MiB" in problem(files.load_rig, tmp_path / "big.yaml")
+    assert "can't be read" in problem(files.load_rig, Path("a\0b"))
+
+
+def test_camera_names_differ(tmp_path):
+    camera = one_camera("front") | {"position_m": [0, 0, 0], "yaw_deg": 0}
+    line = problem(files.load_rig, write(tmp_path, {"cameras": [camera, camera]}))
+    assert line.endswith("cameras: the name 'front' is used twice")
+
+
+def test_numbers_are_those_of_yaml_1_2(tmp_path):
+    text = (QCAR / "vehicle.yaml").read_text()
+    path = write(tmp_path, text.replace(": 10.0", ": 1e1").replace(": 5.0", ": 010"))
+    assert float(files.load_vehicle(path).speed_per_throttle_mps) == 10.0
+    assert float(files.load_vehicle(path).steering_rate_limit_radps) == 10.0
+    path = write(tmp_path, text.replace(": 10.0", ": 1:30"))  # sexagesimal in YAML 1.1
+    assert "must be a number, got the text '1:30'" in problem(files.load_vehicle, path)
+
+
+MARKER = {"id": 0, "family": "tag36h11", "size_m": 2.0, "corners_world_m": _SQUARE.tolist()}
+BAD_MARKERS = [
+    ({"corners_world_m": (1.1 * _SQUARE).tolist()}, "must be a square with sides of 2 m: corner ["),
+    ({"corners_world_m": _SQUARE[[0, 1, 3, 2]].tolist()}, "TL TR BR BL must be a square"),
+    ({"corners_world_m": np.c_[_SQUARE[:, :2], [0.3, 0, 0.3, 0]].tolist()},
+     "corners_world_m: TL TR BR BL must be a square"),
+    ({"corners_world_m": (_SQUARE * [1.1, 0.9, 1]).tolist()}, "TL TR BR BL must be a square"),
+    ({"corners_world_m": _SQUARE[:3].tolist()}, "corners_world_m: must have at least 4 entries"),
+    ({"corners_world_m": _SQUARE[:, :2].tolist()}, "corners_world_m[0]: must have at least 3"),
+    ({"corners_world_m": None}, "markers[0]: needs exactly one of corners_world_m, T_world_marker"),
+    ({"T_world_marker": np.eye(4).tolist()}, "markers[0]: needs exactly one of"),
+    ({"family": "tag37h11"}, "markers[0].family: unknown 'tag37h11': expected one of tag16h5,"),
+    ({"id": 587}, "markers[0].id: tag36h11 has ids 0 to 586, got 587"),
+    ({"id": -1}, "markers[0].id: must be >= 0, got -1"),
+    ({"id": "7"}, "markers[0].id: must be a whole number, got the text '7'"),
+    ({"size_m": 0.0}, "markers[0].size_m: must be > 0, got 0.0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "expected"), BAD_MARKERS, ids=lambda v: str(v)[:40])
+def test_a_bad_marker_is_named_with_its_key(tmp_path, change, expected):
+    entry = {key: value for key, value in (MARKER | change).items() if value is not None}
+    path = write(tmp_path, {"markers": [entry]}, "markers.yaml")
+    line = problem(files.load_markers, path)
+    assert line.startswith(f"{path}: markers[0]")
+    assert expected in line
+
+
+def test_a_marker_stands_once_in_a_map(tmp_path):
+    other_family = MARKER | {"family": "tag25h9"}
+    assert len(files.load_markers(write(tmp_path, {"markers": [MARKER, other_family]})).ids) == 2
+    line = problem(files.load_markers, write(tmp_path, {"markers": [MARKER, MARKER]}))
+    assert "marker 0 of tag36h11 is in the map twice" in line
+
+
+@pytest.mark.parametrize(
+    ("loader", "old", "new", "expected"),
+    [
+        ("vehicle.yaml", "wheelbase_m: 0.256", "wheelbase_m: 0", "wheelbase_m: must be > 0, got 0"),
+        ("vehicle.yaml", "wheelbase_m: 0.256", "", "wheelbase_m: missing"),
+        ("vehicle.yaml", "wheelbase_m:", "wheelbase:", "(and 1 more)"),
+        ("vehicle.yaml", "steering_limit_rad: 0.5", "steering_limit_rad: 30", "must be < 1.5708"),
+        ("route.yaml", "[[1.30, 0.0], [0.50, 0.65]]", "[]", "waypoints_m: must have at least 1"),
+        ("route.yaml", "[1.30, 0.0]", "[1.30]", "waypoints_m[0]: must have at least 2 entries"),
+        ("route.yaml", "psi_deg: 125.0", "psi: 2", "start.psi_deg: missing"),
+        ("route.yaml", "waypoint_radius_m: 0.15", "waypoint_radius_m: -1", "must be > 0, got -1"),
+    ],
+)
+def test_a_bad_vehicle_or_route_is_named_with_its_key(tmp_path, loader, old, new, expected):
+    text = (QCAR / loader).read_text()
+    assert old in text
+    path = write(tmp_path, text.replace(old, new), loader)
+    line = problem(LOADERS[loader], path)
+    assert line.startswith(f"{path}: ")
+    assert expected in line
+
+
+# --- files of other tools ------------------------------------------------------------
+
+KALIBR = """
+cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.01, 0, 0.01, 0]
+  distortion_model: equi
+  intrinsics: [470, 471.5, 639.7, 524.4]
+  resolution: [1280, 1024]
+  rostopic: /cam0/image_raw
+  T_cam_imu:
+    - [0, -1, 0, 0.1]
+    - [0, 0, -1, 0.2]
+    - [1, 0, 0, 0.3]
+    - [0, 0, 0, 1]
+cam1:
+  camera_model: pinhole
+  distortion_coeffs: [0.1, -0.02, 0.001, 0.002]
+  distortion_model: radtan
+  intrinsics: [400.0, 401.0, 320.0, 240.0]
+  resolution: [640, 480]
+  T_cn_cnm1:
+    - [0, 0, 1, 0.5]
+    - [0, 1, 0, 0]
+    - [-1, 0, 0, 0]
+    - [0, 0, 0, 1.0]
+"""
+ROS = """
+image_width: 640
+image_height: 480
+camera_name: narrow
+camera_matrix: {rows: 3, cols: 3, data: [400.5, 0.0, 320.0, 0.0, 401.0, 240.0, 0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.02, 0.001, 0.002, 0.003]}
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+"""
+
+
+def test_a_camchain_is_chained(tmp_path):
+    rig = files.load_rig(write(tmp_path, KALIBR))
+    assert rig.names == ("cam0", "cam1")
+    assert rig.image_sizes_px == ((1280, 1024), (640, 480))
+    data = yaml.safe_load(KALIBR)
+    T_cam0_imu = np.array(data["cam0"]["T_cam_imu"], float)
+    T_cam1_imu = np.array(data["cam1"]["T_cn_cnm1"], float) @ T_cam0_imu
+    matrices = np.asarray(rig.Ts_camera_vehicle.as_matrix())
+    np.testing.assert_allclose(matrices, [T_cam0_imu, T_cam1_imu], atol=1e-12)
+    inverted = yaml.safe_load(KALIBR)  # as OpenVINS writes it
+    inverted["cam0"]["T_imu_cam"] = np.linalg.inv(inverted["cam0"].pop("T_cam_imu")).tolist()
+    again = files.load_rig(write(tmp_path, inverted))
+    np.testing.assert_allclose(again.Ts_camera_vehicle.as_matrix(), matrices, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("camera_model: pinhole", "camera_model: omni", "cam0.camera_model: must be 'pinhole'"),
+        ("camera_model: pinhole", "camera_model: ds", "cam0.camera_model: must be 'pinhole'"),
+        ("camera_model: pinhole", "camera_model: eucm", "cam0.camera_model: must be 'pinhole'"),
+        (
+            "distortion_model: equi",
+            "distortion_model: fov",
+            "cam0.distortion_model: must be one of",
+        ),
+        ("[-0.01, 0, 0.01, 0]", "[-0.01, 0]", "cam0.distortion_coeffs: must have 4 numbers, got 2"),
+        ("[470, 471.5,", "[0, 471.5,", "cam0.intrinsics: the focal lengths must be > 0"),
+        ("[470, 471.5, ", "[", "cam0.intrinsics: must be fu fv pu pv, got 2 numbers"),
+        ("T_cam_imu", "T_imu", "cam0.T_cam_imu: missing"),
+        (
+            "    - [0, -1, 0, 0.1]",
+            "    - [0, 1, 0, 0.1]",
+            "cam0.T_cam_imu: the 3x3 part has det(R)",
+        ),
+        ("\ncam1:", "\ncam2:", "cam1: missing, though there is cam2"),
+    ],
+)
+def test_a_bad_camchain_is_named_with_its_key(tmp_path, old, new, expected):
+    assert old in KALIBR
+    assert expected in problem(files.load_rig, write(tmp_path, KALIBR.replace(old, new, 1)))
+
+
+def numbers(camera: Any) -> list[float]:
+    return np.concatenate([camera.focal_px, camera.center_px, camera.distortion]).tolist()
+
+
+def opencv_file(folder: Path, K: np.ndarray, distortion: list[float]) -> Path:
+    """As the installed OpenCV writes it."""
+    path = folder / "opencv.yaml"
+    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    store.write("image_width", 640)
+    store.write("image_height", 480)
+    store.write("camera_matrix", K)
+    store.write("distortion_coefficients", np.array([distortion]))
+    store.release()
+    return path
+
+
+def test_cameras_of_four_tools(tmp_path):
+    expected = [400.5, 401.0, 320.0, 240.0, 0.1, -0.02, 0.001, 0.002, 0.003]
+    K = np.array([[400.5, 0, 320.0], [0, 401.0, 240.0], [0, 0, 1]])
+    ros, size = files.load_camera(write(tmp_path, ROS))
+    assert (numbers(ros), ros.lenses, size) == (expected, ("radtan",), (640, 480))
+
+    opencv, size = files.load_camera(opencv_file(tmp_path, K, expected[4:]))
+    assert (numbers(opencv), opencv.lenses, size) == (expected, ("radtan",), (640, 480))
+    body = opencv_file(tmp_path, K, expected[4:]).read_text().split("\n", 1)[1]
+    for header in ("%YAML:1.0", "%YAML 1.2"):
+        again, _ = files.load_camera(write(tmp_path, f"{header}\n{body}"))
+        assert numbers(again) == expected
+    fisheye = opencv_file(tmp_path, K, expected[4:8]).read_text() + "fisheye_model: 1\n"
+    again, _ = files.load_camera(write(tmp_path, fisheye))
+    assert (numbers(again), again.lenses) == ([*expected[:8], 0], ("equidistant",))
+
+    matrices = {
+        "cameraIntrinsics": {"rows": 3, "cols": 3, "type": 6, "data": K.reshape(9).tolist()},
+        "distCoeffs": {"rows": 1, "cols": 8, "type": 6, "data": [*expected[4:], 0, 0, 0]},
+    }
+    photon = {"resolution": {"width": 640.0, "height": 480.0}, "observations": ["x" * 10**6]}
+    (tmp_path / "photon.json").write_text(json.dumps(photon | matrices))
+    again, size = files.load_camera(tmp_path / "photon.json")
+    assert (numbers(again), size) == (expected, (640, 480))
+
+
+def test_a_camera_is_chosen_by_name(tmp_path):
+    left, size = files.load_camera(QCAR / "rig.yaml", "left")
+    assert (left.lenses, size) == (("equidistant",), (820, 410))
+    line = problem(files.load_camera, QCAR / "rig.yaml")
+    assert line.endswith("holds several cameras: choose one of front, right, rear, left")
+    assert "has no camera 'up'" in problem(files.load_camera, QCAR / "rig.yaml", "up")
+    camera, _ = files.load_camera(write(tmp_path, KALIBR), "cam1")
+    assert numbers(camera)[:2] == [400.0, 401.0]
+    files.load_camera(write(tmp_path, ROS), "narrow")
+    assert "not named 'wide'" in problem(files.load_camera, write(tmp_path, ROS), "wide")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("[400.5,", "[0.0,", "camera_matrix.data[0]: is 0: this camera has not been calibrated"),
+        ("[400.5,", "[-1,", "camera_matrix.data[0]: the focal length must be > 0, got -1"),
+        ("[400.5, 0.0", "[400.5, 0.5", "camera_matrix.data: must be fx 0 cx, 0 fy cy, 0 0 1"),
+        ("[400.5, ", "[", "camera_matrix.data: must have 3 x 3 numbers, got 8"),
+        ("plumb_bob", "mei", "distortion_model: must be one of plumb_bob"),
+        ("plumb_bob", "equidistant", "distortion_coefficients.data: must be k1 k2 k3 k4"),
+        ("image_width: 640", "", "image_width: missing"),
+        ("cols: 5, data: [0.1,", "cols: 6, data: [0.1, 0.2,", "only k1 k2 p1 p2 k3 are supported"),
+    ],
+)
+def test_a_bad_camera_info_is_named_with_its_key(tmp_path, old, new, expected):
+    assert old in ROS
+    assert expected in problem(files.load_camera, write(tmp_path, ROS.replace(old, new)))
+
+
+def test_json_is_as_strict_as_yaml(tmp_path):
+    for text, expected in [
+        ('{"a": 1, "a": 2}', "duplicate key 'a'"),
+        ("{", "is not valid JSON"),
+        ("[" * 100_000, "is not valid JSON"),
+        ("{}", "is no camera file that jaxnav knows"),
+    ]:
+        assert expected in problem(files.load_camera, write(tmp_path, text, "camera.json"))
+
+
+# --- whatever happens to a file ------------------------------------------------------
+
+
+def mutated(text: bytes) -> st.SearchStrategy[bytes]:
+    """The text with a few bytes replaced, removed or put in, or cut short."""
+    position, byte = st.integers(0, len(text)), st.binary(max_size=3)
+    edit = st.tuples(position, st.integers(0, 3), byte)
+
+    def apply(edits: list[tuple[int, int, bytes]]) -> bytes:
+        changed = text
+        for at, removed, inserted in edits:
+            changed = changed[:at] + inserted + changed[at + removed :]
+        return changed
+
+    return st.lists(edit, min_size=1, max_size=4).map(apply) | position.map(lambda n: text[:n])
+
+
+@pytest.mark.parametrize("name", [*LOADERS, "kalibr.yaml", "ros.yaml"])
+def test_a_mutated_file_is_valid_or_bad_input(name, tmp_path):
+    foreign = {"kalibr.yaml": KALIBR, "ros.yaml": ROS}
+    text = foreign[name].encode() if name in foreign else (QCAR / name).read_bytes()
+    load = LOADERS.get(name, files.load_rig if name == "kalibr.yaml" else files.load_camera)
+    path = tmp_path / name
+
+    @settings(max_examples=120, deadline=None, derandomize=True)
+    @given(mutated(text))
+    def check(raw: bytes) -> None:
+        path.write_bytes(raw)
+        try:
+            loaded = load(path)
+        except BadInput as bad:
+            line = str(bad)
+        else:
+            line = str(path)
+            leaves = [leaf for leaf in jax.tree.leaves(loaded) if hasattr(leaf, "dtype")]
+            assert all(np.isfinite(leaf).all() for leaf in leaves)
+        assert line.startswith(str(path))
+        assert "\n" not in line
+
+    check()
+
+
+# --- out -----------------------------------------------------------------------------
+
+
+def test_a_failed_write_leaves_the_older_file_and_nothing_else(tmp_path):
+    files.atomic_write(tmp_path / "a.txt", "old")
+
+    def fail() -> None:
+        with files.atomic_path(tmp_path / "a.txt") as beside:
+            assert beside.suffix == ".txt"
+            beside.write_text("half")
+            raise KeyError("interrupted")
+
+    with pytest.raises(KeyError):
+        fail()
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.txt", "old")]
+    files.atomic_write(tmp_path / "a.txt", b"new")
+    assert (tmp_path / "a.txt").read_bytes() == b"new"
+
+
+def test_where_nothing_can_be_written_is_one_line(tmp_path):
+    assert "it is a folder" in problem(files.atomic_write, tmp_path, "x")
+    assert "no such file" in problem(files.atomic_write, tmp_path / "none" / "a", "x")
+    files.atomic_write(tmp_path / "file", "x")
+    assert "can't be written" in problem(files.atomic_write, tmp_path / "file" / "a", "x")
+    assert "is a file, not a folder" in problem(files.output_folder, tmp_path / "file")
+    assert "is a file, not a folder" in problem(files.output_folder, tmp_path / "file" / "deep")
+    assert files.output_folder(tmp_path / "deep" / "er").is_dir()
+    assert files.output_folder(tmp_path / "deep" / "er").is_dir()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_closed_folder_is_one_line(tmp_path):
+    (tmp_path / "closed").mkdir(mode=0o500)
+    assert "permission denied" in problem(files.output_folder, tmp_path / "closed")
+    assert "permission denied" in problem(files.atomic_write, tmp_path / "closed" / "a", "x")
+
+
+def test_json_has_plain_numbers_and_no_nan(tmp_path):
+    data = {"a": np.float32(0.5), "b": [np.nan, np.arange(2)], "c": Path("x"), "d": np.bool_(True)}
+    files.write_json(tmp_path / "a.json", data)
+    read = json.loads((tmp_path / "a.json").read_text())
+    assert read == {"a": 0.5, "b": [None, [0, 1]], "c": "x", "d": True}
+
+
+def test_tum_is_translation_then_quaternion_with_w_last(tmp_path):
+    Ts = np.array([[0.5, 0.1, 0.2, 0.3, 1.0, 2.0, 3.0]])
+    files.write_tum(tmp_path / "a.tum", np.array([1532312185.929058]), Ts)
+    row = np.loadtxt(tmp_path / "a.tum")
+    np.testing.assert_allclose(row, [1532312185.929058, 1, 2, 3, 0.1, 0.2, 0.3, 0.5], atol=1e-6)
+    with pytest.raises(ValueError, match="expected, got"):
+        files.write_tum(tmp_path / "a.tum", np.array([1.0, 2.0]), Ts)
