@@ -1,0 +1,60 @@
+# Everything runs inside .venv, which any target that needs it creates. Python >= 3.11 and make
+# are all a machine must have. `make PYTHON=python3.12 test` takes another interpreter.
+
+PYTHON ?= python3
+WORKERS ?= 2
+VENV := .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format benchmark clean
+
+help:
+	@echo "make demo       the main job: a simulated drive, its report in demo/"
+	@echo "make test       lint, types, tests"
+	@echo "make lint       ruff and mypy alone"
+	@echo "make format     let ruff rewrite what it can"
+	@echo "make benchmark  timings against OpenCV and NumPy"
+	@echo "make clean      remove .venv and everything that was generated"
+
+demo: $(VENV)/.installed
+	$(BIN)/jaxnav demo --out demo
+
+test: lint
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+benchmark: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest benchmarks --benchmark-enable --benchmark-only
+
+clean:
+	rm -rf $(VENV) build dist demo out .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# A stamp is written when its step has succeeded, so a failed installation is tried again.
+$(VENV)/.created:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "jaxnav needs Python 3.11 or newer and '$(PYTHON)' is not: try make PYTHON=python3.12" >&2; \
+	  exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+	@touch $@
+
+$(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/.created
+	@echo "installing jaxnav into $(VENV)"
+	@$(PIP_INSTALL) -e .
+	@touch $@
+
+# The test extras contain all that the demo needs.
+$(VENV)/.installed-dev: pyproject.toml constraints.txt | $(VENV)/.created
+	@echo "installing jaxnav and its test extras into $(VENV)"
+	@$(PIP_INSTALL) -e '.[dev]'
+	@touch $(VENV)/.installed $@

@@ -1,0 +1,77 @@
+"""Strict numerics for every test: warnings raise, ranks never promote by themselves, jaxtyping's
+shapes are checked at every call, and float64 is the default."""
+
+import functools
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+import jaxlie
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+# The pure core is all that lies beside the package's __init__, less the shell. The hook sees what
+# is imported after it, so nothing of jaxnav may be imported above.
+CORE = sorted(
+    f"jaxnav.{path.stem}"
+    for path in (Path(__file__).resolve().parents[1] / "jaxnav").glob("*.py")
+    if path.stem not in ("__init__", "cli", "errors", "plotting")
+)
+install_import_hook(CORE, "beartype.beartype")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile once and not in every run: compiled code is kept in .pytest_cache."""
+    if config.pluginmanager.has_plugin("cacheprovider"):
+        directory = config.cache.mkdir(f"jaxlib-{jaxlib.__version__}")
+        jax.config.update("jax_compilation_cache_dir", str(directory))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The real recordings and photographs: $JAXNAV_DATA, else ../shared/data beside the project."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    path = Path(os.environ.get("JAXNAV_DATA") or default)
+    if not path.is_dir():
+        pytest.skip(f"no real data in {path}: set JAXNAV_DATA")
+    return path
+
+
+@pytest.fixture(params=["float32", "float64"])
+def precision(request: pytest.FixtureRequest) -> Iterator[jnp.dtype]:
+    """The test runs once in each precision; JAX's default float is then this one."""
+    with jax.enable_x64(request.param == "float64"):
+        yield jnp.dtype(request.param)
+
+
+def _may_promote(function):
+    @functools.wraps(function)
+    def within(*args, **kwargs):
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
+
+    return within
+
+
+def _let_jaxlie_promote() -> None:
+    """jaxlie adds (3, 3) to (batch, 3, 3): inside its methods, and only there, ranks may differ."""
+    classes = {base for group in (jaxlie.SO3, jaxlie.SE3) for base in group.__mro__}
+    for cls in classes:
+        if not cls.__module__.startswith("jaxlie"):
+            continue
+        for name, attribute in list(vars(cls).items()):
+            if name.startswith("_"):
+                continue
+            if isinstance(attribute, staticmethod | classmethod):
+                setattr(cls, name, type(attribute)(_may_promote(attribute.__func__)))
+            elif callable(attribute):
+                setattr(cls, name, _may_promote(attribute))
+
+
+_let_jaxlie_promote()

@@ -1,0 +1,219 @@
+"""The command line: what a person types reaches the command, what is wrong gets one line."""
+
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from jaxnav import cli
+from jaxnav.errors import BadInput
+
+JAXNAV = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], list]:
+    """Puts a function in place of every command; the list holds what the commands were given."""
+
+    def install(run: Callable) -> list:
+        received = []
+        for name in cli.COMMANDS:
+            module = types.ModuleType(name)
+            module.run = lambda args: received.append(args) or run()
+            monkeypatch.setitem(sys.modules, f"jaxnav.commands.{name}", module)
+        return received
+
+    return install
+
+
+def test_arguments_reach_the_command(command) -> None:
+    received = command(lambda: 0)
+    assert cli.main("demo --seed 3 --no-blur --exposure-ms 2 --rig a.yaml --out x".split()) == 0
+    assert (
+        cli.main("replay --limit 5 --markers one-at-a-time --markers-file m.yaml bag".split()) == 0
+    )
+    assert cli.main("locate a.png --camera c.yaml --marker-size-m 0.1 --json".split()) == 0
+    assert received == [
+        cli.Demo(seed=3, blur=False, exposure_ms=2.0, rig=Path("a.yaml"), out=Path("x")),
+        cli.Replay(Path("bag"), limit=5, markers="one-at-a-time", markers_file=Path("m.yaml")),
+        cli.Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, json=True),
+    ]
+
+
+def test_the_exit_code_is_the_commands(command) -> None:
+    command(lambda: 7)
+    assert cli.main(["demo"]) == 7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ("", "jaxnav: Expected one of {demo, replay, locate}."),
+        ("fly", "jaxnav: Unrecognized options: fly; Available subcommands: demo, replay, locate"),
+        ("demo --fast", "jaxnav demo: Unrecognized options: --fast"),
+        ("demo --sed 3", "jaxnav demo: Unrecognized options: --sed, 3; Perhaps you meant: --seed"),
+        ("demo --seed x", "jaxnav demo: --seed: invalid literal for int()"),
+        ("demo --seed", "jaxnav demo: Missing value for argument '--seed'"),
+        ("demo --seed -1", "jaxnav demo: --seed: must not be negative, got -1"),
+        ("demo --seeds 0", "jaxnav demo: --seeds: must be at least 1, got 0"),
+        ("demo --exposure-ms nan", "jaxnav demo: --exposure-ms: must not be negative and finite"),
+        ("demo --duration-s 0", "jaxnav demo: --duration-s: must be positive and finite, got 0.0"),
+        ("demo --selector best", "jaxnav demo: invalid choice 'best' for argument '--selector'"),
+        ("replay", "jaxnav replay: Missing from jaxnav replay: RECORDING"),
+        ("replay a b", "jaxnav replay: Unrecognized options: b"),
+        ("replay a --limit ten", "jaxnav replay: --limit: invalid literal for int()"),
+        ("replay a --limit 0", "jaxnav replay: --limit: must be at least 1, got 0"),
+        ("locate a.png --camera c", "jaxnav locate: Missing from jaxnav locate: --marker-size-m"),
+        (
+            "locate a.png --camera c --marker-size-m -0.1",
+            "jaxnav locate: --marker-size-m: must be positive and finite, got -0.1",
+        ),
+    ],
+)
+def test_wrong_usage_gets_one_line(arguments, line, command, capsys) -> None:
+    received = command(lambda: 0)
+    assert cli.main(arguments.split()) == cli.EXIT_BAD_INPUT
+    out, err = capsys.readouterr()
+    assert err.startswith(line)
+    assert err.count("\n") == 1
+    assert out == ""
+    assert received == []
+
+
+def test_a_long_path_stays_whole(capsys) -> None:
+    path = "/" + "/".join(["a_rather_long_folder"] * 12)
+    assert cli.main(["demo", path]) == cli.EXIT_BAD_INPUT
+    assert path in capsys.readouterr().err
+
+
+def test_the_line_is_the_same_under_every_encoding() -> None:
+    # tyro frames its messages with box characters or with blanks, as the encoding allows.
+    lines = set()
+    for encoding in ("utf-8", "ascii"):
+        environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"}
+        run = subprocess.run(
+            [*JAXNAV, "demo", "--sed", "3"], env=environment, capture_output=True, text=True
+        )
+        assert run.returncode == cli.EXIT_BAD_INPUT
+        lines.add(run.stderr)
+    (line,) = lines
+    assert "Unrecognized options: --sed, 3; Perhaps you meant: --seed INT, --seeds INT" in line
+
+
+def test_bad_input_gets_one_line(command, capsys) -> None:
+    def run() -> int:
+        raise BadInput("rig.yaml: cameras[1].lens", "unknown lens 'fish'\nexpected one of ...")
+
+    command(run)
+    assert cli.main(["demo"]) == cli.EXIT_BAD_INPUT
+    line = "jaxnav demo: rig.yaml: cameras[1].lens: unknown lens 'fish' expected one of ...\n"
+    assert capsys.readouterr() == ("", line)
+
+
+def test_an_interruption_gets_one_line(command, capsys) -> None:
+    def run() -> int:
+        raise KeyboardInterrupt
+
+    command(run)
+    assert cli.main(["replay", "bag"]) == cli.EXIT_INTERRUPTED
+    assert capsys.readouterr() == ("", "jaxnav replay: interrupted\n")
+
+
+def test_a_defect_keeps_its_traceback(command) -> None:
+    def run() -> int:
+        raise ZeroDivisionError
+
+    command(run)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["demo"])
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_help_explains_every_flag(name, capsys) -> None:
+    assert cli.main([name, "--help"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "{None}" not in out
+    for field in dataclasses.fields(cli.COMMANDS[name]):
+        is_positional = field.name in ("recording", "image")
+        flag = field.name.upper() if is_positional else "--" + field.name.replace("_", "-")
+        assert re.search(rf"(?m)^.? ?{flag}\b", out), flag
+    # A flag without a docstring would be followed by its default alone.
+    unframed = " ".join(out.replace("│", " ").split())
+    assert not re.search(r"--[\w-]+( \S+)? \((default|optional|required)", unframed)
+
+
+def test_help_and_version_name_themselves(capsys) -> None:
+    assert cli.main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in cli.COMMANDS)
+    assert cli.main(["--version"]) == 0
+    assert re.fullmatch(r"jaxnav \d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no os.wait4 on Windows")
+def test_help_takes_no_longer_than_300_ms() -> None:
+    # Processor time, which other processes on the machine don't lengthen; the best of five.
+    seconds = []
+    for _ in range(5):
+        process = subprocess.Popen([*JAXNAV, "--help"], stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        assert process.returncode == 0
+        seconds.append(usage.ru_utime + usage.ru_stime)
+    assert min(seconds) <= 0.3
+
+
+def test_a_closed_pipe_is_no_traceback() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        run = subprocess.run([*JAXNAV, "--help"], stdout=writer, stderr=subprocess.PIPE, text=True)
+    finally:
+        os.close(writer)
+    assert (run.returncode, run.stderr) == (cli.EXIT_BROKEN_PIPE, "")
+
+
+def _configured(environment: dict[str, str]) -> list[str]:
+    """What configure_jax(float64=True) leaves: [cache folder or None, default float]."""
+    script = (
+        "import jax, jax.numpy as jnp; from jaxnav.cli import configure_jax\n"
+        "configure_jax(float64=True)\n"
+        "jax.jit(lambda x: jnp.linalg.inv(x))(jnp.eye(3)).block_until_ready()\n"
+        "print(jax.config.jax_compilation_cache_dir, jnp.zeros(1).dtype)"
+    )
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_"))}
+    run = subprocess.run(
+        [sys.executable, "-W", "error", "-c", script],
+        env=inherited | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stderr == ""
+    return run.stdout.split()
+
+
+def test_compiled_code_is_kept_for_this_machine_and_jaxlib(tmp_path) -> None:
+    folder, dtype = _configured({"XDG_CACHE_HOME": str(tmp_path)})
+    assert Path(folder).parent == tmp_path / "jaxnav"
+    assert re.match(r"jaxlib-\d+\.\d+\.\d+.*-\w+-", Path(folder).name)
+    assert Path(folder).stat().st_mode & 0o777 == 0o700
+    assert dtype == "float64"
+
+
+def test_an_unusable_cache_folder_is_done_without(tmp_path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert _configured({"XDG_CACHE_HOME": str(tmp_path / "file")}) == ["None", "float64"]
+
+
+def test_the_users_own_cache_folder_goes_first(tmp_path) -> None:
+    own = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own"), "XDG_CACHE_HOME": str(tmp_path)}
+    assert _configured(own)[0] == str(tmp_path / "own")
+    assert not (tmp_path / "jaxnav").exists()

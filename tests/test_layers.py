@@ -1,0 +1,218 @@
+"""Who may import whom: every import in jaxnav/ is parsed and held against the arrows.
+
+shell -> users -> navigator -> estimate & control -> models -> geometry, never upward.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "jaxnav"
+
+# From the bottom up. A new module or folder must be placed here before the test passes.
+LAYERS = {
+    "geometry": {"geometry"},
+    "models": {"bicycle", "camera", "markers", "rig"},
+    "estimate & control": {
+        "ambiguity",
+        "candidates",
+        "control",
+        "evaluation",
+        "ippe",
+        "kalman",
+        "motion",
+        "observation",
+        "refine",
+        "residuals",
+    },
+    "navigator": {"navigator"},
+    "users": {
+        "calibration",
+        "detection",
+        "files",
+        "runtime",
+        "simulation",
+        "studies",
+        "tuning",
+    },
+    "shell": {"cli", "commands", "plotting"},
+}
+ORDER = list(LAYERS)
+LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
+PURE_CORE = set(ORDER[: ORDER.index("users")])
+# The users stand side by side; these arrows alone lead from one to another.
+BETWEEN_USERS = {
+    ("studies", "simulation"),
+    ("tuning", "simulation"),
+    ("runtime", "detection"),
+    ("runtime", "files"),
+}
+# `errors` is what the outside world gets: the pure core reports failure by value.
+ERRORS = "errors"
+PUBLIC_NAMES = "__init__"
+
+CORE_MAY_IMPORT = {"jax", "jaxlie", "equinox", "optimistix", "lineax", "jaxtyping", "numpy"} | {
+    "__future__",
+    "abc",
+    "collections",
+    "dataclasses",
+    "enum",
+    "functools",
+    "itertools",
+    "math",
+    "operator",
+    "typing",
+}
+CORE_MAY_NOT_CALL = {"print", "open", "input", "exec", "eval", "breakpoint", "__import__"}
+
+
+def violations(module: str, tree: ast.Module) -> list[str]:
+    """What one file does that its layer must not.
+
+    Args:
+        module: dotted path below the package, e.g. "files.rigs"; "__init__" for its root.
+        tree: the parsed file.
+    """
+    top = module.split(".")[0]
+    if top not in LAYER_OF and top not in (ERRORS, PUBLIC_NAMES):
+        return [f"{module} has no layer: place it in LAYERS"]
+    found = []
+    in_core = LAYER_OF.get(top) in PURE_CORE
+    for imported, line in _imports(module, tree):
+        root, _, rest = imported.partition(".")
+        if root == "jaxnav":
+            if not _may_import(top, rest.split(".")[0]):
+                found.append(f"{module}:{line} imports {imported}")
+        elif in_core and root not in CORE_MAY_IMPORT:
+            found.append(f"{module}:{line} imports {imported}")
+    for node in ast.walk(tree):
+        if in_core and isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            if node.func.id in CORE_MAY_NOT_CALL:
+                found.append(f"{module}:{node.lineno} calls {node.func.id}")
+    return found + list(_configurations(module, tree, forbidden_everywhere=in_core))
+
+
+def _may_import(top: str, target: str) -> bool:
+    """Whether the files of `top` may import `target`, both names of modules or folders."""
+    if top in (PUBLIC_NAMES, target):
+        return True
+    if top == ERRORS:
+        return False
+    layer = LAYER_OF[top]
+    if target in (ERRORS, ""):
+        # The lazy root leads everywhere, so only the shell may go through it.
+        return layer == "shell" or (target == ERRORS and layer == "users")
+    if target not in LAYER_OF:
+        return False
+    if layer == "users" and LAYER_OF[target] == "users":
+        return (top, target) in BETWEEN_USERS
+    return ORDER.index(LAYER_OF[target]) <= ORDER.index(layer)
+
+
+def _imports(module: str, tree: ast.Module) -> Iterator[tuple[str, int]]:
+    """(absolute dotted name, line) of each import, wherever in the file it stands."""
+    folder = ["jaxnav", *module.split(".")[:-1]]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = [node.module] if node.module else []
+            if node.level:
+                base = folder[: len(folder) - node.level + 1] + base
+            name = ".".join(base)
+            # `from jaxnav import files` imports a module; `from jaxnav import e1` the lazy root.
+            for alias in node.names:
+                is_module = name == "jaxnav" and (alias.name in LAYER_OF or alias.name == ERRORS)
+                yield (f"jaxnav.{alias.name}" if is_module else name), node.lineno
+
+
+def _configurations(module: str, tree: ast.Module, forbidden_everywhere: bool) -> Iterator[str]:
+    """Uses of jax.config: in the core and on import none at all, changes only in the shell."""
+    may_change = LAYER_OF.get(module.split(".")[0]) == "shell"
+    inside_functions = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for body in (node.body if isinstance(node.body, list) else [node.body])
+        for inner in ast.walk(body)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module == "jax":
+            if any(alias.name == "config" for alias in node.names):
+                yield f"{module}:{node.lineno} hides jax.config behind an import"
+        if not isinstance(node, ast.Attribute):
+            continue
+        name, at_import = ast.unparse(node), id(node) not in inside_functions
+        if name == "jax.config" and (forbidden_everywhere or at_import):
+            yield f"{module}:{node.lineno} touches jax.config"
+        if name == "jax.config.update" and not (may_change or forbidden_everywhere or at_import):
+            yield f"{module}:{node.lineno} changes the global configuration"
+
+
+def _modules() -> dict[str, Path]:
+    paths = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        paths[".".join(parts)] = path
+    return paths
+
+
+@pytest.mark.parametrize("module", _modules())
+def test_imports_follow_the_arrows(module: str) -> None:
+    path = _modules()[module]
+    assert violations(module, ast.parse(path.read_text(encoding="utf-8"), str(path))) == []
+
+
+def test_every_file_was_found() -> None:
+    assert {"geometry", "navigator", "cli", "errors", "__init__"} <= set(_modules())
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("geometry", "from jaxnav.camera import Camera"),
+        ("geometry", "def f():\n    from jaxnav import camera"),
+        ("geometry", "from .rig import CameraRig"),
+        ("camera", "from jaxnav.errors import BadInput"),
+        ("rig", "from jaxnav.ippe import ippe_square"),
+        ("ippe", "import cv2"),
+        ("refine", "from time import monotonic"),
+        ("kalman", "from jaxnav.navigator import Navigator"),
+        ("navigator", "from jaxnav.files import load_rig"),
+        ("navigator", "import jaxnav"),
+        ("navigator", "from jaxnav import load_rig"),
+        ("navigator", "print('here')"),
+        ("navigator", "def f():\n    import jax\n    return jax.config.jax_enable_x64"),
+        ("files.rigs", "from ..plotting import figure"),
+        ("files.rigs", "from jaxnav.detection import detect"),
+        ("detection.edges", "import jaxnav.simulation.rendering"),
+        ("simulation.plant", "import jax\njax.config.update('jax_enable_x64', True)"),
+        ("simulation.plant", "import jax\ndef f():\n    jax.config.update('jax_enable_x64', 1)"),
+        ("studies.grid", "from jax import config"),
+        ("commands.demo", "import jax\nX64 = jax.config.jax_enable_x64"),
+        ("errors", "from jaxnav.geometry import wrap_angle"),
+        ("novelty", "import math"),
+    ],
+)
+def test_a_forbidden_arrow_is_caught(module: str, source: str) -> None:
+    assert len(violations(module, ast.parse(source))) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("navigator", "from jaxnav.geometry import wrap_angle\nimport jax.numpy as jnp"),
+        ("runtime.replay", "from jaxnav.files.rigs import load_rig"),
+        ("studies.grid", "from jaxnav.simulation import rollout\nimport xarray"),
+        ("files.rigs", "from .reading import read\nfrom jaxnav.errors import BadInput"),
+        ("commands.demo", "from jaxnav import plotting\nfrom jaxnav.cli import Demo"),
+        (
+            "cli",
+            "from jaxnav import __version__\nimport jax\ndef f():\n    jax.config.update('a', 1)",
+        ),
+    ],
+)
+def test_an_allowed_arrow_passes(module: str, source: str) -> None:
+    assert violations(module, ast.parse(source)) == []
