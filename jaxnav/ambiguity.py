@@ -9,7 +9,7 @@ rows of zeros where nothing is taken. It sees the prediction as poses with covar
 motion model made it, so car and hand-held rig share every selector.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -41,6 +41,7 @@ class Selection(eqx.Module):
     flip_probability: Float[Array, ""]  # probability that the selected candidate is the wrong one
 
 
+@runtime_checkable
 class Selector(Protocol):
     """The signature all selectors share."""
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxnav.camera import Camera
 from jaxnav.geometry import safe_norm, transform_points
 from jaxnav.ippe import ippe_from_rays
 from jaxnav.markers import MarkerMap
@@ -43,6 +44,7 @@ def find_candidates(
     markers: MarkerMap,
     obs: Observation,
     corner_sigma_px: Float[Array, ""] | float = 1.0,
+    model_sigma_px: Float[Array, ""] | float = 0.15,
     max_sightings: int = 16,
     max_candidates: int = 4,
     max_steps: int = 12,
@@ -55,10 +57,14 @@ def find_candidates(
 
     Args:
         corner_sigma_px: for observations that bring no sigma of their own.
+        model_sigma_px: what lens calibration and rolling shutter leave in a corner, added in
+            quadrature to the sigma that an observation brings.
         max_sightings: the largest ones are used.
         max_steps: bound on the LM steps.
     """
-    sigma_px = corner_sigma_px if obs.corner_sigma_px is None else obs.corner_sigma_px
+    sigma_px = corner_sigma_px
+    if obs.corner_sigma_px is not None:
+        sigma_px = jnp.sqrt(obs.corner_sigma_px**2 + model_sigma_px**2)
     seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, max_sightings)
     Ts_vehicle_world, owner_visible = _both_poses(rig, markers, seen)
 
@@ -97,7 +103,13 @@ def _both_poses(
 ) -> tuple[jaxlie.SE3, Bool[Array, " 2D"]]:
     """Two vehicle poses (2D,) from every sighting by itself, and whether it is visible."""
 
-    def one(camera, T_camera_vehicle, T_world_marker, size_m, corners_px):
+    def one(
+        camera: Camera,
+        T_camera_vehicle: jaxlie.SE3,
+        T_world_marker: jaxlie.SE3,
+        size_m: Array,
+        corners_px: Array,
+    ) -> jaxlie.SE3:
         Ts_camera_marker = ippe_from_rays(camera.unproject(corners_px), size_m)
         return jax.vmap(
             lambda T_camera_marker: (

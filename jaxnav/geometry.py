@@ -7,7 +7,7 @@ jaxlie, and perturb from the right: `T * exp(xi)`, so that xi lives in the inner
 
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 
 def wrap_angle(angle_rad: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -124,6 +124,6 @@ def transform_points(
     return rotated + on_last_axis(T_a_b.translation(), rotated)
 
 
-def on_last_axis(vector: Float[Array, " n"], like: Float[Array, "*batch n"]) -> Array:
-    """A vector with leading axes of length 1, to meet an array that ends in the same axis."""
+def on_last_axis(vector: Shaped[Array, " n"], like: Shaped[Array, "*batch m"]) -> Array:
+    """A vector with leading axes of length 1, to meet another array along its last axis."""
     return vector.reshape((1,) * (like.ndim - 1) + vector.shape)

@@ -175,9 +175,7 @@ def ippe_from_rays(rays_camera: Float[Array, "4 3"], size_m: Float[Array, ""]) -
     depth = jnp.maximum(rays_virtual[:, 2:], 1e-3)
     pair = ippe_square(rays_virtual[:, :2] / depth, size_m)
     T_camera_virtual = jaxlie.SE3.from_rotation(rotation_from_matrix(R_camera_virtual))
-    return jax.vmap(lambda T_virtual_marker: T_camera_virtual @ T_virtual_marker)(
-        pair.T_camera_marker
-    )
+    return jax.vmap(lambda T: T_camera_virtual @ T)(pair.T_camera_marker)
 
 
 def _rotation_facing(direction: Array) -> Array:

@@ -20,7 +20,7 @@ def corners_marker_m(size_m: Float[Array, "*batch"]) -> Float[Array, "*batch 4 3
 
 
 class MarkerMap(eqx.Module):
-    """M markers: identity, size and pose of each. The order of the map is the order of every M axis."""
+    """M markers: identity, size and pose. The order of the map is the order of every M axis."""
 
     Ts_world_marker: jaxlie.SE3  # batch axis (M,)
     size_m: Float[Array, " M"]

@@ -10,7 +10,7 @@ Both share one interface, so that `step` and the selectors know nothing of the s
 A belief is a bank of K hypotheses along the leading axis of every leaf.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -40,6 +40,7 @@ class Belief(eqx.Module):
     initialised: Bool[Array, " K"]
 
 
+@runtime_checkable
 class Motion(Protocol):
     """What `Navigator` asks of a motion model."""
 
@@ -196,6 +197,7 @@ class ConstantVelocity(eqx.Module):
     initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
     )  # m/s and rad/s
+    lost_sigma_m: float = 0.5  # a prediction less certain than this is forgotten
 
     def init(self) -> Belief:
         """One hypothesis that has seen nothing."""
@@ -208,7 +210,11 @@ class ConstantVelocity(eqx.Module):
         )
 
     def predict(self, belief: Belief, dt_s: Float[Array, ""] | float) -> Belief:
-        """T = T exp(twist dt); the error turns with the frame."""
+        """T = T exp(twist dt); the error turns with the frame.
+
+        Without odometry a prediction is soon worth nothing: past `lost_sigma_m` the next pose
+        starts the filter anew.
+        """
         dtype = belief.mean.dtype
         eye, zero = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
@@ -225,7 +231,9 @@ class ConstantVelocity(eqx.Module):
             )
 
         mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
-        return Belief(mean, covariance, belief.log_weight, belief.initialised)
+        variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
+        kept = belief.initialised & (variance_m2 < self.lost_sigma_m**2)
+        return Belief(mean, covariance, belief.log_weight, kept)
 
     def poses(self, belief: Belief) -> PoseBelief:
         """The pose part of the state."""

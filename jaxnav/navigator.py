@@ -59,6 +59,7 @@ class Navigator(eqx.Module):
     motion: Motion
     controller: Controller | None
     corner_sigma_px: Float[Array, ""]
+    model_sigma_px: Float[Array, ""]
     max_sightings: int = eqx.field(static=True)
     max_candidates: int = eqx.field(static=True)
     max_lm_steps: int = eqx.field(static=True)
@@ -76,6 +77,7 @@ class Navigator(eqx.Module):
         integral_per_ms: float = 0.01,
         integral_limit_ms: float = 5.0,
         corner_sigma_px: float = 1.0,
+        model_sigma_px: float = 0.15,
         max_sightings: int = 16,
         max_candidates: int = 4,
         max_lm_steps: int = 12,
@@ -107,6 +109,7 @@ class Navigator(eqx.Module):
                 integral_limit_ms=jnp.asarray(integral_limit_ms, float),
             )
         self.corner_sigma_px = jnp.asarray(corner_sigma_px, float)
+        self.model_sigma_px = jnp.asarray(model_sigma_px, float)
         self.max_sightings = max_sightings
         self.max_candidates = max_candidates
         self.max_lm_steps = max_lm_steps
@@ -152,12 +155,15 @@ class Navigator(eqx.Module):
             self.markers,
             obs,
             self.corner_sigma_px,
+            self.model_sigma_px,
             self.max_sightings,
             self.max_candidates,
             self.max_lm_steps,
         )
 
-    def _steer(self, state: ControlState | None, pose: Array, located: Array, obs: Observation):
+    def _steer(
+        self, state: ControlState | None, pose: Array, located: Array, obs: Observation
+    ) -> tuple[ControlState | None, Command | None, Array, ControlLog | None]:
         if self.controller is None or state is None:
             return None, None, jnp.asarray(False), None
         dt_s, steering_rad = (jnp.asarray(x, pose.dtype) for x in (obs.dt_s, obs.steering_rad))

@@ -145,20 +145,22 @@ def _minimise(
     """
     chart = _chart(jax.lax.stop_gradient(T_start), points_source, center_source)
 
-    def fn(y, args):
+    def fn(y: Array, args: None) -> Array:
         # Without a visible corner y itself is the residual: nothing moves, no 0 / 0.
         return jnp.concatenate([residual(chart.points(y)), jnp.where(constrained, 0, y)])
 
     dtype = chart.pivot.dtype
     tolerance = 1e-7 if dtype == jnp.float64 else 1e-4
-    solver = optx.LevenbergMarquardt(
+    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
         rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
     )
-    solution = optx.least_squares(fn, solver, jnp.zeros(6, dtype), max_steps=max_steps, throw=False)
+    solution: optx.Solution = optx.least_squares(
+        fn, solver, jnp.zeros(6, dtype), max_steps=max_steps, throw=False
+    )
     return (
         chart.transform(solution.value),
         solution.stats["num_steps"],
-        solution.result == optx.RESULTS.successful,
+        jnp.asarray(solution.result == optx.RESULTS.successful),
     )
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from jaxnav.camera import Camera
 from jaxnav.geometry import transform_points
 from jaxnav.markers import MarkerMap
 from jaxnav.observation import Sightings, cameras_of, sightings
@@ -24,7 +25,13 @@ def reprojection_residuals(
         corners_vehicle: corners of all markers of the map, in the vehicle frame, m.
     """
 
-    def one(camera, T_camera_vehicle, marker_index, corners_px, visible):
+    def one(
+        camera: Camera,
+        T_camera_vehicle: jaxlie.SE3,
+        marker_index: Array,
+        corners_px: Array,
+        visible: Array,
+    ) -> Array:
         corners_camera = transform_points(T_camera_vehicle, corners_vehicle[marker_index])
         return jnp.where(visible, camera.project(corners_camera) - corners_px, 0)
 

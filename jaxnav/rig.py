@@ -47,7 +47,7 @@ class CameraRig(eqx.Module):
 
     def project(
         self, T_vehicle_world: jaxlie.SE3, points_world_m: Float[Array, "*batch 3"]
-    ) -> Float[Array, "C *batch 2"]:
+    ) -> Float[Array, " C *batch 2"]:
         """Pixels of world points in every camera: u = K_j T_jv T_vw p_w (Eq. 2)."""
         points_vehicle = transform_points(T_vehicle_world, points_world_m)
         return jax.vmap(
@@ -58,7 +58,7 @@ class CameraRig(eqx.Module):
 
     def sees(
         self, T_vehicle_world: jaxlie.SE3, points_world_m: Float[Array, "*batch 3"]
-    ) -> Bool[Array, "C *batch"]:
+    ) -> Bool[Array, " C *batch"]:
         """Whether each world point lies in front of each camera and inside its image."""
         points_vehicle = transform_points(T_vehicle_world, points_world_m)
 

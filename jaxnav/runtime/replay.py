@@ -39,12 +39,12 @@ class Replay:
 
 
 class _Frames(eqx.Module):
-    """Frames as `scan` takes them, leading axis (F,) or none; NumPy until they are needed."""
+    """Frames as `scan` takes them, leading axis (F,) or none."""
 
-    corners_px: Float[Array | np.ndarray, "*F C M 4 2"]
-    visible: Bool[Array | np.ndarray, "*F C M"]
-    dt_s: Float[Array | np.ndarray, "*F"]
-    T_world_vehicle_true: Float[Array | np.ndarray, "*F 7"]
+    corners_px: Float[Array, "*F C M 4 2"]
+    visible: Bool[Array, "*F C M"]
+    dt_s: Float[Array, "*F"]
+    T_world_vehicle_true: Float[Array, "*F 7"]
 
 
 def replay(
@@ -66,16 +66,19 @@ def replay(
     step, state = _stepper(recording, selector, one_at_a_time, corner_sigma_px)
 
     @jax.jit
-    def run_chunk(state: State, frames: _Frames) -> tuple[State, tuple[Array, ...]]:
-        return jax.lax.scan(step, state, frames)
+    def run_chunk(state: State, frames: _Frames, begin: Array) -> tuple[State, tuple]:
+        chunk = jax.tree.map(
+            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, begin, CHUNK_FRAMES), frames
+        )
+        return jax.lax.scan(step, state, chunk)
 
     frames = _frames(recording)
-    total = len(recording.stamps_ns)
-    run_chunk_compiled = run_chunk.lower(state, _chunk(frames, 0)).compile()
+    total = len(recording)
+    run_chunk_compiled = run_chunk.lower(state, frames, jnp.asarray(0)).compile()
     started = time.perf_counter()
     chunks = []
     for begin in range(0, total, CHUNK_FRAMES):
-        state, outputs = run_chunk_compiled(state, _chunk(frames, begin))
+        state, outputs = run_chunk_compiled(state, frames, jnp.asarray(begin))
         chunks.append(jax.device_get(outputs))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
@@ -143,29 +146,25 @@ def _whole(markers: MarkerMap) -> MarkerMap:
 
 def _frames(recording: Recording) -> _Frames:
     """All frames, padded to whole chunks with frames that show nothing."""
-    count = len(recording.stamps_ns)
+    count = len(recording)
     dt_s = np.diff(recording.stamps_ns, prepend=recording.stamps_ns[:1]) / 1e9
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, 1))
     reference = recording.reference
     truth = identity if reference is None else reference.T_world_vehicle
     padding = -count % CHUNK_FRAMES
 
-    def pad(rows: np.ndarray) -> np.ndarray:
-        return np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)])
+    def pad(rows: np.ndarray) -> Array:
+        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)]))
 
     visible = np.concatenate(
         [recording.visible, np.zeros((padding, *recording.visible.shape[1:]), bool)]
     )
     return _Frames(
         corners_px=pad(recording.corners_px),
-        visible=visible,
+        visible=jnp.asarray(visible),
         dt_s=pad(np.clip(dt_s, 0, MAX_DT_S)),
         T_world_vehicle_true=pad(truth),
     )
-
-
-def _chunk(frames: _Frames, begin: int) -> _Frames:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf[begin : begin + CHUNK_FRAMES]), frames)
 
 
 def errors(replay: Replay, recording: Recording) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,45 @@
+"""Images in, marker corners out.
+
+    detector = make_detector("aruco", family="tag36h11")
+    detections = detector.detect(image, camera)
+    corners_px, visible, sigma_px, ignored = observe([detections, ...], markers)
+
+A decoder (OpenCV's, or AprilTag's own) says which marker is where, to a pixel; the corners
+come from `refine`, the same for both.
+"""
+
+from jaxnav.detection.apriltag import AprilTagDetector
+from jaxnav.detection.aruco import ArucoDetector
+from jaxnav.detection.families import DICTIONARIES, marker_cells
+from jaxnav.detection.observe import Observed, observe
+from jaxnav.detection.types import Detections, Detector
+from jaxnav.errors import BadInput
+
+__all__ = [
+    "DICTIONARIES",
+    "AprilTagDetector",
+    "ArucoDetector",
+    "Detections",
+    "Detector",
+    "Observed",
+    "make_detector",
+    "marker_cells",
+    "observe",
+]
+
+BACKENDS = {"aruco": ArucoDetector, "apriltag": AprilTagDetector}
+
+
+def make_detector(backend: str = "aruco", family: str = "tag36h11") -> Detector:
+    """A detector of one family of markers.
+
+    Args:
+        backend: "aruco" (OpenCV) or "apriltag" (needs the extra of that name).
+        family: one of `DICTIONARIES`.
+
+    Raises:
+        BadInput: unknown backend or family, a family the backend lacks, or a missing extra.
+    """
+    if backend not in BACKENDS:
+        raise BadInput("detector", f"unknown {backend!r}: expected one of {', '.join(BACKENDS)}")
+    return BACKENDS[backend](family)

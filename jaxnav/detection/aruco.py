@@ -1,0 +1,109 @@
+"""OpenCV's aruco decoder, with a closer look at what it saw and could not read."""
+
+import cv2
+import numpy as np
+
+from jaxnav.camera import Camera
+from jaxnav.detection.families import dictionary
+from jaxnav.detection.lens import Lens
+from jaxnav.detection.read import frames_first, read_marker
+from jaxnav.detection.refine import mean_side_px
+from jaxnav.detection.types import Detections, grey, refined_detections
+
+# The closer look: quadrilaterals of these sides.
+_CLOSER_LOOK_PX = (8.0, 40.0)
+_ENLARGE = 3
+# A prediction may be off by this part of its side, and by some pixels.
+_SEARCH_SIDES, _SEARCH_PX = 0.5, 8
+
+
+class ArucoDetector:
+    """Markers of one family by OpenCV's decoder, their corners by our fit.
+
+    The decoder's own corner refinement is off. Small quadrilaterals that it finds but cannot
+    read, and those around the predictions in a threefold enlargement, are read by `read`.
+    """
+
+    def __init__(self, family: str = "tag36h11", closer_looks: int = 12):
+        """See `make_detector`.
+
+        Args:
+            family: one of `DICTIONARIES`.
+            closer_looks: at how many quadrilaterals of an image to look again, some ms each.
+        """
+        self.family = family
+        self._closer_looks = closer_looks
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+        self._decoder = cv2.aruco.ArucoDetector(dictionary(family), parameters)
+
+    def detect(
+        self,
+        image: np.ndarray,
+        camera: Camera | None = None,
+        predicted_corners_px: np.ndarray | None = None,
+    ) -> Detections:
+        """All markers of the family in the image: see `Detector.detect`."""
+        image = grey(image)
+        lens = Lens(camera)
+        found, unread = self._decode(image)
+        if predicted_corners_px is not None:
+            for quad in np.asarray(predicted_corners_px, float).reshape(-1, 4, 2):
+                if np.all(np.isfinite(quad)) and not any(_overlap(quad, c) for _, c in found):
+                    found_there, unread_there = self._decode_around(image, quad)
+                    found += [
+                        f for f in found_there if not any(_overlap(f[1], c) for _, c in found)
+                    ]
+                    unread = [quad, *unread_there, *unread]
+        looked_at = [corners for _, corners in found]
+        for quad in frames_first(image, _small(unread))[: self._closer_looks]:
+            if any(_overlap(quad, other) for other in looked_at):
+                continue
+            read = read_marker(image, quad, self.family, lens)
+            if read is not None:
+                found.append((read[0], read[1].corners_px))
+                looked_at.append(read[1].corners_px)
+        return refined_detections(image, found, self.family, camera)
+
+    def _decode(self, image: np.ndarray) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
+        """What OpenCV read, (id, corners) each, and the quadrilaterals that it could not read."""
+        quads, ids, unread = self._decoder.detectMarkers(image)
+        found_ids = [] if ids is None else ids.ravel().tolist()
+        found = [
+            (i, quad.reshape(4, 2).astype(float)) for i, quad in zip(found_ids, quads, strict=True)
+        ]
+        return found, [quad.reshape(4, 2).astype(float) for quad in unread]
+
+    def _decode_around(
+        self, image: np.ndarray, quad: np.ndarray
+    ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
+        """`_decode` of an enlarged region around a prediction."""
+        margin = _SEARCH_SIDES * mean_side_px(quad) + _SEARCH_PX
+        low = np.maximum(np.floor(quad.min(axis=0) - margin), 0).astype(int)
+        high = np.minimum(np.ceil(quad.max(axis=0) + margin), image.shape[::-1]).astype(int)
+        if np.any(high - low < 8) or mean_side_px(quad) > _CLOSER_LOOK_PX[1]:
+            return [], []
+        region = image[low[1] : high[1], low[0] : high[0]]
+        enlarged = cv2.resize(region, None, fx=_ENLARGE, fy=_ENLARGE, interpolation=cv2.INTER_CUBIC)
+        found, unread = self._decode(enlarged)
+
+        def back(corners: np.ndarray) -> np.ndarray:
+            return (corners + 0.5) / _ENLARGE - 0.5 + low
+
+        return [(i, back(corners)) for i, corners in found], [back(corners) for corners in unread]
+
+
+def _small(quads: list[np.ndarray]) -> list[np.ndarray]:
+    """The quadrilaterals worth a closer look, each place once."""
+    small: list[np.ndarray] = []
+    for quad in quads:
+        low, high = _CLOSER_LOOK_PX
+        known = any(np.max(np.abs(quad.mean(axis=0) - q.mean(axis=0))) < 0.5 for q in small)
+        if low <= mean_side_px(quad) <= high and not known:
+            small.append(quad)
+    return small
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> bool:
+    apart = np.linalg.norm(a.mean(axis=0) - b.mean(axis=0))
+    return bool(apart < 0.5 * max(mean_side_px(a), mean_side_px(b)))

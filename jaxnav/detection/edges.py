@@ -1,0 +1,255 @@
+"""The four edges of a decoded marker, fitted to the grey levels around them: the model and its fit.
+
+A decoded marker is known: a black frame with known cells inside, on white paper. Its four
+edges (eight numbers, the homography between rays and paper) are those for which the known
+pattern, blurred, explains the pixels best. Fitting them to pixels rather than to points found
+along normals needs no resampling, keeps the noise of the samples independent, so that the
+covariance of the fit is honest, and tells an edge from the cells one or two pixels behind it.
+
+    I(u) = white - contrast * dark(u) + c1 x + c2 y + c3 far(u),    (x, y, 1) ~ M ray(u)
+    dark = sum_kl K_kl Phi2((x - x_l) / s_x, (y - y_k) / s_y; rho)
+
+(x, y) are paper coordinates, K the corners of the cells at (x_l, y_k) (second differences of the
+pattern), Phi2 the binormal integral of the blur on the paper: covariance G (S + I/12) G' with
+G = d(x, y)/du, S that of lens and motion (px^2, fitted) and 1/12 that of a square pixel; far is 1
+beyond the white zone, one cell wide, that every marker has. The light (white, contrast, c) enters
+linearly and is eliminated.
+
+Source: Golub and Pereyra (1973), variable projection; Kaufman (1975) for its Jacobian.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
+
+PIXELS = 1024  # of one fit: the rest are masked
+_STEPS = 20
+PIXEL_VARIANCE_PX2 = 1 / 12  # of a square
+_START_BLUR_PX2 = 0.8**2
+_BLUR_LIMITS_PX2 = (0.0, 5.0**2)
+_HUBER = 2.5  # standard deviations
+_MEHLER_ORDERS = 3
+_MAX_RHO = 0.95
+# The far ground is a hundred grey levels off, give or take, where none of it is in view.
+_FAR_PRIOR = 1e-3
+_CONVERGED = 1e-4  # of half the marker's side
+_PLATEAU = 1e-4  # of the loss
+_MAX_STEP = 0.1
+
+
+class EdgeFit(NamedTuple):
+    """What the fit gives, in paper coordinates."""
+
+    M: Array  # (3, 3), rays to paper
+    blur_px2: Array  # (3,) xx, xy, yy of S
+    covariance: Array  # (8, 8) of the D in (I + D) M, by rows without the last
+    noise: Array  # standard deviation of the residual, grey levels
+    contrast: Array  # white minus black, grey levels
+    residual: Array  # (N,), grey levels
+    converged: Array
+
+
+class _Patch(NamedTuple):
+    rays: Float[Array, "3 N"]
+    rays_px: Float[Array, "2 3 N"]  # derivative by pixel
+    levels: Float[Array, " N"]
+    K: Float[Array, "k k"]  # row along y, column along x
+    mask: Bool[Array, " N"]
+
+
+class _State(NamedTuple):
+    M: Array
+    blur: Array
+    residual: Array
+    hessian: Array
+    gradient: Array
+    scale: Array
+    contrast: Array
+    damping: Array
+    steps: Array
+    converged: Array
+
+
+def step_corners(cells: np.ndarray) -> np.ndarray:
+    """K (n + 1, n + 1) of a pattern of cells (n, n), 1 white, 0 black."""
+    return np.diff(np.diff(np.pad(1 - cells, 1), axis=0), axis=1)
+
+
+@jax.jit
+def fit_edges(
+    rays: Float[Array, "3 N"],
+    rays_px: Float[Array, "2 3 N"],
+    levels: Float[Array, " N"],
+    K: Float[Array, "k k"],
+    mask: Bool[Array, " N"],
+) -> EdgeFit:
+    """Levenberg-Marquardt with Huber's loss, from M = I, in float32 whatever the process uses.
+
+    Args:
+        rays: through the pixels, in a basis in which the first guess of M is the identity.
+        rays_px: their derivatives by pixel.
+        levels: grey levels of the pixels.
+        K: `step_corners` of the marker.
+        mask: which of the pixels there are.
+    """
+    patch = _Patch(rays, rays_px, levels, K, mask)
+    one = jnp.ones((), levels.dtype)
+    blur = jnp.array([1.0, 0.0, 1.0], levels.dtype) * _START_BLUR_PX2
+    ones = jnp.where(mask, one, 0)
+    M = jnp.eye(3, dtype=levels.dtype)
+    residual, hessian, gradient, contrast = _linearise(M, blur, patch, ones)
+    start = _State(
+        M, blur, residual, hessian, gradient,
+        _rms(residual, ones), contrast, 1e-3 * one, jnp.array(0), jnp.array(False),
+    )  # fmt: skip
+
+    def attempt(s: _State) -> _State:
+        diagonal = jnp.diagonal(s.hessian)
+        ridge = jnp.diag(s.damping * diagonal + 1e-6 * jnp.max(diagonal[:8]))
+        step = jnp.linalg.solve(s.hessian + ridge, s.gradient)
+        size = jnp.max(jnp.abs(_CORNER_MOTION @ step[:8]))
+        step = step * jnp.minimum(1, _MAX_STEP / jnp.maximum(size, 1e-9))
+        M, blur = _moved(s.M, s.blur, step)
+        weight = jnp.where(mask, _huber_weight(s.residual / s.scale), 0)
+        residual, hessian, gradient, contrast = _linearise(M, blur, patch, weight)
+        before, after = (_loss(jnp.where(mask, r, 0) / s.scale) for r in (s.residual, residual))
+        better = after <= before
+        scale = _rms(residual, weight)
+        small = (size < _CONVERGED) | (jnp.abs(before - after) < _PLATEAU * before)
+        moved = _State(
+            M, blur, residual, hessian, gradient, scale, contrast,
+            jnp.maximum(s.damping * 0.1, 1e-6), s.steps + 1, small,
+        )  # fmt: skip
+        stayed = s._replace(damping=s.damping * 10, steps=s.steps + 1, converged=small)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, stayed)
+
+    s = jax.lax.while_loop(lambda s: (s.steps < _STEPS) & ~s.converged, attempt, start)
+    weight = jnp.where(mask, _huber_weight(s.residual / s.scale), 0)
+    freedom = jnp.maximum(jnp.sum(weight) - 16, 1)
+    noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
+    ridge = jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(s.hessian), 1e-6 * jnp.max(s.hessian)))
+    covariance = jnp.linalg.inv(s.hessian + ridge)[:8, :8] * noise**2
+    return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, s.residual, s.converged)
+
+
+_CORNER_MOTION = np.moveaxis(generators(SQUARE.T), -1, 0).reshape(8, 8).astype(np.float32)
+
+
+def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Array, ...]:
+    """Residual (N,), normal equations (11, 11), (11,) of D and S without the light, contrast."""
+    xy, xy_px = on_paper(M, patch.rays, patch.rays_px)
+    pixel = PIXEL_VARIANCE_PX2 * jnp.array([1, 0, 1], blur.dtype)
+    variance = blur_on_paper(xy_px, blur + pixel)
+    dark, slope = _dark(xy, variance, patch.K)
+    far = _far(xy, variance, patch.K.shape[0] - 1)
+    # By D through x and y at fixed blur; by S through the blur on the paper.
+    motion = generators(xy)
+    by_D = slope[0] * motion[0] + slope[1] * motion[1]
+    by_S = [
+        jnp.sum(slope[2:] * _blur_on_paper(G, unit), axis=0) for unit in np.eye(3, dtype=np.float32)
+    ]
+    jacobian = jnp.concatenate([by_D, jnp.stack(by_S)])
+
+    light = jnp.stack([-dark, jnp.ones_like(dark), xy[0], xy[1], far])
+    weighted = light * weight[None]
+    prior = jnp.zeros((5, 5), dark.dtype).at[4, 4].set(_FAR_PRIOR)
+    gram = weighted @ light.T + prior
+    solved = jnp.linalg.solve(
+        gram,
+        jnp.concatenate([(weighted @ patch.levels)[:, None], weighted @ jacobian.T], axis=1),
+    )
+    coefficients, along_light = solved[:, 0], solved[:, 1:]
+    residual = patch.levels - coefficients @ light
+    J = -coefficients[0] * (jacobian - along_light.T @ light)
+    weighted = J * weight[None]
+    return residual, weighted @ J.T, weighted @ residual, coefficients[0]
+
+
+def _dark(xy: Array, variance: Array, K: Array) -> tuple[Array, Array]:
+    """Blurred ink (N,), and its derivatives (5, N) by x, y and the blur's xx, yy, xy.
+
+    Phi2(h, k; rho) = Phi Phi + sum_m rho^m / m! He_(m-1)(h) phi(h) He_(m-1)(k) phi(k)  (Mehler).
+    A blurred picture obeys the heat equation: d/d xx is half of d^2/dx^2, d/d xy is d^2/dx dy.
+    """
+    knots = jnp.linspace(-1, 1, K.shape[0], dtype=xy.dtype)[:, None]
+    sigma = jnp.sqrt(variance[:2])
+    rho = jnp.clip(variance[2] / (sigma[0] * sigma[1]), -_MAX_RHO, _MAX_RHO)
+    columns, rows = (_hermite_terms((xy[i : i + 1] - knots) / sigma[i : i + 1]) for i in (0, 1))
+    rows = [K.T @ term for term in rows]
+
+    def derivative(i: int, j: int) -> Array:
+        value, factor = jnp.zeros_like(rho), jnp.ones_like(rho)
+        for m in range(_MEHLER_ORDERS + 1):
+            # T_0' = T_1, T_m' = -T_(m+1).
+            flips = (i if m else max(i - 1, 0)) + (j if m else max(j - 1, 0))
+            product = jnp.sum(columns[m + i] * rows[m + j], axis=0)
+            value = value + (-1) ** flips * factor * product
+            factor = factor * rho / (m + 1)
+        return value
+
+    sx, sy = sigma
+    by_xx, by_yy = derivative(2, 0) / (2 * sx * sx), derivative(0, 2) / (2 * sy * sy)
+    by = [derivative(1, 0) / sx, derivative(0, 1) / sy, by_xx, by_yy, derivative(1, 1) / (sx * sy)]
+    return derivative(0, 0), jnp.stack(by)
+
+
+def _hermite_terms(z: Array) -> list[Array]:
+    """T_0 = Phi, T_m = He_(m-1) phi."""
+    step, bump = _gauss(z)
+    terms, before, he = [step, bump], jnp.ones_like(z), z
+    for m in range(1, _MEHLER_ORDERS + 2):
+        terms.append(he * bump)
+        before, he = he, z * he - m * before
+    return terms
+
+
+def _far(xy: Array, variance: Array, n: int) -> Array:
+    zone = 1 + 2 / n
+    sigma = jnp.sqrt(variance[:2])
+    inside = _gauss((xy + zone) / sigma)[0] - _gauss((xy - zone) / sigma)[0]
+    return 1 - inside[0] * inside[1]
+
+
+def _gauss(z: Array) -> tuple[Array, Array]:
+    """Integral and density of the standard normal.
+
+    Source: Abramowitz and Stegun (1964), 7.1.26; error below 1.5e-7.
+    """
+    exponential = jnp.exp(-0.5 * z * z)
+    t = 1 / (1 + 0.3275911 / math.sqrt(2) * jnp.abs(z))
+    tail = jnp.zeros_like(z)
+    for a in (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592):
+        tail = t * (tail + a)
+    upper = 0.5 * tail * exponential
+    return jnp.where(z < 0, upper, 1 - upper), exponential * (1 / math.sqrt(2 * math.pi))
+
+
+def _moved(M: Array, blur: Array, step: Array) -> tuple[Array, Array]:
+    D = jnp.append(step[:8], 0).reshape(3, 3)
+    xx, xy, yy = blur + step[8:]
+    # The nearest blur that exists: eigenvalues of a 2x2 clipped.
+    mean, half = (xx + yy) / 2, (xx - yy) / 2
+    radius = jnp.sqrt(half**2 + xy**2 + 1e-12)
+    low, high = jnp.clip(jnp.stack([mean - radius, mean + radius]), *_BLUR_LIMITS_PX2)
+    shrink = (high - low) / 2 / radius
+    mean = (high + low) / 2
+    return M + D @ M, jnp.stack([mean + half * shrink, xy * shrink, mean - half * shrink])
+
+
+def _rms(residual: Array, weight: Array) -> Array:
+    return jnp.sqrt(jnp.sum(weight * residual**2) / jnp.maximum(jnp.sum(weight), 1)) + 0.3
+
+
+def _huber_weight(r: Array) -> Array:
+    return _HUBER / jnp.maximum(jnp.abs(r), _HUBER)
+
+
+def _loss(r: Array) -> Array:
+    size = jnp.abs(r)
+    return jnp.sum(jnp.where(size < _HUBER, 0.5 * r**2, _HUBER * (size - 0.5 * _HUBER)))

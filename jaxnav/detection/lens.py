@@ -1,0 +1,54 @@
+"""Pixels to rays and back for the corner fit, through the camera's own lens.
+
+Shapes are fixed and cameras are arguments, so each kind of lens compiles once.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from jaxnav.camera import Camera
+from jaxnav.detection.edges import PIXELS
+
+
+@jax.jit
+def _rays_and_jacobians(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return camera.unproject(pixels), jax.vmap(jax.jacfwd(camera.unproject))(pixels)
+
+
+@jax.jit
+def _project(camera: Camera, points_camera: jax.Array) -> jax.Array:
+    return camera.project(points_camera)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Directions in which a camera sees. Straight lines stay planes through its centre.
+
+    Without a camera, rays are (u, v, 1): straight lines are straight in the image.
+    """
+
+    camera: Camera | None = None
+
+    def rays(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rays (3, N) through pixels (N, 2), and their derivatives (2, 3, N), per px.
+
+        N is at most PIXELS.
+        """
+        n = len(pixels)
+        if self.camera is None:
+            rays = np.vstack([pixels.T, np.ones(n)])
+            return rays, np.broadcast_to(np.eye(3)[:2, :, None], (2, 3, n))
+        padded = np.zeros((PIXELS, 2), np.asarray(self.camera.focal_px).dtype)
+        padded[:n] = pixels
+        rays, jacobian = (
+            np.asarray(a, float)[:n] for a in _rays_and_jacobians(self.camera, padded)
+        )
+        return rays.T, jacobian.T
+
+    def pixels(self, rays: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) of rays (N, 3). Compiles once for each N."""
+        if self.camera is None:
+            return rays[:, :2] / rays[:, 2:]
+        return np.asarray(_project(self.camera, rays), float)

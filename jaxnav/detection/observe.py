@@ -1,0 +1,55 @@
+"""Detections of all cameras in the order of the marker map."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxnav.detection.types import Detections
+from jaxnav.markers import MarkerMap
+
+
+class Observed(NamedTuple):
+    """What C cameras see of M markers. Lanes that are not visible hold zeros (sigma: ones).
+
+    Attributes:
+        corners_px: (C, M, 4, 2), TL TR BR BL.
+        visible: (C, M) bool.
+        sigma_px: (C, M, 4), standard deviation of each corner along one axis.
+        unknown: how many detections are not of the map.
+        duplicates: how many detections were dropped since their image shows their id twice.
+    """
+
+    corners_px: np.ndarray
+    visible: np.ndarray
+    sigma_px: np.ndarray
+    unknown: int
+    duplicates: int
+
+
+def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
+    """The observation of one instant, one `Detections` a camera in the rig's order.
+
+    A marker found twice in one image is dropped from it: the map has it once, so one of the
+    two is a copy or a reflection, and nothing in the image says which.
+    """
+    shape = (len(detections), len(markers.ids))
+    corners_px = np.zeros((*shape, 4, 2))
+    visible = np.zeros(shape, bool)
+    sigma_px = np.ones((*shape, 4))
+    unknown = duplicates = 0
+    for camera, found in enumerate(detections):
+        keys = list(zip(found.ids.tolist(), found.families, strict=True))
+        counts = Counter(keys)
+        for k, key in enumerate(keys):
+            marker = markers.index(*key)
+            if marker is None:
+                unknown += 1
+            elif counts[key] > 1:
+                duplicates += 1
+            else:
+                corners_px[camera, marker] = found.corners_px[k]
+                sigma_px[camera, marker] = found.sigma_px[k]
+                visible[camera, marker] = True
+    return Observed(corners_px, visible, sigma_px, unknown, duplicates)

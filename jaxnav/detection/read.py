@@ -1,0 +1,142 @@
+"""Which marker is it? For those too small or too blurred for a decoder that looks at cells alone.
+
+The frame is fitted first, its inside taken for grey. Then every code of the family, turned four
+ways, is compared with the pixels through the blur that the frame showed: the most likely one
+wins if nothing else comes near, and if the whole marker then explains the picture.
+"""
+
+from functools import cache
+
+import cv2
+import numpy as np
+
+from jaxnav.detection.edges import PIXEL_VARIANCE_PX2
+from jaxnav.detection.families import all_cells
+from jaxnav.detection.lens import Lens
+from jaxnav.detection.paper import blur_on_paper, on_paper
+from jaxnav.detection.refine import (
+    Fitted,
+    RefinedMarker,
+    corners_of,
+    fit_marker,
+    refine_corners,
+)
+
+# The second best code must explain the pixels worse by this many noise variances. Among 2 348
+# codes chance alone gives about 16.
+_MIN_ADVANTAGE = 60.0
+_MIN_EDGE_LEVELS = 10.0  # between the two sides of every edge
+_MAX_CELL_ERROR = 0.5  # ink: nearer to the cell as printed than to its opposite
+_MAX_NOISE = 0.15  # of the contrast, once all is explained
+
+
+def read_marker(
+    image: np.ndarray, corners_px: np.ndarray, family: str, lens: Lens
+) -> tuple[int, RefinedMarker] | None:
+    """Id and corners of the marker in a quadrilateral, None if it holds none.
+
+    Args:
+        image: (H, W) grey levels.
+        corners_px: (4, 2), clockwise from any corner, about a pixel off at most.
+        family: one of `DICTIONARIES`.
+        lens: through which straight edges are seen.
+    """
+    n = all_cells(family).shape[1]
+    frame = np.pad(np.full((n - 2, n - 2), 0.5), 1)
+    fitted = fit_marker(image, corners_px, frame, lens)
+    if fitted is None or fitted.edges.contrast < 10:
+        return None
+    corners_px = corners_of(fitted.M, lens)
+    if not np.all(np.isfinite(corners_px)):
+        return None
+    code = _most_likely(image, fitted, family, lens)
+    if code is None:
+        return None
+    marker_id, turns = code
+    cells = all_cells(family)[marker_id]
+    refined = refine_corners(image, np.roll(corners_px, -turns, axis=0), cells, lens)
+    if not refined.good or refined.fitted is None or refined.noise > _MAX_NOISE:
+        return None
+    if _worst_cell(refined.fitted, n, lens) > _MAX_CELL_ERROR:
+        return None
+    return marker_id, refined
+
+
+@cache
+def _codes(family: str) -> np.ndarray:
+    """Ink inside the frame, (4 * ids, cells): each marker as it looks after 0..3 turns."""
+    inner = 1 - all_cells(family)[:, 1:-1, 1:-1]
+    # Turned k times clockwise, the marker's own top-left corner is corner k of the picture.
+    turned = [np.rot90(inner, -k, axes=(1, 2)) for k in range(4)]
+    return np.stack(turned, axis=1).reshape(4 * len(inner), -1)
+
+
+def _most_likely(
+    image: np.ndarray, fitted: Fitted, family: str, lens: Lens
+) -> tuple[int, int] | None:
+    """(id, turns) of the code that explains the pixels best, None where others come near."""
+    codes = _codes(family)
+    n = all_cells(family).shape[1]
+    ink = _cells_in_image(fitted, n, lens)
+    inside = np.pad(np.ones((n - 2, n - 2), bool), 1).ravel()
+    frame, cells = ink[~inside].sum(axis=0), ink[inside]
+    levels = image[fitted.pixels[:, 1], fitted.pixels[:, 0]].astype(float)
+    levels = levels - levels.mean()
+    # Least squares of the levels on (white, ink of the whole code), for all codes at once.
+    count = len(levels)
+    ink_sum = frame.sum() + codes @ cells.sum(axis=1)
+    ink_ink = frame @ frame + 2 * codes @ (cells @ frame)
+    ink_ink += np.sum((codes @ (cells @ cells.T)) * codes, axis=1)
+    ink_levels = frame @ levels + codes @ (cells @ levels)
+    explained = np.minimum(ink_levels, 0) ** 2 / (ink_ink - ink_sum**2 / count)
+    unexplained = levels @ levels - explained
+    best = int(np.argmin(unexplained))
+    advantage = np.min(np.delete(unexplained, best)) - unexplained[best]
+    if advantage < _MIN_ADVANTAGE * max(unexplained[best] / count, 1.0):
+        return None
+    return divmod(best, 4)
+
+
+def _worst_cell(fitted: Fitted, n: int, lens: Lens) -> float:
+    """The largest error of ink in a cell: 1 where black should be white or the reverse."""
+    ink = _cells_in_image(fitted, n, lens)
+    residual = fitted.edges.residual[: len(fitted.pixels)]
+    seen = np.maximum(np.sum(ink**2, axis=1), 0.1)
+    return float(np.max(np.abs(ink @ residual) / seen) / float(fitted.edges.contrast))
+
+
+def _cells_in_image(fitted: Fitted, n: int, lens: Lens) -> np.ndarray:
+    """How much of each pixel's light comes from each cell, (n * n, N)."""
+    xy, xy_px = on_paper(fitted.M, *lens.rays(fitted.pixels))
+    pixel_px2 = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])
+    variance = blur_on_paper(xy_px, np.asarray(fitted.edges.blur_px2) + pixel_px2)[:2]
+    knots = np.linspace(-1, 1, n + 1)[:, None]
+    # A logistic curve is within 0.01 of the Gaussian integral: enough to read cells.
+    z = np.clip((xy[:, None] - knots) / np.sqrt(variance)[:, None], -20, 20)
+    columns, rows = -np.diff(1 / (1 + np.exp(-1.702 * z)), axis=1)
+    return (rows[:, None] * columns[None]).reshape(n * n, -1)
+
+
+def frames_first(image: np.ndarray, quads: list[np.ndarray]) -> list[np.ndarray]:
+    """The quadrilaterals that have dark edges on lighter ground, the clearest first.
+
+    Levels are taken a little inside and outside of each edge, for all at once.
+    """
+    if not quads:
+        return []
+    t = np.linspace(0.1, 0.9, 9)[:, None]
+    corners = np.stack(quads)  # (Q, 4, 2)
+    center = corners.mean(axis=1, keepdims=True)
+    ends = corners, np.roll(corners, -1, axis=1)
+    edge = ends[0][:, :, None] * (1 - t) + ends[1][:, :, None] * t  # (Q, 4, 9, 2)
+    points = [center[:, :, None] + scale * (edge - center[:, :, None]) for scale in (0.88, 1.12)]
+    levels = cv2.remap(
+        image,
+        np.stack(points).reshape(-1, 36, 2).astype(np.float32),
+        np.empty(0, np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    inside, outside = levels.reshape(2, len(quads), 4, 9).astype(float).mean(axis=3)
+    clear = np.min(outside - inside, axis=1)  # of the worst of the four edges
+    return [quads[k] for k in np.argsort(-clear, kind="stable") if clear[k] > _MIN_EDGE_LEVELS]

@@ -1,0 +1,142 @@
+"""From a decoded marker to its corners: which pixels take part in the fit, and what it says."""
+
+from dataclasses import dataclass
+
+import cv2
+import jax
+import numpy as np
+
+from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges, step_corners
+from jaxnav.detection.lens import Lens
+from jaxnav.detection.paper import SQUARE, generators, homography, on_paper, rays_of
+
+# Markers up to this side are fitted whole; of larger ones only the outline, which is plenty.
+_WHOLE_UP_TO_PX = 30.0
+_OUTLINE_PX = 3.0
+_POINTS_PER_EDGE = 16
+_MIN_PIXELS = 60
+_MAX_NOISE = 0.25  # of the contrast
+_MAX_MOVE = 0.2  # of the side
+# What no residual shows: a pixel is square and not Gaussian, paper is not quite flat.
+_MODEL_SIGMA_PX = 0.006
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fit and the pixels it was made on. M takes the lens's rays to the paper."""
+
+    M: np.ndarray
+    pixels: np.ndarray  # (N, 2) int
+    edges: EdgeFit
+
+
+@dataclass(frozen=True)
+class RefinedMarker:
+    """Corners after the fit.
+
+    Attributes:
+        corners_px: (4, 2), TL TR BR BL; the given ones where the fit failed.
+        sigma_px: (4,), standard deviation of each corner along an axis (RMS of the two).
+        noise: standard deviation of what the fit leaves unexplained, over the contrast.
+        good: whether the fit converged, near its start, on something like the marker.
+        fitted: the fit, where there was one.
+    """
+
+    corners_px: np.ndarray
+    sigma_px: np.ndarray
+    noise: float
+    good: bool
+    fitted: Fitted | None
+
+
+def refine_corners(
+    image: np.ndarray, corners_px: np.ndarray, cells: np.ndarray, lens: Lens
+) -> RefinedMarker:
+    """Corners of a decoded marker to some hundredths of a pixel.
+
+    Args:
+        image: (H, W) grey levels, uint8.
+        corners_px: (4, 2), TL TR BR BL, a pixel or half a cell off at most.
+        cells: (n, n), 1 white, 0 black, with the black frame.
+        lens: through which straight edges are seen.
+    """
+    corners_px = np.asarray(corners_px, float)
+    side_px = mean_side_px(corners_px)
+    # A decoder's corners lie within a pixel, or 3 % of the side, of the truth.
+    failed = RefinedMarker(corners_px, np.full(4, max(1.0, 0.03 * side_px)), np.inf, False, None)
+    fitted = fit_marker(image, corners_px, cells, lens)
+    if fitted is None:
+        return failed
+    fit = fitted.edges
+    fitted_px = corners_of(fitted.M, lens)
+    moved_px = np.max(np.linalg.norm(fitted_px - corners_px, axis=1))
+    good = (
+        bool(fit.converged)
+        and moved_px < max(2.0, _MAX_MOVE * side_px)
+        and float(fit.noise) < _MAX_NOISE * float(fit.contrast)
+    )
+    if not good:
+        return failed
+    # A ray that stays on its corner moves over the image against the paper.
+    _, paper_px = on_paper(fitted.M, *lens.rays(fitted_px))
+    motion = -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
+    variance_px2 = np.einsum("ij,jk,ik->i", motion, np.asarray(fit.covariance, float), motion)
+    sigma_px = np.sqrt(variance_px2.reshape(4, 2).mean(axis=1) + _MODEL_SIGMA_PX**2)
+    return RefinedMarker(fitted_px, sigma_px, float(fit.noise / fit.contrast), True, fitted)
+
+
+def fit_marker(
+    image: np.ndarray, corners_px: np.ndarray, cells: np.ndarray, lens: Lens
+) -> Fitted | None:
+    """The fit itself, good or not; None where too little of the marker is in the image."""
+    M = homography(lens.rays(corners_px)[0].T)
+    pixels = _pixels_around(image.shape, M, lens, mean_side_px(corners_px), len(cells))
+    count = len(pixels)
+    if count < _MIN_PIXELS:
+        return None
+    rays, rays_px = lens.rays(pixels)
+    # In the basis of the first guess all numbers are of order one, as float32 likes them.
+    lanes = np.minimum(np.arange(PIXELS), count - 1)
+    levels = image[pixels[:, 1], pixels[:, 0]]
+    known = (M @ rays)[:, lanes], (M @ rays_px)[:, :, lanes], levels[lanes], step_corners(cells)
+    fit = fit_edges(*(np.asarray(a, np.float32) for a in known), np.arange(PIXELS) < count)
+    fit = jax.device_get(fit)
+    return Fitted(np.asarray(fit.M, float) @ M, pixels, fit)
+
+
+def mean_side_px(corners_px: np.ndarray) -> float:
+    """Mean length of the four sides of a quadrilateral (4, 2), px."""
+    return float(np.mean(np.linalg.norm(corners_px - np.roll(corners_px, 1, 0), axis=1)))
+
+
+def corners_of(M: np.ndarray, lens: Lens) -> np.ndarray:
+    """Pixels (4, 2) of the corners, TL TR BR BL, of a marker with this M."""
+    return lens.pixels(rays_of(M, SQUARE))
+
+
+def _pixels_around(
+    shape: tuple[int, ...], M: np.ndarray, lens: Lens, side_px: float, n: int
+) -> np.ndarray:
+    """The pixels (N, 2) to fit: a small marker with some of its paper, a large one's outline."""
+    t = np.linspace(0, 1, _POINTS_PER_EDGE, endpoint=False)[:, None]
+    ends = zip(SQUARE, np.roll(SQUARE, -1, 0), strict=True)
+    outline = np.concatenate([(1 - t) * a + t * b for a, b in ends])
+    outline_px = lens.pixels(rays_of(M, outline))
+    # Not past the white zone around the marker, one cell wide.
+    reach = round(min(_OUTLINE_PX, max(1.0, side_px / n)))
+    low = np.maximum(np.floor(outline_px.min(0)).astype(int) - reach - 1, 0)
+    high = np.minimum(np.ceil(outline_px.max(0)).astype(int) + reach + 2, shape[::-1])
+    if np.any(high <= low):
+        return np.zeros((0, 2), int)
+    mask = np.zeros((high - low)[::-1], np.uint8)
+    polyline = np.round((outline_px - low) * 16).astype(np.int32)
+    cv2.polylines(mask, [polyline], True, 1, 2 * reach, shift=4)
+    if side_px <= _WHOLE_UP_TO_PX:
+        cv2.fillPoly(mask, [polyline], 1, shift=4)
+    rows, columns = np.nonzero(mask)
+    pixels = np.column_stack([columns, rows]) + low
+    if len(pixels) > PIXELS:
+        # A fixed scattered choice: no row or direction is thinned out alone.
+        order = (pixels @ np.array([12.9898, 78.233]) * 43758.5453) % 1.0
+        pixels = pixels[np.argsort(order, kind="stable")[:PIXELS]]
+    return pixels

@@ -1,0 +1,107 @@
+"""What a detector is and what it returns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from jaxnav.camera import Camera
+from jaxnav.detection.families import marker_cells
+from jaxnav.detection.lens import Lens
+from jaxnav.detection.refine import refine_corners
+from jaxnav.errors import BadInput
+
+
+@dataclass(frozen=True)
+class Detections:
+    """N markers found in one image, of one or several families.
+
+    Attributes:
+        ids: (N,) int.
+        corners_px: (N, 4, 2), TL TR BR BL, the centre of the top-left pixel being (0, 0).
+        sigma_px: (N, 4), standard deviation of each corner along one axis.
+        refined: (N,) bool, whether the corners are those of the fit. Where it failed they are
+            the decoder's, and sigma says so.
+        families: the family of each.
+    """
+
+    ids: np.ndarray
+    corners_px: np.ndarray
+    sigma_px: np.ndarray
+    refined: np.ndarray
+    families: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @staticmethod
+    def concatenate(parts: Sequence["Detections"]) -> "Detections":
+        """Detections of one image by several detectors, say of different families."""
+        return Detections(
+            ids=np.concatenate([np.zeros(0, int), *(p.ids for p in parts)]),
+            corners_px=np.concatenate([np.zeros((0, 4, 2)), *(p.corners_px for p in parts)]),
+            sigma_px=np.concatenate([np.zeros((0, 4)), *(p.sigma_px for p in parts)]),
+            refined=np.concatenate([np.zeros(0, bool), *(p.refined for p in parts)]),
+            families=tuple(family for p in parts for family in p.families),
+        )
+
+
+class Detector(Protocol):
+    """Finds the markers of one family in an image."""
+
+    family: str
+
+    def detect(
+        self,
+        image: np.ndarray,
+        camera: Camera | None = None,
+        predicted_corners_px: np.ndarray | None = None,
+    ) -> Detections:
+        """All markers of the family in the image.
+
+        Args:
+            image: (H, W) or (H, W, 3) in BGR order, uint8.
+            camera: makes edges straight in the world; without it, straight in the image.
+            predicted_corners_px: (K, 4, 2), where markers are expected: a closer look is
+                taken there. They need not be found, nor be all there is.
+
+        Raises:
+            BadInput: not such an image.
+        """
+        ...
+
+
+def grey(image: np.ndarray) -> np.ndarray:
+    """The image in grey levels, (H, W) uint8.
+
+    Raises:
+        BadInput: neither (H, W) nor (H, W, 3), not uint8, or empty.
+    """
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or image.size == 0:
+        raise BadInput("image", f"expected uint8 pixels, got {image.dtype} of shape {image.shape}")
+    if image.ndim == 3 and image.shape[2] == 3:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    if image.ndim != 2:
+        raise BadInput("image", f"expected shape (H, W) or (H, W, 3), got {image.shape}")
+    return image
+
+
+def refined_detections(
+    image: np.ndarray,
+    found: Sequence[tuple[int, np.ndarray]],
+    family: str,
+    camera: Camera | None,
+) -> Detections:
+    """Detections from what a decoder found: (id, (4, 2) corners) each."""
+    lens = Lens(camera)
+    fits = [refine_corners(image, corners, marker_cells(family, i), lens) for i, corners in found]
+    return Detections(
+        ids=np.array([marker_id for marker_id, _ in found], int),
+        corners_px=np.array([fit.corners_px for fit in fits], float).reshape(-1, 4, 2),
+        sigma_px=np.array([fit.sigma_px for fit in fits], float).reshape(-1, 4),
+        refined=np.array([fit.good for fit in fits], bool),
+        families=(family,) * len(found),
+    )

@@ -1,0 +1,248 @@
+"""Pictures: one function, one Figure. Nothing is shown or saved here.
+
+Colours are Okabe and Ito's, told apart by everybody.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = (
+    "#000000",
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+)
+METHOD_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": BLUE, "ls": "-"},
+    {"color": VERMILION, "ls": "--"},
+)
+SELECTED, OTHER = BLUE, ORANGE
+
+
+@dataclass(frozen=True)
+class Track:
+    """A trajectory to draw: poses (N, 3) of x_m, y_m, psi_rad; NaN where unknown."""
+
+    label: str
+    poses: np.ndarray
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera frame with what was seen in it."""
+
+    title: str
+    image: np.ndarray  # (H, W) or (H, W, 3) RGB
+    detected_px: np.ndarray  # (K, 4, 2) corners
+    selected_px: np.ndarray  # (P, 2, 2) marker normals of the candidate taken, foot and tip
+    other_px: np.ndarray  # (Q, 2, 2) of all other candidates
+
+
+def drive_report(
+    times_s: np.ndarray,
+    truth: Track,
+    methods: Sequence[Track],
+    waypoints_m: np.ndarray,
+    waypoint_radius_m: float,
+    markers_m: np.ndarray,
+    title: str = "",
+) -> Figure:
+    """The paper's two figures of a drive: x, y, yaw against time, and the X-Y plane.
+
+    Args:
+        times_s: (N,).
+        truth: the true trajectory.
+        methods: estimates, at most two: the driving one first.
+        waypoints_m: (W, 2).
+        waypoint_radius_m: drawn as circles.
+        markers_m: (M, 4, 3) corners in the world.
+        title: above everything.
+    """
+    figure = Figure(figsize=(11, 6.5), layout="constrained")
+    figure.suptitle(title)
+    grid = figure.add_gridspec(3, 2, width_ratios=(1, 1.15))
+    rows = [figure.add_subplot(grid[row, 0]) for row in range(3)]
+    for row, axes in enumerate(rows):
+        for track, style in _styled(truth, methods):
+            values = track.poses[:, row]
+            axes.plot(times_s, _yaw_deg(values) if row == 2 else values, label=track.label, **style)
+        axes.set_ylabel(("x (m)", "y (m)", "yaw (deg)")[row])
+        axes.grid(alpha=0.3)
+        axes.label_outer()
+    rows[0].legend(loc="best", fontsize=8)
+    rows[-1].set_xlabel("time (s)")
+
+    plane = figure.add_subplot(grid[:, 1])
+    for track, style in _styled(truth, methods):
+        plane.plot(track.poses[:, 0], track.poses[:, 1], label=track.label, **style)
+    known = np.isfinite(truth.poses[:, 0])
+    plane.plot(*truth.poses[known][0, :2], "o", color=BLACK, ms=6)
+    plane.annotate("start", truth.poses[known][0, :2], xytext=(6, -10), textcoords="offset points")
+    for number, (x_m, y_m) in enumerate(waypoints_m, 1):
+        circle = np.linspace(0, 2 * np.pi, 60)
+        plane.plot(
+            x_m + waypoint_radius_m * np.cos(circle),
+            y_m + waypoint_radius_m * np.sin(circle),
+            color=GREEN,
+        )
+        plane.annotate(
+            f"waypoint {number}", (x_m, y_m), ha="center", va="center", fontsize=8, color=GREEN
+        )
+    _draw_markers(plane, markers_m)
+    plane.set(xlabel="x (m)", ylabel="y (m)")
+    plane.set_aspect("equal", adjustable="datalim")
+    plane.grid(alpha=0.3)
+    plane.legend(loc="lower left", fontsize=8)
+    return figure
+
+
+def localisation_report(
+    times_s: np.ndarray,
+    estimate_m: np.ndarray,
+    reference_m: np.ndarray | None,
+    errors: Mapping[str, np.ndarray],
+    markers_m: np.ndarray,
+    title: str = "",
+    connected: bool = True,
+) -> Figure:
+    """A localised recording: the track seen from above and from the side, and errors over time.
+
+    Args:
+        times_s: (N,).
+        estimate_m: (N, 3) positions, NaN where not located.
+        reference_m: (N, 3) or None.
+        errors: name with unit -> (N,) on a logarithmic axis, NaN where unknown.
+        markers_m: (M, 4, 3) corners in the world.
+        title: above everything.
+        connected: whether successive positions belong to one track; points otherwise.
+    """
+    style: dict[str, Any] = (
+        {"ls": "--", "lw": 1} if connected else {"ls": "", "marker": ".", "ms": 1.5}
+    )
+    figure = Figure(figsize=(11, 4.2 + 1.6 * len(errors)), layout="constrained")
+    figure.suptitle(title)
+    grid = figure.add_gridspec(1 + len(errors), 2, height_ratios=(2.6, *[1] * len(errors)))
+    for column, (first, second) in enumerate(((0, 1), (0, 2))):
+        axes = figure.add_subplot(grid[0, column])
+        axes.plot(
+            estimate_m[:, first], estimate_m[:, second], color=BLUE, label="estimate", **style
+        )
+        if reference_m is not None:
+            axes.plot(
+                reference_m[:, first], reference_m[:, second], color=BLACK, lw=1, label="reference"
+            )
+            _fit_view(axes, np.vstack([reference_m, markers_m.reshape(-1, 3)])[:, [first, second]])
+        for corners in markers_m:
+            closed = np.vstack([corners, corners[:1]])
+            axes.plot(closed[:, first], closed[:, second], color=VERMILION, lw=2)
+        axes.set(xlabel=f"{'xyz'[first]} (m)", ylabel=f"{'xyz'[second]} (m)")
+        axes.set_aspect("equal", adjustable="box" if reference_m is not None else "datalim")
+        axes.grid(alpha=0.3)
+        if column == 0:
+            axes.legend(loc="best", fontsize=8)
+    for row, (name, values) in enumerate(errors.items(), 1):
+        axes = figure.add_subplot(grid[row, :])
+        axes.semilogy(times_s, values, ".", ms=2, color=BLUE)
+        axes.set_ylabel(name)
+        axes.grid(alpha=0.3)
+        axes.tick_params(labelbottom=row == len(errors))
+    if errors:
+        axes.set_xlabel("time (s)")
+    return figure
+
+
+def camera_mosaic(rows: Sequence[Sequence[View]], title: str = "") -> Figure:
+    """Camera frames in rows, each with its detections and the normals of all candidate poses.
+
+    Around a small marker the frame shows an enlarged inset.
+    """
+    columns = max(len(row) for row in rows)
+    height, width = rows[0][0].image.shape[:2]
+    figure = Figure(
+        figsize=(4.2 * columns, (4.2 * height / width + 0.35) * len(rows) + 0.5),
+        layout="constrained",
+    )
+    figure.suptitle(title)
+    for r, row in enumerate(rows):
+        for c, view in enumerate(row):
+            axes = figure.add_subplot(len(rows), columns, r * columns + c + 1)
+            axes.set_title(view.title, fontsize=9)
+            _show(axes, view)
+            side = max((_side_px(corners) for corners in view.detected_px), default=np.inf)
+            if side < width / 6:
+                _enlarge(axes, view)
+    return figure
+
+
+def photo_with_poses(view: View) -> Figure:
+    """A photograph with the detected markers and both poses of each."""
+    height, width = view.image.shape[:2]
+    figure = Figure(figsize=(10, 10 * height / width + 0.4), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_title(view.title, fontsize=10)
+    _show(axes, view)
+    return figure
+
+
+def _styled(truth: Track, methods: Sequence[Track]) -> list[tuple[Track, dict[str, Any]]]:
+    return [
+        (truth, {"color": BLACK, "lw": 2.2, "alpha": 0.75}),
+        *zip(methods, METHOD_STYLES, strict=False),
+    ]
+
+
+def _yaw_deg(psi_rad: np.ndarray) -> np.ndarray:
+    """Degrees in [-180, 180), broken where they wrap so that no line crosses the plot."""
+    wrapped = np.rad2deg((psi_rad + np.pi) % (2 * np.pi) - np.pi)
+    jumps = np.abs(np.diff(wrapped, prepend=wrapped[:1])) > 180
+    return np.where(jumps, np.nan, wrapped)
+
+
+def _fit_view(axes: Axes, points: np.ndarray) -> None:
+    """Limits around the given points, so that outliers don't shrink what matters."""
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    margin = 0.08 * np.max(high - low) + 0.05
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+
+
+def _draw_markers(axes: Axes, markers_m: np.ndarray) -> None:
+    for index, corners in enumerate(markers_m):
+        label = "marker" if index == 0 else None
+        axes.plot(corners[:, 0], corners[:, 1], color=VERMILION, lw=5, label=label)
+
+
+def _show(axes: Axes, view: View) -> None:
+    axes.imshow(view.image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    for corners in view.detected_px:
+        closed = np.vstack([corners, corners[:1]])
+        axes.plot(closed[:, 0], closed[:, 1], color=GREEN, lw=1.2)
+        axes.plot(*corners[0], "o", color=GREEN, ms=3)
+    for sticks, color in ((view.other_px, OTHER), (view.selected_px, SELECTED)):
+        for foot, tip in sticks:
+            axes.annotate("", tip, foot, arrowprops={"arrowstyle": "->", "color": color, "lw": 1.8})
+    height, width = view.image.shape[:2]
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    axes.set_axis_off()
+
+
+def _enlarge(axes: Axes, view: View) -> None:
+    corners = view.detected_px[np.argmax([_side_px(corners) for corners in view.detected_px])]
+    center, half = corners.mean(axis=0), 1.6 * _side_px(corners)
+    height, width = view.image.shape[:2]
+    left = 0.62 if center[0] < width / 2 else 0.02
+    inset = axes.inset_axes((left, 0.02, 0.36, 0.36 * width / height))
+    _show(inset, view)
+    inset.set(xlim=(center[0] - half, center[0] + half), ylim=(center[1] + half, center[1] - half))
+    inset.set_axis_on()
+    inset.set(xticks=[], yticks=[])
+
+
+def _side_px(corners: np.ndarray) -> float:
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).max())

@@ -1,0 +1,1 @@
+"""A world to drive in: what cameras, encoders and vehicles would have said."""

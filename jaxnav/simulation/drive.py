@@ -1,0 +1,210 @@
+"""One closed-loop drive: the car moves, cameras look, one navigator steers, others listen.
+
+The loop is the host's, so that the cameras may be anything: rendered images with a detector, or
+corners with noise. Commands act `latency_s` after the stamp of the frame they stem from.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.bicycle import Vehicle
+from jaxnav.control import Command
+from jaxnav.errors import BadInput
+from jaxnav.evaluation import Branch, judge_branch
+from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.navigator import Navigator, Output, State
+from jaxnav.observation import Observation
+from jaxnav.simulation.plant import CarState, OdometryNoise, move_through, read_odometry
+
+PASSED_M = 0.30  # a waypoint counts as passed when the true car came this close
+_SUBSTEPS = 8  # between two events: some 5 ms each
+
+PoseAt = Callable[[np.ndarray], np.ndarray]  # times_s (N,) -> T_world_vehicle (N, 7), wxyz_xyz
+# The true motion around a stamp, the stamp, and what the driver believes (None at first) ->
+# corners (C, M, 4, 2), visible (C, M), sigma (C, M, 4) or None.
+Look = Callable[[PoseAt, float, Output | None], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
+
+
+@dataclass(frozen=True)
+class DriveSettings:
+    """How a drive is run."""
+
+    start_pose: tuple[float, float, float]  # x_m, y_m, psi_rad; the navigator is not told
+    frame_period_s: float = 1 / 15  # the paper's cluster captures and detects at 15 Hz
+    latency_s: float = 0.03
+    duration_s: float = 30.0
+    floor_m: tuple[float, float, float, float] = (-2.5, 2.5, -2.5, 2.5)  # x_min x_max y_min y_max
+    odometry: OdometryNoise = field(default_factory=OdometryNoise)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One step of a drive: the truth, and what every method made of the same observation."""
+
+    stamp_s: float
+    true_pose: np.ndarray  # (3,)
+    observation: Observation
+    outputs: Mapping[str, Output]
+    branches: Mapping[str, Branch]
+
+
+class Methods:
+    """Navigators under comparison, each compiled once: every one gets the same observations.
+
+    The first one drives.
+    """
+
+    def __init__(self, navigators: Mapping[str, Navigator]):
+        self._navigators = dict(navigators)
+        self._steps = {name: jax.jit(_judged_step(nav)) for name, nav in navigators.items()}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything seen, for another drive."""
+        self._states: dict[str, State] = {n: nav.init() for n, nav in self._navigators.items()}
+
+    @property
+    def driver(self) -> str:
+        """The name of the one that drives."""
+        return next(iter(self._navigators))
+
+    def step(
+        self, observation: Observation, true_pose: jax.Array
+    ) -> tuple[dict[str, Output], dict[str, Branch]]:
+        """All outputs, on the host, and what the truth says of each choice."""
+        outputs, branches = {}, {}
+        for name, step in self._steps.items():
+            self._states[name], outputs[name], branches[name] = step(
+                self._states[name], observation, true_pose
+            )
+        return jax.device_get((outputs, branches))
+
+
+def _judged_step(navigator: Navigator) -> Callable[..., tuple[State, Output, Branch]]:
+    def step(
+        state: State, observation: Observation, true_pose: jax.Array
+    ) -> tuple[State, Output, Branch]:
+        state, output = navigator.step(state, observation)
+        truth = T_world_vehicle_from_planar(true_pose)
+        return state, output, judge_branch(output.candidates, output.selected, truth)
+
+    return step
+
+
+def drive(
+    methods: Methods,
+    vehicle: Vehicle,
+    look: Look,
+    settings: DriveSettings,
+    seed: int,
+) -> Iterator[Frame]:
+    """Run a drive, a frame at a time, until it is done, off the floor or out of time.
+
+    Args:
+        methods: who drives and who listens; starts anew.
+        vehicle: the true car.
+        look: the cameras.
+        settings: start, timing and odometry.
+        seed: of the odometry's noise.
+    """
+    if not 0 <= settings.latency_s < settings.frame_period_s:
+        raise BadInput(
+            "latency_s", f"must be at least 0 and below the frame period, got {settings.latency_s}"
+        )
+    methods.reset()
+    motion = _Motion(vehicle, settings.start_pose)
+    key = jax.random.key(seed)
+    frames = int(np.ceil(settings.duration_s / settings.frame_period_s))
+    believed: Output | None = None
+    for index in range(frames):
+        stamp_s = index * settings.frame_period_s
+        motion.run_until(stamp_s + settings.latency_s)
+        true = motion.state_at(stamp_s)
+        corners_px, visible, sigma_px = look(motion.poses_at, stamp_s, believed)
+        key, odometry_key = jax.random.split(key)
+        speed_mps, steering_rad = read_odometry(true, settings.odometry, odometry_key)
+        observation = Observation(
+            corners_px=jnp.asarray(corners_px, float),
+            visible=jnp.asarray(visible),
+            speed_mps=speed_mps,
+            steering_rad=steering_rad,
+            dt_s=jnp.asarray(settings.frame_period_s if index else 0.0, float),
+            corner_sigma_px=None if sigma_px is None else jnp.asarray(sigma_px, float),
+        )
+        outputs, branches = methods.step(observation, true.pose)
+        believed = outputs[methods.driver]
+        assert believed.command is not None
+        yield Frame(stamp_s, np.asarray(true.pose), observation, outputs, branches)
+        x_min, x_max, y_min, y_max = settings.floor_m
+        x_m, y_m, _ = np.asarray(true.pose)
+        if bool(believed.done) or not (x_min <= x_m <= x_max and y_min <= y_m <= y_max):
+            return
+        motion.command = believed.command
+
+
+def waypoints_passed(true_poses: np.ndarray, waypoints_m: np.ndarray) -> int:
+    """How many waypoints, in their order, the true car came within 0.30 m of."""
+    passed = 0
+    for pose in true_poses:
+        while (
+            passed < len(waypoints_m) and np.linalg.norm(pose[:2] - waypoints_m[passed]) <= PASSED_M
+        ):
+            passed += 1
+    return passed
+
+
+_advance = jax.jit(move_through, static_argnums=4)
+
+
+class _Motion:
+    """The true trajectory so far, dense enough to be interpolated linearly."""
+
+    def __init__(self, vehicle: Vehicle, start_pose: tuple[float, float, float]):
+        zero = jnp.zeros(())
+        self.command = Command(zero, zero)
+        self._state = CarState(jnp.asarray(start_pose, float), zero, zero)
+        self._vehicle = vehicle
+        # At rest before the drive begins.
+        self._times_s = [-1e3, 0.0]
+        self._rows = [self._row(self._state)] * 2
+
+    @staticmethod
+    def _row(state: CarState) -> np.ndarray:
+        return np.append(np.asarray(state.pose), [state.speed_mps, state.steering_rad])
+
+    def run_until(self, time_s: float) -> None:
+        """Let the car move under the present command."""
+        begin_s = self._times_s[-1]
+        dt_s = time_s - begin_s
+        if dt_s <= 0:
+            return
+        states = _advance(
+            self._vehicle, self._state, self.command, jnp.asarray(dt_s, float), _SUBSTEPS
+        )
+        self._state = jax.tree.map(lambda leaf: leaf[-1], states)
+        rows = np.column_stack([states.pose, states.speed_mps, states.steering_rad])
+        self._times_s += list(begin_s + dt_s * np.arange(1, len(rows) + 1) / len(rows))
+        self._rows += list(rows)
+
+    def _interpolated(self, times_s: np.ndarray) -> np.ndarray:
+        recent = np.asarray(self._times_s[-64:]), np.asarray(self._rows[-64:])
+        return np.column_stack([np.interp(times_s, recent[0], column) for column in recent[1].T])
+
+    def state_at(self, time_s: float) -> CarState:
+        """The truth at one instant that has been run through."""
+        row = self._interpolated(np.asarray([time_s]))[0]
+        return CarState(
+            jnp.asarray(row[:3], float), jnp.asarray(row[3], float), jnp.asarray(row[4], float)
+        )
+
+    def poses_at(self, times_s: np.ndarray) -> np.ndarray:
+        """T_world_vehicle (N, 7), wxyz_xyz, at instants that have been run through."""
+        x_m, y_m, psi_rad = self._interpolated(np.asarray(times_s))[:, :3].T
+        zero = np.zeros_like(x_m)
+        return np.column_stack(
+            [np.cos(psi_rad / 2), zero, zero, np.sin(psi_rad / 2), x_m, y_m, zero]
+        )

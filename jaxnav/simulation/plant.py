@@ -1,0 +1,74 @@
+"""The simulated car: what really happens when a command is given.
+
+Speed follows the throttle with a first-order lag, the servo turns at a bounded rate, and the
+bicycle model carries the car along arcs. Pure functions of JAX, so that a rollout can be scanned,
+vmapped and differentiated.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnav import bicycle
+from jaxnav.bicycle import Vehicle
+from jaxnav.control import Command
+
+
+class CarState(eqx.Module):
+    """The truth about the car. The heading counts turns: it is not wrapped."""
+
+    pose: Float[Array, "*batch 3"]  # x_m, y_m, psi_rad
+    speed_mps: Float[Array, "*batch"]
+    steering_rad: Float[Array, "*batch"]
+
+
+class OdometryNoise(eqx.Module):
+    """What the wheel odometer and the steering sensor report besides the truth."""
+
+    speed_sigma_mps: float = 0.01
+    steering_sigma_rad: float = 0.005
+    speed_scale: float = 1.0  # 1.1: the odometer reports 10 % too much
+
+
+def move(vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""]) -> CarState:
+    """The car a short time later (short against the speed's time constant and the turn)."""
+    turn_limit = vehicle.steering_rate_limit_radps * dt_s
+    wanted = jnp.clip(command.steering_rad, -vehicle.steering_limit_rad, vehicle.steering_limit_rad)
+    steering = state.steering_rad + jnp.clip(wanted - state.steering_rad, -turn_limit, turn_limit)
+    throttle = jnp.clip(command.throttle, -vehicle.throttle_limit, vehicle.throttle_limit)
+    final_mps = throttle * vehicle.speed_per_throttle_mps
+    speed = final_mps + (state.speed_mps - final_mps) * jnp.exp(
+        -dt_s / vehicle.speed_time_constant_s
+    )
+    pose = bicycle.advance(
+        state.pose,
+        (state.speed_mps + speed) / 2,
+        (state.steering_rad + steering) / 2,
+        dt_s,
+        vehicle.wheelbase_m,
+    )
+    return CarState(pose, speed, steering)
+
+
+def move_through(
+    vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""], substeps: int
+) -> CarState:
+    """The car at `substeps` evenly spaced instants up to dt, leading axis (substeps,)."""
+
+    def one(state: CarState, _: None) -> tuple[CarState, CarState]:
+        moved = move(vehicle, state, command, dt_s / substeps)
+        return moved, moved
+
+    return jax.lax.scan(one, state, None, length=substeps)[1]
+
+
+def read_odometry(
+    state: CarState, noise: OdometryNoise, key: Array
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(speed_mps, steering_rad) as the sensors report them."""
+    speed_error, steering_error = jax.random.normal(key, (2,), state.speed_mps.dtype)
+    return (
+        noise.speed_scale * state.speed_mps + noise.speed_sigma_mps * speed_error,
+        state.steering_rad + noise.steering_sigma_rad * steering_error,
+    )
