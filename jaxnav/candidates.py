@@ -83,10 +83,13 @@ def find_candidates(
         Ts_vehicle_world
     )
     e1_px2 = jax.vmap(joint_e1)(refined.T_vehicle_world)
-    order = jnp.argsort(jnp.where(owner_visible, e1_px2, jnp.inf))
-    refined, e1_px2, valid = jax.tree.map(
-        lambda leaf: leaf[order], (refined, e1_px2, owner_visible)
-    )
+    # Corners far outside of any image can overflow; such a lane is no candidate.
+    finite = jnp.isfinite(e1_px2) & jnp.isfinite(refined.cost)
+    valid = owner_visible & finite
+    e1_px2 = jnp.where(finite, e1_px2, 0)
+    refined = eqx.tree_at(lambda r: r.cost, refined, jnp.where(finite, refined.cost, 0))
+    order = jnp.argsort(jnp.where(valid, e1_px2, jnp.inf))
+    refined, e1_px2, valid = jax.tree.map(lambda leaf: leaf[order], (refined, e1_px2, valid))
     return Candidates(
         T_vehicle_world=refined.T_vehicle_world,
         e1_px2=e1_px2,
@@ -100,7 +103,7 @@ def find_candidates(
 
 def _both_poses(
     rig: CameraRig, markers: MarkerMap, seen: Sightings
-) -> tuple[jaxlie.SE3, Bool[Array, " 2D"]]:
+) -> tuple[jaxlie.SE3, Bool[Array, " twice_D"]]:
     """Two vehicle poses (2D,) from every sighting by itself, and whether it is visible."""
 
     def one(

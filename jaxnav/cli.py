@@ -65,8 +65,10 @@ class Demo:
     """Start and waypoints."""
     blur: bool = True
     """Integrate each image over its exposure while the car moves."""
-    exposure_ms: float = 5.0
+    exposure_ms: float = 10.0
     """Exposure time, ms."""
+    corner_noise_px: float = 0.0
+    """Spoil the detected corners by this much (standard deviation, px)."""
     rolling_shutter: bool = True
     """Expose the rows of an image one after the other."""
     corner_backend: CornerBackend = "aruco"
@@ -80,6 +82,7 @@ class Demo:
         _require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
         _require(self.seeds >= 1, "--seeds", f"must be at least 1, got {self.seeds}")
         _require_finite("--exposure-ms", self.exposure_ms, zero_allowed=True)
+        _require_finite("--corner-noise-px", self.corner_noise_px, zero_allowed=True)
         _require_finite("--duration-s", self.duration_s)
 
 
@@ -93,7 +96,7 @@ class Replay:
     """
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
-    """Folder, bag (.bag, .bag.bz2, ROS 2) or .npz."""
+    """Folder, ROS 1 bag (.bag, .bag.bz2) or .npz."""
     rig: OptionalFile = None
     """Cameras, a rig file or a Kalibr camchain, in place of the recording's own."""
     markers_file: OptionalFile = None

@@ -39,7 +39,7 @@ class Controller(eqx.Module):
 
     The paper's sum of distances (Eq. 19) never decreases: here it is an integral over time, held
     inside `integral_limit_ms`, and starts anew at every waypoint. After the last waypoint the
-    throttle is zero, and so it is before the first pose.
+    throttle is zero, and so it is before the first pose and where the pose is no number.
     """
 
     waypoints_m: Float[Array, "W 2"]
@@ -66,8 +66,8 @@ class Controller(eqx.Module):
         Args:
             pose: (x_m, y_m, psi_rad) of the vehicle in the world.
             located: whether the pose means anything yet.
-            steering_rad: measured steering angle, for the sideslip.
-            dt_s: time since the previous call.
+            steering_rad: measured steering angle, for the sideslip; 0 stands in for no number.
+            dt_s: time since the previous call; 0 stands in for no positive number.
 
         Returns:
             The next state, the command, whether the last waypoint is reached, and the log.
@@ -81,9 +81,12 @@ class Controller(eqx.Module):
 
         to_waypoint = self.waypoints_m[jnp.minimum(index, count - 1)] - pose[:2]
         distance_m = safe_norm(to_waypoint)
-        beta_rad = sideslip_rad(steering_rad)
+        steering_limit = self.vehicle.steering_limit_rad
+        steering_rad = jnp.where(jnp.isfinite(steering_rad), steering_rad, 0)
+        beta_rad = sideslip_rad(jnp.clip(steering_rad, -steering_limit, steering_limit))
         alpha_rad = wrap_angle(safe_atan2(to_waypoint[1], to_waypoint[0]) - pose[2] - beta_rad)
-        drives = located & ~done
+        drives = located & ~done & jnp.isfinite(distance_m) & jnp.isfinite(alpha_rad)
+        dt_s = jnp.where(jnp.isfinite(dt_s) & (dt_s > 0), dt_s, 0)
 
         steering = self._steering(alpha_rad, distance_m, beta_rad)
         integral_ms = jnp.where(arrived, 0, state.integral_ms)

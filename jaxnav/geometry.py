@@ -80,15 +80,15 @@ def safe_norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
 
 
 def safe_sqrt(value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Square root of max(value, 0), with a zero gradient at and below 0."""
-    positive = value > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1)), 0)
+    """Square root of max(value, 0), with a zero gradient at and below 0. NaN stays NaN."""
+    vanishes = value <= 0
+    return jnp.where(vanishes, 0, jnp.sqrt(jnp.where(vanishes, 1, value)))
 
 
 def safe_atan2(y: Float[Array, "*batch"], x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """atan2 in rad, 0 with a zero gradient at the origin."""
-    defined = x**2 + y**2 > 0
-    return jnp.where(defined, jnp.arctan2(y, jnp.where(defined, x, 1)), 0)
+    """atan2 in rad, 0 with a zero gradient at the origin. NaN stays NaN."""
+    undefined = x**2 + y**2 <= 0
+    return jnp.where(undefined, 0, jnp.arctan2(y, jnp.where(undefined, 1, x)))
 
 
 def rotation_from_matrix(R: Float[Array, "3 3"]) -> jaxlie.SO3:

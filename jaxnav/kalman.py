@@ -63,7 +63,7 @@ def symmetrise(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 def white_acceleration(
     density: Float[Array, " d"], dt_s: Float[Array, ""] | float
-) -> Float[Array, "2d 2d"]:
+) -> Float[Array, "2*d 2*d"]:
     """Q of a position-velocity state driven by white acceleration.
 
     Args:

@@ -34,10 +34,19 @@ from jaxnav.observation import Observation
 class Belief(eqx.Module):
     """K hypotheses: means as the motion model stores them, covariances, weights."""
 
-    mean: Float[Array, "K n"]
-    covariance: Float[Array, "K d d"]
-    log_weight: Float[Array, " K"]
-    initialised: Bool[Array, " K"]
+    mean: Float[Array, "*K n"]
+    covariance: Float[Array, "*K d d"]
+    log_weight: Float[Array, "*K"]
+    initialised: Bool[Array, "*K"]
+
+
+def restarted_where_broken(belief: Belief, start: Belief) -> Belief:
+    """The belief, with `start` in place of hypotheses whose numbers overflowed."""
+    hypotheses = (belief.mean, belief.covariance.reshape(*belief.mean.shape[:1], -1))
+    finite = jnp.all(jnp.isfinite(jnp.concatenate(hypotheses, axis=1)), axis=1)
+    return jax.vmap(lambda ok, b, s: jax.tree.map(lambda x, y: jnp.where(ok, x, y), b, s))(
+        finite, belief, start
+    )
 
 
 @runtime_checkable
@@ -53,7 +62,7 @@ class Motion(Protocol):
         candidates: Candidates,
         weights: Float[Array, "K N"],
         obs: Observation,
-    ) -> tuple[Belief, Float[Array, ""]]: ...
+    ) -> tuple[Belief, Float[Array, " K"]]: ...
 
 
 class BicycleKalman(eqx.Module):
@@ -131,7 +140,7 @@ class BicycleKalman(eqx.Module):
         candidates: Candidates,
         weights: Float[Array, "K N"],
         obs: Observation,
-    ) -> tuple[Belief, Float[Array, ""]]:
+    ) -> tuple[Belief, Float[Array, " K"]]:
         """The posterior of every hypothesis (Eqs. 10 and 11), and the pose's NIS (3 dof).
 
         The first pose that is taken starts the filter. Without a pose only the odometry counts,
@@ -170,7 +179,8 @@ class BicycleKalman(eqx.Module):
         H = jnp.eye(6, dtype=pose.dtype).at[3:, 2].set(-turned_velocity)
         R = jnp.block([[R_pose, zero], [zero, jnp.diag(self.odometry_sigma**2)]])
         takes_pose = (seen & belief.initialised).astype(pose.dtype)
-        present = jnp.append(jnp.full(3, takes_pose), jnp.ones(3, pose.dtype))
+        has_odometry = jnp.asarray(obs.has_odometry, pose.dtype)
+        present = jnp.append(jnp.full(3, takes_pose), jnp.full(3, has_odometry))
 
         correction, P, S = kalman.update(P, *kalman.hide_rows(innovation, H, R, present))
         mean = mean + correction
@@ -250,7 +260,7 @@ class ConstantVelocity(eqx.Module):
         candidates: Candidates,
         weights: Float[Array, "K N"],
         obs: Observation,
-    ) -> tuple[Belief, Float[Array, ""]]:
+    ) -> tuple[Belief, Float[Array, " K"]]:
         """The posterior of every hypothesis, and the pose's NIS (6 dof)."""
         return jax.vmap(lambda b, w: self._update_one(b, candidates, w))(belief, weights)
 

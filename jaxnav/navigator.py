@@ -17,7 +17,13 @@ from jaxnav.candidates import Candidates, find_candidates
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.geometry import planar_from_T_world_vehicle
 from jaxnav.markers import MarkerMap
-from jaxnav.motion import Belief, BicycleKalman, ConstantVelocity, Motion
+from jaxnav.motion import (
+    Belief,
+    BicycleKalman,
+    ConstantVelocity,
+    Motion,
+    restarted_where_broken,
+)
 from jaxnav.observation import Observation
 from jaxnav.rig import CameraRig
 
@@ -121,10 +127,12 @@ class Navigator(eqx.Module):
 
     def step(self, state: State, obs: Observation) -> tuple[State, Output]:
         """One pass of Algorithm 1."""
+        obs = obs.usable()
         prior = self.motion.predict(state.belief, obs.dt_s)
         candidates = self.find_candidates(obs)
         selection = self.selector(self.motion.poses(prior), candidates, obs, self.markers)
         belief, nis = self.motion.update(prior, candidates, selection.weights, obs)
+        belief = restarted_where_broken(belief, self.motion.init())
 
         best = jnp.argmax(belief.log_weight)
         T_world_vehicle = jax.tree.map(
@@ -144,7 +152,7 @@ class Navigator(eqx.Module):
             costs=selection.costs,
             selected=selection.selected,
             flip_probability=selection.flip_probability,
-            nis=nis[best],
+            nis=jnp.where(located, nis[best], 0),
             control_log=log,
         )
 

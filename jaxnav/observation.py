@@ -13,8 +13,8 @@ from jaxnav.rig import CameraRig
 class Observation(eqx.Module):
     """One synchronous reading of cameras, odometer and steering sensor.
 
-    Lanes that are not visible hold any finite numbers. A lane with a non-finite corner counts as
-    not visible.
+    Lanes that are not visible hold any finite numbers. What no sensor can mean is left out, see
+    `usable`.
     """
 
     corners_px: Float[Array, "C M 4 2"]  # raw pixels, M in the order of the map
@@ -23,6 +23,26 @@ class Observation(eqx.Module):
     steering_rad: Float[Array, ""] | float = 0.0
     dt_s: Float[Array, ""] | float = 0.0  # since the previous observation
     corner_sigma_px: Float[Array, "C M 4"] | None = None  # None: the estimator's own figure
+    has_odometry: Bool[Array, ""] | bool = True  # False: speed and steering are not known
+
+    def usable(self) -> "Observation":
+        """The same with everything finite that a filter looks at.
+
+        A lane with a non-finite corner is not visible; without a finite speed and steering angle
+        there is no odometry; a `dt_s` that is not a positive number is 0.
+        """
+        finite_steering = jnp.isfinite(self.steering_rad)
+        has_odometry = self.has_odometry & jnp.isfinite(self.speed_mps) & finite_steering
+        usable_dt = jnp.isfinite(self.dt_s) & (jnp.asarray(self.dt_s) > 0)
+        return Observation(
+            corners_px=self.corners_px,
+            visible=self.visible & jnp.all(jnp.isfinite(self.corners_px), axis=(2, 3)),
+            speed_mps=jnp.where(has_odometry, self.speed_mps, 0.0),
+            steering_rad=jnp.where(finite_steering, self.steering_rad, 0.0),
+            dt_s=jnp.where(usable_dt, self.dt_s, 0.0),
+            corner_sigma_px=self.corner_sigma_px,
+            has_odometry=has_odometry,
+        )
 
 
 class Sightings(eqx.Module):
@@ -43,7 +63,9 @@ def sightings(
     sigma_px: Float[Array, "*sigma"] | float = 1.0,
     max_count: int | None = None,
 ) -> Sightings:
-    """The visible (camera, marker) lanes, largest image first, in a fixed number of slots.
+    """The visible (camera, marker) lanes in a fixed number of slots.
+
+    A lane with a non-finite corner, or a sigma that is not a positive number, is not visible.
 
     Args:
         corners_px: (C, M, 4, 2).
@@ -65,12 +87,14 @@ def sightings(
     dtype = rig.cameras.focal_px.dtype
     corners = corners_px.reshape(count, 4, 2).astype(dtype)
     seen = visible.reshape(count) & jnp.all(jnp.isfinite(corners), axis=(1, 2))
+    sigma = jnp.broadcast_to(jnp.asarray(sigma_px, dtype), (*lanes, 4)).reshape(count, 4)
+    seen = seen & jnp.all(jnp.isfinite(sigma) & (sigma > 0), axis=1)
+    sigma = jnp.where(seen[:, None], sigma, 1)
     # A hidden lane becomes a plain square near the principal point: every formula stays finite.
     camera_index = jnp.repeat(jnp.arange(lanes[0]), lanes[1])
     dummy = jnp.asarray([[-20.0, -20.0], [20.0, -20.0], [20.0, 20.0], [-20.0, 20.0]], dtype)
     centers = rig.cameras.center_px[camera_index]
     corners = jnp.where(seen[:, None, None], corners, centers[:, None] + dummy[None])
-    sigma = jnp.broadcast_to(jnp.asarray(sigma_px, dtype), (*lanes, 4)).reshape(count, 4)
     if kept < count:
         diagonals = corners[:, :2] - corners[:, 2:]
         area = jnp.abs(

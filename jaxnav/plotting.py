@@ -234,7 +234,7 @@ def _show(axes: Axes, view: View) -> None:
 
 def _enlarge(axes: Axes, view: View) -> None:
     corners = view.detected_px[np.argmax([_side_px(corners) for corners in view.detected_px])]
-    center, half = corners.mean(axis=0), 1.6 * _side_px(corners)
+    center, half = corners.mean(axis=0), max(1.6 * _side_px(corners), 4.0)
     height, width = view.image.shape[:2]
     left = 0.62 if center[0] < width / 2 else 0.02
     inset = axes.inset_axes((left, 0.02, 0.36, 0.36 * width / height))

@@ -13,13 +13,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.geometry import on_last_axis, safe_norm, transform_points
 from jaxnav.ippe import PosePair, ippe_square
+from jaxnav.levenberg_marquardt import NormalEquationsLM
 from jaxnav.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.observation import Sightings, sightings
 from jaxnav.residuals import reprojection_residuals
@@ -47,7 +47,7 @@ def refine_pose(
     visible: Bool[Array, "C M"],
     T_vehicle_world: jaxlie.SE3,
     corner_sigma_px: Float[Array, "*sigma"] | float = 1.0,
-    max_steps: int = 32,
+    max_steps: int = 100,
 ) -> RefinedPose:
     """The local minimum of e1 next to a pose: all cameras, all markers, all corners at once.
 
@@ -150,10 +150,8 @@ def _minimise(
         return jnp.concatenate([residual(chart.points(y)), jnp.where(constrained, 0, y)])
 
     dtype = chart.pivot.dtype
-    tolerance = 1e-7 if dtype == jnp.float64 else 1e-4
-    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
-        rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
-    )
+    tolerance = 1e-12 if dtype == jnp.float64 else 1e-6  # of the cost, what is left to gain
+    solver = NormalEquationsLM(rtol=tolerance, atol=tolerance)
     solution: optx.Solution = optx.least_squares(
         fn, solver, jnp.zeros(6, dtype), max_steps=max_steps, throw=False
     )
@@ -185,7 +183,7 @@ def _body_covariance(chart: _Chart, J: Array) -> Array:
 
 
 def solve_marker(
-    corners_n: Float[Array, "4 2"], size_m: Float[Array, ""] | float, max_steps: int = 32
+    corners_n: Float[Array, "4 2"], size_m: Float[Array, ""] | float, max_steps: int = 100
 ) -> PosePair:
     """Both poses of one marker in one camera, each refined to its local minimum by LM.
 
@@ -196,7 +194,7 @@ def solve_marker(
     corners_marker = (
         jnp.asarray(size_m, corners_n.dtype) / 2 * jnp.asarray(CORNER_SIGNS, corners_n.dtype)
     )
-    spread = safe_norm((corners_n - jnp.mean(corners_n, axis=0)).reshape(-1))
+    spread = safe_norm((corners_n - jnp.mean(corners_n, axis=0, keepdims=True)).reshape(-1))
     unit = jnp.where(spread > 0, spread, 1) / 100  # a hundred "pixels" across, whatever the units
 
     def residual(points: Array) -> Array:

@@ -22,6 +22,7 @@ LAYERS = {
         "evaluation",
         "ippe",
         "kalman",
+        "levenberg_marquardt",
         "motion",
         "observation",
         "refine",

@@ -46,12 +46,14 @@ from jaxnav.simulation.drive import (
 )
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
-from jaxnav.simulation.sensor import Shutter
+from jaxnav.simulation.sensor import Sensor, Shutter
 
 OURS = "our_method"
 METHOD_A = "method_a_kf"
 LABELS = {OURS: "our method", METHOD_A: "Method A + KF"}
 ROW_TIME_S = 30e-6  # 410 rows in 12 ms, usual for a small CSI sensor
+# A small lens and a cheap sensor indoors: blurred by 0.7 px, 2 grey levels in the dark.
+SENSOR = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0, full_well_e=6000.0)
 START_SPREAD = np.array([0.05, 0.05, np.deg2rad(5.0)])  # around the route's start, m m rad
 MOSAIC_ROWS = 3
 KEEP_EVERY = 8  # of so many frames one keeps its images, for the mosaic
@@ -118,7 +120,7 @@ class World:
             markers=markers,
             vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
             route=load_route(args.route or qcar / "route.yaml"),
-            renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, threads=2),
+            renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, SENSOR),
             detectors=[
                 make_detector(args.corner_backend, family)
                 for family in sorted(set(markers.families))
@@ -155,6 +157,7 @@ class Cameras:
 
     world: World
     rng: np.random.Generator
+    corner_noise_px: float = 0.0  # on top of what detection leaves
     images: list[np.ndarray] = field(default_factory=list)  # the latest, one a camera
 
     def look(
@@ -174,7 +177,9 @@ class Cameras:
             for c, image in enumerate(self.images)
         ]
         observed = observe(found, world.markers)
-        return observed.corners_px, observed.visible, observed.sigma_px
+        noise_px = self.corner_noise_px * self.rng.standard_normal(observed.corners_px.shape)
+        sigma_px = np.hypot(observed.sigma_px, self.corner_noise_px)
+        return observed.corners_px + noise_px, observed.visible, sigma_px
 
     def _predicted(self, believed: Output | None) -> tuple[np.ndarray, np.ndarray]:
         lanes = (len(self.world.rig), len(self.world.markers.ids))
@@ -220,7 +225,7 @@ def _drive(args: Demo, world: World, methods: Methods, seed: int) -> Record:
         duration_s=args.duration_s,
         floor_m=world.floor_m(),
     )
-    cameras = Cameras(world, rng)
+    cameras = Cameras(world, rng, args.corner_noise_px)
     frames: list[Frame] = []
     kept: dict[int, list[np.ndarray]] = {}
     with tqdm(
@@ -254,6 +259,7 @@ def _summary(args: Demo, world: World, record: Record, seed: int) -> dict[str, A
         "corner_backend": args.corner_backend,
         "exposure_ms": args.exposure_ms if args.blur else 0.0,
         "rolling_shutter": args.rolling_shutter,
+        "corner_noise_px": args.corner_noise_px,
         "marker_seen_fraction": np.mean([np.any(f.observation.visible) for f in record.frames]),
         "methods": {name: _score(record, name) for name in (OURS, METHOD_A)},
     }

@@ -28,6 +28,7 @@ from jaxnav.rig import CameraRig
 def run(args: Locate) -> int:
     """Detect, solve, print, and draw where asked to."""
     configure_jax(float64=True)
+    detector = make_detector(args.corner_backend, args.family)
     camera, image_size_px = load_camera(args.camera, args.camera_name)
     image = read_image(args.image)
     height, width = image.shape[:2]
@@ -37,7 +38,7 @@ def run(args: Locate) -> int:
             f"is {width} x {height} pixels, but --camera {args.camera} was calibrated at "
             f"{image_size_px[0]} x {image_size_px[1]}",
         )
-    found = make_detector(args.corner_backend, args.family).detect(image, camera)
+    found = detector.detect(image, camera)
     rig = CameraRig.create([camera], [jaxlie.SE3.identity()], ["camera"], [image_size_px])
     located = [
         _locate(rig, args.marker_size_m, found, index)

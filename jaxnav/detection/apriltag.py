@@ -14,7 +14,7 @@ from jaxnav.errors import BadInput
 _FAMILIES = ("tag16h5", "tag25h9", "tag36h11")
 _TL_TR_BR_BL = [1, 0, 3, 2]
 _PIXEL_EDGE_PX = 0.5  # AprilTag counts from the image's edge, not from a pixel's centre
-_MIN_DECISION_MARGIN = 20.0
+_MIN_DECISION_MARGIN = 10.0  # grey levels; what noise decodes to stays below
 
 
 class AprilTagDetector:

@@ -11,7 +11,8 @@ from jaxnav.detection.refine import mean_side_px
 from jaxnav.detection.types import Detections, grey, refined_detections
 
 # The closer look: quadrilaterals of these sides.
-_CLOSER_LOOK_PX = (8.0, 40.0)
+_CLOSER_LOOK_PX = (8.0, 150.0)
+_ENLARGE_UP_TO_PX = 40.0
 _ENLARGE = 3
 # A prediction may be off by this part of its side, and by some pixels.
 _SEARCH_SIDES, _SEARCH_PX = 0.5, 8
@@ -20,7 +21,7 @@ _SEARCH_SIDES, _SEARCH_PX = 0.5, 8
 class ArucoDetector:
     """Markers of one family by OpenCV's decoder, their corners by our fit.
 
-    The decoder's own corner refinement is off. Small quadrilaterals that it finds but cannot
+    The decoder's own corner refinement is off. Quadrilaterals that it finds but cannot
     read, and those around the predictions in a threefold enlargement, are read by `read`.
     """
 
@@ -35,6 +36,8 @@ class ArucoDetector:
         self._closer_looks = closer_looks
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+        # By default the outline of the white paper swallows the marker on it: 3 of 10 frames lost.
+        parameters.minMarkerDistanceRate = 0.02
         self._decoder = cv2.aruco.ArucoDetector(dictionary(family), parameters)
 
     def detect(
@@ -56,7 +59,7 @@ class ArucoDetector:
                     ]
                     unread = [quad, *unread_there, *unread]
         looked_at = [corners for _, corners in found]
-        for quad in frames_first(image, _small(unread))[: self._closer_looks]:
+        for quad in frames_first(image, _worth_a_look(unread))[: self._closer_looks]:
             if any(_overlap(quad, other) for other in looked_at):
                 continue
             read = read_marker(image, quad, self.family, lens)
@@ -68,7 +71,7 @@ class ArucoDetector:
     def _decode(self, image: np.ndarray) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
         """What OpenCV read, (id, corners) each, and the quadrilaterals that it could not read."""
         quads, ids, unread = self._decoder.detectMarkers(image)
-        found_ids = [] if ids is None else ids.ravel().tolist()
+        found_ids = [] if ids is None else [int(i) for i in ids.ravel()]
         found = [
             (i, quad.reshape(4, 2).astype(float)) for i, quad in zip(found_ids, quads, strict=True)
         ]
@@ -81,7 +84,7 @@ class ArucoDetector:
         margin = _SEARCH_SIDES * mean_side_px(quad) + _SEARCH_PX
         low = np.maximum(np.floor(quad.min(axis=0) - margin), 0).astype(int)
         high = np.minimum(np.ceil(quad.max(axis=0) + margin), image.shape[::-1]).astype(int)
-        if np.any(high - low < 8) or mean_side_px(quad) > _CLOSER_LOOK_PX[1]:
+        if np.any(high - low < 8) or mean_side_px(quad) > _ENLARGE_UP_TO_PX:
             return [], []
         region = image[low[1] : high[1], low[0] : high[0]]
         enlarged = cv2.resize(region, None, fx=_ENLARGE, fy=_ENLARGE, interpolation=cv2.INTER_CUBIC)
@@ -93,15 +96,15 @@ class ArucoDetector:
         return [(i, back(corners)) for i, corners in found], [back(corners) for corners in unread]
 
 
-def _small(quads: list[np.ndarray]) -> list[np.ndarray]:
-    """The quadrilaterals worth a closer look, each place once."""
-    small: list[np.ndarray] = []
+def _worth_a_look(quads: list[np.ndarray]) -> list[np.ndarray]:
+    """Of the quadrilaterals those neither too small nor too large, each place once."""
+    kept: list[np.ndarray] = []
     for quad in quads:
         low, high = _CLOSER_LOOK_PX
-        known = any(np.max(np.abs(quad.mean(axis=0) - q.mean(axis=0))) < 0.5 for q in small)
+        known = any(np.max(np.abs(quad.mean(axis=0) - q.mean(axis=0))) < 0.5 for q in kept)
         if low <= mean_side_px(quad) <= high and not known:
-            small.append(quad)
-    return small
+            kept.append(quad)
+    return kept
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> bool:

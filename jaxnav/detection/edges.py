@@ -10,10 +10,10 @@ covariance of the fit is honest, and tells an edge from the cells one or two pix
     dark = sum_kl K_kl Phi2((x - x_l) / s_x, (y - y_k) / s_y; rho)
 
 (x, y) are paper coordinates, K the corners of the cells at (x_l, y_k) (second differences of the
-pattern), Phi2 the binormal integral of the blur on the paper: covariance G (S + I/12) G' with
-G = d(x, y)/du, S that of lens and motion (px^2, fitted) and 1/12 that of a square pixel; far is 1
-beyond the white zone, one cell wide, that every marker has. The light (white, contrast, c) enters
-linearly and is eliminated.
+pattern), Phi2 the integral of the blur on the paper: covariance G (S + I/12) G', G = d(x, y)/du,
+S that of lens and motion (px^2, fitted), 1/12 that of a square pixel, whose flat top is kept (see
+`_dark`); far is 1 beyond the white zone, one cell wide, that every marker has. The light (white,
+contrast, c) enters linearly and is eliminated.
 
 Source: Golub and Pereyra (1973), variable projection; Kaufman (1975) for its Jacobian.
 """
@@ -146,14 +146,15 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     xy, xy_px = on_paper(M, patch.rays, patch.rays_px)
     pixel = PIXEL_VARIANCE_PX2 * jnp.array([1, 0, 1], blur.dtype)
     variance = blur_on_paper(xy_px, blur + pixel)
-    dark, slope = _dark(xy, variance, patch.K)
+    # Two Gaussians with the fourth cumulant of a box, -1/120 px^4 along u and v: -2 split^4.
+    split = (jnp.sum(xy_px**4, axis=0) / 240) ** 0.25
+    dark, slope = _dark(xy, variance, split, patch.K)
     far = _far(xy, variance, patch.K.shape[0] - 1)
     # By D through x and y at fixed blur; by S through the blur on the paper.
     motion = generators(xy)
-    by_D = slope[0] * motion[0] + slope[1] * motion[1]
-    by_S = [
-        jnp.sum(slope[2:] * _blur_on_paper(G, unit), axis=0) for unit in np.eye(3, dtype=np.float32)
-    ]
+    by_D = slope[:1] * motion[0] + slope[1:2] * motion[1]
+    units = jnp.eye(3, dtype=blur.dtype)
+    by_S = [jnp.sum(slope[2:] * blur_on_paper(xy_px, unit), axis=0) for unit in units]
     jacobian = jnp.concatenate([by_D, jnp.stack(by_S)])
 
     light = jnp.stack([-dark, jnp.ones_like(dark), xy[0], xy[1], far])
@@ -171,42 +172,51 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     return residual, weighted @ J.T, weighted @ residual, coefficients[0]
 
 
-def _dark(xy: Array, variance: Array, K: Array) -> tuple[Array, Array]:
+def _dark(xy: Array, variance: Array, split: Array, K: Array) -> tuple[Array, Array]:
     """Blurred ink (N,), and its derivatives (5, N) by x, y and the blur's xx, yy, xy.
 
-    Phi2(h, k; rho) = Phi Phi + sum_m rho^m / m! He_(m-1)(h) phi(h) He_(m-1)(k) phi(k)  (Mehler).
-    A blurred picture obeys the heat equation: d/d xx is half of d^2/dx^2, d/d xy is d^2/dx dy.
+    Along each axis the blur is a mean of two Gaussians, `split` (2, N) to either side. With
+    U_0(x) = mean Phi and U_m its m-th derivative, up to sign, an ink's corner blurs into
+    Phi2(x, y) = sum_m xy^m / m! U_m(x) U_m(y)  (Mehler). Blurred pictures obey the heat equation:
+    d/d xx is half of d^2/dx^2, d/d xy is d^2/dx dy.
     """
     knots = jnp.linspace(-1, 1, K.shape[0], dtype=xy.dtype)[:, None]
-    sigma = jnp.sqrt(variance[:2])
-    rho = jnp.clip(variance[2] / (sigma[0] * sigma[1]), -_MAX_RHO, _MAX_RHO)
-    columns, rows = (_hermite_terms((xy[i : i + 1] - knots) / sigma[i : i + 1]) for i in (0, 1))
+    sigma = jnp.sqrt(variance[:2] - split**2)
+    limit = _MAX_RHO * sigma[0] * sigma[1]
+    covariance = jnp.clip(variance[2], -limit, limit)
+    columns, rows = (
+        _hermite_terms(xy[i : i + 1] - knots, sigma[i : i + 1], split[i : i + 1]) for i in (0, 1)
+    )
     rows = [K.T @ term for term in rows]
 
     def derivative(i: int, j: int) -> Array:
-        value, factor = jnp.zeros_like(rho), jnp.ones_like(rho)
+        value, factor = jnp.zeros_like(covariance), jnp.ones_like(covariance)
         for m in range(_MEHLER_ORDERS + 1):
-            # T_0' = T_1, T_m' = -T_(m+1).
+            # U_0' = U_1, U_m' = -U_(m+1).
             flips = (i if m else max(i - 1, 0)) + (j if m else max(j - 1, 0))
             product = jnp.sum(columns[m + i] * rows[m + j], axis=0)
             value = value + (-1) ** flips * factor * product
-            factor = factor * rho / (m + 1)
+            factor = factor * covariance / (m + 1)
         return value
 
-    sx, sy = sigma
-    by_xx, by_yy = derivative(2, 0) / (2 * sx * sx), derivative(0, 2) / (2 * sy * sy)
-    by = [derivative(1, 0) / sx, derivative(0, 1) / sy, by_xx, by_yy, derivative(1, 1) / (sx * sy)]
-    return derivative(0, 0), jnp.stack(by)
+    by_blur = [derivative(2, 0) / 2, derivative(0, 2) / 2, derivative(1, 1)]
+    return derivative(0, 0), jnp.stack([derivative(1, 0), derivative(0, 1), *by_blur])
 
 
-def _hermite_terms(z: Array) -> list[Array]:
-    """T_0 = Phi, T_m = He_(m-1) phi."""
-    step, bump = _gauss(z)
-    terms, before, he = [step, bump], jnp.ones_like(z), z
-    for m in range(1, _MEHLER_ORDERS + 2):
-        terms.append(he * bump)
-        before, he = he, z * he - m * before
-    return terms
+def _hermite_terms(distance: Array, sigma: Array, split: Array) -> list[Array]:
+    """U_0 = mean Phi(z), U_m = mean He_(m-1) phi(z) / sigma^m, z = (distance +- split) / sigma."""
+    sides = []
+    for z in ((distance + split) / sigma, (distance - split) / sigma):
+        step, bump = _gauss(z)
+        terms, before, he = [step], jnp.ones_like(z), z
+        scaled = bump / sigma
+        terms.append(scaled)
+        for m in range(1, _MEHLER_ORDERS + 2):
+            scaled = scaled / sigma
+            terms.append(he * scaled)
+            before, he = he, z * he - m * before
+        sides.append(terms)
+    return [(a + b) / 2 for a, b in zip(*sides, strict=True)]
 
 
 def _far(xy: Array, variance: Array, n: int) -> Array:

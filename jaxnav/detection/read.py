@@ -25,7 +25,7 @@ from jaxnav.detection.refine import (
 # The second best code must explain the pixels worse by this many noise variances. Among 2 348
 # codes chance alone gives about 16.
 _MIN_ADVANTAGE = 60.0
-_MIN_EDGE_LEVELS = 10.0  # between the two sides of every edge
+_MIN_EDGE_LEVELS = 10.0  # between the two sides of the edges
 _MAX_CELL_ERROR = 0.5  # ink: nearer to the cell as printed than to its opposite
 _MAX_NOISE = 0.15  # of the contrast, once all is explained
 
@@ -43,7 +43,7 @@ def read_marker(
     """
     n = all_cells(family).shape[1]
     frame = np.pad(np.full((n - 2, n - 2), 0.5), 1)
-    fitted = fit_marker(image, corners_px, frame, lens)
+    fitted = fit_marker(image, corners_px, frame, lens, whole=True)
     if fitted is None or fitted.edges.contrast < 10:
         return None
     corners_px = corners_of(fitted.M, lens)
@@ -54,7 +54,7 @@ def read_marker(
         return None
     marker_id, turns = code
     cells = all_cells(family)[marker_id]
-    refined = refine_corners(image, np.roll(corners_px, -turns, axis=0), cells, lens)
+    refined = refine_corners(image, np.roll(corners_px, -turns, axis=0), cells, lens, True)
     if not refined.good or refined.fitted is None or refined.noise > _MAX_NOISE:
         return None
     if _worst_cell(refined.fitted, n, lens) > _MAX_CELL_ERROR:
@@ -118,9 +118,9 @@ def _cells_in_image(fitted: Fitted, n: int, lens: Lens) -> np.ndarray:
 
 
 def frames_first(image: np.ndarray, quads: list[np.ndarray]) -> list[np.ndarray]:
-    """The quadrilaterals that have dark edges on lighter ground, the clearest first.
+    """The quadrilaterals that are darker along their edges than around, the clearest first.
 
-    Levels are taken a little inside and outside of each edge, for all at once.
+    Levels are taken a little inside and outside of the edges, for all at once.
     """
     if not quads:
         return []
@@ -129,14 +129,9 @@ def frames_first(image: np.ndarray, quads: list[np.ndarray]) -> list[np.ndarray]
     center = corners.mean(axis=1, keepdims=True)
     ends = corners, np.roll(corners, -1, axis=1)
     edge = ends[0][:, :, None] * (1 - t) + ends[1][:, :, None] * t  # (Q, 4, 9, 2)
-    points = [center[:, :, None] + scale * (edge - center[:, :, None]) for scale in (0.88, 1.12)]
-    levels = cv2.remap(
-        image,
-        np.stack(points).reshape(-1, 36, 2).astype(np.float32),
-        np.empty(0, np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    inside, outside = levels.reshape(2, len(quads), 4, 9).astype(float).mean(axis=3)
-    clear = np.min(outside - inside, axis=1)  # of the worst of the four edges
+    points = [center[:, :, None] + scale * (edge - center[:, :, None]) for scale in (0.85, 1.15)]
+    u, v = np.moveaxis(np.stack(points).reshape(-1, 36, 2).astype(np.float32), -1, 0).copy()
+    levels = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside, outside = levels.reshape(2, len(quads), 36).astype(float).mean(axis=2)
+    clear = outside - inside
     return [quads[k] for k in np.argsort(-clear, kind="stable") if clear[k] > _MIN_EDGE_LEVELS]

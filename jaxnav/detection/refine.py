@@ -50,7 +50,11 @@ class RefinedMarker:
 
 
 def refine_corners(
-    image: np.ndarray, corners_px: np.ndarray, cells: np.ndarray, lens: Lens
+    image: np.ndarray,
+    corners_px: np.ndarray,
+    cells: np.ndarray,
+    lens: Lens,
+    whole: bool = False,
 ) -> RefinedMarker:
     """Corners of a decoded marker to some hundredths of a pixel.
 
@@ -59,12 +63,13 @@ def refine_corners(
         corners_px: (4, 2), TL TR BR BL, a pixel or half a cell off at most.
         cells: (n, n), 1 white, 0 black, with the black frame.
         lens: through which straight edges are seen.
+        whole: look inside a large marker too, not at its outline alone.
     """
     corners_px = np.asarray(corners_px, float)
     side_px = mean_side_px(corners_px)
     # A decoder's corners lie within a pixel, or 3 % of the side, of the truth.
     failed = RefinedMarker(corners_px, np.full(4, max(1.0, 0.03 * side_px)), np.inf, False, None)
-    fitted = fit_marker(image, corners_px, cells, lens)
+    fitted = fit_marker(image, corners_px, cells, lens, whole)
     if fitted is None:
         return failed
     fit = fitted.edges
@@ -86,11 +91,13 @@ def refine_corners(
 
 
 def fit_marker(
-    image: np.ndarray, corners_px: np.ndarray, cells: np.ndarray, lens: Lens
+    image: np.ndarray, corners_px: np.ndarray, cells: np.ndarray, lens: Lens, whole: bool
 ) -> Fitted | None:
     """The fit itself, good or not; None where too little of the marker is in the image."""
     M = homography(lens.rays(corners_px)[0].T)
-    pixels = _pixels_around(image.shape, M, lens, mean_side_px(corners_px), len(cells))
+    side_px = mean_side_px(corners_px)
+    whole = whole or side_px <= _WHOLE_UP_TO_PX
+    pixels = _pixels_around(image.shape, M, lens, side_px / len(cells), whole)
     count = len(pixels)
     if count < _MIN_PIXELS:
         return None
@@ -115,15 +122,15 @@ def corners_of(M: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def _pixels_around(
-    shape: tuple[int, ...], M: np.ndarray, lens: Lens, side_px: float, n: int
+    shape: tuple[int, ...], M: np.ndarray, lens: Lens, cell_px: float, whole: bool
 ) -> np.ndarray:
-    """The pixels (N, 2) to fit: a small marker with some of its paper, a large one's outline."""
+    """The pixels (N, 2) to fit: along the outline, or within too."""
     t = np.linspace(0, 1, _POINTS_PER_EDGE, endpoint=False)[:, None]
     ends = zip(SQUARE, np.roll(SQUARE, -1, 0), strict=True)
     outline = np.concatenate([(1 - t) * a + t * b for a, b in ends])
     outline_px = lens.pixels(rays_of(M, outline))
     # Not past the white zone around the marker, one cell wide.
-    reach = round(min(_OUTLINE_PX, max(1.0, side_px / n)))
+    reach = round(min(_OUTLINE_PX, max(1.0, cell_px)))
     low = np.maximum(np.floor(outline_px.min(0)).astype(int) - reach - 1, 0)
     high = np.minimum(np.ceil(outline_px.max(0)).astype(int) + reach + 2, shape[::-1])
     if np.any(high <= low):
@@ -131,7 +138,7 @@ def _pixels_around(
     mask = np.zeros((high - low)[::-1], np.uint8)
     polyline = np.round((outline_px - low) * 16).astype(np.int32)
     cv2.polylines(mask, [polyline], True, 1, 2 * reach, shift=4)
-    if side_px <= _WHOLE_UP_TO_PX:
+    if whole:
         cv2.fillPoly(mask, [polyline], 1, shift=4)
     rows, columns = np.nonzero(mask)
     pixels = np.column_stack([columns, rows]) + low

@@ -110,38 +110,32 @@ def _stepper(
         pose = out.T_world_vehicle.wxyz_xyz
         return state, (pose, out.selected >= 0, out.located, out.flip_probability, branch)
 
-    tracks = _single_markers(recording.markers) if one_at_a_time else _whole(recording.markers)
     count = len(recording.markers.ids) if one_at_a_time else 1
     initial = navigator(recording.markers).init()
     state = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), initial)
-    axis = 1 if one_at_a_time else None
 
     def step(state: State, frame: _Frames) -> tuple[State, tuple]:
-        def one(
-            markers: MarkerMap, state: State, corners_px: Array, visible: Array
-        ) -> tuple[State, tuple]:
-            if one_at_a_time:
-                corners_px, visible = corners_px[:, None], visible[:, None]
-            one_frame = _Frames(corners_px, visible, frame.dt_s, frame.T_world_vehicle_true)
-            return outputs_of(markers, state, one_frame)
+        def alone(state: State, marker: Array) -> tuple[State, tuple]:
+            seen_alone = _Frames(
+                frame.corners_px[:, marker][:, None],
+                frame.visible[:, marker][:, None],
+                frame.dt_s,
+                frame.T_world_vehicle_true,
+            )
+            return outputs_of(_single(recording.markers, marker), state, seen_alone)
 
-        return jax.vmap(one, in_axes=(0, 0, axis, axis))(
-            tracks, state, frame.corners_px, frame.visible
-        )
+        def together(state: State, _: Array) -> tuple[State, tuple]:
+            return outputs_of(recording.markers, state, frame)
+
+        return jax.vmap(alone if one_at_a_time else together)(state, jnp.arange(count))
 
     return step, state
 
 
-def _single_markers(markers: MarkerMap) -> MarkerMap:
-    """M maps of one marker each, batch axis (M,)."""
-    return MarkerMap(
-        jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[:, None]), markers.size_m[:, None], (0,), ("",)
-    )
-
-
-def _whole(markers: MarkerMap) -> MarkerMap:
-    """One map of all markers, batch axis (1,)."""
-    return jax.tree.map(lambda leaf: leaf[None], markers)
+def _single(markers: MarkerMap, index: Array) -> MarkerMap:
+    """A map of one marker, whichever it is."""
+    T_world_marker = jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[index][None])
+    return MarkerMap(T_world_marker, markers.size_m[index][None], ids=(0,), families=("",))
 
 
 def _frames(recording: Recording) -> _Frames:

@@ -4,6 +4,7 @@ renderer and detector; only the lens is the package's, through `Camera.unproject
 from dataclasses import dataclass
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.camera import Camera
@@ -34,20 +35,22 @@ class Scene:
         h = self.size_m / 2
         corners = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
         return np.asarray(
-            self.camera.project(corners @ self.R_camera_marker.T + self.t_camera_marker)
+            self.camera.project(
+                jnp.asarray(corners @ self.R_camera_marker.T + self.t_camera_marker)
+            )
         )
 
     def render(self, rng: np.random.Generator) -> np.ndarray:
         """The image, (H, W) uint8."""
         width, height = self.size_px
         k = SUBPIXELS
-        u = (np.arange(width * k) + 0.5) / k - 0.5
-        v = (np.arange(height * k) + 0.5) / k - 0.5
-        rays = self._rays(u, v)
+        u = ((np.arange(width * k) + 0.5) / k - 0.5).astype(np.float32)
+        v = ((np.arange(height * k) + 0.5) / k - 0.5).astype(np.float32)
+        rays = self._rays(u, v).astype(np.float32)
         # Ray and plane: the marker's own coordinates of the hit.
-        normal = self.R_camera_marker[:, 2]
-        depth = (normal @ self.t_camera_marker) / (rays @ normal)
-        hit = (rays * depth[..., None] - self.t_camera_marker) @ self.R_camera_marker
+        R, t = self.R_camera_marker.astype(np.float32), self.t_camera_marker.astype(np.float32)
+        depth = (R[:, 2] @ t) / (rays @ R[:, 2])
+        hit = (rays * depth[..., None] - t) @ R
         n = len(self.cells)
         column = np.floor((hit[..., 0] / self.size_m + 0.5) * n).astype(int)
         row = np.floor((0.5 - hit[..., 1] / self.size_m) * n).astype(int)
@@ -67,12 +70,17 @@ class Scene:
         return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
     def _rays(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        pixels = np.stack(np.meshgrid(u, v), axis=-1)
         if self.camera.lenses == ("none",):
             focal, center = np.asarray(self.camera.focal_px), np.asarray(self.camera.center_px)
-            xy = (pixels - center) / focal
+            xy = (np.stack(np.meshgrid(u, v), axis=-1) - center) / focal
             return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
-        return np.asarray(self.camera.unproject(pixels))
+        # Exact at whole pixels; between them a lens is linear to a thousandth of a pixel.
+        width, height = self.size_px
+        grid = np.stack(np.meshgrid(np.arange(-1, width + 1), np.arange(-1, height + 1)), axis=-1)
+        rays = np.asarray(self.camera.unproject(jnp.asarray(grid, float)))
+        return np.einsum(
+            "vi,ijc,uj->vuc", _linear(v, height), rays, _linear(u, width), optimize=True
+        )
 
     def _blur(self, image: np.ndarray, k: int) -> np.ndarray:
         length = float(np.hypot(*self.motion_px))
@@ -90,8 +98,13 @@ class Scene:
         return image
 
 
+def _linear(at: np.ndarray, size: int) -> np.ndarray:
+    """Weights (len(at), size + 2) that interpolate between -1, 0, ... size."""
+    return np.maximum(0, 1 - np.abs(at[:, None] - np.arange(-1, size + 1)))
+
+
 def rotation(view_rad: float, azimuth_rad: float, roll_rad: float) -> np.ndarray:
-    """R_camera_marker of a marker seen `view_rad` off its normal, turned about axis `azimuth_rad`."""
+    """R_camera_marker of a marker seen `view_rad` off its normal, tilted about `azimuth_rad`."""
     facing = np.diag([1.0, -1.0, -1.0])
     tilt = cv2.Rodrigues(view_rad * np.array([np.cos(azimuth_rad), np.sin(azimuth_rad), 0.0]))[0]
     roll = cv2.Rodrigues(roll_rad * np.array([0.0, 0.0, 1.0]))[0]

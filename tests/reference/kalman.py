@@ -1,0 +1,55 @@
+"""The paper's Kalman filter as a textbook writes it.
+
+Source: Liu, Schofield, Shan (2023), Eqs. 8-11: explicit inverse, (I - K H) P, rows of a missing
+measurement left out.
+"""
+
+import numpy as np
+
+from tests.reference.paper import velocity
+
+
+def wrap(angle_rad):
+    """The same angle in [-pi, pi]."""
+    return np.arctan2(np.sin(angle_rad), np.cos(angle_rad))
+
+
+def predict(x, P, dt_s, density):
+    """Eq. 9 with the noise of a white acceleration."""
+    A = np.eye(6)
+    Q = np.zeros((6, 6))
+    for i in range(3):
+        A[i, i + 3] = dt_s
+        Q[i, i] = density[i] * dt_s**3 / 3
+        Q[i, i + 3] = Q[i + 3, i] = density[i] * dt_s**2 / 2
+        Q[i + 3, i + 3] = density[i] * dt_s
+    x = A @ x
+    x[2] = wrap(x[2])
+    return x, A @ P @ A.T + Q
+
+
+def update(x, P, pose, R_pose, speed_mps, steering_rad, wheelbase_m, odometry_sigma):
+    """Eqs. 10 and 11; `pose` None: odometry alone. Returns x, P and the NIS of the pose.
+
+    The odometry predicts v (cos, sin)(psi + beta) - (v_x, v_y) = 0: a function of the state whose
+    derivative with respect to psi stands in the heading's column of H.
+    """
+    v = velocity(speed_mps, steering_rad, x[2], wheelbase_m)
+    z_minus_h = list(v - x[3:])
+    H = np.zeros((3, 6))
+    H[:, 3:] = np.eye(3)
+    H[0, 2], H[1, 2] = v[1], -v[0]
+    R = np.diag(np.asarray(odometry_sigma) ** 2)
+    nis = 0.0
+    if pose is not None:
+        innovation = np.asarray(pose) - x[:3]
+        innovation[2] = wrap(innovation[2])
+        S = P[:3, :3] + R_pose
+        nis = innovation @ np.linalg.inv(S) @ innovation
+        z_minus_h = [*innovation, *z_minus_h]
+        H = np.vstack([np.eye(3, 6), H])
+        R = np.block([[R_pose, np.zeros((3, 3))], [np.zeros((3, 3)), R]])
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    x = x + K @ np.array(z_minus_h)
+    x[2] = wrap(x[2])
+    return x, (np.eye(6) - K @ H) @ P, nis

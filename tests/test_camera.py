@@ -1,0 +1,201 @@
+"""Every lens against OpenCV, and its inverse against itself, over the whole image.
+
+The tests of `test_lens_...` are a contract: each runs for every lens the project knows.
+"""
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnav.camera import LENS_COEFFICIENTS, LENSES, Camera, stack_cameras
+from tests.derivatives import check_derivatives
+
+# Lens, coefficients, focal length, image size, half angle of view in degrees along the diagonal.
+# The last two see 150 degrees: an ideal fisheye, and one with Kalibr's usual coefficients.
+MODELS = {
+    "none": ("none", [], 500.0, (640, 480), 38),
+    "radtan": ("radtan", [-0.28, 0.07, 2e-4, -1e-4], 460.0, (752, 480), 44),
+    "radtan k3": ("radtan", [0.11, -0.2, 1e-3, 5e-4, 0.09], 600.0, (1280, 720), 50),
+    "equidistant": ("equidistant", [0.0] * 4, 319.0, (836, 420), 75),
+    "equidistant k": ("equidistant", [-0.013, 0.02, -0.012, 0.002], 319.0, (836, 420), 75),
+}
+
+
+def build(name: str) -> Camera:
+    lens, distortion, focal, (width, height), _ = MODELS[name]
+    return Camera.create((focal, focal + 3), (width / 2 + 1.5, height / 2 - 2), lens, distortion)
+
+
+def points_in_view(name: str, count: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    theta = np.deg2rad(MODELS[name][4]) * np.sqrt(rng.uniform(0, 1, count))
+    phi = rng.uniform(-np.pi, np.pi, count)
+    rays = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+    return np.stack(rays, axis=1) * rng.uniform(0.1, 20, (count, 1))
+
+
+def opencv_pixels(name: str, points: np.ndarray) -> np.ndarray:
+    lens, distortion, *_ = MODELS[name]
+    K = np.asarray(build(name).K, float)
+    if lens == "equidistant":
+        k = np.array(distortion)
+        return cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), K, k)[0][:, 0]
+    k = np.array(distortion) if distortion else None
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, k)[0][:, 0]
+
+
+def all_pixels(name: str) -> np.ndarray:
+    width, height = MODELS[name][3]
+    u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, 40), np.linspace(-0.5, height - 0.5, 25))
+    return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+project = jax.jit(lambda camera, points: camera.project(points))
+
+
+@jax.jit
+def unproject(camera, pixels):
+    """Rays, where they project to, and whether they can be seen."""
+    rays = camera.unproject(pixels)
+    return rays, camera.project(rays), camera.in_front(rays)
+
+
+@jax.jit
+def slopes(camera, points, pixels):
+    return (
+        camera.project(points),
+        jax.vmap(jax.jacfwd(camera.project))(points),
+        jax.vmap(jax.jacrev(camera.project))(points),
+        jax.vmap(jax.jacfwd(camera.unproject))(pixels),
+        jax.vmap(jax.jacrev(camera.unproject))(pixels),
+    )
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_lens_projects_as_opencv_does(name):
+    points = points_in_view(name, 1000)
+    pixels = project(build(name), jnp.asarray(points))
+    np.testing.assert_allclose(pixels, opencv_pixels(name, points), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_lens_is_inverted_over_the_whole_image(name, precision):
+    pixels = all_pixels(name)
+    rays, again, in_front = unproject(build(name), jnp.asarray(pixels))
+    assert rays.dtype == precision
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, atol=1e-6)
+    tolerance_px = 2e-3 if precision == np.float32 else 1e-8
+    np.testing.assert_allclose(again, pixels, atol=tolerance_px)
+    assert np.all(in_front)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_lens_finds_the_ray_that_made_a_pixel(name):
+    points = points_in_view(name, 1000, seed=1)
+    rays, *_ = unproject(build(name), jnp.asarray(opencv_pixels(name, points)))
+    expected = points / np.linalg.norm(points, axis=1, keepdims=True)
+    np.testing.assert_allclose(rays, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["none", "radtan", "equidistant k"])
+def test_lens_has_true_derivatives(name):
+    """Of pixels and rays, with respect to points, pixels and the calibration; also on the axis."""
+    camera = build(name)
+    points = np.append(points_in_view(name, 9, seed=2), [[0.0, 0.0, 2.0]], axis=0)
+    pixels = jnp.asarray(opencv_pixels(name, points))
+
+    def see(focal_px, center_px, distortion, points, pixels):
+        changed = Camera(focal_px, center_px, distortion, camera.lens_index, camera.lenses)
+        return changed.project(points), changed.unproject(pixels)
+
+    calibration = (camera.focal_px, camera.center_px, camera.distortion)
+    check_derivatives(see, *calibration, jnp.asarray(points), pixels, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["none", "radtan", "equidistant k"])
+def test_lens_is_finite_everywhere(name, precision):
+    camera = build(name)
+    points = jnp.asarray(
+        [
+            [0.0, 0.0, 0.0],
+            [0.0, 0.0, -1.0],
+            [1.0, 0.0, 0.0],
+            [0.0, -1.0, 1e-30],
+            [1e-20, 0.0, 1.0],
+            [1.0, 2.0, -3.0],
+            [1e-12, -1e-12, -5.0],
+        ]
+    )
+    pixels = jnp.asarray([[-1e6, 0.0], [1e5, 1e5], [3000.0, -2000.0], [0.0, 0.0]])
+    pixels = jnp.concatenate([pixels, camera.center_px[None]])
+    for values in slopes(camera, points, pixels):
+        assert values.dtype == precision
+        assert np.all(np.isfinite(values))
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2)])
+def test_lens_takes_any_batch(name, batch):
+    count = int(np.prod(batch))
+    camera, flat = build(name), points_in_view(name, count, seed=3)
+    pixels = project(camera, jnp.asarray(flat.reshape(*batch, 3)))
+    assert pixels.shape == (*batch, 2)
+    np.testing.assert_allclose(pixels.reshape(count, 2), opencv_pixels(name, flat), atol=1e-9)
+    rays, again, in_front = jax.eval_shape(unproject, camera, pixels)
+    assert (rays.shape, again.shape, in_front.shape) == ((*batch, 3), (*batch, 2), batch)
+
+
+def test_what_lies_behind_is_not_in_front():
+    behind = jnp.asarray([[0.1, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, -0.5]])
+    assert build("none").in_front(behind).tolist() == [False, True, False]
+    assert build("radtan").in_front(behind).tolist() == [False, True, False]
+    # A fisheye may see backwards, though not straight behind itself.
+    assert build("equidistant").in_front(behind).tolist() == [False, True, True]
+
+
+def test_behind_a_pinhole_lands_outside_on_the_right_side():
+    pixel = build("none").project(jnp.asarray([0.1, -0.2, -1.0]))
+    assert pixel[0] > 640 * 10
+    assert pixel[1] < -480 * 10
+
+
+def test_a_pixel_without_a_ray_does_not_project_back():
+    # This lens folds back at some radius: no ray reaches the far corner.
+    camera = Camera.create((400.0, 400.0), (320.0, 240.0), "radtan", [-0.4])
+    pixel = jnp.asarray([1000.0, 900.0])
+    ray, again, _ = unproject(camera, pixel)
+    assert np.all(np.isfinite(ray))
+    assert np.linalg.norm(again - pixel) > 50
+
+
+def test_a_rig_of_mixed_lenses_keeps_each_camera_s_own():
+    names = list(MODELS)
+    cameras = stack_cameras([build(name) for name in names])
+    assert set(cameras.lenses) == set(LENSES)
+    points = jnp.asarray(points_in_view("none", 1000))
+    pixels, rays = jax.jit(
+        jax.vmap(lambda camera: (camera.project(points), camera.unproject(camera.project(points))))
+    )(cameras)
+    for index, name in enumerate(names):
+        np.testing.assert_allclose(pixels[index], project(build(name), points), atol=1e-12)
+        np.testing.assert_allclose(
+            rays[index], unproject(build(name), pixels[index])[0], atol=1e-12
+        )
+
+
+def test_pinhole_matrix():
+    K = build("radtan").K
+    np.testing.assert_array_equal(K, [[460.0, 0, 377.5], [0, 463.0, 238.0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_too_many_coefficients_are_refused(lens):
+    with pytest.raises(ValueError, match="at most"):
+        Camera.create((1.0, 1.0), (0.0, 0.0), lens, [0.0] * (LENS_COEFFICIENTS[lens] + 1))
+
+
+def test_an_unknown_lens_is_refused():
+    with pytest.raises(ValueError, match="unknown lens 'fisheye'"):
+        Camera.create((1.0, 1.0), (0.0, 0.0), "fisheye")

@@ -1,0 +1,188 @@
+"""Both poses of everything in view, merged and pruned."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from jaxnav.candidates import Candidates, find_candidates
+from jaxnav.observation import Observation
+from jaxnav.residuals import e1
+from tests import worlds
+
+ROOM_VIEW = (0.2, 0.1, 0.6)
+find = jax.jit(
+    find_candidates, static_argnames=("max_sightings", "max_candidates", "max_steps")
+)
+
+
+def view(markers, pose, sigma_px=0.0, seed=0):
+    rig = worlds.qcar_rig()
+    noise = sigma_px * np.random.default_rng(seed).standard_normal((4, len(markers.ids), 4, 2))
+    return rig, markers, worlds.observe(rig, markers, worlds.planar(*pose), jnp.asarray(noise))
+
+
+def pose_errors(candidates: Candidates, pose) -> np.ndarray:
+    """(N, 2): metres and radians from the truth."""
+    truth = worlds.planar(*pose)
+    xi = jax.vmap(lambda T: (truth.inverse() @ T.inverse()).log())(candidates.T_vehicle_world)
+    return np.stack([np.linalg.norm(xi[:, :3], axis=1), np.linalg.norm(xi[:, 3:], axis=1)], axis=1)
+
+
+@pytest.mark.parametrize("sigma_px", [0.0, 0.5])
+def test_one_camera_and_one_marker_give_two(precision, sigma_px):
+    candidates = find(*view(worlds.paper_markers(), worlds.START_VIEW, sigma_px))
+    assert candidates.valid.tolist() == [True, True, False, False]
+    errors = pose_errors(candidates, worlds.START_VIEW)
+    assert candidates.e1_px2.dtype == precision
+    if sigma_px == 0:
+        assert errors[0, 0] < (0.01 if precision == np.float32 else 1e-7)
+        # The mirror pose is far away and nearly as good: the problem the paper is about.
+        assert errors[1, 1] > 0.5
+        assert candidates.e1_px2[1] < 10
+    else:
+        assert errors[:2, 0].min() < 0.5
+
+
+def test_two_cameras_on_one_marker_merge_to_two():
+    noise = {"sigma_px": 0.3, "seed": 3}
+    candidates = find(*view(worlds.paper_markers(), worlds.OVERLAP_VIEW, **noise))
+    assert np.all(candidates.converged)
+    assert int(np.sum(candidates.valid)) in (1, 2)
+    distinct = pose_errors(candidates, worlds.OVERLAP_VIEW)[np.asarray(candidates.valid)]
+    assert distinct[0, 0] < 0.05
+    # All four lanes were refined on the joint e1; what is left out repeats a kept one.
+    kept = np.asarray(candidates.T_vehicle_world.as_matrix())[np.asarray(candidates.valid)]
+    for index in np.flatnonzero(~np.asarray(candidates.valid)):
+        T = np.asarray(candidates.T_vehicle_world.as_matrix())[index]
+        assert np.min(np.abs(kept - T).max(axis=(1, 2))) < 0.05
+
+
+def test_two_cameras_agree_on_two_distinct_poses():
+    """Farther away, where the mirror pose is a minimum of the joint e1 as well."""
+    pose = (1.2, -1.6, np.deg2rad(75.0))
+    rig, markers, obs = view(worlds.paper_markers(), pose, 0.2, seed=1)
+    assert int(np.sum(obs.visible)) == 2
+    candidates = find(rig, markers, obs, max_steps=60)
+    assert int(np.sum(candidates.valid)) == 2
+    errors = pose_errors(candidates, pose)[np.asarray(candidates.valid)]
+    assert errors[:, 1].min() < 0.2
+    assert errors[:, 1].max() > 0.5
+
+
+def test_several_markers_leave_no_doubt():
+    candidates = find(*view(worlds.room_markers(), ROOM_VIEW, 0.3))
+    assert candidates.valid[0]
+    assert candidates.converged[0]
+    errors = pose_errors(candidates, ROOM_VIEW)
+    assert errors[0, 0] < 0.01
+    assert errors[0, 1] < 0.01
+    others = np.flatnonzero(candidates.valid)[1:]
+    assert np.all(np.asarray(candidates.e1_px2)[others] > 100 * candidates.e1_px2[0])
+
+
+def test_costs_are_what_they_say():
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    candidates = find(rig, markers, obs, corner_sigma_px=jnp.asarray(0.3))
+    image_errors = jax.jit(
+        jax.vmap(lambda T: e1(rig, markers, obs.corners_px, obs.visible, T))
+    )(candidates.T_vehicle_world)
+    np.testing.assert_allclose(candidates.e1_px2, image_errors, rtol=1e-9)
+    np.testing.assert_allclose(candidates.cost, candidates.e1_px2 / 0.3**2, rtol=1e-9)
+    valid = np.asarray(candidates.e1_px2)[np.asarray(candidates.valid)]
+    assert np.all(np.diff(valid) >= 0)
+
+
+def test_an_observation_s_own_sigma_is_used_with_the_model_s():
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    sigma = jnp.full((4, 4, 4), 0.4)
+    own = Observation(obs.corners_px, obs.visible, corner_sigma_px=sigma)
+    candidates = find(rig, markers, own, model_sigma_px=jnp.asarray(0.3))
+    np.testing.assert_allclose(candidates.cost[0], candidates.e1_px2[0] / 0.5**2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("filler", [np.nan, np.inf, 1e25, -7.0])
+def test_hidden_lanes_change_nothing(filler):
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    clean = find(rig, markers, obs)
+    hidden = ~obs.visible[:, :, None, None]
+    filled = eqx.tree_at(lambda o: o.corners_px, obs, jnp.where(hidden, filler, obs.corners_px))
+    for leaf, expected in zip(
+        jax.tree.leaves(find(rig, markers, filled)), jax.tree.leaves(clean), strict=True
+    ):
+        np.testing.assert_array_equal(leaf, expected)
+
+
+@pytest.mark.parametrize("filler", [np.nan, 0.0])
+def test_nothing_in_view_gives_no_candidate(precision, filler):
+    rig, markers = worlds.qcar_rig(), worlds.room_markers()
+    blind = Observation(jnp.full((4, 4, 4, 2), filler), jnp.zeros((4, 4), bool))
+    candidates = find(rig, markers, blind)
+    assert not np.any(candidates.valid)
+    assert not np.any(candidates.converged)
+    assert candidates.cost.dtype == precision
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(candidates))
+
+
+def test_absurd_corners_are_no_candidate_in_float32():
+    with jax.enable_x64(False):
+        rig, markers, obs = view(worlds.paper_markers(), worlds.START_VIEW)
+        absurd = eqx.tree_at(lambda o: o.corners_px, obs, obs.corners_px * 1e25)
+        candidates = find(rig, markers, absurd)
+        assert not np.any(candidates.valid)
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(candidates))
+
+
+def test_pruning_keeps_what_explains_all_corners_best():
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    every = find(rig, markers, obs, max_candidates=32)
+    for count in (1, 2):
+        few = find(rig, markers, obs, max_candidates=count)
+        assert few.valid.shape == (count,)
+        np.testing.assert_allclose(few.e1_px2[0], every.e1_px2[0], rtol=1e-6)
+        np.testing.assert_allclose(
+            few.T_vehicle_world.wxyz_xyz[0], every.T_vehicle_world.wxyz_xyz[0], atol=1e-6
+        )
+
+
+def test_few_sightings_are_the_largest_ones():
+    """With one slot the pose is that of the largest image alone."""
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    x, y = np.moveaxis(np.asarray(obs.corners_px), -1, 0)
+    area = np.abs(np.sum(x * np.roll(y, -1, -1) - y * np.roll(x, -1, -1), axis=-1))
+    largest = np.unravel_index(np.argmax(np.where(obs.visible, area, 0)), (4, 4))
+    alone = eqx.tree_at(
+        lambda o: o.visible, obs, jnp.zeros_like(obs.visible).at[largest].set(True)
+    )
+    pruned = find(rig, markers, obs, max_sightings=1)
+    expected = find(rig, markers, alone, max_sightings=1)
+    assert pruned.valid.shape == (2,)
+    np.testing.assert_array_equal(pruned.T_vehicle_world.wxyz_xyz, expected.T_vehicle_world.wxyz_xyz)
+    spoilt = jnp.where(expected.valid, pruned.e1_px2, 0)
+    assert np.all(np.isfinite(spoilt))
+
+
+def test_gradients_are_finite(precision):
+    """Through unproject, IPPE, pruning, LM and covariance; a frontal view and none at all."""
+    rig, markers, start = view(worlds.paper_markers(), worlds.START_VIEW)
+    _, _, frontal = view(worlds.paper_markers(), (0.0, -0.4, np.pi / 2))
+    blind = Observation(jnp.zeros_like(start.corners_px), jnp.zeros_like(start.visible))
+
+    @jax.jit
+    @jax.grad
+    def slope(floats, visible):
+        corners_px, focal_px, Ts = floats
+        changed = eqx.tree_at(
+            lambda r: (r.cameras.focal_px, r.Ts_camera_vehicle), rig, (focal_px, jaxlie.SE3(Ts))
+        )
+        candidates = find_candidates(changed, markers, Observation(corners_px, visible))
+        leaves = jax.tree.leaves(eqx.filter(candidates, eqx.is_inexact_array))
+        return sum(jnp.sum(leaf) for leaf in leaves)
+
+    for obs in (start, frontal, blind):
+        floats = (obs.corners_px, rig.cameras.focal_px, rig.Ts_camera_vehicle.wxyz_xyz)
+        for leaf in slope(floats, obs.visible):
+            assert leaf.dtype == precision
+            assert np.all(np.isfinite(leaf))

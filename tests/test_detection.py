@@ -1,0 +1,252 @@
+"""Detectors: what they find, what they do not, and where; on photographs and on drawn scenes."""
+
+import importlib
+import re
+
+import cv2
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from jaxnav.camera import Camera
+from jaxnav.detection import (
+    DICTIONARIES,
+    Detections,
+    make_detector,
+    marker_cells,
+    observe,
+)
+from jaxnav.detection.lens import Lens
+from jaxnav.detection.read import read_marker
+from jaxnav.errors import BadInput
+from jaxnav.markers import MarkerMap
+from tests.helpers.marker_images import Scene, random_scene, rotation
+
+BACKENDS = ["aruco", "apriltag"]
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def backend(request):
+    if request.param == "apriltag":
+        pytest.importorskip("pyapriltags")
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def detector(backend):
+    return make_detector(backend)
+
+
+def listed_markers(path):
+    """Ids and corners (4, 2), TL TR BR BL, pixel centres at integers, of a photograph's list."""
+    markers = []
+    for line in path.read_text().splitlines():
+        numbers = [float(number) for number in re.findall(r"-?[\d.]+", line)]
+        # The list goes anticlockwise from the top right of OpenCV's picture.
+        markers.append((int(numbers[0]), np.reshape(numbers[1:], (4, 2))[[1, 0, 3, 2]] - 0.5))
+    return markers
+
+
+def test_photographs(detector, data_dir):
+    listed = found = 0
+    errors_px = []
+    for photograph in sorted((data_dir / "apriltag_photos").glob("*.jpg")):
+        detections = detector.detect(cv2.imread(str(photograph)))
+        # The field uses one id: anything else would be made up.
+        assert set(detections.ids.tolist()) <= {0}
+        for marker_id, corners_px in listed_markers(photograph.with_suffix(".txt")):
+            if np.linalg.norm(corners_px - np.roll(corners_px, 1, 0), axis=1).mean() < 20:
+                continue
+            listed += 1
+            away = detections.corners_px.mean(axis=1) - corners_px.mean(axis=0)
+            here = (detections.ids == marker_id) & (np.linalg.norm(away, axis=1) < 3)
+            if here.any():
+                found += 1
+                errors = detections.corners_px[here][0] - corners_px
+                errors_px.append(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+    assert listed == 21
+    assert found >= 0.95 * listed
+    assert np.median(errors_px) < 0.5
+    assert np.max(errors_px) < 2.5  # the same corner first, in all of them
+
+
+def small_scene(rng, side_px, blur_px):
+    """The paper's marker from afar: upright, 39 degrees off its normal, before a patterned wall."""
+    direction = rng.uniform(0, 2 * np.pi)
+    size_px = (200, 120)
+    camera = Camera.create((319.0, 319.0), (99.5, 59.5))
+    depth_m = 0.172 * 319 / side_px
+    offset_m = rng.uniform(-15, 15, 2) * depth_m / 319
+    return Scene(
+        camera,
+        size_px,
+        rotation(np.deg2rad(39), rng.choice([-1, 1]) * np.pi / 2, rng.uniform(-0.1, 0.1)),
+        np.append(offset_m, depth_m),
+        0.172,
+        marker_cells("tag36h11", 0),
+        black=rng.uniform(20, 60),
+        white=rng.uniform(150, 250),
+        texture=20.0,
+        optics_px=0.3,
+        motion_px=(blur_px * np.cos(direction), blur_px * np.sin(direction)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("side_px", "blur_px", "needed"), [(14, 0, 12), (17, 0, 12), (17, 2, 12), (14, 2, 10)]
+)
+def test_small_markers_are_found_from_cold(side_px, blur_px, needed):
+    detector = make_detector("aruco")
+    found, normalised = 0, []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        scene = small_scene(rng, side_px, blur_px)
+        detections = detector.detect(scene.render(rng), scene.camera)
+        assert set(detections.ids.tolist()) <= {0}
+        if len(detections) == 1 and detections.refined[0]:
+            found += 1
+            errors = detections.corners_px[0] - scene.corners_px()
+            normalised.append(errors / detections.sigma_px[0][:, None])
+    assert found >= needed
+    assert np.sqrt(np.mean(np.square(normalised))) < 1.3
+
+
+def test_a_prediction_finds_what_a_cold_search_misses():
+    detector = make_detector("aruco")
+    cold = predicted = 0
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        scene = small_scene(rng, 20, 4.0)
+        image, corners_px = scene.render(rng), scene.corners_px()
+        cold += len(detector.detect(image))
+        guess_px = corners_px[None] + rng.normal(0, 1.5, (1, 1, 2))
+        detections = detector.detect(image, predicted_corners_px=guess_px)
+        predicted += len(detections)
+        assert all(np.max(np.abs(c - corners_px)) < 0.5 for c in detections.corners_px)
+    assert predicted >= 12
+    assert predicted >= cold
+
+
+def test_predictions_elsewhere_do_no_harm(detector):
+    rng = np.random.default_rng(0)
+    scene = random_scene(rng, 40, marker_cells("tag36h11", 5), optics_px=0.4)
+    image = scene.render(rng)
+    nowhere = np.stack([scene.corners_px() + 400, np.full((4, 2), np.nan), np.zeros((4, 2))])
+    detections = detector.detect(image, predicted_corners_px=nowhere)
+    assert detections.ids.tolist() == [5]
+    assert np.max(np.abs(detections.corners_px[0] - scene.corners_px())) < 0.1
+
+
+def test_every_family_opencv_knows():
+    for family in DICTIONARIES:
+        rng = np.random.default_rng(1)
+        scene = random_scene(rng, 60, marker_cells(family, 7), view_max_rad=0.5, optics_px=0.4)
+        detections = make_detector("aruco", family).detect(scene.render(rng))
+        assert detections.ids.tolist() == [7], family
+        assert detections.families == (family,)
+        assert np.max(np.abs(detections.corners_px[0] - scene.corners_px())) < 0.1, family
+
+
+@pytest.mark.parametrize("family", ["tag16h5", "tag25h9", "tag36h11"])
+def test_apriltag_has_the_corners_of_opencv(family):
+    pytest.importorskip("pyapriltags")
+    rng = np.random.default_rng(2)
+    scene = random_scene(rng, 60, marker_cells(family, 7), view_max_rad=0.5, optics_px=0.4)
+    image = scene.render(rng)
+    detections = make_detector("apriltag", family).detect(image)
+    assert detections.ids.tolist() == [7]
+    assert detections.refined.all()
+    assert np.max(np.abs(detections.corners_px[0] - scene.corners_px())) < 0.1
+    other = make_detector("aruco", family).detect(image)
+    assert np.max(np.abs(detections.corners_px - other.corners_px)) < 0.02
+
+
+def test_nothing_is_found_where_nothing_is(detector):
+    rng = np.random.default_rng(3)
+    noise = rng.normal(128, 50, (200, 400))
+    blocks = cv2.resize(rng.normal(128, 60, (50, 100)), (400, 200), interpolation=cv2.INTER_NEAREST)
+    checks = np.kron(np.indices((10, 20)).sum(axis=0) % 2, np.ones((20, 20))) * 180 + 30
+    for picture in (noise, blocks, checks, np.zeros((200, 400))):
+        image = np.clip(picture, 0, 255).astype(np.uint8)
+        detections = detector.detect(image)
+        assert len(detections) == 0
+        assert detections.corners_px.shape == (0, 4, 2)
+        assert detections.sigma_px.shape == (0, 4)
+
+
+def test_frames_with_other_cells_are_not_read():
+    rng = np.random.default_rng(4)
+    read = 0
+    for _ in range(40):
+        cells = np.pad(rng.integers(0, 2, (6, 6)).astype(float), 1)
+        scene = random_scene(rng, 20, cells, view_max_rad=0.6, optics_px=0.4)
+        read += read_marker(scene.render(rng), scene.corners_px(), "tag36h11", Lens()) is not None
+    assert read == 0
+
+
+def test_colour_and_grey_are_the_same(detector):
+    rng = np.random.default_rng(5)
+    image = random_scene(rng, 40, marker_cells("tag36h11", 5), optics_px=0.4).render(rng)
+    grey, colour = detector.detect(image), detector.detect(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    assert np.array_equal(grey.corners_px, colour.corners_px)
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((4, 5)), np.zeros((4, 5, 2), np.uint8), np.zeros((0, 5), np.uint8)]
+)
+def test_what_is_no_image_is_refused(detector, image):
+    with pytest.raises(BadInput, match="image"):
+        detector.detect(image)
+
+
+def test_unknown_names_are_refused(monkeypatch):
+    with pytest.raises(BadInput, match="unknown 'yolo'"):
+        make_detector("yolo")
+    with pytest.raises(BadInput, match="unknown 'tag99h9'"):
+        make_detector("aruco", "tag99h9")
+    with pytest.raises(BadInput, match="none of the apriltag detector's"):
+        make_detector("apriltag", "4x4_50")
+
+    def without(name, *args):
+        if name == "pyapriltags":
+            raise ImportError(name)
+        return original(name, *args)
+
+    original = importlib.import_module
+    monkeypatch.setattr(importlib, "import_module", without)
+    with pytest.raises(BadInput, match=re.escape("pip install 'jaxnav[apriltag]'")):
+        make_detector("apriltag")
+
+
+def a_map(ids, families):
+    poses = jaxlie.SE3(jnp.tile(jnp.array([1.0, 0, 0, 0, 0, 0, 0]), (len(ids), 1)))
+    return MarkerMap(poses, jnp.full(len(ids), 0.1), ids, families)
+
+
+def some(ids, family="tag36h11"):
+    n = len(ids)
+    corners_px = np.arange(n * 8, dtype=float).reshape(n, 4, 2) + 1
+    sigma_px = np.full((n, 4), 0.02)
+    return Detections(np.array(ids, int), corners_px, sigma_px, np.ones(n, bool), (family,) * n)
+
+
+def test_observe_puts_detections_into_the_order_of_the_map():
+    markers = a_map((4, 2, 9), ("tag36h11", "tag36h11", "tag25h9"))
+    mixed = Detections.concatenate([some([9, 2]), some([9], "tag25h9")])
+    observed = observe([some([2, 4]), some([]), mixed], markers)
+    assert observed.visible.tolist() == [[True, True, False], [False] * 3, [False, True, True]]
+    assert np.array_equal(observed.corners_px[0, 0], some([2, 4]).corners_px[1])
+    assert np.array_equal(observed.corners_px[2, 1], mixed.corners_px[1])
+    assert np.array_equal(observed.corners_px[2, 2], mixed.corners_px[2])
+    assert observed.unknown == 1  # id 9 of another family
+    assert observed.duplicates == 0
+    assert np.all(observed.sigma_px[observed.visible] == 0.02)
+    assert np.all(observed.sigma_px[~observed.visible] == 1)
+    assert np.all(observed.corners_px[~observed.visible] == 0)
+
+
+def test_observe_drops_both_of_two_equal_ones():
+    observed = observe([some([4, 4, 2]), some([4])], a_map((4, 2), ("tag36h11",) * 2))
+    assert observed.visible.tolist() == [[False, True], [True, False]]
+    assert observed.duplicates == 2

@@ -1,0 +1,162 @@
+"""Planar poses, rotations and guarded functions against SciPy and finite differences."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jaxnav import geometry
+from tests.derivatives import check_derivatives
+from tests.worlds import planar
+
+ANGLES = st.floats(-1e4, 1e4)
+
+
+@settings(max_examples=200, deadline=None)
+@given(ANGLES)
+def test_wrapping_keeps_the_direction(angle_rad):
+    wrapped = float(geometry.wrap_angle(jnp.asarray(angle_rad)))
+    assert -np.pi - 1e-11 <= wrapped <= np.pi
+    assert np.cos(wrapped) == pytest.approx(np.cos(angle_rad), abs=1e-11)
+    assert np.sin(wrapped) == pytest.approx(np.sin(angle_rad), abs=1e-11)
+
+
+def test_wrapping_at_the_seam():
+    angles = jnp.asarray([-np.pi, np.pi, 3 * np.pi - 0.1, 0.0])
+    np.testing.assert_allclose(
+        geometry.wrap_angle(angles), [-np.pi, -np.pi, np.pi - 0.1, 0.0], atol=1e-14
+    )
+    slopes = jax.vmap(jax.grad(geometry.wrap_angle))(angles)
+    np.testing.assert_array_equal(slopes, 1)
+
+
+def test_planar_pose_is_a_turn_about_z(precision):
+    tolerance = 1e-6 if precision == np.float32 else 1e-14
+    for pose in [(0.0, 0.0, 0.0), (1.0, -2.0, 3.1), (-4.0, 0.5, -3.1), (0.1, 0.2, np.pi / 2)]:
+        T_world_vehicle = planar(*pose)
+        expected = np.eye(4)
+        expected[:2, 3] = pose[:2]
+        expected[:3, :3] = Rotation.from_rotvec([0, 0, pose[2]]).as_matrix()
+        assert T_world_vehicle.wxyz_xyz.dtype == precision
+        np.testing.assert_allclose(T_world_vehicle.as_matrix(), expected, atol=tolerance)
+        back = geometry.planar_from_T_world_vehicle(T_world_vehicle)
+        np.testing.assert_allclose(back, pose, atol=5 * tolerance)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2)])
+def test_planar_poses_over_batches(batch):
+    poses = jnp.asarray(np.random.default_rng(0).uniform(-3, 3, (*batch, 3)))
+    lifted = geometry.T_world_vehicle_from_planar(poses)
+    assert lifted.wxyz_xyz.shape == (*batch, 7)
+    back = geometry.planar_from_T_world_vehicle(lifted)
+    np.testing.assert_allclose(back, poses, atol=1e-13)
+
+
+def test_heading_of_a_tilted_body_is_that_of_its_x_axis():
+    turns = Rotation.random(200, rng=1)
+    x_axis = turns.as_matrix()[:, :, 0]
+    T_world_vehicle = jaxlie.SE3(
+        jnp.concatenate([jnp.asarray(np.roll(turns.as_quat(), 1, axis=1)), jnp.ones((200, 3))], 1)
+    )
+    heading = geometry.planar_from_T_world_vehicle(T_world_vehicle)[:, 2]
+    np.testing.assert_allclose(heading, np.arctan2(x_axis[:, 1], x_axis[:, 0]), atol=1e-9)
+
+
+def test_heading_of_a_vertical_body_is_zero_with_zero_slope():
+    upwards = jaxlie.SE3(jnp.asarray([0.5**0.5, 0.0, -(0.5**0.5), 0.0, 0.0, 0.0, 0.0]))
+
+    def heading(wxyz_xyz):
+        return geometry.planar_from_T_world_vehicle(jaxlie.SE3(wxyz_xyz))[2]
+
+    assert np.isfinite(heading(upwards.wxyz_xyz))
+    assert np.all(np.isfinite(jax.grad(heading)(upwards.wxyz_xyz)))
+
+
+@pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.0, 0.0, 2.5), (0.3, -0.4, 1.2)])
+def test_planar_covariance_is_the_jacobian_s(rotvec):
+    quaternion = jnp.asarray(np.roll(Rotation.from_rotvec(rotvec).as_quat(), 1))
+    T_world_vehicle = jaxlie.SE3(jnp.append(quaternion, jnp.asarray([1.0, 2.0, 3.0])))
+    root = np.random.default_rng(2).normal(size=(6, 6))
+    covariance = jnp.asarray(root @ root.T)
+
+    def planar_of(xi):
+        return geometry.planar_from_T_world_vehicle(T_world_vehicle @ jaxlie.SE3.exp(xi))
+
+    step = 1e-6
+    ahead, behind = (jax.vmap(planar_of)(sign * step * jnp.eye(6)) for sign in (1, -1))
+    J = (ahead - behind).T / (2 * step)
+    result = geometry.planar_covariance(T_world_vehicle, covariance)
+    np.testing.assert_allclose(result, J @ covariance @ J.T, rtol=1e-8, atol=1e-8)
+
+
+def test_guarded_functions_at_their_singularity(precision):
+    zero = jnp.zeros((), precision)
+    assert jax.value_and_grad(geometry.safe_sqrt)(zero) == (0, 0)
+    assert jax.value_and_grad(geometry.safe_sqrt)(jnp.asarray(-1.0)) == (0, 0)
+    assert geometry.safe_norm(jnp.zeros(3)) == 0
+    np.testing.assert_array_equal(jax.grad(geometry.safe_norm)(jnp.zeros(3)), 0)
+    assert geometry.safe_atan2(zero, zero) == 0
+    np.testing.assert_array_equal(jax.grad(geometry.safe_atan2, (0, 1))(zero, zero), (0, 0))
+
+
+def test_guarded_functions_elsewhere_are_the_plain_ones():
+    values = np.random.default_rng(3).normal(size=(50, 2))
+    x, y = jnp.asarray(values.T)
+    np.testing.assert_allclose(geometry.safe_atan2(y, x), np.arctan2(y, x))
+    np.testing.assert_allclose(geometry.safe_norm(jnp.asarray(values)), np.hypot(x, y))
+    np.testing.assert_allclose(geometry.safe_sqrt(x**2), np.abs(x))
+    check_derivatives(geometry.safe_atan2, y, x)
+    check_derivatives(geometry.safe_norm, jnp.asarray(values))
+
+
+def test_guarded_functions_do_not_hide_what_is_no_number():
+    nan = jnp.asarray(jnp.nan)
+    assert np.isnan(geometry.safe_sqrt(nan))
+    assert np.isnan(geometry.safe_norm(jnp.asarray([1.0, np.nan])))
+    assert np.isnan(geometry.safe_atan2(nan, jnp.asarray(1.0)))
+
+
+def half_turns() -> np.ndarray:
+    axes = np.random.default_rng(4).normal(size=(300, 3))
+    axes = np.concatenate([axes, np.eye(3), -np.eye(3), [[1, 1, 0], [0, 1, -1]]])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return 2 * axes[:, :, None] * axes[:, None] - np.eye(3)
+
+
+read_rotations = jax.jit(jax.vmap(geometry.rotation_from_matrix))
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_rotation_is_read_off_any_matrix(precision, near):
+    rng = np.random.default_rng(5)
+    matrices = np.concatenate([Rotation.random(700, rng=5).as_matrix(), half_turns(), [np.eye(3)]])
+    if near:  # almost a half turn, on either side
+        matrices = (
+            matrices @ Rotation.from_rotvec(rng.normal(0, 1e-9, (len(matrices), 3))).as_matrix()
+        )
+    rotations = read_rotations(jnp.asarray(matrices, precision))
+    tolerance = 1e-6 if precision == np.float32 else 1e-14
+    np.testing.assert_allclose(rotations.as_matrix(), matrices, atol=tolerance)
+    np.testing.assert_allclose(np.linalg.norm(rotations.wxyz, axis=1), 1, atol=tolerance)
+
+
+def test_reading_a_rotation_has_finite_slopes_equal_to_differences():
+    jacobian = jax.jit(jax.vmap(jax.jacrev(lambda R: geometry.rotation_from_matrix(R).wxyz)))
+    assert np.all(np.isfinite(jacobian(jnp.asarray([np.eye(3), *half_turns()]))))
+    generic = jnp.asarray(Rotation.random(10, rng=7).as_matrix())
+    check_derivatives(jax.vmap(lambda R: geometry.rotation_from_matrix(R).wxyz), generic)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2)])
+def test_points_are_transformed_alike_in_any_array(batch):
+    rng = np.random.default_rng(6)
+    T_a_b = jaxlie.SE3.exp(jnp.asarray(rng.normal(size=6)))
+    points_b = rng.normal(size=(*batch, 3))
+    matrix = np.asarray(T_a_b.as_matrix())
+    expected = points_b @ matrix[:3, :3].T + matrix[:3, 3]
+    points_a = geometry.transform_points(T_a_b, jnp.asarray(points_b))
+    np.testing.assert_allclose(points_a, expected, atol=1e-13)

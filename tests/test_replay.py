@@ -1,0 +1,131 @@
+"""Real four-camera recordings through the estimator, against TagSLAM's bundle adjustment."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnav.ambiguity import LowestReprojection, PaperCost
+from jaxnav.cli import main
+from jaxnav.motion import ConstantVelocity
+from jaxnav.navigator import Navigator
+from jaxnav.observation import Observation
+from jaxnav.runtime.recordings import Recording, read_recording
+from jaxnav.runtime.replay import CHUNK_FRAMES, errors, replay
+
+
+@pytest.fixture(scope="module")
+def test_7(data_dir) -> Recording:
+    return read_recording(data_dir / "tagslam" / "test_7" / "decoded.npz")
+
+
+@pytest.fixture(autouse=True)
+def keep_the_compile_cache(monkeypatch):
+    """Commands choose a cache of their own; tests keep theirs."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
+
+
+@pytest.mark.parametrize(
+    ("name", "median_m", "p95_m"), [("test_5", 0.004, 0.015), ("test_7", 0.005, 0.045)]
+)
+def test_all_markers_locate_the_rig_to_millimetres(
+    data_dir, tmp_path, capsys, name, median_m, p95_m
+):
+    folder = data_dir / "tagslam" / name
+    code = main(["replay", str(folder), "--out", str(tmp_path), "--headless"])
+    assert code == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["position_error_m"]["median"] <= median_m
+    assert summary["position_error_m"]["p95"] <= p95_m
+    assert summary["rotation_error_deg"]["median"] <= 0.3
+    assert summary["wrong_branch_fraction"] == 0
+    assert summary["outlier_fraction"] < 0.01
+    assert summary["frames"] == {"test_5": 2751, "test_7": 454}[name]
+    assert summary["frames_per_second"] > 0
+    assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
+    rows = np.loadtxt(tmp_path / "trajectory.tum")
+    assert rows.shape == (summary["frames_located"], 8)
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1, atol=1e-6)
+    assert "wrong branch 0.00%" in capsys.readouterr().out
+
+
+def test_one_marker_at_a_time_takes_few_wrong_branches(test_7):
+    result = replay(test_7, LowestReprojection(), one_at_a_time=True)
+    judged = result.seen & test_7.reference.valid[:, None]
+    assert judged.sum() > 2600
+    np.testing.assert_array_equal(result.seen, test_7.visible.any(axis=1))
+    assert (result.branch.wrong & judged).sum() / judged.sum() <= 0.009
+    assert (result.branch.outlier & judged).sum() / judged.sum() <= 0.01
+    position_m, rotation_deg = errors(result, test_7)
+    assert np.nanmedian(position_m) < 0.012
+    assert np.nanmedian(rotation_deg) < 0.6
+
+
+def test_a_replay_is_the_step_over_and_over(test_7):
+    # Not a whole number of chunks: padding must not show.
+    short = test_7.first(CHUNK_FRAMES + 7)
+    result = replay(short, PaperCost())
+    navigator = Navigator(short.rig, short.markers, selector=PaperCost(), motion=ConstantVelocity())
+    step, state = jax.jit(navigator.step), navigator.init()
+    dt_s = np.diff(short.stamps_ns, prepend=short.stamps_ns[:1]) / 1e9
+    for frame in range(len(short)):
+        obs = Observation(
+            jnp.asarray(short.corners_px[frame]),
+            jnp.asarray(short.visible[frame]),
+            dt_s=jnp.asarray(min(dt_s[frame], 1.0)),
+        )
+        state, out = step(state, obs)
+        np.testing.assert_allclose(
+            result.T_world_vehicle[frame, 0], out.T_world_vehicle.wxyz_xyz, atol=1e-9
+        )
+    assert result.T_world_vehicle.shape == (CHUNK_FRAMES + 7, 1, 7)
+
+
+def test_a_recording_without_a_reference_gives_a_track_and_no_errors(
+    test_7, tmp_path, monkeypatch, capsys
+):
+    blind = dataclasses.replace(test_7.first(20), reference=None)
+    monkeypatch.setattr("jaxnav.commands.replay.read_recording", lambda *_: blind)
+    assert main(["replay", "whatever", "--out", str(tmp_path), "--headless"]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert "position_error_m" not in summary
+    assert summary["poses"] == 20
+    assert "error" not in capsys.readouterr().out
+
+
+def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
+    folder = str(data_dir / "tagslam" / "test_7")
+    args = ["--markers", "one-at-a-time", "--selector", "lowest-reprojection", "--limit", "150"]
+    assert main(["replay", folder, "--out", str(tmp_path), "--headless", *args]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["frames"] == 150
+    assert summary["poses"] > summary["frames_located"]
+    assert len(list(tmp_path.glob("trajectory_marker_*.tum"))) == 9
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["missing"], "missing: there is no such file or folder"),
+        (["{tmp}"], "no"),
+        (["{tmp}/x.txt"], "is no recording"),
+        (["{data}/test_7/tag_detections.bag.bz2"], "--rig: missing"),
+        (["{data}/test_7", "--rig", "nowhere.yaml"], "nowhere.yaml"),
+        (["{data}/test_7", "--limit", "0"], "--limit: must be at least 1, got 0"),
+        (["{data}/test_7", "--selector", "none"], "--selector"),
+        (["{data}/test_7", "--out", "{tmp}/x.txt"], "is a file, not a folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(data_dir, tmp_path, capsys, args, message):
+    (tmp_path / "x.txt").write_text("no recording")
+    places = {"tmp": tmp_path, "data": data_dir / "tagslam"}
+    out = [] if "--out" in args else ["--out", str(tmp_path / "out")]
+    code = main(["replay", *(arg.format(**places) for arg in args), *out])
+    error = capsys.readouterr().err
+    assert code == 2
+    assert len(error.strip().splitlines()) == 1
+    assert message in error
+    assert not (tmp_path / "out").exists()
