@@ -10,6 +10,17 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
+# How many markers each family has. AprilTag's keep AprilTag's names; ArUco's are OpenCV's, in lower
+# case without DICT_.
+FAMILY_SIZES = {
+    "tag16h5": 30,
+    "tag25h9": 35,
+    "tag36h10": 2320,
+    "tag36h11": 587,
+    "aruco_original": 1024,
+    "aruco_mip_36h12": 250,
+} | {f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)}
+
 CORNER_SIGNS = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
 
 
@@ -17,6 +28,13 @@ def corners_marker_m(size_m: Float[Array, "*batch"]) -> Float[Array, "*batch 4 3
     """Corners of a marker of the given side in its own frame, m."""
     signs = jnp.asarray(CORNER_SIGNS, size_m.dtype)
     return jnp.einsum("...,ci->...ci", size_m / 2, signs)
+
+
+def opencv_dictionary_name(family: str) -> str:
+    """The name of OpenCV's predefined dictionary of a family, DICT_APRILTAG_36h11 for tag36h11."""
+    if family.startswith("tag"):
+        return f"DICT_APRILTAG_{family.removeprefix('tag')}"
+    return f"DICT_{family.upper()}".replace("MIP_36H12", "MIP_36h12")
 
 
 class MarkerMap(eqx.Module):

@@ -11,7 +11,6 @@ import pytest
 
 from jaxnav.camera import Camera
 from jaxnav.detection import (
-    DICTIONARIES,
     Detections,
     make_detector,
     marker_cells,
@@ -20,7 +19,7 @@ from jaxnav.detection import (
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.read import read_marker
 from jaxnav.errors import BadInput
-from jaxnav.markers import MarkerMap
+from jaxnav.markers import FAMILY_SIZES, MarkerMap
 from tests.helpers.marker_images import Scene, random_scene, rotation
 
 BACKENDS = ["aruco", "apriltag"]
@@ -139,7 +138,7 @@ def test_predictions_elsewhere_do_no_harm(detector):
 
 
 def test_every_family_opencv_knows():
-    for family in DICTIONARIES:
+    for family in FAMILY_SIZES:
         rng = np.random.default_rng(1)
         scene = random_scene(rng, 60, marker_cells(family, 7), view_max_rad=0.5, optics_px=0.4)
         detections = make_detector("aruco", family).detect(scene.render(rng))

@@ -100,19 +100,6 @@ def test_data_is_found_in_a_wheel_and_in_a_checkout(tmp_path, monkeypatch):
     assert files.calib_dir() == package / "calib"
 
 
-def test_families_are_opencv_s():
-    for family, count in files.FAMILY_SIZES.items():
-        name = family.replace("tag", "APRILTAG_") if family.startswith("tag") else family
-        name = name if name.startswith("APRILTAG") else _cv2_name(name)
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
-        assert len(dictionary.bytesList) == count, family
-
-
-def _cv2_name(family: str) -> str:
-    known = [name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_")]
-    return next(name for name in known if name.lower() == family)
-
-
 # --- there and back ------------------------------------------------------------------
 
 

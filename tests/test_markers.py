@@ -1,9 +1,10 @@
 """Markers in the world: corner order, frames, look-up."""
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.markers import corners_marker_m
+from jaxnav.markers import FAMILY_SIZES, corners_marker_m, opencv_dictionary_name
 from tests import worlds
 
 
@@ -51,3 +52,9 @@ def test_index_needs_both_id_and_family():
     assert markers.index(2, "tag36h11") == 2
     assert markers.index(4, "tag36h11") is None
     assert markers.index(2, "tag16h5") is None
+
+
+def test_families_are_opencv_s():
+    for family, count in FAMILY_SIZES.items():
+        code = getattr(cv2.aruco, opencv_dictionary_name(family))
+        assert len(cv2.aruco.getPredefinedDictionary(code).bytesList) == count, family

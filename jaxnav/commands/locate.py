@@ -111,7 +111,8 @@ def _locate(
 
 
 def _pose(candidates: Candidates, n: int, error_px: float) -> dict[str, Any]:
-    T_camera_marker = jaxlie.SE3(jnp.asarray(candidates.T_vehicle_world.wxyz_xyz[n]))
+    wxyz_xyz = candidates.T_vehicle_world.wxyz_xyz[n]
+    T_camera_marker = jaxlie.SE3(jnp.asarray(wxyz_xyz))
     position_m = np.asarray(T_camera_marker.translation())
     R_camera_marker = np.asarray(T_camera_marker.rotation().as_matrix())
     distance_m = np.linalg.norm(position_m)
@@ -173,7 +174,8 @@ def _view(
     sticks: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for _, candidates in located:
         for rank, n in enumerate(np.flatnonzero(candidates.valid)[:2]):
-            Ts_camera_marker = jaxlie.SE3(jnp.asarray(candidates.T_vehicle_world.wxyz_xyz[n][None]))
+            wxyz_xyz = candidates.T_vehicle_world.wxyz_xyz[n]
+            Ts_camera_marker = jaxlie.SE3(jnp.asarray(wxyz_xyz)[None])
             sticks[rank].append(normals_px(camera, Ts_camera_marker, np.array([size_m]))[0])
     return View(
         title=f"{title}: detected marker green, normal of the better pose blue, other pose orange",

@@ -10,13 +10,12 @@ come from `refine`, the same for both.
 
 from jaxnav.detection.apriltag import AprilTagDetector
 from jaxnav.detection.aruco import ArucoDetector
-from jaxnav.detection.families import DICTIONARIES, marker_cells
+from jaxnav.detection.families import marker_cells
 from jaxnav.detection.observe import Observed, observe
 from jaxnav.detection.types import Detections, Detector
 from jaxnav.errors import BadInput
 
 __all__ = [
-    "DICTIONARIES",
     "AprilTagDetector",
     "ArucoDetector",
     "Detections",
@@ -35,7 +34,7 @@ def make_detector(backend: str = "aruco", family: str = "tag36h11") -> Detector:
 
     Args:
         backend: "aruco" (OpenCV) or "apriltag" (needs the extra of that name).
-        family: one of `DICTIONARIES`.
+        family: one of `jaxnav.markers.FAMILY_SIZES`.
 
     Raises:
         BadInput: unknown backend or family, a family the backend lacks, or a missing extra.

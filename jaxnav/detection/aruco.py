@@ -29,7 +29,7 @@ class ArucoDetector:
         """See `make_detector`.
 
         Args:
-            family: one of `DICTIONARIES`.
+            family: one of `jaxnav.markers.FAMILY_SIZES`.
             closer_looks: at how many quadrilaterals of an image to look again, some ms each.
         """
         self.family = family

@@ -6,20 +6,7 @@ import cv2
 import numpy as np
 
 from jaxnav.errors import BadInput
-
-# AprilTag families keep AprilTag's names; ArUco ones are OpenCV's, in lower case, without DICT_.
-DICTIONARIES: dict[str, int] = {
-    "tag16h5": cv2.aruco.DICT_APRILTAG_16h5,
-    "tag25h9": cv2.aruco.DICT_APRILTAG_25h9,
-    "tag36h10": cv2.aruco.DICT_APRILTAG_36h10,
-    "tag36h11": cv2.aruco.DICT_APRILTAG_36h11,
-    "aruco_original": cv2.aruco.DICT_ARUCO_ORIGINAL,
-    "aruco_mip_36h12": cv2.aruco.DICT_ARUCO_MIP_36h12,
-} | {
-    f"{bits}x{bits}_{count}": getattr(cv2.aruco, f"DICT_{bits}X{bits}_{count}")
-    for bits in (4, 5, 6, 7)
-    for count in (50, 100, 250, 1000)
-}
+from jaxnav.markers import FAMILY_SIZES, opencv_dictionary_name
 
 
 def dictionary(family: str) -> cv2.aruco.Dictionary:
@@ -28,9 +15,9 @@ def dictionary(family: str) -> cv2.aruco.Dictionary:
     Raises:
         BadInput: the family is unknown.
     """
-    if family not in DICTIONARIES:
-        raise BadInput("family", f"unknown {family!r}: expected one of {', '.join(DICTIONARIES)}")
-    return cv2.aruco.getPredefinedDictionary(DICTIONARIES[family])
+    if family not in FAMILY_SIZES:
+        raise BadInput("family", f"unknown {family!r}: expected one of {', '.join(FAMILY_SIZES)}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, opencv_dictionary_name(family)))
 
 
 @cache

@@ -8,13 +8,12 @@ from pathlib import Path
 
 from jaxnav.errors import BadInput
 from jaxnav.files.cameras import load_camera
-from jaxnav.files.markers import FAMILY_SIZES, load_markers, save_markers
+from jaxnav.files.markers import load_markers, save_markers
 from jaxnav.files.rigs import load_rig, save_rig
 from jaxnav.files.vehicles import Route, load_route, load_vehicle
 from jaxnav.files.writing import atomic_path, atomic_write, output_folder, write_json, write_tum
 
 __all__ = [
-    "FAMILY_SIZES",
     "Route",
     "atomic_path",
     "atomic_write",

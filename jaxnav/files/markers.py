@@ -23,17 +23,7 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import plain_pose, pose_array, yaml_text
 from jaxnav.files.validation import Count, Entry, Point, Pose, Positive, Text, validate
 from jaxnav.files.writing import atomic_write
-from jaxnav.markers import CORNER_SIGNS, MarkerMap
-
-# How many markers each family has: AprilTag's by AprilTag's names, ArUco's by OpenCV's.
-FAMILY_SIZES = {
-    "tag16h5": 30,
-    "tag25h9": 35,
-    "tag36h10": 2320,
-    "tag36h11": 587,
-    "aruco_original": 1024,
-    "aruco_mip_36h12": 250,
-} | {f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)}
+from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
 
 # A corner may lie this far from the best square, as a part of the side: a tape measure's error.
 _MAX_CORNER_ERROR = 0.03

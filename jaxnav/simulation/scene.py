@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.markers import MarkerMap
+from jaxnav.markers import FAMILY_SIZES, MarkerMap, opencv_dictionary_name
 
 PAPER_GREY, INK_GREY = 215.0, 25.0
 QUIET_ZONE_MODULES = 1
@@ -161,20 +161,15 @@ def _widened(
 
 @lru_cache(maxsize=256)
 def _black_and_white(family: str, marker_id: int) -> np.ndarray:
-    dictionary = cv2.aruco.getPredefinedDictionary(_opencv_dictionary(family))
-    count = len(dictionary.bytesList)
+    if family not in FAMILY_SIZES:
+        raise BadInput("markers", f"unknown family {family!r}: tag36h11, 4x4_50, ... are known")
+    name = opencv_dictionary_name(family)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    count = FAMILY_SIZES[family]
     if not 0 <= marker_id < count:
         raise BadInput("markers", f"family {family} has ids 0 to {count - 1}, not {marker_id}")
     modules = dictionary.markerSize + 2
     return cv2.aruco.generateImageMarker(dictionary, marker_id, modules) > 0
-
-
-def _opencv_dictionary(family: str) -> int:
-    prefix = "DICT_APRILTAG_" if family.startswith("tag") else "DICT_"
-    name = prefix + family.removeprefix("tag").upper()
-    if not hasattr(cv2.aruco, name):
-        raise BadInput("markers", f"unknown family {family!r}: tag36h11, 4x4_50, ... are known")
-    return int(getattr(cv2.aruco, name))
 
 
 def marker_sheet(family: str, marker_id: int) -> np.ndarray:
