@@ -233,8 +233,9 @@ def _drive(args: Demo, world: World, methods: Methods, seed: int) -> Record:
         unit="s",
         desc=f"drive, seed {seed}",
         disable=args.headless,
-        bar_format="{desc}: {n:.1f} of at most {total:.0f} s [{elapsed}] {postfix}",
+        bar_format="{desc}: {n:.1f} of at most {total:.0f} s [{elapsed}]{postfix}",
     ) as bar:
+        bar.set_postfix_str("compiling")
         for frame in drive(methods, world.vehicle, cameras.look, settings, seed):
             if len(frames) % KEEP_EVERY == 0:
                 kept[len(frames)] = cameras.images

@@ -31,11 +31,17 @@ def run(args: Arguments) -> int:
         raise BadInput(args.recording, "holds no frame")
     out = output_folder(args.out)
     with tqdm(total=len(recording), unit="frame", disable=args.headless) as bar:
+        bar.set_postfix_str("compiling")
+
+        def advance(frames: int) -> None:
+            bar.set_postfix_str("", refresh=False)
+            bar.update(frames)
+
         result = replay(
             recording,
             make_selector(args.selector),
             one_at_a_time=args.markers == "one-at-a-time",
-            progress=bar.update,
+            progress=advance,
         )
     summary = summarise(args, recording, result)
     _write_tracks(args, recording, result)

@@ -1,0 +1,461 @@
+"""Algorithm 1 as one pure step: the same alone, scanned, mapped, differentiated and spoilt."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxnav.ambiguity import PoseBelief, Selection
+from jaxnav.candidates import Candidates
+from jaxnav.markers import CORNER_SIGNS
+from jaxnav.motion import Belief, BicycleKalman
+from jaxnav.navigator import Navigator, Output, State
+from jaxnav.observation import Observation
+from tests import worlds
+from tests.derivatives import check_derivatives
+from tests.reference import kalman, paper
+
+WHEELBASE_M = 0.256
+DT_S = 0.1
+STEPS = 20
+START = (1.2, -0.6, np.deg2rad(135.0))
+SPEED_MPS, STEERING_RAD = 0.25, 0.12
+
+
+def navigator(**options) -> Navigator:
+    return Navigator(
+        rig=worlds.qcar_rig(),
+        markers=worlds.paper_markers(),
+        vehicle=worlds.qcar(),
+        waypoints_m=worlds.WAYPOINTS_M,
+        **options,
+    )
+
+
+def true_poses() -> np.ndarray:
+    """(STEPS, 3): the car at constant speed and steering."""
+    poses = paper.drive(START, SPEED_MPS, STEERING_RAD, STEPS * DT_S, WHEELBASE_M, STEPS * 50)
+    return poses[:-1:50]
+
+
+def drive(sigma_px: float = 0.2, seed: int = 0, blind: tuple[int, ...] = ()) -> Observation:
+    """What the car senses on the way, leading axis (STEPS,)."""
+    rig, markers = worlds.qcar_rig(), worlds.paper_markers()
+    noise = sigma_px * np.random.default_rng(seed).standard_normal((STEPS, 4, 1, 4, 2))
+    sees = np.ones(STEPS, bool)
+    sees[list(blind)] = False
+
+    @jax.jit
+    @jax.vmap
+    def look(pose, noise, sees):
+        T_world_vehicle = worlds.T_world_vehicle_from_planar(pose)
+        odometry = {"speed_mps": SPEED_MPS, "steering_rad": STEERING_RAD, "dt_s": DT_S}
+        obs = worlds.observe(rig, markers, T_world_vehicle, noise, **odometry)
+        return eqx.tree_at(lambda o: o.visible, obs, obs.visible & sees)
+
+    return look(jnp.asarray(true_poses()), jnp.asarray(noise), jnp.asarray(sees))
+
+
+def at(tree, index):
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def floats_of(tree):
+    return jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array))
+
+
+step = jax.jit(lambda navigator, state, obs: navigator.step(state, obs))
+scan = jax.jit(lambda navigator, state, obs: jax.lax.scan(navigator.step, state, obs))
+
+
+def step_by_step(nav: Navigator, obs: Observation) -> tuple[State, Output]:
+    state, outputs = nav.init(), []
+    for index in range(STEPS):
+        state, out = step(nav, state, at(obs, index))
+        outputs.append(out)
+    return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *outputs)
+
+
+def test_step_scan_and_vmap_agree(precision):
+    """Everything a user reads; a lane that no one takes only where it is valid."""
+    nav = navigator()
+    tolerance = 2e-3 if precision == np.float32 else 1e-9
+    drives = [drive(seed=seed, blind=(7, 8)) for seed in range(2)]
+    alone = [step_by_step(nav, obs) for obs in drives]
+    scanned = [scan(nav, nav.init(), obs) for obs in drives]
+    mapped = jax.jit(jax.vmap(lambda obs: jax.lax.scan(nav.step, nav.init(), obs)))(
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *drives)
+    )
+
+    def told(result):
+        state, out = result
+        costs = jnp.where(out.candidates.valid, out.costs, 0)
+        return (
+            state, out.pose, out.covariance, out.command, out.done, out.selected, costs,
+            out.T_world_vehicle, out.flip_probability,
+        )  # fmt: skip
+
+    for index in range(2):
+        expected = jax.tree.leaves(told(alone[index]))
+        for other in (scanned[index], at(mapped, index)):
+            for leaf, value in zip(jax.tree.leaves(told(other)), expected, strict=True):
+                np.testing.assert_allclose(leaf, value, rtol=tolerance, atol=tolerance)
+
+
+def test_a_drive_is_traced_once():
+    nav, traces = navigator(), []
+
+    @jax.jit
+    def counted(state, obs):
+        traces.append(None)
+        return nav.step(state, obs)
+
+    obs, state = drive(blind=(3,)), nav.init()
+    for index in range(6):
+        state, _ = counted(state, at(obs, index))
+    assert len(traces) == 1
+
+
+def test_the_bound_step_can_be_jitted(precision):
+    nav, obs = navigator(), at(drive(), 0)
+    jitted = jax.jit(nav.step)
+    state, out = jitted(nav.init(), obs)
+    _, expected = step(nav, nav.init(), obs)
+    np.testing.assert_allclose(out.pose, expected.pose, atol=1e-4)
+    jitted(state, obs)
+    assert jitted._cache_size() == 1
+    assert nav.step == nav.step
+    for leaf in floats_of((state, out)):
+        assert leaf.dtype == precision
+
+
+def test_the_car_is_located_in_both_precisions():
+    outputs = {}
+    for precision in ("float32", "float64"):
+        with jax.enable_x64(precision == "float64"):
+            nav = navigator()
+            state, out = scan(nav, nav.init(), drive())
+            assert {leaf.dtype for leaf in floats_of((state, out))} == {np.dtype(precision)}
+            assert np.all(out.located)
+            outputs[precision] = np.asarray(out.pose, float), np.asarray(out.command.steering_rad)
+    np.testing.assert_allclose(outputs["float32"][0], outputs["float64"][0], atol=3e-3)
+    np.testing.assert_allclose(outputs["float32"][1], outputs["float64"][1], atol=5e-3)
+    errors = outputs["float64"][0] - true_poses()
+    assert np.max(np.abs(errors[-5:, :2])) < 0.05
+    assert np.max(np.abs(errors[-5:, 2])) < 0.03
+
+
+def reference_pose_covariance(nav: Navigator, pose, sigma_px: float) -> np.ndarray:
+    """Covariance of (x, y, psi) at a pose from the pixels' derivatives: equations and loops."""
+    rig, corners = nav.rig, np.asarray(nav.markers.corners_world_m)[0]
+    visible = np.asarray(worlds.observe(rig, nav.markers, worlds.planar(*pose)).visible)[:, 0]
+    T_world_vehicle = np.asarray(worlds.planar(*pose).as_matrix())
+
+    def pixels(xi):
+        T_vehicle_world = np.linalg.inv(
+            T_world_vehicle @ np.asarray(jaxlie.SE3.exp(jnp.asarray(xi)).as_matrix())
+        )
+        seen = []
+        for j in np.flatnonzero(visible):
+            camera = rig.camera(int(j))
+            T_camera_vehicle = np.asarray(rig.Ts_camera_vehicle.as_matrix())[j]
+            for corner in corners:
+                p = T_camera_vehicle @ T_vehicle_world @ np.append(corner, 1)
+                K = np.asarray(camera.K)
+                seen.append(paper.project(K, "equidistant", np.asarray(camera.distortion), p[:3]))
+        return np.ravel(seen)
+
+    h = 1e-5
+    J = np.stack([(pixels(h * e) - pixels(-h * e)) / (2 * h) for e in np.eye(6)], axis=1)
+    P = np.linalg.inv(J.T @ J / sigma_px**2)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    to_planar = np.zeros((3, 6))
+    to_planar[:2, :2] = [[c, -s], [s, c]]
+    to_planar[2, 5] = 1
+    return to_planar @ P @ to_planar.T
+
+
+def test_the_first_two_steps_by_hand():
+    """Pose and covariance from the pixels, the filter's and the controller's equations."""
+    nav = navigator(corner_sigma_px=0.25)
+    motion = nav.motion
+    obs = drive(sigma_px=0.0)
+    state, out = step(nav, nav.init(), at(obs, 0))
+    floor = np.diag(np.asarray(motion.vision_floor) ** 2)
+    noise = (WHEELBASE_M, np.asarray(motion.odometry_sigma))
+
+    truth = true_poses()
+    x = np.append(truth[0], np.zeros(3))
+    P = np.zeros((6, 6))
+    P[:3, :3] = reference_pose_covariance(nav, truth[0], 0.25) + floor
+    P[3:, 3:] = np.diag(np.asarray(motion.initial_velocity_sigma) ** 2)
+    x, P, _ = kalman.update(x, P, None, None, SPEED_MPS, STEERING_RAD, *noise)
+    np.testing.assert_allclose(state.belief.mean[0], x, atol=2e-4)
+    np.testing.assert_allclose(out.covariance, P, rtol=0.02, atol=1e-6)
+    assert out.nis == 0
+    assert out.flip_probability < 0.5
+
+    angle, distance, _ = paper.steering(
+        out.pose, worlds.WAYPOINTS_M[0], STEERING_RAD, WHEELBASE_M
+    )
+    assert out.command.steering_rad == pytest.approx(np.clip(angle, -0.5, 0.5), abs=1e-9)
+    assert out.command.throttle == pytest.approx(0.05 * distance + 0.01 * DT_S * distance)
+
+    state, out = step(nav, state, at(obs, 1))
+    x, P = kalman.predict(x, P, DT_S, np.asarray(motion.acceleration_density))
+    R_pose = reference_pose_covariance(nav, truth[1], 0.25) + floor
+    x, P, nis = kalman.update(x, P, truth[1], R_pose, SPEED_MPS, STEERING_RAD, *noise)
+    np.testing.assert_allclose(state.belief.mean[0], x, atol=2e-3)
+    np.testing.assert_allclose(out.covariance, P, rtol=0.05, atol=1e-5)
+    np.testing.assert_allclose(out.nis, nis, atol=0.02)
+
+
+def test_without_a_marker_odometry_carries_on():
+    nav = navigator()
+    _, out = scan(nav, nav.init(), drive(blind=tuple(range(8, STEPS))))
+    blind = np.arange(STEPS) >= 8
+    np.testing.assert_array_equal(np.asarray(out.selected) == -1, blind)
+    np.testing.assert_array_equal(np.asarray(out.nis)[blind], 0)
+    assert np.all(out.located)
+    position_variance = np.trace(np.asarray(out.covariance)[:, :2, :2], axis1=1, axis2=2)
+    assert np.all(np.diff(position_variance[8:]) > 0)
+    errors = np.asarray(out.pose) - true_poses()
+    assert np.max(np.abs(errors[-1, :2])) < 0.1
+    assert np.all(np.asarray(out.command.throttle) > 0)
+
+
+def test_never_located_never_drives():
+    nav = navigator()
+    state, out = scan(nav, nav.init(), drive(blind=tuple(range(STEPS))))
+    assert not np.any(out.located)
+    assert not np.any(out.command.throttle)
+    assert not np.any(out.command.steering_rad)
+    assert all(np.all(np.isfinite(leaf)) for leaf in floats_of(state))
+
+
+@pytest.fixture(scope="module")
+def located():
+    nav = navigator()
+    obs = at(drive(), 0)
+    state, _ = step(nav, nav.init(), obs)
+    return nav, state, obs
+
+
+ANYTHING = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.tuples(*[ANYTHING] * 3), st.lists(st.one_of(st.just(None), ANYTHING), min_size=8, max_size=8))
+def test_state_and_command_survive_any_reading(located, odometry, corners):
+    nav, state, obs = located
+    spoilt = np.array(obs.corners_px)
+    visible = np.flatnonzero(obs.visible[:, 0])[0]
+    flat = spoilt[visible, 0].reshape(8)
+    for index, value in enumerate(corners):
+        flat[index] = flat[index] if value is None else value
+    readings = (jnp.asarray(value) for value in odometry)
+    state, out = step(nav, state, Observation(jnp.asarray(spoilt), obs.visible, *readings))
+    check_contained(state, out)
+    # And it finds back.
+    for _ in range(2):
+        state, out = step(nav, state, obs)
+    check_contained(state, out)
+
+
+def check_contained(state: State, out: Output) -> None:
+    assert all(np.all(np.isfinite(leaf)) for leaf in floats_of(state))
+    told = (out.pose, out.covariance, out.T_world_vehicle, out.command, out.candidates, out.nis)
+    assert all(np.all(np.isfinite(leaf)) for leaf in floats_of(told))
+    assert abs(float(out.command.steering_rad)) <= 0.5
+    assert abs(float(out.command.throttle)) <= 0.3
+
+
+BROKEN = [np.nan, np.inf, -np.inf, 1e30, -1e30, 1e10]
+
+
+@pytest.mark.parametrize("field", ["speed_mps", "steering_rad", "dt_s", "corners_px"])
+def test_broken_readings_are_contained(precision, field):
+    nav = navigator()
+    obs = at(drive(), 0)
+    located, _ = step(nav, nav.init(), obs)
+    for value in BROKEN:
+        where = (lambda o: o.corners_px) if field == "corners_px" else lambda o: getattr(o, field)
+        bad = eqx.tree_at(where, obs, jnp.full_like(where(obs), value))
+        state, out = step(nav, located, bad)
+        check_contained(state, out)
+        if field == "corners_px" and not np.isfinite(value):
+            assert int(out.selected) == -1
+        state, out = step(nav, state, obs)
+        check_contained(state, out)
+        assert out.located
+
+
+def test_nan_odometry_is_a_step_without_odometry(located):
+    nav, state, obs = located
+    absent = eqx.tree_at(
+        lambda o: o.has_odometry, obs, jnp.asarray(False), is_leaf=lambda x: x is True
+    )
+    expected, _ = step(nav, state, absent)
+    for field in ("speed_mps", "steering_rad"):
+        broken = eqx.tree_at(lambda o, f=field: getattr(o, f), obs, jnp.asarray(jnp.nan))
+        actual, _ = step(nav, state, broken)
+        np.testing.assert_array_equal(actual.belief.mean, expected.belief.mean)
+        np.testing.assert_array_equal(actual.belief.covariance, expected.belief.covariance)
+
+
+def parameters_of(nav: Navigator) -> dict[str, jax.Array]:
+    """Motion noise and gains: what a tuner varies."""
+    motion, controller = nav.motion, nav.controller
+    return {
+        "acceleration_density": motion.acceleration_density,
+        "corner_sigma_px": nav.corner_sigma_px,
+        "integral_per_ms": controller.integral_per_ms,
+        "odometry_sigma": motion.odometry_sigma,
+        "proportional_per_m": controller.proportional_per_m,
+        "vision_floor": motion.vision_floor,
+    }
+
+
+def tuned(nav: Navigator, parameters: dict[str, jax.Array]) -> Navigator:
+    """The navigator with these parameters in place of its own."""
+    return eqx.tree_at(
+        lambda n: [parameters_of(n)[key] for key in sorted(parameters)],
+        nav,
+        [parameters[key] for key in sorted(parameters)],
+    )
+
+
+def test_derivatives_of_a_step():
+    """With respect to corners, odometry, interval, motion noise and gains: three ways."""
+    nav = navigator(max_lm_steps=40)
+    obs = drive()
+    state, _ = step(nav, nav.init(), at(obs, 0))
+    second = at(obs, 1)
+
+    def outcome(corners_px, speed_mps, steering_rad, dt_s, parameters):
+        changed = Observation(corners_px, second.visible, speed_mps, steering_rad, dt_s)
+        after, out = tuned(nav, parameters).step(state, changed)
+        return after.belief.mean, after.belief.covariance, out.command
+
+    arguments = (second.corners_px, second.speed_mps, second.steering_rad, second.dt_s)
+    check_derivatives(
+        outcome, *arguments, parameters_of(nav), step=1e-6, rtol=1e-4, atol=1e-5
+    )
+
+
+def test_a_rollout_of_20_steps_has_a_finite_gradient(precision):
+    """With respect to the filter's noise and the gains, through frames without a marker."""
+    nav = navigator()
+    obs = drive(blind=(5, 6, 7))
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(parameters):
+        changed = tuned(nav, parameters)
+        _, out = jax.lax.scan(changed.step, changed.init(), obs)
+        error = out.pose - jnp.asarray(true_poses())
+        return jnp.sum(error**2) + jnp.sum(out.command.throttle**2) + jnp.sum(out.nis)
+
+    value, gradient = loss(parameters_of(nav))
+    assert np.isfinite(value)
+    for name, leaf in gradient.items():
+        assert leaf.dtype == precision
+        assert np.all(np.isfinite(leaf)), name
+        assert np.all(leaf != 0), name
+
+
+class EachItsOwn(eqx.Module):
+    """A toy selector: hypothesis k takes candidate k, and says nothing of which is true."""
+
+    def __call__(self, prior: PoseBelief, candidates: Candidates, obs, markers) -> Selection:
+        del obs, markers
+        weights = jnp.eye(prior.log_weight.shape[0], candidates.valid.shape[0])
+        return Selection(
+            weights=jnp.where(candidates.valid[None], weights, 0),
+            costs=jnp.where(candidates.valid, candidates.cost, jnp.inf),
+            selected=jnp.argmax(prior.log_weight),
+            flip_probability=jnp.asarray(0.5),
+        )
+
+
+class Bank(eqx.Module):
+    """A toy motion model: two cars side by side, weighed by how they surprise themselves."""
+
+    one: BicycleKalman
+
+    def init(self) -> Belief:
+        return jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), self.one.init())
+
+    def predict(self, belief, dt_s):
+        return self.one.predict(belief, dt_s)
+
+    def poses(self, belief):
+        return self.one.poses(belief)
+
+    def update(self, belief, candidates, weights, obs):
+        after, nis = self.one.update(belief, candidates, weights, obs)
+        log_weight = after.log_weight - nis / 2
+        return eqx.tree_at(lambda b: b.log_weight, after, log_weight), nis
+
+
+def test_more_hypotheses_need_no_change_to_step():
+    """K = 2 through the same step: the reported pose is that of the heavier one."""
+    nav = navigator(selector=EachItsOwn(), motion=Bank(BicycleKalman(worlds.qcar())))
+    state, out = scan(nav, nav.init(), drive(sigma_px=0.3))
+    assert state.belief.mean.shape == (2, 6)
+    assert out.nis.shape == (STEPS,)
+    heavier = int(np.argmax(state.belief.log_weight))
+    np.testing.assert_allclose(out.pose[-1], state.belief.mean[heavier, :3], atol=1e-12)
+    np.testing.assert_array_equal(out.covariance[-1], state.belief.covariance[heavier])
+    assert not np.allclose(state.belief.mean[0], state.belief.mean[1], atol=0.01)
+    assert abs(float(state.belief.log_weight[0] - state.belief.log_weight[1])) > 1
+
+
+def test_it_locates_a_hand_held_rig_without_a_route():
+    """Constant velocity on SE(3), six degrees of freedom, no command."""
+    rig, markers = worlds.handheld_rig(), worlds.room_markers()
+    nav = Navigator(rig=rig, markers=markers, corner_sigma_px=0.3)
+    rng = np.random.default_rng(1)
+    upright = jaxlie.SE3.from_rotation(jaxlie.SO3.from_x_radians(jnp.asarray(-np.pi / 2)))
+    T = worlds.planar(0.2, 0.1, 0.6) @ upright
+    twist = jnp.asarray([0.2, -0.05, 0.1, 0.1, 0.4, -0.1])
+    look = jax.jit(lambda T, n: worlds.observe(rig, markers, T, n, dt_s=0.05))
+    state = nav.init()
+    for _ in range(15):
+        T = T @ jaxlie.SE3.exp(twist * 0.05)
+        noise = jnp.asarray(0.3 * rng.standard_normal((4, 4, 4, 2)))
+        state, out = step(nav, state, look(T, noise))
+    assert out.command is None
+    assert not out.done
+    assert out.covariance.shape == (12, 12)
+    error = (out.T_world_vehicle.inverse() @ T).log()
+    assert np.linalg.norm(error[:3]) < 0.01
+    assert np.linalg.norm(error[3:]) < 0.01
+    # 6 degrees of freedom and the floor
+    assert 0 < float(out.nis) < 30
+
+
+def test_what_cannot_be_built_is_told():
+    rig, markers = worlds.qcar_rig(), worlds.paper_markers()
+    with pytest.raises(ValueError, match="needs a vehicle"):
+        Navigator(rig=rig, markers=markers, waypoints_m=[(1.0, 0.0)])
+    with pytest.raises(ValueError, match=r"\(W, 2\)"):
+        Navigator(rig=rig, markers=markers, vehicle=worlds.qcar(), waypoints_m=[(1.0, 0.0, 0.0)])
+
+
+def test_the_marker_is_where_the_corners_say():
+    """The first output of a noise-free frame projects the marker onto its corners."""
+    nav, obs = navigator(), at(drive(sigma_px=0.0), 0)
+    _, out = step(nav, nav.init(), obs)
+    assert CORNER_SIGNS.shape == (4, 3)
+    pixels = nav.rig.project(
+        worlds.planar(*np.asarray(out.pose)).inverse(), nav.markers.corners_world_m
+    )
+    visible = np.asarray(obs.visible)
+    np.testing.assert_allclose(
+        np.asarray(pixels)[visible], np.asarray(obs.corners_px)[visible], atol=1e-3
+    )
