@@ -9,6 +9,10 @@ from jaxnav.camera import Camera
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
+# Beyond these a reading is an error of the sensor, or of its unit.
+_MAX_SPEED_MPS = 1e3
+_MAX_DT_S = 1e4
+
 
 class Observation(eqx.Module):
     """One synchronous reading of cameras, odometer and steering sensor.
@@ -28,18 +32,19 @@ class Observation(eqx.Module):
     def usable(self) -> "Observation":
         """The same with everything finite that a filter looks at.
 
-        A lane with a non-finite corner is not visible; without a finite speed and steering angle
-        there is no odometry; a `dt_s` that is not a positive number is 0.
+        A lane with a non-finite corner is not visible; without a speed and a steering angle that
+        a vehicle can have there is no odometry; a `dt_s` that is no positive time is 0.
         """
-        finite_steering = jnp.isfinite(self.steering_rad)
-        has_odometry = self.has_odometry & jnp.isfinite(self.speed_mps) & finite_steering
-        usable_dt = jnp.isfinite(self.dt_s) & (jnp.asarray(self.dt_s) > 0)
+        can_steer = jnp.abs(self.steering_rad) < jnp.pi / 2
+        has_odometry = self.has_odometry & (jnp.abs(self.speed_mps) < _MAX_SPEED_MPS) & can_steer
+        dt_s = jnp.asarray(self.dt_s)
+        usable_dt = (dt_s > 0) & (dt_s < _MAX_DT_S)
         return Observation(
             corners_px=self.corners_px,
             visible=self.visible & jnp.all(jnp.isfinite(self.corners_px), axis=(2, 3)),
             speed_mps=jnp.where(has_odometry, self.speed_mps, 0.0),
-            steering_rad=jnp.where(finite_steering, self.steering_rad, 0.0),
-            dt_s=jnp.where(usable_dt, self.dt_s, 0.0),
+            steering_rad=jnp.where(can_steer, self.steering_rad, 0.0),
+            dt_s=jnp.where(usable_dt, dt_s, 0.0),
             corner_sigma_px=self.corner_sigma_px,
             has_odometry=has_odometry,
         )

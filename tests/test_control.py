@@ -49,7 +49,7 @@ def test_steering_is_equations_16_to_18(precision):
     rng = np.random.default_rng(0)
     rtol = 2e-5 if precision == np.float32 else 1e-12
     control = controller()
-    for _ in range(100):
+    for _ in range(50):
         pose = (*rng.uniform(-3, 3, 2), rng.uniform(-np.pi, np.pi))
         measured = rng.uniform(-0.5, 0.5)
         _, command, _, log = act(control, pose, measured)

@@ -73,7 +73,7 @@ def test_a_lane_without_a_positive_sigma_is_not_visible(room, broken):
     assert np.all(seen.sigma_px > 0)
 
 
-@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf, 1e30])
 def test_broken_odometry_is_no_odometry(room, broken):
     *_, obs = room
     good = {"speed_mps": jnp.asarray(0.4), "steering_rad": jnp.asarray(0.1)}

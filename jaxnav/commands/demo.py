@@ -57,7 +57,7 @@ SENSOR = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0, full_well_e=6000.0)
 START_SPREAD = np.array([0.05, 0.05, np.deg2rad(5.0)])  # around the route's start, m m rad
 MOSAIC_ROWS = 3
 KEEP_EVERY = 8  # of so many frames one keeps its images, for the mosaic
-FLOOR_MARGIN_M = 1.0  # how far beyond start, waypoints and markers the car may go
+FLOOR_M = 5.0  # side of the floor around start, waypoints and markers, at least
 
 
 def run(args: Demo) -> int:
@@ -147,7 +147,9 @@ class World:
                 np.asarray(self.markers.corners_world_m)[..., :2].reshape(-1, 2),
             ]
         )
-        low, high = points.min(axis=0) - FLOOR_MARGIN_M, points.max(axis=0) + FLOOR_MARGIN_M
+        center, half = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0) / 2
+        half = np.maximum(half + 1.0, FLOOR_M / 2)
+        low, high = center - half, center + half
         return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
