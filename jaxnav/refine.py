@@ -31,7 +31,11 @@ _PRIOR_SIGMA = 1.0
 
 
 class RefinedPose(eqx.Module):
-    """Result of one refinement. A lane that failed says so; its numbers stay finite."""
+    """Result of one refinement.
+
+    A lane whose numbers overflowed has an infinite cost, is not `converged`, and holds the start
+    and an identity covariance.
+    """
 
     T_vehicle_world: jaxlie.SE3
     cost: Float[Array, ""]  # sum of (residual / sigma)^2: e1 in pixel^2 where sigma is 1 px
@@ -86,12 +90,16 @@ def refine_sightings(
     )
     chart = _chart(T, corners_world, center_world)
     J = jax.jacfwd(lambda y: residual(chart.points(y)))(jnp.zeros(6, chart.pivot.dtype))
+    cost = jnp.sum(residual(chart.points(jnp.zeros(6, chart.pivot.dtype))) ** 2)
+    covariance = _body_covariance(chart, J)
+    numbers = jnp.concatenate([T.wxyz_xyz, cost[None], covariance.reshape(-1)])
+    finite = jnp.all(jnp.isfinite(numbers))
     return RefinedPose(
-        T_vehicle_world=T,
-        cost=jnp.sum(residual(chart.points(jnp.zeros(6, chart.pivot.dtype))) ** 2),
-        covariance=_body_covariance(chart, J),
+        T_vehicle_world=jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, T_vehicle_world.wxyz_xyz)),
+        cost=jnp.where(finite, cost, jnp.inf),
+        covariance=jnp.where(finite, covariance, jnp.eye(6, dtype=covariance.dtype)),
         steps=steps,
-        converged=converged & any_visible,
+        converged=converged & any_visible & finite,
     )
 
 

@@ -29,7 +29,9 @@ def check_derivatives(
         cotangents = jnp.cos(jnp.arange(3 * value.size, dtype=x.dtype)).reshape(3, -1)
         forward = jax.vmap(lambda d: jax.jvp(flat, (x,), (d,))[1])(directions)
         reverse = jax.vmap(lambda c: pull(c)[0])(cotangents)
-        ahead, behind = (jax.vmap(lambda d: flat(x + h * d))(directions) for h in (step, -step))
+        ahead, behind = (
+            jax.vmap(lambda d, h=h: flat(x + h * d))(directions) for h in (step, -step)
+        )
         return forward, reverse, cotangents, (ahead - behind) / (2 * step)
 
     forward, reverse, cotangents, numeric = map(np.asarray, three_ways(x, directions))

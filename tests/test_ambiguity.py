@@ -108,8 +108,9 @@ class TestEverySelector:
 
 
 def test_paper_cost_is_equations_13_and_14():
-    markers, obs = worlds.room_markers(), worlds.observe(
-        worlds.qcar_rig(), worlds.room_markers(), worlds.planar(0.2, 0.1, 0.6)
+    markers, obs = (
+        worlds.room_markers(),
+        worlds.observe(worlds.qcar_rig(), worlds.room_markers(), worlds.planar(0.2, 0.1, 0.6)),
     )
     prior = worlds.planar(0.25, 0.05, 0.7)
     candidates = candidates_at([(0.2, 0.1, 0.6), (0.5, -0.2, 0.1)], [4.0, 3.0])

@@ -13,9 +13,7 @@ from jaxnav.residuals import e1
 from tests import worlds
 
 ROOM_VIEW = (0.2, 0.1, 0.6)
-find = jax.jit(
-    find_candidates, static_argnames=("max_sightings", "max_candidates", "max_steps")
-)
+find = jax.jit(find_candidates, static_argnames=("max_sightings", "max_candidates", "max_steps"))
 
 
 def view(markers, pose, sigma_px=0.0, seed=0):
@@ -86,9 +84,9 @@ def test_several_markers_leave_no_doubt():
 def test_costs_are_what_they_say():
     rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
     candidates = find(rig, markers, obs, corner_sigma_px=jnp.asarray(0.3))
-    image_errors = jax.jit(
-        jax.vmap(lambda T: e1(rig, markers, obs.corners_px, obs.visible, T))
-    )(candidates.T_vehicle_world)
+    image_errors = jax.jit(jax.vmap(lambda T: e1(rig, markers, obs.corners_px, obs.visible, T)))(
+        candidates.T_vehicle_world
+    )
     np.testing.assert_allclose(candidates.e1_px2, image_errors, rtol=1e-9)
     np.testing.assert_allclose(candidates.cost, candidates.e1_px2 / 0.3**2, rtol=1e-9)
     valid = np.asarray(candidates.e1_px2)[np.asarray(candidates.valid)]
@@ -135,6 +133,16 @@ def test_absurd_corners_are_no_candidate_in_float32():
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(candidates))
 
 
+def test_corners_that_defeat_the_covariance_are_no_candidate():
+    """The best fit is a marker at astronomic distance: finite e1, singular information."""
+    rig, markers, obs = view(worlds.paper_markers(), worlds.START_VIEW)
+    corners = obs.corners_px.at[0, 0, :, 1].set(jnp.asarray([1498.0, 232430.0, 232616.0, 1603.0]))
+    candidates = find(rig, markers, eqx.tree_at(lambda o: o.corners_px, obs, corners))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(candidates))
+    covariances = np.asarray(candidates.covariance)
+    assert np.all(np.diagonal(covariances, axis1=1, axis2=2) > 0)
+
+
 def test_pruning_keeps_what_explains_all_corners_best():
     rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
     every = find(rig, markers, obs, max_candidates=32)
@@ -153,13 +161,13 @@ def test_few_sightings_are_the_largest_ones():
     x, y = np.moveaxis(np.asarray(obs.corners_px), -1, 0)
     area = np.abs(np.sum(x * np.roll(y, -1, -1) - y * np.roll(x, -1, -1), axis=-1))
     largest = np.unravel_index(np.argmax(np.where(obs.visible, area, 0)), (4, 4))
-    alone = eqx.tree_at(
-        lambda o: o.visible, obs, jnp.zeros_like(obs.visible).at[largest].set(True)
-    )
+    alone = eqx.tree_at(lambda o: o.visible, obs, jnp.zeros_like(obs.visible).at[largest].set(True))
     pruned = find(rig, markers, obs, max_sightings=1)
     expected = find(rig, markers, alone, max_sightings=1)
     assert pruned.valid.shape == (2,)
-    np.testing.assert_array_equal(pruned.T_vehicle_world.wxyz_xyz, expected.T_vehicle_world.wxyz_xyz)
+    np.testing.assert_array_equal(
+        pruned.T_vehicle_world.wxyz_xyz, expected.T_vehicle_world.wxyz_xyz
+    )
     spoilt = jnp.where(expected.valid, pruned.e1_px2, 0)
     assert np.all(np.isfinite(spoilt))
 

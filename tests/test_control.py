@@ -53,9 +53,7 @@ def test_steering_is_equations_16_to_18(precision):
         pose = (*rng.uniform(-3, 3, 2), rng.uniform(-np.pi, np.pi))
         measured = rng.uniform(-0.5, 0.5)
         _, command, _, log = act(control, pose, measured)
-        angle, distance, alpha = paper.steering(
-            pose, worlds.WAYPOINTS_M[0], measured, WHEELBASE_M
-        )
+        angle, distance, alpha = paper.steering(pose, worlds.WAYPOINTS_M[0], measured, WHEELBASE_M)
         np.testing.assert_allclose(log.distance_m, distance, rtol=rtol)
         np.testing.assert_allclose(log.alpha_rad, alpha, rtol=rtol, atol=2e-6)
         if abs(alpha) < np.pi / 2:
@@ -126,7 +124,9 @@ def test_a_waypoint_behind_gets_full_lock_and_is_reached(direction_deg):
 def test_throttle_is_equation_19():
     control, state, total = controller(), None, 0.0
     for step, x_m in enumerate((3.0, 2.9, 2.8, 2.6)):
-        state, command, _, log = act(control, (x_m, 0.0, np.pi), dt_s=0.1 + 0.01 * step, state=state)
+        state, command, _, log = act(
+            control, (x_m, 0.0, np.pi), dt_s=0.1 + 0.01 * step, state=state
+        )
         total += (x_m - 1.30) * (0.1 + 0.01 * step)
         assert log.integral_ms == pytest.approx(total, rel=1e-12)
         assert command.throttle == pytest.approx(0.05 * (x_m - 1.30) + 0.01 * total, rel=1e-12)
@@ -205,7 +205,5 @@ def test_derivatives():
     check_derivatives(outcome, pose, jnp.asarray(0.2), control, atol=1e-7)
     # On top of the waypoint, and with it exactly behind.
     for where in ((1.3, 0.0, 0.4), (2.3, 0.0, 0.0)):
-        slopes = jax.jit(jax.jacrev(outcome, (0, 1)))(
-            jnp.asarray(where), jnp.asarray(0.0), control
-        )
+        slopes = jax.jit(jax.jacrev(outcome, (0, 1)))(jnp.asarray(where), jnp.asarray(0.0), control)
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))

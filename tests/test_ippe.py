@@ -72,7 +72,7 @@ POSITIONS = [(0, 0, 1.0), (0, 0, 3.2), (0.5, 0, 2), (0.5, 0.3, 2), (-1.2, -0.2, 
 
 
 def upright_views(turned: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Upright markers in a level camera, R (P, 2001, 3, 3) and t (P, 2001, 3), yaw -75 to 75 deg."""
+    """Upright markers in a level camera, R (P, 2001, 3, 3), t (P, 2001, 3), yaw -75 to 75 deg."""
     yaws = np.deg2rad(np.linspace(-75, 75, 2001))
     c, s, zero = np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)
     R = np.stack([[c, zero, -s], [zero, zero - 1, zero], [-s, zero, -c]]).transpose(2, 0, 1)
@@ -155,7 +155,7 @@ def awkward_corners() -> np.ndarray:
     return np.stack(
         [
             square,  # exactly frontal, on the axis
-            square + [0.3, -0.2],  # exactly frontal to a parallel plane
+            square + np.array([0.3, -0.2]),  # exactly frontal to a parallel plane
             square @ np.array([[0.6, 0.8], [-0.8, 0.6]]),
             np.zeros((4, 2)),
             np.full((4, 2), 0.3),

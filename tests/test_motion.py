@@ -148,7 +148,13 @@ def test_the_yaw_innovation_wraps():
     tight = 1e-6 * jnp.eye(6)
     belief = started(motion, (0.0, 0.0, np.pi - 0.02), tight, 0.0, 0.0)
     _, posterior, nis = drive_step(
-        motion, belief, jnp.asarray(0.0), jnp.asarray([0.0, 0.0, -np.pi + 0.02]), tight, weights(True), reading()
+        motion,
+        belief,
+        jnp.asarray(0.0),
+        jnp.asarray([0.0, 0.0, -np.pi + 0.02]),
+        tight,
+        weights(True),
+        reading(),
     )
     assert abs(kalman.wrap(float(posterior.mean[0, 2]) - np.pi)) < 0.02
     assert nis[0] == pytest.approx(0.04**2 / (2 * (1e-6 + 0.005**2)), rel=1e-3)
@@ -163,7 +169,13 @@ def test_odometry_alone_moves_the_car_along_its_arc(precision):
     variances = []
     for _ in range(40):
         _, belief, nis = drive_step(
-            motion, belief, jnp.asarray(dt_s), jnp.zeros(3), jnp.eye(6), weights(False), reading(speed, steering)
+            motion,
+            belief,
+            jnp.asarray(dt_s),
+            jnp.zeros(3),
+            jnp.eye(6),
+            weights(False),
+            reading(speed, steering),
         )
         assert nis[0] == 0
         variances.append(float(belief.covariance[0, 0, 0] + belief.covariance[0, 1, 1]))
@@ -178,7 +190,13 @@ def test_without_odometry_the_rows_are_gone():
     motion = BicycleKalman(worlds.qcar())
     belief = started(motion, (1.0, 0.5, 0.2), 1e-4 * jnp.eye(6))
     prior, posterior, _ = drive_step(
-        motion, belief, jnp.asarray(0.1), jnp.zeros(3), jnp.eye(6), weights(False), reading(9.0, 0.4, False)
+        motion,
+        belief,
+        jnp.asarray(0.1),
+        jnp.zeros(3),
+        jnp.eye(6),
+        weights(False),
+        reading(9.0, 0.4, False),
     )
     np.testing.assert_array_equal(posterior.mean, prior.mean)
     np.testing.assert_allclose(posterior.covariance, prior.covariance, rtol=1e-9, atol=1e-12)
@@ -260,9 +278,7 @@ def test_broken_hypotheses_start_anew():
     stack = eqx.tree_at(lambda b: b.initialised, stack, jnp.ones(3, bool))
     starts = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 3), start)
     broken = eqx.tree_at(lambda b: b.mean, stack, stack.mean.at[1, 4].set(jnp.nan))
-    broken = eqx.tree_at(
-        lambda b: b.covariance, broken, broken.covariance.at[2, 0, 5].set(jnp.inf)
-    )
+    broken = eqx.tree_at(lambda b: b.covariance, broken, broken.covariance.at[2, 0, 5].set(jnp.inf))
     kept = restarted_where_broken(broken, starts)
     assert kept.initialised.tolist() == [True, False, False]
     np.testing.assert_array_equal(kept.mean[0], stack.mean[0])
@@ -304,7 +320,9 @@ def test_constant_velocity_carries_its_covariance_as_samples_do():
     P = np.asarray(predicted.covariance[0])
     whitened = np.linalg.solve(np.linalg.cholesky(P), errors.T)
     # Sampling noise, and 5 % for the Jacobian of exp that F leaves out (half the turn, 0.05 rad).
-    np.testing.assert_allclose(whitened @ whitened.T / count, np.eye(12), atol=0.05 + 5 / np.sqrt(count))
+    np.testing.assert_allclose(
+        whitened @ whitened.T / count, np.eye(12), atol=0.05 + 5 / np.sqrt(count)
+    )
 
 
 def test_constant_velocity_converges_on_a_moving_body():
@@ -345,7 +363,9 @@ def test_constant_velocity_forgets_what_it_lost():
     assert motion.predict(belief, 0.1).initialised[0]
     assert not motion.predict(belief, 10.0).initialised[0]
     there = worlds.planar(-3.0, 2.0, -2.0)
-    again, nis = free_step(motion, belief, jnp.asarray(10.0), there.wxyz_xyz, 1e-4 * jnp.eye(6), weights(True))
+    again, nis = free_step(
+        motion, belief, jnp.asarray(10.0), there.wxyz_xyz, 1e-4 * jnp.eye(6), weights(True)
+    )
     np.testing.assert_allclose(again.mean[0, :7], there.wxyz_xyz, atol=1e-12)
     np.testing.assert_array_equal(again.mean[0, 7:], 0)
     assert nis[0] == 0
@@ -353,7 +373,7 @@ def test_constant_velocity_forgets_what_it_lost():
 
 @pytest.mark.parametrize("kind", ["car", "free"])
 def test_gradients_are_finite_at_rest_and_at_the_prediction(precision, kind):
-    """Of everything with respect to noise parameters, pose and odometry, where innovations are 0."""
+    """Of everything by noise parameters, pose and odometry, where innovations are 0."""
     motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
     pose = worlds.planar(0.3, 0.1, 1.0)
 
