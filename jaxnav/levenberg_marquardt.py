@@ -133,3 +133,48 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
     ) -> tuple[Array, PyTree, dict[str, Any]]:
         """The accepted point as it is."""
         return y, aux, {}
+
+
+class ImplicitGradient(optx.AbstractAdjoint):
+    """Derivatives of a minimum by the implicit function theorem: dy = -H^-1 d(gradient).
+
+    What `optimistix.ImplicitAdjoint` computes, less its check of the linear solve, which calls
+    the host and raises there. Where the Hessian is singular the derivative is zero.
+    """
+
+    def apply(
+        self,
+        primal_fn: Callable[..., Any],
+        rewrite_fn: Callable[..., Any],
+        inputs: PyTree,
+        tags: frozenset[object],
+    ) -> PyTree:
+        """The minimum and what the solver says of it; only the minimum has derivatives."""
+        fixed = jax.tree.map(
+            lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, inputs
+        )
+        root, residual = optx.ImplicitAdjoint().apply(primal_fn, rewrite_fn, fixed, tags)
+        return _moving_with(root, inputs, gradient=rewrite_fn, residual=residual), residual
+
+
+@eqx.filter_custom_jvp
+def _moving_with(
+    root: Array, inputs: PyTree, *, gradient: Callable[..., Array], residual: PyTree
+) -> Array:
+    """The root, where gradient(root, residual, inputs) = 0."""
+    return root
+
+
+@_moving_with.def_jvp
+def _moving_with_jvp(
+    primals: PyTree, tangents: PyTree, *, gradient: Callable[..., Array], residual: PyTree
+) -> tuple[Array, Array]:
+    (root, inputs), (_, t_inputs) = primals, tangents
+    without = jax.tree.map(lambda t: t is None, t_inputs, is_leaf=lambda t: t is None)
+    constant, varying = eqx.partition(inputs, without, is_leaf=lambda t: t is None)
+    _, t_gradient = jax.jvp(
+        lambda v: gradient(root, residual, eqx.combine(v, constant)), (varying,), (t_inputs,)
+    )
+    inverse = jnp.linalg.inv(jax.jacfwd(lambda y: gradient(y, residual, inputs))(root))
+    inverse = jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0)
+    return root, -inverse @ t_gradient

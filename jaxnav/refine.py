@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.geometry import on_last_axis, safe_norm, transform_points
 from jaxnav.ippe import PosePair, ippe_square
-from jaxnav.levenberg_marquardt import NormalEquationsLM
+from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM
 from jaxnav.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.observation import Sightings, sightings
 from jaxnav.residuals import reprojection_residuals
@@ -161,7 +161,12 @@ def _minimise(
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6  # of the cost, what is left to gain
     solver = NormalEquationsLM(rtol=tolerance, atol=tolerance)
     solution: optx.Solution = optx.least_squares(
-        fn, solver, jnp.zeros(6, dtype), max_steps=max_steps, throw=False
+        fn,
+        solver,
+        jnp.zeros(6, dtype),
+        max_steps=max_steps,
+        adjoint=ImplicitGradient(),
+        throw=False,
     )
     return (
         chart.transform(solution.value),

@@ -13,6 +13,11 @@ import jaxlie
 import pytest
 from jaxtyping import install_import_hook
 
+# Most of a run is compilation. LLVM's costly passes win nothing on inputs as small as these.
+# XLA reads this when the first array is made.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # The pure core is all that lies beside the package's __init__, less the shell. The hook sees what

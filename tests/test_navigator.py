@@ -201,7 +201,9 @@ def test_the_first_two_steps_by_hand():
 
     angle, distance, _ = paper.steering(out.pose, worlds.WAYPOINTS_M[0], STEERING_RAD, WHEELBASE_M)
     assert out.command.steering_rad == pytest.approx(np.clip(angle, -0.5, 0.5), abs=1e-9)
-    assert out.command.throttle == pytest.approx(0.05 * distance + 0.01 * DT_S * distance)
+    gains = nav.controller
+    throttle = (gains.proportional_per_m + gains.integral_per_ms * DT_S) * distance
+    assert out.command.throttle == pytest.approx(float(throttle))
 
     state, out = step(nav, state, at(obs, 1))
     x, P = kalman.predict(x, P, DT_S, np.asarray(motion.acceleration_density))

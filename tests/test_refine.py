@@ -253,6 +253,14 @@ def test_the_start_has_no_gradient_and_hidden_lanes_neither(room):
     assert np.all(by_corner[~hidden] != 0)
 
 
+def test_gradients_never_call_the_host():
+    """No error check that raises from inside jit: failure is a value, and the compile is cached."""
+    corners = jnp.asarray(CORNER_SIGNS[:, :2] * 0.1)
+    slope = jax.jit(jax.jacrev(lambda c: solve_marker(c, 0.2).T_camera_marker.wxyz_xyz))
+    assert "callback" not in slope.lower(corners).as_text()
+    assert np.all(np.isfinite(slope(jnp.zeros((4, 2)))))
+
+
 def test_gradients_are_finite_without_a_sight_and_frontally(precision):
     """Exactly frontal, at the start itself and with every lane masked."""
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()
