@@ -15,20 +15,26 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxnav.ambiguity import LowestReprojection as LowestReprojection
+    from jaxnav.ambiguity import Mahalanobis as Mahalanobis
+    from jaxnav.ambiguity import ObjectSpace as ObjectSpace
+    from jaxnav.ambiguity import Oracle as Oracle
+    from jaxnav.ambiguity import OrientationGiven as OrientationGiven
     from jaxnav.ambiguity import PaperCost as PaperCost
+    from jaxnav.ambiguity import RatioTest as RatioTest
     from jaxnav.bicycle import Vehicle as Vehicle
+    from jaxnav.bicycle_kalman import BicycleKalman as BicycleKalman
     from jaxnav.camera import Camera as Camera
+    from jaxnav.constant_velocity import ConstantVelocity as ConstantVelocity
     from jaxnav.errors import BadInput as BadInput
     from jaxnav.files import load_camera as load_camera
     from jaxnav.files import load_markers as load_markers
     from jaxnav.files import load_rig as load_rig
     from jaxnav.files import load_route as load_route
     from jaxnav.files import load_vehicle as load_vehicle
+    from jaxnav.hypotheses import MultiHypothesis as MultiHypothesis
     from jaxnav.ippe import PosePair as PosePair
     from jaxnav.ippe import ippe_square as ippe_square
     from jaxnav.markers import MarkerMap as MarkerMap
-    from jaxnav.motion import BicycleKalman as BicycleKalman
-    from jaxnav.motion import ConstantVelocity as ConstantVelocity
     from jaxnav.navigator import Navigator as Navigator
     from jaxnav.navigator import Observation as Observation
     from jaxnav.refine import refine_pose as refine_pose
@@ -43,15 +49,21 @@ if TYPE_CHECKING:
 # The imports above tell the same to type checkers; a test holds the two together.
 _MODULE_OF = {
     "BadInput": "errors",
-    "BicycleKalman": "motion",
+    "BicycleKalman": "bicycle_kalman",
     "Camera": "camera",
     "CameraRig": "rig",
-    "ConstantVelocity": "motion",
+    "ConstantVelocity": "constant_velocity",
     "LowestReprojection": "ambiguity",
     "MarkerMap": "markers",
     "Navigator": "navigator",
     "Observation": "navigator",
+    "MultiHypothesis": "hypotheses",
     "PaperCost": "ambiguity",
+    "RatioTest": "ambiguity",
+    "OrientationGiven": "ambiguity",
+    "Oracle": "ambiguity",
+    "ObjectSpace": "ambiguity",
+    "Mahalanobis": "ambiguity",
     "PosePair": "ippe",
     "Vehicle": "bicycle",
     "e1": "residuals",

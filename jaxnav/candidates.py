@@ -11,10 +11,10 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.camera import Camera
-from jaxnav.geometry import safe_norm, transform_points
+from jaxnav.geometry import on_ground, safe_norm, transform_points
 from jaxnav.ippe import ippe_from_rays
 from jaxnav.markers import MarkerMap
-from jaxnav.observation import Observation, Sightings, cameras_of, sightings
+from jaxnav.observation import Sightings, Snapshot, cameras_of
 from jaxnav.refine import refine_sightings
 from jaxnav.residuals import reprojection_residuals
 from jaxnav.rig import CameraRig
@@ -40,14 +40,7 @@ class Candidates(eqx.Module):
 
 
 def find_candidates(
-    rig: CameraRig,
-    markers: MarkerMap,
-    obs: Observation,
-    corner_sigma_px: Float[Array, ""] | float = 1.0,
-    model_sigma_px: Float[Array, ""] | float = 0.15,
-    max_sightings: int = 16,
-    max_candidates: int = 4,
-    max_steps: int = 12,
+    snapshot: Snapshot, max_candidates: int = 4, max_steps: int = 12, ground_plane: bool = False
 ) -> Candidates:
     """Every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
 
@@ -56,17 +49,14 @@ def find_candidates(
     `max_candidates` that explain all corners best are refined.
 
     Args:
-        corner_sigma_px: for observations that bring no sigma of their own.
-        model_sigma_px: what lens calibration and rolling shutter leave in a corner, added in
-            quadrature to the sigma that an observation brings.
-        max_sightings: the largest ones are used.
+        snapshot: what is seen.
         max_steps: bound on the LM steps.
+        ground_plane: keep the vehicle level on the ground, z = 0: only (x, y, psi) are refined.
     """
-    sigma_px = corner_sigma_px
-    if obs.corner_sigma_px is not None:
-        sigma_px = jnp.sqrt(obs.corner_sigma_px**2 + model_sigma_px**2)
-    seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, max_sightings)
+    rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
     Ts_vehicle_world, owner_visible = _both_poses(rig, markers, seen)
+    if ground_plane:
+        Ts_vehicle_world = jax.vmap(lambda T: on_ground(T.inverse()).inverse())(Ts_vehicle_world)
 
     def joint_e1(T_vehicle_world: jaxlie.SE3) -> Array:
         corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
@@ -79,7 +69,7 @@ def find_candidates(
         Ts_vehicle_world = jaxlie.SE3(Ts_vehicle_world.wxyz_xyz[best])
         owner_visible = owner_visible[best]
 
-    refined = jax.vmap(lambda T: refine_sightings(rig, markers, seen, T, max_steps))(
+    refined = jax.vmap(lambda T: refine_sightings(rig, markers, seen, T, max_steps, ground_plane))(
         Ts_vehicle_world
     )
     e1_px2 = jax.vmap(joint_e1)(refined.T_vehicle_world)

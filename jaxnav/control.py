@@ -5,6 +5,7 @@ Source: Liu, Schofield, Shan (2023), Eqs. 16-19.
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.bicycle import Vehicle, sideslip_rad
@@ -32,6 +33,25 @@ class ControlState(eqx.Module):
 
     waypoint_index: Int[Array, ""]  # W once the last one is reached
     integral_ms: Float[Array, ""]
+    explored_s: Float[Array, ""]  # how long it has been looking around since it was last sure
+    side: Float[Array, ""]  # to which side of the line of sight it does: 1 left, -1 right, 0 none
+
+
+class Exploration(eqx.Module):
+    """How a car moves that does not know yet which of several poses it has.
+
+    Slowly, on a course at `angle_rad` to the line of sight, to the side it points to already: that
+    is where the poses and their mirror images drift apart. Whichever pose is the true one, the
+    car gets nearer to the marker and so stays inside the circle around it that it stood on, and
+    the ground between the two is open, since the marker is seen. After `duration_s`, or nearer than
+    `min_range_m`, it stands still until it knows.
+    """
+
+    speed_mps: float = 0.5
+    angle_rad: float = float(np.deg2rad(60.0))
+    reach_m: float = 0.4  # how sharply it turns onto that course
+    min_range_m: float = 0.7
+    duration_s: float = 12.0
 
 
 class Controller(eqx.Module):
@@ -39,7 +59,8 @@ class Controller(eqx.Module):
 
     The paper's sum of distances (Eq. 19) never decreases: here it is an integral over time, held
     inside `integral_limit_ms`, and starts anew at every waypoint. After the last waypoint the
-    throttle is zero, and so it is before the first pose and where the pose is no number.
+    throttle is zero, and so it is before the first pose and where the pose is no number. While the
+    pose is undecided the car explores instead, and no waypoint counts as reached.
     """
 
     waypoints_m: Float[Array, "W 2"]
@@ -48,10 +69,12 @@ class Controller(eqx.Module):
     proportional_per_m: Float[Array, ""]  # p1, throttle per metre
     integral_per_ms: Float[Array, ""]  # p2, throttle per metre second
     integral_limit_ms: Float[Array, ""]
+    exploration: Exploration = Exploration()
 
     def init(self) -> ControlState:
         """At the first waypoint, nothing summed up."""
-        return ControlState(jnp.asarray(0), jnp.zeros_like(self.waypoint_radius_m))
+        zero = jnp.zeros_like(self.waypoint_radius_m)
+        return ControlState(jnp.asarray(0), zero, zero, zero)
 
     def __call__(
         self,
@@ -60,6 +83,8 @@ class Controller(eqx.Module):
         located: Bool[Array, ""],
         steering_rad: Float[Array, ""],
         dt_s: Float[Array, ""],
+        decided: Bool[Array, ""] | bool = True,
+        to_marker_m: Float[Array, " 2"] | None = None,
     ) -> tuple[ControlState, Command, Bool[Array, ""], ControlLog]:
         """One command.
 
@@ -68,12 +93,19 @@ class Controller(eqx.Module):
             located: whether the pose means anything yet.
             steering_rad: measured steering angle, for the sideslip; 0 stands in for no number.
             dt_s: time since the previous call; 0 stands in for no positive number.
+            decided: whether the pose may be acted upon.
+            to_marker_m: the nearest marker, seen from the vehicle in its own axes: alike under all
+                poses that are still possible. Needed where `decided` may be False.
 
         Returns:
             The next state, the command, whether the last waypoint is reached, and the log.
         """
         count = self.waypoints_m.shape[0]
-        arrived = located & (self._distance(state.waypoint_index, pose) <= self.waypoint_radius_m)
+        arrived = (
+            located
+            & decided
+            & (self._distance(state.waypoint_index, pose) <= self.waypoint_radius_m)
+        )
         index = jnp.minimum(
             state.waypoint_index + (arrived & (state.waypoint_index < count)), count
         )
@@ -90,16 +122,49 @@ class Controller(eqx.Module):
 
         steering = self._steering(alpha_rad, distance_m, beta_rad)
         integral_ms = jnp.where(arrived, 0, state.integral_ms)
-        integral_ms = integral_ms + jnp.where(drives, distance_m * dt_s, 0)
+        integral_ms = integral_ms + jnp.where(drives & decided, distance_m * dt_s, 0)
         integral_ms = jnp.clip(integral_ms, 0, self.integral_limit_ms)
         throttle = self.proportional_per_m * distance_m + self.integral_per_ms * integral_ms
         limit = self.vehicle.throttle_limit
+        state, explore = self._explore(state, decided, to_marker_m, beta_rad, dt_s)
+        steering = jnp.where(decided, steering, explore.steering_rad)
+        throttle = jnp.where(decided, jnp.clip(throttle, -limit, limit), explore.throttle)
         command = Command(
             steering_rad=jnp.where(drives, steering, 0),
-            throttle=jnp.where(drives, jnp.clip(throttle, -limit, limit), 0),
+            throttle=jnp.where(drives, throttle, 0),
         )
         log = ControlLog(distance_m, alpha_rad, beta_rad, integral_ms)
-        return ControlState(index, integral_ms), command, done, log
+        state = ControlState(index, integral_ms, state.explored_s, state.side)
+        return state, command, done, log
+
+    def _explore(
+        self,
+        state: ControlState,
+        decided: Bool[Array, ""] | bool,
+        to_marker_m: Float[Array, " 2"] | None,
+        beta_rad: Float[Array, ""],
+        dt_s: Float[Array, ""],
+    ) -> tuple[ControlState, Command]:
+        """The command of a car that is not sure of its pose."""
+        zero = jnp.zeros_like(beta_rad)
+        if to_marker_m is None:
+            return state, Command(zero, zero)
+        explore, limit = self.exploration, self.vehicle.steering_limit_rad
+        range_m = safe_norm(to_marker_m)
+        bearing_rad = safe_atan2(to_marker_m[1], to_marker_m[0])
+        nearer_side = jnp.where(bearing_rad > 0, -1.0, 1.0).astype(beta_rad.dtype)
+        side = jnp.where(state.side == 0, nearer_side, state.side)
+        alpha_rad = wrap_angle(bearing_rad + side * explore.angle_rad - beta_rad)
+        steering = self._steering(alpha_rad, jnp.asarray(explore.reach_m, limit.dtype), beta_rad)
+        goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
+        throttle = explore.speed_mps / self.vehicle.speed_per_throttle_mps
+        throttle = jnp.minimum(throttle, self.vehicle.throttle_limit)
+        return ControlState(
+            state.waypoint_index,
+            state.integral_ms,
+            jnp.where(decided, 0, state.explored_s + dt_s),
+            jnp.where(decided, 0, side),
+        ), Command(steering, jnp.where(goes, throttle, 0))
 
     def _distance(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
         waypoint_m = self.waypoints_m[jnp.minimum(index, self.waypoints_m.shape[0] - 1)]

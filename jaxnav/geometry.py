@@ -46,6 +46,31 @@ def planar_from_T_world_vehicle(T_world_vehicle: jaxlie.SE3) -> Float[Array, "*b
     return jnp.concatenate([position_m[..., :2], safe_atan2(sine, cosine)[..., None]], axis=-1)
 
 
+def right_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
+    """J in exp(xi + d) = exp(xi) exp(J d) for small d: the sum of (-ad xi)^k / (k + 1)!.
+
+    jaxlie's `jlog` is its inverse, but loses its digits at turns below a degree, and its gradient
+    is NaN at none. Good to 1e-9 up to a radian.
+    """
+    v, w = xi[:3], xi[3:]
+
+    def cross(a: Array) -> Array:
+        zero = jnp.zeros_like(a[0])
+        return jnp.stack([zero, -a[2], a[1], a[2], zero, -a[0], -a[1], a[0], zero]).reshape(3, 3)
+
+    minus_ad = -jnp.block([[cross(w), cross(v)], [jnp.zeros((3, 3), xi.dtype), cross(w)]])
+    term = total = jnp.eye(6, dtype=xi.dtype)
+    for k in range(1, 13):
+        term = term @ minus_ad / (k + 1)
+        total = total + term
+    return total
+
+
+def on_ground(T_world_vehicle: jaxlie.SE3) -> jaxlie.SE3:
+    """The level pose on the ground at the same place and heading."""
+    return T_world_vehicle_from_planar(planar_from_T_world_vehicle(T_world_vehicle))
+
+
 def planar_covariance(
     T_world_vehicle: jaxlie.SE3, covariance: Float[Array, "6 6"]
 ) -> Float[Array, "3 3"]:

@@ -4,9 +4,10 @@ Source: Liu, Schofield, Shan (2023), Eqs. 8-11; the covariance update in the for
 Joseph (1968), since Eq. 11's (I - K H) P loses positive definiteness in float32.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxnav.small_matrices import cho_solve, cholesky
 
 # A variance never falls below this fraction of the largest one.
 _RELATIVE_FLOOR = 1e-12
@@ -33,7 +34,7 @@ def update(
     Source: Eqs. 10 and 11; P = (I - K H) P (I - K H)' + K R K'.
     """
     S = symmetrise(H @ P @ H.T + R)
-    K = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(S), True), H @ P).T
+    K = cho_solve(cholesky(S), H @ P).T
     I_KH = jnp.eye(P.shape[0], dtype=P.dtype) - K @ H
     posterior = symmetrise(I_KH @ P @ I_KH.T + K @ R @ K.T)
     floor = _RELATIVE_FLOOR * jnp.max(jnp.diagonal(P))
@@ -53,7 +54,7 @@ def hide_rows(
 
 def nis(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
     """Normalised innovation squared, chi-square with m degrees of freedom."""
-    return innovation @ jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(S), True), innovation)
+    return innovation @ cho_solve(cholesky(S), innovation)
 
 
 def symmetrise(P: Float[Array, "n n"]) -> Float[Array, "n n"]:

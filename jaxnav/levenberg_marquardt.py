@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxnav.small_matrices import cho_solve, cholesky
+
 
 class _State(eqx.Module):
     """What is known at the accepted point y: cost, gradient, J'J; and the damping to try next."""
@@ -78,8 +80,8 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
     ) -> tuple[Array, _State, PyTree]:
         """Try one damped step and learn from it."""
         eye = jnp.eye(y.size, dtype=y.dtype)
-        factor = jnp.linalg.cholesky(state.information + state.damping * eye)
-        move = -jax.scipy.linalg.cho_solve((factor, True), state.gradient)
+        factor = cholesky(state.information + state.damping * eye)
+        move = -cho_solve(factor, state.gradient)
         move = jnp.where(jnp.isfinite(move), move, 0)
         promised = jnp.sum(move * (state.damping * move - state.gradient))
 

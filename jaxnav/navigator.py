@@ -11,20 +11,17 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.ambiguity import PaperCost, Selector
+from jaxnav.ambiguity import Selector
 from jaxnav.bicycle import Vehicle
+from jaxnav.bicycle_kalman import BicycleKalman
 from jaxnav.candidates import Candidates, find_candidates
+from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.control import Command, Controller, ControlLog, ControlState
-from jaxnav.geometry import planar_from_T_world_vehicle
+from jaxnav.geometry import planar_from_T_world_vehicle, transform_points
+from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.markers import MarkerMap
-from jaxnav.motion import (
-    Belief,
-    BicycleKalman,
-    ConstantVelocity,
-    Motion,
-    restarted_where_broken,
-)
-from jaxnav.observation import Observation
+from jaxnav.motion import Belief, Motion, restarted_where_broken
+from jaxnav.observation import Observation, Snapshot
 from jaxnav.rig import CameraRig
 
 
@@ -47,7 +44,8 @@ class Output(eqx.Module):
     candidates: Candidates
     costs: Float[Array, " N"]  # of the candidates, in the selector's unit
     selected: Int[Array, ""]  # the candidate taken, -1: none
-    flip_probability: Float[Array, ""]
+    flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
+    decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
     nis: Float[Array, ""]  # of the pose taken, 0 where none was
     control_log: ControlLog | None
 
@@ -69,6 +67,7 @@ class Navigator(eqx.Module):
     max_sightings: int = eqx.field(static=True)
     max_candidates: int = eqx.field(static=True)
     max_lm_steps: int = eqx.field(static=True)
+    ground_plane: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -87,6 +86,7 @@ class Navigator(eqx.Module):
         max_sightings: int = 16,
         max_candidates: int = 4,
         max_lm_steps: int = 12,
+        ground_plane: bool = False,
     ):
         """See the fields of `Controller`, `find_candidates` and the motion models.
 
@@ -95,7 +95,7 @@ class Navigator(eqx.Module):
         """
         self.rig = rig
         self.markers = markers
-        self.selector = PaperCost() if selector is None else selector
+        self.selector = selector or MultiHypothesis()
         if motion is None:
             motion = ConstantVelocity() if vehicle is None else BicycleKalman(vehicle)
         self.motion = motion
@@ -119,28 +119,32 @@ class Navigator(eqx.Module):
         self.max_sightings = max_sightings
         self.max_candidates = max_candidates
         self.max_lm_steps = max_lm_steps
+        self.ground_plane = ground_plane
 
     def init(self) -> State:
         """Nothing seen yet, at the first waypoint."""
         control = None if self.controller is None else self.controller.init()
-        return State(self.motion.init(), control)
+        return State(self.motion.init(self.selector.hypotheses), control)
 
     def step(self, state: State, obs: Observation) -> tuple[State, Output]:
         """One pass of Algorithm 1."""
         obs = obs.usable()
-        prior = self.motion.predict(state.belief, obs.dt_s)
-        candidates = self.find_candidates(obs)
-        selection = self.selector(self.motion.poses(prior), candidates, obs, self.markers)
-        belief, nis = self.motion.update(prior, candidates, selection.weights, obs)
-        belief = restarted_where_broken(belief, self.motion.init())
+        snapshot = self.snapshot(obs)
+        prior = self.motion.predict(state.belief, obs)
+        candidates = self.find_candidates(snapshot)
+        selection = self.selector(self.motion.poses(prior), candidates, snapshot)
+        belief, nis = self.motion.update(prior, selection, obs)
+        belief = restarted_where_broken(belief, self.motion.init(self.selector.hypotheses))
 
-        best = jnp.argmax(belief.log_weight)
+        best = jnp.argmax(jnp.where(belief.initialised, belief.log_weight, -jnp.inf))
         T_world_vehicle = jax.tree.map(
             lambda leaf: leaf[best], self.motion.poses(belief).T_world_vehicle
         )
         pose = planar_from_T_world_vehicle(T_world_vehicle)
         located = belief.initialised[best]
-        control, command, done, log = self._steer(state.control, pose, located, obs)
+        control, command, done, log = self._steer(
+            state.control, T_world_vehicle, located, selection.decided, obs
+        )
         return State(belief, control), Output(
             pose=pose,
             covariance=belief.covariance[best],
@@ -152,30 +156,43 @@ class Navigator(eqx.Module):
             costs=selection.costs,
             selected=selection.selected,
             flip_probability=selection.flip_probability,
+            decided=selection.decided,
             nis=jnp.where(located, nis[best], 0),
             control_log=log,
         )
 
-    def find_candidates(self, obs: Observation) -> Candidates:
-        """Both poses of every marker in view, refined."""
-        return find_candidates(
+    def snapshot(self, obs: Observation) -> Snapshot:
+        """The observation, together with rig and map."""
+        return Snapshot.create(
             self.rig,
             self.markers,
             obs,
             self.corner_sigma_px,
             self.model_sigma_px,
             self.max_sightings,
-            self.max_candidates,
-            self.max_lm_steps,
         )
 
+    def find_candidates(self, snapshot: Snapshot) -> Candidates:
+        """Both poses of every marker in view, refined."""
+        return find_candidates(snapshot, self.max_candidates, self.max_lm_steps, self.ground_plane)
+
     def _steer(
-        self, state: ControlState | None, pose: Array, located: Array, obs: Observation
+        self,
+        state: ControlState | None,
+        T_world_vehicle: jaxlie.SE3,
+        located: Array,
+        decided: Array,
+        obs: Observation,
     ) -> tuple[ControlState | None, Command | None, Array, ControlLog | None]:
         if self.controller is None or state is None:
             return None, None, jnp.asarray(False), None
+        pose = planar_from_T_world_vehicle(T_world_vehicle)
+        centers_m = transform_points(
+            T_world_vehicle.inverse(), self.markers.Ts_world_marker.translation()
+        )[:, :2]
+        nearest_m = centers_m[jnp.argmin(jnp.sum(centers_m**2, axis=1))]
         dt_s, steering_rad = (jnp.asarray(x, pose.dtype) for x in (obs.dt_s, obs.steering_rad))
-        return self.controller(state, pose, located, steering_rad, dt_s)
+        return self.controller(state, pose, located, steering_rad, dt_s, decided, nearest_m)
 
     # Bound methods hash their owner: by identity, so that `jax.jit(navigator.step)` works.
     __hash__ = object.__hash__

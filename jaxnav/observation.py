@@ -1,8 +1,11 @@
 """What the vehicle senses at one instant, and its compact form for the solvers."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.camera import Camera
@@ -28,6 +31,12 @@ class Observation(eqx.Module):
     dt_s: Float[Array, ""] | float = 0.0  # since the previous observation
     corner_sigma_px: Float[Array, "C M 4"] | None = None  # None: the estimator's own figure
     has_odometry: Bool[Array, ""] | bool = True  # False: speed and steering are not known
+    # What another sensor knows, for `OrientationGiven`; a NaN is no reading.
+    heading_rad: Float[Array, ""] | None = None  # psi in the world
+    heading_sigma_rad: Float[Array, ""] | float = 0.02
+    normals_camera: Float[Array, "C M 3"] | None = None  # unit normal of each marker
+    normal_sigma_rad: Float[Array, ""] | float = 0.05
+    T_world_vehicle_true: jaxlie.SE3 | None = None  # simulations only, for `Oracle`
 
     def usable(self) -> "Observation":
         """The same with everything finite that a filter looks at.
@@ -39,13 +48,12 @@ class Observation(eqx.Module):
         has_odometry = self.has_odometry & (jnp.abs(self.speed_mps) < _MAX_SPEED_MPS) & can_steer
         dt_s = jnp.asarray(self.dt_s)
         usable_dt = (dt_s > 0) & (dt_s < _MAX_DT_S)
-        return Observation(
-            corners_px=self.corners_px,
+        return dataclasses.replace(
+            self,
             visible=self.visible & jnp.all(jnp.isfinite(self.corners_px), axis=(2, 3)),
             speed_mps=jnp.where(has_odometry, self.speed_mps, 0.0),
             steering_rad=jnp.where(can_steer, self.steering_rad, 0.0),
             dt_s=jnp.where(usable_dt, dt_s, 0.0),
-            corner_sigma_px=self.corner_sigma_px,
             has_odometry=has_odometry,
         )
 
@@ -115,6 +123,38 @@ def sightings(
         sigma_px=sigma[slots],
         visible=seen[slots],
     )
+
+
+class Snapshot(eqx.Module):
+    """One observation by a rig in a map: all that a pose can be held against."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    obs: Observation
+    seen: Sightings
+
+    @staticmethod
+    def create(
+        rig: CameraRig,
+        markers: MarkerMap,
+        obs: Observation,
+        corner_sigma_px: Float[Array, ""] | float = 1.0,
+        model_sigma_px: Float[Array, ""] | float = 0.15,
+        max_sightings: int = 16,
+    ) -> "Snapshot":
+        """An observation together with what it is an observation of.
+
+        Args:
+            corner_sigma_px: for observations that bring no sigma of their own.
+            model_sigma_px: what lens calibration and rolling shutter leave in a corner, added
+                in quadrature to the sigma that an observation brings.
+            max_sightings: the largest ones are used.
+        """
+        sigma_px = corner_sigma_px
+        if obs.corner_sigma_px is not None:
+            sigma_px = jnp.sqrt(obs.corner_sigma_px**2 + model_sigma_px**2)
+        seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, max_sightings)
+        return Snapshot(rig, markers, obs, seen)
 
 
 def cameras_of(rig: CameraRig, seen: Sightings) -> Camera:

@@ -191,6 +191,36 @@ def photo_with_poses(view: View) -> Figure:
     return figure
 
 
+def reliability_diagram(
+    predicted: np.ndarray, observed: np.ndarray, counts: np.ndarray, title: str = ""
+) -> Figure:
+    """How often what was predicted with a probability came true.
+
+    Args:
+        predicted: (B,) mean prediction of each bin.
+        observed: (B,) frequency in each bin, drawn with its Wilson interval.
+        counts: (B,) members of each bin, drawn below.
+        title: above everything.
+    """
+    figure = Figure(figsize=(6, 6.5), layout="constrained")
+    figure.suptitle(title, fontsize=9)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
+    z = 1.96
+    center = (observed + z**2 / (2 * counts)) / (1 + z**2 / counts)
+    half = np.sqrt(observed * (1 - observed) / counts + (z / (2 * counts)) ** 2)
+    half = half * z / (1 + z**2 / counts)
+    upper.plot([0, 1], [0, 1], color=BLACK, lw=1, ls=":", label="calibrated")
+    upper.vlines(predicted, center - half, center + half, color=BLUE, lw=1)
+    upper.plot(predicted, observed, "o-", color=BLUE, ms=4, label="observed")
+    upper.set(ylabel="frequency of a flip", xlim=(0, 1), ylim=(0, 1))
+    upper.legend(loc="upper left", fontsize=8)
+    lower.bar(predicted, counts, width=0.03, color=BLUE)
+    lower.set(xlabel="flip probability", ylabel="frames", yscale="log")
+    for axes in (upper, lower):
+        axes.grid(alpha=0.3)
+    return figure
+
+
 def _styled(truth: Track, methods: Sequence[Track]) -> list[tuple[Track, dict[str, Any]]]:
     return [
         (truth, {"color": BLACK, "lw": 2.2, "alpha": 0.75}),

@@ -24,6 +24,7 @@ from jaxnav.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.observation import Sightings, sightings
 from jaxnav.residuals import reprojection_residuals
 from jaxnav.rig import CameraRig
+from jaxnav.small_matrices import cholesky, solve_lower
 
 # An angle is known to about a radian, and a distance to about itself, before any corner is
 # looked at. Bounds the covariance where the corners say nothing.
@@ -72,8 +73,13 @@ def refine_sightings(
     seen: Sightings,
     T_vehicle_world: jaxlie.SE3,
     max_steps: int,
+    ground_plane: bool = False,
 ) -> RefinedPose:
-    """`refine_pose` on sightings that have been gathered already."""
+    """`refine_pose` on sightings that have been gathered already.
+
+    With `ground_plane` a level start stays level on the ground: the vehicle's x, y and heading
+    alone are refined, and the covariance is that of these three.
+    """
 
     def residual(corners_vehicle: Array) -> Array:
         pixels = reprojection_residuals(rig, seen, corners_vehicle)
@@ -86,12 +92,14 @@ def refine_sightings(
     corners_world = markers.corners_world_m
 
     T, steps, converged = _minimise(
-        residual, T_vehicle_world, corners_world, center_world, any_visible, max_steps
+        residual, T_vehicle_world, corners_world, center_world, any_visible, max_steps, ground_plane
     )
     chart = _chart(T, corners_world, center_world)
-    J = jax.jacfwd(lambda y: residual(chart.points(y)))(jnp.zeros(6, chart.pivot.dtype))
-    cost = jnp.sum(residual(chart.points(jnp.zeros(6, chart.pivot.dtype))) ** 2)
-    covariance = _body_covariance(chart, J)
+    free = _directions(ground_plane, chart.pivot.dtype)
+    here = jnp.zeros(free.shape[1], chart.pivot.dtype)
+    J = jax.jacfwd(lambda y: residual(chart.points(free @ y)))(here)
+    cost = jnp.sum(residual(chart.points(free @ here)) ** 2)
+    covariance = _body_covariance(chart, J, free)
     numbers = jnp.concatenate([T.wxyz_xyz, cost[None], covariance.reshape(-1)])
     finite = jnp.all(jnp.isfinite(numbers))
     return RefinedPose(
@@ -145,6 +153,7 @@ def _minimise(
     center_source: Array,
     constrained: Array,
     max_steps: int,
+    ground_plane: bool = False,
 ) -> tuple[jaxlie.SE3, Array, Array]:
     """LM on residual(points in the target frame), from a pose.
 
@@ -152,10 +161,11 @@ def _minimise(
     independent of the start.
     """
     chart = _chart(jax.lax.stop_gradient(T_start), points_source, center_source)
+    free = _directions(ground_plane, chart.pivot.dtype)
 
     def fn(y: Array, args: None) -> Array:
         # Without a visible corner y itself is the residual: nothing moves, no 0 / 0.
-        return jnp.concatenate([residual(chart.points(y)), jnp.where(constrained, 0, y)])
+        return jnp.concatenate([residual(chart.points(free @ y)), jnp.where(constrained, 0, y)])
 
     dtype = chart.pivot.dtype
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6  # of the cost, what is left to gain
@@ -163,35 +173,45 @@ def _minimise(
     solution: optx.Solution = optx.least_squares(
         fn,
         solver,
-        jnp.zeros(6, dtype),
+        jnp.zeros(free.shape[1], dtype),
         max_steps=max_steps,
         adjoint=ImplicitGradient(),
         throw=False,
     )
     return (
-        chart.transform(solution.value),
+        chart.transform(free @ solution.value),
         solution.stats["num_steps"],
         jnp.asarray(solution.result == optx.RESULTS.successful),
     )
 
 
-def _body_covariance(chart: _Chart, J: Array) -> Array:
+def _directions(ground_plane: bool, dtype: jnp.dtype) -> Array:
+    """The directions of the chart in which a pose is refined, (6, 6) or (6, 3).
+
+    The frame the chart lives in is the vehicle's: on the ground it shifts along x and y and turns
+    about z.
+    """
+    eye = np.eye(6)
+    return jnp.asarray(eye[:, [0, 1, 5]] if ground_plane else eye, dtype)
+
+
+def _body_covariance(chart: _Chart, J: Array, free: Array) -> Array:
     """Covariance of xi in T_world_vehicle * exp(xi) from the whitened Jacobian in the chart.
 
     Inverted in the chart, where the information matrix is well conditioned, and carried over:
     y moves T_vehicle_world on the left by (scale * shift + pivot x turn, turn), and xi is minus
     that.
     """
-    information = J.T @ J + jnp.eye(6, dtype=J.dtype) / _PRIOR_SIGMA**2
-    factor = jnp.linalg.cholesky(information)
+    information = J.T @ J + jnp.eye(J.shape[1], dtype=J.dtype) / _PRIOR_SIGMA**2
+    factor = cholesky(information)
     px, py, pz = chart.pivot
     zero = jnp.zeros_like(px)
     cross = jnp.stack(
         [jnp.stack([zero, -pz, py]), jnp.stack([pz, zero, -px]), jnp.stack([-py, px, zero])]
     )
     eye = jnp.eye(3, dtype=J.dtype)
-    carry = jnp.block([[chart.scale * eye, cross], [jnp.zeros_like(eye), eye]])
-    root = jax.scipy.linalg.solve_triangular(factor, carry.T, lower=True)
+    carry = jnp.block([[chart.scale * eye, cross], [jnp.zeros_like(eye), eye]]) @ free
+    root = solve_lower(factor, carry.T)
     return root.T @ root
 
 

@@ -1,19 +1,39 @@
 """Both poses of everything in view, merged and pruned."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+import scipy.optimize
 
 from jaxnav.candidates import Candidates, find_candidates
-from jaxnav.observation import Observation
+from jaxnav.geometry import planar_from_T_world_vehicle
+from jaxnav.observation import Observation, Snapshot
 from jaxnav.residuals import e1
 from tests import worlds
 
 ROOM_VIEW = (0.2, 0.1, 0.6)
-find = jax.jit(find_candidates, static_argnames=("max_sightings", "max_candidates", "max_steps"))
+SIZES = ("max_sightings", "max_candidates", "max_steps", "ground_plane")
+
+
+@functools.partial(jax.jit, static_argnames=SIZES)
+def find(
+    rig,
+    markers,
+    obs,
+    corner_sigma_px=1.0,
+    model_sigma_px=0.15,
+    max_sightings=16,
+    max_candidates=4,
+    max_steps=12,
+    ground_plane=False,
+):
+    snapshot = Snapshot.create(rig, markers, obs, corner_sigma_px, model_sigma_px, max_sightings)
+    return find_candidates(snapshot, max_candidates, max_steps, ground_plane)
 
 
 def view(markers, pose, sigma_px=0.0, seed=0):
@@ -172,6 +192,69 @@ def test_few_sightings_are_the_largest_ones():
     assert np.all(np.isfinite(spoilt))
 
 
+GROUND_VIEWS = [worlds.START_VIEW, worlds.OVERLAP_VIEW]
+
+
+@pytest.mark.parametrize("pose", GROUND_VIEWS)
+def test_on_the_ground_only_three_numbers_are_refined(pose, precision):
+    rig, markers, obs = view(worlds.paper_markers(), pose, 0.5, seed=2)
+    free = find(rig, markers, obs, max_steps=40)
+    level = find(rig, markers, obs, max_steps=40, ground_plane=True)
+    single = precision == np.float32
+    assert level.valid[0]
+    assert level.e1_px2.dtype == precision
+    T = np.asarray(jax.vmap(lambda T: T.inverse().as_matrix())(level.T_vehicle_world))
+    np.testing.assert_allclose(T[:, 2, 3], 0, atol=1e-5 if single else 1e-12)
+    np.testing.assert_allclose(T[:, 2], np.tile([0, 0, 1, 0], (4, 1)), atol=1e-5)
+    # Three numbers can't explain the corners better than six.
+    assert level.e1_px2[0] >= free.e1_px2[0] * (1 - 1e-4)
+    # And what is left is noise.
+    assert level.e1_px2[0] < 8 * 0.5**2 * 8
+    kept = np.asarray(level.covariance)
+    np.testing.assert_array_equal(kept[:, 2:5], 0)
+    np.testing.assert_array_equal(kept[:, :, 2:5], 0)
+    planar = kept[:, [0, 1, 5]][:, :, [0, 1, 5]]
+    assert np.all(np.linalg.eigvalsh(planar) > 0)
+    errors = pose_errors(level, pose)
+    assert errors[np.asarray(level.valid), 0].min() < 0.2
+
+
+@pytest.mark.parametrize("pose", GROUND_VIEWS)
+def test_on_the_ground_the_minimum_is_scipy_s(pose):
+    """Pose, cost and covariance of (x, y, psi) by least squares on the projected pixels."""
+    sigma_px = 0.5
+    rig, markers, obs = view(worlds.paper_markers(), pose, sigma_px, seed=2)
+    level = find(rig, markers, obs, jnp.asarray(sigma_px), max_steps=40, ground_plane=True)
+    shown = np.asarray(obs.visible)[:, :, None, None]
+
+    @jax.jit
+    def pixels(planar):
+        T_vehicle_world = worlds.T_world_vehicle_from_planar(planar).inverse()
+        gap = rig.project(T_vehicle_world, markers.corners_world_m) - obs.corners_px
+        return jnp.where(shown, gap, 0).reshape(-1) / sigma_px
+
+    for index in np.flatnonzero(level.valid):
+        T = jaxlie.SE3(level.T_vehicle_world.wxyz_xyz[index]).inverse()
+        found = np.asarray(planar_from_T_world_vehicle(T))
+        solution = scipy.optimize.least_squares(
+            lambda x: np.asarray(pixels(jnp.asarray(x))),
+            found + 0.01, jac="3-point", method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15,
+        )  # fmt: skip
+        np.testing.assert_allclose(found, solution.x, atol=1e-5)
+        assert level.cost[index] == pytest.approx(2 * solution.cost, rel=1e-6)
+        # xi is in the vehicle's axes.
+        c, s = np.cos(found[2]), np.sin(found[2])
+        to_world = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        covariance = np.asarray(level.covariance)[index][np.ix_([0, 1, 5], [0, 1, 5])]
+        expected = np.linalg.inv(solution.jac.T @ solution.jac)
+        sigma = np.sqrt(np.diagonal(expected))
+        scale = np.outer(sigma, sigma)
+        # A weak prior bounds the estimator's covariance.
+        np.testing.assert_allclose(
+            to_world @ covariance @ to_world.T / scale, expected / scale, atol=0.02
+        )
+
+
 def test_gradients_are_finite(precision):
     """Through unproject, IPPE, pruning, LM and covariance; a frontal view and none at all."""
     rig, markers, start = view(worlds.paper_markers(), worlds.START_VIEW)
@@ -185,7 +268,7 @@ def test_gradients_are_finite(precision):
         changed = eqx.tree_at(
             lambda r: (r.cameras.focal_px, r.Ts_camera_vehicle), rig, (focal_px, jaxlie.SE3(Ts))
         )
-        candidates = find_candidates(changed, markers, Observation(corners_px, visible))
+        candidates = find(changed, markers, Observation(corners_px, visible))
         leaves = jax.tree.leaves(eqx.filter(candidates, eqx.is_inexact_array))
         return sum(jnp.sum(leaf) for leaf in leaves)
 

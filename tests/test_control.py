@@ -45,6 +45,12 @@ def act(control, pose, steering_rad=0.0, dt_s=0.1, state=None, located=True):
     )
 
 
+def remembered(waypoint_index: int, integral_ms: float) -> ControlState:
+    """A controller that has driven for a while, sure of its pose."""
+    zero = jnp.asarray(0.0)
+    return ControlState(jnp.asarray(waypoint_index), jnp.asarray(integral_ms), zero, zero)
+
+
 def test_steering_is_equations_16_to_18(precision):
     rng = np.random.default_rng(0)
     rtol = 2e-5 if precision == np.float32 else 1e-12
@@ -148,7 +154,7 @@ def test_the_sum_does_not_wind_up_and_starts_anew_at_every_waypoint():
 
 def test_it_stops_at_the_last_waypoint_for_good():
     control = controller()
-    state = ControlState(jnp.asarray(1), jnp.asarray(2.0))
+    state = remembered(1, 2.0)
     state, command, done, _ = act(control, (0.5, 0.6, 1.0), state=state)
     assert done
     assert (command.steering_rad, command.throttle) == (0, 0)
@@ -167,6 +173,158 @@ def test_it_waits_until_it_is_located():
     assert not done
 
 
+def look_around(
+    control, to_marker_m, state=None, pose=(3.0, 0.0, 2.0), decided=False, dt_s=0.1,
+    steering_rad=0.0, located=True,
+):  # fmt: skip
+    """One call of a car that does not know where it is, and sees a marker from there."""
+    return call(
+        control,
+        control.init() if state is None else state,
+        jnp.asarray(pose, float),
+        jnp.asarray(located),
+        jnp.asarray(steering_rad, float),
+        jnp.asarray(dt_s, float),
+        jnp.asarray(decided),
+        jnp.asarray(to_marker_m, float),
+    )
+
+
+def polar(range_m: float, bearing_deg: float) -> tuple[float, float]:
+    bearing = np.deg2rad(bearing_deg)
+    return range_m * np.cos(bearing), range_m * np.sin(bearing)
+
+
+def test_a_decided_car_drives_as_before(precision):
+    """Whatever is near, and whatever it did before it knew."""
+    control = controller()
+    for bearing_deg in (-70, 10, 150):
+        state, command, done, log = look_around(control, polar(1.5, bearing_deg), decided=True)
+        expected = act(control, (3.0, 0.0, 2.0))
+        for leaf, value in zip(
+            jax.tree.leaves((state, command, done, log)), jax.tree.leaves(expected), strict=True
+        ):
+            np.testing.assert_array_equal(leaf, value)
+            assert leaf.dtype in (precision, bool, jnp.asarray(0).dtype)
+
+
+@pytest.mark.parametrize("bearing_deg", [35.0, -35.0, 80.0, -120.0])
+def test_an_undecided_car_goes_slowly_at_60_degrees_to_the_line_of_sight(bearing_deg):
+    """A bicycle under its commands: to the side it points to already, nearer all the time."""
+    control, speed_mps = controller(), 0.3
+    explore = control.exploration
+    marker = np.array(polar(4.0, bearing_deg))
+    pose, steering, state = np.zeros(3), 0.0, None
+    ranges, courses_deg = [], []
+    for _ in range(60):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        to_marker = np.array([[c, s], [-s, c]]) @ (marker - pose[:2])
+        state, command, done, _ = look_around(
+            control, to_marker, state, pose, dt_s=0.1, steering_rad=steering
+        )
+        assert not done
+        throttle = explore.speed_mps / float(control.vehicle.speed_per_throttle_mps)
+        assert command.throttle == pytest.approx(throttle)
+        assert abs(float(command.steering_rad)) <= 0.5
+        steering = float(command.steering_rad)
+        course = pose[2] + np.arctan(np.tan(steering) / 2)
+        sight = np.arctan2(*(marker - pose[:2])[::-1])
+        courses_deg.append(np.rad2deg(np.angle(np.exp(1j * (course - sight)))))
+        ranges.append(np.hypot(*to_marker))
+        pose = paper.drive(pose, speed_mps, steering, 0.1, WHEELBASE_M, 20)[-1]
+    # It pointed to the right of a marker on its left.
+    side = -np.sign(bearing_deg)
+    assert float(state.side) == side
+    np.testing.assert_allclose(courses_deg[-20:], side * 60.0, atol=6.0)
+    if abs(bearing_deg) < 90:
+        assert np.all(np.diff(ranges) < 0)
+    else:
+        assert np.all(np.diff(ranges[-20:]) < 0)
+    assert float(state.explored_s) == pytest.approx(6.0)
+
+
+def test_it_keeps_its_side_until_it_knows():
+    control = controller()
+    state, first, _, _ = look_around(control, polar(2.0, 5.0))
+    assert state.side == -1
+    state, second, _, _ = look_around(control, polar(2.0, -20.0), state)
+    assert state.side == -1
+    assert first.steering_rad < 0
+    assert second.steering_rad < 0
+    state, _, _, _ = look_around(control, polar(2.0, -20.0), state, decided=True)
+    assert (state.side, state.explored_s) == (0, 0)
+    state, third, _, _ = look_around(control, polar(2.0, -20.0), state)
+    assert state.side == 1
+    assert third.steering_rad > 0
+
+
+def test_it_stands_still_too_near_and_after_too_long():
+    control = controller()
+    nearest_m = control.exploration.min_range_m
+    for range_m, goes in ((nearest_m + 0.01, True), (nearest_m - 0.01, False), (0.0, False)):
+        _, command, _, _ = look_around(control, polar(range_m, 20.0))
+        assert (command.throttle > 0) == goes
+        assert np.isfinite(command.steering_rad)
+    state, count = None, round(control.exploration.duration_s / 0.5)
+    for step in range(count + 3):
+        state, command, _, _ = look_around(control, polar(3.0, 20.0), state, dt_s=0.5)
+        assert (command.throttle > 0) == (step < count)
+    # Once it has known in between it may look around anew.
+    state, _, _, _ = look_around(control, polar(3.0, 20.0), state, decided=True)
+    state, command, _, _ = look_around(control, polar(3.0, 20.0), state)
+    assert command.throttle > 0
+
+
+def test_no_waypoint_is_reached_and_nothing_summed_up_while_undecided():
+    control, waypoint = controller(), (*worlds.WAYPOINTS_M[0], 0.0)
+    state = remembered(0, 1.5)
+    for _ in range(5):
+        state, _, done, _ = look_around(control, polar(2.0, 20.0), state, waypoint)
+        assert int(state.waypoint_index) == 0
+        assert state.integral_ms == 1.5
+        assert not done
+    state, _, _, _ = look_around(control, polar(2.0, 20.0), state, waypoint, decided=True)
+    assert int(state.waypoint_index) == 1
+    last = (*worlds.WAYPOINTS_M[1], 0.0)
+    state, command, done, _ = look_around(control, polar(2.0, 20.0), state, last, decided=True)
+    assert done
+    # What is over stays over.
+    state, command, done, _ = look_around(control, polar(2.0, 20.0), state, last)
+    assert done
+    assert (command.steering_rad, command.throttle) == (0, 0)
+
+
+def test_it_explores_only_where_it_sees_a_marker():
+    """Before the first pose, and without a marker to look at, it stands."""
+    control = controller()
+    _, command, _, _ = look_around(control, polar(2.0, 20.0), located=False)
+    assert (command.steering_rad, command.throttle) == (0, 0)
+    zero = jnp.asarray(0.0)
+    _, command, _, _ = call(
+        control, control.init(), jnp.asarray([3.0, 0.0, 2.0]), jnp.asarray(True), zero,
+        jnp.asarray(0.1), jnp.asarray(False),
+    )  # fmt: skip
+    assert (command.steering_rad, command.throttle) == (0, 0)
+
+
+def test_exploring_has_finite_gradients():
+    control = controller()
+
+    @jax.jit
+    @jax.grad
+    def slope(floats):
+        pose, to_marker_m, steering_rad, dt_s = floats
+        state, command, _, _ = control(
+            control.init(), pose, jnp.asarray(True), steering_rad, dt_s, jnp.asarray(False),
+            to_marker_m,
+        )  # fmt: skip
+        return command.steering_rad + command.throttle + state.explored_s
+
+    for to_marker in (polar(2.0, 20.0), (0.0, 0.0), (-1.0, 0.0)):
+        floats = (jnp.asarray([3.0, 0, 2]), jnp.asarray(to_marker, float), *jnp.asarray([0.1, 0.1]))
+        assert all(np.all(np.isfinite(leaf)) for leaf in slope(floats))
+
+
 ANYTHING = st.floats(allow_nan=True, allow_infinity=True)
 WHATEVER = controller()
 
@@ -180,7 +338,7 @@ WHATEVER = controller()
 @example(1.3, 0.0, 0.0, np.pi / 2, 0.1, 0.0)
 def test_limits_hold_for_any_input(x_m, y_m, psi_rad, steering_rad, dt_s, integral_ms):
     integral_ms = integral_ms if 0 <= integral_ms <= 5 else 0.0
-    state = ControlState(jnp.asarray(0), jnp.asarray(integral_ms))
+    state = remembered(0, integral_ms)
     state, command, _, _ = act(WHATEVER, (x_m, y_m, psi_rad), steering_rad, dt_s, state)
     assert abs(float(command.steering_rad)) <= 0.5
     assert abs(float(command.throttle)) <= 0.3

@@ -17,9 +17,12 @@ LAYERS = {
     "models": {"bicycle", "camera", "markers", "rig"},
     "estimate & control": {
         "ambiguity",
+        "bicycle_kalman",
         "candidates",
+        "constant_velocity",
         "control",
         "evaluation",
+        "hypotheses",
         "ippe",
         "kalman",
         "levenberg_marquardt",
@@ -27,6 +30,7 @@ LAYERS = {
         "observation",
         "refine",
         "residuals",
+        "small_matrices",
     },
     "navigator": {"navigator"},
     "users": {

@@ -1,5 +1,7 @@
 """The filters against textbook NumPy, statistics and simulated motion."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,8 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxnav.candidates import Candidates
-from jaxnav.motion import Belief, BicycleKalman, ConstantVelocity, Motion, restarted_where_broken
+from jaxnav.ambiguity import PoseMeasurement, Selection
+from jaxnav.bicycle_kalman import BicycleKalman
+from jaxnav.constant_velocity import ConstantVelocity
+from jaxnav.motion import Belief, Motion, restarted_where_broken
 from jaxnav.observation import Observation
 from tests import worlds
 from tests.reference import kalman, paper
@@ -17,49 +21,53 @@ from tests.reference import kalman, paper
 WHEELBASE_M = 0.256
 
 
-def weights(taken: bool) -> jax.Array:
-    """All of candidate 0 for the only hypothesis, or nothing."""
-    return jnp.asarray([[float(taken), 0.0]])
-
-
-def candidate(T_world_vehicle: jaxlie.SE3, covariance) -> Candidates:
-    """The pose in lane 0, and a lane that must never be looked at."""
-    wxyz_xyz = T_world_vehicle.inverse().wxyz_xyz
-    other = worlds.planar(9.0, -9.0, 1.0).inverse().wxyz_xyz
-    return Candidates(
-        T_vehicle_world=jaxlie.SE3(jnp.stack([wxyz_xyz, other])),
-        e1_px2=jnp.zeros(2),
-        cost=jnp.zeros(2),
-        covariance=jnp.stack([jnp.asarray(covariance, float), 1e-9 * jnp.eye(6)]),
-        valid=jnp.asarray([True, False]),
-        converged=jnp.ones(2, bool),
-        steps=jnp.ones(2, int),
+def chosen(prior: Belief, T_world_vehicle: jaxlie.SE3, covariance, taken) -> Selection:
+    """What a selector says that gives one pose to every hypothesis, or none."""
+    count = prior.log_weight.shape[0]
+    return Selection(
+        measured=PoseMeasurement(
+            T_world_vehicle=jaxlie.SE3(jnp.tile(T_world_vehicle.wxyz_xyz, (count, 1))),
+            covariance=jnp.tile(jnp.asarray(covariance, float), (count, 1, 1)),
+            taken=jnp.full(count, taken),
+        ),
+        kept=prior.initialised,
+        log_weight=prior.log_weight,
+        heir=jnp.arange(count),
+        costs=jnp.zeros(2),
+        selected=jnp.where(taken, 0, -1),
+        flip_probability=jnp.asarray(0.0),
+        decided=jnp.asarray(True),
     )
 
 
-def reading(speed_mps=0.0, steering_rad=0.0, has_odometry=True) -> Observation:
+def reading(speed_mps=0.0, steering_rad=0.0, has_odometry=True, dt_s=0.1) -> Observation:
     return Observation(
         jnp.zeros((1, 1, 4, 2)),
         jnp.zeros((1, 1), bool),
         jnp.asarray(speed_mps, float),
         jnp.asarray(steering_rad, float),
+        jnp.asarray(dt_s, float),
         has_odometry=jnp.asarray(has_odometry),
     )
 
 
 @jax.jit
-def drive_step(motion, belief, dt_s, pose, covariance, taken, obs):
+def drive_step(motion, belief, pose, covariance, taken, obs):
     """Prediction and update with a planar pose."""
-    T_world_vehicle = worlds.planar(*pose)
-    prior = motion.predict(belief, dt_s)
-    posterior, nis = motion.update(prior, candidate(T_world_vehicle, covariance), taken, obs)
+    prior = motion.predict(belief, obs)
+    selection = chosen(prior, worlds.planar(*pose), covariance, taken)
+    posterior, nis = motion.update(prior, selection, obs)
     return prior, posterior, nis
 
 
 def started(motion, pose, covariance, speed_mps=0.3, steering_rad=0.1) -> Belief:
     obs = reading(speed_mps, steering_rad)
-    arguments = (jnp.asarray(0.1), jnp.asarray(pose), covariance, weights(True), obs)
-    return drive_step(motion, motion.init(), *arguments)[1]
+    return drive_step(motion, motion.init(), jnp.asarray(pose), covariance, True, obs)[1]
+
+
+def patient_car() -> BicycleKalman:
+    """Without a gate: every pose is believed."""
+    return BicycleKalman(worlds.qcar(), gate_nis=np.inf)
 
 
 def planar_part(covariance, psi_rad):
@@ -75,7 +83,7 @@ def planar_part(covariance, psi_rad):
 def test_200_steps_are_the_textbook_s(with_pose):
     """Random poses, odometry and intervals; with pose rows two thirds of the time, or never."""
     rng = np.random.default_rng(0)
-    motion = BicycleKalman(worlds.qcar())
+    motion = patient_car()
     first = np.array([0.5, -0.3, 3.0])
     root = 0.02 * rng.normal(size=(6, 6))
     floor = np.diag(np.asarray(motion.vision_floor) ** 2)
@@ -101,11 +109,10 @@ def test_200_steps_are_the_textbook_s(with_pose):
         _, belief, nis = drive_step(
             motion,
             belief,
-            jnp.asarray(dt_s),
             jnp.asarray(pose),
             jnp.asarray(root @ root.T),
-            weights(sees),
-            reading(speed, steering),
+            sees,
+            reading(speed, steering, dt_s=dt_s),
         )
         np.testing.assert_allclose(kalman.wrap(belief.mean[0, 2] - x[2]), 0, atol=1e-9)
         np.testing.assert_allclose(np.delete(belief.mean[0], 2), np.delete(x, 2), atol=1e-9)
@@ -118,16 +125,15 @@ def test_the_heading_s_column_of_H_is_the_derivative():
     motion = BicycleKalman(worlds.qcar())
     belief = started(motion, (0.1, 0.2, 1.0), 1e-3 * jnp.eye(6))
     speed, steering = 0.8, 0.4
-    prior, posterior, _ = drive_step(
-        motion,
-        belief,
-        jnp.asarray(0.3),
-        jnp.zeros(3),
-        jnp.eye(6),
-        weights(False),
-        reading(speed, steering),
+    _, posterior, _ = drive_step(
+        motion, belief, jnp.zeros(3), jnp.eye(6), False, reading(speed, steering, dt_s=0.3)
     )
-    x, P = np.asarray(prior.mean[0]), np.asarray(prior.covariance[0])
+    x, P = kalman.predict(
+        np.asarray(belief.mean[0]),
+        np.asarray(belief.covariance[0]),
+        0.3,
+        np.asarray(motion.acceleration_density),
+    )
 
     def residual(x):
         return paper.velocity(speed, steering, x[2], WHEELBASE_M) - x[3:]
@@ -144,20 +150,20 @@ def test_the_heading_s_column_of_H_is_the_derivative():
 
 def test_the_yaw_innovation_wraps():
     """Prediction at pi - 0.02, pose at -pi + 0.02: 0.04 rad apart and not 6.24."""
-    motion = BicycleKalman(worlds.qcar())
+    motion = patient_car()
     tight = 1e-6 * jnp.eye(6)
     belief = started(motion, (0.0, 0.0, np.pi - 0.02), tight, 0.0, 0.0)
     _, posterior, nis = drive_step(
         motion,
         belief,
-        jnp.asarray(0.0),
         jnp.asarray([0.0, 0.0, -np.pi + 0.02]),
         tight,
-        weights(True),
-        reading(),
+        True,
+        reading(dt_s=0.0),
     )
     assert abs(kalman.wrap(float(posterior.mean[0, 2]) - np.pi)) < 0.02
-    assert nis[0] == pytest.approx(0.04**2 / (2 * (1e-6 + 0.005**2)), rel=1e-3)
+    variance = 1e-6 + float(motion.vision_floor[2]) ** 2
+    assert nis[0] == pytest.approx(0.04**2 / (2 * variance), rel=1e-3)
     assert -np.pi <= posterior.mean[0, 2] < np.pi
 
 
@@ -168,15 +174,8 @@ def test_odometry_alone_moves_the_car_along_its_arc(precision):
     start = np.asarray(belief.mean[0, :3])
     variances = []
     for _ in range(40):
-        _, belief, nis = drive_step(
-            motion,
-            belief,
-            jnp.asarray(dt_s),
-            jnp.zeros(3),
-            jnp.eye(6),
-            weights(False),
-            reading(speed, steering),
-        )
+        obs = reading(speed, steering, dt_s=dt_s)
+        _, belief, nis = drive_step(motion, belief, jnp.zeros(3), jnp.eye(6), False, obs)
         assert nis[0] == 0
         variances.append(float(belief.covariance[0, 0, 0] + belief.covariance[0, 1, 1]))
     assert belief.mean.dtype == belief.covariance.dtype == precision
@@ -190,16 +189,17 @@ def test_without_odometry_the_rows_are_gone():
     motion = BicycleKalman(worlds.qcar())
     belief = started(motion, (1.0, 0.5, 0.2), 1e-4 * jnp.eye(6))
     prior, posterior, _ = drive_step(
-        motion,
-        belief,
-        jnp.asarray(0.1),
-        jnp.zeros(3),
-        jnp.eye(6),
-        weights(False),
-        reading(9.0, 0.4, False),
+        motion, belief, jnp.zeros(3), jnp.eye(6), False, reading(9.0, 0.4, False)
     )
+    x, P = kalman.predict(
+        np.asarray(belief.mean[0]),
+        np.asarray(belief.covariance[0]),
+        0.1,
+        np.asarray(motion.acceleration_density),
+    )
+    np.testing.assert_allclose(posterior.mean[0], x, rtol=1e-12)
+    np.testing.assert_allclose(posterior.covariance[0], P, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(posterior.mean, prior.mean)
-    np.testing.assert_allclose(posterior.covariance, prior.covariance, rtol=1e-9, atol=1e-12)
 
 
 def test_nis_of_a_matched_filter_is_chi_square():
@@ -220,11 +220,10 @@ def test_nis_of_a_matched_filter_is_chi_square():
         _, belief, nis = drive_step(
             motion,
             belief,
-            jnp.asarray(dt_s),
             jnp.asarray(pose),
             jnp.asarray(covariance),
-            weights(True),
-            reading(has_odometry=False),
+            True,
+            reading(has_odometry=False, dt_s=dt_s),
         )
         values.append(float(nis[0]))
     assert values[0] == 0
@@ -234,11 +233,119 @@ def test_nis_of_a_matched_filter_is_chi_square():
     assert stats.kstest(values, stats.chi2(3).cdf).pvalue > 1e-3
 
 
+def outlier_steps(kind: str):
+    """A step of one hypothesis of either model with a planar pose, at rest."""
+    motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
+
+    def step(belief, x_m, taken=True):
+        pose, covariance = jnp.asarray([x_m, 0.0, 0.0]), 1e-4 * jnp.eye(6)
+        return drive_step(motion, belief, pose, covariance, taken, reading(dt_s=0.02))
+
+    return motion, step
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_the_gate_keeps_an_outlier_out(kind):
+    """The state is the prediction's, the NIS that of the pose that was offered."""
+    motion, step = outlier_steps(kind)
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    assert belief.rejections[0] == 0
+    prior, after, nis = step(belief, 0.3)
+    blind_prior, blind, _ = step(belief, 0.3, taken=False)
+    np.testing.assert_array_equal(prior.mean, blind_prior.mean)
+    np.testing.assert_array_equal(after.mean, blind.mean)
+    np.testing.assert_array_equal(after.covariance, blind.covariance)
+    innovation, floor = np.zeros(6), np.zeros((6, 6))
+    floor[np.diag_indices(6)] = 1e-4
+    if kind == "car":
+        innovation = np.array([0.3, 0, 0]) - np.asarray(prior.mean)[0, :3]
+        S = np.asarray(prior.covariance)[0, :3, :3] + floor[:3, :3]
+    else:
+        T = worlds.planar(0.3, 0.0, 0.0)
+        innovation = np.asarray((jaxlie.SE3(prior.mean[0, :7]).inverse() @ T).log())
+        S = np.asarray(prior.covariance)[0, :6, :6] + floor
+    S = S + np.diag(np.asarray(motion.vision_floor) ** 2)
+    assert nis[0] == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
+    assert nis[0] > motion.gate_nis
+    assert after.rejections[0] == 1
+    # Where nothing is offered it is not counted, and the next good one clears the count.
+    _, unseen, _ = step(after, 0.0, taken=False)
+    assert unseen.rejections[0] == 1
+    _, again, nis = step(unseen, 0.0)
+    assert nis[0] < motion.gate_nis
+    assert again.rejections[0] == 0
+
+
+@pytest.mark.parametrize(("kind", "dof"), [("car", 3), ("free", 6)])
+def test_the_gate_is_where_chi_square_has_9999(kind, dof):
+    motion, _ = outlier_steps(kind)
+    assert motion.gate_nis == pytest.approx(stats.chi2.ppf(0.9999, dof), abs=0.1)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_ten_rejections_in_a_row_start_it_anew(kind):
+    motion, step = outlier_steps(kind)
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    for count in range(1, motion.max_rejections + 1):
+        prior, belief, nis = step(belief, 5.0)
+        assert prior.initialised[0]
+        assert nis[0] > motion.gate_nis
+        assert int(belief.rejections[0]) == count
+        assert abs(float(motion.poses(belief).T_world_vehicle.translation()[0, 0])) < 0.1
+    prior, belief, nis = step(belief, 5.0)
+    assert not prior.initialised[0]
+    assert belief.initialised[0]
+    assert (nis[0], belief.rejections[0]) == (0, 0)
+    position_m = motion.poses(belief).T_world_vehicle.translation()[0]
+    np.testing.assert_allclose(position_m, [5.0, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_hypotheses_are_filters_of_their_own(kind):
+    """Three at once are three alone; one that is not kept starts anew."""
+    motion, _ = outlier_steps(kind)
+    poses = jnp.asarray([[0.0, 0.0, 0.0], [1.0, 0.5, 2.0], [0.3, -1.0, -3.0]])
+    R = 1e-3 * jnp.eye(6)
+
+    @jax.jit
+    def drive(belief, poses, kept):
+        for offset in (0.0, 0.01, 0.03):
+            prior = motion.predict(belief, reading(0.2, 0.1))
+            Ts = worlds.T_world_vehicle_from_planar(poses + offset)
+            selection = dataclasses.replace(
+                chosen(prior, worlds.planar(0.0, 0.0, 0.0), R, True),
+                measured=PoseMeasurement(
+                    Ts, jnp.tile(R, (len(poses), 1, 1)), jnp.ones(len(poses), bool)
+                ),
+                kept=prior.initialised & kept,
+            )
+            belief, nis = motion.update(prior, selection, reading(0.2, 0.1))
+        return belief, nis
+
+    kept = jnp.asarray([True, False, True])
+    together, nis = drive(motion.init(3), poses, kept)
+    for index in range(3):
+        alone, own = drive(motion.init(), poses[index][None], kept[index][None])
+        np.testing.assert_allclose(together.mean[index], alone.mean[0], atol=1e-12)
+        np.testing.assert_allclose(together.covariance[index], alone.covariance[0], atol=1e-12)
+        assert nis[index] == pytest.approx(float(own[0]), rel=1e-9)
+    assert nis[1] == 0
+    np.testing.assert_allclose(
+        motion.poses(together).T_world_vehicle.translation()[1],
+        worlds.planar(*(poses[1] + 0.03)).translation(),
+        atol=1e-9,
+    )
+
+
 @jax.jit
 def first_step(motion, pose, taken):
     """The belief after one look, its NIS, and the poses a selector sees."""
-    prior = motion.predict(motion.init(), 0.1)
-    belief, nis = motion.update(prior, candidate(pose, 1e-4 * jnp.eye(6)), taken, reading())
+    prior = motion.predict(motion.init(), reading())
+    belief, nis = motion.update(prior, chosen(prior, pose, 1e-4 * jnp.eye(6), taken), reading())
     return belief, nis, motion.poses(belief)
 
 
@@ -248,10 +355,10 @@ def test_the_first_pose_starts_the_filter(precision, kind, size):
     assert isinstance(motion, Motion)
     assert not motion.init().initialised[0]
     pose = worlds.planar(0.4, -0.2, 2.0)
-    blind, *_ = first_step(motion, pose, weights(False))
+    blind, *_ = first_step(motion, pose, False)
     assert not blind.initialised[0]
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(blind))
-    belief, nis, found = first_step(motion, pose, weights(True))
+    belief, nis, found = first_step(motion, pose, True)
     assert belief.initialised[0]
     assert nis[0] == 0
     assert belief.covariance.shape == (1, size, size)
@@ -270,6 +377,7 @@ def test_poses_of_a_car_are_level_and_carry_the_planar_covariance():
         jnp.asarray(P[None]),
         jnp.zeros(1),
         jnp.ones(1, bool),
+        jnp.zeros(1, int),
     )
     found = motion.poses(belief)
     expected = np.asarray(worlds.planar(0.3, -0.4, 2.0).wxyz_xyz)
@@ -282,7 +390,7 @@ def test_broken_hypotheses_start_anew():
     start = BicycleKalman(worlds.qcar()).init()
     stack = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf + 1, leaf + 2]), start)
     stack = eqx.tree_at(lambda b: b.initialised, stack, jnp.ones(3, bool))
-    starts = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 3), start)
+    starts = BicycleKalman(worlds.qcar()).init(3)
     broken = eqx.tree_at(lambda b: b.mean, stack, stack.mean.at[1, 4].set(jnp.nan))
     broken = eqx.tree_at(lambda b: b.covariance, broken, broken.covariance.at[2, 0, 5].set(jnp.inf))
     kept = restarted_where_broken(broken, starts)
@@ -294,8 +402,9 @@ def test_broken_hypotheses_start_anew():
 
 @jax.jit
 def free_step(motion, belief, dt_s, wxyz_xyz, covariance, taken):
-    prior = motion.predict(belief, dt_s)
-    return motion.update(prior, candidate(jaxlie.SE3(wxyz_xyz), covariance), taken, reading())
+    obs = reading(dt_s=dt_s)
+    prior = motion.predict(belief, obs)
+    return motion.update(prior, chosen(prior, jaxlie.SE3(wxyz_xyz), covariance, taken), obs)
 
 
 def test_constant_velocity_carries_its_covariance_as_samples_do():
@@ -310,9 +419,10 @@ def test_constant_velocity_carries_its_covariance_as_samples_do():
         jnp.asarray((root @ root.T)[None]),
         jnp.zeros(1),
         jnp.ones(1, bool),
+        jnp.zeros(1, int),
     )
     dt_s = 0.1
-    predicted = motion.predict(belief, dt_s)
+    predicted = motion.predict(belief, reading(dt_s=dt_s))
 
     @jax.jit
     @jax.vmap
@@ -345,7 +455,7 @@ def test_constant_velocity_converges_on_a_moving_body():
         T = advance(T, twist * dt_s)
         noisy = advance(T, jnp.asarray(sigma * rng.standard_normal(6)))
         belief, nis = free_step(
-            motion, belief, dt_s, noisy.wxyz_xyz, jnp.asarray(np.diag(sigma**2)), weights(True)
+            motion, belief, dt_s, noisy.wxyz_xyz, jnp.asarray(np.diag(sigma**2)), True
         )
         if step >= 50:
             values.append(float(nis[0]))
@@ -364,13 +474,13 @@ def test_constant_velocity_forgets_what_it_lost():
     motion = ConstantVelocity()
     pose = worlds.planar(0.3, 0.1, 1.0)
     belief, _ = free_step(
-        motion, motion.init(), jnp.asarray(0.1), pose.wxyz_xyz, 1e-4 * jnp.eye(6), weights(True)
+        motion, motion.init(), jnp.asarray(0.1), pose.wxyz_xyz, 1e-4 * jnp.eye(6), True
     )
-    assert motion.predict(belief, 0.1).initialised[0]
-    assert not motion.predict(belief, 10.0).initialised[0]
+    assert motion.predict(belief, reading(dt_s=0.1)).initialised[0]
+    assert not motion.predict(belief, reading(dt_s=10.0)).initialised[0]
     there = worlds.planar(-3.0, 2.0, -2.0)
     again, nis = free_step(
-        motion, belief, jnp.asarray(10.0), there.wxyz_xyz, 1e-4 * jnp.eye(6), weights(True)
+        motion, belief, jnp.asarray(10.0), there.wxyz_xyz, 1e-4 * jnp.eye(6), True
     )
     np.testing.assert_allclose(again.mean[0, :7], there.wxyz_xyz, atol=1e-12)
     np.testing.assert_array_equal(again.mean[0, 7:], 0)
@@ -387,16 +497,19 @@ def test_gradients_are_finite_at_rest_and_at_the_prediction(precision, kind):
     @jax.grad
     def slope(floats, taken):
         motion, wxyz_xyz, speed_mps, dt_s = floats
-        here = candidate(jaxlie.SE3(wxyz_xyz), 1e-4 * jnp.eye(6))
-        obs = reading(speed_mps)
-        belief, _ = motion.update(motion.init(), here, weights(True), obs)
+        obs = reading(speed_mps, dt_s=dt_s)
+
+        def look(prior, taken):
+            here = chosen(prior, jaxlie.SE3(wxyz_xyz), 1e-4 * jnp.eye(6), taken)
+            return motion.update(prior, here, obs)
+
+        belief, _ = look(motion.init(), True)
         for _ in range(2):
-            belief = motion.predict(belief, dt_s)
-            belief, nis = motion.update(belief, here, taken, obs)
+            belief, nis = look(motion.predict(belief, obs), taken)
         return jnp.sum(belief.mean) + jnp.sum(belief.covariance) + jnp.sum(nis)
 
     for taken in (True, False):
         zero = jnp.asarray(0.0)
-        for leaf in jax.tree.leaves(slope((motion, pose.wxyz_xyz, zero, zero), weights(taken))):
+        for leaf in jax.tree.leaves(slope((motion, pose.wxyz_xyz, zero, zero), taken)):
             assert leaf.dtype == precision
             assert np.all(np.isfinite(leaf))

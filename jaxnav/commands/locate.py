@@ -15,12 +15,12 @@ from jaxnav.camera import Camera
 from jaxnav.candidates import Candidates, find_candidates
 from jaxnav.cli import Locate, configure_jax
 from jaxnav.commands.pictures import normals_px, save_figure
+from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.detection import Detections, make_detector
 from jaxnav.errors import BadInput
 from jaxnav.files import load_camera
 from jaxnav.markers import MarkerMap
-from jaxnav.motion import ConstantVelocity
-from jaxnav.observation import Observation
+from jaxnav.observation import Observation, Snapshot
 from jaxnav.plotting import View, photo_with_poses
 from jaxnav.rig import CameraRig
 
@@ -77,9 +77,10 @@ def read_image(path: Path) -> np.ndarray:
 @jax.jit
 def _solve(rig: CameraRig, markers: MarkerMap, obs: Observation) -> tuple[Candidates, jax.Array]:
     """Both poses of one marker, and the probability that the better one is the mirrored one."""
-    candidates = find_candidates(rig, markers, obs, max_steps=32)
+    snapshot = Snapshot.create(rig, markers, obs)
+    candidates = find_candidates(snapshot, max_steps=32)
     prior = ConstantVelocity().poses(ConstantVelocity().init())
-    selection = LowestReprojection()(prior, candidates, obs, markers)
+    selection = LowestReprojection()(prior, candidates, snapshot)
     return candidates, selection.flip_probability
 
 

@@ -41,6 +41,7 @@ def run(args: Arguments) -> int:
             recording,
             make_selector(args.selector),
             one_at_a_time=args.markers == "one-at-a-time",
+            corner_sigma_px=args.corner_sigma_px,
             progress=advance,
         )
     summary = summarise(args, recording, result)
@@ -65,6 +66,7 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
         "detections_dropped": recording.dropped_detections,
         "poses": int(result.seen.sum()),
         "frames_per_second": result.frames_per_second,
+        "corner_sigma_px": result.corner_sigma_px,
     }
     if recording.reference is None:
         return summary

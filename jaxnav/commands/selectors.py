@@ -1,10 +1,26 @@
 """Selectors by the names of the command line."""
 
-from jaxnav.ambiguity import LowestReprojection, PaperCost, Selector
+from jaxnav.ambiguity import (
+    LowestReprojection,
+    Mahalanobis,
+    ObjectSpace,
+    Oracle,
+    OrientationGiven,
+    PaperCost,
+    RatioTest,
+    Selector,
+)
+from jaxnav.hypotheses import MultiHypothesis
 
 SELECTORS: dict[str, type] = {
+    "multi-hypothesis": MultiHypothesis,
     "lowest-reprojection": LowestReprojection,
+    "ratio-test": RatioTest,
+    "object-space": ObjectSpace,
     "paper-cost": PaperCost,
+    "mahalanobis": Mahalanobis,
+    "orientation-given": OrientationGiven,
+    "oracle": Oracle,
 }
 
 

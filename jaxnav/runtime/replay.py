@@ -15,14 +15,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.ambiguity import Selector
+from jaxnav.candidates import find_candidates
+from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.evaluation import Branch, judge_branch
 from jaxnav.markers import MarkerMap
-from jaxnav.motion import ConstantVelocity
 from jaxnav.navigator import Navigator, State
-from jaxnav.observation import Observation
+from jaxnav.observation import Observation, Snapshot
 from jaxnav.runtime.recording import Recording
 
 CHUNK_FRAMES = 64
+SIGMA_SAMPLES = 512  # detections that tell how far a recording's corners scatter
+MODEL_SIGMA_PX = 0.15  # what lens calibration and rolling shutter leave in a corner
 MAX_DT_S = 1.0  # between two frames; a longer pause is a prediction for one second
 
 
@@ -36,6 +39,7 @@ class Replay:
     flip_probability: Float[np.ndarray, "F tracks"]
     branch: Branch  # leaves (F, tracks); meaningless where there is no reference
     frames_per_second: float  # compilation excluded
+    corner_sigma_px: float  # what the filter was told
 
 
 class _Frames(eqx.Module):
@@ -51,7 +55,7 @@ def replay(
     recording: Recording,
     selector: Selector,
     one_at_a_time: bool = False,
-    corner_sigma_px: float = 1.0,
+    corner_sigma_px: float | None = None,
     progress: Callable[[int], object] = lambda frames: None,
 ) -> Replay:
     """Localise the rig in every frame.
@@ -60,9 +64,12 @@ def replay(
         recording: frames, rig and map.
         selector: which candidate is believed.
         one_at_a_time: every marker for itself, as if it were the only one; M tracks.
-        corner_sigma_px: standard deviation of a corner coordinate.
+        corner_sigma_px: standard deviation of a corner coordinate, by default as the recording
+            itself tells, see `estimate_corner_sigma_px`.
         progress: called with the number of frames done since the last call.
     """
+    if corner_sigma_px is None:
+        corner_sigma_px = estimate_corner_sigma_px(recording)
     step, state = _stepper(recording, selector, one_at_a_time, corner_sigma_px)
 
     @jax.jit
@@ -85,7 +92,40 @@ def replay(
     wxyz_xyz, seen, located, flip_probability, branch = jax.tree.map(
         lambda *leaves: np.concatenate(leaves)[:total], *chunks
     )
-    return Replay(wxyz_xyz, seen, located, flip_probability, branch, total / elapsed_s)
+    return Replay(
+        wxyz_xyz, seen, located, flip_probability, branch, total / elapsed_s, corner_sigma_px
+    )
+
+
+def estimate_corner_sigma_px(recording: Recording) -> float:
+    """How far a recording's corners scatter, from single markers in single cameras.
+
+    The best pose of one marker leaves 2 of 8 coordinates over: its e1 is sigma^2 times chi-square
+    with 2 degrees of freedom, whatever the map and the extrinsics are worth. The median over the
+    recording is not moved by a few bad detections. What calibration adds is `MODEL_SIGMA_PX`.
+    """
+    frames, cameras, marker_indices = np.nonzero(recording.visible)
+    if not len(frames):
+        return 1.0
+    picks = np.linspace(0, len(frames) - 1, min(len(frames), SIGMA_SAMPLES)).astype(int)
+    corners_px = recording.corners_px[frames[picks], cameras[picks], marker_indices[picks]]
+    padding = SIGMA_SAMPLES - len(picks)
+
+    @jax.jit
+    @jax.vmap
+    def best_e1_px2(corners_px: Array, camera: Array, marker: Array) -> Array:
+        seen = jnp.arange(len(recording.rig)) == camera
+        obs = Observation(jnp.broadcast_to(corners_px, (seen.shape[0], 1, 4, 2)), seen[:, None])
+        snapshot = Snapshot.create(recording.rig, _single(recording.markers, marker), obs)
+        candidates = find_candidates(snapshot)
+        return jnp.min(jnp.where(candidates.valid, candidates.e1_px2, jnp.inf))
+
+    def padded(rows: np.ndarray) -> Array:
+        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)]))
+
+    e1_px2 = best_e1_px2(padded(corners_px), padded(cameras[picks]), padded(marker_indices[picks]))
+    sigma_px = np.sqrt(np.median(np.asarray(e1_px2)[: len(picks)]) / (2 * np.log(2)))
+    return float(np.hypot(sigma_px, MODEL_SIGMA_PX))
 
 
 def _stepper(

@@ -31,6 +31,9 @@ def predict(x, P, dt_s, density):
 def update(x, P, pose, R_pose, speed_mps, steering_rad, wheelbase_m, odometry_sigma):
     """Eqs. 10 and 11; `pose` None: odometry alone. Returns x, P and the NIS of the pose.
 
+    The NIS is that of the pose once the odometry is known: by the chain rule of probability the
+    NIS of all rows together, less that of the odometry's.
+
     The odometry predicts v (cos, sin)(psi + beta) - (v_x, v_y) = 0: a function of the state whose
     derivative with respect to psi stands in the heading's column of H.
     """
@@ -40,16 +43,16 @@ def update(x, P, pose, R_pose, speed_mps, steering_rad, wheelbase_m, odometry_si
     H[:, 3:] = np.eye(3)
     H[0, 2], H[1, 2] = v[1], -v[0]
     R = np.diag(np.asarray(odometry_sigma) ** 2)
-    nis = 0.0
+    nis_odometry = z_minus_h @ np.linalg.inv(H @ P @ H.T + R) @ z_minus_h
     if pose is not None:
         innovation = np.asarray(pose) - x[:3]
         innovation[2] = wrap(innovation[2])
-        S = P[:3, :3] + R_pose
-        nis = innovation @ np.linalg.inv(S) @ innovation
         z_minus_h = [*innovation, *z_minus_h]
         H = np.vstack([np.eye(3, 6), H])
         R = np.block([[R_pose, np.zeros((3, 3))], [np.zeros((3, 3)), R]])
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    S_inverse = np.linalg.inv(H @ P @ H.T + R)
+    K = P @ H.T @ S_inverse
+    nis = z_minus_h @ S_inverse @ z_minus_h - nis_odometry
     x = x + K @ np.array(z_minus_h)
     x[2] = wrap(x[2])
     return x, (np.eye(6) - K @ H) @ P, nis

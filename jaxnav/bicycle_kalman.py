@@ -1,0 +1,221 @@
+"""The paper's filter for a car: six states, one measured pose, odometry."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnav import bicycle, kalman
+from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
+from jaxnav.bicycle import Vehicle
+from jaxnav.geometry import (
+    T_world_vehicle_from_planar,
+    planar_covariance,
+    planar_from_T_world_vehicle,
+    wrap_angle,
+)
+from jaxnav.motion import Belief, followed, merged, unstarted
+from jaxnav.observation import Observation
+
+
+class BicycleKalman(eqx.Module):
+    """The paper's six-state filter for a car: x, y, psi, v_x, v_y, psi_dot in the world.
+
+    The state moves at constant velocity (Eq. 9); the pose of the chosen candidate measures the
+    first half, odometer and steering the second. Two things the paper leaves open:
+
+    * The odometry's v (cos(beta + psi), sin(beta + psi)) depends on the state's own heading. Its
+      innovation uses the predicted psi, and H carries the derivative, so a correction of
+      the heading turns the velocity along and the drift of the position corrects the heading.
+    * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
+      floor, since errors of successive frames are correlated (RELIABILITY R8).
+    """
+
+    vehicle: Vehicle
+    acceleration_density: Float[Array, " 3"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.1**2, 0.1**2, 0.3**2])
+    )  # (m/s^2)^2/Hz twice, (rad/s^2)^2/Hz
+    vision_floor: Float[Array, " 3"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.005, 0.005, 0.005])
+    )  # standard deviations, m m rad
+    odometry_sigma: Float[Array, " 3"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.01, 0.01, 0.01])
+    )  # standard deviations, m/s m/s rad/s
+    initial_velocity_sigma: Float[Array, " 3"] = eqx.field(
+        default_factory=lambda: jnp.asarray([1.0, 1.0, 2.0])
+    )  # before the first odometry, m/s m/s rad/s
+    tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
+    height_sigma_m: float = 0.002
+    gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 % (RELIABILITY R1); inf: no gate
+    max_rejections: int = eqx.field(static=True, default=10)
+
+    def init(self, hypotheses: int = 1) -> Belief:
+        """Hypotheses that have seen nothing."""
+        return unstarted(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, hypotheses)
+
+    def predict(self, belief: Belief, obs: Observation) -> Belief:
+        """x = A x, P = A P A' + Q (Eq. 9), then the odometry (Eqs. 10 and 11).
+
+        A hypothesis that the gate has contradicted too often in a row is forgotten.
+        """
+        dtype, dt_s = belief.mean.dtype, jnp.asarray(obs.dt_s, belief.mean.dtype)
+        eye, zero = jnp.eye(3, dtype=dtype), jnp.zeros((3, 3), dtype)
+        A = jnp.block([[eye, dt_s * eye], [zero, eye]])
+        Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
+
+        def one(mean: Array, P: Array) -> tuple[Array, Array]:
+            mean = A @ mean
+            mean = mean.at[2].set(wrap_angle(mean[2]))
+            return self._with_odometry(mean, kalman.predict_covariance(P, A, Q), obs)
+
+        mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
+        believed = belief.rejections < self.max_rejections
+        return Belief(
+            mean,
+            covariance,
+            belief.log_weight,
+            belief.initialised & believed,
+            jnp.where(believed, belief.rejections, 0),
+        )
+
+    def poses(self, belief: Belief) -> PoseBelief:
+        """Level on the ground (Eq. 12), as far as `tilt_sigma_rad` and `height_sigma_m` go."""
+        T_world_vehicle = T_world_vehicle_from_planar(belief.mean[:, :3])
+        eye = jnp.eye(6, dtype=belief.mean.dtype)
+        freedom = eye[:, jnp.array([0, 1, 5])]
+        tilt = [self.height_sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad]
+        nuisance = eye[:, jnp.array([2, 3, 4])] * jnp.asarray(tilt, eye.dtype)[None]
+
+        def body_covariance(pose: Array, P: Array) -> Array:
+            lift = freedom @ jnp.eye(3, dtype=P.dtype).at[:2, :2].set(_turn(-pose[2]))
+            return lift @ P[:3, :3] @ lift.T
+
+        return PoseBelief(
+            T_world_vehicle,
+            jax.vmap(body_covariance)(belief.mean, belief.covariance),
+            belief.log_weight,
+            belief.initialised,
+            freedom,
+            nuisance,
+        )
+
+    def update(
+        self, belief: Belief, selection: Selection, obs: Observation
+    ) -> tuple[Belief, Float[Array, " K"]]:
+        """The posterior of every hypothesis (Eqs. 10 and 11), and its pose's NIS (3 dof).
+
+        A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
+        NIS is above the gate. Without a pose the NIS is 0.
+        """
+        belief = eqx.tree_at(
+            lambda b: (b.log_weight, b.initialised),
+            belief,
+            (selection.log_weight, selection.kept),
+        )
+        measured = selection.measured
+        if isinstance(measured, PosePosterior):
+            belief, nis = jax.vmap(lambda b, m: self._follow(b, m, obs))(belief, measured)
+        else:
+            belief, nis = jax.vmap(lambda b, m: self._update_one(b, m, obs))(belief, measured)
+
+        def difference(mean: Array, base: Array) -> Array:
+            apart = mean - base
+            return apart.at[2].set(wrap_angle(apart[2]))
+
+        def moved(mean: Array, error: Array) -> Array:
+            mean = mean + error
+            return mean.at[2].set(wrap_angle(mean[2]))
+
+        return merged(belief, selection.heir, difference, moved), nis
+
+    def _update_one(
+        self, belief: Belief, measured: PoseMeasurement, obs: Observation
+    ) -> tuple[Belief, Array]:
+        dtype = belief.mean.dtype
+        pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
+        R = planar_covariance(measured.T_world_vehicle, measured.covariance)
+        R = R + jnp.diag(self.vision_floor**2)
+
+        starts = measured.taken & ~belief.initialised
+        first_mean, first_P = self._first(pose, R, obs)
+        mean = jnp.where(starts, first_mean, belief.mean)
+        P = jnp.where(starts, first_P, belief.covariance)
+
+        innovation = pose - mean[:3]
+        innovation = innovation.at[2].set(wrap_angle(innovation[2]))
+        offered = measured.taken & belief.initialised
+        nis = jnp.where(offered, kalman.nis(innovation, P[:3, :3] + R), 0)
+        accepted = offered & (nis <= self.gate_nis)
+        H = jnp.eye(3, 6, dtype=dtype)
+        present = jnp.full(3, accepted).astype(dtype)
+        correction, P, _ = kalman.update(P, *kalman.hide_rows(innovation, H, R, present))
+        mean = mean + correction
+        rejections = jnp.where(offered & ~accepted, belief.rejections + 1, belief.rejections)
+        return Belief(
+            mean.at[2].set(wrap_angle(mean[2])),
+            P,
+            belief.log_weight,
+            belief.initialised | measured.taken,
+            jnp.where(accepted | starts, 0, rejections),
+        ), nis
+
+    def _follow(
+        self, belief: Belief, corrected: PosePosterior, obs: Observation
+    ) -> tuple[Belief, Array]:
+        """One hypothesis whose selector has corrected its pose."""
+        T = corrected.T_world_vehicle
+        pose = planar_from_T_world_vehicle(T)
+        first_mean, first_P = self._first(pose, planar_covariance(T, corrected.covariance), obs)
+        starts = corrected.taken & ~belief.initialised
+        accepted = corrected.taken & belief.initialised & (corrected.nis <= self.gate_nis)
+
+        eye = jnp.eye(6, dtype=belief.mean.dtype)
+        to_body = eye.at[:2, :2].set(_turn(-belief.mean[2]))
+        to_world = eye.at[:2, :2].set(_turn(pose[2]))
+        T_prior = T_world_vehicle_from_planar(belief.mean[:3])
+        freedom = eye[:, jnp.array([0, 1, 5])]
+        P = jnp.where(starts, eye, to_body @ belief.covariance @ to_body.T)
+        correction, P = followed(P, T_prior, T, corrected.covariance, freedom)
+        mean = jnp.append(pose, belief.mean[3:] + correction[3:])
+        mean = jnp.where(accepted, mean, jnp.where(starts, first_mean, belief.mean))
+        P = jnp.where(accepted, to_world @ P @ to_world.T, belief.covariance)
+        rejected = corrected.taken & belief.initialised & ~accepted
+        return Belief(
+            mean,
+            jnp.where(starts, first_P, P),
+            belief.log_weight,
+            belief.initialised | corrected.taken,
+            jnp.where(accepted | starts, 0, belief.rejections + rejected),
+        ), jnp.where(starts, 0, corrected.nis)
+
+    def _first(self, pose: Array, covariance: Array, obs: Observation) -> tuple[Array, Array]:
+        """The state of a hypothesis that starts: a pose, at rest as far as the odometry tells."""
+        zero = jnp.zeros((3, 3), pose.dtype)
+        velocity = jnp.diag(self.initial_velocity_sigma**2)
+        return self._with_odometry(
+            jnp.append(pose, jnp.zeros(3, pose.dtype)),
+            jnp.block([[covariance, zero], [zero, velocity]]),
+            obs,
+        )
+
+    def _with_odometry(self, mean: Array, P: Array, obs: Observation) -> tuple[Array, Array]:
+        """The state after speed and steering were measured, at its own heading."""
+        dtype = mean.dtype
+        speed_mps, steering_rad = (
+            jnp.asarray(value, dtype) for value in (obs.speed_mps, obs.steering_rad)
+        )
+        velocity = bicycle.velocity_world(
+            speed_mps, steering_rad, mean[2], self.vehicle.wheelbase_m
+        )
+        turned_velocity = jnp.stack([-velocity[1], velocity[0], jnp.zeros_like(speed_mps)])
+        H = jnp.eye(3, 6, k=3, dtype=dtype).at[:, 2].set(-turned_velocity)
+        R = jnp.diag(self.odometry_sigma**2).astype(dtype)
+        present = jnp.full(3, jnp.asarray(obs.has_odometry, dtype))
+        correction, P, _ = kalman.update(P, *kalman.hide_rows(velocity - mean[3:], H, R, present))
+        mean = mean + correction
+        return mean.at[2].set(wrap_angle(mean[2])), P
+
+
+def _turn(angle_rad: Array) -> Array:
+    c, s = jnp.cos(angle_rad), jnp.sin(angle_rad)
+    return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])

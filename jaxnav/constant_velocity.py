@@ -1,0 +1,165 @@
+"""A filter for bodies that move freely: pose on SE(3) and twist."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from jaxnav import kalman
+from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
+from jaxnav.motion import Belief, followed, merged, unstarted
+from jaxnav.observation import Observation
+
+
+class ConstantVelocity(eqx.Module):
+    """A body that moves freely: pose on SE(3) and body twist, for hand-held and aerial rigs.
+
+    The mean is (wxyz, xyz) of T_world_vehicle followed by the twist (m/s, rad/s) in vehicle axes;
+    the 12 error states are xi in `T_world_vehicle * exp(xi)` and the twist's own error. There is no
+    odometry. Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
+    """
+
+    acceleration_density: Float[Array, " 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([1.0**2] * 3 + [2.0**2] * 3)
+    )  # (m/s^2)^2/Hz three times, (rad/s^2)^2/Hz three times
+    vision_floor: Float[Array, " 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.002] * 3 + [0.002] * 3)
+    )  # standard deviations, m and rad
+    initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
+    )  # m/s and rad/s
+    lost_sigma_m: float = 0.5  # a prediction less certain than this is forgotten
+    gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 % (RELIABILITY R1); inf: no gate
+    max_rejections: int = eqx.field(static=True, default=10)
+
+    def init(self, hypotheses: int = 1) -> Belief:
+        """Hypotheses that have seen nothing."""
+        mean = jnp.zeros(13, self.acceleration_density.dtype).at[0].set(1)
+        return unstarted(mean, 12, hypotheses)
+
+    def predict(self, belief: Belief, obs: Observation) -> Belief:
+        """T = T exp(twist dt); the error turns with the frame.
+
+        Without odometry a prediction is soon worth nothing: past `lost_sigma_m` the next pose
+        starts the filter anew. So it does where the gate has contradicted it too often in a row.
+        """
+        dtype, dt_s = belief.mean.dtype, jnp.asarray(obs.dt_s, belief.mean.dtype)
+        eye, zero = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
+        Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
+
+        def one(mean: Array, P: Array) -> tuple[Array, Array]:
+            motion = jaxlie.SE3.exp(mean[7:] * dt_s)
+            T_world_vehicle = (jaxlie.SE3(mean[:7]) @ motion).normalize()
+            F = jnp.block([[motion.inverse().adjoint(), dt_s * eye], [zero, eye]])
+            return (
+                jnp.append(T_world_vehicle.wxyz_xyz, mean[7:]),
+                kalman.predict_covariance(P, F, Q),
+            )
+
+        mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
+        variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
+        believed = belief.rejections < self.max_rejections
+        return Belief(
+            mean,
+            covariance,
+            belief.log_weight,
+            belief.initialised & believed & (variance_m2 < self.lost_sigma_m**2),
+            jnp.where(believed, belief.rejections, 0),
+        )
+
+    def poses(self, belief: Belief) -> PoseBelief:
+        """The pose part of the state."""
+        return PoseBelief(
+            jaxlie.SE3(belief.mean[:, :7]),
+            belief.covariance[:, :6, :6],
+            belief.log_weight,
+            belief.initialised,
+            jnp.eye(6, dtype=belief.mean.dtype),
+            jnp.zeros((6, 0), belief.mean.dtype),
+        )
+
+    def update(
+        self, belief: Belief, selection: Selection, obs: Observation
+    ) -> tuple[Belief, Float[Array, " K"]]:
+        """The posterior of every hypothesis, and its pose's NIS (6 dof).
+
+        A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
+        NIS is above the gate. Without a pose the NIS is 0.
+        """
+        belief = eqx.tree_at(
+            lambda b: (b.log_weight, b.initialised),
+            belief,
+            (selection.log_weight, selection.kept),
+        )
+        measured = selection.measured
+        if isinstance(measured, PosePosterior):
+            belief, nis = jax.vmap(self._follow)(belief, measured)
+        else:
+            belief, nis = jax.vmap(self._update_one)(belief, measured)
+
+        def difference(mean: Array, base: Array) -> Array:
+            between = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
+            return jnp.append(between.log(), mean[7:] - base[7:])
+
+        def moved(mean: Array, error: Array) -> Array:
+            T = (jaxlie.SE3(mean[:7]) @ jaxlie.SE3.exp(error[:6])).normalize()
+            return jnp.append(T.wxyz_xyz, mean[7:] + error[6:])
+
+        return merged(belief, selection.heir, difference, moved), nis
+
+    def _update_one(self, belief: Belief, measured: PoseMeasurement) -> tuple[Belief, Array]:
+        dtype = belief.mean.dtype
+        wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
+        R = measured.covariance + jnp.diag(self.vision_floor**2)
+
+        starts = measured.taken & ~belief.initialised
+        first_mean, first_P = self._first(wxyz_xyz, R)
+        mean = jnp.where(starts, first_mean, belief.mean)
+        P = jnp.where(starts, first_P, belief.covariance)
+
+        T_world_prior = jaxlie.SE3(mean[:7])
+        offered = measured.taken & belief.initialised
+        # Where no pose is taken the difference is that of a pose with itself: log stays smooth.
+        T_measured = jaxlie.SE3(jnp.where(offered, wxyz_xyz, T_world_prior.wxyz_xyz))
+        innovation = (T_world_prior.inverse() @ T_measured).log()
+        nis = jnp.where(offered, kalman.nis(innovation, P[:6, :6] + R), 0)
+        accepted = offered & (nis <= self.gate_nis)
+        H = jnp.eye(6, 12, dtype=dtype)
+        present = jnp.full(6, accepted).astype(dtype)
+        correction, P, _ = kalman.update(P, *kalman.hide_rows(innovation, H, R, present))
+        T_posterior = (T_world_prior @ jaxlie.SE3.exp(correction[:6])).normalize()
+        rejections = jnp.where(offered & ~accepted, belief.rejections + 1, belief.rejections)
+        return Belief(
+            jnp.append(T_posterior.wxyz_xyz, mean[7:] + correction[6:]),
+            P,
+            belief.log_weight,
+            belief.initialised | measured.taken,
+            jnp.where(accepted | starts, 0, rejections),
+        ), nis
+
+    def _follow(self, belief: Belief, corrected: PosePosterior) -> tuple[Belief, Array]:
+        """One hypothesis whose selector has corrected its pose."""
+        T = corrected.T_world_vehicle
+        first_mean, first_P = self._first(T.wxyz_xyz, corrected.covariance)
+        starts = corrected.taken & ~belief.initialised
+        accepted = corrected.taken & belief.initialised & (corrected.nis <= self.gate_nis)
+        T_prior = jaxlie.SE3(jnp.where(accepted, belief.mean[:7], T.wxyz_xyz))
+        eye = jnp.eye(6, dtype=belief.mean.dtype)
+        correction, P = followed(belief.covariance, T_prior, T, corrected.covariance, eye)
+        mean = jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:])
+        rejected = corrected.taken & belief.initialised & ~accepted
+        return Belief(
+            jnp.where(accepted, mean, jnp.where(starts, first_mean, belief.mean)),
+            jnp.where(accepted, P, jnp.where(starts, first_P, belief.covariance)),
+            belief.log_weight,
+            belief.initialised | corrected.taken,
+            jnp.where(accepted | starts, 0, belief.rejections + rejected),
+        ), jnp.where(starts, 0, corrected.nis)
+
+    def _first(self, wxyz_xyz: Array, covariance: Array) -> tuple[Array, Array]:
+        """The state of a body that starts: a pose, at rest as far as anybody knows."""
+        zero = jnp.zeros((6, 6), wxyz_xyz.dtype)
+        velocity = jnp.diag(self.initial_velocity_sigma**2)
+        P = jnp.block([[covariance, zero], [zero, velocity]])
+        return jnp.append(wxyz_xyz, jnp.zeros(6, wxyz_xyz.dtype)), P

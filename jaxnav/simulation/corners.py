@@ -1,0 +1,31 @@
+"""What cameras see, as corners alone: no image, no detector. Pure, for rollouts under vmap."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+
+MIN_SIDE_PX = 8.0  # below this no detector reads a marker
+
+
+def see(
+    rig: CameraRig, markers: MarkerMap, T_world_vehicle: jaxlie.SE3
+) -> tuple[Float[Array, "C M 4 2"], Bool[Array, "C M"]]:
+    """Exact corners in pixels, and which markers can be read.
+
+    A marker can be read where all its corners are inside the image, its printed side is towards the
+    camera, and its diagonals span a square of at least `MIN_SIDE_PX`.
+    """
+    T_vehicle_world = T_world_vehicle.inverse()
+    corners_px = rig.project(T_vehicle_world, markers.corners_world_m)
+    inside = jnp.all(rig.sees(T_vehicle_world, markers.corners_world_m), axis=-1)
+    normals = markers.Ts_world_marker.rotation().as_matrix()[:, :, 2]
+    Ts_world_camera = jax.vmap(lambda T: T_world_vehicle @ T.inverse())(rig.Ts_camera_vehicle)
+    towards = Ts_world_camera.translation()[:, None] - markers.Ts_world_marker.translation()[None]
+    faces = jnp.einsum("cmi,mi->cm", towards, normals) > 0
+    diagonals = corners_px[:, :, :2] - corners_px[:, :, 2:]
+    area_px2 = jnp.abs(jnp.cross(diagonals[:, :, 0], diagonals[:, :, 1])) / 2
+    return corners_px, inside & faces & (area_px2 > MIN_SIDE_PX**2)

@@ -1,0 +1,195 @@
+"""Many closed-loop drives at once, at corner level: one scan, vmapped over the seeds.
+
+The navigator's own `step` is in the loop; plant, odometer and corners are those of `drive.py`
+without its images. Finished drives stand still and are not counted any further.
+"""
+
+from collections.abc import Callable, Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.bicycle import Vehicle
+from jaxnav.control import Command
+from jaxnav.geometry import T_world_vehicle_from_planar, safe_norm, wrap_angle
+from jaxnav.kalman import nis
+from jaxnav.markers import MarkerMap
+from jaxnav.navigator import Navigator, State
+from jaxnav.observation import Observation
+from jaxnav.rig import CameraRig
+from jaxnav.simulation.corners import see
+from jaxnav.simulation.drive import PASSED_M
+from jaxnav.simulation.plant import CarState, move_through, read_odometry
+from jaxnav.simulation.scenarios import Scenario
+
+_SUBSTEPS = 4  # of either part of a frame period
+
+
+class Trace(eqx.Module):
+    """What is kept of every frame, leading axes (seeds, frames)."""
+
+    true_pose: Float[Array, "*S 3"]
+    pose: Float[Array, "*S 3"]
+    nees: Float[Array, "*S"]  # of (x, y, psi), 3 dof
+    located: Bool[Array, "*S"]
+    decided: Bool[Array, "*S"]
+    flip_probability: Float[Array, "*S"]
+    active: Bool[Array, "*S"]  # the drive had not ended before this frame
+    on_floor: Bool[Array, "*S"]
+    passed: Int[Array, "*S"]  # waypoints the true car has come near to, in order
+    done: Bool[Array, "*S"]  # the navigator believes so
+
+
+class _World(eqx.Module):
+    """What one seed drew, and where its drive stands."""
+
+    key: Array
+    rig: CameraRig  # the true one
+    car: CarState
+    acting: Command  # until the latency of the next one is over
+    command: Command
+    state: State
+    passed: Int[Array, ""]
+    ended: Bool[Array, ""]
+    on_floor: Bool[Array, ""]
+
+
+class Rollout:
+    """Drives of one navigator in one scenario, compiled once for a number of seeds.
+
+    `run` yields traces of `chunk_frames` frames until all drives have ended.
+    """
+
+    def __init__(
+        self,
+        navigator: Navigator,
+        vehicle: Vehicle,
+        markers: MarkerMap,
+        scenario: Scenario,
+        corner_noise_px: float,
+        chunk_frames: int = 30,
+    ):
+        self._navigator = navigator
+        self._vehicle = vehicle
+        self._markers = markers
+        self._scenario = scenario
+        self._corner_noise_px = corner_noise_px
+        self._chunk_frames = chunk_frames
+        self._start = jax.jit(jax.vmap(self._first))
+        self._advance = jax.jit(jax.vmap(self._chunk, in_axes=(0, None)))
+
+    def run(
+        self, seeds: Int[Array, " S"], progress: Callable[[float], object] = lambda s: None
+    ) -> Iterator[Trace]:
+        """Traces (S, chunk_frames) one after the other.
+
+        Args:
+            seeds: a drive for each; a seed's drive does not depend on the others.
+            progress: called with the simulated seconds since the last call.
+        """
+        keys = jax.vmap(jax.random.key)(seeds)
+        worlds = self._start(keys)
+        for begin in range(0, self._scenario.frames, self._chunk_frames):
+            worlds, trace = self._advance(worlds, jnp.asarray(begin))
+            yield jax.device_get(trace)
+            progress(self._chunk_frames * self._scenario.frame_period_s)
+            if bool(jnp.all(worlds.ended)):
+                return
+
+    def _first(self, key: Array) -> _World:
+        scenario = self._scenario
+        key, start_key, rig_key = jax.random.split(key, 3)
+        spread = jnp.asarray(scenario.start_spread)
+        start = jnp.asarray(scenario.start_pose) + spread * jax.random.uniform(
+            start_key, (3,), spread.dtype, -1, 1
+        )
+        zero = jnp.zeros_like(start[0])
+        return _World(
+            key=key,
+            rig=scenario.true_rig(self._navigator.rig, rig_key),
+            car=CarState(start, zero, zero),
+            acting=Command(zero, zero),
+            command=Command(zero, zero),
+            state=self._navigator.init(),
+            passed=jnp.asarray(0),
+            ended=jnp.asarray(False),
+            on_floor=jnp.asarray(True),
+        )
+
+    def _chunk(self, world: _World, begin: Array) -> tuple[_World, Trace]:
+        return jax.lax.scan(self._frame, world, begin + jnp.arange(self._chunk_frames))
+
+    def _frame(self, world: _World, index: Array) -> tuple[_World, Trace]:
+        """Move for a frame period, the command of the last frame after its latency; then look."""
+        scenario = self._scenario
+        dtype = world.car.pose.dtype
+        period_s = jnp.asarray(scenario.frame_period_s, dtype)
+        moves = index > 0
+        stamp_s = index * period_s
+        car = jax.tree.map(
+            lambda new, old: jnp.where(moves & ~world.ended, new, old),
+            self._moved(world, period_s),
+            world.car,
+        )
+        car = scenario.displaced(car, stamp_s, period_s)
+        key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, index))
+
+        # A smear shifts the corners to where they were a little earlier.
+        smear = scenario.corner_lag_s / scenario.frame_period_s
+        seen_from = car.pose + smear * (world.car.pose - car.pose)
+        corners_px, visible = see(world.rig, self._markers, T_world_vehicle_from_planar(seen_from))
+        noise_px = self._corner_noise_px * jax.random.normal(key_corners, corners_px.shape, dtype)
+        visible = visible & ~scenario.hidden(stamp_s)
+        corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
+        speed_mps, steering_rad = read_odometry(car, scenario.odometry, key_odometry)
+        truth = T_world_vehicle_from_planar(car.pose)
+        obs = Observation(
+            corners_px=corners_px,
+            visible=visible,
+            speed_mps=speed_mps,
+            steering_rad=steering_rad,
+            dt_s=jnp.where(moves, period_s, 0),
+            **scenario.other_sensors(car, truth, key_odometry),
+        )
+        state, out = self._navigator.step(world.state, obs)
+
+        waypoints_m = jnp.asarray(scenario.waypoints_m, dtype).reshape(-1, 2)
+        count = waypoints_m.shape[0]
+        target_m = waypoints_m[jnp.minimum(world.passed, count - 1)]
+        near = safe_norm(car.pose[:2] - target_m) <= PASSED_M
+        passed = jnp.where(world.ended, world.passed, jnp.minimum(world.passed + near, count))
+        x_min, x_max, y_min, y_max = scenario.floor_m
+        x_m, y_m = car.pose[:2]
+        inside = (x_min <= x_m) & (x_m <= x_max) & (y_min <= y_m) & (y_m <= y_max)
+        on_floor = world.on_floor & inside
+        error = (out.pose - car.pose).at[2].set(wrap_angle(out.pose[2] - car.pose[2]))
+        trace = Trace(
+            true_pose=car.pose,
+            pose=out.pose,
+            nees=nis(error, out.covariance[:3, :3]),
+            located=out.located,
+            decided=out.decided,
+            flip_probability=out.flip_probability,
+            active=~world.ended,
+            on_floor=on_floor,
+            passed=passed,
+            done=out.done,
+        )
+        command = Command(*(jnp.zeros_like(x_m),) * 2)
+        if out.command is not None and scenario.drives:
+            command = out.command
+        ended = world.ended | ~on_floor | (out.done if scenario.drives else False)
+        return _World(
+            world.key, world.rig, car, world.command, command, state, passed, ended, on_floor
+        ), trace
+
+    def _moved(self, world: _World, period_s: Array) -> CarState:
+        """The car one period later: a command acts `latency_s` after the frame it stems from."""
+        latency_s = jnp.asarray(self._scenario.latency_s, period_s.dtype)
+        car = world.car
+        for command, dt_s in ((world.acting, latency_s), (world.command, period_s - latency_s)):
+            states = move_through(self._vehicle, car, command, dt_s, _SUBSTEPS)
+            car = jax.tree.map(lambda leaf: leaf[-1], states)
+        return car

@@ -1,0 +1,148 @@
+"""`jaxnav simulate` and `jaxnav reliability`: what they count, and what bad input gets."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from jaxnav.cli import main
+from jaxnav.simulation.rollout import Trace
+from jaxnav.simulation.scenarios import scenarios
+from jaxnav.simulation.scores import Drives
+from jaxnav.simulation.single_frames import Reliability
+
+SCENARIO = scenarios()["paper"]
+
+
+@pytest.fixture(autouse=True)
+def keep_the_settings_of_jax(monkeypatch):
+    """Commands choose a precision and a cache of their own; tests keep theirs."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
+    monkeypatch.setattr("jaxnav.commands.simulate.configure_jax", lambda float64: None)
+    monkeypatch.setattr("jaxnav.commands.reliability.configure_jax", lambda float64: None)
+
+
+def trace(drives=4, frames=60, **changes) -> Trace:
+    """Drives that know their pose from frame 5 on and pass both waypoints."""
+    shape = (drives, frames)
+    leaves = {
+        "true_pose": np.zeros((*shape, 3)),
+        "pose": np.zeros((*shape, 3)) + np.array([0.03, 0.04, 0.0]),
+        "nees": np.full(shape, 3.0),
+        "located": np.ones(shape, bool),
+        "decided": np.broadcast_to(np.arange(frames) >= 5, shape).copy(),
+        "flip_probability": np.zeros(shape),
+        "active": np.ones(shape, bool),
+        "on_floor": np.ones(shape, bool),
+        "passed": np.full(shape, 2),
+        "done": np.zeros(shape, bool),
+    }
+    return Trace(**(leaves | changes))
+
+
+def test_perfect_drives():
+    summary = Drives([trace()], SCENARIO).summary()
+    assert summary["drives"] == 4
+    assert summary["success_rate"]["value"] == 1
+    assert 0.4 < summary["success_rate"]["interval"][0] < 0.6  # Wilson, 4 of 4
+    assert summary["wrong_branch_fraction"]["value"] == 0
+    assert summary["wrong_branch_fraction"]["interval"][1] > 0.5  # 4 drives prove little
+    assert summary["time_to_decide_s"]["median"]["value"] == pytest.approx(5 / 15)
+    assert summary["median_position_error_m"]["value"] == pytest.approx(0.05)
+    assert summary["anees"]["value"] == pytest.approx(3)
+
+
+def test_wrong_headings_are_counted_where_they_are():
+    pose = np.zeros((4, 60, 3))
+    pose[0, :45, 2] = np.deg2rad(21.0)  # decided from 5, late from 30
+    pose[1, :, 2] = 2 * np.pi + np.deg2rad(19.0)
+    summary = Drives([trace(pose=pose)], SCENARIO).summary()
+    assert summary["wrong_branch_fraction"]["value"] == pytest.approx(45 / 240)
+    assert summary["wrong_branch_fraction_after_2s"]["value"] == pytest.approx(15 / 120)
+    assert summary["wrong_once_decided_fraction"]["value"] == pytest.approx(40 / 220)
+    low, high = summary["wrong_branch_fraction"]["interval"]
+    assert low <= 45 / 240 <= high
+
+
+def test_a_drive_off_the_floor_or_short_of_a_waypoint_has_failed():
+    on_floor = np.ones((4, 60), bool)
+    on_floor[0, 50:] = False
+    passed = np.full((4, 60), 2)
+    passed[1] = 1
+    summary = Drives([trace(on_floor=on_floor, passed=passed)], SCENARIO).summary()
+    assert summary["success_rate"]["value"] == 0.5
+
+
+def test_batches_of_unequal_length_are_one_set():
+    never = np.zeros((3, 30), bool)
+    parts = [Drives([trace()], SCENARIO), Drives([trace(3, 30, decided=never)], SCENARIO)]
+    joined = Drives.joined([parts[0].first(2), parts[1]])
+    assert joined.time_to_decide_s.tolist() == [5 / 15, 5 / 15, np.inf, np.inf, np.inf]
+    assert joined.summary()["drives"] == 5
+    assert joined.summary()["time_to_decide_s"]["median"]["value"] == np.inf
+
+
+def test_calibration_error_is_the_weighted_gap():
+    probability = np.repeat([0.02, 0.52], [30, 10])
+    happened = np.zeros(40, bool)
+    happened[30:37] = True
+    found = Reliability.of(probability, happened)
+    assert found.counts.tolist() == [30, 10]
+    assert found.expected_calibration_error == pytest.approx((30 * 0.02 + 10 * 0.18) / 40)
+
+
+def simulate(*arguments: str) -> str:
+    """The last line that the command prints. A process of its own: it chooses the precision."""
+    code = "import sys; from jaxnav.cli import main; sys.exit(main())"
+    return subprocess.run(
+        [sys.executable, "-c", code, "simulate", "--headless", *arguments],
+        env=os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.splitlines()[-1]
+
+
+def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path):
+    file = tmp_path / "s.json"
+    arguments = ["--seeds", "3", "--selector", "oracle", "--scenario", "approach"]
+    row = simulate(*arguments, "--json", str(file))
+    result = json.loads(file.read_text())
+    assert result["run"]["selector"] == "oracle"
+    assert result["success_rate"]["value"] == 1
+    assert row.startswith("| oracle | 1 | 100.0% |")
+    assert simulate(*arguments, "--json", str(file), "--resume") == row
+    assert json.loads(file.read_text())["drives"] == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["simulate", "--seeds", "0"], "--seeds"),
+        (["simulate", "--corner-noise-px", "nan"], "--corner-noise-px"),
+        (["simulate", "--corner-noise-px", "-1"], "--corner-noise-px"),
+        (["simulate", "--told-noise-px", "0"], "--told-noise-px"),
+        (["simulate", "--resume"], "--resume"),
+        (["simulate", "--scenario", "moon"], "moon"),
+        (["simulate", "--markers", "nowhere.yaml"], "nowhere.yaml"),
+        (["reliability", "--frames", "0"], "--frames"),
+        (["reliability", "nowhere.bag"], "nowhere.bag"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, told, capsys):
+    assert main([*arguments, *(["--headless"] if "--resume" not in arguments else [])]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert told in lines[0]
+
+
+def test_random_views_are_drawn(tmp_path, capsys):
+    assert main(["reliability", "--frames", "400", "--headless", "--out", str(tmp_path)]) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert 150 < summary["pairs"] < 350
+    assert 0.02 < summary["flipped_fraction"] < 0.25
+    assert summary["expected_calibration_error"] < 0.15
+    assert (tmp_path / "reliability.png").stat().st_size > 5000

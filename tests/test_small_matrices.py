@@ -1,0 +1,59 @@
+"""Unrolled linear algebra against LAPACK."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from jaxnav import small_matrices as small
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [1, 3, 6])
+def test_a_batch_of_systems_is_solved_as_lapack_does(n, dtype):
+    rng = np.random.default_rng(n)
+    roots = rng.normal(size=(50, n, n + 2))
+    A = (roots @ np.swapaxes(roots, 1, 2) + 0.1 * np.eye(n)).astype(dtype)
+    b = rng.normal(size=(50, n, 2)).astype(dtype)
+
+    @jax.jit
+    @jax.vmap
+    def solve(A, b):
+        L = small.cholesky(A)
+        return L, small.cho_solve(L, b), small.cho_solve(L, b[:, 0]), small.log_det(L)
+
+    L, x, x0, log_det = solve(jnp.asarray(A), jnp.asarray(b))
+    assert L.dtype == dtype
+    tolerance = 1e-9 if dtype == np.float64 else 2e-3
+    np.testing.assert_allclose(
+        L, np.linalg.cholesky(A.astype(float)), atol=tolerance, rtol=tolerance
+    )
+    expected = np.linalg.solve(A.astype(float), b)
+    np.testing.assert_allclose(x, expected, atol=tolerance, rtol=tolerance)
+    np.testing.assert_allclose(x0, expected[..., 0], atol=tolerance, rtol=tolerance)
+    np.testing.assert_allclose(log_det, np.linalg.slogdet(A)[1], atol=tolerance)
+
+
+def test_an_indefinite_matrix_has_no_factor():
+    A = jnp.asarray([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert not np.all(np.isfinite(small.cholesky(A)))
+
+
+def test_inverses():
+    rng = np.random.default_rng(0)
+    A = jnp.asarray(rng.normal(size=(3, 3)))
+    np.testing.assert_allclose(small.inverse_3(A), np.linalg.inv(A), rtol=1e-9)
+    J = jaxlie.SE3.exp(jnp.asarray(rng.normal(size=6))).jlog()
+    np.testing.assert_allclose(small.inverse_of_blocks(J), np.linalg.inv(J), atol=1e-9)
+
+
+def test_gradients_are_those_of_lapack():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(3, 5))
+    A, b = jnp.asarray(root @ root.T), jnp.asarray(rng.normal(size=3))
+    ours = jax.grad(lambda A: b @ small.cho_solve(small.cholesky(A), b))(A)
+    x = np.linalg.solve(A, b)
+    # The lower triangle alone is read.
+    expected = -np.outer(x, x)
+    np.testing.assert_allclose(ours + ours.T, expected + expected.T, rtol=1e-9)
