@@ -8,7 +8,6 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import jaxlie
 import pytest
 from jaxtyping import install_import_hook
@@ -16,7 +15,9 @@ from jaxtyping import install_import_hook
 # Most of a run is compilation. LLVM's costly passes win nothing on inputs as small as these.
 # XLA reads this when the first array is made.
 os.environ.setdefault(
-    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
+    "--xla_cpu_use_fusion_emitters=false",
 )
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -28,14 +29,6 @@ CORE = sorted(
     if path.stem not in ("__init__", "cli", "errors", "plotting")
 )
 install_import_hook(CORE, "beartype.beartype")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Compile once and not in every run: compiled code is kept in .pytest_cache."""
-    if config.pluginmanager.has_plugin("cacheprovider"):
-        directory = config.cache.mkdir(f"jaxlib-{jaxlib.__version__}")
-        jax.config.update("jax_compilation_cache_dir", str(directory))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 @pytest.fixture(scope="session")
