@@ -19,7 +19,13 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.candidates import Candidates
-from jaxnav.geometry import planar_from_T_world_vehicle, safe_atan2, safe_norm, wrap_angle
+from jaxnav.geometry import (
+    planar_from_T_world_vehicle,
+    rotation_error_rad,
+    safe_atan2,
+    safe_norm,
+    wrap_angle,
+)
 from jaxnav.observation import Snapshot
 from jaxnav.residuals import e2
 from jaxnav.small_matrices import cholesky, log_det, solve_lower
@@ -36,6 +42,8 @@ class PoseBelief(eqx.Module):
     # What no filter follows, times its sigma: a car rolls, pitches and bounces a little, and its
     # cameras point a little elsewhere than the calibration says. xi = nuisance @ N(0, 1).
     nuisance: Float[Array, "6 t"]
+    # Measured poses farther from the prediction than this, as NIS, the filter keeps out.
+    gate_nis: Float[Array, ""] | float
 
 
 class PoseMeasurement(eqx.Module):
@@ -196,8 +204,8 @@ class OrientationGiven(eqx.Module):
     The observation brings them, each with its sigma: `heading_rad` from a compass or a gyro that
     was aligned before (MegaTag2), `normals_camera` from an RGB-D camera (Jin et al.) or from
     lenticular markers (Tanaka et al.). Adds their whitened squared error to that of the corners.
-    Where the observation brings neither it is the lower whitened e1; it believes the sensor
-    without asking whether it can be right.
+    Where the observation brings neither it is the lower whitened e1, as wide as its minimum is;
+    it believes the sensor without asking whether it can be right.
 
     Source: Jin, Matikainen, Srinivasa (2017), "Sensor fusion for fiducial tags"; Tanaka et
     al. (2014), "Solution to pose ambiguity of visual markers using moire patterns"; Limelight's
@@ -207,7 +215,8 @@ class OrientationGiven(eqx.Module):
     hypotheses: ClassVar[int] = 1
 
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
-        costs = candidates.cost
+        # Less the width of the minimum: how much of what is possible each candidate stands for.
+        costs = candidates.cost - _log_determinants(candidates.covariance)
         Ts_world_vehicle = jax.vmap(lambda T: T.inverse())(candidates.T_vehicle_world)
         if snapshot.obs.heading_rad is not None:
             psi_rad = planar_from_T_world_vehicle(Ts_world_vehicle)[:, 2]
@@ -229,7 +238,9 @@ class Oracle(eqx.Module):
         T_true = snapshot.obs.T_world_vehicle_true
         if T_true is None:
             raise ValueError("Oracle needs observations that carry T_world_vehicle_true")
-        turns = jax.vmap(lambda T: turn_rad(T @ T_true))(candidates.T_vehicle_world)
+        turns = jax.vmap(lambda T: rotation_error_rad(T.inverse(), T_true))(
+            candidates.T_vehicle_world
+        )
         return _cheapest(prior, candidates, turns, doubts=jnp.zeros_like(turns))
 
 
@@ -314,9 +325,3 @@ def _normals_error(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Arr
     cosine = jnp.sum(normals_camera * measured, axis=2)
     turn_rad = jnp.where(known, safe_atan2(sine, cosine), 0)
     return jnp.sum((turn_rad / obs.normal_sigma_rad) ** 2)
-
-
-def turn_rad(T: jaxlie.SE3) -> Float[Array, ""]:
-    """Angle of the rotation of a motion, rad, from 0 to pi."""
-    w, x, y, z = T.rotation().wxyz
-    return 2 * safe_atan2(safe_norm(jnp.stack([x, y, z])), jnp.abs(w))

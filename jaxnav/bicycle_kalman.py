@@ -9,6 +9,8 @@ from jaxnav import bicycle, kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
 from jaxnav.bicycle import Vehicle
 from jaxnav.geometry import (
+    OFF_GROUND,
+    ON_GROUND,
     T_world_vehicle_from_planar,
     planar_covariance,
     planar_from_T_world_vehicle,
@@ -16,6 +18,7 @@ from jaxnav.geometry import (
 )
 from jaxnav.motion import Belief, followed, merged, unstarted
 from jaxnav.observation import Observation
+from jaxnav.small_matrices import sandwich
 
 
 class BicycleKalman(eqx.Module):
@@ -81,14 +84,14 @@ class BicycleKalman(eqx.Module):
     def poses(self, belief: Belief) -> PoseBelief:
         """Level on the ground (Eq. 12), as far as `tilt_sigma_rad` and `height_sigma_m` go."""
         T_world_vehicle = T_world_vehicle_from_planar(belief.mean[:, :3])
-        eye = jnp.eye(6, dtype=belief.mean.dtype)
-        freedom = eye[:, jnp.array([0, 1, 5])]
+        dtype = belief.mean.dtype
+        freedom = jnp.asarray(ON_GROUND, dtype)
         tilt = [self.height_sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad]
-        nuisance = eye[:, jnp.array([2, 3, 4])] * jnp.asarray(tilt, eye.dtype)[None]
+        nuisance = jnp.asarray(OFF_GROUND, dtype) * jnp.asarray(tilt, dtype)[None]
 
         def body_covariance(pose: Array, P: Array) -> Array:
-            lift = freedom @ jnp.eye(3, dtype=P.dtype).at[:2, :2].set(_turn(-pose[2]))
-            return lift @ P[:3, :3] @ lift.T
+            to_body = jnp.eye(3, dtype=P.dtype).at[:2, :2].set(_turn(-pose[2]))
+            return sandwich(freedom, sandwich(to_body, P[:3, :3]))
 
         return PoseBelief(
             T_world_vehicle,
@@ -97,6 +100,7 @@ class BicycleKalman(eqx.Module):
             belief.initialised,
             freedom,
             nuisance,
+            self.gate_nis,
         )
 
     def update(
@@ -173,12 +177,12 @@ class BicycleKalman(eqx.Module):
         to_body = eye.at[:2, :2].set(_turn(-belief.mean[2]))
         to_world = eye.at[:2, :2].set(_turn(pose[2]))
         T_prior = T_world_vehicle_from_planar(belief.mean[:3])
-        freedom = eye[:, jnp.array([0, 1, 5])]
-        P = jnp.where(starts, eye, to_body @ belief.covariance @ to_body.T)
+        freedom = jnp.asarray(ON_GROUND, eye.dtype)
+        P = jnp.where(starts, eye, sandwich(to_body, belief.covariance))
         correction, P = followed(P, T_prior, T, corrected.covariance, freedom)
         mean = jnp.append(pose, belief.mean[3:] + correction[3:])
         mean = jnp.where(accepted, mean, jnp.where(starts, first_mean, belief.mean))
-        P = jnp.where(accepted, to_world @ P @ to_world.T, belief.covariance)
+        P = jnp.where(accepted, sandwich(to_world, P), belief.covariance)
         rejected = corrected.taken & belief.initialised & ~accepted
         return Belief(
             mean,

@@ -77,6 +77,7 @@ class ConstantVelocity(eqx.Module):
             belief.initialised,
             jnp.eye(6, dtype=belief.mean.dtype),
             jnp.zeros((6, 0), belief.mean.dtype),
+            self.gate_nis,
         )
 
     def update(

@@ -48,6 +48,7 @@ class Exploration(eqx.Module):
     """
 
     speed_mps: float = 0.5
+    settle_s: float = 0.1  # how soon it is at that speed: the throttle leads where the car lags
     angle_rad: float = float(np.deg2rad(60.0))
     reach_m: float = 0.4  # how sharply it turns onto that course
     min_range_m: float = 0.7
@@ -85,6 +86,7 @@ class Controller(eqx.Module):
         dt_s: Float[Array, ""],
         decided: Bool[Array, ""] | bool = True,
         to_marker_m: Float[Array, " 2"] | None = None,
+        speed_mps: Float[Array, ""] | float = np.nan,
     ) -> tuple[ControlState, Command, Bool[Array, ""], ControlLog]:
         """One command.
 
@@ -96,6 +98,7 @@ class Controller(eqx.Module):
             decided: whether the pose may be acted upon.
             to_marker_m: the nearest marker, seen from the vehicle in its own axes: alike under all
                 poses that are still possible. Needed where `decided` may be False.
+            speed_mps: measured speed, which exploring controls; no number: it drives open-loop.
 
         Returns:
             The next state, the command, whether the last waypoint is reached, and the log.
@@ -126,7 +129,7 @@ class Controller(eqx.Module):
         integral_ms = jnp.clip(integral_ms, 0, self.integral_limit_ms)
         throttle = self.proportional_per_m * distance_m + self.integral_per_ms * integral_ms
         limit = self.vehicle.throttle_limit
-        state, explore = self._explore(state, decided, to_marker_m, beta_rad, dt_s)
+        state, explore = self._explore(state, decided, to_marker_m, beta_rad, speed_mps, dt_s)
         steering = jnp.where(decided, steering, explore.steering_rad)
         throttle = jnp.where(decided, jnp.clip(throttle, -limit, limit), explore.throttle)
         command = Command(
@@ -143,6 +146,7 @@ class Controller(eqx.Module):
         decided: Bool[Array, ""] | bool,
         to_marker_m: Float[Array, " 2"] | None,
         beta_rad: Float[Array, ""],
+        speed_mps: Float[Array, ""] | float,
         dt_s: Float[Array, ""],
     ) -> tuple[ControlState, Command]:
         """The command of a car that is not sure of its pose."""
@@ -157,8 +161,11 @@ class Controller(eqx.Module):
         alpha_rad = wrap_angle(bearing_rad + side * explore.angle_rad - beta_rad)
         steering = self._steering(alpha_rad, jnp.asarray(explore.reach_m, limit.dtype), beta_rad)
         goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
-        throttle = explore.speed_mps / self.vehicle.speed_per_throttle_mps
-        throttle = jnp.minimum(throttle, self.vehicle.throttle_limit)
+        lead = jnp.maximum(self.vehicle.speed_time_constant_s / explore.settle_s - 1, 0)
+        short_mps = explore.speed_mps - speed_mps
+        short_mps = jnp.where(jnp.isfinite(short_mps), short_mps, 0)
+        throttle = (explore.speed_mps + lead * short_mps) / self.vehicle.speed_per_throttle_mps
+        throttle = jnp.clip(throttle, 0, self.vehicle.throttle_limit)
         return ControlState(
             state.waypoint_index,
             state.integral_ms,

@@ -7,7 +7,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.candidates import Candidates
-from jaxnav.geometry import safe_norm
+from jaxnav.geometry import rotation_error_rad, safe_norm
 
 OUTLIER_DEG = 10.0
 
@@ -34,12 +34,6 @@ def judge_branch(
     outlier = judged & (nearest_rad > jnp.deg2rad(OUTLIER_DEG))
     wrong = judged & ~outlier & (angles_rad[jnp.maximum(selected, 0)] > nearest_rad)
     return Branch(judged, wrong, outlier, judged & (jnp.sum(candidates.valid) > 1))
-
-
-def rotation_error_rad(T_a_b: jaxlie.SE3, T_a_c: jaxlie.SE3) -> Float[Array, ""]:
-    """Angle between two orientations, rad, from 0 to pi."""
-    w, x, y, z = (T_a_b.rotation().inverse() @ T_a_c.rotation()).wxyz
-    return 2 * jnp.arctan2(safe_norm(jnp.stack([x, y, z])), jnp.abs(w))
 
 
 def position_error_m(T_a_b: jaxlie.SE3, T_a_c: jaxlie.SE3) -> Float[Array, ""]:

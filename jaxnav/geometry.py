@@ -5,9 +5,20 @@ also the pose of b in a. Tangent vectors of SE(3) are ordered (translation, rota
 jaxlie, and perturb from the right: `T * exp(xi)`, so that xi lives in the inner frame.
 """
 
+from collections.abc import Callable
+from math import factorial
+
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float, Shaped
+
+from jaxnav.small_matrices import product, sandwich
+
+# Of xi, and of what else is ordered (translation, rotation): on level ground a vehicle shifts along
+# its x and y and turns about its z.
+ON_GROUND = np.eye(6)[:, [0, 1, 5]]
+OFF_GROUND = np.eye(6)[:, [2, 3, 4]]
 
 
 def wrap_angle(angle_rad: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -47,23 +58,38 @@ def planar_from_T_world_vehicle(T_world_vehicle: jaxlie.SE3) -> Float[Array, "*b
 
 
 def right_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
-    """J in exp(xi + d) = exp(xi) exp(J d) for small d: the sum of (-ad xi)^k / (k + 1)!.
+    """J in exp(xi + d) = exp(xi) exp(J d) for small d.
 
     jaxlie's `jlog` is its inverse, but loses its digits at turns below a degree, and its gradient
-    is NaN at none. Good to 1e-9 up to a radian.
+    is NaN at none. The functions of the angle are power series here: good to 1e-9 up to a radian.
+
+    Source: Barfoot (2017), Eqs. 7.77 and 7.86, at -xi.
     """
-    v, w = xi[:3], xi[3:]
+    V, W = skew(-xi[:3]), skew(-xi[3:])
+    squared = jnp.sum(xi[3:] ** 2)
 
-    def cross(a: Array) -> Array:
-        zero = jnp.zeros_like(a[0])
-        return jnp.stack([zero, -a[2], a[1], a[2], zero, -a[0], -a[1], a[0], zero]).reshape(3, 3)
+    def series(coefficient: Callable[[int], float]) -> Array:
+        total = jnp.zeros_like(squared)
+        for k in reversed(range(7)):
+            total = (-1) ** k * coefficient(k) + squared * total
+        return total
 
-    minus_ad = -jnp.block([[cross(w), cross(v)], [jnp.zeros((3, 3), xi.dtype), cross(w)]])
-    term = total = jnp.eye(6, dtype=xi.dtype)
-    for k in range(1, 13):
-        term = term @ minus_ad / (k + 1)
-        total = total + term
-    return total
+    a = series(lambda k: 1 / factorial(2 * k + 2))
+    b = series(lambda k: 1 / factorial(2 * k + 3))
+    c = series(lambda k: 1 / factorial(2 * k + 4))
+    d = series(lambda k: (k + 1) / factorial(2 * k + 5))
+    WW, WV, VW = product(W, W), product(W, V), product(V, W)
+    WVW, WWV, VWW = product(WV, W), product(WW, V), product(VW, W)
+    J = jnp.eye(3, dtype=xi.dtype) + a * W + b * WW
+    Q = V / 2 + b * (WV + VW + WVW) + c * (WWV + VWW - 3 * WVW)
+    Q = Q + d * (product(WVW, W) + product(W, WVW))
+    return jnp.block([[J, Q], [jnp.zeros_like(J), J]])
+
+
+def skew(a: Float[Array, " 3"]) -> Float[Array, "3 3"]:
+    """The matrix of the cross product: skew(a) @ b = a x b."""
+    zero = jnp.zeros_like(a[0])
+    return jnp.stack([zero, -a[2], a[1], a[2], zero, -a[0], -a[1], a[0], zero]).reshape(3, 3)
 
 
 def on_ground(T_world_vehicle: jaxlie.SE3) -> jaxlie.SE3:
@@ -95,7 +121,7 @@ def planar_covariance(
     )
     jacobian = jnp.zeros((3, 6), c.dtype)
     jacobian = jacobian.at[:2, :3].set(R_world_vehicle[:2]).at[2, 3:].set(dpsi_dw)
-    return jacobian @ covariance @ jacobian.T
+    return sandwich(jacobian, covariance)
 
 
 def safe_norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
@@ -114,6 +140,12 @@ def safe_atan2(y: Float[Array, "*batch"], x: Float[Array, "*batch"]) -> Float[Ar
     """atan2 in rad, 0 with a zero gradient at the origin. NaN stays NaN."""
     undefined = x**2 + y**2 <= 0
     return jnp.where(undefined, 0, jnp.arctan2(y, jnp.where(undefined, 1, x)))
+
+
+def rotation_error_rad(T_a_b: jaxlie.SE3, T_a_c: jaxlie.SE3) -> Float[Array, ""]:
+    """Angle between two orientations, rad, 0 to pi; its gradient is zero between equal ones."""
+    w, x, y, z = (T_a_b.rotation().inverse() @ T_a_c.rotation()).wxyz
+    return 2 * safe_atan2(safe_norm(jnp.stack([x, y, z])), jnp.abs(w))
 
 
 def rotation_from_matrix(R: Float[Array, "3 3"]) -> jaxlie.SO3:

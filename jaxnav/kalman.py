@@ -7,7 +7,7 @@ Joseph (1968), since Eq. 11's (I - K H) P loses positive definiteness in float32
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.small_matrices import cho_solve, cholesky
+from jaxnav.small_matrices import cho_solve, cholesky, product, sandwich
 
 # A variance never falls below this fraction of the largest one.
 _RELATIVE_FLOOR = 1e-12
@@ -17,7 +17,7 @@ def predict_covariance(
     P: Float[Array, "n n"], F: Float[Array, "n n"], Q: Float[Array, "n n"]
 ) -> Float[Array, "n n"]:
     """F P F' + Q (Eq. 9), symmetric."""
-    return symmetrise(F @ P @ F.T + Q)
+    return symmetrise(sandwich(F, P) + Q)
 
 
 def update(
@@ -33,12 +33,12 @@ def update(
 
     Source: Eqs. 10 and 11; P = (I - K H) P (I - K H)' + K R K'.
     """
-    S = symmetrise(H @ P @ H.T + R)
-    K = cho_solve(cholesky(S), H @ P).T
-    I_KH = jnp.eye(P.shape[0], dtype=P.dtype) - K @ H
-    posterior = symmetrise(I_KH @ P @ I_KH.T + K @ R @ K.T)
-    floor = _RELATIVE_FLOOR * jnp.max(jnp.diagonal(P))
-    return K @ innovation, posterior + floor * jnp.eye(P.shape[0], dtype=P.dtype), S
+    HP = product(H, P)
+    S = symmetrise(product(HP, H.T) + R)
+    K = cho_solve(cholesky(S), HP).T
+    I_KH = jnp.eye(P.shape[0], dtype=P.dtype) - product(K, H)
+    posterior = symmetrise(sandwich(I_KH, P) + sandwich(K, R))
+    return K @ innovation, floored(posterior, P), S
 
 
 def hide_rows(
@@ -55,6 +55,12 @@ def hide_rows(
 def nis(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
     """Normalised innovation squared, chi-square with m degrees of freedom."""
     return innovation @ cho_solve(cholesky(S), innovation)
+
+
+def floored(posterior: Float[Array, "n n"], prior: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A covariance kept positive definite next to the prior's largest variance."""
+    floor = _RELATIVE_FLOOR * jnp.max(jnp.diagonal(prior))
+    return posterior + floor * jnp.eye(prior.shape[0], dtype=prior.dtype)
 
 
 def symmetrise(P: Float[Array, "n n"]) -> Float[Array, "n n"]:

@@ -24,7 +24,7 @@ from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, Selection
 from jaxnav.geometry import right_jacobian
 from jaxnav.observation import Observation
-from jaxnav.small_matrices import cho_solve, cholesky, inverse_3, inverse_of_blocks
+from jaxnav.small_matrices import cho_solve, cholesky, inverse_3, inverse_of_blocks, sandwich
 
 
 class Belief(eqx.Module):
@@ -81,17 +81,16 @@ def followed(
     away = T.log()
     xi = away @ freedom
     # Error at the prediction -> at the corrected pose, and back.
-    carry = freedom.T @ right_jacobian(away) @ freedom
+    carry = sandwich(freedom.T, right_jacobian(away))
     back = inverse_3(carry) if d == 3 else inverse_of_blocks(carry)
-    posterior = freedom.T @ covariance @ freedom
+    posterior = sandwich(freedom.T, covariance)
     factor = cholesky(P[:d, :d])
     gain = cho_solve(factor, P[:d]).T  # (n, d), identity on top
-    at_prior = back @ posterior @ back.T
-    carried = kalman.symmetrise(P + gain @ (at_prior - P[:d, :d]) @ gain.T)
+    at_prior = sandwich(back, posterior)
+    carried = kalman.symmetrise(P + sandwich(gain, at_prior - P[:d, :d]))
     to_posterior = jnp.eye(P.shape[0], dtype=P.dtype).at[:d, :d].set(carry)
-    carried = kalman.symmetrise(to_posterior @ carried @ to_posterior.T)
-    floor = 1e-12 * jnp.max(jnp.diagonal(P))
-    return gain @ xi, carried + floor * jnp.eye(P.shape[0], dtype=P.dtype)
+    carried = kalman.symmetrise(sandwich(to_posterior, carried))
+    return gain @ xi, kalman.floored(carried, P)
 
 
 def merged(

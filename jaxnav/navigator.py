@@ -21,7 +21,7 @@ from jaxnav.geometry import planar_from_T_world_vehicle, transform_points
 from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.markers import MarkerMap
 from jaxnav.motion import Belief, Motion, restarted_where_broken
-from jaxnav.observation import Observation, Snapshot
+from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
 from jaxnav.rig import CameraRig
 
 
@@ -82,7 +82,7 @@ class Navigator(eqx.Module):
         integral_per_ms: float = 0.005,
         integral_limit_ms: float = 5.0,
         corner_sigma_px: float = 1.0,
-        model_sigma_px: float = 0.15,
+        model_sigma_px: float = MODEL_SIGMA_PX,
         max_sightings: int = 16,
         max_candidates: int = 4,
         max_lm_steps: int = 12,
@@ -191,8 +191,13 @@ class Navigator(eqx.Module):
             T_world_vehicle.inverse(), self.markers.Ts_world_marker.translation()
         )[:, :2]
         nearest_m = centers_m[jnp.argmin(jnp.sum(centers_m**2, axis=1))]
-        dt_s, steering_rad = (jnp.asarray(x, pose.dtype) for x in (obs.dt_s, obs.steering_rad))
-        return self.controller(state, pose, located, steering_rad, dt_s, decided, nearest_m)
+        speed_mps = jnp.where(obs.has_odometry, obs.speed_mps, jnp.nan)
+        steering_rad, dt_s, speed_mps = (
+            jnp.asarray(x, pose.dtype) for x in (obs.steering_rad, obs.dt_s, speed_mps)
+        )
+        return self.controller(
+            state, pose, located, steering_rad, dt_s, decided, nearest_m, speed_mps
+        )
 
     # Bound methods hash their owner: by identity, so that `jax.jit(navigator.step)` works.
     __hash__ = object.__hash__

@@ -12,6 +12,8 @@ from jaxnav.camera import Camera
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
+# What lens calibration and rolling shutter leave in a corner, beside its own scatter.
+MODEL_SIGMA_PX = 0.15
 # Beyond these a reading is an error of the sensor, or of its unit.
 _MAX_SPEED_MPS = 1e3
 _MAX_DT_S = 1e4
@@ -139,7 +141,7 @@ class Snapshot(eqx.Module):
         markers: MarkerMap,
         obs: Observation,
         corner_sigma_px: Float[Array, ""] | float = 1.0,
-        model_sigma_px: Float[Array, ""] | float = 0.15,
+        model_sigma_px: Float[Array, ""] | float = MODEL_SIGMA_PX,
         max_sightings: int = 16,
     ) -> "Snapshot":
         """An observation together with what it is an observation of.

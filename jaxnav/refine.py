@@ -17,14 +17,14 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.geometry import on_last_axis, safe_norm, transform_points
+from jaxnav.geometry import ON_GROUND, on_last_axis, safe_norm, skew, transform_points
 from jaxnav.ippe import PosePair, ippe_square
 from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM
 from jaxnav.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.observation import Sightings, sightings
 from jaxnav.residuals import reprojection_residuals
 from jaxnav.rig import CameraRig
-from jaxnav.small_matrices import cholesky, solve_lower
+from jaxnav.small_matrices import cholesky, product, solve_lower
 
 # An angle is known to about a radian, and a distance to about itself, before any corner is
 # looked at. Bounds the covariance where the corners say nothing.
@@ -191,8 +191,7 @@ def _directions(ground_plane: bool, dtype: jnp.dtype) -> Array:
     The frame the chart lives in is the vehicle's: on the ground it shifts along x and y and turns
     about z.
     """
-    eye = np.eye(6)
-    return jnp.asarray(eye[:, [0, 1, 5]] if ground_plane else eye, dtype)
+    return jnp.asarray(ON_GROUND if ground_plane else np.eye(6), dtype)
 
 
 def _body_covariance(chart: _Chart, J: Array, free: Array) -> Array:
@@ -204,15 +203,10 @@ def _body_covariance(chart: _Chart, J: Array, free: Array) -> Array:
     """
     information = J.T @ J + jnp.eye(J.shape[1], dtype=J.dtype) / _PRIOR_SIGMA**2
     factor = cholesky(information)
-    px, py, pz = chart.pivot
-    zero = jnp.zeros_like(px)
-    cross = jnp.stack(
-        [jnp.stack([zero, -pz, py]), jnp.stack([pz, zero, -px]), jnp.stack([-py, px, zero])]
-    )
     eye = jnp.eye(3, dtype=J.dtype)
-    carry = jnp.block([[chart.scale * eye, cross], [jnp.zeros_like(eye), eye]]) @ free
-    root = solve_lower(factor, carry.T)
-    return root.T @ root
+    carry = jnp.block([[chart.scale * eye, skew(chart.pivot)], [jnp.zeros_like(eye), eye]])
+    root = solve_lower(factor, product(carry, free).T)
+    return product(root.T, root)
 
 
 def solve_marker(

@@ -160,3 +160,20 @@ def test_points_are_transformed_alike_in_any_array(batch):
     expected = points_b @ matrix[:3, :3].T + matrix[:3, 3]
     points_a = geometry.transform_points(T_a_b, jnp.asarray(points_b))
     np.testing.assert_allclose(points_a, expected, atol=1e-13)
+
+
+def test_the_angle_of_a_turn():
+    rng = np.random.default_rng(7)
+    for angle in (0.0, 1e-9, 0.3, 3.0, np.pi):
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        T = jaxlie.SE3.from_rotation_and_translation(
+            jaxlie.SO3.exp(jnp.asarray(angle * axis)), jnp.asarray(rng.normal(size=3))
+        )
+        assert float(geometry.rotation_error_rad(jaxlie.SE3.identity(), T)) == pytest.approx(
+            angle, abs=1e-12
+        )
+        opposite = jaxlie.SE3(T.wxyz_xyz.at[:4].multiply(-1))
+        assert float(geometry.rotation_error_rad(opposite, jaxlie.SE3.identity())) == pytest.approx(
+            angle, abs=1e-12
+        )

@@ -13,6 +13,7 @@ import scipy.optimize
 
 from jaxnav.ambiguity import PoseBelief, Selection
 from jaxnav.candidates import Candidates, find_candidates
+from jaxnav.fan import fan
 from jaxnav.geometry import on_ground
 from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.motion import Belief, followed, merged
@@ -88,6 +89,7 @@ def priors(pose, freedom=PLANAR, nuisance=None, count=8, scale=1.0, seed=1) -> P
         initialised=jnp.ones(count, bool),
         freedom=jnp.asarray(freedom),
         nuisance=jnp.zeros((6, 0)) if nuisance is None else jnp.asarray(nuisance),
+        gate_nis=jnp.inf,
     )
 
 
@@ -258,10 +260,10 @@ def test_the_fan_covers_all_viewing_angles(kind, pose):
     bank = MultiHypothesis(hypotheses=24 if kind == "car" else 60)
     freedom = PLANAR if kind == "car" else EYE
     prior = priors(pose, freedom=freedom, count=bank.hypotheses)
-    fan = bank._fan(prior, candidates, snapshot)
-    assert fan.initialised.shape == (bank.hypotheses,)
-    assert np.sum(np.exp(fan.log_weight)) == pytest.approx(1)
-    Ts = matrix(fan.T_world_vehicle)
+    start = fan(prior, candidates, snapshot, bank.hypotheses)
+    assert start.initialised.shape == (bank.hypotheses,)
+    assert np.sum(np.exp(start.log_weight)) == pytest.approx(1)
+    Ts = matrix(start.T_world_vehicle)
     members = Ts[: -min(candidates.valid.shape[0], 3)]
     directions = viewing_directions(members, snapshot)
     if kind == "car":
@@ -291,7 +293,7 @@ def test_the_fan_covers_all_viewing_angles(kind, pose):
     for T in wanted:
         T = on_ground(T) if kind == "car" else T
         xi = np.stack([logarithm(np.linalg.inv(member) @ matrix(T)) for member in members])
-        P = freedom.T @ np.asarray(fan.covariance)[: len(members)] @ freedom
+        P = freedom.T @ np.asarray(start.covariance)[: len(members)] @ freedom
         distances = [
             x @ freedom @ np.linalg.solve(C, freedom.T @ x) for x, C in zip(xi, P, strict=True)
         ]

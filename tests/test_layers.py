@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "jaxnav"
 
 # From the bottom up. A new module or folder must be placed here before the test passes.
 LAYERS = {
-    "geometry": {"geometry"},
+    "geometry": {"geometry", "small_matrices"},
     "models": {"bicycle", "camera", "markers", "rig"},
     "estimate & control": {
         "ambiguity",
@@ -22,15 +22,16 @@ LAYERS = {
         "constant_velocity",
         "control",
         "evaluation",
+        "fan",
         "hypotheses",
         "ippe",
         "kalman",
         "levenberg_marquardt",
+        "map_fit",
         "motion",
         "observation",
         "refine",
         "residuals",
-        "small_matrices",
     },
     "navigator": {"navigator"},
     "users": {

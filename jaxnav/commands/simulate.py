@@ -20,6 +20,7 @@ from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
 
 BATCH = 256  # drives that run side by side
+VIEWS = 2  # cameras that see a marker at once; the smallest of more views is left out
 
 
 def run(args: Arguments) -> int:
@@ -60,6 +61,7 @@ def _drive(args: Arguments, name: str, noise_px: float) -> dict[str, Any]:
             height_sigma_m=scenario.told_height_sigma_m,
         ),
         corner_sigma_px=told_px,
+        max_sightings=VIEWS * len(markers.ids),
     )
     batch = min(BATCH, args.seeds)
     rollout = Rollout(navigator, vehicle, markers, scenario, noise_px)

@@ -20,12 +20,11 @@ from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.evaluation import Branch, judge_branch
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator, State
-from jaxnav.observation import Observation, Snapshot
+from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
 from jaxnav.runtime.recording import Recording
 
 CHUNK_FRAMES = 64
 SIGMA_SAMPLES = 512  # detections that tell how far a recording's corners scatter
-MODEL_SIGMA_PX = 0.15  # what lens calibration and rolling shutter leave in a corner
 MAX_DT_S = 1.0  # between two frames; a longer pause is a prediction for one second
 
 

@@ -14,9 +14,10 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.ambiguity import LowestReprojection, PoseBelief
+from jaxnav.ambiguity import LowestReprojection
 from jaxnav.camera import Camera
 from jaxnav.candidates import find_candidates
+from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.evaluation import judge_branch
 from jaxnav.geometry import transform_points
 from jaxnav.markers import MarkerMap
@@ -46,7 +47,10 @@ class Frames(eqx.Module):
 
 
 def single_frames(
-    count: int, seed: int, views: Views | None = None, progress: Callable[[int], object] = id
+    count: int,
+    seed: int,
+    views: Views | None = None,
+    progress: Callable[[int], object] = lambda done: None,
 ) -> Frames:
     """Independent frames, on the host.
 
@@ -94,14 +98,7 @@ def _frame(key: Array, views: Views, rig: CameraRig, markers: MarkerMap) -> Fram
     obs = Observation(corners_px[None, None], jnp.ones((1, 1), bool))
     snapshot = Snapshot.create(rig, markers, obs, noise_px)
     candidates = find_candidates(snapshot, max_steps=20)
-    nothing_known = PoseBelief(
-        jaxlie.SE3(jaxlie.SE3.identity().wxyz_xyz[None]),
-        jnp.eye(6)[None],
-        jnp.zeros(1),
-        jnp.zeros(1, bool),
-        jnp.eye(6),
-        jnp.zeros((6, 0)),
-    )
+    nothing_known = ConstantVelocity().poses(ConstantVelocity().init())
     selection = LowestReprojection()(nothing_known, candidates, snapshot)
     branch = judge_branch(candidates, selection.selected, T_camera_world.inverse())
     return Frames(selection.flip_probability, branch.wrong, branch.ambiguous & ~branch.outlier)
