@@ -16,7 +16,7 @@ from jaxnav.geometry import (
     planar_from_T_world_vehicle,
     wrap_angle,
 )
-from jaxnav.motion import Belief, followed, merged, unstarted
+from jaxnav.motion import Belief, corrected, followed, forgotten, gated, unstarted
 from jaxnav.observation import Observation
 from jaxnav.small_matrices import sandwich
 
@@ -72,14 +72,8 @@ class BicycleKalman(eqx.Module):
             return self._with_odometry(mean, kalman.predict_covariance(P, A, Q), obs)
 
         mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
-        believed = belief.rejections < self.max_rejections
-        return Belief(
-            mean,
-            covariance,
-            belief.log_weight,
-            belief.initialised & believed,
-            jnp.where(believed, belief.rejections, 0),
-        )
+        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
+        return forgotten(predicted, belief.rejections >= self.max_rejections)
 
     def poses(self, belief: Belief) -> PoseBelief:
         """Level on the ground (Eq. 12), as far as `tilt_sigma_rad` and `height_sigma_m` go."""
@@ -111,86 +105,64 @@ class BicycleKalman(eqx.Module):
         A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
         NIS is above the gate. Without a pose the NIS is 0.
         """
-        belief = eqx.tree_at(
-            lambda b: (b.log_weight, b.initialised),
-            belief,
-            (selection.log_weight, selection.kept),
-        )
-        measured = selection.measured
-        if isinstance(measured, PosePosterior):
-            belief, nis = jax.vmap(lambda b, m: self._follow(b, m, obs))(belief, measured)
-        else:
-            belief, nis = jax.vmap(lambda b, m: self._update_one(b, m, obs))(belief, measured)
 
         def difference(mean: Array, base: Array) -> Array:
             apart = mean - base
             return apart.at[2].set(wrap_angle(apart[2]))
 
-        def moved(mean: Array, error: Array) -> Array:
-            mean = mean + error
-            return mean.at[2].set(wrap_angle(mean[2]))
+        def correct(
+            belief: Belief, measured: PoseMeasurement | PosePosterior
+        ) -> tuple[Belief, Array]:
+            if isinstance(measured, PosePosterior):
+                return self._follow(belief, measured, obs)
+            return self._measure(belief, measured, obs)
 
-        return merged(belief, selection.heir, difference, moved), nis
+        return corrected(belief, selection, correct, difference, _moved)
 
-    def _update_one(
+    def _measure(
         self, belief: Belief, measured: PoseMeasurement, obs: Observation
     ) -> tuple[Belief, Array]:
-        dtype = belief.mean.dtype
+        """One hypothesis whose selector has chosen a candidate."""
+        P = belief.covariance
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         R = planar_covariance(measured.T_world_vehicle, measured.covariance)
         R = R + jnp.diag(self.vision_floor**2)
-
-        starts = measured.taken & ~belief.initialised
-        first_mean, first_P = self._first(pose, R, obs)
-        mean = jnp.where(starts, first_mean, belief.mean)
-        P = jnp.where(starts, first_P, belief.covariance)
-
-        innovation = pose - mean[:3]
+        innovation = pose - belief.mean[:3]
         innovation = innovation.at[2].set(wrap_angle(innovation[2]))
-        offered = measured.taken & belief.initialised
-        nis = jnp.where(offered, kalman.nis(innovation, P[:3, :3] + R), 0)
-        accepted = offered & (nis <= self.gate_nis)
-        H = jnp.eye(3, 6, dtype=dtype)
-        present = jnp.full(3, accepted).astype(dtype)
-        correction, P, _ = kalman.update(P, *kalman.hide_rows(innovation, H, R, present))
-        mean = mean + correction
-        rejections = jnp.where(offered & ~accepted, belief.rejections + 1, belief.rejections)
-        return Belief(
-            mean.at[2].set(wrap_angle(mean[2])),
-            P,
-            belief.log_weight,
-            belief.initialised | measured.taken,
-            jnp.where(accepted | starts, 0, rejections),
-        ), nis
+        correction, posterior, S = kalman.update(P, innovation, jnp.eye(3, 6, dtype=P.dtype), R)
+        return gated(
+            belief,
+            measured.taken,
+            kalman.nis(innovation, S),
+            self.gate_nis,
+            first=self._first(pose, R, obs),
+            posterior=(_moved(belief.mean, correction), posterior),
+        )
 
     def _follow(
-        self, belief: Belief, corrected: PosePosterior, obs: Observation
+        self, belief: Belief, measured: PosePosterior, obs: Observation
     ) -> tuple[Belief, Array]:
         """One hypothesis whose selector has corrected its pose."""
-        T = corrected.T_world_vehicle
+        T = measured.T_world_vehicle
         pose = planar_from_T_world_vehicle(T)
-        first_mean, first_P = self._first(pose, planar_covariance(T, corrected.covariance), obs)
-        starts = corrected.taken & ~belief.initialised
-        accepted = corrected.taken & belief.initialised & (corrected.nis <= self.gate_nis)
-
         eye = jnp.eye(6, dtype=belief.mean.dtype)
         to_body = eye.at[:2, :2].set(_turn(-belief.mean[2]))
         to_world = eye.at[:2, :2].set(_turn(pose[2]))
-        T_prior = T_world_vehicle_from_planar(belief.mean[:3])
-        freedom = jnp.asarray(ON_GROUND, eye.dtype)
-        P = jnp.where(starts, eye, sandwich(to_body, belief.covariance))
-        correction, P = followed(P, T_prior, T, corrected.covariance, freedom)
-        mean = jnp.append(pose, belief.mean[3:] + correction[3:])
-        mean = jnp.where(accepted, mean, jnp.where(starts, first_mean, belief.mean))
-        P = jnp.where(accepted, sandwich(to_world, P), belief.covariance)
-        rejected = corrected.taken & belief.initialised & ~accepted
-        return Belief(
-            mean,
-            jnp.where(starts, first_P, P),
-            belief.log_weight,
-            belief.initialised | corrected.taken,
-            jnp.where(accepted | starts, 0, belief.rejections + rejected),
-        ), jnp.where(starts, 0, corrected.nis)
+        correction, P = followed(
+            jnp.where(belief.initialised, sandwich(to_body, belief.covariance), eye),
+            T_world_vehicle_from_planar(belief.mean[:3]),
+            T,
+            measured.covariance,
+            jnp.asarray(ON_GROUND, eye.dtype),
+        )
+        return gated(
+            belief,
+            measured.taken,
+            measured.nis,
+            self.gate_nis,
+            first=self._first(pose, planar_covariance(T, measured.covariance), obs),
+            posterior=(jnp.append(pose, belief.mean[3:] + correction[3:]), sandwich(to_world, P)),
+        )
 
     def _first(self, pose: Array, covariance: Array, obs: Observation) -> tuple[Array, Array]:
         """The state of a hypothesis that starts: a pose, at rest as far as the odometry tells."""
@@ -216,8 +188,12 @@ class BicycleKalman(eqx.Module):
         R = jnp.diag(self.odometry_sigma**2).astype(dtype)
         present = jnp.full(3, jnp.asarray(obs.has_odometry, dtype))
         correction, P, _ = kalman.update(P, *kalman.hide_rows(velocity - mean[3:], H, R, present))
-        mean = mean + correction
-        return mean.at[2].set(wrap_angle(mean[2])), P
+        return _moved(mean, correction), P
+
+
+def _moved(mean: Array, error: Array) -> Array:
+    mean = mean + error
+    return mean.at[2].set(wrap_angle(mean[2]))
 
 
 def _turn(angle_rad: Array) -> Array:

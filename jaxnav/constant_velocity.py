@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
-from jaxnav.motion import Belief, followed, merged, unstarted
+from jaxnav.motion import Belief, corrected, followed, forgotten, gated, unstarted
 from jaxnav.observation import Observation
 
 
@@ -59,14 +59,9 @@ class ConstantVelocity(eqx.Module):
 
         mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
         variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
-        believed = belief.rejections < self.max_rejections
-        return Belief(
-            mean,
-            covariance,
-            belief.log_weight,
-            belief.initialised & believed & (variance_m2 < self.lost_sigma_m**2),
-            jnp.where(believed, belief.rejections, 0),
-        )
+        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
+        contradicted = belief.rejections >= self.max_rejections
+        return forgotten(predicted, contradicted | ~(variance_m2 < self.lost_sigma_m**2))
 
     def poses(self, belief: Belief) -> PoseBelief:
         """The pose part of the state."""
@@ -88,75 +83,54 @@ class ConstantVelocity(eqx.Module):
         A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
         NIS is above the gate. Without a pose the NIS is 0.
         """
-        belief = eqx.tree_at(
-            lambda b: (b.log_weight, b.initialised),
-            belief,
-            (selection.log_weight, selection.kept),
-        )
-        measured = selection.measured
-        if isinstance(measured, PosePosterior):
-            belief, nis = jax.vmap(self._follow)(belief, measured)
-        else:
-            belief, nis = jax.vmap(self._update_one)(belief, measured)
 
         def difference(mean: Array, base: Array) -> Array:
             between = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
             return jnp.append(between.log(), mean[7:] - base[7:])
 
-        def moved(mean: Array, error: Array) -> Array:
-            T = (jaxlie.SE3(mean[:7]) @ jaxlie.SE3.exp(error[:6])).normalize()
-            return jnp.append(T.wxyz_xyz, mean[7:] + error[6:])
+        def correct(
+            belief: Belief, measured: PoseMeasurement | PosePosterior
+        ) -> tuple[Belief, Array]:
+            if isinstance(measured, PosePosterior):
+                return self._follow(belief, measured)
+            return self._measure(belief, measured)
 
-        return merged(belief, selection.heir, difference, moved), nis
+        return corrected(belief, selection, correct, difference, _moved)
 
-    def _update_one(self, belief: Belief, measured: PoseMeasurement) -> tuple[Belief, Array]:
-        dtype = belief.mean.dtype
+    def _measure(self, belief: Belief, measured: PoseMeasurement) -> tuple[Belief, Array]:
+        """One hypothesis whose selector has chosen a candidate."""
+        mean, P = belief.mean, belief.covariance
         wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
         R = measured.covariance + jnp.diag(self.vision_floor**2)
-
-        starts = measured.taken & ~belief.initialised
-        first_mean, first_P = self._first(wxyz_xyz, R)
-        mean = jnp.where(starts, first_mean, belief.mean)
-        P = jnp.where(starts, first_P, belief.covariance)
-
-        T_world_prior = jaxlie.SE3(mean[:7])
-        offered = measured.taken & belief.initialised
         # Where no pose is taken the difference is that of a pose with itself: log stays smooth.
-        T_measured = jaxlie.SE3(jnp.where(offered, wxyz_xyz, T_world_prior.wxyz_xyz))
-        innovation = (T_world_prior.inverse() @ T_measured).log()
-        nis = jnp.where(offered, kalman.nis(innovation, P[:6, :6] + R), 0)
-        accepted = offered & (nis <= self.gate_nis)
-        H = jnp.eye(6, 12, dtype=dtype)
-        present = jnp.full(6, accepted).astype(dtype)
-        correction, P, _ = kalman.update(P, *kalman.hide_rows(innovation, H, R, present))
-        T_posterior = (T_world_prior @ jaxlie.SE3.exp(correction[:6])).normalize()
-        rejections = jnp.where(offered & ~accepted, belief.rejections + 1, belief.rejections)
-        return Belief(
-            jnp.append(T_posterior.wxyz_xyz, mean[7:] + correction[6:]),
-            P,
-            belief.log_weight,
-            belief.initialised | measured.taken,
-            jnp.where(accepted | starts, 0, rejections),
-        ), nis
+        offered = measured.taken & belief.initialised
+        T_measured = jaxlie.SE3(jnp.where(offered, wxyz_xyz, mean[:7]))
+        innovation = (jaxlie.SE3(mean[:7]).inverse() @ T_measured).log()
+        correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, 12, dtype=P.dtype), R)
+        return gated(
+            belief,
+            measured.taken,
+            kalman.nis(innovation, S),
+            self.gate_nis,
+            first=self._first(wxyz_xyz, R),
+            posterior=(_moved(mean, correction), posterior),
+        )
 
-    def _follow(self, belief: Belief, corrected: PosePosterior) -> tuple[Belief, Array]:
+    def _follow(self, belief: Belief, measured: PosePosterior) -> tuple[Belief, Array]:
         """One hypothesis whose selector has corrected its pose."""
-        T = corrected.T_world_vehicle
-        first_mean, first_P = self._first(T.wxyz_xyz, corrected.covariance)
-        starts = corrected.taken & ~belief.initialised
-        accepted = corrected.taken & belief.initialised & (corrected.nis <= self.gate_nis)
-        T_prior = jaxlie.SE3(jnp.where(accepted, belief.mean[:7], T.wxyz_xyz))
+        T = measured.T_world_vehicle
+        offered = measured.taken & belief.initialised
+        T_prior = jaxlie.SE3(jnp.where(offered, belief.mean[:7], T.wxyz_xyz))
         eye = jnp.eye(6, dtype=belief.mean.dtype)
-        correction, P = followed(belief.covariance, T_prior, T, corrected.covariance, eye)
-        mean = jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:])
-        rejected = corrected.taken & belief.initialised & ~accepted
-        return Belief(
-            jnp.where(accepted, mean, jnp.where(starts, first_mean, belief.mean)),
-            jnp.where(accepted, P, jnp.where(starts, first_P, belief.covariance)),
-            belief.log_weight,
-            belief.initialised | corrected.taken,
-            jnp.where(accepted | starts, 0, belief.rejections + rejected),
-        ), jnp.where(starts, 0, corrected.nis)
+        correction, P = followed(belief.covariance, T_prior, T, measured.covariance, eye)
+        return gated(
+            belief,
+            measured.taken,
+            measured.nis,
+            self.gate_nis,
+            first=self._first(T.wxyz_xyz, measured.covariance),
+            posterior=(jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:]), P),
+        )
 
     def _first(self, wxyz_xyz: Array, covariance: Array) -> tuple[Array, Array]:
         """The state of a body that starts: a pose, at rest as far as anybody knows."""
@@ -164,3 +138,8 @@ class ConstantVelocity(eqx.Module):
         velocity = jnp.diag(self.initial_velocity_sigma**2)
         P = jnp.block([[covariance, zero], [zero, velocity]])
         return jnp.append(wxyz_xyz, jnp.zeros(6, wxyz_xyz.dtype)), P
+
+
+def _moved(mean: Array, error: Array) -> Array:
+    T = (jaxlie.SE3(mean[:7]) @ jaxlie.SE3.exp(error[:6])).normalize()
+    return jnp.append(T.wxyz_xyz, mean[7:] + error[6:])

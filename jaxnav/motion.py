@@ -12,7 +12,7 @@ cars, `constant_velocity.py` for everything else.
 """
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -58,6 +58,68 @@ def unstarted(mean: Float[Array, " n"], error_states: int, hypotheses: int) -> B
         initialised=jnp.zeros(hypotheses, bool),
         rejections=jnp.zeros(hypotheses, int),
     )
+
+
+def forgotten(belief: Belief, lost: Bool[Array, " K"]) -> Belief:
+    """The prediction without the hypotheses that are lost: their next pose starts them anew."""
+    return eqx.tree_at(
+        lambda b: (b.initialised, b.rejections),
+        belief,
+        (belief.initialised & ~lost, jnp.where(lost, 0, belief.rejections)),
+    )
+
+
+def corrected(
+    belief: Belief,
+    selection: Selection,
+    correct: Callable[[Belief, Any], tuple[Belief, Array]],
+    difference: Callable[[Array, Array], Array],
+    moved: Callable[[Array, Array], Array],
+) -> tuple[Belief, Float[Array, " K"]]:
+    """The belief after a selection: every hypothesis corrected, equal ones merged.
+
+    Args:
+        correct: (a hypothesis, its part of `selection.measured`) -> (corrected, NIS).
+        difference: see `merged`.
+        moved: see `merged`.
+    """
+    belief = eqx.tree_at(
+        lambda b: (b.log_weight, b.initialised), belief, (selection.log_weight, selection.kept)
+    )
+    belief, nis = jax.vmap(correct)(belief, selection.measured)
+    return merged(belief, selection.heir, difference, moved), nis
+
+
+def gated(
+    belief: Belief,
+    taken: Bool[Array, ""],
+    nis: Float[Array, ""],
+    gate_nis: Float[Array, ""] | float,
+    first: tuple[Array, Array],
+    posterior: tuple[Array, Array],
+) -> tuple[Belief, Float[Array, ""]]:
+    """One hypothesis that was offered a pose, and its NIS, 0 where there was none to compare.
+
+    It starts with `first`, or takes `posterior` where the gate admits it, or stays as predicted
+    (RELIABILITY R1).
+
+    Args:
+        first: mean and covariance of a hypothesis that starts here.
+        posterior: mean and covariance of one that takes the pose.
+    """
+    offered = taken & belief.initialised
+    starts, accepted = taken & ~belief.initialised, offered & (nis <= gate_nis)
+    mean, covariance = (
+        jnp.where(accepted, new, jnp.where(starts, begin, old))
+        for new, begin, old in zip(posterior, first, (belief.mean, belief.covariance), strict=True)
+    )
+    return Belief(
+        mean,
+        covariance,
+        belief.log_weight,
+        belief.initialised | taken,
+        jnp.where(accepted | starts, 0, belief.rejections + offered),
+    ), jnp.where(offered, nis, 0)
 
 
 def followed(

@@ -192,25 +192,26 @@ def photo_with_poses(view: View) -> Figure:
 
 
 def reliability_diagram(
-    predicted: np.ndarray, observed: np.ndarray, counts: np.ndarray, title: str = ""
+    predicted: np.ndarray,
+    observed: np.ndarray,
+    intervals: tuple[np.ndarray, np.ndarray],
+    counts: np.ndarray,
+    title: str = "",
 ) -> Figure:
     """How often what was predicted with a probability came true.
 
     Args:
         predicted: (B,) mean prediction of each bin.
-        observed: (B,) frequency in each bin, drawn with its Wilson interval.
+        observed: (B,) frequency in each bin.
+        intervals: lower and upper end (B,) of what it may be.
         counts: (B,) members of each bin, drawn below.
         title: above everything.
     """
     figure = Figure(figsize=(6, 6.5), layout="constrained")
     figure.suptitle(title, fontsize=9)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
-    z = 1.96
-    center = (observed + z**2 / (2 * counts)) / (1 + z**2 / counts)
-    half = np.sqrt(observed * (1 - observed) / counts + (z / (2 * counts)) ** 2)
-    half = half * z / (1 + z**2 / counts)
     upper.plot([0, 1], [0, 1], color=BLACK, lw=1, ls=":", label="calibrated")
-    upper.vlines(predicted, center - half, center + half, color=BLUE, lw=1)
+    upper.vlines(predicted, *intervals, color=BLUE, lw=1)
     upper.plot(predicted, observed, "o-", color=BLUE, ms=4, label="observed")
     upper.set(ylabel="frequency of a flip", xlim=(0, 1), ylim=(0, 1))
     upper.legend(loc="upper left", fontsize=8)

@@ -115,11 +115,9 @@ def real() -> Rollout:
 
 
 def test_a_seed_s_drive_does_not_depend_on_the_others(real):
-    reported = []
-    first = list(real.run(jnp.asarray([3, 5, 8]), reported.append))
+    first = list(real.run(jnp.asarray([3, 5, 8])))
     other = list(real.run(jnp.asarray([5, 1, 3])))
     assert len(first) == len(other) == 2
-    assert sum(reported) == pytest.approx(1.2)
     for one, two in zip(first, other, strict=True):
         for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
             np.testing.assert_allclose(a[[0, 1]], b[[2, 0]], rtol=1e-9, atol=1e-9)

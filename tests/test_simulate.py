@@ -12,7 +12,7 @@ from jaxnav.cli import main
 from jaxnav.simulation.rollout import Trace
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
-from jaxnav.simulation.single_frames import Reliability
+from jaxnav.simulation.statistics import Reliability
 
 SCENARIO = scenarios()["paper"]
 
@@ -44,7 +44,7 @@ def trace(drives=4, frames=60, **changes) -> Trace:
 
 
 def test_perfect_drives():
-    summary = Drives([trace()], SCENARIO).summary()
+    summary = Drives.of([trace()], SCENARIO).summary()
     assert summary["drives"] == 4
     assert summary["success_rate"]["value"] == 1
     assert 0.4 < summary["success_rate"]["interval"][0] < 0.6  # Wilson, 4 of 4
@@ -59,7 +59,7 @@ def test_wrong_headings_are_counted_where_they_are():
     pose = np.zeros((4, 60, 3))
     pose[0, :45, 2] = np.deg2rad(21.0)  # decided from 5, late from 30
     pose[1, :, 2] = 2 * np.pi + np.deg2rad(19.0)
-    summary = Drives([trace(pose=pose)], SCENARIO).summary()
+    summary = Drives.of([trace(pose=pose)], SCENARIO).summary()
     assert summary["wrong_branch_fraction"]["value"] == pytest.approx(45 / 240)
     assert summary["wrong_branch_fraction_after_2s"]["value"] == pytest.approx(15 / 120)
     assert summary["wrong_once_decided_fraction"]["value"] == pytest.approx(40 / 220)
@@ -72,13 +72,13 @@ def test_a_drive_off_the_floor_or_short_of_a_waypoint_has_failed():
     on_floor[0, 50:] = False
     passed = np.full((4, 60), 2)
     passed[1] = 1
-    summary = Drives([trace(on_floor=on_floor, passed=passed)], SCENARIO).summary()
+    summary = Drives.of([trace(on_floor=on_floor, passed=passed)], SCENARIO).summary()
     assert summary["success_rate"]["value"] == 0.5
 
 
 def test_batches_of_unequal_length_are_one_set():
     never = np.zeros((3, 30), bool)
-    parts = [Drives([trace()], SCENARIO), Drives([trace(3, 30, decided=never)], SCENARIO)]
+    parts = [Drives.of([trace()], SCENARIO), Drives.of([trace(3, 30, decided=never)], SCENARIO)]
     joined = Drives.joined([parts[0].first(2), parts[1]])
     assert joined.time_to_decide_s.tolist() == [5 / 15, 5 / 15, np.inf, np.inf, np.inf]
     assert joined.summary()["drives"] == 5

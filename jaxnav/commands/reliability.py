@@ -14,7 +14,8 @@ from jaxnav.files import output_folder, write_json
 from jaxnav.plotting import reliability_diagram
 from jaxnav.runtime.recordings import read_recording
 from jaxnav.runtime.replay import replay
-from jaxnav.simulation.single_frames import Reliability, single_frames
+from jaxnav.simulation.single_frames import single_frames
+from jaxnav.simulation.statistics import Reliability
 
 
 def run(args: Arguments) -> int:
@@ -40,7 +41,9 @@ def run(args: Arguments) -> int:
         f"{name}: {summary['pairs']} pairs, {summary['flipped_fraction']:.2%} flipped, "
         f"expected calibration error {found.expected_calibration_error:.4f}"
     )
-    figure = reliability_diagram(found.predicted, found.observed, found.counts, title=text)
+    figure = reliability_diagram(
+        found.predicted, found.observed, found.intervals, found.counts, title=text
+    )
     save_figure(figure, out / "reliability.png")
     write_json(out / "summary.json", summary)
     print(text)

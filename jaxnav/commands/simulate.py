@@ -2,19 +2,23 @@
 
 import itertools
 import json
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from jaxnav.bicycle import Vehicle
 from jaxnav.bicycle_kalman import BicycleKalman
 from jaxnav.cli import Simulate as Arguments
 from jaxnav.cli import configure_jax
 from jaxnav.commands.selectors import SELECTORS, make_selector
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
+from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
+from jaxnav.rig import CameraRig
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
@@ -29,11 +33,12 @@ def run(args: Arguments) -> int:
     names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
     wanted = list(itertools.product(names, args.corner_noise_px))
     done = _resumed(args)
+    world = _World.load(args)
     print(_HEADER)
     for name, noise_px in wanted:
         key = _key(args, name, noise_px)
         found = [one for one in done if one["run"] == key]
-        result = found[0] if found else {"run": key} | _drive(args, name, noise_px)
+        result = found[0] if found else {"run": key} | _drive(args, world, key)
         if not found:
             done.append(result)
         if args.json is not None:
@@ -43,28 +48,44 @@ def run(args: Arguments) -> int:
     return 0
 
 
-def _drive(args: Arguments, name: str, noise_px: float) -> dict[str, Any]:
-    qcar = calib_dir() / "qcar"
-    vehicle = load_vehicle(args.vehicle or qcar / "vehicle.yaml")
-    markers = load_markers(args.markers or qcar / "markers.yaml")
+@dataclass(frozen=True)
+class _World:
+    """What all drives have in common."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle
+
+    @staticmethod
+    def load(args: Arguments) -> "_World":
+        qcar = calib_dir() / "qcar"
+        return _World(
+            rig=load_rig(args.rig or qcar / "rig.yaml"),
+            markers=load_markers(args.markers or qcar / "markers.yaml"),
+            vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
+        )
+
+
+def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any]:
+    """All drives of one row of the table."""
+    name, noise_px = key["selector"], key["corner_noise_px"]
     scenario = scenarios()[args.scenario]
-    told_px = noise_px if args.told_noise_px is None else args.told_noise_px
     navigator = Navigator(
-        rig=load_rig(args.rig or qcar / "rig.yaml"),
-        markers=markers,
-        vehicle=vehicle,
+        rig=world.rig,
+        markers=world.markers,
+        vehicle=world.vehicle,
         waypoints_m=scenario.waypoints_m,
         selector=make_selector(name),
         motion=BicycleKalman(
-            vehicle,
+            world.vehicle,
             tilt_sigma_rad=scenario.told_tilt_sigma_rad,
             height_sigma_m=scenario.told_height_sigma_m,
         ),
-        corner_sigma_px=told_px,
-        max_sightings=VIEWS * len(markers.ids),
+        corner_sigma_px=key["told_noise_px"],
+        max_sightings=VIEWS * len(world.markers.ids),
     )
     batch = min(BATCH, args.seeds)
-    rollout = Rollout(navigator, vehicle, markers, scenario, noise_px)
+    rollout = Rollout(navigator, world.vehicle, world.markers, scenario, noise_px)
     parts = []
     with tqdm(
         total=args.seeds,
@@ -75,9 +96,9 @@ def _drive(args: Arguments, name: str, noise_px: float) -> dict[str, Any]:
     ) as bar:
         for begin in range(0, args.seeds, batch):
             seeds = args.seed + begin + np.arange(batch)
-            drives = Drives(list(rollout.run(jnp.asarray(seeds))), scenario)
-            parts.append(drives.first(min(batch, args.seeds - begin)))
-            bar.update(min(batch, args.seeds - begin))
+            wanted = min(batch, args.seeds - begin)
+            parts.append(Drives.of(list(rollout.run(jnp.asarray(seeds))), scenario).first(wanted))
+            bar.update(wanted)
     return Drives.joined(parts).summary()
 
 

@@ -4,7 +4,7 @@ The navigator's own `step` is in the loop; plant, odometer and corners are those
 without its images. Finished drives stand still and are not counted any further.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -80,21 +80,17 @@ class Rollout:
         self._start = jax.jit(jax.vmap(self._first))
         self._advance = jax.jit(jax.vmap(self._chunk, in_axes=(0, None)))
 
-    def run(
-        self, seeds: Int[Array, " S"], progress: Callable[[float], object] = lambda s: None
-    ) -> Iterator[Trace]:
+    def run(self, seeds: Int[Array, " S"]) -> Iterator[Trace]:
         """Traces (S, chunk_frames) one after the other.
 
         Args:
             seeds: a drive for each; a seed's drive does not depend on the others.
-            progress: called with the simulated seconds since the last call.
         """
         keys = jax.vmap(jax.random.key)(seeds)
         worlds = self._start(keys)
         for begin in range(0, self._scenario.frames, self._chunk_frames):
             worlds, trace = self._advance(worlds, jnp.asarray(begin))
             yield jax.device_get(trace)
-            progress(self._chunk_frames * self._scenario.frame_period_s)
             if bool(jnp.all(worlds.ended)):
                 return
 

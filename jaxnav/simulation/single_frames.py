@@ -102,31 +102,3 @@ def _frame(key: Array, views: Views, rig: CameraRig, markers: MarkerMap) -> Fram
     selection = LowestReprojection()(nothing_known, candidates, snapshot)
     branch = judge_branch(candidates, selection.selected, T_camera_world.inverse())
     return Frames(selection.flip_probability, branch.wrong, branch.ambiguous & ~branch.outlier)
-
-
-@dataclass(frozen=True)
-class Reliability:
-    """Predicted against observed frequencies, in bins of equal width."""
-
-    predicted: np.ndarray  # mean prediction of each bin
-    observed: np.ndarray
-    counts: np.ndarray
-
-    @staticmethod
-    def of(probability: np.ndarray, happened: np.ndarray, bins: int = 20) -> "Reliability":
-        """Bin predictions in [0, 1]; empty bins are left out."""
-        index = np.minimum((probability * bins).astype(int), bins - 1)
-        counts = np.bincount(index, minlength=bins)
-        used = counts > 0
-        predicted = np.bincount(index, probability, bins)[used] / counts[used]
-        observed = np.bincount(index, happened.astype(float), bins)[used] / counts[used]
-        return Reliability(predicted, observed, counts[used])
-
-    @property
-    def expected_calibration_error(self) -> float:
-        """Mean gap between prediction and frequency, weighted by the bins' counts.
-
-        Source: Naeini, Cooper, Hauskrecht (2015).
-        """
-        gaps = np.abs(self.predicted - self.observed)
-        return float(np.sum(self.counts * gaps) / np.sum(self.counts))
