@@ -52,9 +52,8 @@ class Spy:
 
 def run(navigator, scenario: Scenario, noise_px=0.0, seeds=SEEDS, chunk_frames=15) -> Trace:
     """The whole rollout, leading axes (seeds, frames)."""
-    rollout = Rollout(navigator, CAR, MARKERS, scenario, noise_px, chunk_frames)
-    traces = list(rollout.run(seeds))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *traces)
+    rollout = Rollout(navigator, CAR, MARKERS, scenario, noise_px, chunk_frames=chunk_frames)
+    return rollout.run(seeds)
 
 
 def short(name: str, **changes) -> Scenario:
@@ -115,18 +114,38 @@ def real() -> Rollout:
 
 
 def test_a_seed_s_drive_does_not_depend_on_the_others(real):
-    first = list(real.run(jnp.asarray([3, 5, 8])))
-    other = list(real.run(jnp.asarray([5, 1, 3])))
-    assert len(first) == len(other) == 2
-    for one, two in zip(first, other, strict=True):
-        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
-            np.testing.assert_allclose(a[[0, 1]], b[[2, 0]], rtol=1e-9, atol=1e-9)
-    assert not np.allclose(first[0].true_pose[0], first[0].true_pose[1])
-    assert not np.allclose(first[0].pose[0] - first[0].true_pose[0], 0)
+    ended = []
+    first = real.run(jnp.asarray([3, 5, 8]), ended.append)
+    assert sum(ended) == 3
+    # Two lanes for four drives: the last two take over where others have ended.
+    few = dataclasses.replace(real, lanes=2)
+    other = few.run(jnp.asarray([5, 1, 8, 3]))
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(a, b[[3, 0, 2]], rtol=1e-6, atol=1e-6)
+    assert not np.allclose(first.true_pose[0], first.true_pose[1])
+    assert not np.allclose(first.pose[0] - first.true_pose[0], 0)
+
+
+def test_a_lane_takes_the_next_seed_where_its_drive_has_ended():
+    """Drives of unequal length: some leave the floor early, some stay to the end."""
+    scenario = short(
+        "paper", start_pose=(1.9, 0.0, 0.0), start_spread=(0.6, 0.1, 0.0), duration_s=2.0
+    )
+    seeds = jnp.arange(7)
+    together = run(Spy(throttle=0.05), scenario, seeds=seeds)
+    rollout = Rollout(Spy(throttle=0.05), CAR, MARKERS, scenario, 0.0, lanes=3, chunk_frames=15)
+    queued = rollout.run(seeds)
+    lengths = np.sum(together.active, axis=1)
+    assert lengths.min() < 10 < lengths.max() == scenario.frames
+    np.testing.assert_array_equal(np.sum(queued.active, axis=1), lengths)
+    for drive, length in enumerate(lengths):
+        np.testing.assert_allclose(
+            queued.true_pose[drive, :length], together.true_pose[drive, :length], atol=1e-12
+        )
 
 
 def test_the_navigator_s_errors_are_measured(real):
-    trace = next(iter(real.run(SEEDS)))
+    trace = real.run(SEEDS)
     assert trace.located.all()
     distance_m = np.linalg.norm((trace.pose - trace.true_pose)[..., :2], axis=-1)
     assert np.all((distance_m > 0) & (distance_m < 5))  # a mirror image may be taken

@@ -44,7 +44,7 @@ def trace(drives=4, frames=60, **changes) -> Trace:
 
 
 def test_perfect_drives():
-    summary = Drives.of([trace()], SCENARIO).summary()
+    summary = Drives.of(trace(), SCENARIO).summary()
     assert summary["drives"] == 4
     assert summary["success_rate"]["value"] == 1
     assert 0.4 < summary["success_rate"]["interval"][0] < 0.6  # Wilson, 4 of 4
@@ -59,7 +59,7 @@ def test_wrong_headings_are_counted_where_they_are():
     pose = np.zeros((4, 60, 3))
     pose[0, :45, 2] = np.deg2rad(21.0)  # decided from 5, late from 30
     pose[1, :, 2] = 2 * np.pi + np.deg2rad(19.0)
-    summary = Drives.of([trace(pose=pose)], SCENARIO).summary()
+    summary = Drives.of(trace(pose=pose), SCENARIO).summary()
     assert summary["wrong_branch_fraction"]["value"] == pytest.approx(45 / 240)
     assert summary["wrong_branch_fraction_after_2s"]["value"] == pytest.approx(15 / 120)
     assert summary["wrong_once_decided_fraction"]["value"] == pytest.approx(40 / 220)
@@ -72,17 +72,16 @@ def test_a_drive_off_the_floor_or_short_of_a_waypoint_has_failed():
     on_floor[0, 50:] = False
     passed = np.full((4, 60), 2)
     passed[1] = 1
-    summary = Drives.of([trace(on_floor=on_floor, passed=passed)], SCENARIO).summary()
+    summary = Drives.of(trace(on_floor=on_floor, passed=passed), SCENARIO).summary()
     assert summary["success_rate"]["value"] == 0.5
 
 
-def test_batches_of_unequal_length_are_one_set():
-    never = np.zeros((3, 30), bool)
-    parts = [Drives.of([trace()], SCENARIO), Drives.of([trace(3, 30, decided=never)], SCENARIO)]
-    joined = Drives.joined([parts[0].first(2), parts[1]])
-    assert joined.time_to_decide_s.tolist() == [5 / 15, 5 / 15, np.inf, np.inf, np.inf]
-    assert joined.summary()["drives"] == 5
-    assert joined.summary()["time_to_decide_s"]["median"]["value"] == np.inf
+def test_drives_that_never_decide_count_as_never():
+    decided = np.zeros((5, 60), bool)
+    decided[:2, 5:] = True
+    drives = Drives.of(trace(5, decided=decided), SCENARIO)
+    assert drives.time_to_decide_s.tolist() == [5 / 15, 5 / 15, np.inf, np.inf, np.inf]
+    assert drives.summary()["time_to_decide_s"]["median"]["value"] == np.inf
 
 
 def test_calibration_error_is_the_weighted_gap():

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from tqdm import tqdm
 
 from jaxnav.bicycle import Vehicle
@@ -23,7 +22,6 @@ from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
 
-BATCH = 256  # drives that run side by side
 VIEWS = 2  # cameras that see a marker at once; the smallest of more views is left out
 
 
@@ -84,9 +82,7 @@ def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any
         corner_sigma_px=key["told_noise_px"],
         max_sightings=VIEWS * len(world.markers.ids),
     )
-    batch = min(BATCH, args.seeds)
     rollout = Rollout(navigator, world.vehicle, world.markers, scenario, noise_px)
-    parts = []
     with tqdm(
         total=args.seeds,
         unit="drive",
@@ -94,12 +90,8 @@ def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any
         disable=args.headless,
         leave=False,
     ) as bar:
-        for begin in range(0, args.seeds, batch):
-            seeds = args.seed + begin + np.arange(batch)
-            wanted = min(batch, args.seeds - begin)
-            parts.append(Drives.of(list(rollout.run(jnp.asarray(seeds))), scenario).first(wanted))
-            bar.update(wanted)
-    return Drives.joined(parts).summary()
+        trace = rollout.run(args.seed + jnp.arange(args.seeds), bar.update)
+    return Drives.of(trace, scenario).summary()
 
 
 def _key(args: Arguments, name: str, noise_px: float) -> dict[str, Any]:

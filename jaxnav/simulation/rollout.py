@@ -4,11 +4,13 @@ The navigator's own `step` is in the loop; plant, odometer and corners are those
 without its images. Finished drives stand still and are not counted any further.
 """
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.bicycle import Vehicle
@@ -51,51 +53,68 @@ class _World(eqx.Module):
     acting: Command  # until the latency of the next one is over
     command: Command
     state: State
+    frame: Int[Array, ""]  # the next one
     passed: Int[Array, ""]
     ended: Bool[Array, ""]
     on_floor: Bool[Array, ""]
 
 
-class Rollout:
-    """Drives of one navigator in one scenario, compiled once for a number of seeds.
+class Rollout(eqx.Module):
+    """Drives of one navigator in one scenario, compiled once for a batch of lanes.
 
-    `run` yields traces of `chunk_frames` frames until all drives have ended.
+    A lane whose drive has ended takes the next seed, so that long drives keep nobody waiting.
     """
 
-    def __init__(
-        self,
-        navigator: Navigator,
-        vehicle: Vehicle,
-        markers: MarkerMap,
-        scenario: Scenario,
-        corner_noise_px: float,
-        chunk_frames: int = 30,
-    ):
-        self._navigator = navigator
-        self._vehicle = vehicle
-        self._markers = markers
-        self._scenario = scenario
-        self._corner_noise_px = corner_noise_px
-        self._chunk_frames = chunk_frames
-        self._start = jax.jit(jax.vmap(self._first))
-        self._advance = jax.jit(jax.vmap(self._chunk, in_axes=(0, None)))
+    navigator: Navigator
+    vehicle: Vehicle
+    markers: MarkerMap
+    scenario: Scenario = eqx.field(static=True)
+    corner_noise_px: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    lanes: int = eqx.field(static=True, default=128)
+    chunk_frames: int = eqx.field(static=True, default=30)
 
-    def run(self, seeds: Int[Array, " S"]) -> Iterator[Trace]:
-        """Traces (S, chunk_frames) one after the other.
+    def run(
+        self, seeds: Int[Array, " S"], progress: Callable[[int], object] = lambda ended: None
+    ) -> Trace:
+        """Every drive, leading axes (S, frames): as many frames as the longest one has.
 
         Args:
             seeds: a drive for each; a seed's drive does not depend on the others.
+            progress: called with the number of drives that have ended since the last call.
         """
-        keys = jax.vmap(jax.random.key)(seeds)
-        worlds = self._start(keys)
-        for begin in range(0, self._scenario.frames, self._chunk_frames):
-            worlds, trace = self._advance(worlds, jnp.asarray(begin))
-            yield jax.device_get(trace)
-            if bool(jnp.all(worlds.ended)):
-                return
+        lanes, waiting = min(self.lanes, len(seeds)), deque(range(len(seeds)))
+        owner = np.full(lanes, -1)
+        chunks: list[list[Trace]] = [[] for _ in seeds]
+        worlds = self._start(jnp.resize(seeds, (lanes,)))
+        while True:
+            idle = owner < 0
+            owner[idle] = [waiting.popleft() if waiting else -1 for _ in range(idle.sum())]
+            if np.all(owner < 0):
+                break
+            fresh = self._start(seeds[np.maximum(owner, 0)])
+            worlds, trace, over = self._advance(_where(jnp.asarray(idle), fresh, worlds))
+            trace, over = jax.device_get((trace, over))
+            for lane in np.flatnonzero(owner >= 0):
+                chunks[owner[lane]].append(jax.tree.map(lambda leaf, lane=lane: leaf[lane], trace))
+            over = over & (owner >= 0)
+            owner[over] = -1
+            progress(int(over.sum()))
+        return _side_by_side(chunks)
+
+    @eqx.filter_jit
+    def _start(self, seeds: Int[Array, " lanes"]) -> _World:
+        return jax.vmap(lambda seed: self._first(jax.random.key(seed)))(seeds)
+
+    @eqx.filter_jit
+    def _advance(self, worlds: _World) -> tuple[_World, Trace, Bool[Array, " lanes"]]:
+        """Some frames of every lane, and which drives are over."""
+        worlds, trace = jax.vmap(
+            lambda world: jax.lax.scan(lambda w, _: self._frame(w), world, length=self.chunk_frames)
+        )(worlds)
+        return worlds, trace, worlds.ended
 
     def _first(self, key: Array) -> _World:
-        scenario = self._scenario
+        scenario = self.scenario
         key, start_key, rig_key = jax.random.split(key, 3)
         spread = jnp.asarray(scenario.start_spread)
         start = jnp.asarray(scenario.start_pose) + spread * jax.random.uniform(
@@ -104,39 +123,37 @@ class Rollout:
         zero = jnp.zeros_like(start[0])
         return _World(
             key=key,
-            rig=scenario.true_rig(self._navigator.rig, rig_key),
+            rig=scenario.true_rig(self.navigator.rig, rig_key),
             car=CarState(start, zero, zero),
             acting=Command(zero, zero),
             command=Command(zero, zero),
-            state=self._navigator.init(),
+            state=self.navigator.init(),
+            frame=jnp.asarray(0),
             passed=jnp.asarray(0),
             ended=jnp.asarray(False),
             on_floor=jnp.asarray(True),
         )
 
-    def _chunk(self, world: _World, begin: Array) -> tuple[_World, Trace]:
-        return jax.lax.scan(self._frame, world, begin + jnp.arange(self._chunk_frames))
-
-    def _frame(self, world: _World, index: Array) -> tuple[_World, Trace]:
+    def _frame(self, world: _World) -> tuple[_World, Trace]:
         """Move for a frame period, the command of the last frame after its latency; then look."""
-        scenario = self._scenario
+        scenario = self.scenario
         dtype = world.car.pose.dtype
         period_s = jnp.asarray(scenario.frame_period_s, dtype)
-        moves = index > 0
-        stamp_s = index * period_s
+        moves = world.frame > 0
+        stamp_s = world.frame * period_s
         car = jax.tree.map(
             lambda new, old: jnp.where(moves & ~world.ended, new, old),
             self._moved(world, period_s),
             world.car,
         )
         car = scenario.displaced(car, stamp_s, period_s)
-        key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, index))
+        key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, world.frame))
 
         # A smear shifts the corners to where they were a little earlier.
         smear = scenario.corner_lag_s / scenario.frame_period_s
         seen_from = car.pose + smear * (world.car.pose - car.pose)
-        corners_px, visible = see(world.rig, self._markers, T_world_vehicle_from_planar(seen_from))
-        noise_px = self._corner_noise_px * jax.random.normal(key_corners, corners_px.shape, dtype)
+        corners_px, visible = see(world.rig, self.markers, T_world_vehicle_from_planar(seen_from))
+        noise_px = self.corner_noise_px * jax.random.normal(key_corners, corners_px.shape, dtype)
         visible = visible & ~scenario.hidden(stamp_s)
         corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
         speed_mps, steering_rad = read_odometry(car, scenario.odometry, key_odometry)
@@ -149,7 +166,7 @@ class Rollout:
             dt_s=jnp.where(moves, period_s, 0),
             **scenario.other_sensors(car, truth, key_odometry),
         )
-        state, out = self._navigator.step(world.state, obs)
+        state, out = self.navigator.step(world.state, obs)
 
         waypoints_m = jnp.asarray(scenario.waypoints_m, dtype).reshape(-1, 2)
         count = waypoints_m.shape[0]
@@ -176,16 +193,41 @@ class Rollout:
         command = Command(*(jnp.zeros_like(x_m),) * 2)
         if out.command is not None and scenario.drives:
             command = out.command
-        ended = world.ended | ~on_floor | (out.done if scenario.drives else False)
+        frame = world.frame + 1
+        ended = world.ended | ~on_floor | (frame >= scenario.frames)
+        if scenario.drives:
+            ended = ended | out.done
         return _World(
-            world.key, world.rig, car, world.command, command, state, passed, ended, on_floor
+            world.key, world.rig, car, world.command, command, state, frame, passed, ended, on_floor
         ), trace
 
     def _moved(self, world: _World, period_s: Array) -> CarState:
         """The car one period later: a command acts `latency_s` after the frame it stems from."""
-        latency_s = jnp.asarray(self._scenario.latency_s, period_s.dtype)
+        latency_s = jnp.asarray(self.scenario.latency_s, period_s.dtype)
         car = world.car
         for command, dt_s in ((world.acting, latency_s), (world.command, period_s - latency_s)):
-            states = move_through(self._vehicle, car, command, dt_s, _SUBSTEPS)
+            states = move_through(self.vehicle, car, command, dt_s, _SUBSTEPS)
             car = jax.tree.map(lambda leaf: leaf[-1], states)
         return car
+
+
+def _side_by_side(chunks: list[list[Trace]]) -> Trace:
+    """Drives of unequal length as one array: what is over stays as it was, and is not active."""
+    drives: list[Trace] = [
+        jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts) for parts in chunks
+    ]
+    frames = max(len(drive.active) for drive in drives)
+
+    def stacked(*leaves: np.ndarray) -> np.ndarray:
+        rest = [[(0, frames - len(leaf))] + [(0, 0)] * (leaf.ndim - 1) for leaf in leaves]
+        return np.stack([np.pad(a, p, mode="edge") for a, p in zip(leaves, rest, strict=True)])
+
+    active = [np.pad(drive.active, (0, frames - len(drive.active))) for drive in drives]
+    trace: Trace = jax.tree.map(stacked, *drives)
+    return eqx.tree_at(lambda t: t.active, trace, np.stack(active))
+
+
+def _where(chosen: Bool[Array, " lanes"], yes: _World, no: _World) -> _World:
+    pick = jax.vmap(lambda c, a, b: jax.tree.map(lambda x, y: jnp.where(c, x, y), a, b))
+    world: _World = pick(chosen, yes, no)
+    return world

@@ -4,8 +4,8 @@ Frames of one drive are not independent, so every interval counts drives: Wilson
 for everything else the bootstrap over drives.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -35,9 +35,9 @@ class Drives:
     success: np.ndarray
 
     @staticmethod
-    def of(traces: Sequence[Trace], scenario: Scenario) -> "Drives":
-        """Traces of any number of seeds, (S, frames) each, frames of every seed in order."""
-        trace: Any = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *traces)
+    def of(drives: Trace, scenario: Scenario) -> "Drives":
+        """Drives, leading axes (S, frames)."""
+        trace: Any = jax.device_get(drives)
         counted = trace.active & trace.located
         decided = counted & trace.decided
         times_s = np.arange(trace.active.shape[1]) * scenario.frame_period_s
@@ -57,23 +57,6 @@ class Drives:
             time_to_decide_s=np.where(decided.any(axis=1), times_s[decided.argmax(axis=1)], np.inf),
             success=trace.on_floor.all(axis=1) & (passed if scenario.drives else right_at_last),
         )
-
-    @staticmethod
-    def joined(parts: Sequence["Drives"]) -> "Drives":
-        """The drives of several batches as one set."""
-        frames = max(part.counted.shape[1] for part in parts)
-
-        def whole(arrays: list[np.ndarray]) -> np.ndarray:
-            if arrays[0].ndim == 2:
-                arrays = [np.pad(a, ((0, 0), (0, frames - a.shape[1]))) for a in arrays]
-            return np.concatenate(arrays)
-
-        names = [field.name for field in fields(Drives)]
-        return Drives(**{name: whole([getattr(p, name) for p in parts]) for name in names})
-
-    def first(self, count: int) -> "Drives":
-        """The first drives alone."""
-        return Drives(*(getattr(self, field.name)[:count] for field in fields(self)))
 
     def summary(self) -> dict[str, Any]:
         """All measures. Fractions are of frames; errors and NEES of frames that are decided."""

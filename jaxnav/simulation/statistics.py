@@ -1,0 +1,50 @@
+"""Rates, and how far they can be trusted."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_Z = 1.959963984540054  # 95 % of a normal distribution lies within
+
+
+def wilson_interval(rate: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the 95 % interval of a proportion that was observed in `count` trials.
+
+    Source: Wilson (1927).
+    """
+    center = (rate + _Z**2 / (2 * count)) / (1 + _Z**2 / count)
+    half = _Z / (1 + _Z**2 / count) * np.sqrt(rate * (1 - rate) / count + (_Z / (2 * count)) ** 2)
+    return np.maximum(center - half, 0), np.minimum(center + half, 1)
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Predicted against observed frequencies, in bins of equal width."""
+
+    predicted: np.ndarray  # mean prediction of each bin
+    observed: np.ndarray
+    counts: np.ndarray
+
+    @staticmethod
+    def of(probability: np.ndarray, happened: np.ndarray, bins: int = 20) -> "Reliability":
+        """Bin predictions in [0, 1]; empty bins are left out."""
+        index = np.minimum((probability * bins).astype(int), bins - 1)
+        counts = np.bincount(index, minlength=bins)
+        used = counts > 0
+        predicted = np.bincount(index, probability, bins)[used] / counts[used]
+        observed = np.bincount(index, happened.astype(float), bins)[used] / counts[used]
+        return Reliability(predicted, observed, counts[used])
+
+    @property
+    def intervals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ends of the 95 % interval of every bin's frequency."""
+        return wilson_interval(self.observed, self.counts)
+
+    @property
+    def expected_calibration_error(self) -> float:
+        """Mean gap between prediction and frequency, weighted by the bins' counts.
+
+        Source: Naeini, Cooper, Hauskrecht (2015).
+        """
+        gaps = np.abs(self.predicted - self.observed)
+        return float(np.sum(self.counts * gaps) / np.sum(self.counts))
