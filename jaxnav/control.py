@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.bicycle import Vehicle, sideslip_rad
+from jaxnav.bicycle import Vehicle, curvature_per_m, sideslip_rad
 from jaxnav.geometry import safe_atan2, safe_norm, wrap_angle
 
 
@@ -60,8 +60,10 @@ class Controller(eqx.Module):
 
     The paper's sum of distances (Eq. 19) never decreases: here it is an integral over time, held
     inside `integral_limit_ms`, and starts anew at every waypoint. After the last waypoint the
-    throttle is zero, and so it is before the first pose and where the pose is no number. While the
-    pose is undecided the car explores instead, and no waypoint counts as reached.
+    throttle is zero, and so it is before the first pose and where the pose is no number. From a
+    waypoint inside the smallest circle the car can drive, which it would orbit, it drives straight
+    on until it can be reached. While the pose is undecided the car explores instead, and no
+    waypoint counts as reached.
     """
 
     waypoints_m: Float[Array, "W 2"]
@@ -124,6 +126,7 @@ class Controller(eqx.Module):
         dt_s = jnp.where(jnp.isfinite(dt_s) & (dt_s > 0), dt_s, 0)
 
         steering = self._steering(alpha_rad, distance_m, beta_rad)
+        steering = jnp.where(self._orbited(alpha_rad, distance_m), 0, steering)
         integral_ms = jnp.where(arrived, 0, state.integral_ms)
         integral_ms = integral_ms + jnp.where(drives & decided, distance_m * dt_s, 0)
         integral_ms = jnp.clip(integral_ms, 0, self.integral_limit_ms)
@@ -176,6 +179,20 @@ class Controller(eqx.Module):
     def _distance(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
         waypoint_m = self.waypoints_m[jnp.minimum(index, self.waypoints_m.shape[0] - 1)]
         return safe_norm(waypoint_m - pose[:2])
+
+    def _orbited(
+        self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""]
+    ) -> Bool[Array, ""]:
+        """Whether the waypoint lies so deep inside the smallest circle the car can drive that it
+        would go round it for ever. Straight on, it leaves the circle.
+        """
+        limit = self.vehicle.steering_limit_rad
+        radius_m = 1 / curvature_per_m(limit, self.vehicle.wheelbase_m)
+        # From the circle's centre, on the waypoint's side of the course.
+        ahead_m = distance_m * jnp.cos(alpha_rad)
+        aside_m = distance_m * jnp.abs(jnp.sin(alpha_rad)) - radius_m
+        missed_by_m = radius_m - safe_norm(jnp.stack([ahead_m, aside_m]))
+        return missed_by_m > self.waypoint_radius_m / 2
 
     def _steering(
         self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""], beta_rad: Float[Array, ""]

@@ -62,7 +62,12 @@ def test_steering_is_equations_16_to_18(precision):
         angle, distance, alpha = paper.steering(pose, worlds.WAYPOINTS_M[0], measured, WHEELBASE_M)
         np.testing.assert_allclose(log.distance_m, distance, rtol=rtol)
         np.testing.assert_allclose(log.alpha_rad, alpha, rtol=rtol, atol=2e-6)
-        if abs(alpha) < np.pi / 2:
+        # The circle of full lock, R_r of Eq. 5, and how far it passes from the waypoint.
+        circle_m = WHEELBASE_M / (np.cos(np.arctan(np.tan(0.5) / 2)) * np.tan(0.5))
+        passes_m = circle_m - abs(distance * np.exp(1j * abs(alpha)) - 1j * circle_m)
+        if passes_m > 0.075:
+            assert command.steering_rad == 0
+        elif abs(alpha) < np.pi / 2:
             np.testing.assert_allclose(
                 command.steering_rad, np.clip(angle, -0.5, 0.5), rtol=rtol, atol=1e-6
             )
@@ -127,6 +132,25 @@ def test_a_waypoint_behind_gets_full_lock_and_is_reached(direction_deg):
     assert done
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(("distance_m", "direction_deg"), [(0.45, 90), (0.6, 80), (0.4, 120)])
+def test_a_waypoint_inside_the_smallest_circle_is_not_orbited(side, distance_m, direction_deg):
+    direction = side * np.deg2rad(direction_deg)
+    control = controller([(distance_m * np.cos(direction), distance_m * np.sin(direction))])
+    _, command, _, _ = act(control, (0.0, 0.0, 0.0))
+    assert command.steering_rad == 0
+    pose, steering, state = np.zeros(3), 0.0, None
+    for _ in range(200):
+        state, command, done, _ = act(control, pose, steering, state=state)
+        if done:
+            break
+        wanted = float(command.steering_rad)
+        steering += np.clip(wanted - steering, -0.5, 0.5)  # the servo's 5 rad/s
+        pose = paper.drive(pose, 0.4, steering, 0.1, WHEELBASE_M, 20)[-1]
+        assert np.linalg.norm(pose[:2]) < 2.0
+    assert done
+
+
 def test_throttle_is_equation_19():
     control, state, total = controller(), None, 0.0
     for step, x_m in enumerate((3.0, 2.9, 2.8, 2.6)):
@@ -175,7 +199,7 @@ def test_it_waits_until_it_is_located():
 
 def look_around(
     control, to_marker_m, state=None, pose=(3.0, 0.0, 2.0), decided=False, dt_s=0.1,
-    steering_rad=0.0, located=True,
+    steering_rad=0.0, located=True, speed_mps=np.nan,
 ):  # fmt: skip
     """One call of a car that does not know where it is, and sees a marker from there."""
     return call(
@@ -187,6 +211,7 @@ def look_around(
         jnp.asarray(dt_s, float),
         jnp.asarray(decided),
         jnp.asarray(to_marker_m, float),
+        jnp.asarray(speed_mps, float),
     )
 
 
@@ -241,6 +266,31 @@ def test_an_undecided_car_goes_slowly_at_60_degrees_to_the_line_of_sight(bearing
     else:
         assert np.all(np.diff(ranges[-20:]) < 0)
     assert float(state.explored_s) == pytest.approx(6.0)
+
+
+def test_the_throttle_leads_where_the_car_lags():
+    """With the odometer's speed it is at its exploring speed three times as soon as the motor is
+    at its own; open-loop where there is none."""
+    control = controller()
+    explore, vehicle = control.exploration, control.vehicle
+    gain_mps, tau_s = float(vehicle.speed_per_throttle_mps), float(vehicle.speed_time_constant_s)
+    assert tau_s == pytest.approx(0.3)
+    for known, reached_s in ((True, explore.settle_s), (False, tau_s)):
+        speed_mps, times_s, period_s = 0.0, [], 0.01
+        for frame in range(200):
+            _, command, _, _ = look_around(
+                control, polar(2.0, 20.0), speed_mps=speed_mps if known else np.nan
+            )
+            speed_mps += (gain_mps * float(command.throttle) - speed_mps) * period_s / tau_s
+            assert 0 <= command.throttle <= vehicle.throttle_limit
+            assert speed_mps <= explore.speed_mps + 1e-9
+            if speed_mps >= (1 - np.exp(-1)) * explore.speed_mps:
+                times_s.append((frame + 1) * period_s)
+        assert times_s[0] == pytest.approx(reached_s, rel=0.2)
+        assert speed_mps == pytest.approx(explore.speed_mps, rel=0.01)
+    # Too fast, as after a slope: it lets the car roll.
+    _, command, _, _ = look_around(control, polar(2.0, 20.0), speed_mps=5.0)
+    assert command.throttle == 0
 
 
 def test_it_keeps_its_side_until_it_knows():
@@ -313,16 +363,18 @@ def test_exploring_has_finite_gradients():
     @jax.jit
     @jax.grad
     def slope(floats):
-        pose, to_marker_m, steering_rad, dt_s = floats
+        pose, to_marker_m, steering_rad, dt_s, speed_mps = floats
         state, command, _, _ = control(
             control.init(), pose, jnp.asarray(True), steering_rad, dt_s, jnp.asarray(False),
-            to_marker_m,
+            to_marker_m, speed_mps,
         )  # fmt: skip
         return command.steering_rad + command.throttle + state.explored_s
 
     for to_marker in (polar(2.0, 20.0), (0.0, 0.0), (-1.0, 0.0)):
-        floats = (jnp.asarray([3.0, 0, 2]), jnp.asarray(to_marker, float), *jnp.asarray([0.1, 0.1]))
-        assert all(np.all(np.isfinite(leaf)) for leaf in slope(floats))
+        for speed_mps in (0.4, np.nan):
+            numbers = jnp.asarray([0.1, 0.1, speed_mps])
+            floats = (jnp.asarray([3.0, 0, 2]), jnp.asarray(to_marker, float), *numbers)
+            assert all(np.all(np.isfinite(leaf)) for leaf in slope(floats))
 
 
 ANYTHING = st.floats(allow_nan=True, allow_infinity=True)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
+import scipy.stats
 
 from jaxnav.ambiguity import PoseBelief, Selection
 from jaxnav.candidates import Candidates, find_candidates
@@ -517,6 +518,47 @@ def test_one_gross_outlier_changes_nothing():
         gaps_m, gaps_rad = errors_of(spoilt, np.asarray(clean.pose))
         assert np.max(gaps_m) < 0.01
         assert np.max(gaps_rad) < np.deg2rad(0.5)
+
+
+def test_what_the_gate_keeps_out_changes_no_verdict_either():
+    """An outlier long after the decision, far from the marker, where its poses lie close."""
+    frame = 60
+    obs = sensed(SIDEWAYS, 0.4)
+    clean = run(car(), obs)
+    assert np.all(clean.decided[:, frame - 1])
+    moved = obs.corners_px.at[:, frame].add(jnp.asarray([60.0, -25.0]).reshape(1, 1, 1, 1, 2))
+    spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, moved))
+    assert np.all(spoilt.rejections[:, frame] == 1)
+    assert np.all(spoilt.decided[:, frame:])
+    before = np.asarray(clean.flip_probability[:, frame - 1])
+    assert np.all(np.asarray(spoilt.flip_probability[:, frame]) < before + 1e-6)
+    np.testing.assert_array_equal(spoilt.hypotheses[:, frame], clean.hypotheses[:, frame - 1])
+
+
+def test_the_reported_pose_s_own_tails_are_part_of_the_flip_probability():
+    """One hypothesis alone, and nothing in view: what its heading's sigma says."""
+    far_deg = 20.0
+    snapshot = view(NEAR)
+    nothing = Snapshot.create(
+        snapshot.rig,
+        snapshot.markers,
+        eqx.tree_at(lambda o: o.visible, snapshot.obs, jnp.zeros_like(snapshot.obs.visible)),
+        0.3,
+    )
+    prior = priors(NEAR)
+    only = eqx.tree_at(lambda p: p.initialised, prior, jnp.arange(8) == 3)
+    for sigma_deg in (2.0, 10.0, 40.0):
+        P = np.diag([0.05, 0.05, 0, 0, 0, np.deg2rad(sigma_deg)]) ** 2
+        wide = eqx.tree_at(lambda p: p.covariance, only, jnp.tile(jnp.asarray(P), (8, 1, 1)))
+        selection = select(EXACT, wide, find(nothing), nothing)
+        expected = 2 * scipy.stats.norm.sf(far_deg / sigma_deg)
+        assert float(selection.flip_probability) == pytest.approx(expected, rel=1e-3, abs=1e-12)
+        assert bool(selection.decided) == (sigma_deg < 12)
+
+
+def test_a_bank_without_room_for_a_fan_is_refused():
+    with pytest.raises(ValueError, match="at least 5"):
+        MultiHypothesis(hypotheses=4)
 
 
 @pytest.fixture(scope="module")

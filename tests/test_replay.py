@@ -11,6 +11,7 @@ import pytest
 from jaxnav.ambiguity import LowestReprojection, PaperCost
 from jaxnav.cli import main
 from jaxnav.constant_velocity import ConstantVelocity
+from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation
 from jaxnav.runtime.recordings import Recording, read_recording
@@ -67,6 +68,18 @@ def test_one_marker_at_a_time_takes_few_wrong_branches(test_7):
     position_m, rotation_deg = errors(result, test_7)
     assert np.nanmedian(position_m) < 0.012
     assert np.nanmedian(rotation_deg) < 0.6
+
+
+def test_the_bank_halves_the_wrong_branches_at_least(test_7):
+    """Every marker by itself, no odometry, every detection judged that has two poses or one."""
+    wrong = []
+    for selector in (LowestReprojection(), MultiHypothesis()):
+        result = replay(test_7, selector, one_at_a_time=True)
+        judged = result.seen & test_7.reference.valid[:, None]
+        wrong.append(int((result.branch.wrong & judged).sum()))
+        assert np.all(result.located[judged])
+    assert wrong[0] >= 5
+    assert wrong[1] <= wrong[0] / 2
 
 
 def test_a_replay_is_the_step_over_and_over(test_7):

@@ -35,6 +35,16 @@ def test_a_batch_of_systems_is_solved_as_lapack_does(n, dtype):
     np.testing.assert_allclose(log_det, np.linalg.slogdet(A)[1], atol=tolerance)
 
 
+@pytest.mark.parametrize("shape", [(6, 6, 6), (3, 12, 5), (2, 1, 4)])
+def test_products(shape):
+    n, k, m = shape
+    rng = np.random.default_rng(2)
+    A, B, P = rng.normal(size=(n, k)), rng.normal(size=(k, m)), rng.normal(size=(k, k))
+    np.testing.assert_allclose(small.product(jnp.asarray(A), jnp.asarray(B)), A @ B, atol=1e-12)
+    sandwich = small.sandwich(jnp.asarray(A), jnp.asarray(P))
+    np.testing.assert_allclose(sandwich, A @ P @ A.T, atol=1e-12)
+
+
 def test_an_indefinite_matrix_has_no_factor():
     A = jnp.asarray([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     assert not np.all(np.isfinite(small.cholesky(A)))
