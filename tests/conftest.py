@@ -26,7 +26,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 CORE = sorted(
     f"jaxnav.{path.stem}"
     for path in (Path(__file__).resolve().parents[1] / "jaxnav").glob("*.py")
-    if path.stem not in ("__init__", "cli", "errors", "plotting")
+    if path.stem not in ("__init__", "arguments", "cli", "errors", "plotting")
 )
 install_import_hook(CORE, "beartype.beartype")
 

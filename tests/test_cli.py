@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from jaxnav import cli
+from jaxnav.arguments import COMMANDS, Demo, Locate, Replay
 from jaxnav.errors import BadInput
 
 JAXNAV = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
@@ -23,7 +24,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], list]:
 
     def install(run: Callable) -> list:
         received = []
-        for name in cli.COMMANDS:
+        for name in COMMANDS:
             module = types.ModuleType(name)
             module.run = lambda args: received.append(args) or run()
             monkeypatch.setitem(sys.modules, f"jaxnav.commands.{name}", module)
@@ -40,9 +41,9 @@ def test_arguments_reach_the_command(command) -> None:
     )
     assert cli.main("locate a.png --camera c.yaml --marker-size-m 0.1 --json".split()) == 0
     assert received == [
-        cli.Demo(seed=3, blur=False, exposure_ms=2.0, rig=Path("a.yaml"), out=Path("x")),
-        cli.Replay(Path("bag"), limit=5, markers="one-at-a-time", markers_file=Path("m.yaml")),
-        cli.Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, json=True),
+        Demo(seed=3, blur=False, exposure_ms=2.0, rig=Path("a.yaml"), out=Path("x")),
+        Replay(Path("bag"), limit=5, markers="one-at-a-time", markers_file=Path("m.yaml")),
+        Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, json=True),
     ]
 
 
@@ -134,13 +135,13 @@ def test_a_defect_keeps_its_traceback(command) -> None:
         cli.main(["demo"])
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_help_explains_every_flag(name, capsys) -> None:
     assert cli.main([name, "--help"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
     assert "{None}" not in out
-    for field in dataclasses.fields(cli.COMMANDS[name]):
+    for field in dataclasses.fields(COMMANDS[name]):
         is_positional = field.name in ("recording", "image")
         flag = field.name.upper() if is_positional else "--" + field.name.replace("_", "-")
         assert re.search(rf"(?m)^.? ?{flag}\b", out), flag
@@ -152,7 +153,7 @@ def test_help_explains_every_flag(name, capsys) -> None:
 def test_help_and_version_name_themselves(capsys) -> None:
     assert cli.main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(name in out for name in cli.COMMANDS)
+    assert all(name in out for name in COMMANDS)
     assert cli.main(["--version"]) == 0
     assert re.fullmatch(r"jaxnav \d+\.\d+\.\d+\n", capsys.readouterr().out)
 
@@ -183,7 +184,7 @@ def test_a_closed_pipe_is_no_traceback() -> None:
 def _configured(environment: dict[str, str]) -> list[str]:
     """What configure_jax(float64=True) leaves: [cache folder or None, default float]."""
     script = (
-        "import jax, jax.numpy as jnp; from jaxnav.cli import configure_jax\n"
+        "import jax, jax.numpy as jnp; from jaxnav.commands.process import configure_jax\n"
         "configure_jax(float64=True)\n"
         "jax.jit(lambda x: jnp.linalg.inv(x))(jnp.eye(3)).block_until_ready()\n"
         "print(jax.config.jax_compilation_cache_dir, jnp.zeros(1).dtype)"
@@ -217,3 +218,20 @@ def test_the_users_own_cache_folder_goes_first(tmp_path) -> None:
     own = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own"), "XDG_CACHE_HOME": str(tmp_path)}
     assert _configured(own)[0] == str(tmp_path / "own")
     assert not (tmp_path / "jaxnav").exists()
+
+
+def test_the_users_own_flags_for_xla_are_kept(tmp_path) -> None:
+    script = (
+        "import os; from jaxnav.commands.process import configure_jax\n"
+        "configure_jax(float64=False); print(os.environ['XLA_FLAGS'])"
+    )
+    flag, own = "--xla_cpu_use_fusion_emitters", "--xla_cpu_multi_thread_eigen=false"
+    for given, kept in (("", f"{flag}=false"), (own, f"{own} {flag}=false"), (f"{flag}=true",) * 2):
+        run = subprocess.run(
+            [sys.executable, "-c", script],
+            env=os.environ | {"XLA_FLAGS": given, "XDG_CACHE_HOME": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert run.stdout.strip() == kept

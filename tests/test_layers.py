@@ -43,7 +43,7 @@ LAYERS = {
         "studies",
         "tuning",
     },
-    "shell": {"cli", "commands", "plotting"},
+    "shell": {"arguments", "cli", "commands", "plotting"},
 }
 ORDER = list(LAYERS)
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
@@ -213,7 +213,7 @@ def test_a_forbidden_arrow_is_caught(module: str, source: str) -> None:
         ("runtime.replay", "from jaxnav.files.rigs import load_rig"),
         ("studies.grid", "from jaxnav.simulation import rollout\nimport xarray"),
         ("files.rigs", "from .reading import read\nfrom jaxnav.errors import BadInput"),
-        ("commands.demo", "from jaxnav import plotting\nfrom jaxnav.cli import Demo"),
+        ("commands.demo", "from jaxnav import plotting\nfrom jaxnav.arguments import Demo"),
         (
             "cli",
             "from jaxnav import __version__\nimport jax\ndef f():\n    jax.config.update('a', 1)",

@@ -12,8 +12,9 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxnav.ambiguity import LowestReprojection
-from jaxnav.cli import Demo, configure_jax
+from jaxnav.arguments import Demo
 from jaxnav.commands.pictures import save_figure, views_of
+from jaxnav.commands.process import configure_jax
 from jaxnav.commands.rendered_world import Cameras, World
 from jaxnav.commands.selectors import make_selector
 from jaxnav.files import (

@@ -11,10 +11,11 @@ import jaxlie
 import numpy as np
 
 from jaxnav.ambiguity import LowestReprojection
+from jaxnav.arguments import Locate
 from jaxnav.camera import Camera
 from jaxnav.candidates import Candidates, find_candidates
-from jaxnav.cli import Locate, configure_jax
 from jaxnav.commands.pictures import normals_px, save_figure
+from jaxnav.commands.process import configure_jax
 from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.detection import Detections, make_detector
 from jaxnav.errors import BadInput

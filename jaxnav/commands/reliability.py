@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.cli import Reliability as Arguments
-from jaxnav.cli import configure_jax
+from jaxnav.arguments import Reliability as Arguments
 from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.process import configure_jax
 from jaxnav.commands.selectors import make_selector
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder, write_json

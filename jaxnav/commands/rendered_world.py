@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.ambiguity import Selector
+from jaxnav.arguments import Demo
 from jaxnav.bicycle import Vehicle
-from jaxnav.cli import Demo
 from jaxnav.detection import Detections, Detector, make_detector, observe
 from jaxnav.errors import BadInput
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_route, load_vehicle

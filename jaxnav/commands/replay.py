@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from jaxnav.cli import Replay as Arguments
-from jaxnav.cli import configure_jax
+from jaxnav.arguments import Replay as Arguments
 from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.process import configure_jax
 from jaxnav.commands.selectors import make_selector
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig, output_folder, write_json, write_tum

@@ -8,10 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 from tqdm import tqdm
 
+from jaxnav.arguments import Simulate as Arguments
 from jaxnav.bicycle import Vehicle
 from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.cli import Simulate as Arguments
-from jaxnav.cli import configure_jax
+from jaxnav.commands.process import configure_jax
 from jaxnav.commands.selectors import SELECTORS, make_selector
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
