@@ -143,7 +143,7 @@ class Navigator(eqx.Module):
         pose = planar_from_T_world_vehicle(T_world_vehicle)
         located = belief.initialised[best]
         control, command, done, log = self._steer(
-            state.control, T_world_vehicle, located, selection.decided, obs
+            state.control, pose, T_world_vehicle, located, selection.decided, obs
         )
         return State(belief, control), Output(
             pose=pose,
@@ -179,6 +179,7 @@ class Navigator(eqx.Module):
     def _steer(
         self,
         state: ControlState | None,
+        pose: Array,
         T_world_vehicle: jaxlie.SE3,
         located: Array,
         decided: Array,
@@ -186,7 +187,6 @@ class Navigator(eqx.Module):
     ) -> tuple[ControlState | None, Command | None, Array, ControlLog | None]:
         if self.controller is None or state is None:
             return None, None, jnp.asarray(False), None
-        pose = planar_from_T_world_vehicle(T_world_vehicle)
         centers_m = transform_points(
             T_world_vehicle.inverse(), self.markers.Ts_world_marker.translation()
         )[:, :2]
