@@ -17,7 +17,7 @@ from jaxnav.observation import Snapshot
 from jaxnav.simulation.statistics import Reliability
 from tests import worlds
 
-FRAMES, NOISE_PX, SIZE_M = 1500, 1.0, 0.12
+FRAMES, NOISE_PX, SIZE_M = 4000, 1.0, 0.12
 RIG = worlds.qcar_rig()
 
 
@@ -63,11 +63,11 @@ def frames():
 
 def test_a_wall_of_markers_flips_and_says_how_probably(frames):
     probability, flipped, pair = frames(0.0)
-    assert np.mean(pair) > 0.5
-    assert np.mean(flipped[pair]) > 0.01
+    assert np.mean(pair) > 0.1
+    assert np.mean(flipped[pair]) > 0.1
     found = Reliability.of(probability[pair], flipped[pair], bins=10)
-    assert found.expected_calibration_error < 0.03
-    assert np.mean(probability[pair]) == pytest.approx(np.mean(flipped[pair]), rel=0.3)
+    assert found.expected_calibration_error < 0.07
+    assert np.mean(probability[pair]) == pytest.approx(np.mean(flipped[pair]), rel=0.15)
 
 
 def test_markers_that_do_not_share_a_plane_leave_little_doubt(frames):
