@@ -31,6 +31,14 @@ CORE = sorted(
 install_import_hook(CORE, "beartype.beartype")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def let_compiled_code_go() -> Iterator[None]:
+    """Every executable holds some memory maps, of which Linux allows a process 65 530: past them a
+    whole run of the suite in two processes crashes inside jaxlib."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The real recordings and photographs: $JAXNAV_DATA, else ../shared/data beside the project."""
