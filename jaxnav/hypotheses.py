@@ -69,8 +69,13 @@ class MultiHypothesis(eqx.Module):
         starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
         bank = _where(starts, fan(prior, candidates, snapshot, self.hypotheses), prior)
         floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
+        # All slots take as many steps as the slowest: empty ones do what the heaviest does.
+        heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
+        starts_at = jax.vmap(lambda used, slot: _where(used, slot, _at(_poses(bank), heaviest)))(
+            bank.initialised, _poses(bank)
+        )
         fits = jax.vmap(lambda T, P: fit(T, P, prior, snapshot, floor, self.max_steps))(
-            bank.T_world_vehicle, bank.covariance
+            starts_at.T_world_vehicle, starts_at.covariance
         )
         alive = bank.initialised & fits.finite
         evidence = self._evidence(fits, alive, candidates, starts)
@@ -81,7 +86,7 @@ class MultiHypothesis(eqx.Module):
         passes = starts | (fits.posterior.nis <= prior.gate_nis)
         after = jax.vmap(_where)(passes, _poses(fits.posterior), _poses(bank))
         best = jnp.argmax(log_weight)
-        T_best = jax.tree.map(lambda leaf: leaf[best], after.T_world_vehicle)
+        T_best = _at(after, best).T_world_vehicle
         apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(after.T_world_vehicle)
         sigmas_rad = safe_sqrt(jnp.trace(after.covariance[:, 3:, 3:], axis1=1, axis2=2))
         mass = jnp.where(alive, jnp.exp(log_weight), 0)
@@ -186,6 +191,11 @@ class _Poses(eqx.Module):
 
 def _poses(of: PoseBelief | PosePosterior) -> _Poses:
     return _Poses(of.T_world_vehicle, of.covariance)
+
+
+def _at(poses: _Poses, index: Int[Array, ""]) -> _Poses:
+    one: _Poses = jax.tree.map(lambda leaf: leaf[index], poses)
+    return one
 
 
 def _beyond(
