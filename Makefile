@@ -22,7 +22,7 @@ demo: $(VENV)/.installed
 	$(BIN)/jaxnav demo --out demo
 
 test: lint
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

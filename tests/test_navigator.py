@@ -29,12 +29,11 @@ SPEED_MPS, STEERING_RAD = 0.25, 0.12
 
 def navigator(**options) -> Navigator:
     """The paper's rule, unless told otherwise: the bank has tests of its own."""
-    options.setdefault("selector", PaperCost())
+    options = {"selector": PaperCost(), "waypoints_m": worlds.WAYPOINTS_M} | options
     return Navigator(
         rig=worlds.qcar_rig(),
         markers=worlds.paper_markers(),
         vehicle=worlds.qcar(),
-        waypoints_m=worlds.WAYPOINTS_M,
         **options,
     )
 
@@ -84,9 +83,10 @@ def step_by_step(nav: Navigator, obs: Observation) -> tuple[State, Output]:
 
 
 def test_step_scan_and_vmap_agree(precision):
-    """Everything a user reads; a lane that no one takes only where it is valid."""
+    """Everything a user reads; a lane that no one takes only where it is valid, and as far as the
+    bounded number of LM steps has brought it."""
     nav = navigator()
-    tolerance = 2e-3 if precision == np.float32 else 1e-9
+    tolerance = 2e-3 if precision == np.float32 else 1e-7  # where LM stops
     drives = [drive(seed=seed, blind=(7, 8)) for seed in range(2)]
     alone = [step_by_step(nav, obs) for obs in drives]
     scanned = [scan(nav, nav.init(), obs) for obs in drives]
@@ -96,17 +96,26 @@ def test_step_scan_and_vmap_agree(precision):
 
     def told(result):
         state, out = result
-        costs = jnp.where(out.candidates.valid, out.costs, 0)
         return (
-            state, out.pose, out.covariance, out.command, out.done, out.selected, costs,
-            out.T_world_vehicle, out.flip_probability,
+            state, out.pose, out.covariance, out.command, out.done, out.selected,
+            out.T_world_vehicle,
         )  # fmt: skip
+
+    def of_all_lanes(out):
+        costs = jnp.where(out.candidates.valid, out.costs, 0)
+        return jnp.append(costs.reshape(-1), out.flip_probability)
 
     for index in range(2):
         expected = jax.tree.leaves(told(alone[index]))
         for other in (scanned[index], at(mapped, index)):
             for leaf, value in zip(jax.tree.leaves(told(other)), expected, strict=True):
                 np.testing.assert_allclose(leaf, value, rtol=tolerance, atol=tolerance)
+            np.testing.assert_allclose(
+                of_all_lanes(other[1]),
+                of_all_lanes(alone[index][1]),
+                rtol=max(tolerance, 1e-5),
+                atol=max(tolerance, 1e-6),
+            )
 
 
 def test_a_drive_is_traced_once():
@@ -184,14 +193,17 @@ def reference_pose_covariance(nav: Navigator, pose, sigma_px: float) -> np.ndarr
 
 def test_the_first_two_steps_by_hand():
     """Pose and covariance from the pixels, the filter's and the controller's equations."""
-    nav = navigator(corner_sigma_px=0.25)
+    truth = true_poses()
+    # Ahead and far enough: on a waypoint inside the smallest circle the controller turns no wheel.
+    direction = truth[0, 2] + np.deg2rad(20.0)
+    waypoint = truth[0, :2] + 3.0 * np.array([np.cos(direction), np.sin(direction)])
+    nav = navigator(corner_sigma_px=0.25, waypoints_m=[waypoint])
     motion = nav.motion
     obs = drive(sigma_px=0.0)
     state, out = step(nav, nav.init(), at(obs, 0))
     floor = np.diag(np.asarray(motion.vision_floor) ** 2)
     noise = (WHEELBASE_M, np.asarray(motion.odometry_sigma))
 
-    truth = true_poses()
     x = np.append(truth[0], np.zeros(3))
     P = np.zeros((6, 6))
     P[:3, :3] = reference_pose_covariance(nav, truth[0], 0.25) + floor
@@ -202,8 +214,9 @@ def test_the_first_two_steps_by_hand():
     assert out.nis == 0
     assert out.flip_probability < 0.5
 
-    angle, distance, _ = paper.steering(out.pose, worlds.WAYPOINTS_M[0], STEERING_RAD, WHEELBASE_M)
-    assert out.command.steering_rad == pytest.approx(np.clip(angle, -0.5, 0.5), abs=1e-9)
+    angle, distance, _ = paper.steering(out.pose, waypoint, STEERING_RAD, WHEELBASE_M)
+    assert abs(angle) < 0.5
+    assert out.command.steering_rad == pytest.approx(angle, abs=1e-9)
     gains = nav.controller
     throttle = (gains.proportional_per_m + gains.integral_per_ms * DT_S) * distance
     assert out.command.throttle == pytest.approx(float(throttle))
