@@ -197,7 +197,7 @@ def test_the_first_two_steps_by_hand():
     # Ahead and far enough: on a waypoint inside the smallest circle the controller turns no wheel.
     direction = truth[0, 2] + np.deg2rad(20.0)
     waypoint = truth[0, :2] + 3.0 * np.array([np.cos(direction), np.sin(direction)])
-    nav = navigator(corner_sigma_px=0.25, waypoints_m=[waypoint])
+    nav = navigator(corner_sigma_px=0.25, waypoints_m=[waypoint.tolist()])
     motion = nav.motion
     obs = drive(sigma_px=0.0)
     state, out = step(nav, nav.init(), at(obs, 0))
