@@ -60,12 +60,13 @@ def task(selector: Selector, first: bool) -> Callable[[], object]:
     )
     readings = observations(navigator, STEPS)
     step: Callable[..., tuple[State, object]] = jax.jit(navigator.step)
-    started, _ = step(navigator.init(), readings[0])
+    unstarted = navigator.init()
+    started, _ = step(unstarted, readings[0])
 
     def run() -> None:
         state = started
         for obs in readings:
-            state, out = step(navigator.init() if first else state, obs)
+            state, out = step(unstarted if first else state, obs)
             jax.block_until_ready(out)
 
     return run

@@ -20,8 +20,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.candidates import Candidates
 from jaxnav.geometry import (
+    inverse_cayley,
     planar_from_T_world_vehicle,
     rotation_error_rad,
+    rotation_matrix,
     safe_atan2,
     safe_norm,
     wrap_angle,
@@ -181,19 +183,14 @@ class Mahalanobis(eqx.Module):
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
         T_world_vehicle_prior = jax.tree.map(lambda leaf: leaf[0], prior.T_world_vehicle)
         volume = _log_determinants(candidates.covariance)
-        # Where there is no prior the distance is that of a pose with itself: log stays smooth.
-        asked = candidates.valid & prior.initialised[0]
 
-        def distance(T_vehicle_world: jaxlie.SE3, covariance: Array, asked: Array) -> Array:
-            itself = T_world_vehicle_prior.inverse().wxyz_xyz
-            T = jaxlie.SE3(jnp.where(asked, T_vehicle_world.wxyz_xyz, itself))
-            S = prior.covariance[0] + covariance
-            factor = cholesky(S)
-            away = (T @ T_world_vehicle_prior).inverse().log()
+        def distance(T_vehicle_world: jaxlie.SE3, covariance: Array) -> Array:
+            factor = cholesky(prior.covariance[0] + covariance)
+            away = inverse_cayley((T_vehicle_world @ T_world_vehicle_prior).inverse())
             whitened = solve_lower(factor, away)
             return jnp.sum(whitened**2) + log_det(factor)
 
-        far = jax.vmap(distance)(candidates.T_vehicle_world, candidates.covariance, asked)
+        far = jax.vmap(distance)(candidates.T_vehicle_world, candidates.covariance)
         costs = candidates.cost - volume + jnp.where(prior.initialised[0], far, 0)
         return _cheapest(prior, candidates, costs, _doubt(candidates.valid, costs))
 
@@ -315,9 +312,10 @@ def _normals_error(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Arr
     """Squared angles between the markers' normals and the measured ones, in sigmas."""
     obs, rig = snapshot.obs, snapshot.rig
     assert obs.normals_camera is not None
-    normals_world = snapshot.markers.Ts_world_marker.rotation().as_matrix()[:, :, 2]
-    R_vehicle_world = T_vehicle_world.rotation().as_matrix()
-    Rs_camera_vehicle = rig.Ts_camera_vehicle.rotation().as_matrix()
+    matrices = jax.vmap(rotation_matrix)
+    normals_world = matrices(snapshot.markers.Ts_world_marker.rotation())[:, :, 2]
+    R_vehicle_world = rotation_matrix(T_vehicle_world.rotation())
+    Rs_camera_vehicle = matrices(rig.Ts_camera_vehicle.rotation())
     normals_camera = jnp.einsum("cij,jk,mk->cmi", Rs_camera_vehicle, R_vehicle_world, normals_world)
     known = obs.visible & jnp.all(jnp.isfinite(obs.normals_camera), axis=2)
     measured = jnp.where(known[..., None], obs.normals_camera, normals_camera)

@@ -11,7 +11,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.camera import Camera
-from jaxnav.geometry import on_ground, safe_norm, transform_points
+from jaxnav.geometry import on_ground, rotation_matrix, safe_norm, transform_points
 from jaxnav.ippe import ippe_from_rays
 from jaxnav.markers import MarkerMap
 from jaxnav.observation import Sightings, Snapshot, cameras_of
@@ -128,7 +128,7 @@ def _repeats(
     center_world = markers.Ts_world_marker.translation()[first_seen]
     centers_vehicle = jax.vmap(lambda T: transform_points(T, center_world))(T_vehicle_world)
     range_m = jnp.maximum(safe_norm(centers_vehicle), 1e-3)
-    R = T_vehicle_world.rotation().as_matrix()
+    R = jax.vmap(rotation_matrix)(T_vehicle_world.rotation())
     # |R_i - R_j|_F = 2 sqrt(2) sin(angle / 2)
     turn = safe_norm((R[:, None] - R[None]).reshape(*R.shape[:1], *R.shape[:1], 9)) / jnp.sqrt(2.0)
     shift = safe_norm(centers_vehicle[:, None] - centers_vehicle[None]) / range_m[:, None]

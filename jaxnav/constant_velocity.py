@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
+from jaxnav.geometry import cayley, inverse_cayley
 from jaxnav.motion import Belief, corrected, followed, forgotten, gated, unstarted
 from jaxnav.observation import Observation
 
@@ -16,7 +17,7 @@ class ConstantVelocity(eqx.Module):
     """A body that moves freely: pose on SE(3) and body twist, for hand-held and aerial rigs.
 
     The mean is (wxyz, xyz) of T_world_vehicle followed by the twist (m/s, rad/s) in vehicle axes;
-    the 12 error states are xi in `T_world_vehicle * exp(xi)` and the twist's own error. There is no
+    the 12 error states are xi in `T_world_vehicle * cay(xi)` and the twist's own error. There is no
     odometry. Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
     """
 
@@ -86,7 +87,7 @@ class ConstantVelocity(eqx.Module):
 
         def difference(mean: Array, base: Array) -> Array:
             between = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
-            return jnp.append(between.log(), mean[7:] - base[7:])
+            return jnp.append(inverse_cayley(between), mean[7:] - base[7:])
 
         def correct(
             belief: Belief, measured: PoseMeasurement | PosePosterior
@@ -102,10 +103,7 @@ class ConstantVelocity(eqx.Module):
         mean, P = belief.mean, belief.covariance
         wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
         R = measured.covariance + jnp.diag(self.vision_floor**2)
-        # Where no pose is taken the difference is that of a pose with itself: log stays smooth.
-        offered = measured.taken & belief.initialised
-        T_measured = jaxlie.SE3(jnp.where(offered, wxyz_xyz, mean[:7]))
-        innovation = (jaxlie.SE3(mean[:7]).inverse() @ T_measured).log()
+        innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
         correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, 12, dtype=P.dtype), R)
         return gated(
             belief,
@@ -119,10 +117,13 @@ class ConstantVelocity(eqx.Module):
     def _follow(self, belief: Belief, measured: PosePosterior) -> tuple[Belief, Array]:
         """One hypothesis whose selector has corrected its pose."""
         T = measured.T_world_vehicle
-        offered = measured.taken & belief.initialised
-        T_prior = jaxlie.SE3(jnp.where(offered, belief.mean[:7], T.wxyz_xyz))
-        eye = jnp.eye(6, dtype=belief.mean.dtype)
-        correction, P = followed(belief.covariance, T_prior, T, measured.covariance, eye)
+        correction, P = followed(
+            belief.covariance,
+            jaxlie.SE3(belief.mean[:7]),
+            T,
+            measured.covariance,
+            jnp.eye(6, dtype=belief.mean.dtype),
+        )
         return gated(
             belief,
             measured.taken,
@@ -141,5 +142,5 @@ class ConstantVelocity(eqx.Module):
 
 
 def _moved(mean: Array, error: Array) -> Array:
-    T = (jaxlie.SE3(mean[:7]) @ jaxlie.SE3.exp(error[:6])).normalize()
+    T = (jaxlie.SE3(mean[:7]) @ cayley(error[:6])).normalize()
     return jnp.append(T.wxyz_xyz, mean[7:] + error[6:])

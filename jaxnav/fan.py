@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxnav.ambiguity import PoseBelief
 from jaxnav.candidates import Candidates
-from jaxnav.geometry import on_ground, safe_atan2, safe_norm, wrap_angle
+from jaxnav.geometry import on_ground, rotation_matrix, safe_atan2, safe_norm, wrap_angle
 from jaxnav.observation import Snapshot
 
 CANDIDATES = 3  # at most so many stand beside the fan
@@ -69,7 +69,7 @@ def fan(
     range_m = safe_norm(towards)
 
     def covariance(T: jaxlie.SE3, axes: Array) -> Array:
-        R = T.rotation().as_matrix()
+        R = rotation_matrix(T.rotation())
         swing = jnp.cross(axes, (T.translation() - center)[None])
         about = jnp.concatenate([swing @ R, axes @ R], axis=1)  # (axes, 6)
         local = jnp.concatenate(
@@ -101,7 +101,7 @@ def _planar_fan(
     Returns:
         Quaternions (count, 4), axes of uncertainty (count, 1, 3), its sigma in rad.
     """
-    normal = T_world_marker.rotation().as_matrix()[:, 2]
+    normal = rotation_matrix(T_world_marker.rotation())[:, 2]
     azimuth_rad = wrap_angle(safe_atan2(towards[1], towards[0]) - safe_atan2(normal[1], normal[0]))
     angles_rad = jnp.linspace(-_FAN_RAD, _FAN_RAD, count, dtype=towards.dtype) - azimuth_rad
     zero = jnp.zeros_like(angles_rad)
@@ -134,7 +134,7 @@ def _spherical_fan(
     turns = jax.vmap(
         lambda wxyz: (R_world_marker @ jaxlie.SO3(wxyz) @ R_world_marker.inverse()).wxyz
     )(turns_marker)
-    Rs = jax.vmap(lambda v: (R_world_marker @ _shortest_turn(v)).as_matrix())(views)
+    Rs = jax.vmap(lambda v: rotation_matrix(R_world_marker @ _shortest_turn(v)))(views)
     axes = jnp.swapaxes(Rs[:, :, :2], 1, 2)
     area = 2 * np.pi * (1 - np.cos(_FAN_RAD)) / count
     return turns, axes, float(np.sqrt(area) / 2)

@@ -2,11 +2,9 @@
 
 `T_a_b` maps coordinates in frame b to coordinates in frame a (`p_a = T_a_b @ p_b`) and is
 also the pose of b in a. Tangent vectors of SE(3) are ordered (translation, rotation), as in
-jaxlie, and perturb from the right: `T * exp(xi)`, so that xi lives in the inner frame.
+jaxlie, and perturb from the right: `T * exp(xi)`, or `T * cay(xi)`, which is the same up to third
+order; so xi lives in the inner frame.
 """
-
-from collections.abc import Callable
-from math import factorial
 
 import jax.numpy as jnp
 import jaxlie
@@ -57,33 +55,67 @@ def planar_from_T_world_vehicle(T_world_vehicle: jaxlie.SE3) -> Float[Array, "*b
     return jnp.concatenate([position_m[..., :2], safe_atan2(sine, cosine)[..., None]], axis=-1)
 
 
-def right_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
-    """J in exp(xi + d) = exp(xi) exp(J d) for small d.
+def cayley(xi: Float[Array, " 6"]) -> jaxlie.SE3:
+    """The rigid motion (1 - X / 2)^-1 (1 + X / 2), where X is the 4 x 4 matrix of a twist xi.
 
-    jaxlie's `jlog` is its inverse, but loses its digits at turns below a degree, and its gradient
-    is NaN at none. The functions of the angle are power series here: good to 1e-9 up to a radian.
+    exp(xi) up to third order, and like it a motion about a fixed screw axis, with cay(-xi) the
+    inverse of cay(xi); but rational: no series, no 0 / 0. Here it parametrises whatever is next to
+    a pose.
 
-    Source: Barfoot (2017), Eqs. 7.77 and 7.86, at -xi.
+    Source: Selig (2007), "Cayley maps for SE(3)".
     """
-    V, W = skew(-xi[:3]), skew(-xi[3:])
-    squared = jnp.sum(xi[3:] ** 2)
+    half = xi[3:] / 2
+    swing = jnp.cross(half, xi[:3])
+    swing = (swing + jnp.cross(half, swing)) / (1 + jnp.sum(half**2))
+    rotation = jaxlie.SO3(jnp.append(jnp.ones(1, xi.dtype), half)).normalize()
+    return jaxlie.SE3.from_rotation_and_translation(rotation, xi[:3] + swing)
 
-    def series(coefficient: Callable[[int], float]) -> Array:
-        total = jnp.zeros_like(squared)
-        for k in reversed(range(7)):
-            total = (-1) ** k * coefficient(k) + squared * total
-        return total
 
-    a = series(lambda k: 1 / factorial(2 * k + 2))
-    b = series(lambda k: 1 / factorial(2 * k + 3))
-    c = series(lambda k: 1 / factorial(2 * k + 4))
-    d = series(lambda k: (k + 1) / factorial(2 * k + 5))
-    WW, WV, VW = product(W, W), product(W, V), product(V, W)
-    WVW, WWV, VWW = product(WV, W), product(WW, V), product(VW, W)
-    J = jnp.eye(3, dtype=xi.dtype) + a * W + b * WW
-    Q = V / 2 + b * (WV + VW + WVW) + c * (WWV + VWW - 3 * WVW)
-    Q = Q + d * (product(WVW, W) + product(W, WVW))
-    return jnp.block([[J, Q], [jnp.zeros_like(J), J]])
+def inverse_cayley(T: jaxlie.SE3) -> Float[Array, " 6"]:
+    """The twist xi of a rigid motion T = cay(xi), for turns up to 170 degrees.
+
+    Larger turns, whose twists grow without bound, give that of a turn just as large as this.
+    """
+    wxyz = T.rotation().wxyz
+    w = jnp.where(wxyz[:1] < 0, -1, 1) * jnp.maximum(jnp.abs(wxyz[:1]), np.cos(np.deg2rad(85.0)))
+    half = wxyz[1:] / w
+    return jnp.concatenate([T.translation() - jnp.cross(half, T.translation()), 2 * half])
+
+
+def cayley_points(xi: Float[Array, " 6"], points: Float[Array, "*batch 3"]) -> Array:
+    """The points moved by cay(xi)."""
+    half = on_last_axis(xi[3:] / 2, points)
+    move = 2 * jnp.cross(half, points) + on_last_axis(xi[:3], points)
+    swing = jnp.cross(half, move)
+    return points + move + (swing + jnp.cross(half, swing)) / (1 + jnp.sum(xi[3:] ** 2) / 4)
+
+
+def cayley_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
+    """J in cay(xi + d) = cay(xi) cay(J d) for small d."""
+    half = skew(xi[3:] / 2)
+    squared = jnp.sum(xi[3:] ** 2) / 4
+    eye = jnp.eye(3, dtype=xi.dtype)
+    turn = (eye - half) / (1 + squared)
+    A = eye + (product(half, half) - half) / (1 + squared)  # (1 + half)^-1
+    return jnp.block([[A, -product(skew(xi[:3] / 2), turn)], [jnp.zeros_like(eye), turn]])
+
+
+def inverse_cayley_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
+    """The inverse of `cayley_jacobian`."""
+    half = skew(xi[3:] / 2)
+    squared = jnp.sum(xi[3:] ** 2) / 4
+    eye = jnp.eye(3, dtype=xi.dtype)
+    turn = (1 + squared) * eye + half + product(half, half)  # (1 + squared) (1 - half)^-1
+    back = eye + half
+    return jnp.block([[back, product(back, skew(xi[:3] / 2))], [jnp.zeros_like(eye), turn]])
+
+
+def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "3 3"]:
+    """The matrix of a unit quaternion: a fifth of the operations of jaxlie's, which normalises."""
+    w, v = rotation.wxyz[0], rotation.wxyz[1:]
+    outer = v[:, None] * v[None]
+    eye = jnp.eye(3, dtype=v.dtype)
+    return (w**2 - jnp.sum(v**2)) * eye + 2 * (outer + w * skew(v))
 
 
 def skew(a: Float[Array, " 3"]) -> Float[Array, "3 3"]:
@@ -106,7 +138,7 @@ def planar_covariance(
         T_world_vehicle: the pose the covariance belongs to.
         covariance: (6, 6), of xi in `T_world_vehicle * exp(xi)`, ordered (translation, rotation).
     """
-    R_world_vehicle = T_world_vehicle.rotation().as_matrix()
+    R_world_vehicle = rotation_matrix(T_world_vehicle.rotation())
     # d psi: the rotation vector in world axes, projected on the rate of the heading.
     c, s = R_world_vehicle[0, 0], R_world_vehicle[1, 0]
     horizontal = jnp.maximum(c**2 + s**2, jnp.finfo(c.dtype).eps)
@@ -177,7 +209,7 @@ def transform_points(
     T_a_b: jaxlie.SE3, points_b: Float[Array, "*batch 3"]
 ) -> Float[Array, "*batch 3"]:
     """Points in frame a of one transform applied to a whole array of points in frame b."""
-    rotated = points_b @ T_a_b.rotation().as_matrix().T
+    rotated = points_b @ rotation_matrix(T_a_b.rotation()).T
     return rotated + on_last_axis(T_a_b.translation(), rotated)
 
 

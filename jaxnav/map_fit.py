@@ -1,6 +1,6 @@
 """The update of one hypothesis: the minimum of the paper's e next to its prediction.
 
-    e(T) = |r(T)|^2 / sigma^2 + |xi|^2_P,      T = T_prior exp(xi),
+    e(T) = |r(T)|^2 / sigma^2 + |xi|^2_P,      T = T_prior cay(xi),
 
 minimised over the directions in which the vehicle can move, instead of compared at two poses; with
 Laplace's evidence for the prediction, which weighs it.
@@ -16,7 +16,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.ambiguity import PoseBelief, PosePosterior
-from jaxnav.geometry import right_jacobian, transform_points
+from jaxnav.geometry import cayley, cayley_jacobian, cayley_points, transform_points
 from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM
 from jaxnav.observation import Snapshot
 from jaxnav.residuals import reprojection_residuals
@@ -63,10 +63,7 @@ def fit(
     corners = transform_points(T_world_prior.inverse(), snapshot.markers.corners_world_m)
 
     def whitened(xi: Array) -> Array:
-        back = jaxlie.SE3.exp(-xi)
-        pixels = reprojection_residuals(
-            snapshot.rig, snapshot.seen, transform_points(back, corners)
-        )
+        pixels = reprojection_residuals(snapshot.rig, snapshot.seen, cayley_points(-xi, corners))
         return (pixels / snapshot.seen.sigma_px[..., None]).reshape(-1)
 
     if nuisance.shape[1]:
@@ -112,9 +109,8 @@ def fit(
     # I - (I + R)^-1 = R (I + R)^-1, symmetric.
     C = eye - cho_solve(innovation, eye)
     xi = spread @ u_fused
-    moved = jaxlie.SE3.exp(xi)
-    T = (T_world_prior @ moved).normalize()
-    carry = product(right_jacobian(xi), spread)
+    T = (T_world_prior @ cayley(xi)).normalize()
+    carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, (C + C.T) / 2)
     numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], nis[None]]
     finite = usable & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))

@@ -5,10 +5,13 @@ sees them. The marker frame is x right, y up, z out of the paper towards the rea
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
+
+from jaxnav.geometry import rotation_matrix
 
 # How many markers each family has. AprilTag's keep AprilTag's names; ArUco's are OpenCV's, in lower
 # case without DICT_.
@@ -49,7 +52,7 @@ class MarkerMap(eqx.Module):
     def corners_world_m(self) -> Float[Array, "M 4 3"]:
         """All corners in the world, m."""
         corners = corners_marker_m(self.size_m)
-        R = self.Ts_world_marker.rotation().as_matrix()
+        R = jax.vmap(rotation_matrix)(self.Ts_world_marker.rotation())
         return jnp.einsum("mij,mcj->mci", R, corners) + self.Ts_world_marker.translation()[:, None]
 
     def index(self, marker_id: int, family: str) -> int | None:

@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, Selection
-from jaxnav.geometry import right_jacobian
+from jaxnav.geometry import cayley_jacobian, inverse_cayley, inverse_cayley_jacobian
 from jaxnav.observation import Observation
-from jaxnav.small_matrices import cho_solve, cholesky, inverse_3, inverse_of_blocks, sandwich
+from jaxnav.small_matrices import cho_solve, cholesky, sandwich
 
 
 class Belief(eqx.Module):
@@ -132,19 +132,18 @@ def followed(
     """The whole state after its pose was corrected: the regression of the rest on the pose.
 
     Args:
-        P: of the predicted state, its first d entries the pose error xi = freedom' log(...).
+        P: of the predicted state, its first d entries the pose error xi = freedom' cay^-1(...).
         covariance: (6, 6) of the corrected pose, at the corrected pose.
 
     Returns:
         Correction of the state (the pose's own entries included), and covariance after it.
     """
     d = freedom.shape[1]
-    T = T_world_prior.inverse() @ T_world_vehicle
-    away = T.log()
+    away = inverse_cayley(T_world_prior.inverse() @ T_world_vehicle)
     xi = away @ freedom
     # Error at the prediction -> at the corrected pose, and back.
-    carry = sandwich(freedom.T, right_jacobian(away))
-    back = inverse_3(carry) if d == 3 else inverse_of_blocks(carry)
+    carry = sandwich(freedom.T, cayley_jacobian(away))
+    back = sandwich(freedom.T, inverse_cayley_jacobian(away))
     posterior = sandwich(freedom.T, covariance)
     factor = cholesky(P[:d, :d])
     gain = cho_solve(factor, P[:d]).T  # (n, d), identity on top

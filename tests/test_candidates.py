@@ -171,7 +171,9 @@ def test_pruning_keeps_what_explains_all_corners_best():
         assert few.valid.shape == (count,)
         np.testing.assert_allclose(few.e1_px2[0], every.e1_px2[0], rtol=1e-6)
         np.testing.assert_allclose(
-            few.T_vehicle_world.wxyz_xyz[0], every.T_vehicle_world.wxyz_xyz[0], atol=1e-6
+            jaxlie.SE3(few.T_vehicle_world.wxyz_xyz[0]).as_matrix(),
+            jaxlie.SE3(every.T_vehicle_world.wxyz_xyz[0]).as_matrix(),
+            atol=1e-6,
         )
 
 

@@ -177,3 +177,63 @@ def test_the_angle_of_a_turn():
         assert float(geometry.rotation_error_rad(opposite, jaxlie.SE3.identity())) == pytest.approx(
             angle, abs=1e-12
         )
+
+
+def twist_matrix(xi):
+    x, y, z = xi[3:]
+    return np.block(
+        [[np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), xi[:3, None]], [np.zeros((1, 4))]]
+    )
+
+
+def cay(xi):
+    X, eye = twist_matrix(xi), np.eye(4)
+    return np.linalg.solve(eye - X / 2, eye + X / 2)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 1e-4, 0.3, 2.0])
+def test_cayley_is_the_rational_motion_of_a_twist(turn_rad, precision):
+    tolerance = 1e-5 if precision == np.float32 else 1e-12
+    rng = np.random.default_rng(0)
+    axis = rng.normal(size=3)
+    xi = np.append(rng.normal(size=3), turn_rad * axis / np.linalg.norm(axis))
+    points = rng.normal(size=(2, 5, 3))
+    twist = jnp.asarray(xi, precision)
+    T = jax.jit(geometry.cayley)(twist)
+    np.testing.assert_allclose(T.as_matrix(), cay(xi), atol=tolerance)
+    np.testing.assert_allclose(geometry.inverse_cayley(T), xi, atol=10 * tolerance)
+    moved = geometry.cayley_points(twist, jnp.asarray(points, precision))
+    expected = points @ cay(xi)[:3, :3].T + cay(xi)[:3, 3]
+    np.testing.assert_allclose(moved, expected, atol=tolerance)
+    np.testing.assert_allclose(
+        geometry.rotation_matrix(T.rotation()), cay(xi)[:3, :3], atol=tolerance
+    )
+    small = 0.1 * xi
+    close = np.linalg.norm(small) ** 3 / 10 + tolerance
+    np.testing.assert_allclose(
+        cay(small), np.asarray(jaxlie.SE3.exp(jnp.asarray(small)).as_matrix()), atol=close
+    )
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.3, 2.0])
+def test_the_jacobian_of_cayley_is_that_of_differences(turn_rad):
+    rng = np.random.default_rng(1)
+    axis = rng.normal(size=3)
+    xi = np.append(rng.normal(size=3), turn_rad * axis / np.linalg.norm(axis))
+    J = np.asarray(geometry.cayley_jacobian(jnp.asarray(xi)))
+    step = 1e-6
+    for k, d in enumerate(step * np.eye(6)):
+        local = np.linalg.inv(cay(xi)) @ (cay(xi + d) - cay(xi - d)) / (2 * step)
+        np.testing.assert_allclose(local, twist_matrix(J[:, k]), atol=1e-8)
+    back = geometry.inverse_cayley_jacobian(jnp.asarray(xi))
+    np.testing.assert_allclose(back @ J, np.eye(6), atol=1e-12)
+
+
+def test_a_half_turn_has_a_finite_twist_and_gradient():
+    T = jaxlie.SE3(jnp.asarray([0.0, 0.6, 0.0, 0.8, 1.0, 2.0, 3.0]))
+    assert np.all(np.isfinite(geometry.inverse_cayley(T)))
+    jacobian = jax.jacfwd(lambda x: geometry.inverse_cayley(jaxlie.SE3(x)))(T.wxyz_xyz)
+    assert np.all(np.isfinite(jacobian))
+    turned = jaxlie.SO3.exp(jnp.asarray([0.0, 0.0, np.deg2rad(169.0)]))
+    xi = geometry.inverse_cayley(jaxlie.SE3.from_rotation(turned))
+    np.testing.assert_allclose(xi[5], 2 * np.tan(np.deg2rad(169.0) / 2), rtol=1e-9)

@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
 
@@ -48,14 +47,6 @@ def test_products(shape):
 def test_an_indefinite_matrix_has_no_factor():
     A = jnp.asarray([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     assert not np.all(np.isfinite(small.cholesky(A)))
-
-
-def test_inverses():
-    rng = np.random.default_rng(0)
-    A = jnp.asarray(rng.normal(size=(3, 3)))
-    np.testing.assert_allclose(small.inverse_3(A), np.linalg.inv(A), rtol=1e-9)
-    J = jaxlie.SE3.exp(jnp.asarray(rng.normal(size=6))).jlog()
-    np.testing.assert_allclose(small.inverse_of_blocks(J), np.linalg.inv(J), atol=1e-9)
 
 
 def test_gradients_are_those_of_lapack():

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from jaxnav.geometry import rotation_matrix
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
@@ -22,7 +23,7 @@ def see(
     T_vehicle_world = T_world_vehicle.inverse()
     corners_px = rig.project(T_vehicle_world, markers.corners_world_m)
     inside = jnp.all(rig.sees(T_vehicle_world, markers.corners_world_m), axis=-1)
-    normals = markers.Ts_world_marker.rotation().as_matrix()[:, :, 2]
+    normals = jax.vmap(rotation_matrix)(markers.Ts_world_marker.rotation())[:, :, 2]
     Ts_world_camera = jax.vmap(lambda T: T_world_vehicle @ T.inverse())(rig.Ts_camera_vehicle)
     towards = Ts_world_camera.translation()[:, None] - markers.Ts_world_marker.translation()[None]
     faces = jnp.einsum("cmi,mi->cm", towards, normals) > 0
