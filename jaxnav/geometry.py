@@ -209,8 +209,8 @@ def transform_points(
     T_a_b: jaxlie.SE3, points_b: Float[Array, "*batch 3"]
 ) -> Float[Array, "*batch 3"]:
     """Points in frame a of one transform applied to a whole array of points in frame b."""
-    rotated = points_b @ rotation_matrix(T_a_b.rotation()).T
-    return rotated + on_last_axis(T_a_b.translation(), rotated)
+    R, t = rotation_matrix(T_a_b.rotation()), on_last_axis(T_a_b.translation(), points_b)
+    return sum((points_b[..., k : k + 1] * on_last_axis(R[:, k], points_b) for k in range(3)), t)
 
 
 def on_last_axis(vector: Shaped[Array, " n"], like: Shaped[Array, "*batch m"]) -> Array:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.ambiguity import PoseBelief, PosePosterior, Selection
 from jaxnav.candidates import Candidates
 from jaxnav.fan import CANDIDATES, fan, normalised
-from jaxnav.geometry import rotation_error_rad, safe_norm, safe_sqrt
+from jaxnav.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
 from jaxnav.map_fit import Fit, fit
 from jaxnav.observation import Snapshot
 from jaxnav.small_matrices import cholesky, sandwich, solve_lower
@@ -136,10 +136,7 @@ class MultiHypothesis(eqx.Module):
         """
         count = self.hypotheses
         T = poses.T_world_vehicle
-        between = jaxlie.SE3(T.wxyz_xyz[:, None]).inverse() @ jaxlie.SE3(T.wxyz_xyz[None])
-        wxyz = between.rotation().wxyz
-        turns = 2 * jnp.where(wxyz[..., :1] < 0, -1, 1) * wxyz[..., 1:]
-        apart = jnp.concatenate([between.translation(), turns], axis=-1) @ freedom
+        apart = jax.vmap(jax.vmap(_apart, (None, 0)), (0, None))(T.wxyz_xyz, T.wxyz_xyz) @ freedom
         nearest_m = jnp.min(
             safe_norm(
                 T.translation()[:, None] - snapshot.markers.Ts_world_marker.translation()[None]
@@ -196,6 +193,15 @@ def _poses(of: PoseBelief | PosePosterior) -> _Poses:
 def _at(poses: _Poses, index: Int[Array, ""]) -> _Poses:
     one: _Poses = jax.tree.map(lambda leaf: leaf[index], poses)
     return one
+
+
+def _apart(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, " 6"]:
+    """Shift in the first pose's axes, and turn (rad, to second order), from it to the other."""
+    (w, v), (w_other, v_other) = (base[0], base[1:4]), (other[0], other[1:4])
+    cosine = w * w_other + v @ v_other
+    sine = w * v_other - w_other * v - jnp.cross(v, v_other)
+    shift = (other[4:] - base[4:]) @ rotation_matrix(jaxlie.SO3(base[:4]))
+    return jnp.append(shift, 2 * jnp.where(cosine < 0, -1, 1) * sine)
 
 
 def _beyond(

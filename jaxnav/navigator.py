@@ -64,7 +64,7 @@ class Navigator(eqx.Module):
     controller: Controller | None
     corner_sigma_px: Float[Array, ""]
     model_sigma_px: Float[Array, ""]
-    max_sightings: int = eqx.field(static=True)
+    max_sightings: int | None = eqx.field(static=True)
     max_candidates: int = eqx.field(static=True)
     max_lm_steps: int = eqx.field(static=True)
     ground_plane: bool = eqx.field(static=True)
@@ -83,12 +83,12 @@ class Navigator(eqx.Module):
         integral_limit_ms: float = 5.0,
         corner_sigma_px: float = 1.0,
         model_sigma_px: float = MODEL_SIGMA_PX,
-        max_sightings: int = 16,
+        max_sightings: int | None = None,
         max_candidates: int = 4,
         max_lm_steps: int = 12,
         ground_plane: bool = False,
     ):
-        """See the fields of `Controller`, `find_candidates` and the motion models.
+        """See the fields of `Controller`, `Snapshot`, `find_candidates` and the motion models.
 
         Raises:
             ValueError: waypoints without a vehicle, or of the wrong shape.

@@ -142,7 +142,7 @@ class Snapshot(eqx.Module):
         obs: Observation,
         corner_sigma_px: Float[Array, ""] | float = 1.0,
         model_sigma_px: Float[Array, ""] | float = MODEL_SIGMA_PX,
-        max_sightings: int = 16,
+        max_sightings: int | None = None,
     ) -> "Snapshot":
         """An observation together with what it is an observation of.
 
@@ -150,12 +150,13 @@ class Snapshot(eqx.Module):
             corner_sigma_px: for observations that bring no sigma of their own.
             model_sigma_px: what lens calibration and rolling shutter leave in a corner, added
                 in quadrature to the sigma that an observation brings.
-            max_sightings: the largest ones are used.
+            max_sightings: the largest ones are used; by default two of every marker, 16 at most.
         """
         sigma_px = corner_sigma_px
         if obs.corner_sigma_px is not None:
             sigma_px = jnp.sqrt(obs.corner_sigma_px**2 + model_sigma_px**2)
-        seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, max_sightings)
+        count = max_sightings or min(2 * len(markers.ids), 16)
+        seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, count)
         return Snapshot(rig, markers, obs, seen)
 
 

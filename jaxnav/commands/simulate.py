@@ -22,8 +22,6 @@ from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
 
-VIEWS = 2  # cameras that see a marker at once; the smallest of more views is left out
-
 
 def run(args: Arguments) -> int:
     """Drive every combination of selector and noise; print a table, and keep the numbers."""
@@ -80,7 +78,6 @@ def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any
             height_sigma_m=scenario.told_height_sigma_m,
         ),
         corner_sigma_px=key["told_noise_px"],
-        max_sightings=VIEWS * len(world.markers.ids),
     )
     rollout = Rollout(navigator, world.vehicle, world.markers, scenario, noise_px)
     with tqdm(
