@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.candidates import Candidates
 from jaxnav.geometry import (
-    inverse_cayley,
     planar_from_T_world_vehicle,
     rotation_error_rad,
     rotation_matrix,
@@ -65,7 +64,7 @@ class PosePosterior(eqx.Module):
 
     T_world_vehicle: jaxlie.SE3  # batch axis (K,)
     covariance: Float[Array, "*K 6 6"]  # of xi in T_world_vehicle * exp(xi)
-    nis: Float[Array, "*K"]  # of what the corners said against the prediction
+    innovation: Float[Array, "*K d"]  # of the corners, whitened: its square is the NIS
     taken: Bool[Array, "*K"]
 
 
@@ -183,14 +182,19 @@ class Mahalanobis(eqx.Module):
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
         T_world_vehicle_prior = jax.tree.map(lambda leaf: leaf[0], prior.T_world_vehicle)
         volume = _log_determinants(candidates.covariance)
+        # Where there is no prior the distance is that of a pose with itself: log stays smooth.
+        asked = candidates.valid & prior.initialised[0]
 
-        def distance(T_vehicle_world: jaxlie.SE3, covariance: Array) -> Array:
-            factor = cholesky(prior.covariance[0] + covariance)
-            away = inverse_cayley((T_vehicle_world @ T_world_vehicle_prior).inverse())
+        def distance(T_vehicle_world: jaxlie.SE3, covariance: Array, asked: Array) -> Array:
+            itself = T_world_vehicle_prior.inverse().wxyz_xyz
+            T = jaxlie.SE3(jnp.where(asked, T_vehicle_world.wxyz_xyz, itself))
+            S = prior.covariance[0] + covariance
+            factor = cholesky(S)
+            away = (T @ T_world_vehicle_prior).inverse().log()
             whitened = solve_lower(factor, away)
             return jnp.sum(whitened**2) + log_det(factor)
 
-        far = jax.vmap(distance)(candidates.T_vehicle_world, candidates.covariance)
+        far = jax.vmap(distance)(candidates.T_vehicle_world, candidates.covariance, asked)
         costs = candidates.cost - volume + jnp.where(prior.initialised[0], far, 0)
         return _cheapest(prior, candidates, costs, _doubt(candidates.valid, costs))
 

@@ -1,5 +1,7 @@
 """The paper's filter for a car: six states, one measured pose, odometry."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,7 +18,7 @@ from jaxnav.geometry import (
     planar_from_T_world_vehicle,
     wrap_angle,
 )
-from jaxnav.motion import Belief, corrected, followed, forgotten, gated, unstarted
+from jaxnav.motion import Belief, contradicted, corrected, followed, forgotten, gated, unstarted
 from jaxnav.observation import Observation
 from jaxnav.small_matrices import sandwich
 
@@ -50,16 +52,17 @@ class BicycleKalman(eqx.Module):
     tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
     height_sigma_m: float = 0.002
     gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 % (RELIABILITY R1); inf: no gate
-    max_rejections: int = eqx.field(static=True, default=10)
+    max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
+    max_rejected_s: float = 7.0  # whether they agree or not
 
     def init(self, hypotheses: int = 1) -> Belief:
         """Hypotheses that have seen nothing."""
-        return unstarted(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, hypotheses)
+        return unstarted(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, 3, hypotheses)
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
         """x = A x, P = A P A' + Q (Eq. 9), then the odometry (Eqs. 10 and 11).
 
-        A hypothesis that the gate has contradicted too often in a row is forgotten.
+        A hypothesis that the gate has contradicted too often or too long is forgotten.
         """
         dtype, dt_s = belief.mean.dtype, jnp.asarray(obs.dt_s, belief.mean.dtype)
         eye, zero = jnp.eye(3, dtype=dtype), jnp.zeros((3, 3), dtype)
@@ -73,7 +76,7 @@ class BicycleKalman(eqx.Module):
 
         mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
-        return forgotten(predicted, belief.rejections >= self.max_rejections)
+        return forgotten(predicted, contradicted(belief, self.max_rejections, self.max_rejected_s))
 
     def poses(self, belief: Belief) -> PoseBelief:
         """Level on the ground (Eq. 12), as far as `tilt_sigma_rad` and `height_sigma_m` go."""
@@ -110,14 +113,14 @@ class BicycleKalman(eqx.Module):
             apart = mean - base
             return apart.at[2].set(wrap_angle(apart[2]))
 
-        def correct(
-            belief: Belief, measured: PoseMeasurement | PosePosterior
-        ) -> tuple[Belief, Array]:
-            if isinstance(measured, PosePosterior):
-                return self._follow(belief, measured, obs)
-            return self._measure(belief, measured, obs)
-
-        return corrected(belief, selection, correct, difference, _moved)
+        return corrected(
+            belief,
+            selection,
+            partial(self._measure, obs=obs),
+            partial(self._follow, obs=obs),
+            difference,
+            _moved,
+        )
 
     def _measure(
         self, belief: Belief, measured: PoseMeasurement, obs: Observation
@@ -133,8 +136,9 @@ class BicycleKalman(eqx.Module):
         return gated(
             belief,
             measured.taken,
-            kalman.nis(innovation, S),
+            kalman.whitened(innovation, S),
             self.gate_nis,
+            obs.dt_s,
             first=self._first(pose, R, obs),
             posterior=(_moved(belief.mean, correction), posterior),
         )
@@ -158,8 +162,9 @@ class BicycleKalman(eqx.Module):
         return gated(
             belief,
             measured.taken,
-            measured.nis,
+            measured.innovation,
             self.gate_nis,
+            obs.dt_s,
             first=self._first(pose, planar_covariance(T, measured.covariance), obs),
             posterior=(jnp.append(pose, belief.mean[3:] + correction[3:]), sandwich(to_world, P)),
         )

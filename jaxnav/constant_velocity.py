@@ -1,5 +1,7 @@
 """A filter for bodies that move freely: pose on SE(3) and twist."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
 from jaxnav.geometry import cayley, inverse_cayley
-from jaxnav.motion import Belief, corrected, followed, forgotten, gated, unstarted
+from jaxnav.motion import Belief, contradicted, corrected, followed, forgotten, gated, unstarted
 from jaxnav.observation import Observation
 
 
@@ -32,18 +34,19 @@ class ConstantVelocity(eqx.Module):
     )  # m/s and rad/s
     lost_sigma_m: float = 0.5  # a prediction less certain than this is forgotten
     gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 % (RELIABILITY R1); inf: no gate
-    max_rejections: int = eqx.field(static=True, default=10)
+    max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
+    max_rejected_s: float = 7.0  # whether they agree or not
 
     def init(self, hypotheses: int = 1) -> Belief:
         """Hypotheses that have seen nothing."""
         mean = jnp.zeros(13, self.acceleration_density.dtype).at[0].set(1)
-        return unstarted(mean, 12, hypotheses)
+        return unstarted(mean, 12, 6, hypotheses)
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
         """T = T exp(twist dt); the error turns with the frame.
 
         Without odometry a prediction is soon worth nothing: past `lost_sigma_m` the next pose
-        starts the filter anew. So it does where the gate has contradicted it too often in a row.
+        starts the filter anew. So it does where the gate has contradicted it too often or too long.
         """
         dtype, dt_s = belief.mean.dtype, jnp.asarray(obs.dt_s, belief.mean.dtype)
         eye, zero = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
@@ -61,8 +64,8 @@ class ConstantVelocity(eqx.Module):
         mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
         variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
-        contradicted = belief.rejections >= self.max_rejections
-        return forgotten(predicted, contradicted | ~(variance_m2 < self.lost_sigma_m**2))
+        wrong = contradicted(belief, self.max_rejections, self.max_rejected_s)
+        return forgotten(predicted, wrong | ~(variance_m2 < self.lost_sigma_m**2))
 
     def poses(self, belief: Belief) -> PoseBelief:
         """The pose part of the state."""
@@ -89,16 +92,18 @@ class ConstantVelocity(eqx.Module):
             between = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
             return jnp.append(inverse_cayley(between), mean[7:] - base[7:])
 
-        def correct(
-            belief: Belief, measured: PoseMeasurement | PosePosterior
-        ) -> tuple[Belief, Array]:
-            if isinstance(measured, PosePosterior):
-                return self._follow(belief, measured)
-            return self._measure(belief, measured)
+        return corrected(
+            belief,
+            selection,
+            partial(self._measure, dt_s=obs.dt_s),
+            partial(self._follow, dt_s=obs.dt_s),
+            difference,
+            _moved,
+        )
 
-        return corrected(belief, selection, correct, difference, _moved)
-
-    def _measure(self, belief: Belief, measured: PoseMeasurement) -> tuple[Belief, Array]:
+    def _measure(
+        self, belief: Belief, measured: PoseMeasurement, dt_s: Array | float
+    ) -> tuple[Belief, Array]:
         """One hypothesis whose selector has chosen a candidate."""
         mean, P = belief.mean, belief.covariance
         wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
@@ -108,13 +113,16 @@ class ConstantVelocity(eqx.Module):
         return gated(
             belief,
             measured.taken,
-            kalman.nis(innovation, S),
+            kalman.whitened(innovation, S),
             self.gate_nis,
+            dt_s,
             first=self._first(wxyz_xyz, R),
             posterior=(_moved(mean, correction), posterior),
         )
 
-    def _follow(self, belief: Belief, measured: PosePosterior) -> tuple[Belief, Array]:
+    def _follow(
+        self, belief: Belief, measured: PosePosterior, dt_s: Array | float
+    ) -> tuple[Belief, Array]:
         """One hypothesis whose selector has corrected its pose."""
         T = measured.T_world_vehicle
         correction, P = followed(
@@ -127,8 +135,9 @@ class ConstantVelocity(eqx.Module):
         return gated(
             belief,
             measured.taken,
-            measured.nis,
+            measured.innovation,
             self.gate_nis,
+            dt_s,
             first=self._first(T.wxyz_xyz, measured.covariance),
             posterior=(jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:]), P),
         )

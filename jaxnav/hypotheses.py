@@ -83,7 +83,8 @@ class MultiHypothesis(eqx.Module):
         alive = alive & (log_weight > self.forget_log_weight)
 
         # What the gate keeps out moves nothing: such a hypothesis is where it was predicted.
-        passes = starts | (fits.posterior.nis <= prior.gate_nis)
+        nis = jnp.sum(fits.posterior.innovation**2, axis=1)
+        passes = starts | (nis <= prior.gate_nis)
         after = jax.vmap(_where)(passes, _poses(fits.posterior), _poses(bank))
         best = jnp.argmax(log_weight)
         T_best = _at(after, best).T_world_vehicle

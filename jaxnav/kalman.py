@@ -7,7 +7,7 @@ Joseph (1968), since Eq. 11's (I - K H) P loses positive definiteness in float32
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.small_matrices import cho_solve, cholesky, product, sandwich
+from jaxnav.small_matrices import cho_solve, cholesky, product, sandwich, solve_lower
 
 # A variance never falls below this fraction of the largest one.
 _RELATIVE_FLOOR = 1e-12
@@ -52,9 +52,14 @@ def hide_rows(
     return present * innovation, present[:, None] * H, kept * R + jnp.diag(1 - present)
 
 
+def whitened(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, " m"]:
+    """The innovation in units of its own sigma."""
+    return solve_lower(cholesky(S), innovation)
+
+
 def nis(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
     """Normalised innovation squared, chi-square with m degrees of freedom."""
-    return innovation @ cho_solve(cholesky(S), innovation)
+    return jnp.sum(whitened(innovation, S) ** 2)
 
 
 def floored(posterior: Float[Array, "n n"], prior: Float[Array, "n n"]) -> Float[Array, "n n"]:

@@ -27,6 +27,7 @@ from jaxnav.small_matrices import (
     product,
     sandwich,
     solve_lower,
+    solve_upper,
 )
 
 
@@ -103,22 +104,22 @@ def fit(
     unspread = solve_lower(root, eye)
     R = cho_solve(alone, eye)
     R = R + sandwich(unspread, sandwich(freedom.T, jnp.diag(floor**2)))
-    innovation = cholesky(R + eye)
-    u_fused = cho_solve(innovation, u_alone)
-    nis = u_alone @ u_fused
+    sigma = cholesky(R + eye)  # of u_alone about the prediction
+    contradiction = solve_lower(sigma, u_alone)
+    u_fused = solve_upper(sigma, contradiction)
     # I - (I + R)^-1 = R (I + R)^-1, symmetric.
-    C = eye - cho_solve(innovation, eye)
+    C = eye - cho_solve(sigma, eye)
     xi = spread @ u_fused
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, (C + C.T) / 2)
-    numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], nis[None]]
+    numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], contradiction]
     finite = usable & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
     return Fit(
         posterior=PosePosterior(
             jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, T_world_prior.wxyz_xyz)),
             jnp.where(finite, posterior_covariance, jnp.eye(6, dtype=dtype)),
-            jnp.where(finite, nis, jnp.inf),
+            jnp.where(finite, contradiction, jnp.inf),
             finite,
         ),
         cost=jnp.where(finite, cost, jnp.inf),

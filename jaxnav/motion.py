@@ -11,8 +11,9 @@ A belief is a bank of K hypotheses along the leading axis of every leaf. `bicycl
 cars, `constant_velocity.py` for everything else.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -21,10 +22,18 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav import kalman
-from jaxnav.ambiguity import PoseBelief, Selection
+from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
 from jaxnav.geometry import cayley_jacobian, inverse_cayley, inverse_cayley_jacobian
 from jaxnav.observation import Observation
 from jaxnav.small_matrices import cho_solve, cholesky, sandwich
+
+
+class Rejections(eqx.Module):
+    """Measured poses in a row that the gate kept out (RELIABILITY R1 to R3)."""
+
+    count: Int[Array, "*K"]  # of the last ones, which agree with each other
+    last: Float[Array, "*K m"]  # whitened innovation of the last one
+    duration_s: Float[Array, "*K"]  # of all of them
 
 
 class Belief(eqx.Module):
@@ -34,7 +43,7 @@ class Belief(eqx.Module):
     covariance: Float[Array, "*K d d"]
     log_weight: Float[Array, "*K"]
     initialised: Bool[Array, "*K"]
-    rejections: Int[Array, "*K"]  # measured poses in a row that the gate kept out
+    rejections: Rejections
 
 
 @runtime_checkable
@@ -49,14 +58,20 @@ class Motion(Protocol):
     ) -> tuple[Belief, Float[Array, " K"]]: ...
 
 
-def unstarted(mean: Float[Array, " n"], error_states: int, hypotheses: int) -> Belief:
+def unstarted(
+    mean: Float[Array, " n"], error_states: int, pose_states: int, hypotheses: int
+) -> Belief:
     """K hypotheses that have seen nothing."""
     return Belief(
         mean=jnp.tile(mean, (hypotheses, 1)),
         covariance=jnp.tile(jnp.eye(error_states, dtype=mean.dtype), (hypotheses, 1, 1)),
         log_weight=jnp.zeros(hypotheses, mean.dtype),
         initialised=jnp.zeros(hypotheses, bool),
-        rejections=jnp.zeros(hypotheses, int),
+        rejections=Rejections(
+            jnp.zeros(hypotheses, int),
+            jnp.zeros((hypotheses, pose_states), mean.dtype),
+            jnp.zeros(hypotheses, mean.dtype),
+        ),
     )
 
 
@@ -65,36 +80,50 @@ def forgotten(belief: Belief, lost: Bool[Array, " K"]) -> Belief:
     return eqx.tree_at(
         lambda b: (b.initialised, b.rejections),
         belief,
-        (belief.initialised & ~lost, jnp.where(lost, 0, belief.rejections)),
+        (belief.initialised & ~lost, _cleared(belief.rejections, lost)),
     )
+
+
+def contradicted(
+    belief: Belief, max_count: int, max_duration_s: Float[Array, ""] | float
+) -> Bool[Array, " K"]:
+    """Whether so many rejected poses in a row agree, or none was taken for so long (R3)."""
+    rejections = belief.rejections
+    return (rejections.count >= max_count) | (rejections.duration_s >= max_duration_s)
 
 
 def corrected(
     belief: Belief,
     selection: Selection,
-    correct: Callable[[Belief, Any], tuple[Belief, Array]],
+    measure: Callable[[Belief, PoseMeasurement], tuple[Belief, Array]],
+    follow: Callable[[Belief, PosePosterior], tuple[Belief, Array]],
     difference: Callable[[Array, Array], Array],
     moved: Callable[[Array, Array], Array],
 ) -> tuple[Belief, Float[Array, " K"]]:
     """The belief after a selection: every hypothesis corrected, equal ones merged.
 
     Args:
-        correct: (a hypothesis, its part of `selection.measured`) -> (corrected, NIS).
+        measure: (a hypothesis, the candidate it takes) -> (corrected, NIS).
+        follow: (a hypothesis, its pose that was corrected already) -> (corrected, NIS).
         difference: see `merged`.
         moved: see `merged`.
     """
     belief = eqx.tree_at(
         lambda b: (b.log_weight, b.initialised), belief, (selection.log_weight, selection.kept)
     )
-    belief, nis = jax.vmap(correct)(belief, selection.measured)
+    if isinstance(selection.measured, PosePosterior):
+        belief, nis = jax.vmap(follow)(belief, selection.measured)
+    else:
+        belief, nis = jax.vmap(measure)(belief, selection.measured)
     return merged(belief, selection.heir, difference, moved), nis
 
 
 def gated(
     belief: Belief,
     taken: Bool[Array, ""],
-    nis: Float[Array, ""],
+    innovation: Float[Array, " m"],
     gate_nis: Float[Array, ""] | float,
+    dt_s: Float[Array, ""] | float,
     first: tuple[Array, Array],
     posterior: tuple[Array, Array],
 ) -> tuple[Belief, Float[Array, ""]]:
@@ -104,9 +133,12 @@ def gated(
     (RELIABILITY R1).
 
     Args:
+        innovation: of the pose, whitened.
+        dt_s: since the last observation.
         first: mean and covariance of a hypothesis that starts here.
         posterior: mean and covariance of one that takes the pose.
     """
+    nis = jnp.sum(innovation**2)
     offered = taken & belief.initialised
     starts, accepted = taken & ~belief.initialised, offered & (nis <= gate_nis)
     mean, covariance = (
@@ -118,8 +150,30 @@ def gated(
         covariance,
         belief.log_weight,
         belief.initialised | taken,
-        jnp.where(accepted | starts, 0, belief.rejections + offered),
+        _cleared(_and_another(belief.rejections, offered, innovation, dt_s), accepted | starts),
     ), jnp.where(offered, nis, 0)
+
+
+def _and_another(
+    rejections: Rejections, rejected: Bool[Array, ""], innovation: Array, dt_s: Array | float
+) -> Rejections:
+    """One more, which agrees with the last one if it lies within 60 degrees of its direction."""
+    both = jnp.sum(innovation**2) * jnp.sum(rejections.last**2)
+    along = innovation @ rejections.last
+    agrees = (along > 0) & (along**2 > both / 4)
+    return Rejections(
+        jnp.where(rejected, jnp.where(agrees, rejections.count, 0) + 1, rejections.count),
+        jnp.where(rejected, innovation, rejections.last),
+        rejections.duration_s + jnp.where(rejected, dt_s, 0).astype(innovation.dtype),
+    )
+
+
+def _cleared(rejections: Rejections, where: Bool[Array, "*K"]) -> Rejections:
+    return Rejections(
+        jnp.where(where, 0, rejections.count),
+        jnp.where(where[..., None], 0, rejections.last),
+        jnp.where(where, 0, rejections.duration_s),
+    )
 
 
 def followed(
@@ -185,12 +239,12 @@ def merged(
     )
     alone = jnp.sum(member, axis=1) <= 1
     stays = belief.initialised & (heir == jnp.arange(count))
-    return Belief(
+    return dataclasses.replace(
+        belief,
         mean=jnp.where(alone[:, None], belief.mean, jax.vmap(moved)(belief.mean, shift)),
         covariance=jnp.where(alone[:, None, None], belief.covariance, covariance),
         log_weight=jnp.where(stays, jnp.log(jnp.where(total > 0, total, 1)), belief.log_weight),
         initialised=stays,
-        rejections=belief.rejections,
     )
 
 

@@ -2,6 +2,7 @@
 shapes are checked at every call, and float64 is the default."""
 
 import functools
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,8 +20,11 @@ os.environ.setdefault(
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
     "--xla_cpu_use_fusion_emitters=false",
 )
+jax.config.update("jax_enable_compilation_cache", False)  # not even its keys
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# Tracing makes millions of small objects that are not garbage; to look for it costs a tenth.
+gc.set_threshold(100_000, 20, 50)
 # The pure core is all that lies beside the package's __init__, less the shell. The hook sees what
 # is imported after it, so nothing of jaxnav may be imported above.
 CORE = sorted(

@@ -5,7 +5,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.flatten_util import ravel_pytree
+
+# Gradients that are finite in the smaller range of float32 are finite in float64; one compilation
+# less of what takes longest.
+in_float32 = pytest.mark.parametrize("precision", ["float32"], indirect=True)
 
 
 def check_derivatives(

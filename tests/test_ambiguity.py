@@ -30,6 +30,7 @@ from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.markers import MarkerMap
 from jaxnav.observation import Snapshot
 from tests import worlds
+from tests.derivatives import in_float32
 from tests.reference import paper
 
 BANK = MultiHypothesis(hypotheses=8)
@@ -139,7 +140,7 @@ def check_selection(selection: Selection, selector: Selector, candidates: Candid
     assert measured.T_world_vehicle.wxyz_xyz.shape == (K, 7)
     assert measured.covariance.shape == (K, 6, 6)
     if isinstance(measured, PosePosterior):
-        assert measured.nis.shape == (K,)
+        assert measured.innovation.shape == (K, 3)
     for mask in (measured.taken, selection.kept):
         assert mask.shape == (K,)
         assert mask.dtype == bool
@@ -225,6 +226,7 @@ class TestEverySelector:
         if selector.hypotheses == 1 or not initialised:
             assert selection.flip_probability == 0
 
+    @in_float32
     def test_has_finite_gradients(self, selector, precision):
         """Of all it says by all that goes in; frontally, with and without a prior, and blind."""
         first = seen_from(TRUTH)

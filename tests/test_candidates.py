@@ -15,6 +15,7 @@ from jaxnav.geometry import planar_from_T_world_vehicle
 from jaxnav.observation import Observation, Snapshot
 from jaxnav.residuals import e1
 from tests import worlds
+from tests.derivatives import in_float32
 
 ROOM_VIEW = (0.2, 0.1, 0.6)
 SIZES = ("max_sightings", "max_candidates", "max_steps", "ground_plane")
@@ -257,6 +258,7 @@ def test_on_the_ground_the_minimum_is_scipy_s(pose):
         )
 
 
+@in_float32
 def test_gradients_are_finite(precision):
     """Through unproject, IPPE, pruning, LM and covariance; a frontal view and none at all."""
     rig, markers, start = view(worlds.paper_markers(), worlds.START_VIEW)

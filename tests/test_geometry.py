@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxnav import geometry
 from tests.derivatives import check_derivatives
+from tests.reference.rigid import cayley, inverse_cayley, twist_matrix
 from tests.worlds import planar
 
 ANGLES = st.floats(-1e4, 1e4)
@@ -179,18 +180,6 @@ def test_the_angle_of_a_turn():
         )
 
 
-def twist_matrix(xi):
-    x, y, z = xi[3:]
-    return np.block(
-        [[np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), xi[:3, None]], [np.zeros((1, 4))]]
-    )
-
-
-def cay(xi):
-    X, eye = twist_matrix(xi), np.eye(4)
-    return np.linalg.solve(eye - X / 2, eye + X / 2)
-
-
 @pytest.mark.parametrize("turn_rad", [0.0, 1e-4, 0.3, 2.0])
 def test_cayley_is_the_rational_motion_of_a_twist(turn_rad, precision):
     tolerance = 1e-5 if precision == np.float32 else 1e-12
@@ -200,18 +189,19 @@ def test_cayley_is_the_rational_motion_of_a_twist(turn_rad, precision):
     points = rng.normal(size=(2, 5, 3))
     twist = jnp.asarray(xi, precision)
     T = jax.jit(geometry.cayley)(twist)
-    np.testing.assert_allclose(T.as_matrix(), cay(xi), atol=tolerance)
+    np.testing.assert_allclose(T.as_matrix(), cayley(xi), atol=tolerance)
+    np.testing.assert_allclose(inverse_cayley(cayley(xi)), xi, atol=1e-12)
     np.testing.assert_allclose(geometry.inverse_cayley(T), xi, atol=10 * tolerance)
     moved = geometry.cayley_points(twist, jnp.asarray(points, precision))
-    expected = points @ cay(xi)[:3, :3].T + cay(xi)[:3, 3]
+    expected = points @ cayley(xi)[:3, :3].T + cayley(xi)[:3, 3]
     np.testing.assert_allclose(moved, expected, atol=tolerance)
     np.testing.assert_allclose(
-        geometry.rotation_matrix(T.rotation()), cay(xi)[:3, :3], atol=tolerance
+        geometry.rotation_matrix(T.rotation()), cayley(xi)[:3, :3], atol=tolerance
     )
     small = 0.1 * xi
     close = np.linalg.norm(small) ** 3 / 10 + tolerance
     np.testing.assert_allclose(
-        cay(small), np.asarray(jaxlie.SE3.exp(jnp.asarray(small)).as_matrix()), atol=close
+        cayley(small), np.asarray(jaxlie.SE3.exp(jnp.asarray(small)).as_matrix()), atol=close
     )
 
 
@@ -223,7 +213,7 @@ def test_the_jacobian_of_cayley_is_that_of_differences(turn_rad):
     J = np.asarray(geometry.cayley_jacobian(jnp.asarray(xi)))
     step = 1e-6
     for k, d in enumerate(step * np.eye(6)):
-        local = np.linalg.inv(cay(xi)) @ (cay(xi + d) - cay(xi - d)) / (2 * step)
+        local = np.linalg.inv(cayley(xi)) @ (cayley(xi + d) - cayley(xi - d)) / (2 * step)
         np.testing.assert_allclose(local, twist_matrix(J[:, k]), atol=1e-8)
     back = geometry.inverse_cayley_jacobian(jnp.asarray(xi))
     np.testing.assert_allclose(back @ J, np.eye(6), atol=1e-12)

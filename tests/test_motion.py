@@ -16,6 +16,7 @@ from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.motion import Belief, Motion, restarted_where_broken
 from jaxnav.observation import Observation
 from tests import worlds
+from tests.derivatives import in_float32
 from tests.reference import kalman, paper
 
 WHEELBASE_M = 0.256
@@ -233,9 +234,10 @@ def test_nis_of_a_matched_filter_is_chi_square():
     assert stats.kstest(values, stats.chi2(3).cdf).pvalue > 1e-3
 
 
-def outlier_steps(kind: str):
+def outlier_steps(kind: str, **options):
     """A step of one hypothesis of either model with a planar pose, at rest."""
-    motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
+    car = kind == "car"
+    motion = BicycleKalman(worlds.qcar(), **options) if car else ConstantVelocity(**options)
 
     def step(belief, x_m, taken=True):
         pose, covariance = jnp.asarray([x_m, 0.0, 0.0]), 1e-4 * jnp.eye(6)
@@ -251,7 +253,7 @@ def test_the_gate_keeps_an_outlier_out(kind):
     belief = motion.init()
     for _ in range(20):
         _, belief, _ = step(belief, 0.0)
-    assert belief.rejections[0] == 0
+    assert belief.rejections.count[0] == 0
     prior, after, nis = step(belief, 0.3)
     blind_prior, blind, _ = step(belief, 0.3, taken=False)
     np.testing.assert_array_equal(prior.mean, blind_prior.mean)
@@ -269,13 +271,13 @@ def test_the_gate_keeps_an_outlier_out(kind):
     S = S + np.diag(np.asarray(motion.vision_floor) ** 2)
     assert nis[0] == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
     assert nis[0] > motion.gate_nis
-    assert after.rejections[0] == 1
+    assert after.rejections.count[0] == 1
     # Where nothing is offered it is not counted, and the next good one clears the count.
     _, unseen, _ = step(after, 0.0, taken=False)
-    assert unseen.rejections[0] == 1
+    assert unseen.rejections.count[0] == 1
     _, again, nis = step(unseen, 0.0)
     assert nis[0] < motion.gate_nis
-    assert again.rejections[0] == 0
+    assert again.rejections.count[0] == 0
 
 
 @pytest.mark.parametrize(("kind", "dof"), [("car", 3), ("free", 6)])
@@ -294,14 +296,33 @@ def test_ten_rejections_in_a_row_start_it_anew(kind):
         prior, belief, nis = step(belief, 5.0)
         assert prior.initialised[0]
         assert nis[0] > motion.gate_nis
-        assert int(belief.rejections[0]) == count
+        assert int(belief.rejections.count[0]) == count
         assert abs(float(motion.poses(belief).T_world_vehicle.translation()[0, 0])) < 0.1
     prior, belief, nis = step(belief, 5.0)
     assert not prior.initialised[0]
     assert belief.initialised[0]
-    assert (nis[0], belief.rejections[0]) == (0, 0)
+    assert (nis[0], belief.rejections.count[0]) == (0, 0)
     position_m = motion.poses(belief).T_world_vehicle.translation()[0]
     np.testing.assert_allclose(position_m, [5.0, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_rejections_that_contradict_each_other_start_nothing(kind):
+    """A reflection here, then there (RELIABILITY R3): only after a while it starts anew."""
+    patience = 30  # steps of 0.02 s
+    motion, step = outlier_steps(kind, max_rejected_s=0.02 * patience - 0.001)
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    for count in range(patience):
+        prior, belief, nis = step(belief, 5.0 if count % 2 else -5.0)
+        assert prior.initialised[0]
+        assert nis[0] > motion.gate_nis
+        assert belief.rejections.count[0] == 1
+        assert belief.rejections.duration_s[0] == pytest.approx(0.02 * (count + 1))
+    prior, belief, _ = step(belief, 5.0)
+    assert not prior.initialised[0]
+    assert (belief.rejections.count[0], belief.rejections.duration_s[0]) == (0, 0)
 
 
 @pytest.mark.parametrize("kind", ["car", "free"])
@@ -377,7 +398,7 @@ def test_poses_of_a_car_are_level_and_carry_the_planar_covariance():
         jnp.asarray(P[None]),
         jnp.zeros(1),
         jnp.ones(1, bool),
-        jnp.zeros(1, int),
+        motion.init().rejections,
     )
     found = motion.poses(belief)
     expected = np.asarray(worlds.planar(0.3, -0.4, 2.0).wxyz_xyz)
@@ -419,7 +440,7 @@ def test_constant_velocity_carries_its_covariance_as_samples_do():
         jnp.asarray((root @ root.T)[None]),
         jnp.zeros(1),
         jnp.ones(1, bool),
-        jnp.zeros(1, int),
+        motion.init().rejections,
     )
     dt_s = 0.1
     predicted = motion.predict(belief, reading(dt_s=dt_s))
@@ -488,6 +509,7 @@ def test_constant_velocity_forgets_what_it_lost():
 
 
 @pytest.mark.parametrize("kind", ["car", "free"])
+@in_float32
 def test_gradients_are_finite_at_rest_and_at_the_prediction(precision, kind):
     """Of everything by noise parameters, pose and odometry, where innovations are 0."""
     motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
