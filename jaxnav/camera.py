@@ -157,7 +157,7 @@ def _radtan_distort(xy: Array, distortion: Array) -> Array:
     _, _, p1, p2, _ = distortion
     x, y = xy[..., 0], xy[..., 1]
     r2 = x**2 + y**2
-    radial = _radtan_gain(r2, distortion)
+    radial = _radtan_gain(distortion)(r2)
     return jnp.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
@@ -167,15 +167,15 @@ def _radtan_distort(xy: Array, distortion: Array) -> Array:
     )
 
 
-def _radtan_gain(r2: Array, distortion: Array) -> Array:
+def _radtan_gain(distortion: Array) -> Callable[[Array], Array]:
     k1, k2, _, _, k3 = distortion
-    return 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return lambda r2: 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
 
 
 def _equidistant(points: Array, distortion: Array) -> Array:
     radius = safe_norm(points[..., :2])
     theta = jnp.arctan2(radius, jnp.where(radius > 0, points[..., 2], 1))
-    gain = _equidistant_gain(theta, distortion)
+    gain = _equidistant_gain(distortion)(theta)
     # theta / radius, which tends to 1 / z on the axis
     off_axis = radius > 1e-7 * jnp.abs(points[..., 2])
     safe_depth = jnp.where(off_axis, 1, jnp.where(points[..., 2] > 0, points[..., 2], 1))
@@ -183,10 +183,14 @@ def _equidistant(points: Array, distortion: Array) -> Array:
     return points[..., :2] * (ratio * gain)[..., None]
 
 
-def _equidistant_gain(theta: Array, distortion: Array) -> Array:
+def _equidistant_gain(distortion: Array) -> Callable[[Array], Array]:
     k1, k2, k3, k4, _ = distortion
-    t2 = theta**2
-    return 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+
+    def gain(theta: Array) -> Array:
+        t2 = theta**2
+        return 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+
+    return gain
 
 
 def _bearing(xy: Array) -> Array:
@@ -202,7 +206,8 @@ def _pinhole_bearing(xy: Array, distortion: Array) -> Array:
 def _radtan_bearing(xy_distorted: Array, distortion: Array) -> Array:
     radius_distorted = safe_norm(xy_distorted)
     table = np.tan(np.linspace(0, np.deg2rad(89), _TABLE_SIZE))
-    radius = _invert(lambda r: r * _radtan_gain(r**2, distortion), radius_distorted, table)
+    gain = _radtan_gain(distortion)
+    radius = _invert(lambda r: r * gain(r**2), radius_distorted, table)
     safe = jnp.where(radius_distorted > 0, radius_distorted, 1)
     start = xy_distorted * jnp.where(radius_distorted > 0, radius / safe, 1)[..., None]
 
@@ -237,7 +242,8 @@ def _radtan_bearing(xy_distorted: Array, distortion: Array) -> Array:
 def _equidistant_bearing(xy_distorted: Array, distortion: Array) -> Array:
     theta_distorted = safe_norm(xy_distorted)
     table = np.linspace(0, np.pi, _TABLE_SIZE)
-    theta = _invert(lambda t: t * _equidistant_gain(t, distortion), theta_distorted, table)
+    gain = _equidistant_gain(distortion)
+    theta = _invert(lambda t: t * gain(t), theta_distorted, table)
     # sin(theta) / theta_distorted, which tends to 1 on the axis
     off_axis = theta_distorted > 1e-7
     ratio = jnp.where(off_axis, jnp.sin(theta) / jnp.where(off_axis, theta_distorted, 1), 1)

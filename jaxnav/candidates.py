@@ -58,9 +58,11 @@ def find_candidates(
     if ground_plane:
         Ts_vehicle_world = jax.vmap(lambda T: on_ground(T.inverse()).inverse())(Ts_vehicle_world)
 
+    residuals = reprojection_residuals(rig, seen)
+
     def joint_e1(T_vehicle_world: jaxlie.SE3) -> Array:
         corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
-        return jnp.sum(reprojection_residuals(rig, seen, corners_vehicle) ** 2)
+        return jnp.sum(residuals(corners_vehicle) ** 2)
 
     count = min(max_candidates, owner_visible.shape[0])
     if count < owner_visible.shape[0]:

@@ -17,6 +17,7 @@ from jaxnav.small_matrices import product, sandwich
 # its x and y and turns about its z.
 ON_GROUND = np.eye(6)[:, [0, 1, 5]]
 OFF_GROUND = np.eye(6)[:, [2, 3, 4]]
+_SKEW = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 1, 0).reshape(9, 3)
 
 
 def wrap_angle(angle_rad: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -120,8 +121,7 @@ def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "3 3"]:
 
 def skew(a: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """The matrix of the cross product: skew(a) @ b = a x b."""
-    zero = jnp.zeros_like(a[0])
-    return jnp.stack([zero, -a[2], a[1], a[2], zero, -a[0], -a[1], a[0], zero]).reshape(3, 3)
+    return (jnp.asarray(_SKEW, a.dtype) @ a).reshape(3, 3)
 
 
 def on_ground(T_world_vehicle: jaxlie.SE3) -> jaxlie.SE3:
@@ -209,8 +209,15 @@ def transform_points(
     T_a_b: jaxlie.SE3, points_b: Float[Array, "*batch 3"]
 ) -> Float[Array, "*batch 3"]:
     """Points in frame a of one transform applied to a whole array of points in frame b."""
-    R, t = rotation_matrix(T_a_b.rotation()), on_last_axis(T_a_b.translation(), points_b)
-    return sum((points_b[..., k : k + 1] * on_last_axis(R[:, k], points_b) for k in range(3)), t)
+    return turn_and_shift(rotation_matrix(T_a_b.rotation()), T_a_b.translation(), points_b)
+
+
+def turn_and_shift(
+    R: Float[Array, "3 3"], t: Float[Array, " 3"], points: Float[Array, "*batch 3"]
+) -> Float[Array, "*batch 3"]:
+    """R p + t for every point."""
+    columns = [on_last_axis(R[:, k], points) for k in range(3)]
+    return sum((points[..., k : k + 1] * columns[k] for k in range(3)), on_last_axis(t, points))
 
 
 def on_last_axis(vector: Shaped[Array, " n"], like: Shaped[Array, "*batch m"]) -> Array:

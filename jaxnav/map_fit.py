@@ -61,11 +61,11 @@ def fit(
     usable = jnp.all(jnp.isfinite(P)) & (jnp.min(jnp.diagonal(P)) > 0)
     root = cholesky(jnp.where(usable, P, eye))
     spread = product(freedom, root)
+    pixels = reprojection_residuals(snapshot.rig, snapshot.seen)
     corners = transform_points(T_world_prior.inverse(), snapshot.markers.corners_world_m)
 
     def whitened(xi: Array) -> Array:
-        pixels = reprojection_residuals(snapshot.rig, snapshot.seen, cayley_points(-xi, corners))
-        return (pixels / snapshot.seen.sigma_px[..., None]).reshape(-1)
+        return (pixels(cayley_points(-xi, corners)) / snapshot.seen.sigma_px[..., None]).reshape(-1)
 
     if nuisance.shape[1]:
         # The nuisance t is small: residuals are linear in it, and its best value in them.

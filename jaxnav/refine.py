@@ -81,9 +81,10 @@ def refine_sightings(
     alone are refined, and the covariance is that of these three.
     """
 
+    pixels = reprojection_residuals(rig, seen)
+
     def residual(corners_vehicle: Array) -> Array:
-        pixels = reprojection_residuals(rig, seen, corners_vehicle)
-        return (pixels / seen.sigma_px[..., None]).reshape(-1)
+        return (pixels(corners_vehicle) / seen.sigma_px[..., None]).reshape(-1)
 
     any_visible = jnp.any(seen.visible)
     weight = seen.visible.astype(seen.corners_px.dtype)[:, None]

@@ -3,42 +3,51 @@
 Source: Liu, Schofield, Shan (2023), Eqs. 3, 13 and 14.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.camera import Camera
-from jaxnav.geometry import transform_points
+from jaxnav.geometry import rotation_matrix, transform_points, turn_and_shift
 from jaxnav.markers import MarkerMap
 from jaxnav.observation import Sightings, cameras_of, sightings
 from jaxnav.rig import CameraRig
 
 
 def reprojection_residuals(
-    rig: CameraRig, seen: Sightings, corners_vehicle: Float[Array, "M 4 3"]
-) -> Float[Array, "D 4 2"]:
+    rig: CameraRig, seen: Sightings
+) -> Callable[[Float[Array, "M 4 3"]], Float[Array, "D 4 2"]]:
     """Projected minus observed corners in pixels, zero in hidden lanes.
+
+    What does not depend on the pose is done once, before anything is minimised.
 
     Args:
         seen: the sightings.
-        corners_vehicle: corners of all markers of the map, in the vehicle frame, m.
+
+    Returns:
+        A function of the corners of all markers of the map, in the vehicle frame, m.
     """
-
-    def one(
-        camera: Camera,
-        T_camera_vehicle: jaxlie.SE3,
-        marker_index: Array,
-        corners_px: Array,
-        visible: Array,
-    ) -> Array:
-        corners_camera = transform_points(T_camera_vehicle, corners_vehicle[marker_index])
-        return jnp.where(visible, camera.project(corners_camera) - corners_px, 0)
-
+    cameras = cameras_of(rig, seen)
     Ts_camera_vehicle = jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index])
-    return jax.vmap(one)(
-        cameras_of(rig, seen), Ts_camera_vehicle, seen.marker_index, seen.corners_px, seen.visible
-    )
+    Rs_camera_vehicle = jax.vmap(rotation_matrix)(Ts_camera_vehicle.rotation())
+
+    def one(camera: Camera, R: Array, t: Array, corners: Array, corners_px: Array) -> Array:
+        return camera.project(turn_and_shift(R, t, corners)) - corners_px
+
+    def residuals(corners_vehicle: Array) -> Array:
+        pixels = jax.vmap(one)(
+            cameras,
+            Rs_camera_vehicle,
+            Ts_camera_vehicle.translation(),
+            corners_vehicle[seen.marker_index],
+            seen.corners_px,
+        )
+        return jnp.where(seen.visible[:, None, None], pixels, 0)
+
+    return residuals
 
 
 def e1(
@@ -54,7 +63,7 @@ def e1(
     """
     seen = sightings(rig, markers, corners_px, visible)
     corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
-    return jnp.sum(reprojection_residuals(rig, seen, corners_vehicle) ** 2)
+    return jnp.sum(reprojection_residuals(rig, seen)(corners_vehicle) ** 2)
 
 
 def e2(

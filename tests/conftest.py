@@ -4,6 +4,7 @@ shapes are checked at every call, and float64 is the default."""
 import functools
 import gc
 import os
+import platform
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,12 +14,14 @@ import jaxlie
 import pytest
 from jaxtyping import install_import_hook
 
-# Most of a run is compilation. LLVM's costly passes win nothing on inputs as small as these.
-# XLA reads this when the first array is made.
+# Most of a run is compilation. LLVM's costly passes and wide registers win nothing on inputs as
+# small as these, nor does a second thread beside a second worker. XLA reads this when the
+# first array is made.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+    + (" --xla_cpu_max_isa=SSE4_2" if platform.machine() == "x86_64" else ""),
 )
 jax.config.update("jax_enable_compilation_cache", False)  # not even its keys
 jax.config.update("jax_enable_x64", True)
