@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.observation import Observation, sightings
+from jaxnav.observation import Observation, Snapshot, sightings
 from tests import worlds
 
 VIEW = (0.2, 0.1, 0.6)
@@ -39,6 +39,17 @@ def test_few_slots_keep_the_largest_images(room):
         kept = np.asarray(seen.camera_index) * 4 + np.asarray(seen.marker_index)
         np.testing.assert_array_equal(kept[seen.visible], np.argsort(-areas)[:count][seen.visible])
         assert np.sum(seen.visible) == min(count, np.sum(obs.visible))
+
+
+@pytest.mark.parametrize(("count", "slots"), [(1, 2), (4, 8), (9, 16)])
+def test_two_views_of_every_marker_have_a_slot_and_sixteen_at_most(count, slots):
+    rig = worlds.qcar_rig()
+    markers = worlds.marker_map(
+        [(worlds.upright(0.3 * k), [1.0, 0.2 * k, 0.2]) for k in range(count)], [0.172] * count
+    )
+    obs = Observation(jnp.zeros((len(rig), count, 4, 2)), jnp.zeros((len(rig), count), bool))
+    assert Snapshot.create(rig, markers, obs).seen.visible.shape == (slots,)
+    assert Snapshot.create(rig, markers, obs, max_sightings=3).seen.visible.shape == (3,)
 
 
 def test_hidden_lanes_are_finite_whatever_they_held(room):
