@@ -1,14 +1,12 @@
 """The paper's filter for a car: six states, one measured pose, odometry."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnav import bicycle, kalman
-from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
+from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
 from jaxnav.bicycle import Vehicle
 from jaxnav.geometry import (
     OFF_GROUND,
@@ -18,12 +16,12 @@ from jaxnav.geometry import (
     planar_from_T_world_vehicle,
     wrap_angle,
 )
-from jaxnav.motion import Belief, contradicted, corrected, followed, forgotten, gated, unstarted
+from jaxnav.motion import Belief, Motion, contradicted, followed, forgotten, gated, unstarted
 from jaxnav.observation import Observation
 from jaxnav.small_matrices import sandwich
 
 
-class BicycleKalman(eqx.Module):
+class BicycleKalman(Motion):
     """The paper's six-state filter for a car: x, y, psi, v_x, v_y, psi_dot in the world.
 
     The state moves at constant velocity (Eq. 9); the pose of the chosen candidate measures the
@@ -100,32 +98,10 @@ class BicycleKalman(eqx.Module):
             self.gate_nis,
         )
 
-    def update(
-        self, belief: Belief, selection: Selection, obs: Observation
-    ) -> tuple[Belief, Float[Array, " K"]]:
-        """The posterior of every hypothesis (Eqs. 10 and 11), and its pose's NIS (3 dof).
-
-        A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
-        NIS is above the gate. Without a pose the NIS is 0.
-        """
-
-        def difference(mean: Array, base: Array) -> Array:
-            apart = mean - base
-            return apart.at[2].set(wrap_angle(apart[2]))
-
-        return corrected(
-            belief,
-            selection,
-            partial(self._measure, obs=obs),
-            partial(self._follow, obs=obs),
-            difference,
-            _moved,
-        )
-
-    def _measure(
+    def measure(
         self, belief: Belief, measured: PoseMeasurement, obs: Observation
     ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has chosen a candidate."""
+        """One hypothesis whose selector has chosen a candidate; and its NIS (3 dof)."""
         P = belief.covariance
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         R = planar_covariance(measured.T_world_vehicle, measured.covariance)
@@ -140,13 +116,13 @@ class BicycleKalman(eqx.Module):
             self.gate_nis,
             obs.dt_s,
             first=self._first(pose, R, obs),
-            posterior=(_moved(belief.mean, correction), posterior),
+            posterior=(self.moved(belief.mean, correction), posterior),
         )
 
-    def _follow(
+    def follow(
         self, belief: Belief, measured: PosePosterior, obs: Observation
     ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has corrected its pose."""
+        """One hypothesis whose selector has corrected its pose; and its NIS (3 dof)."""
         T = measured.T_world_vehicle
         pose = planar_from_T_world_vehicle(T)
         eye = jnp.eye(6, dtype=belief.mean.dtype)
@@ -168,6 +144,16 @@ class BicycleKalman(eqx.Module):
             first=self._first(pose, planar_covariance(T, measured.covariance), obs),
             posterior=(jnp.append(pose, belief.mean[3:] + correction[3:]), sandwich(to_world, P)),
         )
+
+    def difference(self, mean: Array, base: Array) -> Array:
+        """Of the states, the heading's wrapped."""
+        apart = mean - base
+        return apart.at[2].set(wrap_angle(apart[2]))
+
+    def moved(self, base: Array, error: Array) -> Array:
+        """The sum, its heading wrapped."""
+        mean = base + error
+        return mean.at[2].set(wrap_angle(mean[2]))
 
     def _first(self, pose: Array, covariance: Array, obs: Observation) -> tuple[Array, Array]:
         """The state of a hypothesis that starts: a pose, at rest as far as the odometry tells."""
@@ -193,12 +179,7 @@ class BicycleKalman(eqx.Module):
         R = jnp.diag(self.odometry_sigma**2).astype(dtype)
         present = jnp.full(3, jnp.asarray(obs.has_odometry, dtype))
         correction, P, _ = kalman.update(P, *kalman.hide_rows(velocity - mean[3:], H, R, present))
-        return _moved(mean, correction), P
-
-
-def _moved(mean: Array, error: Array) -> Array:
-    mean = mean + error
-    return mean.at[2].set(wrap_angle(mean[2]))
+        return self.moved(mean, correction), P
 
 
 def _turn(angle_rad: Array) -> Array:

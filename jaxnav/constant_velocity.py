@@ -1,7 +1,5 @@
 """A filter for bodies that move freely: pose on SE(3) and twist."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,13 +7,13 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from jaxnav import kalman
-from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
+from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
 from jaxnav.geometry import cayley, inverse_cayley
-from jaxnav.motion import Belief, contradicted, corrected, followed, forgotten, gated, unstarted
+from jaxnav.motion import Belief, Motion, contradicted, followed, forgotten, gated, unstarted
 from jaxnav.observation import Observation
 
 
-class ConstantVelocity(eqx.Module):
+class ConstantVelocity(Motion):
     """A body that moves freely: pose on SE(3) and body twist, for hand-held and aerial rigs.
 
     The mean is (wxyz, xyz) of T_world_vehicle followed by the twist (m/s, rad/s) in vehicle axes;
@@ -79,32 +77,10 @@ class ConstantVelocity(eqx.Module):
             self.gate_nis,
         )
 
-    def update(
-        self, belief: Belief, selection: Selection, obs: Observation
-    ) -> tuple[Belief, Float[Array, " K"]]:
-        """The posterior of every hypothesis, and its pose's NIS (6 dof).
-
-        A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
-        NIS is above the gate. Without a pose the NIS is 0.
-        """
-
-        def difference(mean: Array, base: Array) -> Array:
-            between = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
-            return jnp.append(inverse_cayley(between), mean[7:] - base[7:])
-
-        return corrected(
-            belief,
-            selection,
-            partial(self._measure, dt_s=obs.dt_s),
-            partial(self._follow, dt_s=obs.dt_s),
-            difference,
-            _moved,
-        )
-
-    def _measure(
-        self, belief: Belief, measured: PoseMeasurement, dt_s: Array | float
+    def measure(
+        self, belief: Belief, measured: PoseMeasurement, obs: Observation
     ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has chosen a candidate."""
+        """One hypothesis whose selector has chosen a candidate; and its NIS (6 dof)."""
         mean, P = belief.mean, belief.covariance
         wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
         R = measured.covariance + jnp.diag(self.vision_floor**2)
@@ -115,15 +91,15 @@ class ConstantVelocity(eqx.Module):
             measured.taken,
             kalman.whitened(innovation, S),
             self.gate_nis,
-            dt_s,
+            obs.dt_s,
             first=self._first(wxyz_xyz, R),
-            posterior=(_moved(mean, correction), posterior),
+            posterior=(self.moved(mean, correction), posterior),
         )
 
-    def _follow(
-        self, belief: Belief, measured: PosePosterior, dt_s: Array | float
+    def follow(
+        self, belief: Belief, measured: PosePosterior, obs: Observation
     ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has corrected its pose."""
+        """One hypothesis whose selector has corrected its pose; and its NIS (6 dof)."""
         T = measured.T_world_vehicle
         correction, P = followed(
             belief.covariance,
@@ -137,10 +113,20 @@ class ConstantVelocity(eqx.Module):
             measured.taken,
             measured.innovation,
             self.gate_nis,
-            dt_s,
+            obs.dt_s,
             first=self._first(T.wxyz_xyz, measured.covariance),
             posterior=(jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:]), P),
         )
+
+    def difference(self, mean: Array, base: Array) -> Array:
+        """(xi, twist): from the pose `base`, in its axes."""
+        T_base_other = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
+        return jnp.append(inverse_cayley(T_base_other), mean[7:] - base[7:])
+
+    def moved(self, base: Array, error: Array) -> Array:
+        """The pose times cay(xi), the twist plus its error."""
+        T = (jaxlie.SE3(base[:7]) @ cayley(error[:6])).normalize()
+        return jnp.append(T.wxyz_xyz, base[7:] + error[6:])
 
     def _first(self, wxyz_xyz: Array, covariance: Array) -> tuple[Array, Array]:
         """The state of a body that starts: a pose, at rest as far as anybody knows."""
@@ -148,8 +134,3 @@ class ConstantVelocity(eqx.Module):
         velocity = jnp.diag(self.initial_velocity_sigma**2)
         P = jnp.block([[covariance, zero], [zero, velocity]])
         return jnp.append(wxyz_xyz, jnp.zeros(6, wxyz_xyz.dtype)), P
-
-
-def _moved(mean: Array, error: Array) -> Array:
-    T = (jaxlie.SE3(mean[:7]) @ cayley(error[:6])).normalize()
-    return jnp.append(T.wxyz_xyz, mean[7:] + error[6:])

@@ -6,14 +6,15 @@ All share one interface, so that `step` and the selectors know nothing of the st
     belief = motion.predict(belief, obs)                         # dt, and odometry where there is
     prior  = motion.poses(belief)                                # what a selector sees
     belief, nis = motion.update(belief, selection, obs)
+    covariance = motion.error_covariance(belief, best)           # of the pose that is reported
 
 A belief is a bank of K hypotheses along the leading axis of every leaf. `bicycle_kalman.py` is for
 cars, `constant_velocity.py` for everything else.
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -46,16 +47,71 @@ class Belief(eqx.Module):
     rejections: Rejections
 
 
-@runtime_checkable
-class Motion(Protocol):
-    """What `Navigator` asks of a motion model."""
+class Motion(eqx.Module):
+    """What `Navigator` asks of a motion model, and what all models do alike."""
 
-    def init(self, hypotheses: int = 1) -> Belief: ...
-    def predict(self, belief: Belief, obs: Observation) -> Belief: ...
-    def poses(self, belief: Belief) -> PoseBelief: ...
+    @abc.abstractmethod
+    def init(self, hypotheses: int = 1) -> Belief:
+        """Hypotheses that have seen nothing."""
+
+    @abc.abstractmethod
+    def predict(self, belief: Belief, obs: Observation) -> Belief:
+        """The belief at this observation, before its corners are looked at."""
+
+    @abc.abstractmethod
+    def poses(self, belief: Belief) -> PoseBelief:
+        """What a selector sees of it."""
+
+    @abc.abstractmethod
+    def measure(
+        self, belief: Belief, measured: PoseMeasurement, obs: Observation
+    ) -> tuple[Belief, Array]:
+        """One hypothesis whose selector has chosen a candidate; and its NIS."""
+
+    @abc.abstractmethod
+    def follow(
+        self, belief: Belief, measured: PosePosterior, obs: Observation
+    ) -> tuple[Belief, Array]:
+        """One hypothesis whose selector has corrected its pose; and its NIS."""
+
+    @abc.abstractmethod
+    def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
+        """The error state that leads from one mean to another."""
+
+    @abc.abstractmethod
+    def moved(self, base: Float[Array, " n"], error: Float[Array, " d"]) -> Float[Array, " n"]:
+        """The mean to which an error state leads."""
+
     def update(
         self, belief: Belief, selection: Selection, obs: Observation
-    ) -> tuple[Belief, Float[Array, " K"]]: ...
+    ) -> tuple[Belief, Float[Array, " K"]]:
+        """The posterior of every hypothesis (Eqs. 10 and 11), equal ones merged, and their NIS.
+
+        A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
+        NIS is above the gate. Without a pose the NIS is 0.
+        """
+        belief = eqx.tree_at(
+            lambda b: (b.log_weight, b.initialised), belief, (selection.log_weight, selection.kept)
+        )
+        measured = selection.measured
+        one = self.follow if isinstance(measured, PosePosterior) else self.measure
+        belief, nis = jax.vmap(lambda b, m: one(b, m, obs))(belief, measured)
+        return merged(belief, selection.heir, self.difference, self.moved), nis
+
+    def error_covariance(self, belief: Belief, index: Int[Array, ""]) -> Float[Array, "d d"]:
+        """What is to be expected of a hypothesis' error: the spread of the whole bank about it.
+
+        Source: Bar-Shalom, Li, Kirubarajan (2001), section 1.4.16 (moments of a mixture).
+        """
+        mass = jnp.where(belief.initialised, jnp.exp(belief.log_weight), 0)
+        total = jnp.sum(mass)
+        share = jnp.where(total > 0, mass / jnp.where(total > 0, total, 1), 0)
+        share = jnp.where(total > 0, share, jnp.arange(mass.shape[0]) == index)
+        apart = jax.vmap(lambda mean: self.difference(mean, belief.mean[index]))(belief.mean)
+        apart = jnp.where((share > 0)[:, None], apart, 0)
+        return jnp.einsum("i,ide->de", share, belief.covariance) + jnp.einsum(
+            "i,id,ie->de", share, apart, apart
+        )
 
 
 def unstarted(
@@ -90,32 +146,6 @@ def contradicted(
     """Whether so many rejected poses in a row agree, or none was taken for so long (R3)."""
     rejections = belief.rejections
     return (rejections.count >= max_count) | (rejections.duration_s >= max_duration_s)
-
-
-def corrected(
-    belief: Belief,
-    selection: Selection,
-    measure: Callable[[Belief, PoseMeasurement], tuple[Belief, Array]],
-    follow: Callable[[Belief, PosePosterior], tuple[Belief, Array]],
-    difference: Callable[[Array, Array], Array],
-    moved: Callable[[Array, Array], Array],
-) -> tuple[Belief, Float[Array, " K"]]:
-    """The belief after a selection: every hypothesis corrected, equal ones merged.
-
-    Args:
-        measure: (a hypothesis, the candidate it takes) -> (corrected, NIS).
-        follow: (a hypothesis, its pose that was corrected already) -> (corrected, NIS).
-        difference: see `merged`.
-        moved: see `merged`.
-    """
-    belief = eqx.tree_at(
-        lambda b: (b.log_weight, b.initialised), belief, (selection.log_weight, selection.kept)
-    )
-    if isinstance(selection.measured, PosePosterior):
-        belief, nis = jax.vmap(follow)(belief, selection.measured)
-    else:
-        belief, nis = jax.vmap(measure)(belief, selection.measured)
-    return merged(belief, selection.heir, difference, moved), nis
 
 
 def gated(

@@ -36,7 +36,7 @@ class Output(eqx.Module):
     """Everything `step` knows after one observation."""
 
     pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
-    covariance: Float[Array, "d d"]  # of the state: (6, 6) for a car, see the motion model
+    covariance: Float[Array, "d d"]  # of the state's error: (6, 6) for a car, see the motion model
     T_world_vehicle: jaxlie.SE3
     located: Bool[Array, ""]  # False until the first pose was taken
     command: Command | None
@@ -147,7 +147,7 @@ class Navigator(eqx.Module):
         )
         return State(belief, control), Output(
             pose=pose,
-            covariance=belief.covariance[best],
+            covariance=self.motion.error_covariance(belief, best),
             T_world_vehicle=T_world_vehicle,
             located=located,
             command=command,

@@ -13,7 +13,9 @@ import scipy.optimize
 import scipy.stats
 
 from jaxnav.ambiguity import PoseBelief, Selection
+from jaxnav.bicycle_kalman import BicycleKalman
 from jaxnav.candidates import Candidates, find_candidates
+from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.fan import fan
 from jaxnav.geometry import on_ground
 from jaxnav.hypotheses import MultiHypothesis
@@ -326,6 +328,44 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
         np.testing.assert_allclose(error, 0, atol=1e-12)
         np.testing.assert_allclose(after.covariance[receiver], covariance, atol=1e-12)
         assert np.exp(after.log_weight[receiver]) == pytest.approx(weights[who].sum())
+
+
+@pytest.mark.parametrize(("kind", "size"), [("car", 6), ("free", 12)])
+def test_the_reported_covariance_is_that_of_the_error(kind, size):
+    """Truths drawn from the bank: their distance to the heaviest hypothesis, in units of the
+    reported covariance, is chi-square on average, though the truth is often another one's."""
+    motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
+    rng = np.random.default_rng(5)
+    shifts = 0.15 * rng.normal(size=(4, size))
+    start = motion.init(4)
+    seam = start.mean.at[:, 2].add(3.1 if kind == "car" else 0.0)
+    means = jax.vmap(motion.moved)(seam, jnp.asarray(shifts))
+    roots = 0.02 * rng.normal(size=(4, size, size)) + 0.03 * np.eye(size)
+    share = np.array([0.5, 0.3, 0.2, 0.9])
+    belief = eqx.tree_at(
+        lambda b: (b.mean, b.covariance, b.log_weight, b.initialised),
+        start,
+        (
+            means,
+            jnp.asarray(roots @ np.swapaxes(roots, 1, 2)),
+            jnp.log(share),
+            jnp.asarray([True, True, True, False]),
+        ),
+    )
+    drawn = rng.choice(3, size=20_000, p=share[:3])
+    errors = np.einsum("sde,se->sd", roots[drawn], rng.normal(size=(len(drawn), size)))
+    truths = jax.vmap(motion.moved)(means[drawn], jnp.asarray(errors))
+    away = np.asarray(jax.vmap(lambda truth: motion.difference(truth, means[0]))(truths))
+    covariance = np.asarray(motion.error_covariance(belief, jnp.asarray(0)))
+    nees = np.einsum("sd,sd->s", away, np.linalg.solve(covariance, away.T).T)
+    assert nees.mean() == pytest.approx(size, rel=0.03)
+    own = np.einsum("sd,sd->s", away, np.linalg.solve(belief.covariance[0], away.T).T)
+    assert own.mean() > 3 * size
+    # Nobody there, and nobody else.
+    for nobody in (motion.init(4), motion.init(1)):
+        np.testing.assert_array_equal(
+            motion.error_covariance(nobody, jnp.asarray(0)), nobody.covariance[0]
+        )
 
 
 def test_nobody_merges_with_itself():

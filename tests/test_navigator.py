@@ -420,7 +420,13 @@ def test_more_hypotheses_need_no_change_to_step():
     assert out.nis.shape == (STEPS,)
     heavier = int(np.argmax(state.belief.log_weight))
     np.testing.assert_allclose(out.pose[-1], state.belief.mean[heavier, :3], atol=1e-12)
-    np.testing.assert_array_equal(out.covariance[-1], state.belief.covariance[heavier])
+    share = np.exp(np.asarray(state.belief.log_weight))
+    means = np.asarray(state.belief.mean)
+    apart = means - means[heavier]
+    apart[:, 2] = kalman.wrap(apart[:, 2])
+    spread = np.asarray(state.belief.covariance) + np.einsum("id,ie->ide", apart, apart)
+    expected = np.einsum("i,ide->de", share / share.sum(), spread)
+    np.testing.assert_allclose(out.covariance[-1], expected, atol=1e-12)
     assert not np.allclose(state.belief.mean[0], state.belief.mean[1], atol=0.01)
     assert abs(float(state.belief.log_weight[0] - state.belief.log_weight[1])) > 1
 
