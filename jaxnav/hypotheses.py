@@ -14,8 +14,6 @@ Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27 (Laplace'
 Alspach, Sorenson (1972) (Gaussian sums).
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,6 +28,7 @@ from jaxnav.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe
 from jaxnav.map_fit import Fit, fit
 from jaxnav.observation import Snapshot
 from jaxnav.small_matrices import cholesky, sandwich, solve_lower
+from jaxnav.trees import where
 
 
 class MultiHypothesis(eqx.Module):
@@ -67,13 +66,12 @@ class MultiHypothesis(eqx.Module):
         any_seen = jnp.any(snapshot.seen.visible)
         snapshot = _trusted(snapshot, candidates)
         starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
-        bank = _where(starts, fan(prior, candidates, snapshot, self.hypotheses), prior)
+        bank = where(starts, fan(prior, candidates, snapshot, self.hypotheses), prior)
         floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
         # All slots take as many steps as the slowest: empty ones do what the heaviest does.
         heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
-        starts_at = jax.vmap(lambda used, slot: _where(used, slot, _at(_poses(bank), heaviest)))(
-            bank.initialised, _poses(bank)
-        )
+        does_as = jnp.where(bank.initialised, jnp.arange(self.hypotheses), heaviest)
+        starts_at = _at(_poses(bank), does_as)
         fits = jax.vmap(lambda T, P: fit(T, P, prior, snapshot, floor, self.max_steps))(
             starts_at.T_world_vehicle, starts_at.covariance
         )
@@ -85,7 +83,7 @@ class MultiHypothesis(eqx.Module):
         # What the gate keeps out moves nothing: such a hypothesis is where it was predicted.
         nis = jnp.sum(fits.posterior.innovation**2, axis=1)
         passes = starts | (nis <= prior.gate_nis)
-        after = jax.vmap(_where)(passes, _poses(fits.posterior), _poses(bank))
+        after = where(passes, _poses(fits.posterior), _poses(bank))
         best = jnp.argmax(log_weight)
         T_best = _at(after, best).T_world_vehicle
         apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(after.T_world_vehicle)
@@ -191,9 +189,9 @@ def _poses(of: PoseBelief | PosePosterior) -> _Poses:
     return _Poses(of.T_world_vehicle, of.covariance)
 
 
-def _at(poses: _Poses, index: Int[Array, ""]) -> _Poses:
-    one: _Poses = jax.tree.map(lambda leaf: leaf[index], poses)
-    return one
+def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:
+    chosen: _Poses = jax.tree.map(lambda leaf: leaf[index], poses)
+    return chosen
 
 
 def _apart(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, " 6"]:
@@ -214,7 +212,3 @@ def _beyond(
     scale = np.sqrt(2) * jnp.maximum(sigma_rad, 1e-6)
     below, above = (limit_rad - apart_rad) / scale, (limit_rad + apart_rad) / scale
     return (jax.scipy.special.erfc(below) + jax.scipy.special.erfc(above)) / 2
-
-
-def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -27,6 +27,7 @@ from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selecti
 from jaxnav.geometry import cayley_jacobian, inverse_cayley, inverse_cayley_jacobian
 from jaxnav.observation import Observation
 from jaxnav.small_matrices import cho_solve, cholesky, sandwich
+from jaxnav.trees import where
 
 
 class Rejections(eqx.Module):
@@ -282,6 +283,4 @@ def restarted_where_broken(belief: Belief, start: Belief) -> Belief:
     """The belief, with `start` in place of hypotheses whose numbers overflowed."""
     hypotheses = (belief.mean, belief.covariance.reshape(*belief.mean.shape[:1], -1))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(hypotheses, axis=1)), axis=1)
-    return jax.vmap(lambda ok, b, s: jax.tree.map(lambda x, y: jnp.where(ok, x, y), b, s))(
-        finite, belief, start
-    )
+    return where(finite, belief, start)

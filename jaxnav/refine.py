@@ -80,7 +80,6 @@ def refine_sightings(
     With `ground_plane` a level start stays level on the ground: the vehicle's x, y and heading
     alone are refined, and the covariance is that of these three.
     """
-
     pixels = reprojection_residuals(rig, seen)
 
     def residual(corners_vehicle: Array) -> Array:

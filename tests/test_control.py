@@ -15,7 +15,7 @@ from tests.derivatives import check_derivatives
 from tests.reference import paper
 
 WHEELBASE_M = 0.256
-call = eqx.filter_jit(lambda controller, *args: controller(*args))
+call = eqx.filter_jit(lambda controller, *args, **named: controller(*args, **named))
 
 
 def controller(waypoints_m=worlds.WAYPOINTS_M, **changes) -> Controller:
@@ -34,7 +34,7 @@ def controller(waypoints_m=worlds.WAYPOINTS_M, **changes) -> Controller:
     )
 
 
-def act(control, pose, steering_rad=0.0, dt_s=0.1, state=None, located=True):
+def act(control, pose, steering_rad=0.0, dt_s=0.1, state=None, located=True, **looking):
     return call(
         control,
         control.init() if state is None else state,
@@ -42,6 +42,7 @@ def act(control, pose, steering_rad=0.0, dt_s=0.1, state=None, located=True):
         jnp.asarray(located),
         jnp.asarray(steering_rad, float),
         jnp.asarray(dt_s, float),
+        **{name: jnp.asarray(value) for name, value in looking.items()},
     )
 
 
@@ -198,21 +199,11 @@ def test_it_waits_until_it_is_located():
 
 
 def look_around(
-    control, to_marker_m, state=None, pose=(3.0, 0.0, 2.0), decided=False, dt_s=0.1,
-    steering_rad=0.0, located=True, speed_mps=np.nan,
-):  # fmt: skip
+    control, to_marker_m, state=None, pose=(3.0, 0.0, 2.0), decided=False, speed_mps=np.nan, **given
+):
     """One call of a car that does not know where it is, and sees a marker from there."""
-    return call(
-        control,
-        control.init() if state is None else state,
-        jnp.asarray(pose, float),
-        jnp.asarray(located),
-        jnp.asarray(steering_rad, float),
-        jnp.asarray(dt_s, float),
-        jnp.asarray(decided),
-        jnp.asarray(to_marker_m, float),
-        jnp.asarray(speed_mps, float),
-    )
+    looking = {"decided": decided, "to_marker_m": to_marker_m, "speed_mps": speed_mps}
+    return act(control, pose, state=state, **given, **looking)
 
 
 def polar(range_m: float, bearing_deg: float) -> tuple[float, float]:

@@ -25,6 +25,7 @@ from jaxnav.simulation.corners import see
 from jaxnav.simulation.drive import PASSED_M
 from jaxnav.simulation.plant import CarState, move_through, read_odometry
 from jaxnav.simulation.scenarios import Scenario
+from jaxnav.trees import where
 
 _SUBSTEPS = 4  # of either part of a frame period
 
@@ -82,22 +83,21 @@ class Rollout(eqx.Module):
             seeds: a drive for each; a seed's drive does not depend on the others.
             progress: called with the number of drives that have ended since the last call.
         """
-        lanes, waiting = min(self.lanes, len(seeds)), deque(range(len(seeds)))
-        owner = np.full(lanes, -1)
+        lanes = min(self.lanes, len(seeds))
+        owner, waiting = np.arange(lanes), deque(range(lanes, len(seeds)))
         chunks: list[list[Trace]] = [[] for _ in seeds]
-        worlds = self._start(jnp.resize(seeds, (lanes,)))
-        while True:
-            idle = owner < 0
-            owner[idle] = [waiting.popleft() if waiting else -1 for _ in range(idle.sum())]
-            if np.all(owner < 0):
-                break
-            fresh = self._start(seeds[np.maximum(owner, 0)])
-            worlds, trace, over = self._advance(_where(jnp.asarray(idle), fresh, worlds))
-            trace, over = jax.device_get((trace, over))
+        worlds = self._start(seeds[:lanes])
+        while np.any(owner >= 0):
+            worlds, trace = self._advance(worlds)
+            trace, over = jax.device_get((trace, worlds.ended))
             for lane in np.flatnonzero(owner >= 0):
                 chunks[owner[lane]].append(jax.tree.map(lambda leaf, lane=lane: leaf[lane], trace))
             over = over & (owner >= 0)
-            owner[over] = -1
+            owner[over] = [waiting.popleft() if waiting else -1 for _ in range(over.sum())]
+            starts = over & (owner >= 0)
+            if np.any(starts):
+                fresh = self._start(seeds[np.maximum(owner, 0)])
+                worlds = where(jnp.asarray(starts), fresh, worlds)
             progress(int(over.sum()))
         return _side_by_side(chunks)
 
@@ -106,12 +106,12 @@ class Rollout(eqx.Module):
         return jax.vmap(lambda seed: self._first(jax.random.key(seed)))(seeds)
 
     @eqx.filter_jit
-    def _advance(self, worlds: _World) -> tuple[_World, Trace, Bool[Array, " lanes"]]:
-        """Some frames of every lane, and which drives are over."""
-        worlds, trace = jax.vmap(
+    def _advance(self, worlds: _World) -> tuple[_World, Trace]:
+        """Some frames of every lane."""
+        advanced: tuple[_World, Trace] = jax.vmap(
             lambda world: jax.lax.scan(lambda w, _: self._frame(w), world, length=self.chunk_frames)
         )(worlds)
-        return worlds, trace, worlds.ended
+        return advanced
 
     def _first(self, key: Array) -> _World:
         scenario = self.scenario
@@ -225,9 +225,3 @@ def _side_by_side(chunks: list[list[Trace]]) -> Trace:
     active = [np.pad(drive.active, (0, frames - len(drive.active))) for drive in drives]
     trace: Trace = jax.tree.map(stacked, *drives)
     return eqx.tree_at(lambda t: t.active, trace, np.stack(active))
-
-
-def _where(chosen: Bool[Array, " lanes"], yes: _World, no: _World) -> _World:
-    pick = jax.vmap(lambda c, a, b: jax.tree.map(lambda x, y: jnp.where(c, x, y), a, b))
-    world: _World = pick(chosen, yes, no)
-    return world

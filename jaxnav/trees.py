@@ -1,0 +1,20 @@
+"""Choice between whole states."""
+
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+_Tree = TypeVar("_Tree")
+
+
+def where(condition: Bool[Array, "*rows"], yes: _Tree, no: _Tree) -> _Tree:
+    """`jnp.where` of every leaf; the condition's axes are the leaves' leading ones."""
+
+    def choose(a: Any, b: Any) -> Array:
+        shape = condition.shape + (1,) * (jnp.ndim(a) - condition.ndim)
+        return jnp.where(condition.reshape(shape), a, b)
+
+    chosen: _Tree = jax.tree.map(choose, yes, no)
+    return chosen
