@@ -44,6 +44,7 @@ class Output(eqx.Module):
     candidates: Candidates
     costs: Float[Array, " N"]  # of the candidates, in the selector's unit
     selected: Int[Array, ""]  # the candidate taken, -1: none
+    hypothesis: Int[Array, ""]  # the one reported; while it survives, it keeps its number
     flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
     decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
     nis: Float[Array, ""]  # of the pose taken, 0 where none was
@@ -155,6 +156,7 @@ class Navigator(eqx.Module):
             candidates=candidates,
             costs=selection.costs,
             selected=selection.selected,
+            hypothesis=best,
             flip_probability=selection.flip_probability,
             decided=selection.decided,
             nis=jnp.where(located, nis[best], 0),

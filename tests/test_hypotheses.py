@@ -407,6 +407,7 @@ class Seen(eqx.Module):
     """What is kept of a drive, leading axes (seeds, frames)."""
 
     pose: jax.Array
+    hypothesis: jax.Array
     decided: jax.Array
     flip_probability: jax.Array
     nis: jax.Array
@@ -428,6 +429,7 @@ def run(nav: Navigator, obs: Observation) -> Seen:
         belief = state.belief
         return state, Seen(
             pose=out.pose,
+            hypothesis=out.hypothesis,
             decided=out.decided,
             flip_probability=out.flip_probability,
             nis=out.nis,
@@ -525,6 +527,12 @@ def test_a_short_drive_across_decides_for_the_truth():
     assert np.max(position_m[sure]) < 0.7
     assert np.median(position_m[:, -1]) < 0.1
     assert np.max(position_m[:, -1]) < 0.3
+    # The reported pose jumps to the other branch only where the reported hypothesis changes.
+    jumped = np.abs(kalman.wrap(np.diff(seen.pose[..., 2], axis=1))) > np.deg2rad(20)
+    changed = np.diff(seen.hypothesis, axis=1) != 0
+    assert np.any(jumped)
+    assert np.all(changed[jumped])
+    assert not np.any(jumped & sure[:, :-1])
 
 
 def test_one_gross_outlier_changes_nothing():

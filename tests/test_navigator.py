@@ -419,6 +419,7 @@ def test_more_hypotheses_need_no_change_to_step():
     assert state.belief.mean.shape == (2, 6)
     assert out.nis.shape == (STEPS,)
     heavier = int(np.argmax(state.belief.log_weight))
+    assert int(out.hypothesis[-1]) == heavier
     np.testing.assert_allclose(out.pose[-1], state.belief.mean[heavier, :3], atol=1e-12)
     share = np.exp(np.asarray(state.belief.log_weight))
     means = np.asarray(state.belief.mean)
