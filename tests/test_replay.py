@@ -16,7 +16,7 @@ from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation
 from jaxnav.runtime.recordings import Recording, read_recording
-from jaxnav.runtime.replay import CHUNK_FRAMES, errors, replay
+from jaxnav.runtime.replay import CHUNK_FRAMES, errors, frames_in_view, replay
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +83,13 @@ def test_the_bank_halves_the_wrong_branches_at_least(test_7):
     assert wrong[1] <= wrong[0] / 2
 
 
+def test_frames_in_view_are_counted_from_every_appearance():
+    seen = np.array([[1, 0], [1, 1], [0, 1], [1, 1], [1, 0], [1, 1]], bool)
+    counts = [[1, 0], [2, 1], [0, 2], [1, 3], [2, 0], [3, 1]]
+    np.testing.assert_array_equal(frames_in_view(seen), counts)
+    assert frames_in_view(seen[:0]).shape == (0, 2)
+
+
 def test_a_replay_is_the_step_over_and_over(test_7):
     # Not a whole number of chunks: padding must not show.
     short = test_7.first(CHUNK_FRAMES + 7)
@@ -125,6 +132,9 @@ def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["frames"] == 150
     assert summary["poses"] > summary["frames_located"]
+    # The one wrong choice came late, so it is one of fewer.
+    settled = summary["wrong_branch_fraction_after_5_frames"]
+    assert 0 < summary["wrong_branch_fraction"] < settled < 0.01
     assert len(list(tmp_path.glob("trajectory_marker_*.tum"))) == 9
 
 

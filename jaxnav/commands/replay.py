@@ -14,7 +14,9 @@ from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig, output_folder, write_json, write_tum
 from jaxnav.plotting import localisation_report
 from jaxnav.runtime.recordings import Recording, read_recording
-from jaxnav.runtime.replay import Replay, errors, replay
+from jaxnav.runtime.replay import Replay, errors, frames_in_view, replay
+
+SETTLED_FRAMES = 5  # of an appearance: a choice made later has had a history
 
 
 def run(args: Arguments) -> int:
@@ -72,13 +74,20 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
         return summary
     position_m, rotation_deg = errors(result, recording)
     judged = result.seen & recording.reference.valid[:, None]
-    count = max(int(judged.sum()), 1)
+    settled = judged & (frames_in_view(result.seen) > SETTLED_FRAMES)
+
+    wrong, outlier = np.asarray(result.branch.wrong), np.asarray(result.branch.outlier)
+
+    def fraction(of: np.ndarray, among: np.ndarray) -> float:
+        return float((of & among).sum()) / max(int(among.sum()), 1)
+
     return summary | {
         "poses_with_reference": int(judged.sum()),
         "position_error_m": _spread(position_m),
         "rotation_error_deg": _spread(rotation_deg),
-        "wrong_branch_fraction": float((result.branch.wrong & judged).sum()) / count,
-        "outlier_fraction": float((result.branch.outlier & judged).sum()) / count,
+        "wrong_branch_fraction": fraction(wrong, judged),
+        f"wrong_branch_fraction_after_{SETTLED_FRAMES}_frames": fraction(wrong, settled),
+        "outlier_fraction": fraction(outlier, judged),
     }
 
 

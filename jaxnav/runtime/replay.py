@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.ambiguity import Selector
 from jaxnav.candidates import find_candidates
@@ -198,6 +198,13 @@ def _frames(recording: Recording) -> _Frames:
         dt_s=pad(np.clip(dt_s, 0, MAX_DT_S)),
         T_world_vehicle_true=pad(truth),
     )
+
+
+def frames_in_view(seen: Bool[np.ndarray, "F tracks"]) -> Int[np.ndarray, "F tracks"]:
+    """How many frames in a row every track has been seen, this one included; 0 where it is not."""
+    frame = np.arange(len(seen))[:, None]
+    last_unseen = np.maximum.accumulate(np.where(seen, -1, frame), axis=0)
+    return np.where(seen, frame - last_unseen, 0)
 
 
 def errors(replay: Replay, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
