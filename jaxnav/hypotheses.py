@@ -25,7 +25,7 @@ from jaxnav.ambiguity import PoseBelief, PosePosterior, Selection
 from jaxnav.candidates import Candidates
 from jaxnav.fan import CANDIDATES, fan, normalised
 from jaxnav.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
-from jaxnav.map_fit import Fit, fit
+from jaxnav.map_fit import Fit, fit, fused
 from jaxnav.observation import Snapshot
 from jaxnav.small_matrices import cholesky, sandwich, solve_lower
 from jaxnav.trees import where
@@ -51,6 +51,7 @@ class MultiHypothesis(eqx.Module):
     linear_rad: float = float(np.deg2rad(3.0))  # an angle, and as much of the range
     forget_log_weight: float = -20.0  # lighter ones are dropped
     outlier_log_evidence: float = -12.0  # what a single frame can say against a hypothesis
+    max_inflation: float = 10.0  # of a prediction's covariance, where it is contradicted
     gate: float = 30.0  # whitened squared distance to the corners' own minimum; above: an outlier
     far_rad: float = float(np.deg2rad(20.0))
     decided_mass: float = 3e-5
@@ -76,14 +77,15 @@ class MultiHypothesis(eqx.Module):
             starts_at.T_world_vehicle, starts_at.covariance
         )
         alive = bank.initialised & fits.finite
-        evidence = self._evidence(fits, alive, candidates, starts)
+        inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
+        posteriors = jax.vmap(lambda fit: fused(fit, inflation))(fits)
+        evidence = self._evidence(fits, inflation, alive, candidates, starts)
         log_weight = normalised(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
         alive = alive & (log_weight > self.forget_log_weight)
 
         # What the gate keeps out moves nothing: such a hypothesis is where it was predicted.
-        nis = jnp.sum(fits.posterior.innovation**2, axis=1)
-        passes = starts | (nis <= prior.gate_nis)
-        after = where(passes, _poses(fits.posterior), _poses(bank))
+        passes = starts | (_nis(fits) <= prior.gate_nis * inflation)
+        after = where(passes, _poses(posteriors), _poses(bank))
         best = jnp.argmax(log_weight)
         T_best = _at(after, best).T_world_vehicle
         apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(after.T_world_vehicle)
@@ -97,7 +99,7 @@ class MultiHypothesis(eqx.Module):
         costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
         located = jnp.any(alive)
         return Selection(
-            measured=eqx.tree_at(lambda m: m.taken, fits.posterior, alive & any_seen),
+            measured=eqx.tree_at(lambda m: m.taken, posteriors, alive & any_seen),
             kept=alive & ~starts,
             log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
             heir=self._heirs(after, log_weight, alive, prior.freedom, snapshot),
@@ -109,12 +111,32 @@ class MultiHypothesis(eqx.Module):
             & (sigmas_rad[best] < self.decided_sigma_rad),
         )
 
+    def _inflation(
+        self, fits: Fit, alive: Bool[Array, " K"], starts: Array, freedom: int
+    ) -> Float[Array, ""]:
+        """By how much more than they say the predictions vary.
+
+        Where the corners contradict even the hypothesis that predicted them best, all were
+        predicted alike wrongly: wheels slip, a stamp is late, a camera has turned.
+        """
+        least = jnp.min(jnp.where(alive, _nis(fits), jnp.inf))
+        known = jnp.isfinite(least) & ~starts
+        excess = _excess(jnp.where(known, least, 0), jnp.asarray(freedom, least.dtype))
+        return jnp.minimum(excess, self.max_inflation).astype(least.dtype)
+
     def _evidence(
-        self, fits: Fit, alive: Bool[Array, " K"], candidates: Candidates, starts: Array
+        self,
+        fits: Fit,
+        inflation: Float[Array, ""],
+        alive: Bool[Array, " K"],
+        candidates: Candidates,
+        starts: Array,
     ) -> Float[Array, " K"]:
         """What this frame adds to the log-weights, bounded; nothing where it fits none of them."""
-        best = jnp.max(jnp.where(alive, fits.log_evidence, -jnp.inf))
-        bounded = jnp.maximum(fits.log_evidence - best, self.outlier_log_evidence)
+        forgiven = jnp.where(alive, _nis(fits), 0) * (1 - 1 / inflation) / 2
+        log_evidence = fits.log_evidence + forgiven
+        best = jnp.max(jnp.where(alive, log_evidence, -jnp.inf))
+        bounded = jnp.maximum(log_evidence - best, self.outlier_log_evidence)
         free_cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
         least = jnp.min(jnp.where(alive, fits.cost, jnp.inf))
         fits_one = starts | (least - free_cost < self.gate)
@@ -163,21 +185,29 @@ class MultiHypothesis(eqx.Module):
         return jnp.where(jnp.any(takes, axis=0), jnp.argmin(best_rank, axis=0), jnp.arange(count))
 
 
+def _nis(fits: Fit) -> Float[Array, " K"]:
+    return jnp.sum(fits.innovation**2, axis=1)
+
+
 def _trusted(snapshot: Snapshot, candidates: Candidates) -> Snapshot:
     """The corners, trusted no more than their own misfit allows.
 
     Where not even the best pose explains them within three sigmas of chi-square, their sigma is
     larger than they say: a blurred, bent or half hidden marker.
-
-    Source: Birge (1932), "The calculation of errors by the method of least squares".
     """
     seen = snapshot.seen
     misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
     freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
-    expected = freedom + 3 * jnp.sqrt(2 * freedom)
-    excess = jnp.where(jnp.isfinite(misfit), misfit / expected, 1)
-    scale = jnp.sqrt(jnp.maximum(excess, 1))
+    scale = jnp.sqrt(_excess(jnp.where(jnp.isfinite(misfit), misfit, 0), freedom))
     return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, seen.sigma_px * scale)
+
+
+def _excess(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:
+    """Of a sum of squares over three sigmas of its chi-square; 1 below.
+
+    Source: Birge (1932), "The calculation of errors by the method of least squares".
+    """
+    return jnp.maximum(chi2 / (freedom + 3 * jnp.sqrt(2 * freedom)), 1)
 
 
 class _Poses(eqx.Module):

@@ -31,7 +31,7 @@ from jaxnav.trees import where
 
 
 class Rejections(eqx.Module):
-    """Measured poses in a row that the gate kept out (RELIABILITY R1 to R3)."""
+    """Measured poses in a row that contradict the prediction (RELIABILITY R1 to R3)."""
 
     count: Int[Array, "*K"]  # of the last ones, which agree with each other
     last: Float[Array, "*K m"]  # whitened innovation of the last one
@@ -154,6 +154,7 @@ def gated(
     taken: Bool[Array, ""],
     innovation: Float[Array, " m"],
     gate_nis: Float[Array, ""] | float,
+    inflation: Float[Array, ""] | float,
     dt_s: Float[Array, ""] | float,
     first: tuple[Array, Array],
     posterior: tuple[Array, Array],
@@ -165,13 +166,16 @@ def gated(
 
     Args:
         innovation: of the pose, whitened.
+        gate_nis: a larger NIS is a contradiction, and counted.
+        inflation: and, times this, is kept out.
         dt_s: since the last observation.
         first: mean and covariance of a hypothesis that starts here.
         posterior: mean and covariance of one that takes the pose.
     """
     nis = jnp.sum(innovation**2)
     offered = taken & belief.initialised
-    starts, accepted = taken & ~belief.initialised, offered & (nis <= gate_nis)
+    starts, agrees = taken & ~belief.initialised, offered & (nis <= gate_nis)
+    accepted = offered & (nis <= gate_nis * inflation)
     mean, covariance = (
         jnp.where(accepted, new, jnp.where(starts, begin, old))
         for new, begin, old in zip(posterior, first, (belief.mean, belief.covariance), strict=True)
@@ -181,7 +185,7 @@ def gated(
         covariance,
         belief.log_weight,
         belief.initialised | taken,
-        _cleared(_and_another(belief.rejections, offered, innovation, dt_s), accepted | starts),
+        _cleared(_and_another(belief.rejections, offered, innovation, dt_s), agrees | starts),
     ), jnp.where(offered, nis, 0)
 
 
