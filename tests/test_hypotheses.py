@@ -155,6 +155,31 @@ def test_a_fit_is_the_minimum_of_the_whitened_e(exact, lane):
     assert np.sum(selection.measured.innovation[lane] ** 2) == pytest.approx(nis, rel=1e-4)
 
 
+@pytest.mark.parametrize("most", [1.0, 1.5, 1e9])
+def test_predictions_that_are_all_contradicted_are_trusted_less(most):
+    """As if their covariance were larger by the least NIS over three sigmas of chi-square."""
+    snapshot = view(NEAR)
+    prior = priors(NEAR + np.array([0.02, -0.015, 0.01]), scale=0.05)
+    selector = eqx.tree_at(lambda s: s.max_inflation, EXACT, most)
+    measured = select(selector, prior, find(snapshot), snapshot).measured
+    nis = np.sum(np.asarray(measured.innovation) ** 2, axis=1)
+    excess = np.min(nis) / (3 + 3 * np.sqrt(6))
+    assert excess > 1.8
+    np.testing.assert_allclose(measured.inflation, min(excess, most), rtol=1e-6)
+    for lane in (0, 3):
+        T_prior = matrix(prior.T_world_vehicle)[lane]
+        P = min(excess, most) * PLANAR.T @ np.asarray(prior.covariance)[lane] @ PLANAR
+        u, J, _ = textbook_fit(T_prior, P, PLANAR, snapshot)
+        expected = np.linalg.inv(J.T @ J + np.linalg.inv(P))
+        T = matrix(measured.T_world_vehicle)[lane]
+        away = PLANAR.T @ inverse_cayley(np.linalg.inv(T_prior @ cayley(PLANAR @ u)) @ T)
+        covariance = PLANAR.T @ np.asarray(measured.covariance)[lane] @ PLANAR
+        sigma = np.sqrt(np.diagonal(expected))
+        np.testing.assert_allclose(away / sigma, 0, atol=0.02)
+        np.testing.assert_allclose(covariance / np.outer(sigma, sigma),
+                                   expected / np.outer(sigma, sigma), atol=0.03)  # fmt: skip
+
+
 @pytest.mark.parametrize("tilt_sigma", [0.005, 0.02])
 def test_a_nuisance_is_an_unknown_with_that_prior(tilt_sigma):
     """Height, roll and pitch: six unknowns by SciPy, of which three are looked at."""
@@ -534,6 +559,21 @@ def test_a_short_drive_across_decides_for_the_truth():
     assert np.any(jumped)
     assert np.all(changed[jumped])
     assert not np.any(jumped & sure[:, :-1])
+
+
+def test_wheels_that_slip_choose_no_branch():
+    """They turn a car a tenth less than they say, so that all branches are contradicted alike."""
+    poses = arc((2.0, -1.0, np.deg2rad(125.0)), 0.5, -0.4)
+    slipping = sensed(poses, 1.1 * 0.5, -0.4)
+
+    def wrong_once_decided(max_inflation: float) -> np.ndarray:
+        nav = eqx.tree_at(lambda n: n.selector.max_inflation, car(), max_inflation)
+        seen = run(nav, slipping)
+        assert np.all(np.any(seen.decided, axis=1))
+        return (errors_of(seen, poses)[1] > np.deg2rad(20)) & np.asarray(seen.decided)
+
+    assert not np.any(wrong_once_decided(car().selector.max_inflation))
+    assert np.any(wrong_once_decided(1.0))
 
 
 def test_one_gross_outlier_changes_nothing():
