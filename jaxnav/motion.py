@@ -35,7 +35,7 @@ class Rejections(eqx.Module):
 
     count: Int[Array, "*K"]  # of the last ones, which agree with each other
     last: Float[Array, "*K m"]  # whitened innovation of the last one
-    duration_s: Float[Array, "*K"]  # of all of them
+    duration_s: Float[Array, "*K"]  # of all of them, those that were taken nevertheless included
 
 
 class Belief(eqx.Module):
@@ -144,7 +144,7 @@ def forgotten(belief: Belief, lost: Bool[Array, " K"]) -> Belief:
 def contradicted(
     belief: Belief, max_count: int, max_duration_s: Float[Array, ""] | float
 ) -> Bool[Array, " K"]:
-    """Whether so many rejected poses in a row agree, or none was taken for so long (R3)."""
+    """Whether so many contradictions in a row agree, or they have lasted so long (R3)."""
     rejections = belief.rejections
     return (rejections.count >= max_count) | (rejections.duration_s >= max_duration_s)
 
@@ -203,12 +203,8 @@ def _and_another(
     )
 
 
-def _cleared(rejections: Rejections, where: Bool[Array, "*K"]) -> Rejections:
-    return Rejections(
-        jnp.where(where, 0, rejections.count),
-        jnp.where(where[..., None], 0, rejections.last),
-        jnp.where(where, 0, rejections.duration_s),
-    )
+def _cleared(rejections: Rejections, over: Bool[Array, "*K"]) -> Rejections:
+    return where(over, jax.tree.map(jnp.zeros_like, rejections), rejections)
 
 
 def followed(
