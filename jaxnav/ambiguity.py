@@ -65,8 +65,8 @@ class PosePosterior(eqx.Module):
     T_world_vehicle: jaxlie.SE3  # batch axis (K,)
     covariance: Float[Array, "*K 6 6"]  # of xi in T_world_vehicle * exp(xi)
     innovation: Float[Array, "*K d"]  # of the corners, whitened: its square is the NIS
-    # What the prediction's covariance was multiplied with: so much more contradiction the gate
-    # lets pass. It is counted all the same.
+    # What the covariance was multiplied with: so much more contradiction the gate lets pass. It is
+    # counted all the same.
     inflation: Float[Array, "*K"]
     taken: Bool[Array, "*K"]
 

@@ -25,7 +25,7 @@ from jaxnav.ambiguity import PoseBelief, PosePosterior, Selection
 from jaxnav.candidates import Candidates
 from jaxnav.fan import CANDIDATES, fan, normalised
 from jaxnav.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
-from jaxnav.map_fit import Fit, fit, fused
+from jaxnav.map_fit import Fit, fit
 from jaxnav.observation import Snapshot
 from jaxnav.small_matrices import cholesky, sandwich, solve_lower
 from jaxnav.trees import where
@@ -51,7 +51,7 @@ class MultiHypothesis(eqx.Module):
     linear_rad: float = float(np.deg2rad(3.0))  # an angle, and as much of the range
     forget_log_weight: float = -20.0  # lighter ones are dropped
     outlier_log_evidence: float = -12.0  # what a single frame can say against a hypothesis
-    max_inflation: float = 10.0  # of a prediction's covariance, where it is contradicted
+    max_inflation: float = 10.0  # of a covariance, where prediction and corners disagree
     gate: float = 30.0  # whitened squared distance to the corners' own minimum; above: an outlier
     far_rad: float = float(np.deg2rad(20.0))
     decided_mass: float = 3e-5
@@ -78,13 +78,13 @@ class MultiHypothesis(eqx.Module):
         )
         alive = bank.initialised & fits.finite
         inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
-        posteriors = jax.vmap(lambda fit: fused(fit, inflation))(fits)
+        posteriors = jax.vmap(_inflated, (0, None))(fits.posterior, inflation)
         evidence = self._evidence(fits, inflation, alive, candidates, starts)
         log_weight = normalised(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
         alive = alive & (log_weight > self.forget_log_weight)
 
         # What the gate keeps out moves nothing: such a hypothesis is where it was predicted.
-        passes = starts | (_nis(fits) <= prior.gate_nis * inflation)
+        passes = starts | (_nis(posteriors) <= prior.gate_nis * inflation)
         after = where(passes, _poses(posteriors), _poses(bank))
         best = jnp.argmax(log_weight)
         T_best = _at(after, best).T_world_vehicle
@@ -114,12 +114,12 @@ class MultiHypothesis(eqx.Module):
     def _inflation(
         self, fits: Fit, alive: Bool[Array, " K"], starts: Array, freedom: int
     ) -> Float[Array, ""]:
-        """By how much more than they say the predictions vary.
+        """By how much more than they say predictions and corners vary.
 
-        Where the corners contradict even the hypothesis that predicted them best, all were
-        predicted alike wrongly: wheels slip, a stamp is late, a camera has turned.
+        Where they contradict each other even in the hypothesis where they do least, all are wrong
+        alike: wheels slip, a stamp is late, a camera has turned.
         """
-        least = jnp.min(jnp.where(alive, _nis(fits), jnp.inf))
+        least = jnp.min(jnp.where(alive, _nis(fits.posterior), jnp.inf))
         known = jnp.isfinite(least) & ~starts
         excess = _excess(jnp.where(known, least, 0), jnp.asarray(freedom, least.dtype))
         return jnp.minimum(excess, self.max_inflation).astype(least.dtype)
@@ -133,7 +133,7 @@ class MultiHypothesis(eqx.Module):
         starts: Array,
     ) -> Float[Array, " K"]:
         """What this frame adds to the log-weights, bounded; nothing where it fits none of them."""
-        forgiven = jnp.where(alive, _nis(fits), 0) * (1 - 1 / inflation) / 2
+        forgiven = jnp.where(alive, _nis(fits.posterior), 0) * (1 - 1 / inflation) / 2
         log_evidence = fits.log_evidence + forgiven
         best = jnp.max(jnp.where(alive, log_evidence, -jnp.inf))
         bounded = jnp.maximum(log_evidence - best, self.outlier_log_evidence)
@@ -185,8 +185,16 @@ class MultiHypothesis(eqx.Module):
         return jnp.where(jnp.any(takes, axis=0), jnp.argmin(best_rank, axis=0), jnp.arange(count))
 
 
-def _nis(fits: Fit) -> Float[Array, " K"]:
-    return jnp.sum(fits.innovation**2, axis=1)
+def _nis(posteriors: PosePosterior) -> Float[Array, " K"]:
+    return jnp.sum(posteriors.innovation**2, axis=1)
+
+
+def _inflated(posterior: PosePosterior, inflation: Float[Array, ""]) -> PosePosterior:
+    return eqx.tree_at(
+        lambda p: (p.covariance, p.inflation),
+        posterior,
+        (posterior.covariance * inflation, posterior.inflation * inflation),
+    )
 
 
 def _trusted(snapshot: Snapshot, candidates: Candidates) -> Snapshot:

@@ -15,7 +15,6 @@ import jaxlie
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PosePosterior
 from jaxnav.geometry import cayley, cayley_jacobian, cayley_points, transform_points
 from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM
@@ -28,21 +27,14 @@ from jaxnav.small_matrices import (
     product,
     sandwich,
     solve_lower,
+    solve_upper,
 )
 
 
 class Fit(eqx.Module):
-    """The minimum of e next to a prediction, and what the corners say by themselves.
+    """The minimum of e next to a prediction."""
 
-    That is u = `alone` with covariance `alone_covariance`, of xi = `spread` u: in units in which
-    the prediction is u = 0 with covariance 1.
-    """
-
-    T_world_prior: jaxlie.SE3
-    spread: Float[Array, "6 d"]
-    alone: Float[Array, " d"]
-    alone_covariance: Float[Array, "d d"]
-    innovation: Float[Array, " d"]  # of the corners, whitened: its square is the NIS
+    posterior: PosePosterior
     cost: Float[Array, ""]  # |r|^2 / sigma^2 at the minimum
     log_evidence: Float[Array, ""]
     finite: Bool[Array, ""]
@@ -105,43 +97,33 @@ def fit(
     cost = jnp.sum(r**2)
     log_evidence = -(cost + u @ u) / 2 - log_det(cholesky(information + eye)) / 2
 
+    # What the corners say by themselves: u_alone, with covariance R; fused with the prediction.
     ridge = jnp.sqrt(jnp.finfo(dtype).eps)
-    corners_alone = cholesky(information + ridge * eye)
-    alone = u - cho_solve(corners_alone, J.T @ r)
+    alone = cholesky(information + ridge * eye)
+    u_alone = u - cho_solve(alone, J.T @ r)
     unspread = solve_lower(root, eye)
-    R = cho_solve(corners_alone, eye)
+    R = cho_solve(alone, eye)
     R = R + sandwich(unspread, sandwich(freedom.T, jnp.diag(floor**2)))
-    innovation = kalman.whitened(alone, R + eye)
-    numbers = [alone, R.reshape(-1), log_evidence[None], innovation]
+    sigma = cholesky(R + eye)  # of u_alone about the prediction
+    contradiction = solve_lower(sigma, u_alone)
+    u_fused = solve_upper(sigma, contradiction)
+    # I - (I + R)^-1 = R (I + R)^-1, symmetric.
+    C = eye - cho_solve(sigma, eye)
+    xi = spread @ u_fused
+    T = (T_world_prior @ cayley(xi)).normalize()
+    carry = product(cayley_jacobian(xi), spread)
+    posterior_covariance = sandwich(carry, (C + C.T) / 2)
+    numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], contradiction]
     finite = usable & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
     return Fit(
-        T_world_prior=T_world_prior,
-        spread=spread,
-        alone=alone,
-        alone_covariance=R,
-        innovation=jnp.where(finite, innovation, jnp.inf),
+        posterior=PosePosterior(
+            jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, T_world_prior.wxyz_xyz)),
+            jnp.where(finite, posterior_covariance, jnp.eye(6, dtype=dtype)),
+            jnp.where(finite, contradiction, jnp.inf),
+            jnp.ones((), dtype),
+            finite,
+        ),
         cost=jnp.where(finite, cost, jnp.inf),
         log_evidence=jnp.where(finite, log_evidence, -jnp.inf),
         finite=finite,
-    )
-
-
-def fused(fit: Fit, inflation: Float[Array, ""]) -> PosePosterior:
-    """The corners and the prediction, the latter with its covariance times `inflation`."""
-    eye = jnp.eye(fit.alone.shape[0], dtype=fit.alone.dtype)
-    sigma = cholesky(fit.alone_covariance + inflation * eye)  # of u about the prediction
-    # s 1 - s (s 1 + R)^-1 s = s R (s 1 + R)^-1, symmetric.
-    C = inflation * (eye - inflation * cho_solve(sigma, eye))
-    xi = fit.spread @ (inflation * cho_solve(sigma, fit.alone))
-    T = (fit.T_world_prior @ cayley(xi)).normalize()
-    carry = product(cayley_jacobian(xi), fit.spread)
-    covariance = sandwich(carry, (C + C.T) / 2)
-    numbers = [T.wxyz_xyz, covariance.reshape(-1)]
-    finite = fit.finite & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
-    return PosePosterior(
-        jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, fit.T_world_prior.wxyz_xyz)),
-        jnp.where(finite, covariance, jnp.eye(6, dtype=covariance.dtype)),
-        jnp.where(finite, fit.innovation, jnp.inf),
-        inflation,
-        finite,
     )
