@@ -16,7 +16,7 @@ from jaxnav.geometry import (
     planar_from_T_world_vehicle,
     wrap_angle,
 )
-from jaxnav.motion import Belief, Motion, contradicted, followed, forgotten, gated, unstarted
+from jaxnav.motion import Belief, Motion, Offer, contradicted, followed, forgotten, unstarted
 from jaxnav.observation import Observation
 from jaxnav.small_matrices import sandwich
 
@@ -98,32 +98,23 @@ class BicycleKalman(Motion):
             self.gate_nis,
         )
 
-    def measure(
-        self, belief: Belief, measured: PoseMeasurement, obs: Observation
-    ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has chosen a candidate; and its NIS (3 dof)."""
+    def measure(self, belief: Belief, measured: PoseMeasurement, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has chosen a candidate, in 3 dof."""
         P = belief.covariance
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         R = planar_covariance(measured.T_world_vehicle, measured.covariance)
         R = R + jnp.diag(self.vision_floor**2)
-        innovation = pose - belief.mean[:3]
-        innovation = innovation.at[2].set(wrap_angle(innovation[2]))
+        innovation = self.difference(pose, belief.mean[:3])
         correction, posterior, S = kalman.update(P, innovation, jnp.eye(3, 6, dtype=P.dtype), R)
-        return gated(
-            belief,
-            measured.taken,
+        return Offer(
             kalman.whitened(innovation, S),
-            self.gate_nis,
-            1.0,
-            obs.dt_s,
+            gate_nis=self.gate_nis,
             first=self._first(pose, R, obs),
             posterior=(self.moved(belief.mean, correction), posterior),
         )
 
-    def follow(
-        self, belief: Belief, measured: PosePosterior, obs: Observation
-    ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has corrected its pose; and its NIS (3 dof)."""
+    def follow(self, belief: Belief, measured: PosePosterior, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has corrected its pose, in 3 dof."""
         T = measured.T_world_vehicle
         pose = planar_from_T_world_vehicle(T)
         eye = jnp.eye(6, dtype=belief.mean.dtype)
@@ -136,13 +127,10 @@ class BicycleKalman(Motion):
             measured.covariance,
             jnp.asarray(ON_GROUND, eye.dtype),
         )
-        return gated(
-            belief,
-            measured.taken,
+        return Offer(
             measured.innovation,
-            self.gate_nis,
-            measured.inflation,
-            obs.dt_s,
+            gate_nis=self.gate_nis,
+            inflation=measured.inflation,
             first=self._first(pose, planar_covariance(T, measured.covariance), obs),
             posterior=(jnp.append(pose, belief.mean[3:] + correction[3:]), sandwich(to_world, P)),
         )

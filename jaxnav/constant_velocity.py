@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
 from jaxnav.geometry import cayley, inverse_cayley
-from jaxnav.motion import Belief, Motion, contradicted, followed, forgotten, gated, unstarted
+from jaxnav.motion import Belief, Motion, Offer, contradicted, followed, forgotten, unstarted
 from jaxnav.observation import Observation
 
 
@@ -77,30 +77,22 @@ class ConstantVelocity(Motion):
             self.gate_nis,
         )
 
-    def measure(
-        self, belief: Belief, measured: PoseMeasurement, obs: Observation
-    ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has chosen a candidate; and its NIS (6 dof)."""
+    def measure(self, belief: Belief, measured: PoseMeasurement, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has chosen a candidate, in 6 dof."""
         mean, P = belief.mean, belief.covariance
         wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
         R = measured.covariance + jnp.diag(self.vision_floor**2)
         innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
         correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, 12, dtype=P.dtype), R)
-        return gated(
-            belief,
-            measured.taken,
+        return Offer(
             kalman.whitened(innovation, S),
-            self.gate_nis,
-            1.0,
-            obs.dt_s,
+            gate_nis=self.gate_nis,
             first=self._first(wxyz_xyz, R),
             posterior=(self.moved(mean, correction), posterior),
         )
 
-    def follow(
-        self, belief: Belief, measured: PosePosterior, obs: Observation
-    ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has corrected its pose; and its NIS (6 dof)."""
+    def follow(self, belief: Belief, measured: PosePosterior, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has corrected its pose, in 6 dof."""
         T = measured.T_world_vehicle
         correction, P = followed(
             belief.covariance,
@@ -109,13 +101,10 @@ class ConstantVelocity(Motion):
             measured.covariance,
             jnp.eye(6, dtype=belief.mean.dtype),
         )
-        return gated(
-            belief,
-            measured.taken,
+        return Offer(
             measured.innovation,
-            self.gate_nis,
-            measured.inflation,
-            obs.dt_s,
+            gate_nis=self.gate_nis,
+            inflation=measured.inflation,
             first=self._first(T.wxyz_xyz, measured.covariance),
             posterior=(jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:]), P),
         )

@@ -78,7 +78,7 @@ class MultiHypothesis(eqx.Module):
         )
         alive = bank.initialised & fits.finite
         inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
-        posteriors = jax.vmap(_inflated, (0, None))(fits.posterior, inflation)
+        posteriors = _inflated(fits.posterior, inflation)
         evidence = self._evidence(fits, inflation, alive, candidates, starts)
         log_weight = normalised(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
         alive = alive & (log_weight > self.forget_log_weight)
@@ -189,11 +189,11 @@ def _nis(posteriors: PosePosterior) -> Float[Array, " K"]:
     return jnp.sum(posteriors.innovation**2, axis=1)
 
 
-def _inflated(posterior: PosePosterior, inflation: Float[Array, ""]) -> PosePosterior:
+def _inflated(posteriors: PosePosterior, inflation: Float[Array, ""]) -> PosePosterior:
     return eqx.tree_at(
         lambda p: (p.covariance, p.inflation),
-        posterior,
-        (posterior.covariance * inflation, posterior.inflation * inflation),
+        posteriors,
+        (posteriors.covariance * inflation, posteriors.inflation * inflation),
     )
 
 

@@ -15,6 +15,7 @@ cars, `constant_velocity.py` for everything else.
 import abc
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -48,6 +49,16 @@ class Belief(eqx.Module):
     rejections: Rejections
 
 
+class Offer(NamedTuple):
+    """What a pose would make of one hypothesis."""
+
+    innovation: Float[Array, " m"]  # of the pose, whitened
+    first: tuple[Array, Array]  # mean and covariance, if it starts here
+    posterior: tuple[Array, Array]  # mean and covariance, if it takes the pose
+    gate_nis: Float[Array, ""] | float  # a larger NIS is a contradiction, and counted
+    inflation: Float[Array, ""] | float = 1.0  # times the gate, NIS is kept out
+
+
 class Motion(eqx.Module):
     """What `Navigator` asks of a motion model, and what all models do alike."""
 
@@ -64,16 +75,12 @@ class Motion(eqx.Module):
         """What a selector sees of it."""
 
     @abc.abstractmethod
-    def measure(
-        self, belief: Belief, measured: PoseMeasurement, obs: Observation
-    ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has chosen a candidate; and its NIS."""
+    def measure(self, belief: Belief, measured: PoseMeasurement, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has chosen a candidate."""
 
     @abc.abstractmethod
-    def follow(
-        self, belief: Belief, measured: PosePosterior, obs: Observation
-    ) -> tuple[Belief, Array]:
-        """One hypothesis whose selector has corrected its pose; and its NIS."""
+    def follow(self, belief: Belief, measured: PosePosterior, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has corrected its pose."""
 
     @abc.abstractmethod
     def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
@@ -95,8 +102,10 @@ class Motion(eqx.Module):
             lambda b: (b.log_weight, b.initialised), belief, (selection.log_weight, selection.kept)
         )
         measured = selection.measured
-        one = self.follow if isinstance(measured, PosePosterior) else self.measure
-        belief, nis = jax.vmap(lambda b, m: one(b, m, obs))(belief, measured)
+        offer = self.follow if isinstance(measured, PosePosterior) else self.measure
+        belief, nis = jax.vmap(lambda b, m: gated(b, offer(b, m, obs), m.taken, obs.dt_s))(
+            belief, measured
+        )
         return merged(belief, selection.heir, self.difference, self.moved), nis
 
     def error_covariance(self, belief: Belief, index: Int[Array, ""]) -> Float[Array, "d d"]:
@@ -151,13 +160,9 @@ def contradicted(
 
 def gated(
     belief: Belief,
+    offer: Offer,
     taken: Bool[Array, ""],
-    innovation: Float[Array, " m"],
-    gate_nis: Float[Array, ""] | float,
-    inflation: Float[Array, ""] | float,
     dt_s: Float[Array, ""] | float,
-    first: tuple[Array, Array],
-    posterior: tuple[Array, Array],
 ) -> tuple[Belief, Float[Array, ""]]:
     """One hypothesis that was offered a pose, and its NIS, 0 where there was none to compare.
 
@@ -165,27 +170,21 @@ def gated(
     (RELIABILITY R1).
 
     Args:
-        innovation: of the pose, whitened.
-        gate_nis: a larger NIS is a contradiction, and counted.
-        inflation: and, times this, is kept out.
+        taken: whether there is a pose at all.
         dt_s: since the last observation.
-        first: mean and covariance of a hypothesis that starts here.
-        posterior: mean and covariance of one that takes the pose.
     """
-    nis = jnp.sum(innovation**2)
+    nis = jnp.sum(offer.innovation**2)
     offered = taken & belief.initialised
-    starts, agrees = taken & ~belief.initialised, offered & (nis <= gate_nis)
-    accepted = offered & (nis <= gate_nis * inflation)
-    mean, covariance = (
-        jnp.where(accepted, new, jnp.where(starts, begin, old))
-        for new, begin, old in zip(posterior, first, (belief.mean, belief.covariance), strict=True)
-    )
+    starts, agrees = taken & ~belief.initialised, offered & (nis <= offer.gate_nis)
+    accepted = offered & (nis <= offer.gate_nis * offer.inflation)
+    predicted = (belief.mean, belief.covariance)
+    mean, covariance = where(accepted, offer.posterior, where(starts, offer.first, predicted))
     return Belief(
         mean,
         covariance,
         belief.log_weight,
         belief.initialised | taken,
-        _cleared(_and_another(belief.rejections, offered, innovation, dt_s), agrees | starts),
+        _cleared(_and_another(belief.rejections, offered, offer.innovation, dt_s), agrees | starts),
     ), jnp.where(offered, nis, 0)
 
 
