@@ -32,6 +32,7 @@ LAYERS = {
         "observation",
         "refine",
         "residuals",
+        "selectors",
     },
     "navigator": {"navigator"},
     "users": {
@@ -43,7 +44,7 @@ LAYERS = {
         "studies",
         "tuning",
     },
-    "shell": {"arguments", "cli", "commands", "plotting"},
+    "shell": {"arguments", "cli", "commands", "plotting", "study_plotting"},
 }
 ORDER = list(LAYERS)
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}

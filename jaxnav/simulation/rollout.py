@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxnav.bicycle import Vehicle
 from jaxnav.control import Command
@@ -25,6 +25,7 @@ from jaxnav.simulation.corners import see
 from jaxnav.simulation.drive import PASSED_M
 from jaxnav.simulation.plant import CarState, move_through, read_odometry
 from jaxnav.simulation.scenarios import Scenario
+from jaxnav.simulation.single_frames import directions
 from jaxnav.trees import where
 
 _SUBSTEPS = 4  # of either part of a frame period
@@ -39,6 +40,7 @@ class Trace(eqx.Module):
     located: Bool[Array, "*S"]
     decided: Bool[Array, "*S"]
     flip_probability: Float[Array, "*S"]
+    lm_steps: Int[Array, "*S"]  # of the slower candidate
     active: Bool[Array, "*S"]  # the drive had not ended before this frame
     on_floor: Bool[Array, "*S"]
     passed: Int[Array, "*S"]  # waypoints the true car has come near to, in order
@@ -50,6 +52,7 @@ class _World(eqx.Module):
 
     key: Array
     rig: CameraRig  # the true one
+    bias: Float[Array, "C M 4 2"]  # directions in the image
     car: CarState
     acting: Command  # until the latency of the next one is over
     command: Command
@@ -71,22 +74,25 @@ class Rollout(eqx.Module):
     markers: MarkerMap
     scenario: Scenario = eqx.field(static=True)
     corner_noise_px: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    # Of every corner of every camera, in a direction of its own, the same in all frames of a drive.
+    corner_bias_px: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)
+    start_pose: Float[Array, " 3"] | None = None  # in place of the scenario's
     lanes: int = eqx.field(static=True, default=128)
     chunk_frames: int = eqx.field(static=True, default=30)
 
     def run(
-        self, seeds: Int[Array, " S"], progress: Callable[[int], object] = lambda ended: None
+        self, keys: Key[Array, " S"], progress: Callable[[int], object] = lambda ended: None
     ) -> Trace:
         """Every drive, leading axes (S, frames): as many frames as the longest one has.
 
         Args:
-            seeds: a drive for each; a seed's drive does not depend on the others.
+            keys: a drive for each; a key's drive does not depend on the others.
             progress: called with the number of drives that have ended since the last call.
         """
-        lanes = min(self.lanes, len(seeds))
-        owner, waiting = np.arange(lanes), deque(range(lanes, len(seeds)))
-        chunks: list[list[Trace]] = [[] for _ in seeds]
-        worlds = self._start(seeds[:lanes])
+        lanes = min(self.lanes, len(keys))
+        owner, waiting = np.arange(lanes), deque(range(lanes, len(keys)))
+        chunks: list[list[Trace]] = [[] for _ in keys]
+        worlds = self._start(keys[:lanes])
         while np.any(owner >= 0):
             worlds, trace = self._advance(worlds)
             trace, over = jax.device_get((trace, worlds.ended))
@@ -96,14 +102,14 @@ class Rollout(eqx.Module):
             owner[over] = [waiting.popleft() if waiting else -1 for _ in range(over.sum())]
             starts = over & (owner >= 0)
             if np.any(starts):
-                fresh = self._start(seeds[np.maximum(owner, 0)])
+                fresh = self._start(keys[np.maximum(owner, 0)])
                 worlds = where(jnp.asarray(starts), fresh, worlds)
             progress(int(over.sum()))
         return _side_by_side(chunks)
 
     @eqx.filter_jit
-    def _start(self, seeds: Int[Array, " lanes"]) -> _World:
-        return jax.vmap(lambda seed: self._first(jax.random.key(seed)))(seeds)
+    def _start(self, keys: Key[Array, " lanes"]) -> _World:
+        return jax.vmap(self._first)(keys)
 
     @eqx.filter_jit
     def _advance(self, worlds: _World) -> tuple[_World, Trace]:
@@ -117,13 +123,17 @@ class Rollout(eqx.Module):
         scenario = self.scenario
         key, start_key, rig_key = jax.random.split(key, 3)
         spread = jnp.asarray(scenario.start_spread)
-        start = jnp.asarray(scenario.start_pose) + spread * jax.random.uniform(
+        start_pose = scenario.start_pose if self.start_pose is None else self.start_pose
+        start = jnp.asarray(start_pose) + spread * jax.random.uniform(
             start_key, (3,), spread.dtype, -1, 1
         )
         zero = jnp.zeros_like(start[0])
+        corners = (len(self.navigator.rig), len(self.markers.ids), 4)
+        turns = jax.random.uniform(jax.random.fold_in(rig_key, 1), corners, start.dtype)
         return _World(
             key=key,
             rig=scenario.true_rig(self.navigator.rig, rig_key),
+            bias=directions(turns),
             car=CarState(start, zero, zero),
             acting=Command(zero, zero),
             command=Command(zero, zero),
@@ -154,6 +164,7 @@ class Rollout(eqx.Module):
         seen_from = car.pose + smear * (world.car.pose - car.pose)
         corners_px, visible = see(world.rig, self.markers, T_world_vehicle_from_planar(seen_from))
         noise_px = self.corner_noise_px * jax.random.normal(key_corners, corners_px.shape, dtype)
+        noise_px = noise_px + self.corner_bias_px * world.bias
         visible = visible & ~scenario.hidden(stamp_s)
         corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
         speed_mps, steering_rad = read_odometry(car, scenario.odometry, key_odometry)
@@ -185,6 +196,7 @@ class Rollout(eqx.Module):
             located=out.located,
             decided=out.decided,
             flip_probability=out.flip_probability,
+            lm_steps=jnp.max(jnp.where(out.candidates.valid, out.candidates.steps, 0)),
             active=~world.ended,
             on_floor=on_floor,
             passed=passed,
@@ -198,7 +210,17 @@ class Rollout(eqx.Module):
         if scenario.drives:
             ended = ended | out.done
         return _World(
-            world.key, world.rig, car, world.command, command, state, frame, passed, ended, on_floor
+            world.key,
+            world.rig,
+            world.bias,
+            car,
+            world.command,
+            command,
+            state,
+            frame,
+            passed,
+            ended,
+            on_floor,
         ), trace
 
     def _moved(self, world: _World, period_s: Array) -> CarState:
