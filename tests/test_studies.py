@@ -5,6 +5,7 @@ import json
 import os
 import re
 import time
+import tracemalloc
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -403,3 +404,28 @@ def test_a_bad_command_is_one_line(
     assert code == 2
     assert said in printed.err
     assert printed.err.count("\n") == 1
+
+
+def test_memory_does_not_grow_with_the_study(tmp_path: Path) -> None:
+    class Many(Fake):
+        """As many trials as one likes, at once."""
+
+        def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
+            found = {}
+            for name, variable in SCHEMA.variables.items():
+                shape = (len(cells), 2, len(trials)) if variable.of_selector else None
+                found[name] = np.zeros(shape or (len(cells), len(trials)), variable.dtype)
+            return found
+
+    def peak_bytes(trials: int) -> int:
+        study = Many(config(trials=trials, axes={"a_m": [1, 2], "selector": ["x", "z"]}))
+        store = open_store(tmp_path / f"{trials}.zarr", study, 5_000)
+        tracemalloc.start()
+        run_here(store)
+        summarise(read_dataset(store.path), study.grid, store.layout)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        return peak
+
+    few, many = peak_bytes(10_000), peak_bytes(80_000)
+    assert many < 1.3 * few
