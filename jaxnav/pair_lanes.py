@@ -28,7 +28,7 @@ from jaxnav.ippe import PosePair
 from jaxnav.markers import CORNER_SIGNS
 
 _SIGNS = [(int(a), int(b)) for a, b, _ in CORNER_SIGNS]
-_FIRST_STEPS = 3  # for all lanes; nine of ten need no more
+_FIRST_STEPS = 2  # for all lanes; most need no more
 _ROUNDS, _FIRST_ROUND = 5, 4  # of the lanes that are left: 4, 8, 16, 32, 64 further steps
 
 Lane = Float[Array, "*lanes"]
@@ -93,16 +93,17 @@ def closed_form(seen: Marks) -> tuple[Poses, Poses]:
     g = jnp.where(safe, twist[0] * along[1] - twist[1] * along[0], 0) / divisor
     h = jnp.where(safe, across[0] * twist[1] - across[1] * twist[0], 0) / divisor
     weight = [1 + a * g + b * h for a, b in _SIGNS]
-    center_x, center_y = (sum(c[i] * weight[i] for i in range(4)) / 4 for c in (x, y))
+    whole = weight[0] + weight[1] + weight[2] + weight[3]
+    center_x, center_y = (sum(c[i] * weight[i] for i in range(4)) / whole for c in (x, y))
     jacobian = [
         [
-            sum(_SIGNS[i][k] * c[i] * weight[i] for i in range(4)) / 4 - center * slope
+            sum(_SIGNS[i][k] * c[i] * weight[i] for i in range(4)) / whole - center * slope
             for k, slope in ((0, g), (1, h))
         ]
         for c, center in ((x, center_x), (y, center_y))
     ]
 
-    # As a camera that looks straight at the centre would see it.
+    # As a camera that looks straight at the centre would see it: det(p) is the ray's length.
     ray_x, ray_y = center_x + mean_x, center_y + mean_y
     length = jnp.sqrt(1 + ray_x * ray_x + ray_y * ray_y)
     rx, ry, rz = ray_x / length, ray_y / length, 1 / length
@@ -110,9 +111,8 @@ def closed_form(seen: Marks) -> tuple[Poses, Poses]:
     sight = ((1 - rx * rx / lean, -rx * ry / lean, -rx), (-rx * ry / lean, 1 - ry * ry / lean, -ry))
     p00, p01 = (sight[k][0] - ray_x * sight[k][2] for k in (0, 1))
     p10, p11 = (sight[k][1] - ray_y * sight[k][2] for k in (0, 1))
-    area = p00 * p11 - p01 * p10
-    a, b = ((p11 * jacobian[0][k] - p01 * jacobian[1][k]) / area for k in (0, 1))
-    c, d = ((p00 * jacobian[1][k] - p10 * jacobian[0][k]) / area for k in (0, 1))
+    a, b = ((p11 * jacobian[0][k] - p01 * jacobian[1][k]) / length for k in (0, 1))
+    c, d = ((p00 * jacobian[1][k] - p10 * jacobian[0][k]) / length for k in (0, 1))
 
     # Its two rotations.
     s0, s1, d0, d1 = (a + d) / 2, (c - b) / 2, (a - d) / 2, (c + b) / 2
@@ -141,12 +141,12 @@ def closed_form(seen: Marks) -> tuple[Poses, Poses]:
         on_sight = 1 / gamma
         depth = moment / (8 * seen.unit * seen.unit)
         plausible = (depth > on_sight / 2) & (depth < on_sight * 2)
-        scale = jnp.where(plausible, 1 / jnp.where(plausible, depth, 1), gamma)
+        depth = jnp.where(plausible, depth, on_sight)
         center = (
-            jnp.where(plausible, offset_x * scale, center_x),
-            jnp.where(plausible, offset_y * scale, center_y),
+            jnp.where(plausible, offset_x, center_x * depth) / depth,
+            jnp.where(plausible, offset_y, center_y * depth) / depth,
         )
-        return Poses(_quaternion(axis_x, axis_y), center, scale)
+        return Poses(_quaternion(axis_x, axis_y), center, 1 / depth)
 
     return pose(1), pose(-1)
 
@@ -168,7 +168,7 @@ def _quaternion(axis_x: list[Lane], axis_y: list[Lane]) -> tuple[Lane, Lane, Lan
         w, x, y, z = (
             jnp.where(better, new, old) for new, old in zip(rows[k], (w, x, y, z), strict=True)
         )
-    length = jnp.sqrt(w * w + x * x + y * y + z * z)
+    length = 2 * jnp.sqrt(best)  # row i is 4 q_i q
     return w / length, x / length, y / length, z / length
 
 
@@ -220,7 +220,7 @@ def _cost(pose: Poses, seen: Marks) -> Lane:
         jnp.minimum(corners[4].depth, corners[6].depth),
     )
     in_front = (nearest > 1e-3) & (pose.scale > 0)
-    return jnp.where(in_front, total / (seen.unit * seen.unit), jnp.inf)
+    return jnp.where(in_front, total, jnp.inf) / (seen.unit * seen.unit)
 
 
 def residuals(pose: Poses, seen: Marks) -> list[Lane]:
@@ -491,7 +491,7 @@ def solve_pairs(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) ->
     batch = corners_n.shape[0]
     if batch == 0:
         return _empty(corners_n.dtype)
-    lanes = _block_lanes(batch, 8208, 2**18)
+    lanes = _block_lanes(batch, 2064, 2**18)
 
     def begin(corners: Array) -> tuple[Marks, Poses, Trace]:
         seen, start = _stacked_pair(corners)
