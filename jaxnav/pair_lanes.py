@@ -473,7 +473,7 @@ def ippe_squares(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) -
     batch = corners_n.shape[0]
     if batch == 0:
         return _empty(corners_n.dtype)
-    lanes = _block_lanes(batch, 8208, 2**18)
+    lanes = _block_lanes(batch, 4112, 2**18)
 
     def block(corners: Array, size: Array) -> PosePair:
         seen, pair = _stacked_pair(corners)
@@ -536,9 +536,7 @@ def _finished(pose: Poses, seen: Marks, trace: Trace) -> tuple[Poses, Trace]:
             trace_here = here[1]._replace(done=here[1].done | (index >= total))
             better = _improve(here[0], there, trace_here, steps)
             pose, trace = jax.tree.map(
-                lambda leaf, new: leaf.at[index].set(
-                    new, mode="drop", unique_indices=False, indices_are_sorted=True
-                ),
+                lambda leaf, new: leaf.at[index].set(new, mode="drop", indices_are_sorted=True),
                 (pose, trace),
                 better,
             )
