@@ -281,7 +281,7 @@ def main() -> None:
     print(f"{versions}; {model}, {threads} threads for jax, 1 for OpenCV; batch {BATCH}\n")
     backend = jax.default_backend()
     print(
-        f"| both poses of one marker | us, {backend} | CPU us | times OpenCV | by CPU time | pairs/s |"
+        f"| both poses of one marker | us, {backend} | CPU us | wall ratio | CPU ratio | pairs/s |"
     )
     print("|---|---|---|---|---|---|")
     peer = np.ones(2)
