@@ -30,6 +30,7 @@ LAYERS = {
         "map_fit",
         "motion",
         "observation",
+        "pair_lanes",
         "refine",
         "residuals",
         "selectors",
