@@ -378,6 +378,20 @@ def test_workers_that_die_for_good_are_one_line(tmp_path: Path, by_value: None) 
     assert count_done(store.path) == 0
 
 
+def test_a_scheduler_that_goes_is_one_line(tmp_path: Path, by_value: None) -> None:
+    study = Fake(config())
+    study.slow_s = 0.2
+    store = open_store(tmp_path / "s.zarr", study, 5)
+
+    with (
+        local_cluster(1) as owner,
+        remote_cluster(owner.scheduler.address, lambda: None, timeout_s=2.0) as client,
+        pytest.raises(BadInput, match=r"--scheduler: the scheduler is gone; what is done is kept"),
+    ):
+        run_on_cluster(store, client, "--scheduler", lambda done: owner.cluster.close())
+    assert 0 < count_done(store.path) < 120
+
+
 @pytest.mark.parametrize(
     ("args", "said"),
     [

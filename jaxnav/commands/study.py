@@ -58,7 +58,8 @@ def _cluster(args: Arguments, stack: ExitStack) -> Any:
         return stack.enter_context(local_cluster(args.workers))
     if args.scheduler is not None:
         client = stack.enter_context(remote_cluster(args.scheduler, prepare_worker))
-        print(f"dashboard: {client.dashboard_link}", flush=True)
+        if "dashboard" in client.scheduler_info()["services"]:
+            print(f"dashboard: {client.dashboard_link}", flush=True)
         return client
     return None
 

@@ -60,7 +60,7 @@ def run_on_cluster(
             versions, or are gone.
     """
     from distributed import wait
-    from distributed.client import FutureCancelledError
+    from distributed.client import FutureCancelledError, FuturesCancelledError
     from distributed.comm import CommClosedError
     from distributed.scheduler import KilledWorker
 
@@ -94,7 +94,7 @@ def run_on_cluster(
         raise BadInput(
             where, f"a box killed one worker after the other: {error}; {_KEPT}"
         ) from None
-    except (FutureCancelledError, CommClosedError, OSError):
+    except (FutureCancelledError, FuturesCancelledError, CommClosedError, OSError):
         raise BadInput(where, f"the scheduler is gone; {_KEPT}") from None
     except OtherVersions as error:
         raise BadInput(where, f"{error}; {_KEPT}") from None
@@ -153,16 +153,23 @@ def local_cluster(workers: int) -> Iterator["Client"]:
 
 
 @contextmanager
-def remote_cluster(address: str, prepare: Callable[[], Any]) -> Iterator["Client"]:
+def remote_cluster(
+    address: str, prepare: Callable[[], Any], timeout_s: float = 10.0
+) -> Iterator["Client"]:
     """A cluster that is there already.
 
     Args:
         prepare: called in every worker, also in later ones, before it runs anything.
+        timeout_s: how long the scheduler is waited for.
 
     Raises:
         BadInput: nobody answers at the address.
     """
+    import logging
+
     from distributed import Client, WorkerPlugin
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we say ourselves what happened
 
     class Prepare(WorkerPlugin):
         name = "jaxnav"
@@ -171,7 +178,7 @@ def remote_cluster(address: str, prepare: Callable[[], Any]) -> Iterator["Client
             prepare()
 
     try:
-        client = Client(address, timeout=10)
+        client = Client(address, timeout=timeout_s)
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else "nobody answers"
         raise BadInput("--scheduler", f"no Dask scheduler at {address!r}: {reason}") from None
