@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxnav import bicycle, kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
@@ -74,7 +74,11 @@ class BicycleKalman(Motion):
 
         mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
-        return forgotten(predicted, contradicted(belief, self.max_rejections, self.max_rejected_s))
+        return forgotten(predicted, self.lost(belief))
+
+    def lost(self, belief: Belief) -> Bool[Array, " K"]:
+        """Whether the gate has contradicted a hypothesis too often or too long."""
+        return contradicted(belief, self.max_rejections, self.max_rejected_s)
 
     def poses(self, belief: Belief) -> PoseBelief:
         """Level on the ground (Eq. 12), as far as `tilt_sigma_rad` and `height_sigma_m` go."""

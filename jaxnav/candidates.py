@@ -38,6 +38,14 @@ class Candidates(eqx.Module):
     converged: Bool[Array, " N"]
     steps: Int[Array, " N"]
 
+    def padded(self, count: int) -> "Candidates":
+        """So many lanes; those that are added are not valid."""
+        kept = self.valid.shape[0]
+        more = jax.tree.map(
+            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:1], count - kept, axis=0)]), self
+        )
+        return eqx.tree_at(lambda c: c.valid, more, more.valid & (jnp.arange(count) < kept))
+
 
 def find_candidates(
     snapshot: Snapshot, max_candidates: int = 4, max_steps: int = 12, ground_plane: bool = False

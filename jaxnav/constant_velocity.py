@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
@@ -62,8 +62,12 @@ class ConstantVelocity(Motion):
         mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
         variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
-        wrong = contradicted(belief, self.max_rejections, self.max_rejected_s)
+        wrong = self.lost(belief)
         return forgotten(predicted, wrong | ~(variance_m2 < self.lost_sigma_m**2))
+
+    def lost(self, belief: Belief) -> Bool[Array, " K"]:
+        """Whether the gate has contradicted a hypothesis too often or too long."""
+        return contradicted(belief, self.max_rejections, self.max_rejected_s)
 
     def poses(self, belief: Belief) -> PoseBelief:
         """The pose part of the state."""

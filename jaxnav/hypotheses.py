@@ -67,11 +67,14 @@ class MultiHypothesis(eqx.Module):
         any_seen = jnp.any(snapshot.seen.visible)
         snapshot = _trusted(snapshot, candidates)
         starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
-        bank = where(starts, fan(prior, candidates, snapshot, self.hypotheses), prior)
+        count = prior.log_weight.shape[0]
+        bank = prior
+        if count == self.hypotheses:  # else whoever left the rest away knows that none starts
+            bank = where(starts, fan(prior, candidates, snapshot, count), prior)
         floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
         # All slots take as many steps as the slowest: empty ones do what the heaviest does.
         heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
-        does_as = jnp.where(bank.initialised, jnp.arange(self.hypotheses), heaviest)
+        does_as = jnp.where(bank.initialised, jnp.arange(count), heaviest)
         starts_at = _at(_poses(bank), does_as)
         fits = jax.vmap(lambda T, P: fit(T, P, prior, snapshot, floor, self.max_steps))(
             starts_at.T_world_vehicle, starts_at.covariance
@@ -155,7 +158,7 @@ class MultiHypothesis(eqx.Module):
         Close is a fraction of the receiver's own sigma, or of an angle so small that the corners
         are linear in it.
         """
-        count = self.hypotheses
+        count = log_weight.shape[0]
         T = poses.T_world_vehicle
         apart = jax.vmap(jax.vmap(_apart, (None, 0)), (0, None))(T.wxyz_xyz, T.wxyz_xyz) @ freedom
         nearest_m = jnp.min(
@@ -176,8 +179,10 @@ class MultiHypothesis(eqx.Module):
         whitened = jax.vmap(lambda L, a: solve_lower(L, a.T))(factor, apart)
         close = jnp.sum(whitened**2, axis=1) < self.merge_distance**2  # [receiver, other]
         close = close & alive[:, None] & alive[None]
-        rank = jnp.argsort(jnp.argsort(-jnp.where(alive, log_weight, -jnp.inf)))
-        heavier = rank[:, None] < rank[None]
+        weight = jnp.where(alive, log_weight, -jnp.inf)
+        first = jnp.arange(count)[:, None] < jnp.arange(count)[None]
+        heavier = (weight[:, None] > weight[None]) | ((weight[:, None] == weight[None]) & first)
+        rank = jnp.sum(heavier, axis=0)
         # A receiver is taken in by nobody itself.
         takes = close & heavier
         takes = takes & ~jnp.any(takes, axis=0)[:, None]

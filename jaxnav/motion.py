@@ -47,6 +47,7 @@ class Belief(eqx.Module):
     log_weight: Float[Array, "*K"]
     initialised: Bool[Array, "*K"]
     rejections: Rejections
+    number: Int[Array, "*K"]  # stays with a hypothesis wherever it stands in the bank
 
 
 class Offer(NamedTuple):
@@ -69,6 +70,10 @@ class Motion(eqx.Module):
     @abc.abstractmethod
     def predict(self, belief: Belief, obs: Observation) -> Belief:
         """The belief at this observation, before its corners are looked at."""
+
+    @abc.abstractmethod
+    def lost(self, belief: Belief) -> Bool[Array, " K"]:
+        """Hypotheses that the gate has contradicted too often or too long: `predict` drops them."""
 
     @abc.abstractmethod
     def poses(self, belief: Belief) -> PoseBelief:
@@ -133,6 +138,7 @@ def unstarted(
         covariance=jnp.tile(jnp.eye(error_states, dtype=mean.dtype), (hypotheses, 1, 1)),
         log_weight=jnp.zeros(hypotheses, mean.dtype),
         initialised=jnp.zeros(hypotheses, bool),
+        number=jnp.arange(hypotheses),
         rejections=Rejections(
             jnp.zeros(hypotheses, int),
             jnp.zeros((hypotheses, pose_states), mean.dtype),
@@ -185,6 +191,7 @@ def gated(
         belief.log_weight,
         belief.initialised | taken,
         _cleared(_and_another(belief.rejections, offered, offer.innovation, dt_s), agrees | starts),
+        belief.number,
     ), jnp.where(offered, nis, 0)
 
 
@@ -278,8 +285,44 @@ def merged(
     )
 
 
+def leading(belief: Belief, count: int) -> Belief:
+    """The first hypotheses of a bank."""
+    first: Belief = jax.tree.map(lambda leaf: leaf[:count], belief)
+    return first
+
+
+def followed_by(belief: Belief, empty: Belief) -> Belief:
+    """Hypotheses in the first slots of a bank that is empty otherwise."""
+    kept = belief.initialised.shape[0]
+    bank: Belief = jax.tree.map(lambda a, b: jnp.concatenate([a, b[kept:]]), belief, empty)
+    return bank
+
+
+def numbered_anew_where_empty(belief: Belief) -> Belief:
+    """The same, slots counted from 0 where no hypothesis lives that goes by another number."""
+    anew = jnp.arange(belief.number.shape[0])
+    number = jnp.where(jnp.any(belief.initialised), belief.number, anew)
+    return dataclasses.replace(belief, number=number)
+
+
+def survivors_first(belief: Belief) -> Belief:
+    """The same bank, hypotheses that live before those that don't, each in their order."""
+    count = belief.initialised.shape[0]
+    if count == 1:
+        return belief
+    lives = belief.initialised.astype(int)
+    place = jnp.where(
+        belief.initialised,
+        jnp.cumsum(lives) - 1,
+        jnp.sum(lives) + jnp.cumsum(1 - lives) - 1,
+    )
+    order = jnp.argmax(place[None] == jnp.arange(count)[:, None], axis=1)
+    sorted_bank: Belief = jax.tree.map(lambda leaf: leaf[order], belief)
+    return sorted_bank
+
+
 def restarted_where_broken(belief: Belief, start: Belief) -> Belief:
     """The belief, with `start` in place of hypotheses whose numbers overflowed."""
     hypotheses = (belief.mean, belief.covariance.reshape(*belief.mean.shape[:1], -1))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(hypotheses, axis=1)), axis=1)
-    return where(finite, belief, start)
+    return dataclasses.replace(where(finite, belief, start), number=belief.number)

@@ -3,7 +3,7 @@
 Source: Liu, Schofield, Shan (2023), Algorithm 1.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -20,9 +20,21 @@ from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.geometry import planar_from_T_world_vehicle, transform_points
 from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.markers import MarkerMap
-from jaxnav.motion import Belief, Motion, restarted_where_broken
+from jaxnav.motion import (
+    Belief,
+    Motion,
+    followed_by,
+    leading,
+    numbered_anew_where_empty,
+    restarted_where_broken,
+    survivors_first,
+)
 from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
 from jaxnav.rig import CameraRig
+
+# Slots of the banks that `step_by_regime` keeps compiled beside the whole one: nine frames of ten
+# need a single one, and of the others two of three no more than these.
+_BANKS = (1, 8)
 
 
 class State(eqx.Module):
@@ -49,6 +61,21 @@ class Output(eqx.Module):
     decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
     nis: Float[Array, ""]  # of the pose taken, 0 where none was
     control_log: ControlLog | None
+
+
+class _Estimate(eqx.Module):
+    """The belief after an observation, and what is reported of it; see `Output`."""
+
+    belief: Belief
+    T_world_vehicle: jaxlie.SE3
+    covariance: Float[Array, "d d"]
+    located: Bool[Array, ""]
+    costs: Float[Array, " N"]
+    selected: Int[Array, ""]
+    hypothesis: Int[Array, ""]
+    flip_probability: Float[Array, ""]
+    decided: Bool[Array, ""]
+    nis: Float[Array, ""]
 
 
 class Navigator(eqx.Module):
@@ -131,35 +158,101 @@ class Navigator(eqx.Module):
         """One pass of Algorithm 1."""
         obs = obs.usable()
         snapshot = self.snapshot(obs)
-        prior = self.motion.predict(state.belief, obs)
         candidates = self.find_candidates(snapshot)
+        estimate = self._estimate(state.belief, snapshot, candidates)
+        return self._acted(state, obs, candidates, estimate)
+
+    def step_by_regime(self, state: State, obs: Observation) -> tuple[State, Output]:
+        """`step` without the slots that are empty: the same up to rounding.
+
+        Branches for one sighting or several, and for one hypothesis, a few or the whole bank: worth
+        it where many lanes run side by side, each in its own branch (see `lanes.py`).
+        """
+        obs = obs.usable()
+        snapshot = self.snapshot(obs)
+        candidates = self._candidates_by_regime(snapshot)
+        belief, count = state.belief, state.belief.initialised.shape[0]
+        if count == 1 or not isinstance(self.selector, MultiHypothesis):
+            estimate = self._estimate(belief, snapshot, candidates)
+            return self._acted(state, obs, candidates, estimate)
+        starts = jnp.any(snapshot.seen.visible) & ~jnp.any(
+            belief.initialised & ~self.motion.lost(belief)
+        )
+        empty = self.motion.init(count)
+
+        def within(size: int) -> Callable[[Belief], _Estimate]:
+            def estimate(belief: Belief) -> _Estimate:
+                found = self._estimate(leading(belief, size), snapshot, candidates)
+                bank = followed_by(survivors_first(found.belief), empty)
+                return eqx.tree_at(lambda e: e.belief, found, bank)
+
+            return estimate
+
+        sizes = [size for size in _BANKS if size < count] + [count]
+        needed = jnp.max(jnp.where(belief.initialised, jnp.arange(count) + 1, 0))
+        needed = jnp.where(starts, count, needed)
+        index = jnp.sum(needed > jnp.asarray(sizes[:-1]))
+        estimate = jax.lax.switch(index, [within(size) for size in sizes], belief)
+        return self._acted(state, obs, candidates, estimate)
+
+    def _candidates_by_regime(self, snapshot: Snapshot) -> Candidates:
+        visible = snapshot.seen.visible
+        count = min(self.max_candidates, 2 * visible.shape[0])
+        if visible.shape[0] == 1:
+            return self.find_candidates(snapshot)
+        return jax.lax.cond(
+            jnp.any(visible[1:]),
+            self.find_candidates,
+            lambda snapshot: self.find_candidates(snapshot.largest(1)).padded(count),
+            snapshot,
+        )
+
+    def _estimate(self, belief: Belief, snapshot: Snapshot, candidates: Candidates) -> "_Estimate":
+        obs = snapshot.obs
+        start = self.motion.init(belief.initialised.shape[0])
+        prior = numbered_anew_where_empty(self.motion.predict(belief, obs))
         selection = self.selector(self.motion.poses(prior), candidates, snapshot)
         belief, nis = self.motion.update(prior, selection, obs)
-        belief = restarted_where_broken(belief, self.motion.init(self.selector.hypotheses))
+        belief = restarted_where_broken(belief, start)
 
         best = jnp.argmax(jnp.where(belief.initialised, belief.log_weight, -jnp.inf))
-        T_world_vehicle = jax.tree.map(
-            lambda leaf: leaf[best], self.motion.poses(belief).T_world_vehicle
-        )
-        pose = planar_from_T_world_vehicle(T_world_vehicle)
         located = belief.initialised[best]
-        control, command, done, log = self._steer(
-            state.control, pose, T_world_vehicle, located, selection.decided, obs
-        )
-        return State(belief, control), Output(
-            pose=pose,
+        return _Estimate(
+            belief=belief,
+            T_world_vehicle=jax.tree.map(
+                lambda leaf: leaf[best], self.motion.poses(belief).T_world_vehicle
+            ),
             covariance=self.motion.error_covariance(belief, best),
-            T_world_vehicle=T_world_vehicle,
             located=located,
-            command=command,
-            done=done,
-            candidates=candidates,
             costs=selection.costs,
             selected=selection.selected,
-            hypothesis=best,
+            hypothesis=belief.number[best],
             flip_probability=selection.flip_probability,
             decided=selection.decided,
             nis=jnp.where(located, nis[best], 0),
+        )
+
+    def _acted(
+        self, state: State, obs: Observation, candidates: Candidates, estimate: "_Estimate"
+    ) -> tuple[State, Output]:
+        pose = planar_from_T_world_vehicle(estimate.T_world_vehicle)
+        control, command, done, log = self._steer(
+            state.control, pose, estimate.T_world_vehicle, estimate.located, estimate.decided, obs
+        )
+        return State(estimate.belief, control), Output(
+            pose=pose,
+            covariance=estimate.covariance,
+            T_world_vehicle=estimate.T_world_vehicle,
+            located=estimate.located,
+            command=command,
+            done=done,
+            candidates=candidates,
+            costs=estimate.costs,
+            selected=estimate.selected,
+            hypothesis=estimate.hypothesis,
+            flip_probability=estimate.flip_probability,
+            decided=estimate.decided,
+            nis=estimate.nis,
             control_log=log,
         )
 

@@ -159,6 +159,11 @@ class Snapshot(eqx.Module):
         seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, count)
         return Snapshot(rig, markers, obs, seen)
 
+    def largest(self, count: int) -> "Snapshot":
+        """The same with the first sightings alone."""
+        seen = jax.tree.map(lambda leaf: leaf[:count], self.seen)
+        return dataclasses.replace(self, seen=seen)
+
 
 def cameras_of(rig: CameraRig, seen: Sightings) -> Camera:
     """The camera of every sighting, batch axis (D,)."""

@@ -331,7 +331,7 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     heir = np.array([0, 0, 2, 0, 2, 2])
     belief = Belief(
         jnp.asarray(means), jnp.asarray(covariances), jnp.log(weights), jnp.asarray(alive),
-        unstarted(jnp.zeros(n), n, 3, count).rejections,
+        unstarted(jnp.zeros(n), n, 3, count).rejections, jnp.arange(count),
     )  # fmt: skip
 
     def difference(mean, base):
@@ -398,6 +398,7 @@ def test_nobody_merges_with_itself():
     motionless = Belief(
         jnp.ones((3, 2)), jnp.tile(jnp.eye(2), (3, 1, 1)), jnp.log(jnp.asarray([0.2, 0.3, 0.5])),
         jnp.asarray([True, False, True]), unstarted(jnp.zeros(2), 2, 1, 3).rejections,
+        jnp.arange(3),
     )  # fmt: skip
     after = merged(motionless, jnp.arange(3), lambda m, b: m - b, lambda m, e: m + e)
     for one, other in zip(jax.tree.leaves(after), jax.tree.leaves(motionless), strict=True):

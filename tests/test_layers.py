@@ -13,7 +13,15 @@ PACKAGE = Path(__file__).resolve().parents[1] / "jaxnav"
 
 # From the bottom up. A new module or folder must be placed here before the test passes.
 LAYERS = {
-    "geometry": {"geometry", "small_matrices", "trees"},
+    "geometry": {
+        "geometry",
+        "lane_rules",
+        "lane_tables",
+        "lane_values",
+        "lanes",
+        "small_matrices",
+        "trees",
+    },
     "models": {"bicycle", "camera", "markers", "rig"},
     "estimate & control": {
         "ambiguity",

@@ -399,6 +399,7 @@ def test_poses_of_a_car_are_level_and_carry_the_planar_covariance():
         jnp.zeros(1),
         jnp.ones(1, bool),
         motion.init().rejections,
+        jnp.zeros(1, int),
     )
     found = motion.poses(belief)
     expected = np.asarray(worlds.planar(0.3, -0.4, 2.0).wxyz_xyz)
@@ -441,6 +442,7 @@ def test_constant_velocity_carries_its_covariance_as_samples_do():
         jnp.zeros(1),
         jnp.ones(1, bool),
         motion.init().rejections,
+        jnp.zeros(1, int),
     )
     dt_s = 0.1
     predicted = motion.predict(belief, reading(dt_s=dt_s))

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from jaxnav.ambiguity import PaperCost, PoseBelief, PoseMeasurement, Selection
 from jaxnav.candidates import Candidates
+from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.markers import CORNER_SIGNS
 from jaxnav.navigator import Navigator, Output, State
 from jaxnav.observation import Observation, Snapshot
@@ -409,6 +410,22 @@ class EachItsOwn(eqx.Module):
             flip_probability=jnp.asarray(0.5),
             decided=jnp.asarray(True),
         )
+
+
+def test_step_by_regime_is_step():
+    """A start with the whole bank, a few hypotheses, one; one sighting, two and none."""
+    nav = navigator(selector=MultiHypothesis(hypotheses=12), max_sightings=2)
+    obs = drive(sigma_px=1.0, blind=(STEPS - 2,))
+    state, out = scan(nav, nav.init(), obs)
+    by_regime = jax.jit(lambda nav, state, obs: jax.lax.scan(nav.step_by_regime, state, obs))
+    _, same = by_regime(nav, nav.init(), obs)
+    alive = int(np.sum(state.belief.initialised))
+    assert alive < 8
+    for name in ("selected", "hypothesis", "decided", "located", "done"):
+        np.testing.assert_array_equal(getattr(same, name), getattr(out, name))
+    for name in ("pose", "covariance", "flip_probability", "nis", "command"):
+        for a, b in zip(*(jax.tree.leaves(getattr(o, name)) for o in (same, out)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8)
 
 
 def test_more_hypotheses_need_no_change_to_step():

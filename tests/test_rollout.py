@@ -52,6 +52,8 @@ class Spy:
             command=Command(jnp.asarray(self.steering_rad), jnp.asarray(self.throttle)),
         )
 
+    step_by_regime = step
+
 
 def run(navigator, scenario: Scenario, noise_px=0.0, seeds=SEEDS, chunk_frames=15) -> Trace:
     """The whole rollout, leading axes (seeds, frames)."""
@@ -145,6 +147,27 @@ def test_a_lane_takes_the_next_seed_where_its_drive_has_ended():
         np.testing.assert_allclose(
             queued.true_pose[drive, :length], together.true_pose[drive, :length], atol=1e-12
         )
+
+
+def test_many_drives_are_those_of_few():
+    """Lanes along the last axis, in two threads, in blocks that some leave early."""
+    scenario = short(
+        "paper", start_pose=(1.9, 0.0, 0.0), start_spread=(0.6, 0.1, 0.0), duration_s=1.2
+    )
+    seeds = jnp.arange(45)
+    options = {"corner_noise_px": 0.5, "chunk_frames": 5}
+    few = Rollout(Spy(throttle=0.05), CAR, MARKERS, scenario, **options)
+    many = dataclasses.replace(few, many=40, many_lanes=16, threads=2)
+    counted = []
+    one, other = few.run(keys(seeds)), many.run(keys(seeds), counted.append)
+    assert sum(counted) == 45
+    assert len(np.unique(np.sum(one.active, axis=1))) > 2
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    # Bit for bit, whatever else runs and how many threads do it.
+    again = dataclasses.replace(many, threads=1).run(keys(seeds[::-1]))
+    for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b[::-1])
 
 
 def test_the_navigator_s_errors_are_measured(real):

@@ -1,0 +1,108 @@
+"""Closed-loop simulation: steps a second over all lanes, whole drives.
+
+    python benchmarks/bench_simulate.py [--seeds N]
+    pytest benchmarks/bench_simulate.py --benchmark-enable --benchmark-only
+
+The paper's scenario at corner noise of 1 px. A step counts where its drive is still under way. Few
+drives run under `vmap` (as all did once), many through `over_lanes`; both in one process, in turns.
+CPU time is that of all threads: on a machine that others use it says more than the clock.
+"""
+
+import platform
+import resource
+import sys
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnav.commands.process import configure_jax
+from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
+from jaxnav.navigator import Navigator
+from jaxnav.selectors import make_selector
+from jaxnav.simulation.rollout import Rollout
+from jaxnav.simulation.scenarios import scenarios
+
+SELECTORS = ("paper-cost", "lowest-reprojection", "multi-hypothesis")
+FEW, MANY, ROUNDS = 256, 4096, 3
+
+
+def rollout(selector: str, **options: Any) -> Rollout:
+    """The paper's drive of a QCar."""
+    qcar, scenario = calib_dir() / "qcar", scenarios()["paper"]
+    vehicle, markers = load_vehicle(qcar / "vehicle.yaml"), load_markers(qcar / "markers.yaml")
+    navigator = Navigator(
+        load_rig(qcar / "rig.yaml"),
+        markers,
+        vehicle,
+        waypoints_m=scenario.waypoints_m,
+        selector=make_selector(selector),
+    )
+    return Rollout(navigator, vehicle, markers, scenario, 1.0, **options)
+
+
+def _keys(count: int) -> jax.Array:
+    return jax.vmap(jax.random.key)(jnp.arange(count))
+
+
+def timed(drives: Rollout, seeds: int) -> tuple[float, float, int]:
+    """Seconds by the clock, seconds of all threads, steps of drives under way."""
+    clock, cpu = time.perf_counter(), time.process_time()
+    steps = int(np.sum(drives.run(_keys(seeds)).active))
+    return time.perf_counter() - clock, time.process_time() - cpu, steps
+
+
+def start(drives: Rollout, chunks: int = 1) -> float:
+    """Steps a second of one thread in the first second, when the bank is full."""
+    worlds = drives._start(_keys(drives.many_lanes))
+    jax.block_until_ready(worlds)
+    begin = time.perf_counter()
+    for _ in range(chunks):
+        worlds, _ = drives._advance_many(worlds)
+    jax.block_until_ready(worlds)
+    return drives.many_lanes * drives.chunk_frames * chunks / (time.perf_counter() - begin)
+
+
+def main() -> None:
+    """Print the table."""
+    configure_jax(float64=False)
+    jax.config.update("jax_enable_compilation_cache", False)
+    many = int(sys.argv[sys.argv.index("--seeds") + 1]) if "--seeds" in sys.argv else MANY
+    print(
+        f"jax {jax.__version__}, {platform.processor() or platform.machine()}, "
+        f"{rollout('paper-cost').threads} cores, float32, {many} drives\n\n"
+        "| selector | steps/s, `vmap` | steps/s | CPU us a step, `vmap` | CPU us a step | "
+        "steps/s in the first second, one thread | compile s, `vmap` | compile s |\n"
+        "|---|---|---|---|---|---|---|---|",
+        flush=True,
+    )
+    for selector in SELECTORS:
+        pair = [(rollout(selector, many=sys.maxsize), FEW), (rollout(selector, many=1), many)]
+        cold = [timed(drives, seeds)[0] for drives, seeds in pair]
+        rounds = [[timed(drives, seeds) for drives, seeds in pair] for _ in range(ROUNDS)]
+        clock, cpu, steps = np.moveaxis(np.asarray(rounds), 2, 0)
+        rate, cost = np.median(steps / clock, 0), np.median(cpu / steps, 0) * 1e6
+        compiling = np.asarray(cold) - np.median(clock, 0)
+        print(
+            f"| {selector} | {rate[0]:,.0f} | {rate[1]:,.0f} | {cost[0]:.0f} | {cost[1]:.0f} | "
+            f"{start(pair[1][0]):,.0f} | {compiling[0]:.0f} | {compiling[1]:.0f} |",
+            flush=True,
+        )
+    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"\npeak memory of all together {peak_mib:.0f} MiB")
+
+
+@pytest.mark.parametrize("selector", SELECTORS)
+def test_whole_drives(benchmark: Any, selector: str) -> None:
+    """A round is a thousand drives."""
+    drives = rollout(selector, many=1)
+    drives.run(_keys(8))
+    trace = benchmark.pedantic(drives.run, (_keys(1024),), rounds=3)
+    benchmark.extra_info["steps a second"] = np.sum(trace.active) / benchmark.stats["median"]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""What `over_lanes` computes with: values that differ between the lanes, and others."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+UNROLLED = 32  # terms of a sum, rows of a table that a lane chooses from
+# Operations a number: what is worth computing twice, and what is worth a pass over memory.
+CHEAP, DEAR = 2, 24
+
+
+class Lane:
+    """A value that differs between the lanes: (*shape, L).
+
+    `work` counts the operations a number has cost since it was last written to memory. With `at` it
+    is some lanes of a longer row, fetched when somebody looks at them.
+    """
+
+    def __init__(self, source: jax.Array, work: int = 0, at: jax.Array | None = None):
+        self.source, self.work, self.at = source, work, at
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """That of one lane."""
+        return self.source.shape[:-1]
+
+    @property
+    def rows(self) -> jax.Array:
+        """The array itself."""
+        if self.at is not None:
+            fetched = self.source.at[..., self.at].get(mode="promise_in_bounds")
+            self.source, self.at = lax.optimization_barrier(fetched), None
+        return self.source
+
+
+# A value that differs between lanes; one that does not; one that is known while tracing.
+Value = Lane | jax.Array | np.ndarray
+
+
+def written(value: Value, cheap: int) -> Value:
+    """A value that whoever needs it reads, instead of computing it once more for himself."""
+    if not isinstance(value, Lane) or value.work <= cheap:
+        return value
+    return Lane(lax.optimization_barrier(value.rows))
+
+
+def known(value: Any) -> Value:
+    """Small constants are worth knowing: they choose rows."""
+    if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
+        return value if isinstance(value, jax.core.Tracer) else np.asarray(value)
+    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key) or value.size > 4096:
+        return value
+    return np.asarray(value)
+
+
+def rows_of(value: Value, lanes: int) -> jax.Array:
+    """(*shape, L), whether or not the lanes differ."""
+    if isinstance(value, Lane):
+        return value.rows
+    value = jnp.asarray(value)
+    return lax.broadcast_in_dim(value, (*value.shape, lanes), tuple(range(value.ndim)))
+
+
+def at_place(rows: jax.Array, index: dict[Any, Any]) -> jax.Array:
+    """rows[index], some axes at one place each."""
+    start = [index.get(axis, 0) for axis in range(rows.ndim)]
+    stop = [index[a] + 1 if a in index else size for a, size in enumerate(rows.shape)]
+    return lax.squeeze(lax.slice(rows, start, stop), tuple(index))
+
+
+def scanned(
+    rows: jax.Array, axis: int, combine: Callable[[Any, Any], Any], neutral: int, reverse: bool
+) -> jax.Array:
+    size, step = rows.shape[axis], 1
+    while step < size:
+        config = [(0, 0, 0)] * rows.ndim
+        config[axis] = (-step, step, 0) if reverse else (step, -step, 0)
+        shifted = lax.pad(rows, jnp.asarray(neutral, rows.dtype), config)
+        rows = lax.optimization_barrier(combine(rows, shifted))
+        step *= 2
+    return rows
