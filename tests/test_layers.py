@@ -27,6 +27,7 @@ LAYERS = {
         "ippe",
         "kalman",
         "levenberg_marquardt",
+        "linearised",
         "map_fit",
         "motion",
         "observation",
