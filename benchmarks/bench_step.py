@@ -1,28 +1,63 @@
-"""One step of the car: the bank of hypotheses against a single one, and what the fan costs.
+"""One step of the car: how long it takes, against OpenCV and NumPy; to compile; to differentiate.
 
     python benchmarks/bench_step.py
+    pytest benchmarks/bench_step.py --benchmark-enable --benchmark-only
 
-The QCar sees the paper's marker from 3.2 m at corner noise of 1 px. All steps are compiled once,
-run one at a time as on the car, and take turns; medians over the rounds.
+The QCar sees the paper's marker from 3.2 m, in its front camera, at corner noise of 1 px. Steps are
+run one at a time as on the car, and take turns with their peers in `step_numpy.py`.
 """
 
+import os
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+from jaxnav.commands.process import configure_jax
 
-from jaxnav.ambiguity import LowestReprojection, Mahalanobis, PaperCost, Selector
-from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.navigator import Navigator, State
-from jaxnav.observation import Observation
-from jaxnav.simulation.corners import see
+configure_jax(float64=False)  # before the first array, as the commands do
 
-ROUNDS, STEPS, PERIOD_S, SPEED_MPS = 30, 20, 1 / 15, 0.3
-START = (0.5, -1.7, np.pi / 2 - 0.9)
+import cv2  # noqa: E402
+import equinox as eqx  # noqa: E402
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import step_numpy as peer  # noqa: E402
+
+from jaxnav.ambiguity import PaperCost, Selector  # noqa: E402
+from jaxnav.control import Command  # noqa: E402
+from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
+from jaxnav.geometry import T_world_vehicle_from_planar  # noqa: E402
+from jaxnav.hypotheses import MultiHypothesis  # noqa: E402
+from jaxnav.navigator import Navigator, State  # noqa: E402
+from jaxnav.observation import Observation  # noqa: E402
+from jaxnav.simulation.corners import see  # noqa: E402
+from jaxnav.simulation.plant import CarState, move_through  # noqa: E402
+
+STEPS, PERIOD_S, SPEED_MPS = 20, 1 / 15, 0.3
+ROUNDS = 110  # times STEPS: 2 200 steps of each
+START = (0.5, -1.7, np.pi / 2)
+ROLLOUT_STEPS = 100
+SELECTORS: dict[str, Selector] = {"paper-cost": PaperCost(), "multi-hypothesis": MultiHypothesis()}
+
+
+def navigator_with(selector: Selector) -> Navigator:
+    """The paper's car on the paper's route."""
+    qcar = calib_dir() / "qcar"
+    return Navigator(
+        load_rig(qcar / "rig.yaml"),
+        load_markers(qcar / "markers.yaml"),
+        load_vehicle(qcar / "vehicle.yaml"),
+        waypoints_m=[(1.30, 0.0), (0.50, 0.65)],
+        selector=selector,
+    )
 
 
 def observations(navigator: Navigator, count: int) -> list[Observation]:
@@ -48,53 +83,235 @@ def observations(navigator: Navigator, count: int) -> list[Observation]:
     return readings
 
 
-def task(selector: Selector, first: bool) -> Callable[[], object]:
-    """`STEPS` steps of a drive; or as many first ones, of a car that has seen nothing yet."""
-    qcar = calib_dir() / "qcar"
-    navigator = Navigator(
-        load_rig(qcar / "rig.yaml"),
-        load_markers(qcar / "markers.yaml"),
-        load_vehicle(qcar / "vehicle.yaml"),
-        waypoints_m=[(1.30, 0.0), (0.50, 0.65)],
-        selector=selector,
+def as_reading(obs: Observation) -> peer.Reading:
+    """The same for the peer."""
+    return peer.Reading(
+        np.asarray(obs.corners_px, float)[:, 0],
+        np.asarray(obs.visible)[:, 0],
+        *(float(value) for value in (obs.speed_mps, obs.steering_rad, obs.dt_s)),
     )
-    readings = observations(navigator, STEPS)
-    step: Callable[..., tuple[State, object]] = jax.jit(navigator.step)
-    unstarted = navigator.init()
-    started, _ = step(unstarted, readings[0])
 
-    def run() -> None:
-        state = started
-        for obs in readings:
-            state, out = step(unstarted if first else state, obs)
+
+class Drive:
+    """A drive by jaxnav and by its peer, from the state after the first sight."""
+
+    def __init__(self, selector: Selector):
+        self.navigator = navigator_with(selector)
+        self.readings = observations(self.navigator, STEPS + 1)
+        navigator = self.navigator
+        self.step = jax.jit(lambda state, obs: navigator.step(state, obs))
+        self.unstarted = navigator.init()
+        self.started, _ = self.step(self.unstarted, self.readings[0])
+        self.peer = peer.NumpyStep(navigator)
+        self.peer_started = peer.memory(self.started)
+        self.peer_readings = [as_reading(obs) for obs in self.readings]
+
+    def ours(self, seconds: list[float]) -> None:
+        state = self.started
+        for obs in self.readings[1:]:
+            begin = time.perf_counter()
+            state, out = self.step(state, obs)
             jax.block_until_ready(out)
+            seconds.append(time.perf_counter() - begin)
 
-    return run
+    def first(self, seconds: list[float]) -> None:
+        """Of a car that has seen nothing yet: the whole fan."""
+        for obs in self.readings[:3]:
+            begin = time.perf_counter()
+            _, out = self.step(self.unstarted, obs)
+            jax.block_until_ready(out)
+            seconds.append(time.perf_counter() - begin)
+
+    def second(self, seconds: list[float]) -> None:
+        """Right after it: the fan is still there."""
+        for obs in self.readings[1:4]:
+            begin = time.perf_counter()
+            _, out = self.step(self.started, obs)
+            jax.block_until_ready(out)
+            seconds.append(time.perf_counter() - begin)
+
+    def theirs(self, seconds: list[float]) -> None:
+        state = self.peer_started
+        for reading in self.peer_readings[1:]:
+            begin = time.perf_counter()
+            state, _ = self.peer(state, reading)
+            seconds.append(time.perf_counter() - begin)
+
+
+def same_step(drive: Drive) -> tuple[float, float, float]:
+    """Over a drive, how far both are apart: pose (m, rad; largest), and the share of steps in which
+    both select the same candidate and both decide alike."""
+    state, memory = drive.started, drive.peer_started
+    apart, selected, decided = [], [], []
+    for obs, reading in zip(drive.readings[1:], drive.peer_readings[1:], strict=True):
+        state, out = drive.step(state, obs)
+        memory, result = drive.peer(memory, reading)
+        apart.append(np.max(np.abs(np.asarray(out.pose) - result.pose)))
+        selected.append(int(out.selected) == result.selected)
+        decided.append(bool(out.decided) == result.decided)
+    return float(np.max(apart)), float(np.mean(selected)), float(np.mean(decided))
+
+
+@pytest.mark.parametrize("name", SELECTORS)
+def test_the_peer_takes_the_same_step(name: str) -> None:
+    """Within a centimetre over the drive (they minimise in pixels and in normalised coordinates),
+    and the same choices but for a tie or two."""
+    apart, selected, decided = same_step(Drive(SELECTORS[name]))
+    assert apart < 0.015
+    assert selected >= 0.9
+    assert decided >= 0.9
+
+
+@pytest.mark.parametrize("name", SELECTORS)
+@pytest.mark.parametrize("who", ["ours", "first", "second", "theirs"])
+def test_step(benchmark: Any, name: str, who: str) -> None:
+    """A drive of `STEPS` steps, or three first or second ones."""
+    cv2.setNumThreads(1)
+    benchmark(getattr(Drive(SELECTORS[name]), who), [])
+
+
+Parameters = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+
+
+def rollout_loss(navigator: Navigator) -> tuple[Callable[[Parameters], jax.Array], Parameters]:
+    """A closed loop of plant and step, and its parameters: Q, R twice, and both gains."""
+    vehicle = load_vehicle(calib_dir() / "qcar" / "vehicle.yaml")
+    where = lambda n: (  # noqa: E731
+        n.motion.acceleration_density, n.motion.vision_floor, n.motion.odometry_sigma,
+        n.controller.proportional_per_m, n.controller.integral_per_ms,
+    )  # fmt: skip
+    noise_px = jax.random.normal(jax.random.key(0), (ROLLOUT_STEPS, len(navigator.rig), 1, 4, 2))
+    period_s = jnp.asarray(PERIOD_S)
+
+    def loss(parameters: Parameters) -> jax.Array:
+        tuned = eqx.tree_at(where, navigator, parameters)
+
+        def frame(carry: tuple[CarState, Command, State], noise: jax.Array) -> Any:
+            car, command, state = carry
+            car = jax.tree.map(
+                lambda leaf: leaf[-1], move_through(vehicle, car, command, period_s, 4)
+            )
+            corners_px, visible = see(
+                tuned.rig, tuned.markers, T_world_vehicle_from_planar(car.pose)
+            )
+            obs = Observation(
+                corners_px=jnp.where(visible[..., None, None], corners_px + noise, 0),
+                visible=visible,
+                speed_mps=car.speed_mps,
+                steering_rad=car.steering_rad,
+                dt_s=period_s,
+            )
+            state, out = tuned.step(state, obs)
+            return (car, out.command, state), jnp.sum((out.pose[:2] - car.pose[:2]) ** 2)
+
+        zero = jnp.zeros(())
+        start = CarState(jnp.asarray(START, float), zero, zero)
+        _, errors = jax.lax.scan(frame, (start, Command(zero, zero), tuned.init()), noise_px)
+        return jnp.mean(errors)
+
+    return loss, where(navigator)
+
+
+@pytest.mark.parametrize("name", SELECTORS)
+@pytest.mark.parametrize("what", ["forward", "gradient"])
+def test_rollout(benchmark: Any, name: str, what: str) -> None:
+    """A rollout of `ROLLOUT_STEPS` steps, and its gradient."""
+    loss, parameters = rollout_loss(navigator_with(SELECTORS[name]))
+    function = jax.jit(loss if what == "forward" else jax.grad(loss))
+    benchmark(lambda: jax.block_until_ready(function(parameters)))
+
+
+def print_steps() -> None:
+    """Median and 99 % of the step, ours and theirs."""
+    cv2.setNumThreads(1)
+    drives = {name: Drive(selector) for name, selector in SELECTORS.items()}
+    rows = [(name, who) for name in drives for who in ("ours", "theirs", "first", "second")]
+    rows.remove(("paper-cost", "first"))
+    rows.remove(("paper-cost", "second"))
+    seconds: dict[tuple[str, str], list[float]] = {row: [] for row in rows}
+    for _ in range(ROUNDS):
+        for name, who in rows:
+            getattr(drives[name], who)(seconds[name, who])
+    labels = {
+        "ours": "{}", "theirs": "{}, cv2 + NumPy",
+        "first": "{}, first sight: the fan starts", "second": "{}, the step after: the whole fan",
+    }  # fmt: skip
+    print("| one step | median us | 99 % us | calls |\n|---|---|---|---|")
+    for (name, who), times in seconds.items():
+        median, high = np.quantile(times, [0.5, 0.99]) * 1e6
+        print(f"| {labels[who].format(name)} | {median:.0f} | {high:.0f} | {len(times)} |")
+    print("\n| the same step? | poses apart at most (m, rad) | same candidate | same decided |")
+    print("|---|---|---|---|")
+    for name, drive in drives.items():
+        apart, selected, decided = same_step(drive)
+        print(f"| {name} | {apart:.4f} | {selected:.0%} | {decided:.0%} |")
+
+
+def print_compilation() -> None:
+    """Trace and compile, in fresh processes: first without, then with what the first left."""
+    print("\n| trace + compile | trace s | lower s | compile s | sum s |\n|---|---|---|---|---|")
+    for name in SELECTORS:
+        with tempfile.TemporaryDirectory() as cache:
+            for kind in ("cold", "cached"):
+                run = subprocess.run(
+                    [sys.executable, __file__, "--compile", name],
+                    env=os.environ | {"JAX_COMPILATION_CACHE_DIR": cache},
+                    capture_output=True,
+                    text=True,
+                    check=True,
+                )
+                parts = [float(part) for part in run.stdout.split()]
+                cells = " | ".join(f"{part:.2f}" for part in (*parts, sum(parts)))
+                print(f"| {name}, {kind} | {cells} |")
+
+
+def compile_once(name: str) -> None:
+    """Seconds to trace, lower and compile one step."""
+    navigator = navigator_with(SELECTORS[name])
+    state, obs = navigator.init(), observations(navigator, 1)[0]
+    stamps = [time.perf_counter()]
+    traced = jax.jit(lambda state, obs: navigator.step(state, obs)).trace(state, obs)
+    stamps.append(time.perf_counter())
+    lowered = traced.lower()
+    stamps.append(time.perf_counter())
+    lowered.compile()
+    stamps.append(time.perf_counter())
+    print(*np.diff(stamps))
+
+
+def print_gradients() -> None:
+    """Gradient over forward pass, medians of interleaved runs."""
+    print(f"\n| {ROLLOUT_STEPS} steps | forward ms | gradient ms | ratio | forward, gradient MiB |")
+    print("|---|---|---|---|---|")
+    for name, selector in SELECTORS.items():
+        loss, parameters = rollout_loss(navigator_with(selector))
+        both = [jax.jit(f).lower(parameters).compile() for f in (loss, jax.value_and_grad(loss))]
+        value, gradients = both[1](parameters)
+        assert all(jnp.all(jnp.isfinite(g)) for g in gradients)
+        assert np.isclose(value, both[0](parameters), rtol=0.05)
+        seconds: list[list[float]] = [[], []]
+        for _ in range(20):
+            for function, times in zip(both, seconds, strict=True):
+                begin = time.perf_counter()
+                jax.block_until_ready(function(parameters))
+                times.append(time.perf_counter() - begin)
+        forward, gradient = (np.median(times) * 1e3 for times in seconds)
+        ratio = np.median(np.array(seconds[1]) / np.array(seconds[0]))
+        memory = [f.memory_analysis().temp_size_in_bytes / 2**20 for f in both]
+        print(f"| {name} | {forward:.1f} | {gradient:.1f} | {ratio:.2f} "
+              f"| {memory[0]:.2f}, {memory[1]:.2f} |")  # fmt: skip
 
 
 def main() -> None:
-    """Print the table."""
-    tasks = {
-        "lowest-reprojection": task(LowestReprojection(), False),
-        "paper-cost": task(PaperCost(), False),
-        "mahalanobis": task(Mahalanobis(), False),
-        "multi-hypothesis": task(MultiHypothesis(), False),
-        "multi-hypothesis, first step: the fan": task(MultiHypothesis(), True),
-    }
-    for run in tasks.values():
-        run()
-    times: dict[str, list[float]] = {name: [] for name in tasks}
-    for _ in range(ROUNDS):
-        for name, run in tasks.items():
-            started = time.perf_counter()
-            run()
-            times[name].append((time.perf_counter() - started) / STEPS * 1e6)
-    single = np.array(times["lowest-reprojection"])
-    print(f"{jnp.zeros(1).dtype}, {jax.default_backend()}\n")
-    print("| one step of the car | us | times lowest-reprojection |\n|---|---|---|")
-    for name, microseconds in times.items():
-        ratio = np.median(np.array(microseconds) / single)
-        print(f"| {name} | {np.median(microseconds):.0f} | {ratio:.2f} |")
+    """Print the tables."""
+    if sys.argv[1:2] == ["--compile"]:
+        compile_once(sys.argv[2])
+        return
+    print(f"jax {jax.__version__}, OpenCV {cv2.__version__}, NumPy {np.__version__}, "
+          f"{jnp.zeros(1).dtype}, {jax.default_backend()}, {os.cpu_count()} cores\n")  # fmt: skip
+    print_steps()
+    print_compilation()
+    print_gradients()
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ class BicycleKalman(Motion):
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
 
         def one(mean: Array, P: Array) -> tuple[Array, Array]:
-            mean = A @ mean
+            mean = jnp.sum(A * mean[None], axis=1)
             mean = mean.at[2].set(wrap_angle(mean[2]))
             return self._with_odometry(mean, kalman.predict_covariance(P, A, Q), obs)
 

@@ -23,7 +23,7 @@ LENS_COEFFICIENTS = {"none": 0, "radtan": 5, "equidistant": 4}
 
 # Points nearer to the camera's plane than this multiple of their distance are projected as
 # if they lay there: finite and far outside of any image instead of infinite or mirrored.
-_MIN_DEPTH_RATIO = 1e-3
+MIN_DEPTH_RATIO = 1e-3
 # Where an inverse lens starts: 96 angles from the axis, up to 89 (radtan) or 180 degrees.
 _TABLE_SIZE = 96
 _NEWTON_STEPS = 4
@@ -117,7 +117,7 @@ class Camera(eqx.Module):
         """Whether a point can be seen through this lens at all, (*batch) bool."""
         depth_ratio = points_camera[..., 2] / jnp.maximum(safe_norm(points_camera), 1e-12)
         return self._select(
-            [depth_ratio > (-0.99 if lens == "equidistant" else _MIN_DEPTH_RATIO)
+            [depth_ratio > (-0.99 if lens == "equidistant" else MIN_DEPTH_RATIO)
              for lens in self.lenses]
         )  # fmt: skip
 
@@ -145,7 +145,7 @@ def _pinhole(points: Array, distortion: Array) -> Array:
     del distortion
     depth = points[..., 2:]
     # The gradient of the clamp may vanish; that of a division by zero may not.
-    nearest = _MIN_DEPTH_RATIO * jnp.maximum(safe_norm(points)[..., None], 1e-12)
+    nearest = MIN_DEPTH_RATIO * jnp.maximum(safe_norm(points)[..., None], 1e-12)
     return points[..., :2] / jnp.maximum(depth, nearest)
 
 

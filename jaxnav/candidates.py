@@ -18,6 +18,7 @@ from jaxnav.observation import Sightings, Snapshot, cameras_of
 from jaxnav.refine import refine_sightings
 from jaxnav.residuals import reprojection_residuals
 from jaxnav.rig import CameraRig
+from jaxnav.small_matrices import in_order
 
 # Two local minima this close are one: 1.1 degrees, and as much of the distance to the markers.
 _SAME_POSE_RAD = 0.02
@@ -79,16 +80,16 @@ def find_candidates(
         Ts_vehicle_world = jaxlie.SE3(Ts_vehicle_world.wxyz_xyz[best])
         owner_visible = owner_visible[best]
 
-    refined = jax.vmap(lambda T: refine_sightings(rig, markers, seen, T, max_steps, ground_plane))(
-        Ts_vehicle_world
+    refined = refine_sightings(
+        rig, markers, seen, Ts_vehicle_world, max_steps, ground_plane, wanted=owner_visible
     )
-    e1_px2 = jax.vmap(joint_e1)(refined.T_vehicle_world)
+    e1_px2 = refined.e1_px2
     # Corners far outside of any image can overflow; such a lane is no candidate.
     finite = jnp.isfinite(e1_px2) & jnp.isfinite(refined.cost)
     valid = owner_visible & finite
     e1_px2 = jnp.where(finite, e1_px2, 0)
     refined = eqx.tree_at(lambda r: r.cost, refined, jnp.where(finite, refined.cost, 0))
-    order = jnp.argsort(jnp.where(valid, e1_px2, jnp.inf))
+    order = in_order(-jnp.where(valid, e1_px2, jnp.inf), count)
     refined, e1_px2, valid = jax.tree.map(lambda leaf: leaf[order], (refined, e1_px2, valid))
     return Candidates(
         T_vehicle_world=refined.T_vehicle_world,

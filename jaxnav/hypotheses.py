@@ -14,6 +14,8 @@ Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27 (Laplace'
 Alspach, Sorenson (1972) (Gaussian sums).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,7 +29,7 @@ from jaxnav.fan import CANDIDATES, fan, normalised
 from jaxnav.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
 from jaxnav.map_fit import Fit, fit
 from jaxnav.observation import Snapshot
-from jaxnav.small_matrices import cholesky, sandwich, solve_lower
+from jaxnav.small_matrices import cholesky, product, ranks, sandwich, solve_lower
 from jaxnav.trees import where
 
 
@@ -67,17 +69,16 @@ class MultiHypothesis(eqx.Module):
         any_seen = jnp.any(snapshot.seen.visible)
         snapshot = _trusted(snapshot, candidates)
         starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
-        count = prior.log_weight.shape[0]
-        bank = prior
+        count, bank = prior.log_weight.shape[0], prior
         if count == self.hypotheses:  # else whoever left the rest away knows that none starts
-            bank = where(starts, fan(prior, candidates, snapshot, count), prior)
+            bank = _started(starts, prior, candidates, snapshot)
         floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
         # All slots take as many steps as the slowest: empty ones do what the heaviest does.
         heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
         does_as = jnp.where(bank.initialised, jnp.arange(count), heaviest)
         starts_at = _at(_poses(bank), does_as)
-        fits = jax.vmap(lambda T, P: fit(T, P, prior, snapshot, floor, self.max_steps))(
-            starts_at.T_world_vehicle, starts_at.covariance
+        fits = fit(
+            starts_at.T_world_vehicle, starts_at.covariance, prior, snapshot, floor, self.max_steps
         )
         alive = bank.initialised & fits.finite
         inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
@@ -105,7 +106,11 @@ class MultiHypothesis(eqx.Module):
             measured=eqx.tree_at(lambda m: m.taken, posteriors, alive & any_seen),
             kept=alive & ~starts,
             log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
-            heir=self._heirs(after, log_weight, alive, prior.freedom, snapshot),
+            heir=jax.lax.cond(
+                jnp.sum(alive) > 1,
+                lambda: self._heirs(after, log_weight, alive, prior.freedom, snapshot),
+                lambda: jnp.arange(self.hypotheses),
+            ),
             costs=costs,
             selected=jnp.where(jnp.any(candidates.valid) & located, jnp.argmin(costs), -1),
             flip_probability=jnp.where(located, flip_probability, 0),
@@ -160,7 +165,8 @@ class MultiHypothesis(eqx.Module):
         """
         count = log_weight.shape[0]
         T = poses.T_world_vehicle
-        apart = jax.vmap(jax.vmap(_apart, (None, 0)), (0, None))(T.wxyz_xyz, T.wxyz_xyz) @ freedom
+        apart = jax.vmap(jax.vmap(_apart, (None, 0)), (0, None))(T.wxyz_xyz, T.wxyz_xyz)
+        apart = jax.vmap(lambda rows: product(rows, freedom))(apart)
         nearest_m = jnp.min(
             safe_norm(
                 T.translation()[:, None] - snapshot.markers.Ts_world_marker.translation()[None]
@@ -179,15 +185,29 @@ class MultiHypothesis(eqx.Module):
         whitened = jax.vmap(lambda L, a: solve_lower(L, a.T))(factor, apart)
         close = jnp.sum(whitened**2, axis=1) < self.merge_distance**2  # [receiver, other]
         close = close & alive[:, None] & alive[None]
-        weight = jnp.where(alive, log_weight, -jnp.inf)
-        first = jnp.arange(count)[:, None] < jnp.arange(count)[None]
-        heavier = (weight[:, None] > weight[None]) | ((weight[:, None] == weight[None]) & first)
-        rank = jnp.sum(heavier, axis=0)
+        rank = ranks(jnp.where(alive, log_weight, -jnp.inf))
+        heavier = rank[:, None] < rank[None]
         # A receiver is taken in by nobody itself.
         takes = close & heavier
         takes = takes & ~jnp.any(takes, axis=0)[:, None]
         best_rank = jnp.where(takes, rank[:, None], count)
         return jnp.where(jnp.any(takes, axis=0), jnp.argmin(best_rank, axis=0), jnp.arange(count))
+
+
+def _started(
+    starts: Bool[Array, ""], prior: PoseBelief, candidates: Candidates, snapshot: Snapshot
+) -> PoseBelief:
+    """The prediction, or a fan where nothing has been seen before: computed only then."""
+
+    def changing(bank: PoseBelief) -> tuple[Any, ...]:
+        return bank.T_world_vehicle.wxyz_xyz, bank.covariance, bank.log_weight, bank.initialised
+
+    wxyz_xyz, *rest = jax.lax.cond(
+        starts,
+        lambda: changing(fan(prior, candidates, snapshot, prior.log_weight.shape[0])),
+        lambda: changing(prior),
+    )
+    return eqx.tree_at(changing, prior, (wxyz_xyz, *rest))
 
 
 def _nis(posteriors: PosePosterior) -> Float[Array, " K"]:

@@ -14,29 +14,38 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxnav.small_matrices import cho_solve, cholesky
+from jaxnav.small_matrices import solve_positive
 
 
-class _State(eqx.Module):
-    """What is known at the accepted point y: cost, gradient, J'J; and the damping to try next."""
+class LMState(eqx.Module):
+    """What is known at the accepted points: residual and derivative; and the damping to try next.
 
-    cost: Float[Array, ""]  # sum of squares
-    gradient: Float[Array, " n"]  # J'r
-    information: Float[Array, "n n"]  # J'J
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]
+    The loop carries J and not J'J: what it carries XLA computes once, and what is formed from it
+    at the beginning of a step as well.
+    """
+
+    cost: Float[Array, " N"]  # sum of squares
+    residual: Float[Array, "m N"]
+    J: Float[Array, "n m N"]  # one row for each unknown
+    damping: Float[Array, " N"]  # 0: none yet
+    growth: Float[Array, " N"]
+    steps: Int[Array, " N"]
     first: Bool[Array, ""]
-    terminate: Bool[Array, ""]
+    done: Bool[Array, " N"]
 
 
 class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
-    """Levenberg-Marquardt on dense normal equations with Nielsen's damping.
+    """Levenberg-Marquardt on dense normal equations with Nielsen's damping, N problems at once.
 
-    Unknowns are one array (n,), scaled so that lambda * I suits them all, and few: J'J squares the
-    condition number. A step is accepted when it lowers the cost. The search ends when the model
-    promises to lower the cost by less than `rtol * cost + atol`.
+    The function maps unknowns (n, N) to residuals (m, N), every problem by itself, and returns
+    their derivatives (n, m, N) as `aux`. The solver ends when all problems have; one that has ended
+    stays where it is. `solution.state` says which have, and after how many steps.
+
+    Unknowns are scaled so that lambda * I suits them all, and few: J'J squares the condition
+    number. A step is accepted when it lowers the cost. The search ends when the model promises to
+    lower the cost by less than `rtol * cost + atol`.
 
     Source: Madsen, Nielsen, Tingleff (2004), "Methods for non-linear least squares problems",
     Algorithm 3.16.
@@ -56,17 +65,18 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         f_struct: PyTree,
         aux_struct: PyTree,
         tags: frozenset[object],
-    ) -> _State:
+    ) -> LMState:
         """Nothing known: the first step stays at y and looks around."""
-        n, dtype = y.size, y.dtype
-        return _State(
-            cost=jnp.asarray(jnp.inf, dtype),
-            gradient=jnp.zeros(n, dtype),
-            information=jnp.zeros((n, n), dtype),
-            damping=jnp.asarray(1.0, dtype),
-            growth=jnp.asarray(2.0, dtype),
+        lanes = jnp.zeros(y.shape[1], y.dtype)
+        return LMState(
+            cost=lanes + jnp.inf,
+            residual=jnp.zeros(f_struct.shape, y.dtype),
+            J=jnp.zeros(aux_struct.shape, y.dtype),
+            damping=lanes,  # the first point with a derivative chooses it
+            growth=lanes + 2,
+            steps=lanes.astype(int),
             first=jnp.asarray(True),
-            terminate=jnp.asarray(False),
+            done=lanes > 0,
         )
 
     def step(
@@ -75,39 +85,43 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         y: Array,
         args: PyTree,
         options: dict[str, Any],
-        state: _State,
+        state: LMState,
         tags: frozenset[object],
-    ) -> tuple[Array, _State, PyTree]:
-        """Try one damped step and learn from it."""
-        eye = jnp.eye(y.size, dtype=y.dtype)
-        factor = cholesky(state.information + state.damping * eye)
-        move = -cho_solve(factor, state.gradient)
+    ) -> tuple[Array, LMState, PyTree]:
+        """Try one damped step of every problem and learn from it."""
+        information = jnp.sum(state.J[:, None] * state.J[None], axis=2)
+        gradient = jnp.sum(state.J * state.residual[None], axis=1)
+        n = y.shape[0]
+        largest = jnp.max(jnp.stack([information[i, i] for i in range(n)]), axis=0)
+        damping = jnp.where(
+            state.damping > 0,
+            jnp.maximum(state.damping, jnp.finfo(y.dtype).eps * largest),
+            self.initial_damping * largest,
+        )
+        eye = jnp.eye(n, dtype=y.dtype)[:, :, None]
+        move = -solve_positive(information + damping[None, None] * eye, gradient)
         move = jnp.where(jnp.isfinite(move), move, 0)
-        promised = jnp.sum(move * (state.damping * move - state.gradient))
+        promised = jnp.sum(move * (damping[None] * move - gradient), axis=0)
 
-        residual, push_forward, aux = jax.linearize(lambda z: fn(z, args), y + move, has_aux=True)
-        J_transposed = jax.vmap(push_forward)(eye)
-        cost = jnp.sum(residual**2)
-        accept = cost < state.cost
-        information = J_transposed @ J_transposed.T
+        residual, J = fn(y + move, args)
+        cost = jnp.sum(residual**2, axis=0)
+        accept = (cost < state.cost) & ~state.done
         gained = (state.cost - cost) / jnp.where(promised > 0, promised, 1)
         relaxed = jnp.maximum(1 / 3, 1 - (2 * gained - 1) ** 3)
-        start = self.initial_damping * jnp.max(jnp.diagonal(information))
-        calmer = jnp.where(state.first, start, state.damping * relaxed)
-        calmer = jnp.maximum(calmer, jnp.finfo(y.dtype).eps * jnp.max(jnp.diagonal(information)))
         exhausted = promised <= self.rtol * state.cost + self.atol
         return (
-            jnp.where(accept, y + move, y),
-            _State(
+            jnp.where(accept[None], y + move, y),
+            LMState(
                 cost=jnp.where(accept, cost, state.cost),
-                gradient=jnp.where(accept, J_transposed @ residual, state.gradient),
-                information=jnp.where(accept, information, state.information),
-                damping=jnp.where(accept, calmer, state.damping * state.growth),
+                residual=jnp.where(accept[None], residual, state.residual),
+                J=jnp.where(accept[None, None], J, state.J),
+                damping=damping * jnp.where(accept, relaxed, state.growth),
                 growth=jnp.where(accept, 2.0, 2 * state.growth),
+                steps=state.steps + ~state.done,
                 first=jnp.asarray(False),
-                terminate=~state.first & exhausted,
+                done=state.done | (~state.first & exhausted),
             ),
-            aux,
+            J,
         )
 
     def terminate(
@@ -116,11 +130,11 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         y: Array,
         args: PyTree,
         options: dict[str, Any],
-        state: _State,
+        state: LMState,
         tags: frozenset[object],
     ) -> tuple[Array, optx.RESULTS]:
-        """Whether no step is worth taking."""
-        return state.terminate, cast(optx.RESULTS, optx.RESULTS.successful)
+        """Whether no step of any problem is worth taking."""
+        return jnp.all(state.done), cast(optx.RESULTS, optx.RESULTS.successful)
 
     def postprocess(
         self,
@@ -129,16 +143,16 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         aux: PyTree,
         args: PyTree,
         options: dict[str, Any],
-        state: _State,
+        state: LMState,
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[Array, PyTree, dict[str, Any]]:
-        """The accepted point as it is."""
+        """The accepted points as they are."""
         return y, aux, {}
 
 
 class ImplicitGradient(optx.AbstractAdjoint):
-    """Derivatives of a minimum by the implicit function theorem: dy = -H^-1 d(gradient).
+    """Derivatives of N minima (n, N) by the implicit function theorem: dy = -H^-1 d(gradient).
 
     What `optimistix.ImplicitAdjoint` computes, less its check of the linear solve, which calls
     the host and raises there. Where the Hessian is singular the derivative is zero.
@@ -177,6 +191,12 @@ def _moving_with_jvp(
     _, t_gradient = jax.jvp(
         lambda v: gradient(root, residual, eqx.combine(v, constant)), (varying,), (t_inputs,)
     )
-    inverse = jnp.linalg.inv(jax.jacfwd(lambda y: gradient(y, residual, inputs))(root))
-    inverse = jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0)
-    return root, -inverse @ t_gradient
+    # No problem depends on another: one direction for all of them yields a column of every Hessian.
+    _, push_forward = jax.linearize(lambda y: gradient(y, residual, inputs), root)
+    n, lanes = root.shape
+    directions = jnp.broadcast_to(jnp.eye(n, dtype=root.dtype)[:, :, None], (n, n, lanes))
+    columns = jax.vmap(push_forward)(directions)
+    inverse = jnp.linalg.inv(jnp.transpose(columns, (2, 1, 0)))
+    solvable = jnp.all(jnp.isfinite(inverse), axis=(1, 2))
+    inverse = jnp.where(solvable[:, None, None], inverse, 0)
+    return root, -jnp.einsum("lij,jl->il", inverse, t_gradient)

@@ -1,4 +1,4 @@
-"""The update of one hypothesis: the minimum of the paper's e next to its prediction.
+"""The update of hypotheses: the minimum of the paper's e next to its prediction.
 
     e(T) = |r(T)|^2 / sigma^2 + |xi|^2_P,      T = T_prior cay(xi),
 
@@ -8,6 +8,10 @@ Laplace's evidence for the prediction, which weighs it.
 Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27.
 """
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,10 +20,10 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.ambiguity import PoseBelief, PosePosterior
-from jaxnav.geometry import cayley, cayley_jacobian, cayley_points, transform_points
+from jaxnav.geometry import cayley, cayley_jacobian, rotation_matrix
 from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM
+from jaxnav.linearised import crossed, reprojection_rows, turned
 from jaxnav.observation import Snapshot
-from jaxnav.residuals import reprojection_residuals
 from jaxnav.small_matrices import (
     cho_solve,
     cholesky,
@@ -27,6 +31,7 @@ from jaxnav.small_matrices import (
     product,
     sandwich,
     solve_lower,
+    solve_positive,
     solve_upper,
 )
 
@@ -35,14 +40,14 @@ class Fit(eqx.Module):
     """The minimum of e next to a prediction."""
 
     posterior: PosePosterior
-    cost: Float[Array, ""]  # |r|^2 / sigma^2 at the minimum
-    log_evidence: Float[Array, ""]
-    finite: Bool[Array, ""]
+    cost: Float[Array, "*K"]  # |r|^2 / sigma^2 at the minimum
+    log_evidence: Float[Array, "*K"]
+    finite: Bool[Array, "*K"]
 
 
 def fit(
     T_world_prior: jaxlie.SE3,
-    covariance: Float[Array, "6 6"],
+    covariance: Float[Array, "K 6 6"],
     prior: PoseBelief,
     snapshot: Snapshot,
     floor: Float[Array, " 6"],
@@ -51,56 +56,134 @@ def fit(
     """Minimise e over u, in units of the prediction's own sigma: xi = freedom L u, P = L L'.
 
     Args:
+        T_world_prior: K predictions.
         floor: standard deviations (m, rad) of what successive frames get wrong alike, which no
             number of frames averages out.
+
+    Returns:
+        K minima, along the leading axis of every leaf.
     """
     freedom, nuisance = prior.freedom, prior.nuisance
     d, dtype = freedom.shape[1], covariance.dtype
     eye = jnp.eye(d, dtype=dtype)
-    P = sandwich(freedom.T, covariance)
-    usable = jnp.all(jnp.isfinite(P)) & (jnp.min(jnp.diagonal(P)) > 0)
-    root = cholesky(jnp.where(usable, P, eye))
-    spread = product(freedom, root)
-    pixels = reprojection_residuals(snapshot.rig, snapshot.seen)
-    corners = transform_points(T_world_prior.inverse(), snapshot.markers.corners_world_m)
+    P = jax.vmap(lambda P: sandwich(freedom.T, P))(covariance)
+    variances = jnp.diagonal(P, axis1=1, axis2=2)
+    usable = jnp.all(jnp.isfinite(P), axis=(1, 2)) & (jnp.min(variances, axis=1) > 0)
+    root = jax.vmap(cholesky)(jnp.where(usable[:, None, None], P, eye[None]))
+    spread = jax.vmap(lambda L: product(freedom, L))(root)
+    linearised = _linearised(T_world_prior, jnp.moveaxis(spread, 0, -1), nuisance, snapshot)
 
-    def whitened(xi: Array) -> Array:
-        return (pixels(cayley_points(-xi, corners)) / snapshot.seen.sigma_px[..., None]).reshape(-1)
-
-    if nuisance.shape[1]:
-        # The nuisance t is small: residuals are linear in it, and its best value in them.
-        J_t = jax.jacfwd(lambda t: whitened(nuisance @ t))(jnp.zeros(nuisance.shape[1], dtype))
-        factor_t = cholesky(J_t.T @ J_t + jnp.eye(nuisance.shape[1], dtype=dtype))
-
-        def residual(u: Array) -> Array:
-            r = whitened(spread @ u)
-            t = -cho_solve(factor_t, J_t.T @ r)
-            return jnp.concatenate([r + J_t @ t, t])
-    else:
-
-        def residual(u: Array) -> Array:
-            return whitened(spread @ u)
+    def with_prediction(u: Array, _: None) -> tuple[Any, Array]:
+        r, J = linearised(u)
+        also = jnp.broadcast_to(eye[:, :, None], (d, d, u.shape[1]))
+        return jnp.concatenate([r, u]), jnp.concatenate([J, also], axis=1)
 
     tolerance = 1e-10 if dtype == jnp.float64 else 1e-5
     solution: optx.Solution = optx.least_squares(
-        lambda u, _: jnp.concatenate([residual(u), u]),
+        with_prediction,
         NormalEquationsLM(rtol=tolerance, atol=tolerance),
-        jnp.zeros(d, dtype),
+        jnp.zeros((d, covariance.shape[0]), dtype),
+        has_aux=True,
         max_steps=max_steps,
         adjoint=ImplicitGradient(),
         throw=False,
     )
-    u = solution.value
-    r, push_forward = jax.linearize(residual, u)
-    J = jax.vmap(push_forward)(eye).T
-    information = J.T @ J
-    cost = jnp.sum(r**2)
-    log_evidence = -(cost + u @ u) / 2 - log_det(cholesky(information + eye)) / 2
+    r, J = linearised(solution.value)
+    information = jnp.sum(J[:, None] * J[None], axis=2)
+    gradient = jnp.sum(J * r[None], axis=1)
+    fused: Fit = jax.vmap(
+        partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 4)
+    )(
+        T_world_prior,
+        usable,
+        root,
+        spread,
+        solution.value,
+        jnp.sum(r**2, axis=0),
+        gradient,
+        information,
+    )
+    return fused
+
+
+def _linearised(
+    T_world_prior: jaxlie.SE3,
+    spread: Float[Array, "6 d K"],
+    nuisance: Float[Array, "6 t"],
+    snapshot: Snapshot,
+) -> Callable[[Float[Array, "d K"]], tuple[Array, Array]]:
+    """The whitened residuals (m, K) of u (d, K) in the nuisance that suits them best, and their
+    derivatives (d, m, K)."""
+    rows = reprojection_rows(snapshot.rig, snapshot.seen)
+    corners_world = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
+    T_prior_world = T_world_prior.inverse()
+    R = jnp.moveaxis(jax.vmap(rotation_matrix)(T_prior_world.rotation()), 0, -1)
+    shift = T_prior_world.translation().T[:, None]
+    corners = jnp.sum(R[:, :, None] * corners_world.T[None, :, :, None], axis=1) + shift
+    if nuisance.shape[1]:
+        # The nuisance is small: residuals are linear in it.
+        _, slope = rows(corners)
+        J_t = -jnp.sum(_answers(slope, corners)[:, None] * nuisance[:, :, None, None], axis=0)
+        eye = jnp.eye(nuisance.shape[1], dtype=R.dtype)
+        information = jnp.sum(J_t[:, None] * J_t[None], axis=2) + eye[:, :, None]
+        best_t = solve_positive(information[:, :, None], J_t)
+
+    def linearised(u: Array) -> tuple[Array, Array]:
+        xi = jnp.sum(spread * u[None], axis=1)
+        half, shift = xi[3:] / 2, xi[:3]
+        per_norm = 1 / (1 + jnp.sum(half**2, axis=0))
+        # cay(-xi) moves the corners; d cay(xi) = cay(xi) cay(J d), see `cayley_jacobian`.
+        moved = turned(-half, corners) - (shift + _swung(-half, shift))[:, None]
+        turn = (spread[3:] - crossed(half[:, None], spread[3:])) * per_norm[None, None]
+        along = spread[:3] + _swung(-half[:, None], spread[:3])
+        along = along - crossed(shift[:, None] / 2, turn)
+        twist = jnp.concatenate([along, turn])
+        r, slope = rows(moved)
+        J = -jnp.sum(_answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
+        J = jnp.concatenate([J, r.reshape(1, *J.shape[1:])])
+        if nuisance.shape[1]:
+            # In the best nuisance, whose own prior pays for it.
+            best = -jnp.sum(best_t[None] * J[:, None], axis=2)
+            J = jnp.concatenate([J + jnp.sum(best[:, :, None] * J_t[None], axis=1), best], axis=1)
+        return J[-1], J[:-1]
+
+    return linearised
+
+
+def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
+    """What cay adds to a shift: it turns while it shifts."""
+    swing = crossed(half, shift)
+    return (swing + crossed(half, swing)) / (1 + jnp.sum(half**2, axis=0))[None]
+
+
+def _answers(slope: Float[Array, "3 2 P K"], points: Float[Array, "3 P K"]) -> Array:
+    """How residuals answer to a shift and a turn of all corners about the origin, (6, 2 P, K)."""
+    answers = jnp.concatenate([slope, crossed(points[:, None], slope)])
+    return answers.reshape(6, -1, answers.shape[-1])
+
+
+def _fused(
+    T_world_prior: jaxlie.SE3,
+    usable: Bool[Array, ""],
+    root: Float[Array, "d d"],
+    spread: Float[Array, "6 d"],
+    u: Float[Array, " d"],
+    cost: Float[Array, ""],
+    gradient: Float[Array, " d"],
+    information: Float[Array, "d d"],
+    *,
+    freedom: Float[Array, "6 d"],
+    floor: Float[Array, " 6"],
+) -> Fit:
+    """Prediction and corners at one minimum: posterior and evidence."""
+    dtype = u.dtype
+    eye = jnp.eye(u.shape[0], dtype=dtype)
+    log_evidence = -(cost + jnp.sum(u**2)) / 2 - log_det(cholesky(information + eye)) / 2
 
     # What the corners say by themselves: u_alone, with covariance R; fused with the prediction.
     ridge = jnp.sqrt(jnp.finfo(dtype).eps)
     alone = cholesky(information + ridge * eye)
-    u_alone = u - cho_solve(alone, J.T @ r)
+    u_alone = u - cho_solve(alone, gradient)
     unspread = solve_lower(root, eye)
     R = cho_solve(alone, eye)
     R = R + sandwich(unspread, sandwich(freedom.T, jnp.diag(floor**2)))

@@ -124,9 +124,8 @@ class Motion(eqx.Module):
         share = jnp.where(total > 0, share, jnp.arange(mass.shape[0]) == index)
         apart = jax.vmap(lambda mean: self.difference(mean, belief.mean[index]))(belief.mean)
         apart = jnp.where((share > 0)[:, None], apart, 0)
-        return jnp.einsum("i,ide->de", share, belief.covariance) + jnp.einsum(
-            "i,id,ie->de", share, apart, apart
-        )
+        squared = apart[:, :, None] * apart[:, None]
+        return jnp.sum(share[:, None, None] * (belief.covariance + squared), axis=0)
 
 
 def unstarted(
@@ -268,17 +267,27 @@ def merged(
     member = (heir[None] == jnp.arange(count)[:, None]) & belief.initialised[None]
     total = jnp.sum(jnp.where(member, mass[None], 0), axis=1)
     share = jnp.where(member, mass[None] / jnp.where(total > 0, total, 1)[:, None], 0)
-    apart = jax.vmap(lambda base: jax.vmap(lambda m: difference(m, base))(belief.mean))(belief.mean)
-    shift = jnp.einsum("ji,jid->jd", share, apart)
-    spread = apart - shift[:, None]
-    covariance = jnp.einsum("ji,ide->jde", share, belief.covariance) + jnp.einsum(
-        "ji,jid,jie->jde", share, spread, spread
-    )
     alone = jnp.sum(member, axis=1) <= 1
+
+    def common() -> tuple[Array, Array]:
+        apart = jax.vmap(lambda base: jax.vmap(lambda m: difference(m, base))(belief.mean))(
+            belief.mean
+        )
+        shift = jnp.einsum("ji,jid->jd", share, apart)
+        spread = apart - shift[:, None]
+        covariance = jnp.einsum("ji,ide->jde", share, belief.covariance) + jnp.einsum(
+            "ji,jid,jie->jde", share, spread, spread
+        )
+        return jax.vmap(moved)(belief.mean, shift), covariance
+
+    # Few frames merge anything.
+    mean, covariance = jax.lax.cond(
+        jnp.all(alone), lambda: (belief.mean, belief.covariance), common
+    )
     stays = belief.initialised & (heir == jnp.arange(count))
     return dataclasses.replace(
         belief,
-        mean=jnp.where(alone[:, None], belief.mean, jax.vmap(moved)(belief.mean, shift)),
+        mean=jnp.where(alone[:, None], belief.mean, mean),
         covariance=jnp.where(alone[:, None, None], belief.covariance, covariance),
         log_weight=jnp.where(stays, jnp.log(jnp.where(total > 0, total, 1)), belief.log_weight),
         initialised=stays,

@@ -11,12 +11,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.camera import Camera
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
+from jaxnav.small_matrices import in_order
 
 # What lens calibration and rolling shutter leave in a corner, beside its own scatter.
 MODEL_SIGMA_PX = 0.15
 # Beyond these a reading is an error of the sensor, or of its unit.
 _MAX_SPEED_MPS = 1e3
 _MAX_DT_S = 1e4
+# Up to here comparing every lane with every other is faster than a sort.
+_FEW_LANES = 32
 
 
 class Observation(eqx.Module):
@@ -115,7 +118,9 @@ def sightings(
         area = jnp.abs(
             diagonals[:, 0, 0] * diagonals[:, 1, 1] - diagonals[:, 0, 1] * diagonals[:, 1, 0]
         )
-        _, slots = jax.lax.top_k(jnp.where(seen, area, -1), kept)
+        area = jnp.where(seen, area, -1)
+        few = count <= _FEW_LANES
+        slots = in_order(area, kept) if few else jax.lax.top_k(area, kept)[1]
     else:
         slots = jnp.arange(count)
     return Sightings(

@@ -8,6 +8,8 @@ The paper minimises e1 (Eq. 3) from both IPPE poses; see `candidates.py` for tha
 """
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,13 +19,18 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.geometry import ON_GROUND, on_last_axis, safe_norm, skew, transform_points
+from jaxnav.geometry import ON_GROUND, rotation_matrix, safe_norm, skew
 from jaxnav.ippe import PosePair, ippe_square
-from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM, moving_with
+from jaxnav.levenberg_marquardt import (
+    ImplicitGradient,
+    LMState,
+    NormalEquationsLM,
+    moving_with,
+)
+from jaxnav.linearised import Rows, crossed, pinhole_rows, reprojection_rows, turned
 from jaxnav.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.observation import Sightings, sightings
 from jaxnav.pair_lanes import solve_pairs
-from jaxnav.residuals import reprojection_residuals
 from jaxnav.rig import CameraRig
 from jaxnav.small_matrices import cholesky, product, solve_lower
 
@@ -40,10 +47,11 @@ class RefinedPose(eqx.Module):
     """
 
     T_vehicle_world: jaxlie.SE3
-    cost: Float[Array, ""]  # sum of (residual / sigma)^2: e1 in pixel^2 where sigma is 1 px
-    covariance: Float[Array, "6 6"]  # of xi in T_world_vehicle * exp(xi): vehicle axes, (m, rad)
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    cost: Float[Array, "*N"]  # sum of (residual / sigma)^2
+    e1_px2: Float[Array, "*N"]  # the paper's: as if every sigma were 1 px
+    covariance: Float[Array, "*N 6 6"]  # of xi in T_world_vehicle * exp(xi): vehicle axes, (m, rad)
+    steps: Int[Array, "*N"]
+    converged: Bool[Array, "*N"]
 
 
 def refine_pose(
@@ -65,147 +73,172 @@ def refine_pose(
         max_steps: bound on the LM steps; a lane that needs more is not `converged`.
     """
     seen = sightings(rig, markers, corners_px, visible, corner_sigma_px)
-    return refine_sightings(rig, markers, seen, T_vehicle_world, max_steps)
+    start = jaxlie.SE3(T_vehicle_world.wxyz_xyz[None])
+    refined = refine_sightings(rig, markers, seen, start, max_steps)
+    return jax.tree.map(lambda leaf: leaf[0], refined)
 
 
 def refine_sightings(
     rig: CameraRig,
     markers: MarkerMap,
     seen: Sightings,
-    T_vehicle_world: jaxlie.SE3,
+    Ts_vehicle_world: jaxlie.SE3,
     max_steps: int,
     ground_plane: bool = False,
+    wanted: Bool[Array, " N"] | None = None,
 ) -> RefinedPose:
-    """`refine_pose` on sightings that have been gathered already.
+    """`refine_pose` from N poses, on sightings that have been gathered already.
+
+    All take as many steps as the slowest; those that are not `wanted` take none.
 
     With `ground_plane` a level start stays level on the ground: the vehicle's x, y and heading
     alone are refined, and the covariance is that of these three.
     """
-    pixels = reprojection_residuals(rig, seen)
-
-    def residual(corners_vehicle: Array) -> Array:
-        return (pixels(corners_vehicle) / seen.sigma_px[..., None]).reshape(-1)
-
+    rows = reprojection_rows(rig, seen)
     any_visible = jnp.any(seen.visible)
     weight = seen.visible.astype(seen.corners_px.dtype)[:, None]
     centers_world = markers.Ts_world_marker.translation()[seen.marker_index]
     center_world = jnp.sum(weight * centers_world, axis=0) / jnp.maximum(jnp.sum(weight), 1)
-    corners_world = markers.corners_world_m
+    corners_world = markers.corners_world_m[seen.marker_index].reshape(-1, 3)
+    # The chart's frame is the vehicle's: on the ground it shifts along x, y and turns about z.
+    free = jnp.asarray(ON_GROUND if ground_plane else np.eye(6), corners_world.dtype)
 
-    T, steps, converged = _minimise(
-        residual, T_vehicle_world, corners_world, center_world, any_visible, max_steps, ground_plane
-    )
+    start = _chart(jax.lax.stop_gradient(Ts_vehicle_world), corners_world, center_world)
+    constrained = jnp.full(start.scale.shape, any_visible)
+    if wanted is not None:
+        constrained = constrained & wanted
+    T, solution = _minimise(start, rows, free, constrained, max_steps)
     chart = _chart(T, corners_world, center_world)
-    free = _directions(ground_plane, chart.pivot.dtype)
-    here = jnp.zeros(free.shape[1], chart.pivot.dtype)
-    J = jax.jacfwd(lambda y: residual(chart.points(free @ y)))(here)
-    cost = jnp.sum(residual(chart.points(free @ here)) ** 2)
-    covariance = _body_covariance(chart, J, free)
-    numbers = jnp.concatenate([T.wxyz_xyz, cost[None], covariance.reshape(-1)])
-    finite = jnp.all(jnp.isfinite(numbers))
+    residual, J = chart.linearised(rows, free)(
+        jnp.zeros_like(chart.pivot, shape=(free.shape[1], chart.scale.size))
+    )
+    cost = jnp.sum(residual**2, axis=0)
+    sigma_px = jnp.tile(seen.sigma_px.reshape(-1), 2)[:, None]
+    e1_px2 = jnp.sum((residual * sigma_px) ** 2, axis=0)
+    covariance = jax.vmap(partial(_body_covariance, free=free), in_axes=(-1, -1, -1))(
+        chart.pivot, chart.scale, jnp.sum(J[:, None] * J[None], axis=2)
+    )
+    numbers = [T.wxyz_xyz, cost[:, None], covariance.reshape(*cost.shape, -1)]
+    finite = jnp.all(jnp.isfinite(jnp.concatenate(numbers, axis=1)), axis=1)
+    kept = jnp.where(finite[:, None], T.wxyz_xyz, Ts_vehicle_world.wxyz_xyz)
+    unknown = jnp.eye(6, dtype=covariance.dtype)[None]
     return RefinedPose(
-        T_vehicle_world=jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, T_vehicle_world.wxyz_xyz)),
+        T_vehicle_world=jaxlie.SE3(kept),
         cost=jnp.where(finite, cost, jnp.inf),
-        covariance=jnp.where(finite, covariance, jnp.eye(6, dtype=covariance.dtype)),
-        steps=steps,
-        converged=converged & any_visible & finite,
+        e1_px2=jnp.where(finite, e1_px2, jnp.inf),
+        covariance=jnp.where(finite[:, None, None], covariance, unknown),
+        steps=solution.steps,
+        converged=solution.done & any_visible & finite,
     )
 
 
 class _Chart(eqx.Module):
-    """Local coordinates around a pose: y = (shift / scale, turn about the pivot).
+    """Local coordinates around N poses: y = (shift / scale, turn about the pivot), (6, N).
 
     The turn is the rotation by the quaternion (1, turn / 2), normalised: equal to the rotation
     vector to second order, smooth everywhere and free of sin(x) / x.
     """
 
     T: jaxlie.SE3
-    pivot: Float[Array, " 3"]  # in the target frame of T
-    arms: Float[Array, "*points 3"]  # from the pivot to the points, at y = 0
-    scale: Float[Array, ""]  # m
+    pivot: Float[Array, "3 N"]  # in the target frame of T
+    arms: Float[Array, "3 P N"]  # from the pivot to the points, at y = 0
+    scale: Float[Array, " N"]  # m
 
-    def points(self, y: Float[Array, " 6"]) -> Float[Array, "*points 3"]:
-        """The points in the target frame, moved by y."""
-        turn = on_last_axis(y[3:], self.arms)
-        swing = jnp.cross(turn, self.arms)
-        swing = (swing + jnp.cross(turn / 2, swing)) / (1 + jnp.sum(y[3:] ** 2) / 4)
-        return self.arms + swing + on_last_axis(self.pivot + self.scale * y[:3], self.arms)
+    def linearised(
+        self, rows: Callable[[Array], Rows], free: Float[Array, "6 n"]
+    ) -> Callable[[Float[Array, "n N"]], tuple[Array, Array]]:
+        """Residuals (m, N) of the points moved by free @ y, and their derivatives (n, m, N)."""
 
-    def transform(self, y: Float[Array, " 6"]) -> jaxlie.SE3:
-        """The transform itself, moved by y."""
-        turn = jaxlie.SO3(jnp.append(jnp.ones(1, y.dtype), y[3:] / 2)).normalize()
-        arm = self.T.translation() - self.pivot
-        return jaxlie.SE3.from_rotation_and_translation(
-            (turn @ self.T.rotation()).normalize(), turn @ arm + self.pivot + self.scale * y[:3]
-        )
+        def at(y: Array) -> tuple[Array, Array]:
+            y = jnp.sum(free[:, :, None] * y[None], axis=1)
+            half = y[3:] / 2
+            arms = turned(half, self.arms)
+            residual, slope = rows(arms + (self.pivot + self.scale[None] * y[:3])[:, None])
+            about = crossed(arms[:, None], slope)
+            about = about + crossed(about, half[:, None, None])
+            about = about / (1 + jnp.sum(half**2, axis=0))[None, None, None]
+            J = jnp.concatenate([self.scale[None, None, None] * slope, about])
+            J = J.reshape(6, -1, J.shape[-1])
+            if free.shape[1] < 6:
+                J = jnp.sum(J[:, None] * free[:, :, None, None], axis=0)
+            return residual.reshape(-1, residual.shape[-1]), J
+
+        return at
+
+    def transform(self, y: Float[Array, "6 N"]) -> jaxlie.SE3:
+        """The poses themselves, moved by y."""
+
+        def one(T: jaxlie.SE3, pivot: Array, scale: Array, y: Array) -> jaxlie.SE3:
+            turn = jaxlie.SO3(jnp.append(jnp.ones(1, y.dtype), y[3:] / 2)).normalize()
+            arm = T.translation() - pivot
+            return jaxlie.SE3.from_rotation_and_translation(
+                (turn @ T.rotation()).normalize(), turn @ arm + pivot + scale * y[:3]
+            )
+
+        return jax.vmap(one, in_axes=(0, -1, -1, -1))(self.T, self.pivot, self.scale, y)
 
 
-def _chart(T: jaxlie.SE3, points_source: Array, center_source: Array) -> _Chart:
-    pivot = transform_points(T, center_source)
-    points = transform_points(T, points_source)
-    arms = points - on_last_axis(pivot, points)
-    return _Chart(T, pivot, arms, jnp.maximum(safe_norm(pivot), 1e-3))
+def _chart(
+    T: jaxlie.SE3, points_source: Float[Array, "P 3"], center_source: Float[Array, " 3"]
+) -> _Chart:
+    R = jnp.moveaxis(jax.vmap(rotation_matrix)(T.rotation()), 0, -1)
+    pivot = jnp.sum(R * center_source[None, :, None], axis=1) + T.translation().T
+    offsets = points_source - center_source[None]
+    arms = jnp.sum(R[:, :, None] * offsets.T[None, :, :, None], axis=1)
+    return _Chart(T, pivot, arms, jnp.maximum(safe_norm(pivot.T), 1e-3))
 
 
 def _minimise(
-    residual: Callable[[Array], Array],
-    T_start: jaxlie.SE3,
-    points_source: Array,
-    center_source: Array,
-    constrained: Array,
+    chart: _Chart,
+    rows: Callable[[Array], Rows],
+    free: Float[Array, "6 n"],
+    constrained: Bool[Array, " N"],
     max_steps: int,
-    ground_plane: bool = False,
-) -> tuple[jaxlie.SE3, Array, Array]:
-    """LM on residual(points in the target frame), from a pose.
+) -> tuple[jaxlie.SE3, LMState]:
+    """LM from the chart's poses: where each ends, and how.
 
-    Gradients are those of the implicit function at the minimum: right only where `converged`, and
+    Gradients are those of the implicit function at the minimum: right only where `done`, and
     independent of the start.
     """
-    chart = _chart(jax.lax.stop_gradient(T_start), points_source, center_source)
-    free = _directions(ground_plane, chart.pivot.dtype)
+    linearised = chart.linearised(rows, free)
+    n, dtype = free.shape[1], chart.pivot.dtype
 
-    def fn(y: Array, args: None) -> Array:
+    def fn(y: Array, args: None) -> tuple[Any, Array]:
         # Without a visible corner y itself is the residual: nothing moves, no 0 / 0.
-        return jnp.concatenate([residual(chart.points(free @ y)), jnp.where(constrained, 0, y)])
+        residual, J = linearised(y)
+        residual = jnp.where(constrained[None], residual, 0)
+        J = jnp.where(constrained[None, None], J, 0)
+        eye = jnp.eye(n, dtype=dtype)[:, :, None] * ~constrained[None, None]
+        return (
+            jnp.concatenate([residual, jnp.where(constrained[None], 0, y)]),
+            jnp.concatenate([J, eye], axis=1),
+        )
 
-    dtype = chart.pivot.dtype
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6  # of the cost, what is left to gain
-    solver = NormalEquationsLM(rtol=tolerance, atol=tolerance)
     solution: optx.Solution = optx.least_squares(
         fn,
-        solver,
-        jnp.zeros(free.shape[1], dtype),
+        NormalEquationsLM(rtol=tolerance, atol=tolerance),
+        jnp.zeros((n, chart.scale.shape[0]), dtype),
+        has_aux=True,
         max_steps=max_steps,
         adjoint=ImplicitGradient(),
         throw=False,
     )
-    return (
-        chart.transform(free @ solution.value),
-        solution.stats["num_steps"],
-        jnp.asarray(solution.result == optx.RESULTS.successful),
-    )
+    y = jnp.sum(free[:, :, None] * solution.value[None], axis=1)
+    return chart.transform(y), solution.state
 
 
-def _directions(ground_plane: bool, dtype: jnp.dtype) -> Array:
-    """The directions of the chart in which a pose is refined, (6, 6) or (6, 3).
-
-    The frame the chart lives in is the vehicle's: on the ground it shifts along x and y and turns
-    about z.
-    """
-    return jnp.asarray(ON_GROUND if ground_plane else np.eye(6), dtype)
-
-
-def _body_covariance(chart: _Chart, J: Array, free: Array) -> Array:
-    """Covariance of xi in T_world_vehicle * exp(xi) from the whitened Jacobian in the chart.
+def _body_covariance(pivot: Array, scale: Array, information: Array, free: Array) -> Array:
+    """Covariance of xi in T_world_vehicle * exp(xi) from the whitened J'J in the chart.
 
     Inverted in the chart, where the information matrix is well conditioned, and carried over:
     y moves T_vehicle_world on the left by (scale * shift + pivot x turn, turn), and xi is minus
     that.
     """
-    information = J.T @ J + jnp.eye(J.shape[1], dtype=J.dtype) / _PRIOR_SIGMA**2
-    factor = cholesky(information)
-    eye = jnp.eye(3, dtype=J.dtype)
-    carry = jnp.block([[chart.scale * eye, skew(chart.pivot)], [jnp.zeros_like(eye), eye]])
+    eye = jnp.eye(3, dtype=pivot.dtype)
+    prior = jnp.eye(information.shape[0], dtype=pivot.dtype) / _PRIOR_SIGMA**2
+    factor = cholesky(information + prior)
+    carry = jnp.block([[scale * eye, skew(pivot)], [jnp.zeros_like(eye), eye]])
     root = solve_lower(factor, product(carry, free).T)
     return product(root.T, root)
 
@@ -220,29 +253,24 @@ def solve_marker(
     corners_n = jnp.asarray(corners_n)
     start = ippe_square(corners_n, size_m)
     marker = _SingleMarker(corners_n, jnp.asarray(size_m, corners_n.dtype))
-
-    def one(T_start: jaxlie.SE3) -> tuple[Array, Array]:
-        origin = jnp.zeros(3, corners_n.dtype)
-        T, _, _ = _minimise(
-            marker.residual, T_start, marker.corners_m, origin, jnp.asarray(True), max_steps
-        )
-        return T.wxyz_xyz, marker.error(T)
-
-    wxyz_xyz, errors = jax.vmap(one)(start.T_camera_marker)
+    chart = marker.chart(jax.lax.stop_gradient(start.T_camera_marker))
+    free = jnp.eye(6, dtype=corners_n.dtype)
+    T, _ = _minimise(chart, marker.rows, free, jnp.ones(2, bool), max_steps)
+    errors = marker.errors(T)
     order = jnp.where(errors[0] <= errors[1], jnp.array([0, 1]), jnp.array([1, 0]))
-    return PosePair(jaxlie.SE3(wxyz_xyz[order]), errors[order])
+    return PosePair(jaxlie.SE3(T.wxyz_xyz[order]), errors[order])
 
 
 class _SingleMarker(eqx.Module):
-    """What one camera sees of one marker."""
+    """What one camera sees of one marker, and how it fits to N poses of it."""
 
     corners_n: Float[Array, "4 2"]
     size_m: Float[Array, ""]
 
-    @property
-    def corners_m(self) -> Float[Array, "4 3"]:
-        """In the marker's own frame."""
-        return self.size_m / 2 * jnp.asarray(CORNER_SIGNS, self.corners_n.dtype)
+    def chart(self, T_camera_marker: jaxlie.SE3) -> _Chart:
+        """About the marker's own centre."""
+        corners_m = self.size_m / 2 * jnp.asarray(CORNER_SIGNS, self.corners_n.dtype)
+        return _chart(T_camera_marker, corners_m, jnp.zeros(3, self.corners_n.dtype))
 
     @property
     def unit(self) -> Float[Array, ""]:
@@ -251,15 +279,16 @@ class _SingleMarker(eqx.Module):
         spread = safe_norm(offsets.reshape(-1))
         return jnp.where(spread > 0, spread, 1) / 100
 
-    def residual(self, points: Float[Array, "4 3"]) -> Float[Array, " 8"]:
-        """In units, of corners at these places in the camera's frame."""
-        depth = jnp.maximum(points[:, 2:], 1e-3 * safe_norm(points)[:, None])
-        return ((points[:, :2] / depth - self.corners_n) / self.unit).reshape(-1)
+    @property
+    def rows(self) -> Callable[[Array], Rows]:
+        """Residuals in units, with their derivatives."""
+        return pinhole_rows(self.corners_n, self.unit)
 
-    def error(self, T_camera_marker: jaxlie.SE3) -> Float[Array, ""]:
+    def errors(self, T_camera_marker: jaxlie.SE3) -> Float[Array, " N"]:
         """RMS over the eight coordinates, in units of the corners."""
-        residual = self.residual(transform_points(T_camera_marker, self.corners_m))
-        return self.unit * safe_norm(residual) / np.sqrt(8)
+        chart = self.chart(T_camera_marker)
+        residual, _ = self.rows(chart.arms + chart.pivot[:, None])
+        return self.unit * safe_norm(residual.reshape(8, -1).T) / np.sqrt(8)
 
 
 @jax.jit
@@ -283,28 +312,26 @@ def _solve_pairs_jvp(
     """By the implicit function theorem, as the derivatives of `solve_marker`."""
     pair = _solve_pairs(*primals)
     wxyz_xyz = pair.T_camera_marker.wxyz_xyz
-    both = jax.vmap(_at_minimum, in_axes=(0, None, None))
     _, (t_poses, t_errors) = jax.jvp(
-        lambda corners_n, size_m: jax.vmap(both)(wxyz_xyz, corners_n, size_m), primals, tangents
+        lambda *seen: jax.vmap(_at_minima)(wxyz_xyz, *seen), primals, tangents
     )
     return pair, PosePair(jaxlie.SE3(t_poses), t_errors)
 
 
-def _at_minimum(wxyz_xyz: Array, corners_n: Array, size_m: Array) -> tuple[Array, Array]:
-    """A refined pose and its error, which move with the corners and the size as minima do."""
+def _at_minima(
+    wxyz_xyz: Float[Array, "2 7"], corners_n: Array, size_m: Array
+) -> tuple[Array, Array]:
+    """Refined poses and their errors, which move with the corners and the size as minima do."""
     T = jaxlie.SE3(jax.lax.stop_gradient(wxyz_xyz))
     marker = _SingleMarker(corners_n, size_m)
-    here = jnp.zeros(6, wxyz_xyz.dtype)
+    here = jnp.zeros((6, 2), wxyz_xyz.dtype)
     y = moving_with(here, (T, marker), gradient=_gradient_of_marker, residual=None)
-    moved = _chart_of_marker(T, marker).transform(y)
-    return moved.wxyz_xyz, marker.error(moved)
-
-
-def _chart_of_marker(T: jaxlie.SE3, marker: _SingleMarker) -> _Chart:
-    return _chart(T, marker.corners_m, jnp.zeros(3, marker.corners_n.dtype))
+    moved = marker.chart(T).transform(y)
+    return moved.wxyz_xyz, marker.errors(moved)
 
 
 def _gradient_of_marker(y: Array, _: None, inputs: tuple[jaxlie.SE3, _SingleMarker]) -> Array:
     T, marker = inputs
-    chart = _chart_of_marker(T, marker)
-    return jax.grad(lambda z: jnp.sum(marker.residual(chart.points(z)) ** 2) / 2)(y)
+    linearised = marker.chart(T).linearised(marker.rows, jnp.eye(6, dtype=y.dtype))
+    residual, J = linearised(y)
+    return jnp.sum(J * residual[None], axis=1)

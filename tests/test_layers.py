@@ -35,6 +35,7 @@ LAYERS = {
         "ippe",
         "kalman",
         "levenberg_marquardt",
+        "linearised",
         "map_fit",
         "motion",
         "observation",

@@ -58,3 +58,21 @@ def test_gradients_are_those_of_lapack():
     # The lower triangle alone is read.
     expected = -np.outer(x, x)
     np.testing.assert_allclose(ours + ours.T, expected + expected.T, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 3, 6])
+def test_many_positive_systems_side_by_side(n):
+    rng = np.random.default_rng(n)
+    roots = rng.normal(size=(20, n, n + 2))
+    A, b = roots @ np.swapaxes(roots, 1, 2), rng.normal(size=(20, n))
+    x = small.solve_positive(jnp.asarray(np.moveaxis(A, 0, -1)), jnp.asarray(b.T))
+    np.testing.assert_allclose(x.T, np.linalg.solve(A, b[..., None])[..., 0], rtol=1e-6, atol=1e-8)
+    assert not np.any(np.isfinite(small.solve_positive(-jnp.eye(n), jnp.ones(n))))
+
+
+@pytest.mark.parametrize("values", [[3.0, 1.0, 2.0], [1.0, 1.0, 1.0], [-np.inf, 5.0, -np.inf, 5.0]])
+def test_ranks_are_those_of_a_stable_sort(values):
+    order = np.argsort(-np.asarray(values), kind="stable")
+    np.testing.assert_array_equal(small.ranks(jnp.asarray(values))[order], np.arange(len(values)))
+    for count in (1, 2, 3):
+        np.testing.assert_array_equal(small.in_order(jnp.asarray(values), count), order[:count])
