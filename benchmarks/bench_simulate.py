@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.selectors import make_selector
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.navigator import Navigator
+from jaxnav.selectors import make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 
@@ -44,16 +44,21 @@ def rollout(selector: str, **options: Any) -> Rollout:
     return Rollout(navigator, vehicle, markers, scenario, 1.0, **options)
 
 
+def keys(count: int) -> jax.Array:
+    """One of every drive."""
+    return jax.vmap(jax.random.key)(jnp.arange(count))
+
+
 def timed(drives: Rollout, seeds: int) -> tuple[float, float, int]:
     """Seconds by the clock, seconds of all threads, steps of drives under way."""
     clock, cpu = time.perf_counter(), time.process_time()
-    steps = int(np.sum(drives.run(jnp.arange(seeds)).active))
+    steps = int(np.sum(drives.run(keys(seeds)).active))
     return time.perf_counter() - clock, time.process_time() - cpu, steps
 
 
 def start(drives: Rollout, chunks: int = 1) -> float:
     """Steps a second of one thread in the first second, when the bank is full."""
-    worlds = drives._start(jnp.arange(drives.many_lanes))
+    worlds = drives._start(keys(drives.many_lanes))
     jax.block_until_ready(worlds)
     begin = time.perf_counter()
     for _ in range(chunks):
@@ -95,8 +100,8 @@ def main() -> None:
 def test_whole_drives(benchmark: Any, selector: str) -> None:
     """A round is a thousand drives."""
     drives = rollout(selector, many=1)
-    drives.run(jnp.arange(8))
-    trace = benchmark.pedantic(drives.run, (jnp.arange(1024),), rounds=3)
+    drives.run(keys(8))
+    trace = benchmark.pedantic(drives.run, (keys(1024),), rounds=3)
     benchmark.extra_info["steps a second"] = np.sum(trace.active) / benchmark.stats["median"]
 
 

@@ -33,6 +33,7 @@ Scenario = Literal[
     "miscalibrated",
     "blur",
 ]
+StudyKind = Literal["ambiguity", "drive"]
 CornerBackend = Literal["aruco", "apriltag"]
 Switch = tyro.conf.FlagCreatePairsOff[bool]
 QCarFile = Annotated[
@@ -248,12 +249,78 @@ class Reliability:
         _require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
 
 
+@dataclass(frozen=True)
+class Study:
+    """Run a Monte-Carlo study: a labelled grid of parameters, many trials in every cell.
+
+    `ambiguity` studies single frames, `drive` closed-loop drives. CONFIG is a YAML file, or the
+    name of one that comes with jaxnav (`jaxnav study ambiguity list` lists them, and all that can
+    vary). The result is a Zarr store that xarray opens. A study that was interrupted or killed goes
+    on when the same command is given again, and ends with the same bits.
+    """
+
+    kind: tyro.conf.Positional[StudyKind]
+    """What a trial is."""
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
+    """YAML file with `trials`, `axes` and what is fixed; or a name; or `list`."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="STORE", help_behavior_hint="(default: out/CONFIG.zarr)"),
+    ] = None
+    """Where the result goes, or goes on."""
+    workers: Annotated[
+        int | None,
+        tyro.conf.arg(metavar="N", constructor=int, help_behavior_hint="(default: this process)"),
+    ] = None
+    """Start so many Dask workers on this machine."""
+    scheduler: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="ADDRESS", constructor=str, help_behavior_hint="(optional)"),
+    ] = None
+    """Run on the Dask cluster with its scheduler there, e.g. tcp://127.0.0.1:8786."""
+    chunk_trials: Annotated[
+        int | None,
+        tyro.conf.arg(
+            metavar="N", constructor=int, help_behavior_hint="(default: 65536, or 256 drives)"
+        ),
+    ] = None
+    """How many trials are run and written at a time. Changes no result."""
+    headless: Switch = False
+    """No progress bar."""
+
+    def __post_init__(self) -> None:
+        if self.chunk_trials is not None:
+            least = f"must be at least 1, got {self.chunk_trials}"
+            _require(self.chunk_trials >= 1, "--chunk-trials", least)
+        if self.workers is not None:
+            _require(self.workers >= 1, "--workers", f"must be at least 1, got {self.workers}")
+            _require(self.scheduler is None, "--scheduler", "brings its own workers")
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Draw a study: flip-rate maps, curves with their intervals, reliability diagrams.
+
+    Written to --out: PNG files, and summary.json with the measures of every cell. A study that is
+    not finished is drawn as far as it is.
+    """
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STORE")]
+    """What `jaxnav study` wrote."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
+    """Folder for the pictures."""
+    headless: Switch = False
+    """No progress bar."""
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
     | Annotated[Locate, tyro.conf.subcommand("locate")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Reliability, tyro.conf.subcommand("reliability")]
+    | Annotated[Study, tyro.conf.subcommand("study")]
+    | Annotated[Plot, tyro.conf.subcommand("plot")]
 )
 COMMANDS = {
     "demo": Demo,
@@ -261,6 +328,8 @@ COMMANDS = {
     "locate": Locate,
     "simulate": Simulate,
     "reliability": Reliability,
+    "study": Study,
+    "plot": Plot,
 }
 
 

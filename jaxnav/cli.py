@@ -1,4 +1,4 @@
-"""The command line: `jaxnav demo`, `simulate`, `replay`, `locate`, `reliability`.
+"""The command line: `jaxnav demo`, `simulate`, `study`, `plot`, `replay`, `locate`, `reliability`.
 
 What a command does lies in `jaxnav.commands` and is imported when the command runs, so that
 `--help` stays instant; what it can be told lies in `arguments.py`.
@@ -16,7 +16,17 @@ from collections.abc import Iterator, Sequence
 
 import tyro
 
-from jaxnav.arguments import COMMANDS, Command, Demo, Locate, Reliability, Replay, Simulate
+from jaxnav.arguments import (
+    COMMANDS,
+    Command,
+    Demo,
+    Locate,
+    Plot,
+    Reliability,
+    Replay,
+    Simulate,
+    Study,
+)
 from jaxnav.errors import BadInput
 
 EXIT_BAD_INPUT = 2
@@ -27,6 +37,10 @@ DESCRIPTION = (
     "Localise and drive a vehicle with one square marker and several cameras. "
     "`jaxnav COMMAND --help` explains a command, `jaxnav --version` prints the version."
 )
+
+
+_STUDY_PACKAGES = ("dask", "distributed", "xarray", "zarr")
+_Command = Demo | Replay | Locate | Simulate | Reliability | Study | Plot
 
 
 class UsageError(Exception):
@@ -67,12 +81,17 @@ def _dispatch(args: list[str]) -> int:
     command = _parse(args)
     if command is None:
         return 0
-    module = importlib.import_module(f"jaxnav.commands.{type(command).__name__.lower()}")
-    code: int = module.run(command)
+    try:
+        module = importlib.import_module(f"jaxnav.commands.{type(command).__name__.lower()}")
+        code: int = module.run(command)
+    except ModuleNotFoundError as missing:
+        if missing.name not in _STUDY_PACKAGES:
+            raise
+        raise UsageError(f"needs {missing.name}: pip install 'jaxnav[study]'") from None
     return code
 
 
-def _parse(args: list[str]) -> Demo | Replay | Locate | Simulate | Reliability | None:
+def _parse(args: list[str]) -> _Command | None:
     """The command, or None where help was asked for and printed."""
     messages = io.StringIO()
     wide = not {"-h", "--help"} & set(args)
@@ -81,7 +100,7 @@ def _parse(args: list[str]) -> Demo | Replay | Locate | Simulate | Reliability |
             contextlib.redirect_stderr(messages),
             _unwrapped() if wide else contextlib.nullcontext(),
         ):
-            command: Demo | Replay | Locate | Simulate | Reliability = tyro.cli(
+            command: _Command = tyro.cli(
                 Command,
                 prog="jaxnav",
                 description=DESCRIPTION,

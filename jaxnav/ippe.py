@@ -25,8 +25,10 @@ class PosePair(eqx.Module):
     At a frontal view the two coincide.
     """
 
-    T_camera_marker: jaxlie.SE3  # batch axis (2,)
-    reprojection_error: Float[Array, " 2"]  # RMS over the eight coordinates, units of corners_n
+    T_camera_marker: jaxlie.SE3  # batch axes (*batch, 2)
+    reprojection_error: Float[
+        Array, "*batch 2"
+    ]  # RMS over the eight coordinates, units of corners_n
 
 
 def ippe_square(corners_n: Float[Array, "4 2"], size_m: Float[Array, ""] | float) -> PosePair:

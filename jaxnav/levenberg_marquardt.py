@@ -3,7 +3,7 @@
 optimistix keeps its loop, its bound on the steps, its result codes and its implicit adjoint; this
 class only says what a step is. Against `optimistix.LevenbergMarquardt` it forms J'J once a
 step, and it stops when no step can lower the cost any more instead of when y and every residual
-stand still. `benchmarks/bench_pose.py`: 1.6 times as fast at equal steps; compilation takes half
+stand still. `benchmarks/bench_pair.py`: 1.6 times as fast at equal steps; compilation takes half
 the time, and float32 works in a process that has float64 enabled.
 """
 
@@ -156,18 +156,18 @@ class ImplicitGradient(optx.AbstractAdjoint):
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, inputs
         )
         root, residual = optx.ImplicitAdjoint().apply(primal_fn, rewrite_fn, fixed, tags)
-        return _moving_with(root, inputs, gradient=rewrite_fn, residual=residual), residual
+        return moving_with(root, inputs, gradient=rewrite_fn, residual=residual), residual
 
 
 @eqx.filter_custom_jvp
-def _moving_with(
+def moving_with(
     root: Array, inputs: PyTree, *, gradient: Callable[..., Array], residual: PyTree
 ) -> Array:
-    """The root, where gradient(root, residual, inputs) = 0."""
+    """The root, where gradient(root, residual, inputs) = 0 whatever the inputs."""
     return root
 
 
-@_moving_with.def_jvp
+@moving_with.def_jvp
 def _moving_with_jvp(
     primals: PyTree, tangents: PyTree, *, gradient: Callable[..., Array], residual: PyTree
 ) -> tuple[Array, Array]:

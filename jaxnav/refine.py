@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.geometry import ON_GROUND, on_last_axis, safe_norm, skew, transform_points
 from jaxnav.ippe import PosePair, ippe_square
-from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM
+from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM, moving_with
 from jaxnav.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.observation import Sightings, sightings
+from jaxnav.pair_lanes import solve_pairs
 from jaxnav.residuals import reprojection_residuals
 from jaxnav.rig import CameraRig
 from jaxnav.small_matrices import cholesky, product, solve_lower
@@ -218,28 +219,92 @@ def solve_marker(
     """
     corners_n = jnp.asarray(corners_n)
     start = ippe_square(corners_n, size_m)
-    corners_marker = (
-        jnp.asarray(size_m, corners_n.dtype) / 2 * jnp.asarray(CORNER_SIGNS, corners_n.dtype)
-    )
-    spread = safe_norm((corners_n - jnp.mean(corners_n, axis=0, keepdims=True)).reshape(-1))
-    unit = jnp.where(spread > 0, spread, 1) / 100  # a hundred "pixels" across, whatever the units
-
-    def residual(points: Array) -> Array:
-        depth = jnp.maximum(points[:, 2:], 1e-3 * safe_norm(points)[:, None])
-        return ((points[:, :2] / depth - corners_n) / unit).reshape(-1)
+    marker = _SingleMarker(corners_n, jnp.asarray(size_m, corners_n.dtype))
 
     def one(T_start: jaxlie.SE3) -> tuple[Array, Array]:
         origin = jnp.zeros(3, corners_n.dtype)
-        T, _, _ = _minimise(residual, T_start, corners_marker, origin, jnp.asarray(True), max_steps)
-        rms = safe_norm(residual(transform_points(T, corners_marker))) / np.sqrt(8)
-        return T.wxyz_xyz, unit * rms
+        T, _, _ = _minimise(
+            marker.residual, T_start, marker.corners_m, origin, jnp.asarray(True), max_steps
+        )
+        return T.wxyz_xyz, marker.error(T)
 
     wxyz_xyz, errors = jax.vmap(one)(start.T_camera_marker)
     order = jnp.where(errors[0] <= errors[1], jnp.array([0, 1]), jnp.array([1, 0]))
     return PosePair(jaxlie.SE3(wxyz_xyz[order]), errors[order])
 
 
+class _SingleMarker(eqx.Module):
+    """What one camera sees of one marker."""
+
+    corners_n: Float[Array, "4 2"]
+    size_m: Float[Array, ""]
+
+    @property
+    def corners_m(self) -> Float[Array, "4 3"]:
+        """In the marker's own frame."""
+        return self.size_m / 2 * jnp.asarray(CORNER_SIGNS, self.corners_n.dtype)
+
+    @property
+    def unit(self) -> Float[Array, ""]:
+        """A hundredth of the marker's spread: a hundred "pixels" across, whatever the units."""
+        offsets = self.corners_n - jnp.mean(self.corners_n, axis=0, keepdims=True)
+        spread = safe_norm(offsets.reshape(-1))
+        return jnp.where(spread > 0, spread, 1) / 100
+
+    def residual(self, points: Float[Array, "4 3"]) -> Float[Array, " 8"]:
+        """In units, of corners at these places in the camera's frame."""
+        depth = jnp.maximum(points[:, 2:], 1e-3 * safe_norm(points)[:, None])
+        return ((points[:, :2] / depth - self.corners_n) / self.unit).reshape(-1)
+
+    def error(self, T_camera_marker: jaxlie.SE3) -> Float[Array, ""]:
+        """RMS over the eight coordinates, in units of the corners."""
+        residual = self.residual(transform_points(T_camera_marker, self.corners_m))
+        return self.unit * safe_norm(residual) / np.sqrt(8)
+
+
 @jax.jit
 def solve_markers(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) -> PosePair:
-    """`solve_marker` for a batch: (B, 4, 2) corners and (B,) sides give batch axes (B, 2)."""
-    return jax.vmap(solve_marker)(corners_n, size_m)
+    """`solve_marker` for a batch, by lanes: (B, 4, 2) corners and (B,) sides give axes (B, 2).
+
+    A marker's result is the same in every batch. Corners that are not finite give NaN.
+    """
+    return _solve_pairs(corners_n, size_m)
+
+
+@jax.custom_jvp
+def _solve_pairs(corners_n: Array, size_m: Array) -> PosePair:
+    return solve_pairs(corners_n, size_m)
+
+
+@_solve_pairs.defjvp
+def _solve_pairs_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[PosePair, PosePair]:
+    """By the implicit function theorem, as the derivatives of `solve_marker`."""
+    pair = _solve_pairs(*primals)
+    wxyz_xyz = pair.T_camera_marker.wxyz_xyz
+    both = jax.vmap(_at_minimum, in_axes=(0, None, None))
+    _, (t_poses, t_errors) = jax.jvp(
+        lambda corners_n, size_m: jax.vmap(both)(wxyz_xyz, corners_n, size_m), primals, tangents
+    )
+    return pair, PosePair(jaxlie.SE3(t_poses), t_errors)
+
+
+def _at_minimum(wxyz_xyz: Array, corners_n: Array, size_m: Array) -> tuple[Array, Array]:
+    """A refined pose and its error, which move with the corners and the size as minima do."""
+    T = jaxlie.SE3(jax.lax.stop_gradient(wxyz_xyz))
+    marker = _SingleMarker(corners_n, size_m)
+    here = jnp.zeros(6, wxyz_xyz.dtype)
+    y = moving_with(here, (T, marker), gradient=_gradient_of_marker, residual=None)
+    moved = _chart_of_marker(T, marker).transform(y)
+    return moved.wxyz_xyz, marker.error(moved)
+
+
+def _chart_of_marker(T: jaxlie.SE3, marker: _SingleMarker) -> _Chart:
+    return _chart(T, marker.corners_m, jnp.zeros(3, marker.corners_n.dtype))
+
+
+def _gradient_of_marker(y: Array, _: None, inputs: tuple[jaxlie.SE3, _SingleMarker]) -> Array:
+    T, marker = inputs
+    chart = _chart_of_marker(T, marker)
+    return jax.grad(lambda z: jnp.sum(marker.residual(chart.points(z)) ** 2) / 2)(y)

@@ -45,6 +45,19 @@ class CameraRig(eqx.Module):
         """One camera of the rig."""
         return jax.tree.map(lambda leaf: leaf[index], self.cameras)
 
+    def first(self, count: int) -> "CameraRig":
+        """The rig with its first cameras alone."""
+        kept = jax.tree.map(lambda leaf: leaf[:count], (self.cameras, self.Ts_camera_vehicle))
+        cameras, Ts_camera_vehicle = kept
+        return CameraRig(
+            cameras, Ts_camera_vehicle, self.names[:count], self.image_sizes_px[:count]
+        )
+
+    def with_focal_px(self, mean_px: Float[Array, ""] | float) -> "CameraRig":
+        """The rig with all focal lengths scaled to this mean."""
+        focal_px = self.cameras.focal_px * (mean_px / jnp.mean(self.cameras.focal_px))
+        return eqx.tree_at(lambda rig: rig.cameras.focal_px, self, focal_px)
+
     def project(
         self, T_vehicle_world: jaxlie.SE3, points_world_m: Float[Array, "*batch 3"]
     ) -> Float[Array, " C *batch 2"]:

@@ -55,7 +55,7 @@ def test_the_exit_code_is_the_commands(command) -> None:
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("", "jaxnav: Expected one of {demo, replay, locate, simulate, reliability}."),
+        ("", "jaxnav: Expected one of {demo, replay, locate, simulate, reliability, study, plot}."),
         ("fly", "jaxnav: Unrecognized options: fly; Available subcommands: demo, replay, locate"),
         ("demo --fast", "jaxnav demo: Unrecognized options: --fast"),
         ("demo --sed 3", "jaxnav demo: Unrecognized options: --sed, 3; Perhaps you meant: --seed"),
@@ -135,6 +135,9 @@ def test_a_defect_keeps_its_traceback(command) -> None:
         cli.main(["demo"])
 
 
+POSITIONAL = {"kind": r"\{ambiguity,drive\}"}
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_explains_every_flag(name, capsys) -> None:
     assert cli.main([name, "--help"]) == 0
@@ -142,9 +145,13 @@ def test_help_explains_every_flag(name, capsys) -> None:
     assert err == ""
     assert "{None}" not in out
     for field in dataclasses.fields(COMMANDS[name]):
-        is_positional = field.name in ("recording", "image")
-        flag = field.name.upper() if is_positional else "--" + field.name.replace("_", "-")
-        assert re.search(rf"(?m)^.? ?{flag}\b", out), flag
+        is_positional = field.name in ("recording", "image", "store", "config", "kind")
+        flag = (
+            POSITIONAL.get(field.name, field.name.upper())
+            if is_positional
+            else "--" + field.name.replace("_", "-")
+        )
+        assert re.search(rf"(?m)^.? ?{flag}(?!\w)", out), flag
     # A flag without a docstring would be followed by its default alone.
     unframed = " ".join(out.replace("│", " ").split())
     assert not re.search(r"--[\w-]+( \S+)? \((default|optional|required)", unframed)

@@ -38,8 +38,10 @@ LAYERS = {
         "map_fit",
         "motion",
         "observation",
+        "pair_lanes",
         "refine",
         "residuals",
+        "selectors",
     },
     "navigator": {"navigator"},
     "users": {
@@ -51,7 +53,7 @@ LAYERS = {
         "studies",
         "tuning",
     },
-    "shell": {"arguments", "cli", "commands", "plotting"},
+    "shell": {"arguments", "cli", "commands", "plotting", "study_plotting"},
 }
 ORDER = list(LAYERS)
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}

@@ -22,6 +22,7 @@ from tests.reference import paper
 RIG, MARKERS, CAR = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()
 QUIET = OdometryNoise(speed_sigma_mps=0.0, steering_sigma_rad=0.0)
 SEEDS = jnp.asarray([3, 5, 8])
+keys = jax.vmap(jax.random.key)
 
 
 class Spy:
@@ -39,7 +40,9 @@ class Spy:
         return jnp.asarray(0)
 
     def step(self, frame, obs):
+        one = SimpleNamespace(valid=jnp.ones(1, bool), steps=jnp.ones(1, int))
         return frame + 1, SimpleNamespace(
+            candidates=one,
             pose=planar_from_T_world_vehicle(obs.T_world_vehicle_true),
             covariance=jnp.eye(6),
             located=jnp.any(obs.visible),
@@ -55,7 +58,7 @@ class Spy:
 def run(navigator, scenario: Scenario, noise_px=0.0, seeds=SEEDS, chunk_frames=15) -> Trace:
     """The whole rollout, leading axes (seeds, frames)."""
     rollout = Rollout(navigator, CAR, MARKERS, scenario, noise_px, chunk_frames=chunk_frames)
-    return rollout.run(seeds)
+    return rollout.run(keys(seeds))
 
 
 def short(name: str, **changes) -> Scenario:
@@ -117,11 +120,11 @@ def real() -> Rollout:
 
 def test_a_seed_s_drive_does_not_depend_on_the_others(real):
     ended = []
-    first = real.run(jnp.asarray([3, 5, 8]), ended.append)
+    first = real.run(keys(jnp.asarray([3, 5, 8])), ended.append)
     assert sum(ended) == 3
     # Two lanes for four drives: the last two take over where others have ended.
     few = dataclasses.replace(real, lanes=2)
-    other = few.run(jnp.asarray([5, 1, 8, 3]))
+    other = few.run(keys(jnp.asarray([5, 1, 8, 3])))
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(a, b[[3, 0, 2]], rtol=1e-6, atol=1e-6)
     assert not np.allclose(first.true_pose[0], first.true_pose[1])
@@ -136,7 +139,7 @@ def test_a_lane_takes_the_next_seed_where_its_drive_has_ended():
     seeds = jnp.arange(7)
     together = run(Spy(throttle=0.05), scenario, seeds=seeds)
     rollout = Rollout(Spy(throttle=0.05), CAR, MARKERS, scenario, 0.0, lanes=3, chunk_frames=15)
-    queued = rollout.run(seeds)
+    queued = rollout.run(keys(seeds))
     lengths = np.sum(together.active, axis=1)
     assert lengths.min() < 10 < lengths.max() == scenario.frames
     np.testing.assert_array_equal(np.sum(queued.active, axis=1), lengths)
@@ -156,19 +159,19 @@ def test_many_drives_are_those_of_few():
     few = Rollout(Spy(throttle=0.05), CAR, MARKERS, scenario, **options)
     many = dataclasses.replace(few, many=40, many_lanes=16, threads=2)
     counted = []
-    one, other = few.run(seeds), many.run(seeds, counted.append)
+    one, other = few.run(keys(seeds)), many.run(keys(seeds), counted.append)
     assert sum(counted) == 45
     assert len(np.unique(np.sum(one.active, axis=1))) > 2
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
     # Bit for bit, whatever else runs and how many threads do it.
-    again = dataclasses.replace(many, threads=1).run(seeds[::-1])
+    again = dataclasses.replace(many, threads=1).run(keys(seeds[::-1]))
     for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b[::-1])
 
 
 def test_the_navigator_s_errors_are_measured(real):
-    trace = real.run(SEEDS)
+    trace = real.run(keys(SEEDS))
     assert trace.located.all()
     distance_m = np.linalg.norm((trace.pose - trace.true_pose)[..., :2], axis=-1)
     assert np.all((distance_m > 0) & (distance_m < 5))  # a mirror image may be taken

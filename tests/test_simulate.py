@@ -35,6 +35,7 @@ def trace(drives=4, frames=60, **changes) -> Trace:
         "located": np.ones(shape, bool),
         "decided": np.broadcast_to(np.arange(frames) >= 5, shape).copy(),
         "flip_probability": np.zeros(shape),
+        "lm_steps": np.ones(shape, int),
         "active": np.ones(shape, bool),
         "on_floor": np.ones(shape, bool),
         "passed": np.full(shape, 2),

@@ -16,7 +16,6 @@ from jaxnav.arguments import Demo
 from jaxnav.commands.pictures import save_figure, views_of
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.rendered_world import Cameras, World
-from jaxnav.commands.selectors import make_selector
 from jaxnav.files import (
     output_folder,
     write_json,
@@ -24,6 +23,7 @@ from jaxnav.files import (
 )
 from jaxnav.geometry import T_world_vehicle_from_planar
 from jaxnav.plotting import Track, camera_mosaic, drive_report
+from jaxnav.selectors import make_selector
 from jaxnav.simulation.drive import (
     DriveSettings,
     Frame,

@@ -8,13 +8,13 @@ from tqdm import tqdm
 from jaxnav.arguments import Reliability as Arguments
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.selectors import make_selector
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder, write_json
 from jaxnav.plotting import reliability_diagram
 from jaxnav.runtime.recordings import read_recording
 from jaxnav.runtime.replay import replay
-from jaxnav.simulation.single_frames import single_frames
+from jaxnav.selectors import make_selector
+from jaxnav.simulation.random_views import random_views
 from jaxnav.simulation.statistics import Reliability
 
 
@@ -54,7 +54,7 @@ def run(args: Arguments) -> int:
 def _simulated(args: Arguments) -> tuple[str, np.ndarray, np.ndarray]:
     """What the image alone says of a pair, on random views."""
     with tqdm(total=args.frames, unit="frame", disable=args.headless) as bar:
-        frames = single_frames(args.frames, args.seed, progress=bar.update)
+        frames = random_views(args.frames, args.seed, progress=bar.update)
     pair = np.asarray(frames.pair)
     return (
         "random views",

@@ -9,12 +9,12 @@ from tqdm import tqdm
 from jaxnav.arguments import Replay as Arguments
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.selectors import make_selector
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig, output_folder, write_json, write_tum
 from jaxnav.plotting import localisation_report
 from jaxnav.runtime.recordings import Recording, read_recording
 from jaxnav.runtime.replay import Replay, errors, frames_in_view, replay
+from jaxnav.selectors import make_selector
 
 SETTLED_FRAMES = 5  # of an appearance: a choice made later has had a history
 

@@ -5,6 +5,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from tqdm import tqdm
 
@@ -12,12 +13,12 @@ from jaxnav.arguments import Simulate as Arguments
 from jaxnav.bicycle import Vehicle
 from jaxnav.bicycle_kalman import BicycleKalman
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.selectors import SELECTORS, make_selector
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
 from jaxnav.rig import CameraRig
+from jaxnav.selectors import SELECTORS, make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
@@ -87,7 +88,8 @@ def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any
         disable=args.headless,
         leave=False,
     ) as bar:
-        trace = rollout.run(args.seed + jnp.arange(args.seeds), bar.update)
+        keys = jax.vmap(jax.random.key)(args.seed + jnp.arange(args.seeds))
+        trace = rollout.run(keys, bar.update)
     return Drives.of(trace, scenario).summary()
 
 

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxnav.bicycle import Vehicle
 from jaxnav.control import Command
@@ -31,6 +31,7 @@ from jaxnav.simulation.corners import see
 from jaxnav.simulation.drive import PASSED_M
 from jaxnav.simulation.plant import CarState, move_through, read_odometry
 from jaxnav.simulation.scenarios import Scenario
+from jaxnav.simulation.single_frames import directions
 from jaxnav.trees import where
 
 _Step = Callable[[State, Observation], tuple[State, Output]]
@@ -47,6 +48,7 @@ class Trace(eqx.Module):
     located: Bool[Array, "*S"]
     decided: Bool[Array, "*S"]
     flip_probability: Float[Array, "*S"]
+    lm_steps: Int[Array, "*S"]  # of the slower candidate
     active: Bool[Array, "*S"]  # the drive had not ended before this frame
     on_floor: Bool[Array, "*S"]
     passed: Int[Array, "*S"]  # waypoints the true car has come near to, in order
@@ -58,6 +60,7 @@ class _World(eqx.Module):
 
     key: Array
     rig: CameraRig  # the true one
+    bias: Float[Array, "C M 4 2"]  # directions in the image
     car: CarState
     acting: Command  # until the latency of the next one is over
     command: Command
@@ -81,6 +84,9 @@ class Rollout(eqx.Module):
     markers: MarkerMap
     scenario: Scenario = eqx.field(static=True)
     corner_noise_px: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    # Of every corner of every camera, in a direction of its own, the same in all frames of a drive.
+    corner_bias_px: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)
+    start_pose: Float[Array, " 3"] | None = None  # in place of the scenario's
     lanes: int = eqx.field(static=True, default=128)
     chunk_frames: int = eqx.field(static=True, default=15)
     many: int = eqx.field(static=True, default=2048)  # drives for which `over_lanes` pays
@@ -88,25 +94,25 @@ class Rollout(eqx.Module):
     threads: int = eqx.field(static=True, default=max(1, os.cpu_count() or 1))
 
     def run(
-        self, seeds: Int[Array, " S"], progress: Callable[[int], object] = lambda ended: None
+        self, keys: Key[Array, " S"], progress: Callable[[int], object] = lambda ended: None
     ) -> Trace:
         """Every drive, leading axes (S, frames): as many frames as the longest one has.
 
         Args:
-            seeds: a drive for each; a seed's drive does not depend on the others.
+            keys: a drive for each; a key's drive does not depend on the others.
             progress: called with the number of drives that have ended since the last call.
         """
-        if len(seeds) < self.many:
-            lanes, threads, advance = min(self.lanes, len(seeds)), 1, self._advance
+        if len(keys) < self.many:
+            lanes, threads, advance = min(self.lanes, len(keys)), 1, self._advance
         else:
             lanes, threads, advance = self.many_lanes, self.threads, self._advance_many
-        drives = _Drives(len(seeds), self.chunk_frames)
-        waiting, lock = deque(range(len(seeds))), threading.Lock()
+        drives = _Drives(len(keys), self.chunk_frames)
+        waiting, lock = deque(range(len(keys))), threading.Lock()
         compiling = threading.Lock()  # one thread does it for all
 
         def work(_: int) -> None:
             owner = np.full(lanes, -1)
-            worlds = self._start(seeds[np.zeros(lanes, int)])
+            worlds = self._start(keys[np.zeros(lanes, int)])
             over = np.ones(lanes, bool)
             turn: Any = compiling
             while True:
@@ -116,7 +122,7 @@ class Rollout(eqx.Module):
                     return
                 starts = over & (owner >= 0)
                 if np.any(starts):
-                    fresh = self._start(seeds[np.maximum(owner, 0)])
+                    fresh = self._start(keys[np.maximum(owner, 0)])
                     worlds = where(jnp.asarray(starts), fresh, worlds)
                 with turn:
                     worlds, trace = advance(worlds)
@@ -127,14 +133,14 @@ class Rollout(eqx.Module):
                     drives.take(owner, trace)
                     progress(int(over.sum()))
 
-        threads = max(1, min(threads, -(-len(seeds) // lanes)))
+        threads = max(1, min(threads, -(-len(keys) // lanes)))
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(work, range(threads)))
         return drives.side_by_side()
 
     @eqx.filter_jit
-    def _start(self, seeds: Int[Array, " lanes"]) -> _World:
-        worlds = jax.vmap(lambda seed: self._first(jax.random.key(seed)))(seeds)
+    def _start(self, keys: Key[Array, " lanes"]) -> _World:
+        worlds = jax.vmap(self._first)(keys)
         # Types as `_advance` returns them, or it would be compiled twice.
         return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), worlds)
 
@@ -163,13 +169,17 @@ class Rollout(eqx.Module):
         scenario = self.scenario
         key, start_key, rig_key = jax.random.split(key, 3)
         spread = jnp.asarray(scenario.start_spread)
-        start = jnp.asarray(scenario.start_pose) + spread * jax.random.uniform(
+        start_pose = scenario.start_pose if self.start_pose is None else self.start_pose
+        start = jnp.asarray(start_pose) + spread * jax.random.uniform(
             start_key, (3,), spread.dtype, -1, 1
         )
         zero = jnp.zeros_like(start[0])
+        corners = (len(self.navigator.rig), len(self.markers.ids), 4)
+        turns = jax.random.uniform(jax.random.fold_in(rig_key, 1), corners, start.dtype)
         return _World(
             key=key,
             rig=scenario.true_rig(self.navigator.rig, rig_key),
+            bias=directions(turns),
             car=CarState(start, zero, zero),
             acting=Command(zero, zero),
             command=Command(zero, zero),
@@ -200,6 +210,7 @@ class Rollout(eqx.Module):
         seen_from = car.pose + smear * (world.car.pose - car.pose)
         corners_px, visible = see(world.rig, self.markers, T_world_vehicle_from_planar(seen_from))
         noise_px = self.corner_noise_px * jax.random.normal(key_corners, corners_px.shape, dtype)
+        noise_px = noise_px + self.corner_bias_px * world.bias
         visible = visible & ~scenario.hidden(stamp_s)
         corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
         speed_mps, steering_rad = read_odometry(car, scenario.odometry, key_odometry)
@@ -231,6 +242,7 @@ class Rollout(eqx.Module):
             located=out.located,
             decided=out.decided,
             flip_probability=out.flip_probability,
+            lm_steps=jnp.max(jnp.where(out.candidates.valid, out.candidates.steps, 0)),
             active=~world.ended,
             on_floor=on_floor,
             passed=passed,
@@ -244,7 +256,17 @@ class Rollout(eqx.Module):
         if scenario.drives:
             ended = ended | out.done
         return _World(
-            world.key, world.rig, car, world.command, command, state, frame, passed, ended, on_floor
+            world.key,
+            world.rig,
+            world.bias,
+            car,
+            world.command,
+            command,
+            state,
+            frame,
+            passed,
+            ended,
+            on_floor,
         ), trace
 
     def _moved(self, world: _World, period_s: Array) -> CarState:

@@ -28,6 +28,7 @@ class Drives:
     decided: np.ndarray  # and act upon it
     late: np.ndarray  # and come after the first two seconds
     wrong: np.ndarray
+    yaw_error_rad: np.ndarray  # not negative
     position_error_m: np.ndarray
     nees: np.ndarray
     duration_s: np.ndarray
@@ -42,7 +43,8 @@ class Drives:
         decided = counted & trace.decided
         times_s = np.arange(trace.active.shape[1]) * scenario.frame_period_s
         yaw_rad = (trace.pose[..., 2] - trace.true_pose[..., 2] + np.pi) % (2 * np.pi) - np.pi
-        wrong = np.abs(yaw_rad) > np.deg2rad(WRONG_DEG)
+        yaw_error_rad = np.abs(yaw_rad)
+        wrong = yaw_error_rad > np.deg2rad(WRONG_DEG)
         passed = trace.passed.max(axis=1) >= len(scenario.waypoints_m)
         last = trace.active.sum(axis=1) - 1
         right_at_last = ~wrong[np.arange(len(last)), last]
@@ -51,6 +53,7 @@ class Drives:
             decided=decided,
             late=counted & (times_s >= 2.0),
             wrong=wrong,
+            yaw_error_rad=yaw_error_rad,
             position_error_m=np.linalg.norm((trace.pose - trace.true_pose)[..., :2], axis=-1),
             nees=trace.nees,
             duration_s=trace.active.sum(axis=1) * scenario.frame_period_s,

@@ -1,104 +1,118 @@
-"""Single frames of one marker in one camera: does the flip probability mean what it says?
-
-A frame is a random view of a square marker with Gaussian corner noise. It is flipped when, of its
-two refined poses, the one that was taken is not the one nearer to the truth in angle.
-"""
-
-from collections.abc import Callable
-from dataclasses import dataclass
+"""Single frames of one marker: where it stands before the cameras, and what is seen of it."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from jaxnav.ambiguity import LowestReprojection
 from jaxnav.camera import Camera
-from jaxnav.candidates import find_candidates
-from jaxnav.constant_velocity import ConstantVelocity
-from jaxnav.evaluation import judge_branch
-from jaxnav.geometry import transform_points
+from jaxnav.geometry import rotation_from_matrix
 from jaxnav.markers import MarkerMap
-from jaxnav.observation import Observation, Snapshot
+from jaxnav.observation import Observation
 from jaxnav.rig import CameraRig
+from jaxnav.simulation.corners import see
 
-SIZE_M = 0.172
-FOCAL_PX = 320.0
-BATCH = 2000
-
-
-@dataclass(frozen=True)
-class Views:
-    """What is drawn, each uniformly between its ends."""
-
-    side_px: tuple[float, float] = (10.0, 100.0)
-    angle_rad: tuple[float, float] = (0.0, float(np.deg2rad(60.0)))  # normal to line of sight
-    noise_px: tuple[float, float] = (0.2, 2.0)
+IMAGE_PX = 2048  # side of a pinhole camera's image
 
 
-class Frames(eqx.Module):
-    """What became of the frames, leading axis (F,)."""
+class View(eqx.Module):
+    """Where one marker stands, seen from the vehicle; scalars, or leading axes throughout."""
 
-    flip_probability: Float[Array, "*F"]
-    flipped: Bool[Array, "*F"]
-    pair: Bool[Array, "*F"]  # there were two poses to choose from, one of them near the truth
+    range_m: Float[Array, "*F"]  # from the cameras' mean position to the marker's centre
+    bearing_rad: Float[Array, "*F"]  # of the marker: left of straight ahead
+    elevation_rad: Float[Array, "*F"]  # above the horizon
+    view_angle_rad: Float[Array, "*F"]  # between the marker's normal and the line of sight
+    azimuth_rad: Float[Array, "*F"]  # where the normal leans to: 0 the reader's right, pi/2 up
+    roll_rad: Float[Array, "*F"]  # of the marker about its normal
 
 
-def single_frames(
-    count: int,
-    seed: int,
-    views: Views | None = None,
-    progress: Callable[[int], object] = lambda done: None,
-) -> Frames:
-    """Independent frames, on the host.
+class CornerErrors(eqx.Module):
+    """How a detector's corners differ from the true ones."""
+
+    noise_px: Float[Array, "*F"]  # standard deviation, independent
+    bias_px: Float[Array, "*F"]  # of every corner, in a direction of its own
+    blur_px: Float[Array, "*F"]  # length of a streak, in which each corner is found anywhere
+
+
+def pinhole_rig(cameras: int, focal_px: float, baseline_m: float) -> CameraRig:
+    """Cameras without distortion that look ahead side by side, the first in the vehicle's origin.
 
     Args:
-        progress: called with the number of frames done since the last call.
+        baseline_m: from each to the next, to the right.
     """
-    views = views or Views()
-    batch = min(BATCH, count)
+    R_camera_vehicle = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    rotation = rotation_from_matrix(jnp.asarray(R_camera_vehicle, float))
+    center = (IMAGE_PX - 1) / 2
+    camera = Camera.create((focal_px, focal_px), (center, center))
+    return CameraRig.create(
+        [camera] * cameras,
+        [
+            jaxlie.SE3.from_rotation_and_translation(
+                rotation, jnp.asarray([-i * baseline_m, 0.0, 0.0])
+            )
+            for i in range(cameras)
+        ],
+        [f"camera{i}" for i in range(cameras)],
+        [(IMAGE_PX, IMAGE_PX)] * cameras,
+    )
+
+
+def marker_as_world(size_m: Float[Array, ""] | float) -> MarkerMap:
+    """A map of one marker, whose frame is the world's."""
     identity = jaxlie.SE3.identity()
-    camera = Camera.create((FOCAL_PX, FOCAL_PX), (400.0, 300.0), "none", ())
-    rig = CameraRig.create([camera], [identity], ["camera"], [(800, 600)])
-    markers = MarkerMap(jaxlie.SE3(identity.wxyz_xyz[None]), jnp.asarray([SIZE_M]), (0,), ("",))
-    run = jax.jit(jax.vmap(lambda key: _frame(key, views, rig, markers)))
-    keys = jax.random.split(jax.random.key(seed), -(-count // batch) * batch)
-    parts = []
-    for begin in range(0, len(keys), batch):
-        parts.append(jax.device_get(run(keys[begin : begin + batch])))
-        progress(min(batch, count - begin))
-    frames: Frames = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
-    return frames
+    return MarkerMap(jaxlie.SE3(identity.wxyz_xyz[None]), jnp.asarray([size_m]), (0,), ("",))
 
 
-def _frame(key: Array, views: Views, rig: CameraRig, markers: MarkerMap) -> Frames:
-    draws = jax.random.uniform(key, (8,))
-    noise_key = jax.random.fold_in(key, 0)
+def T_vehicle_world_of(view: View, rig: CameraRig) -> jaxlie.SE3:
+    """The pose of the marker, which is the world, that a view describes. Of one view."""
+    cos_up, sin_up = jnp.cos(view.elevation_rad), jnp.sin(view.elevation_rad)
+    sight = jnp.stack(
+        [cos_up * jnp.cos(view.bearing_rad), cos_up * jnp.sin(view.bearing_rad), sin_up]
+    )
+    # A marker that looks at the cameras, upright: x to its reader's right, z along its normal.
+    x = jnp.stack([jnp.sin(view.bearing_rad), -jnp.cos(view.bearing_rad), jnp.zeros_like(sin_up)])
+    facing = rotation_from_matrix(jnp.stack([x, jnp.cross(-sight, x), -sight], axis=1))
+    lean = jnp.stack(
+        [-jnp.sin(view.azimuth_rad), jnp.cos(view.azimuth_rad), jnp.zeros_like(sin_up)]
+    )
+    rotation = (
+        facing
+        @ jaxlie.SO3.exp(view.view_angle_rad * lean)
+        @ jaxlie.SO3.from_z_radians(view.roll_rad)
+    )
+    centers_vehicle = jax.vmap(lambda T: T.inverse().translation())(rig.Ts_camera_vehicle)
+    return jaxlie.SE3.from_rotation_and_translation(
+        rotation, jnp.mean(centers_vehicle, axis=0) + view.range_m * sight
+    )
 
-    def between(index: int, ends: tuple[float, float]) -> Array:
-        return ends[0] + (ends[1] - ends[0]) * draws[index]
 
-    depth_m = FOCAL_PX * SIZE_M / between(0, views.side_px)
-    tilt, noise_px = between(1, views.angle_rad), between(2, views.noise_px)
-    around, roll = 2 * jnp.pi * draws[3], 2 * jnp.pi * draws[4]
-    place = depth_m * jnp.stack([1.2 * draws[5] - 0.6, 0.8 * draws[6] - 0.4, jnp.ones(())])
-    # A marker that looks at the camera, tilted about an axis across the line of sight, rolled.
-    sight = place / jnp.sqrt(jnp.sum(place**2))
-    x = jnp.cross(jnp.asarray([0.0, 1.0, 0.0]), -sight)
-    x = x / jnp.sqrt(jnp.sum(x**2))
-    facing = jaxlie.SO3.from_matrix(jnp.stack([x, jnp.cross(-sight, x), -sight], axis=1))
-    axis = jnp.stack([jnp.cos(around), jnp.sin(around), jnp.zeros(())])
-    tilted = facing @ jaxlie.SO3.exp(tilt * axis) @ jaxlie.SO3.from_z_radians(roll)
-    # The marker is the world, the camera the vehicle.
-    T_camera_world = jaxlie.SE3.from_rotation_and_translation(tilted, place)
-    corners_px = rig.camera(0).project(transform_points(T_camera_world, markers.corners_world_m[0]))
-    corners_px = corners_px + noise_px * jax.random.normal(noise_key, (4, 2))
-    obs = Observation(corners_px[None, None], jnp.ones((1, 1), bool))
-    snapshot = Snapshot.create(rig, markers, obs, noise_px)
-    candidates = find_candidates(snapshot, max_steps=20)
-    nothing_known = ConstantVelocity().poses(ConstantVelocity().init())
-    selection = LowestReprojection()(nothing_known, candidates, snapshot)
-    branch = judge_branch(candidates, selection.selected, T_camera_world.inverse())
-    return Frames(selection.flip_probability, branch.wrong, branch.ambiguous & ~branch.outlier)
+def observe(
+    view: View, errors: CornerErrors, rig: CameraRig, markers: MarkerMap, key: Array
+) -> tuple[Observation, jaxlie.SE3]:
+    """What the cameras see of a marker that is the world, and T_world_vehicle. Of one view."""
+    T_world_vehicle = T_vehicle_world_of(view, rig).inverse()
+    corners_px, visible = see(rig, markers, T_world_vehicle)
+    corners_px = corners_px + corner_errors_px(errors, corners_px.shape, corners_px.dtype, key)
+    return Observation(corners_px, visible), T_world_vehicle
+
+
+def corner_errors_px(
+    errors: CornerErrors, shape: tuple[int, ...], dtype: jnp.dtype, key: Array
+) -> Float[Array, "C M 4 2"]:
+    """What is added to exact corners, shape (C, M, 4, 2)."""
+    noise_key, bias_key, blur_key, streak_key = jax.random.split(key, 4)
+    noise = jax.random.normal(noise_key, shape, dtype)
+    streak = directions(jax.random.uniform(streak_key, shape[:2], dtype))[:, :, None]
+    along = jax.random.uniform(blur_key, shape[:3], dtype, -0.5, 0.5)
+    return (
+        errors.noise_px * noise
+        + errors.bias_px * directions(jax.random.uniform(bias_key, shape[:3], dtype))
+        + errors.blur_px * along[..., None] * streak
+    )
+
+
+def directions(turn: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
+    """Unit vectors in the image, from a turn in [0, 1)."""
+    return jnp.stack([jnp.cos(2 * jnp.pi * turn), jnp.sin(2 * jnp.pi * turn)], axis=-1)

@@ -1,4 +1,4 @@
-"""Selectors by the names of the command line."""
+"""Selectors by the names that files and command lines use."""
 
 from jaxnav.ambiguity import (
     LowestReprojection,

@@ -1,0 +1,244 @@
+"""Closed-loop drives: whether the car arrives, how long it takes, how well it knows its pose.
+
+A trial is one drive of `Rollout`: the navigator's own step, plant, odometer and corners.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.bicycle import Vehicle
+from jaxnav.bicycle_kalman import BicycleKalman
+from jaxnav.markers import MarkerMap
+from jaxnav.navigator import Navigator
+from jaxnav.rig import CameraRig
+from jaxnav.selectors import SELECTORS, make_selector
+from jaxnav.simulation.rollout import Rollout, Trace
+from jaxnav.simulation.scenarios import Scenario, scenarios
+from jaxnav.simulation.scores import Drives
+from jaxnav.studies.config import Config
+from jaxnav.studies.lanes import in_precision
+from jaxnav.studies.parameters import Parameter
+from jaxnav.studies.study import Cell, Rate, Schema, Study, Variable
+
+OUTCOMES = ("arrived", "failed", "left the floor", "invalid")
+ARRIVED, FAILED, LEFT_FLOOR, INVALID = range(4)
+LANES = 128
+
+
+def _positive(description: str, unit: str, default: float | None) -> Parameter:
+    return Parameter(description, unit, default, low=0.0, open_low=True)
+
+
+PARAMETERS = {
+    "scenario": Parameter("what happens", "", "paper", choices=tuple(scenarios()), static=True),
+    "selector": Parameter(
+        "which pose is believed", "", "multi-hypothesis", choices=tuple(SELECTORS), static=True
+    ),
+    "cameras": Parameter(
+        "the first ones of the rig; by default all",
+        "",
+        None,
+        low=1,
+        high=64,
+        whole=True,
+        static=True,
+    ),
+    "corner_noise_px": Parameter("standard deviation of a corner coordinate", "px", 1.0, low=0.0),
+    "corner_bias_px": Parameter(
+        "of every corner, in a direction of its own through all of a drive", "px", 0.0, low=0.0
+    ),
+    "told_noise_px": _positive("sigma the estimator is told (R); else the noise", "px", None),
+    "marker_size_m": _positive("side of every marker; by default the map's", "m", None),
+    "focal_px": _positive("mean of the cameras' focal lengths; else the rig's", "px", None),
+    "process_noise_scale": _positive("times the motion model's Q", "", 1.0),
+    "odometry_noise_scale": _positive("times the odometry's R", "", 1.0),
+    "proportional_per_m": Parameter("gain of the throttle", "1/m", 0.03, low=0.0),
+    "integral_per_ms": Parameter("gain of the throttle", "1/(m s)", 0.005, low=0.0),
+    "waypoint_radius_m": _positive("a waypoint is reached within this", "m", 0.15),
+    "start_x_m": Parameter("where the drive starts; by default the scenario's", "m", None),
+    "start_y_m": Parameter("where the drive starts; by default the scenario's", "m", None),
+    "start_heading_deg": Parameter("of the start; by default the scenario's", "deg", None),
+    "odometer_scale": Parameter(
+        "what the odometer reports over what is true", "", None, low=0.1, high=10.0, static=True
+    ),
+    "duration_s": Parameter(
+        "a drive ends after this", "s", None, low=0.1, high=3600.0, static=True
+    ),
+}
+
+
+SCHEMA = Schema(
+    kind="drive",
+    parameters=PARAMETERS,
+    variables={
+        "outcome": Variable("what became of the drive", dtype="int8", outcomes=OUTCOMES),
+        "ever_wrong": Variable(
+            "whether a decided pose was the wrong one", dtype="int8", outcomes=("no", "yes")
+        ),
+        "wrong_fraction": Variable("of the frames with a pose, heading off by 20 degrees"),
+        "wrong_once_decided_fraction": Variable("of the frames that are decided"),
+        "duration_s": Variable("of the drive", "s"),
+        "time_to_decide_s": Variable("from the start; missing where it never decided", "s"),
+        "position_error_m": Variable("median over the decided frames of a drive", "m"),
+        "position_error_max_m": Variable("largest of the decided frames of a drive", "m"),
+        "rotation_error_deg": Variable("median over the decided frames of a drive", "deg"),
+        "nees": Variable("mean over the decided frames of a drive, 3 degrees of freedom"),
+        "lm_steps": Variable("of the slower candidate, mean over the frames"),
+    },
+    rates={
+        "success_rate": Rate("arrived, of all drives", "outcome", ("arrived",), OUTCOMES),
+        "flip_rate": Rate("ever wrong once decided", "ever_wrong", ("yes",), ("no", "yes")),
+        "invalid_rate": Rate("not finite", "outcome", ("invalid",), OUTCOMES),
+    },
+    box_trials=256,
+)
+
+
+class DriveStudy(Study):
+    """What `jaxnav study drive` runs."""
+
+    schema = SCHEMA
+
+    def __init__(self, config: Config, rig: CameraRig, markers: MarkerMap, vehicle: Vehicle):
+        super().__init__(config)
+        world = (rig, markers, vehicle)
+        self.rig, self.markers, self.vehicle = in_precision(world, config.precision)
+
+    def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
+        with jax.enable_x64(self.config.precision == "float64"):
+            scored = [self._cell(cell, trials) for cell in cells]
+        return {name: np.stack([one[name] for one in scored]) for name in SCHEMA.variables}
+
+    def _cell(self, cell: Cell, trials: range) -> dict[str, np.ndarray]:
+        """The drives of one cell."""
+        scenario = self.scenario(cell)
+        rollout = self.rollout(cell, scenario)
+        # The same shapes, and so the same bits, however many drives are asked for.
+        numbers = np.resize(np.asarray(trials), max(len(trials), rollout.lanes))
+        key = jax.random.key(self.config.seed)
+        keys = jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.asarray(numbers))
+        scores = _scores(rollout.run(keys), scenario)
+        return {name: values[: len(trials)] for name, values in scores.items()}
+
+    @staticmethod
+    def scenario(cell: Cell) -> Scenario:
+        """What happens in a cell."""
+        value: dict[str, Any] = dict(cell)
+        scenario = scenarios()[value["scenario"]]
+        if value["odometer_scale"] is not None:
+            odometry = dataclasses.replace(scenario.odometry, speed_scale=value["odometer_scale"])
+            scenario = dataclasses.replace(scenario, odometry=odometry)
+        if value["duration_s"] is not None:
+            scenario = dataclasses.replace(scenario, duration_s=value["duration_s"])
+        return scenario
+
+    def rollout(self, cell: Cell, scenario: Scenario) -> Rollout:
+        """The simulation of a cell's drives."""
+        value: dict[str, Any] = dict(cell)
+        rig, markers = self._world(value)
+        motion = BicycleKalman(
+            self.vehicle,
+            tilt_sigma_rad=scenario.told_tilt_sigma_rad,
+            height_sigma_m=scenario.told_height_sigma_m,
+        )
+        motion = eqx.tree_at(
+            lambda m: (m.acceleration_density, m.odometry_sigma),
+            motion,
+            (
+                motion.acceleration_density * value["process_noise_scale"],
+                motion.odometry_sigma * np.sqrt(value["odometry_noise_scale"]),
+            ),
+        )
+        told_px = value["told_noise_px"] or max(value["corner_noise_px"], 0.1)
+        navigator = Navigator(
+            rig=rig,
+            markers=markers,
+            vehicle=self.vehicle,
+            waypoints_m=scenario.waypoints_m,
+            waypoint_radius_m=value["waypoint_radius_m"],
+            selector=make_selector(value["selector"]),
+            motion=motion,
+            proportional_per_m=value["proportional_per_m"],
+            integral_per_ms=value["integral_per_ms"],
+            corner_sigma_px=told_px,
+        )
+        starts = [value["start_x_m"], value["start_y_m"], value["start_heading_deg"]]
+        start = [
+            usual if given is None else given
+            for given, usual in zip(
+                [*starts[:2], None if starts[2] is None else np.deg2rad(starts[2])],
+                scenario.start_pose,
+                strict=True,
+            )
+        ]
+        return Rollout(
+            navigator,
+            self.vehicle,
+            markers,
+            scenario,
+            value["corner_noise_px"],
+            value["corner_bias_px"],
+            jnp.asarray(start, float),
+            lanes=min(LANES, self.config.trials),
+            # By the study, not by the chunk: both ways round differently.
+            many=1 if self.config.trials >= Rollout.many else sys.maxsize,
+        )
+
+    def _world(self, value: Mapping[str, Any]) -> tuple[CameraRig, MarkerMap]:
+        rig, markers = jax.tree.map(jnp.asarray, (self.rig, self.markers))
+        rig = rig.first(value["cameras"] or len(rig))
+        if value["focal_px"] is not None:
+            rig = rig.with_focal_px(value["focal_px"])
+        if value["marker_size_m"] is not None:
+            sizes_m = jnp.full_like(markers.size_m, value["marker_size_m"])
+            markers = eqx.tree_at(lambda m: m.size_m, markers, sizes_m)
+        return rig, markers
+
+
+def _scores(trace: Trace, scenario: Scenario) -> dict[str, np.ndarray]:
+    """One number of every drive for each variable."""
+    drives = Drives.of(trace, scenario)
+    on_floor = np.asarray(trace.on_floor).all(axis=1)
+    outcome = np.where(drives.success, ARRIVED, np.where(on_floor, FAILED, LEFT_FLOOR))
+    finite = np.isfinite(np.asarray(trace.pose)).all(axis=2) & np.isfinite(drives.nees)
+    broken = np.any(~finite & drives.counted, axis=1)
+    wrong_decided = drives.wrong & drives.decided
+    yaw_deg = np.rad2deg(drives.yaw_error_rad)
+    return {
+        "outcome": np.where(broken, INVALID, outcome).astype(np.int8),
+        "ever_wrong": np.where(broken, np.iinfo(np.int8).max, wrong_decided.any(axis=1)).astype(
+            np.int8
+        ),
+        "wrong_fraction": _fraction(drives.wrong & drives.counted, drives.counted),
+        "wrong_once_decided_fraction": _fraction(wrong_decided, drives.decided),
+        "duration_s": drives.duration_s.astype(np.float32),
+        "time_to_decide_s": np.where(
+            np.isfinite(drives.time_to_decide_s), drives.time_to_decide_s, np.nan
+        ).astype(np.float32),
+        "position_error_m": _over(np.nanmedian, drives.position_error_m, drives.decided),
+        "position_error_max_m": _over(np.nanmax, drives.position_error_m, drives.decided),
+        "rotation_error_deg": _over(np.nanmedian, yaw_deg, drives.decided),
+        "nees": _over(np.nanmean, drives.nees, drives.decided),
+        "lm_steps": _over(np.nanmean, np.asarray(trace.lm_steps), drives.counted),
+    }
+
+
+def _fraction(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    count = whole.sum(axis=1)
+    fraction = part.sum(axis=1) / np.maximum(count, 1)
+    return np.where(count > 0, fraction, np.nan).astype(np.float32)
+
+
+def _over(statistic: Any, values: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """A statistic of the chosen frames of every drive; NaN where there are none."""
+    some = frames.any(axis=1)
+    chosen = np.where(frames, values, np.nan)
+    chosen[~some, 0] = 0.0  # nothing to warn of
+    return np.where(some, statistic(chosen, axis=1), np.nan).astype(np.float32)

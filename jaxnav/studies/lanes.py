@@ -1,0 +1,84 @@
+"""One function over many lanes: fixed batches, every local device, the same bits whoever runs it.
+
+The batches all have one shape, so that a lane is computed by the same machine code wherever it
+lies. Several devices take a batch each.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+BATCH = 2048
+Tree = TypeVar("Tree")
+
+
+def run_lanes(
+    program: Callable[..., Any],
+    shared: tuple[Any, ...],
+    lanes: tuple[np.ndarray, ...],
+    precision: str,
+) -> dict[str, np.ndarray]:
+    """program(*shared, *lane) -> dict of arrays, for every lane, on the host.
+
+    Args:
+        program: a function of one lane; the same object for the same program, or it is compiled
+            again.
+        shared: what all lanes have in common.
+        lanes: arrays with a common leading axis, floats in any precision.
+        precision: "float32" or "float64".
+    """
+    count = len(lanes[0])
+    with jax.enable_x64(precision == "float64"):
+        devices = tuple(jax.local_devices())
+        batch = BATCH * len(devices)
+        run, sharding = _compiled(program, devices)
+        parts = []
+        for begin in range(0, count, batch):
+            some = in_precision(
+                [_padded(leaf[begin : begin + batch], batch) for leaf in lanes], precision
+            )
+            found = run(in_precision(shared, precision), *jax.device_put(some, sharding))
+            kept = min(batch, count - begin)
+            parts.append({name: leaf[:kept] for name, leaf in jax.device_get(found).items()})
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def in_precision(tree: Tree, precision: str) -> Tree:
+    """Arrays of numbers on the host, its floats as the study computes with them."""
+
+    def one(leaf: Any) -> np.ndarray:
+        array = np.asarray(leaf)
+        return array.astype(precision) if array.dtype.kind == "f" else array
+
+    converted: Tree = jax.tree.map(one, tree)
+    return converted
+
+
+@functools.lru_cache(maxsize=64)
+def _compiled(
+    program: Callable[..., Any], devices: tuple[jax.Device, ...]
+) -> tuple[Callable[..., Any], NamedSharding]:
+    mesh = Mesh(np.array(devices), ("lane",))
+    lane, everywhere = PartitionSpec("lane"), PartitionSpec()
+
+    def batch(shared: tuple[Any, ...], *lanes: jax.Array) -> Any:
+        over_lanes = jax.vmap(lambda *one: program(*shared, *one))
+        if len(devices) == 1:
+            return over_lanes(*lanes)
+        return jax.shard_map(
+            lambda shared, *some: jax.vmap(lambda *one: program(*shared, *one))(*some),
+            mesh=mesh,
+            in_specs=(everywhere, *[lane] * len(lanes)),
+            out_specs=lane,
+            check_vma=False,
+        )(shared, *lanes)
+
+    return jax.jit(batch), NamedSharding(mesh, lane)
+
+
+def _padded(leaf: np.ndarray, length: int) -> np.ndarray:
+    return np.concatenate([leaf, np.repeat(leaf[-1:], length - len(leaf), axis=0)])

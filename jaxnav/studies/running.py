@@ -1,0 +1,187 @@
+"""Runs the boxes of a study that are not done: in this process, or on a Dask cluster.
+
+Whoever runs a box, this process writes it. On a cluster Dask carries tasks and results, restarts
+what a dead worker had, and shows its dashboard.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxnav.errors import BadInput
+from jaxnav.studies.store import Box, StudyStore, versions
+from jaxnav.studies.study import Cell, Study
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_IN_FLIGHT = 2  # boxes for each worker, so that none waits for the next one
+_PATIENCE_S = 30.0  # for a cluster without workers
+Progress = Callable[[int], object]
+
+
+def run_here(store: StudyStore, progress: Progress = lambda done: None) -> None:
+    """Run what is missing in this process, on all its devices; write while the next one runs.
+
+    Raises:
+        BadInput: the store can't be written to.
+    """
+
+    def keep(box: Box, found: Mapping[str, np.ndarray]) -> None:
+        store.write(box, found)
+        progress(store.layout.size(box))
+
+    with ThreadPoolExecutor(1) as writer:
+        writing: Future[None] | None = None
+        try:
+            for box in store.missing():
+                found = run_box(store.study, *_task(store, box))
+                if writing is not None:
+                    writing.result()
+                writing = writer.submit(keep, box, found)
+        finally:
+            if writing is not None:
+                writing.result()
+
+
+def run_on_cluster(
+    store: StudyStore, client: "Client", where: str, progress: Progress = lambda done: None
+) -> None:
+    """Run what is missing on a cluster's workers.
+
+    Args:
+        where: the flag that named the cluster, for messages.
+
+    Raises:
+        BadInput: the store can't be written to; workers die of one box again and again, run other
+            versions, or are gone.
+    """
+    from distributed import wait
+    from distributed.client import FutureCancelledError, FuturesCancelledError
+    from distributed.comm import CommClosedError
+    from distributed.scheduler import KilledWorker
+
+    waiting, lonely_s = store.missing(), 0.0
+    running: dict[Any, Box] = {}
+    try:
+        while True:
+            workers = len(client.scheduler_info(n_workers=-1)["workers"])
+            lonely_s = 0.0 if workers else lonely_s + 1
+            if lonely_s > _PATIENCE_S:
+                raise BadInput(where, f"no worker for {_PATIENCE_S:g} s; {_KEPT}")
+            while len(running) < _IN_FLIGHT * max(workers, 1):
+                box = next(waiting, None)
+                if box is None:
+                    break
+                future = client.submit(
+                    run_box, store.study, *_task(store, box), versions(), pure=False
+                )
+                running[future] = box
+            if not running:
+                return
+            try:
+                wait(list(running), timeout=1.0, return_when="FIRST_COMPLETED")
+            except TimeoutError:
+                continue
+            for future in [f for f in running if f.done()]:
+                box = running.pop(future)
+                store.write(box, future.result())
+                progress(store.layout.size(box))
+    except KilledWorker as error:
+        raise BadInput(
+            where, f"a box killed one worker after the other: {error}; {_KEPT}"
+        ) from None
+    except (FutureCancelledError, FuturesCancelledError, CommClosedError, OSError):
+        raise BadInput(where, f"the scheduler is gone; {_KEPT}") from None
+    except OtherVersions as error:
+        raise BadInput(where, f"{error}; {_KEPT}") from None
+    finally:
+        client.cancel(list(running), force=True)
+
+
+_KEPT = "what is done is kept, the same command goes on"
+
+
+class OtherVersions(RuntimeError):
+    """A worker would compute other bits."""
+
+
+def run_box(
+    study: Study, cells: list[Cell], trials: range, wanted: Mapping[str, str] | None = None
+) -> dict[str, np.ndarray]:
+    """The trials of one box.
+
+    Args:
+        wanted: versions without which it is not run.
+
+    Raises:
+        OtherVersions: these are not they.
+    """
+    here = versions()
+    if wanted is not None and here != wanted:
+        other = ", ".join(f"{n} {here[n]} and not {v}" for n, v in wanted.items() if here[n] != v)
+        raise OtherVersions(f"a worker has {other}")
+    return study.run(cells, trials)
+
+
+def _task(store: StudyStore, box: Box) -> tuple[list[Cell], range]:
+    last = store.layout.region(box)[-1]
+    return [store.study.grid.cell(i) for i in store.layout.cells(box)], range(last.start, last.stop)
+
+
+@contextmanager
+def local_cluster(workers: int) -> Iterator["Client"]:
+    """Worker processes on this machine, one box each at a time."""
+    import logging
+
+    from distributed import Client, LocalCluster
+
+    with (
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+@contextmanager
+def remote_cluster(
+    address: str, prepare: Callable[[], Any], timeout_s: float = 10.0
+) -> Iterator["Client"]:
+    """A cluster that is there already.
+
+    Args:
+        prepare: called in every worker, also in later ones, before it runs anything.
+        timeout_s: how long the scheduler is waited for.
+
+    Raises:
+        BadInput: nobody answers at the address.
+    """
+    import logging
+
+    from distributed import Client, WorkerPlugin
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we say ourselves what happened
+
+    class Prepare(WorkerPlugin):
+        name = "jaxnav"
+
+        def setup(self, worker: Any) -> None:
+            prepare()
+
+    try:
+        client = Client(address, timeout=timeout_s)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else "nobody answers"
+        raise BadInput("--scheduler", f"no Dask scheduler at {address!r}: {reason}") from None
+    with client:
+        client.register_plugin(Prepare())
+        yield client

@@ -1,0 +1,234 @@
+"""Results on disk: one Zarr store a study, which xarray opens.
+
+Boxes are written whole, and only then marked as done, so a study that was killed goes on where it
+was. A store belongs to one config and to one set of versions; others are refused.
+"""
+
+import json
+import math
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+import zarr
+
+from jaxnav.errors import BadInput
+from jaxnav.studies.config import difference
+from jaxnav.studies.layout import Layout
+from jaxnav.studies.study import Study, Variable
+
+_DONE = "done"
+_PACKAGES = ("jaxnav", "jax", "jaxlib", "equinox", "optimistix", "numpy")
+Box = tuple[int, ...]
+
+
+def versions() -> dict[str, str]:
+    """What the bits of a result depend on besides its config."""
+    return {name: version(name) for name in _PACKAGES} | {"backend": jax.default_backend()}
+
+
+class StudyStore:
+    """The store of one study."""
+
+    def __init__(self, path: Path, study: Study):
+        """Opened by `open_store`."""
+        self.path = path
+        self.study = study
+        self._group = _open_group(path, "r+")
+        self._arrays: dict[str, Any] = dict(self._group.arrays())
+        self.layout = read_layout(path)
+
+    def missing(self) -> Iterator[Box]:
+        """The boxes that are not done, in order."""
+        done = np.asarray(self._arrays[_DONE][...])
+        for index in np.argwhere(done == 0):
+            yield tuple(int(i) for i in index)
+
+    def write(self, box: Box, found: Mapping[str, np.ndarray]) -> None:
+        """Keep the results of one box.
+
+        Raises:
+            BadInput: the disk is full, or the store can't be written to.
+        """
+        region = self.layout.region(box)
+        lengths = [part.stop - part.start for part in region]
+        try:
+            for name in self.study.schema.variables:
+                values = found[name]
+                inner = values.shape[1:-1]
+                shaped = values.reshape(*lengths[:-1], *inner, lengths[-1])
+                everything = [slice(None)] * len(inner)
+                self._arrays[name][(*region[:-1], *everything, region[-1])] = shaped
+            self._arrays[_DONE][box] = 1
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise BadInput(
+                self.path, f"can't be written: {reason}; what is in it stays readable"
+            ) from None
+
+
+def open_store(path: Path, study: Study, box_trials: int | None = None) -> StudyStore:
+    """The store of a study: a new one, or the one that was begun.
+
+    Raises:
+        BadInput: it is not a study's, belongs to another, or can't be made.
+    """
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        _create(path, study, box_trials or study.schema.box_trials)
+    found = read_attributes(path)
+    wanted = {"config": study.config.to_dict(), "versions": versions()}
+    differing = [
+        line for key in ("config", "versions") for line in difference(wanted[key], found[key])
+    ]
+    if differing:
+        raise BadInput(
+            path,
+            f"holds another study and is not mixed with this one: {'; '.join(differing)}",
+        )
+    return StudyStore(path, study)
+
+
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Config and versions of a store.
+
+    Raises:
+        BadInput: it is not a store of a study.
+    """
+    attributes: dict[str, Any] = dict(_open_group(path, "r").attrs)
+    try:
+        return {key: json.loads(attributes[key]) for key in ("config", "versions")}
+    except (KeyError, TypeError, ValueError):
+        raise BadInput(path, "is not a store of jaxnav study") from None
+
+
+def read_dataset(path: Path) -> xr.Dataset:
+    """All trials of a store, lazily: nothing is loaded before it is asked for.
+
+    Raises:
+        BadInput: it is not a store of a study.
+    """
+    read_attributes(path)
+    whole = xr.open_zarr(path, chunks=None, consolidated=False, mask_and_scale=False)
+    return whole.drop_vars(_DONE)
+
+
+def read_layout(path: Path) -> Layout:
+    """How the store is cut.
+
+    Raises:
+        BadInput: it is not a store of a study.
+    """
+    cut = dict(_open_group(path, "r")[_DONE].attrs)
+    return Layout(tuple(cut["shape"]), tuple(cut["box"]))  # type: ignore[arg-type]
+
+
+def count_done(path: Path) -> int:
+    """How many trials of all cells are in a store.
+
+    Raises:
+        BadInput: it is not a store of a study.
+    """
+    done: Any = _open_group(path, "r")[_DONE]
+    layout = read_layout(path)
+    return sum(layout.size(box) for box in np.argwhere(done[...] == 1).tolist())
+
+
+def _open_group(path: Path, mode: Any) -> zarr.Group:
+    if not path.exists():
+        raise BadInput(path, "doesn't exist")
+    try:
+        group = zarr.open_group(path, mode=mode)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BadInput(path, f"is not a store of jaxnav study ({reason})") from None
+    if _DONE not in group:
+        raise BadInput(path, "is not a store of jaxnav study")
+    return group
+
+
+def _create(path: Path, study: Study, most: int) -> None:
+    """A new store, whole or not at all."""
+    config = study.config
+    axes = study.grid.outer_axes
+    layout = Layout.of([*map(len, axes.values()), config.trials], most)
+    beside = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            group = zarr.create_group(
+                beside,
+                attributes={
+                    "title": f"jaxnav study {study.schema.kind}",
+                    "config": json.dumps(config.to_dict()),
+                    "versions": json.dumps(versions()),
+                },
+            )
+            for name, values in config.axes.items():
+                parameter = study.schema.parameters[name]
+                array = np.asarray(values) if not parameter.choices else np.asarray(values, object)
+                _coordinate(group, name, array, parameter.unit, parameter.description)
+            for name, variable in study.schema.variables.items():
+                _empty(group, name, variable, study, layout)
+            done = group.create_array(
+                _DONE,
+                shape=layout.counts,
+                chunks=(1,) * len(layout.counts),
+                dtype="int8",
+                fill_value=0,
+                dimension_names=[f"{name}_box" for name in (*axes, "trial")],
+                compressors=None,
+            )
+            done.attrs.update({"shape": list(layout.shape), "box": list(layout.box)})
+            if path.exists():
+                path.rmdir()
+            beside.rename(path)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise BadInput(path, f"can't be made: {reason}") from None
+
+
+def _coordinate(
+    group: zarr.Group, name: str, values: np.ndarray, unit: str, description: str
+) -> None:
+    dtype: Any = "string" if values.dtype == object else values.dtype
+    array = group.create_array(
+        name, shape=values.shape, chunks=values.shape, dtype=dtype, dimension_names=[name]
+    )
+    array[...] = values
+    array.attrs.update({"units": unit or "1", "long_name": description})
+
+
+def _empty(group: zarr.Group, name: str, variable: Variable, study: Study, layout: Layout) -> None:
+    dimensions = study.grid.dimensions(variable)
+    places = dict(zip((*study.grid.outer_axes, "trial"), range(len(layout.shape)), strict=True))
+    shape, box = [], []
+    for dimension in dimensions:
+        if dimension in places:
+            shape.append(layout.shape[places[dimension]])
+            box.append(layout.box[places[dimension]])
+        else:
+            shape.append(len(study.config.axes[dimension]))
+            box.append(shape[-1])
+    dtype = np.dtype(variable.dtype)
+    missing = math.nan if dtype.kind == "f" else np.iinfo(dtype).max
+    array = group.create_array(
+        name,
+        shape=shape,
+        chunks=tuple(box),
+        dtype=dtype,
+        fill_value=missing,
+        dimension_names=dimensions,
+    )
+    attributes: dict[str, Any] = {"units": variable.unit or "1", "long_name": variable.description}
+    if variable.outcomes:
+        attributes["flag_values"] = list(range(len(variable.outcomes)))
+        attributes["flag_meanings"] = " ".join(variable.outcomes)
+    array.attrs.update(attributes)

@@ -1,0 +1,92 @@
+"""What all kinds of study have in common: cells times trials in, named variables out."""
+
+import abc
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from jaxnav.studies.config import Config
+from jaxnav.studies.parameters import Parameter, Value
+
+Cell = Mapping[str, Value]  # a value of every parameter
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One thing that is measured in every trial."""
+
+    description: str
+    unit: str = ""
+    dtype: str = "float32"  # a missing one is NaN, or the largest int
+    of_selector: bool = False  # measured once for each selector of the axis of that name
+    outcomes: tuple[str, ...] = ()  # what the numbers of an int8 mean
+    among: tuple[str, ...] = ()  # the outcomes it is summed up over; all by default
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A proportion: trials with one of some outcomes among those with one of others."""
+
+    description: str
+    variable: str
+    of: tuple[str, ...]
+    among: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Schema:
+    """A kind of study: what it can vary and what it measures."""
+
+    kind: str
+    parameters: Mapping[str, Parameter]
+    variables: Mapping[str, Variable]
+    rates: Mapping[str, Rate]
+    box_trials: int  # that are run and written together, unless a person says otherwise
+    inner: tuple[str, ...] = ()  # axes that every trial runs through by itself
+    predicted: str | None = None  # the variable that is the probability of `flip_rate`
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The labelled grid of one study."""
+
+    schema: Schema
+    config: Config
+
+    @property
+    def outer_axes(self) -> dict[str, Sequence[Value]]:
+        """The axes that are not `inner`."""
+        return {n: v for n, v in self.config.axes.items() if n not in self.schema.inner}
+
+    def dimensions(self, variable: Variable) -> tuple[str, ...]:
+        """The names of a variable's dimensions."""
+        inner = self.schema.inner if variable.of_selector else ()
+        return (*self.outer_axes, *(n for n in inner if n in self.config.axes), "trial")
+
+    def cell(self, index: Sequence[int]) -> Cell:
+        """The cell at a place of the outer axes."""
+        axes = self.outer_axes.items()
+        varied = {name: values[i] for (name, values), i in zip(axes, index, strict=True)}
+        return {**self.config.fixed, **varied}
+
+
+class Study(abc.ABC):
+    """A study that can run any part of itself. It can be pickled, and holds no device arrays."""
+
+    schema: ClassVar[Schema]
+
+    def __init__(self, config: Config):
+        self.grid = Grid(self.schema, config)
+
+    @property
+    def config(self) -> Config:
+        """What the study is."""
+        return self.grid.config
+
+    @abc.abstractmethod
+    def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
+        """Every variable of these trials of these cells, (cells, trials) or (cells, selectors,
+        trials). A trial's bits depend on its cell and its number alone.
+        """
