@@ -109,7 +109,7 @@ class MultiHypothesis(eqx.Module):
             heir=jax.lax.cond(
                 jnp.sum(alive) > 1,
                 lambda: self._heirs(after, log_weight, alive, prior.freedom, snapshot),
-                lambda: jnp.arange(self.hypotheses),
+                lambda: jnp.arange(count),
             ),
             costs=costs,
             selected=jnp.where(jnp.any(candidates.valid) & located, jnp.argmin(costs), -1),

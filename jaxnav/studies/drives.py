@@ -4,6 +4,7 @@ A trial is one drive of `Rollout`: the navigator's own step, plant, odometer and
 """
 
 import dataclasses
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -29,6 +30,7 @@ from jaxnav.studies.study import Cell, Rate, Schema, Study, Variable
 OUTCOMES = ("arrived", "failed", "left the floor", "invalid")
 ARRIVED, FAILED, LEFT_FLOOR, INVALID = range(4)
 LANES = 128
+_MANY_TRIALS = 8192
 
 
 def _positive(description: str, unit: str, default: float | None) -> Parameter:
@@ -110,6 +112,16 @@ class DriveStudy(Study):
         world = (rig, markers, vehicle)
         self.rig, self.markers, self.vehicle = in_precision(world, config.precision)
 
+    @property
+    def box_trials(self) -> int:
+        """Few enough to see it move; as many as fill the lanes where it takes the fast path."""
+        return _MANY_TRIALS if self._many else self.schema.box_trials
+
+    @property
+    def _many(self) -> bool:
+        """By the study, not by the box: few drives and many are computed in different ways."""
+        return self.config.trials >= Rollout.many
+
     def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
         with jax.enable_x64(self.config.precision == "float64"):
             scored = [self._cell(cell, trials) for cell in cells]
@@ -120,7 +132,8 @@ class DriveStudy(Study):
         scenario = self.scenario(cell)
         rollout = self.rollout(cell, scenario)
         # The same shapes, and so the same bits, however many drives are asked for.
-        numbers = np.resize(np.asarray(trials), max(len(trials), rollout.lanes))
+        lanes = 0 if self._many else rollout.lanes
+        numbers = np.resize(np.asarray(trials), max(len(trials), lanes))
         key = jax.random.key(self.config.seed)
         keys = jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.asarray(numbers))
         scores = _scores(rollout.run(keys), scenario)
@@ -186,6 +199,7 @@ class DriveStudy(Study):
             value["corner_bias_px"],
             jnp.asarray(start, float),
             lanes=min(LANES, self.config.trials),
+            many=1 if self._many else sys.maxsize,
         )
 
     def _world(self, value: Mapping[str, Any]) -> tuple[CameraRig, MarkerMap]:

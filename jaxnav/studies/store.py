@@ -80,7 +80,7 @@ def open_store(path: Path, study: Study, box_trials: int | None = None) -> Study
         BadInput: it is not a study's, belongs to another, or can't be made.
     """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        _create(path, study, box_trials or study.schema.box_trials)
+        _create(path, study, box_trials or study.box_trials)
     found = read_attributes(path)
     wanted = {"config": study.config.to_dict(), "versions": versions()}
     differing = [

@@ -43,7 +43,7 @@ class Schema:
     parameters: Mapping[str, Parameter]
     variables: Mapping[str, Variable]
     rates: Mapping[str, Rate]
-    box_trials: int  # that are run and written together, unless a person says otherwise
+    box_trials: int  # of a study, as a rule
     inner: tuple[str, ...] = ()  # axes that every trial runs through by itself
     predicted: str | None = None  # the variable that is the probability of `flip_rate`
 
@@ -84,6 +84,11 @@ class Study(abc.ABC):
     def config(self) -> Config:
         """What the study is."""
         return self.grid.config
+
+    @property
+    def box_trials(self) -> int:
+        """How many trials are run and written together, unless a person says otherwise."""
+        return self.schema.box_trials
 
     @abc.abstractmethod
     def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
