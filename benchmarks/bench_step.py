@@ -18,7 +18,7 @@ from typing import Any
 
 from jaxnav.commands.process import configure_jax
 
-configure_jax(float64=False)  # before the first array, as the commands do
+configure_jax(float64=False, threads=1)  # before the first array, as the commands do
 
 import cv2  # noqa: E402
 import equinox as eqx  # noqa: E402

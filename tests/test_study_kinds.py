@@ -276,6 +276,9 @@ def test_the_shipped_configs_are_studies(kind: str, capsys: pytest.CaptureFixtur
     assert all(name in out for name in [*names, *study.schema.parameters])
 
 
-def test_a_rig_has_as_many_cameras_as_it_has(tmp_path: Path) -> None:
+def test_a_rig_has_as_many_cameras_as_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("jaxnav.commands.study.configure_jax", lambda float64: None)
     (tmp_path / "s.yaml").write_text("trials: 1\nrig: qcar\naxes: {cameras: [1, 5]}\n")
     assert main(["study", "ambiguity", str(tmp_path / "s.yaml")]) == 2

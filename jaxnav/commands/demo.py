@@ -42,7 +42,7 @@ KEEP_EVERY = 8  # of so many frames one keeps its images, for the mosaic
 
 def run(args: Demo) -> int:
     """Drive, report, and say in one line how it went."""
-    configure_jax(float64=True)
+    configure_jax(float64=True, threads=1)
     world = World.load(args)
     out = output_folder(args.out)
     methods = Methods(

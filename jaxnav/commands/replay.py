@@ -21,7 +21,7 @@ SETTLED_FRAMES = 5  # of an appearance: a choice made later has had a history
 
 def run(args: Arguments) -> int:
     """Localise, write the trajectory, and measure it where there is a reference."""
-    configure_jax(float64=True)
+    configure_jax(float64=True, threads=1)
     recording = read_recording(
         args.recording,
         None if args.rig is None else load_rig(args.rig),

@@ -110,7 +110,9 @@ class Rollout(eqx.Module):
         waiting, lock = deque(range(len(keys))), threading.Lock()
         compiling = threading.Lock()  # one thread does it for all
 
-        def work(_: int) -> None:
+        over_all = threading.Event()
+
+        def work() -> None:
             owner = np.full(lanes, -1)
             worlds = self._start(keys[np.zeros(lanes, int)])
             over = np.ones(lanes, bool)
@@ -118,7 +120,7 @@ class Rollout(eqx.Module):
             while True:
                 with lock:
                     owner[over] = [waiting.popleft() if waiting else -1 for _ in range(over.sum())]
-                if not np.any(owner >= 0):
+                if over_all.is_set() or not np.any(owner >= 0):
                     return
                 starts = over & (owner >= 0)
                 if np.any(starts):
@@ -134,8 +136,22 @@ class Rollout(eqx.Module):
                     progress(int(over.sum()))
 
         threads = max(1, min(threads, -(-len(keys) // lanes)))
+        if threads == 1:
+            work()
+            return drives.side_by_side()
+        float64 = jnp.zeros(()).dtype == jnp.float64  # which a thread would not know
+
+        def work_alike() -> None:
+            with jax.enable_x64(float64):
+                work()
+
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, range(threads)))
+            working = [pool.submit(work_alike) for _ in range(threads)]
+            try:
+                for one in working:
+                    one.result()
+            finally:
+                over_all.set()  # an interruption or a failure ends all of them
         return drives.side_by_side()
 
     @eqx.filter_jit
