@@ -7,19 +7,19 @@ Peers run in the same process and take turns, OpenCV on one thread and on the fi
 batch; figures are medians over the rounds. Precision is float32, flags are those of the commands.
 """
 
-import contextlib
 import functools
 import importlib.metadata
 import os
 import platform
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import jax
 import jax.numpy as jnp
+import jaxlie
 import lineax as lx
 import numpy as np
 import optimistix as optx
@@ -30,7 +30,6 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from jaxnav import refine
 from jaxnav.commands.process import configure_jax
 from jaxnav.ippe import PosePair, ippe_square
-from jaxnav.levenberg_marquardt import NormalEquationsLM
 from jaxnav.markers import CORNER_SIGNS
 from jaxnav.pair_lanes import ippe_squares, solve_pairs
 
@@ -98,32 +97,34 @@ def single_thread(corners: np.ndarray, refined: bool) -> Task:
     return lambda: opencv_pairs(corners, refined), len(corners)
 
 
-def one_by_one(
-    corners: np.ndarray, make_solver: Callable[..., optx.AbstractLeastSquaresSolver]
-) -> Task:
-    """`solve_marker` under vmap, by at most `STEPS` steps of a solver."""
-
-    def run(corners: jax.Array, sizes: jax.Array) -> PosePair:
-        with _solver(make_solver):
-            one = functools.partial(refine.solve_marker, max_steps=STEPS)
-            return jax.vmap(one)(corners, sizes)
-
-    return _compiled(run, corners)
+def one_by_one(corners: np.ndarray) -> Task:
+    """`solve_marker` under vmap, by at most `STEPS` steps."""
+    one = functools.partial(refine.solve_marker, max_steps=STEPS)
+    return _compiled(lambda corners, sizes: jax.vmap(one)(corners, sizes), corners)
 
 
-@contextlib.contextmanager
-def _solver(make: Callable[..., optx.AbstractLeastSquaresSolver]) -> Iterator[None]:
-    own = refine.NormalEquationsLM
-    refine.NormalEquationsLM = make  # type: ignore[assignment,misc]
-    try:
-        yield
-    finally:
-        refine.NormalEquationsLM = own  # type: ignore[misc]
+def builtin_lm(corners: np.ndarray) -> Task:
+    """The same minima by optimistix's own solver, as good as it gets."""
+    solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4, linear_solver=lx.Normal(lx.Cholesky()))
 
+    def one_marker(corners_n: jax.Array, size_m: jax.Array) -> jax.Array:
+        marker = refine._SingleMarker(corners_n, size_m)
 
-def builtin_lm(rtol: float, atol: float) -> optx.AbstractLeastSquaresSolver:
-    """optimistix's own, as good as it gets."""
-    return optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4, linear_solver=lx.Normal(lx.Cholesky()))
+        def one_pose(wxyz_xyz: jax.Array) -> jax.Array:
+            chart = marker.chart(jaxlie.SE3(wxyz_xyz[None]))
+            linearised = chart.linearised(marker.rows, jnp.eye(6))
+            solution = optx.least_squares(
+                lambda y, _: linearised(y[:, None])[0][:, 0],
+                solver,
+                jnp.zeros(6),
+                max_steps=STEPS,
+                throw=False,
+            )
+            return chart.transform(solution.value[:, None]).wxyz_xyz[0]
+
+        return jax.vmap(one_pose)(ippe_square(corners_n, size_m).T_camera_marker.wxyz_xyz)
+
+    return _compiled(lambda corners, sizes: jax.vmap(one_marker)(corners, sizes), corners)
 
 
 def medians_us(tasks: dict[str, Task]) -> dict[str, np.ndarray]:
@@ -245,9 +246,8 @@ def test_refined(benchmark: BenchmarkFixture, corners: np.ndarray, name: str) ->
 @pytest.mark.parametrize("name", ["own", "optimistix"])
 def test_general(benchmark: BenchmarkFixture, corners: np.ndarray, name: str) -> None:
     """`solve_marker` under vmap: our step and optimistix's."""
-    run, benchmark.extra_info["items"] = one_by_one(
-        corners[:GENERAL_LANES], NormalEquationsLM if name == "own" else builtin_lm
-    )
+    general = one_by_one if name == "own" else builtin_lm
+    run, benchmark.extra_info["items"] = general(corners[:GENERAL_LANES])
     benchmark(run)
 
 
@@ -268,8 +268,8 @@ def main() -> None:
             "OpenCV IPPE_SQUARE + 2 refineLM": single_thread(few, refined=True),
             "solve_markers": _compiled(solve_pairs, many),
             "solve_markers, 1 px": _compiled(solve_pairs, noisy),
-            f"solve_marker, vmap, {STEPS} steps at most": one_by_one(some, NormalEquationsLM),
-            "the same by optimistix.LevenbergMarquardt": one_by_one(some, builtin_lm),
+            f"solve_marker, vmap, {STEPS} steps at most": one_by_one(some),
+            "the same by optimistix.LevenbergMarquardt": builtin_lm(some),
         }
     )
     model = _cpu_model()

@@ -155,7 +155,7 @@ class ImplicitGradient(optx.AbstractAdjoint):
     """Derivatives of N minima (n, N) by the implicit function theorem: dy = -H^-1 d(gradient).
 
     What `optimistix.ImplicitAdjoint` computes, less its check of the linear solve, which calls
-    the host and raises there. Where the Hessian is singular the derivative is zero.
+    the host and raises there. Where the Hessian is not positive definite the derivative is zero.
     """
 
     def apply(
@@ -196,7 +196,7 @@ def _moving_with_jvp(
     n, lanes = root.shape
     directions = jnp.broadcast_to(jnp.eye(n, dtype=root.dtype)[:, :, None], (n, n, lanes))
     columns = jax.vmap(push_forward)(directions)
-    inverse = jnp.linalg.inv(jnp.transpose(columns, (2, 1, 0)))
-    solvable = jnp.all(jnp.isfinite(inverse), axis=(1, 2))
-    inverse = jnp.where(solvable[:, None, None], inverse, 0)
-    return root, -jnp.einsum("lij,jl->il", inverse, t_gradient)
+    inverse = jax.vmap(solve_positive, in_axes=(None, 0))(columns, directions)
+    solvable = jnp.all(jnp.isfinite(inverse), axis=(0, 1))
+    inverse = jnp.where(solvable[None, None], inverse, 0)
+    return root, -jnp.sum(inverse * t_gradient[:, None], axis=0)

@@ -75,8 +75,8 @@ class Rollout(eqx.Module):
     """Drives of one navigator in one scenario, compiled once for a batch of lanes.
 
     A lane whose drive has ended takes the next seed, so that long drives keep nobody waiting. Many
-    drives run through `over_lanes`, a thread for each core: ten times as fast as `vmap`, which
-    compiles ten times as fast and so is for a few.
+    drives run through `over_lanes`, a thread for each core or device: ten times as fast as `vmap`,
+    which compiles ten times as fast and so is for a few.
     """
 
     navigator: Navigator
@@ -106,6 +106,9 @@ class Rollout(eqx.Module):
             lanes, threads, advance = min(self.lanes, len(keys)), 1, self._advance
         else:
             lanes, threads, advance = self.many_lanes, self.threads, self._advance_many
+        devices = jax.local_devices()
+        if len(devices) > 1:
+            threads = len(devices)  # every device has one, and runs what another would run
         drives = _Drives(len(keys), self.chunk_frames)
         waiting, lock = deque(range(len(keys))), threading.Lock()
         compiling = threading.Lock()  # one thread does it for all
@@ -141,12 +144,12 @@ class Rollout(eqx.Module):
             return drives.side_by_side()
         float64 = jnp.zeros(()).dtype == jnp.float64  # which a thread would not know
 
-        def work_alike() -> None:
-            with jax.enable_x64(float64):
+        def work_alike(number: int) -> None:
+            with jax.enable_x64(float64), jax.default_device(devices[number % len(devices)]):
                 work()
 
         with ThreadPoolExecutor(threads) as pool:
-            working = [pool.submit(work_alike) for _ in range(threads)]
+            working = [pool.submit(work_alike, number) for number in range(threads)]
             try:
                 for one in working:
                     one.result()
