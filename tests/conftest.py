@@ -20,7 +20,8 @@ from jaxtyping import install_import_hook
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"
     + (" --xla_cpu_max_isa=SSE4_2" if platform.machine() == "x86_64" else ""),
 )
 jax.config.update("jax_enable_compilation_cache", False)  # not even its keys
