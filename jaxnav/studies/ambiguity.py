@@ -32,17 +32,12 @@ from jaxnav.simulation.single_frames import (
 )
 from jaxnav.studies.config import Config
 from jaxnav.studies.lanes import in_precision, run_lanes
-from jaxnav.studies.parameters import RANDOM, Parameter
+from jaxnav.studies.parameters import RANDOM, Parameter, cameras, positive, told_noise_px
 from jaxnav.studies.study import Cell, Rate, Schema, Study, Variable
 
 RIGHT, FLIPPED, DECLINED, OUTLIER, UNSEEN, INVALID = range(6)
 OUTCOMES = ("right", "flipped", "declined", "outlier", "unseen", "invalid")
 PINHOLE_FOCAL_PX = 320.0
-_LEAST_TOLD_PX = 0.1  # a noise-free corner is still not told to be exact
-
-
-def _length(description: str, unit: str, default: float | None) -> Parameter:
-    return Parameter(description, unit, default, low=0.0, open_low=True)
 
 
 def _error(description: str, default: float) -> Parameter:
@@ -54,7 +49,7 @@ def _angle(description: str) -> Parameter:
 
 
 PARAMETERS = {
-    "range_m": _length("from the cameras to the marker's centre", "m", 2.0),
+    "range_m": positive("from the cameras to the marker's centre", "m", 2.0),
     "view_angle_deg": Parameter(
         "between the marker's normal and the line of sight", "deg", 30.0, low=0.0, high=89.0
     ),
@@ -62,23 +57,15 @@ PARAMETERS = {
     "roll_deg": _angle("of the marker about its normal"),
     "bearing_deg": _angle("of the marker, left of straight ahead"),
     "elevation_deg": Parameter("of the marker above the horizon", "deg", 0.0, low=-80.0, high=80.0),
-    "marker_size_m": _length("side of the black square", "m", 0.172),
-    "focal_px": _length("of every camera; by default 320, or a rig file's own", "px", None),
+    "marker_size_m": positive("side of the black square", "m", 0.172),
+    "focal_px": positive("of every camera; by default 320, or a rig file's own", "px", None),
     "corner_noise_px": _error("standard deviation of a corner coordinate", 0.5),
     "corner_bias_px": _error("of every corner, in a direction of its own, never told", 0.0),
     "blur_px": _error("length of a streak, each corner is found anywhere in it", 0.0),
-    "told_noise_px": _length("sigma the estimator is told (R); else the noise", "px", None),
-    "prior_position_sigma_m": _length("of a prediction's error; by default none", "m", None),
-    "prior_angle_sigma_deg": _length("of a prediction's error; by default none", "deg", None),
-    "cameras": Parameter(
-        "side by side, or the first ones of the rig file",
-        "",
-        None,
-        low=1,
-        high=64,
-        whole=True,
-        static=True,
-    ),
+    "told_noise_px": positive("sigma the estimator is told (R); else the noise", "px", None),
+    "prior_position_sigma_m": positive("of a prediction's error; by default none", "m", None),
+    "prior_angle_sigma_deg": positive("of a prediction's error; by default none", "deg", None),
+    "cameras": cameras("side by side, or the first ones of the rig file"),
     "baseline_m": Parameter(
         "between cameras that stand side by side", "m", 0.2, low=0.0, static=True
     ),
@@ -148,8 +135,8 @@ class AmbiguityStudy(Study):
             name: np.empty((len(cells), *self._inner_shape(variable), len(trials)), variable.dtype)
             for name, variable in SCHEMA.variables.items()
         }
-        for (cameras, baseline_m, max_steps), members in programs.items():
-            rig = self._rig(cameras, baseline_m)
+        for (count, baseline_m, max_steps), members in programs.items():
+            rig = self._rig(count, baseline_m)
             numbers = [_numbers(cells[i], rig) for i in members]
             lanes = run_lanes(
                 _program(self._selectors, max_steps),
@@ -171,19 +158,18 @@ class AmbiguityStudy(Study):
         on_axis = variable.of_selector and "selector" in self.config.axes
         return (len(self._selectors),) if on_axis else ()
 
-    def _rig(self, cameras: int | None, baseline_m: float) -> CameraRig:
+    def _rig(self, count: int | None, baseline_m: float) -> CameraRig:
         if self.rig is None:
             with jax.enable_x64(True):
-                pinhole = pinhole_rig(cameras or 1, PINHOLE_FOCAL_PX, baseline_m)
+                pinhole = pinhole_rig(count or 1, PINHOLE_FOCAL_PX, baseline_m)
             return in_precision(pinhole, self.config.precision)
-        return self.rig.first(cameras or len(self.rig))
+        return self.rig.first(count or len(self.rig))
 
 
 def _numbers(cell: Cell, rig: CameraRig) -> list[float]:
     """The values that are traced, in the order of `_NUMBERS`. NaN: random, or none."""
     filled: dict[str, Any] = dict(cell)
-    if cell["told_noise_px"] is None:
-        filled["told_noise_px"] = max(filled["corner_noise_px"], _LEAST_TOLD_PX)
+    filled["told_noise_px"] = told_noise_px(filled["told_noise_px"], filled["corner_noise_px"])
     if cell["focal_px"] is None:
         filled["focal_px"] = np.mean(rig.cameras.focal_px)
     return [np.nan if filled[n] in (None, RANDOM) else float(filled[n]) for n in _NUMBERS]

@@ -24,7 +24,7 @@ from jaxnav.simulation.scenarios import Scenario, scenarios
 from jaxnav.simulation.scores import Drives
 from jaxnav.studies.config import Config
 from jaxnav.studies.lanes import in_precision
-from jaxnav.studies.parameters import Parameter
+from jaxnav.studies.parameters import Parameter, cameras, positive, told_noise_px
 from jaxnav.studies.study import Cell, Rate, Schema, Study, Variable
 
 OUTCOMES = ("arrived", "failed", "left the floor", "invalid")
@@ -33,36 +33,24 @@ LANES = 128
 _MANY_TRIALS = 8192
 
 
-def _positive(description: str, unit: str, default: float | None) -> Parameter:
-    return Parameter(description, unit, default, low=0.0, open_low=True)
-
-
 PARAMETERS = {
     "scenario": Parameter("what happens", "", "paper", choices=tuple(scenarios()), static=True),
     "selector": Parameter(
         "which pose is believed", "", "multi-hypothesis", choices=tuple(SELECTORS), static=True
     ),
-    "cameras": Parameter(
-        "the first ones of the rig; by default all",
-        "",
-        None,
-        low=1,
-        high=64,
-        whole=True,
-        static=True,
-    ),
+    "cameras": cameras("the first ones of the rig; by default all"),
     "corner_noise_px": Parameter("standard deviation of a corner coordinate", "px", 1.0, low=0.0),
     "corner_bias_px": Parameter(
         "of every corner, in a direction of its own through all of a drive", "px", 0.0, low=0.0
     ),
-    "told_noise_px": _positive("sigma the estimator is told (R); else the noise", "px", None),
-    "marker_size_m": _positive("side of every marker; by default the map's", "m", None),
-    "focal_px": _positive("mean of the cameras' focal lengths; else the rig's", "px", None),
-    "process_noise_scale": _positive("times the motion model's Q", "", 1.0),
-    "odometry_noise_scale": _positive("times the odometry's R", "", 1.0),
+    "told_noise_px": positive("sigma the estimator is told (R); else the noise", "px", None),
+    "marker_size_m": positive("side of every marker; by default the map's", "m", None),
+    "focal_px": positive("mean of the cameras' focal lengths; else the rig's", "px", None),
+    "process_noise_scale": positive("times the motion model's Q", "", 1.0),
+    "odometry_noise_scale": positive("times the odometry's R", "", 1.0),
     "proportional_per_m": Parameter("gain of the throttle", "1/m", 0.03, low=0.0),
     "integral_per_ms": Parameter("gain of the throttle", "1/(m s)", 0.005, low=0.0),
-    "waypoint_radius_m": _positive("a waypoint is reached within this", "m", 0.15),
+    "waypoint_radius_m": positive("a waypoint is reached within this", "m", 0.15),
     "start_x_m": Parameter("where the drive starts; by default the scenario's", "m", None),
     "start_y_m": Parameter("where the drive starts; by default the scenario's", "m", None),
     "start_heading_deg": Parameter("of the start; by default the scenario's", "deg", None),
@@ -168,7 +156,7 @@ class DriveStudy(Study):
                 motion.odometry_sigma * np.sqrt(value["odometry_noise_scale"]),
             ),
         )
-        told_px = value["told_noise_px"] or max(value["corner_noise_px"], 0.1)
+        told_px = told_noise_px(value["told_noise_px"], value["corner_noise_px"])
         navigator = Navigator(
             rig=rig,
             markers=markers,

@@ -37,11 +37,10 @@ def run_lanes(
         batch = BATCH * len(devices)
         run, sharding = _compiled(program, devices)
         parts = []
+        shared, lanes = in_precision((shared, lanes), precision)
         for begin in range(0, count, batch):
-            some = in_precision(
-                [_padded(leaf[begin : begin + batch], batch) for leaf in lanes], precision
-            )
-            found = run(in_precision(shared, precision), *jax.device_put(some, sharding))
+            some = [_padded(leaf[begin : begin + batch], batch) for leaf in lanes]
+            found = run(shared, *jax.device_put(some, sharding))
             kept = min(batch, count - begin)
             parts.append({name: leaf[:kept] for name, leaf in jax.device_get(found).items()})
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -65,12 +64,14 @@ def _compiled(
     mesh = Mesh(np.array(devices), ("lane",))
     lane, everywhere = PartitionSpec("lane"), PartitionSpec()
 
+    def on_one_device(shared: tuple[Any, ...], *lanes: jax.Array) -> Any:
+        return jax.vmap(lambda *one: program(*shared, *one))(*lanes)
+
     def batch(shared: tuple[Any, ...], *lanes: jax.Array) -> Any:
-        over_lanes = jax.vmap(lambda *one: program(*shared, *one))
         if len(devices) == 1:
-            return over_lanes(*lanes)
+            return on_one_device(shared, *lanes)
         return jax.shard_map(
-            lambda shared, *some: jax.vmap(lambda *one: program(*shared, *one))(*some),
+            on_one_device,
             mesh=mesh,
             in_specs=(everywhere, *[lane] * len(lanes)),
             out_specs=lane,

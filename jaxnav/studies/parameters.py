@@ -12,6 +12,7 @@ from jaxnav.errors import BadInput
 Value = float | int | str | None
 RANDOM = "random"
 _MAX_VALUES = 100_000
+_LEAST_TOLD_PX = 0.1
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,21 @@ class Parameter:
         low = f"{'>' if self.open_low else '>='} {self.low:g}" if self.low > -math.inf else ""
         high = f"<= {self.high:g}" if self.high < math.inf else ""
         return " and ".join(bound for bound in (low, high) if bound)
+
+
+def positive(description: str, unit: str, default: float | None) -> Parameter:
+    """A number above zero."""
+    return Parameter(description, unit, default, low=0.0, open_low=True)
+
+
+def cameras(description: str) -> Parameter:
+    """How many cameras there are."""
+    return Parameter(description, "", None, low=1, high=64, whole=True, static=True)
+
+
+def told_noise_px(told_px: float | None, noise_px: float) -> float:
+    """The sigma an estimator is told: the noise, if nothing is said; never that all is exact."""
+    return max(noise_px, _LEAST_TOLD_PX) if told_px is None else told_px
 
 
 def _spaced(given: Mapping[str, Any], where: str) -> list[float]:

@@ -64,7 +64,7 @@ def run_on_cluster(
     from distributed.comm import CommClosedError
     from distributed.scheduler import KilledWorker
 
-    waiting, lonely_s = store.missing(), 0.0
+    waiting, lonely_s, wanted = store.missing(), 0.0, versions()
     running: dict[Any, Box] = {}
     try:
         while True:
@@ -76,9 +76,7 @@ def run_on_cluster(
                 box = next(waiting, None)
                 if box is None:
                     break
-                future = client.submit(
-                    run_box, store.study, *_task(store, box), versions(), pure=False
-                )
+                future = client.submit(run_box, store.study, *_task(store, box), wanted, pure=False)
                 running[future] = box
             if not running:
                 return
@@ -120,8 +118,7 @@ def run_box(
     Raises:
         OtherVersions: these are not they.
     """
-    here = versions()
-    if wanted is not None and here != wanted:
+    if wanted is not None and (here := versions()) != wanted:
         other = ", ".join(f"{n} {here[n]} and not {v}" for n, v in wanted.items() if here[n] != v)
         raise OtherVersions(f"a worker has {other}")
     return study.run(cells, trials)
