@@ -7,6 +7,7 @@ The QCar sees the paper's marker from 3.2 m, in its front camera, at corner nois
 run one at a time as on the car, and take turns with their peers in `step_numpy.py`.
 """
 
+import functools
 import os
 import subprocess
 import sys
@@ -36,6 +37,7 @@ from jaxnav.control import Command  # noqa: E402
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
 from jaxnav.geometry import T_world_vehicle_from_planar  # noqa: E402
 from jaxnav.hypotheses import MultiHypothesis  # noqa: E402
+from jaxnav.levenberg_marquardt import KEEP_MINIMA  # noqa: E402
 from jaxnav.navigator import Navigator, State  # noqa: E402
 from jaxnav.observation import Observation  # noqa: E402
 from jaxnav.simulation.corners import see  # noqa: E402
@@ -186,6 +188,7 @@ def rollout_loss(navigator: Navigator) -> tuple[Callable[[Parameters], jax.Array
     def loss(parameters: Parameters) -> jax.Array:
         tuned = eqx.tree_at(where, navigator, parameters)
 
+        @functools.partial(jax.checkpoint, policy=KEEP_MINIMA, prevent_cse=False)
         def frame(carry: tuple[CarState, Command, State], noise: jax.Array) -> Any:
             car, command, state = carry
             car = jax.tree.map(

@@ -14,9 +14,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxnav.small_matrices import solve_positive
+
+_MINIMUM = "minimum"
+# For the gradient of many steps, `jax.checkpoint(step, policy=KEEP_MINIMA)`: of a step it keeps no
+# more than its carry and where each search has ended, and searches nothing twice.
+KEEP_MINIMA = jax.checkpoint_policies.save_only_these_names(_MINIMUM)
 
 
 class LMState(eqx.Module):
@@ -170,6 +176,10 @@ class ImplicitGradient(optx.AbstractAdjoint):
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, inputs
         )
         root, residual = optx.ImplicitAdjoint().apply(primal_fn, rewrite_fn, fixed, tags)
+        root, residual = jax.tree.map(
+            lambda leaf: checkpoint_name(leaf, _MINIMUM) if eqx.is_array(leaf) else leaf,
+            (root, residual),
+        )
         return moving_with(root, inputs, gradient=rewrite_fn, residual=residual), residual
 
 

@@ -8,7 +8,9 @@ import jaxlie
 import numpy as np
 import optimistix
 import pytest
+from jax.extend.core import jaxprs_in_params
 
+from jaxnav.levenberg_marquardt import KEEP_MINIMA
 from jaxnav.markers import CORNER_SIGNS
 from jaxnav.observation import Observation
 from jaxnav.refine import refine_pose, solve_marker, solve_markers
@@ -259,6 +261,29 @@ def test_gradients_never_call_the_host():
     slope = jax.jit(jax.jacrev(lambda c: solve_marker(c, 0.2).T_camera_marker.wxyz_xyz))
     assert "callback" not in slope.lower(corners).as_text()
     assert np.all(np.isfinite(slope(jnp.zeros((4, 2)))))
+
+
+def searches(jaxpr) -> int:
+    return sum(
+        (eqn.primitive.name == "while") + sum(map(searches, jaxprs_in_params(eqn.params)))
+        for eqn in jaxpr.eqns
+    )
+
+
+def test_a_gradient_that_keeps_the_minima_searches_nothing_twice():
+    corners = jnp.asarray(CORNER_SIGNS[:, :2] * 0.1 + [[0, 0], [0, 0.01], [0, 0], [0, 0]])
+
+    def loss(c):
+        return jnp.sum(solve_marker(c, 0.2, 5).T_camera_marker.wxyz_xyz[:, 4:] ** 3)
+
+    def gradient(policy):
+        return jax.grad(jax.checkpoint(loss, policy=policy))
+
+    again = gradient(jax.checkpoint_policies.nothing_saveable)
+    assert searches(jax.make_jaxpr(again)(corners).jaxpr) == 2
+    assert searches(jax.make_jaxpr(gradient(KEEP_MINIMA))(corners).jaxpr) == 1
+    slope = jax.jit(gradient(KEEP_MINIMA))(corners)
+    np.testing.assert_allclose(slope, jax.jit(jax.grad(loss))(corners), rtol=1e-9)
 
 
 def test_gradients_are_finite_without_a_sight_and_frontally(precision):
