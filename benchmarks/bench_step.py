@@ -40,6 +40,7 @@ from jaxnav.hypotheses import MultiHypothesis  # noqa: E402
 from jaxnav.levenberg_marquardt import KEEP_MINIMA  # noqa: E402
 from jaxnav.navigator import Navigator, State  # noqa: E402
 from jaxnav.observation import Observation  # noqa: E402
+from jaxnav.runtime.compiled import compiled_step  # noqa: E402
 from jaxnav.simulation.corners import see  # noqa: E402
 from jaxnav.simulation.plant import CarState, move_through  # noqa: E402
 
@@ -251,21 +252,37 @@ def print_steps() -> None:
 
 
 def print_compilation() -> None:
-    """Trace and compile, in fresh processes: first without, then with what the first left."""
+    """From a navigator to its first step, in fresh processes: `jax.jit` without and with what a
+    process before it has left in JAX's cache; `compiled_step` with what one has left in its own."""
     print("\n| trace + compile | trace s | lower s | compile s | sum s |\n|---|---|---|---|---|")
     for name in SELECTORS:
         with tempfile.TemporaryDirectory() as cache:
-            for kind in ("cold", "cached"):
+
+            def seconds(how: str, name: str = name, cache: str = cache) -> list[float]:
                 run = subprocess.run(
-                    [sys.executable, __file__, "--compile", name],
+                    [sys.executable, __file__, how, name],
                     env=os.environ | {"JAX_COMPILATION_CACHE_DIR": cache},
                     capture_output=True,
                     text=True,
                     check=True,
                 )
-                parts = [float(part) for part in run.stdout.split()]
+                return [float(part) for part in run.stdout.split()]
+
+            for kind in ("cold", "JAX's cache"):
+                parts = seconds("--compile")
                 cells = " | ".join(f"{part:.2f}" for part in (*parts, sum(parts)))
                 print(f"| {name}, {kind} | {cells} |")
+            seconds("--load")
+            print(f"| {name}, `compiled_step` | | | | {seconds('--load')[0]:.2f} |")
+
+
+def load_once(name: str) -> None:
+    """Seconds until the first step is done, by way of `compiled_step`."""
+    navigator = navigator_with(SELECTORS[name])
+    state, obs = navigator.init(), observations(navigator, 1)[0]
+    begin = time.perf_counter()
+    jax.block_until_ready(compiled_step(navigator)(state, obs))
+    print(time.perf_counter() - begin)
 
 
 def compile_once(name: str) -> None:
@@ -309,6 +326,9 @@ def main() -> None:
     """Print the tables."""
     if sys.argv[1:2] == ["--compile"]:
         compile_once(sys.argv[2])
+        return
+    if sys.argv[1:2] == ["--load"]:
+        load_once(sys.argv[2])
         return
     print(f"jax {jax.__version__}, OpenCV {cv2.__version__}, NumPy {np.__version__}, "
           f"{jnp.zeros(1).dtype}, {jax.default_backend()}, {os.cpu_count()} cores\n")  # fmt: skip

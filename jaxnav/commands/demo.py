@@ -23,6 +23,7 @@ from jaxnav.files import (
 )
 from jaxnav.geometry import T_world_vehicle_from_planar
 from jaxnav.plotting import Track, camera_mosaic, drive_report
+from jaxnav.runtime.compiled import compiled_step
 from jaxnav.selectors import make_selector
 from jaxnav.simulation.drive import (
     DriveSettings,
@@ -49,7 +50,8 @@ def run(args: Demo) -> int:
         {
             OURS: world.navigator(make_selector(args.selector)),
             METHOD_A: world.navigator(LowestReprojection()),
-        }
+        },
+        compiled_step,
     )
     summaries = []
     for seed in range(args.seed, args.seed + args.seeds):

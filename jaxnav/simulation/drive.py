@@ -24,6 +24,7 @@ PASSED_M = 0.30  # a waypoint counts as passed when the true car came this close
 _SUBSTEPS = 8  # between two events: some 5 ms each
 
 PoseAt = Callable[[np.ndarray], np.ndarray]  # times_s (N,) -> T_world_vehicle (N, 7), wxyz_xyz
+Step = Callable[[State, Observation], tuple[State, Output]]
 # The true motion around a stamp, the stamp, and what the driver believes (None at first) ->
 # corners (C, M, 4, 2), visible (C, M), sigma (C, M, 4) or None.
 Look = Callable[[PoseAt, float, Output | None], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
@@ -58,9 +59,13 @@ class Methods:
     The first one drives.
     """
 
-    def __init__(self, navigators: Mapping[str, Navigator]):
+    def __init__(
+        self,
+        navigators: Mapping[str, Navigator],
+        compiled: Callable[[Navigator], Step] = lambda navigator: jax.jit(navigator.step),
+    ):
         self._navigators = dict(navigators)
-        self._steps = {name: jax.jit(_judged_step(nav)) for name, nav in navigators.items()}
+        self._steps = {name: compiled(navigator) for name, navigator in navigators.items()}
         self.reset()
 
     def reset(self) -> None:
@@ -78,21 +83,15 @@ class Methods:
         """All outputs, on the host, and what the truth says of each choice."""
         outputs, branches = {}, {}
         for name, step in self._steps.items():
-            self._states[name], outputs[name], branches[name] = step(
-                self._states[name], observation, true_pose
-            )
+            self._states[name], outputs[name] = step(self._states[name], observation)
+            branches[name] = _judged(outputs[name], true_pose)
         return jax.device_get((outputs, branches))
 
 
-def _judged_step(navigator: Navigator) -> Callable[..., tuple[State, Output, Branch]]:
-    def step(
-        state: State, observation: Observation, true_pose: jax.Array
-    ) -> tuple[State, Output, Branch]:
-        state, output = navigator.step(state, observation)
-        truth = T_world_vehicle_from_planar(true_pose)
-        return state, output, judge_branch(output.candidates, output.selected, truth)
-
-    return step
+@jax.jit
+def _judged(output: Output, true_pose: jax.Array) -> Branch:
+    truth = T_world_vehicle_from_planar(true_pose)
+    return judge_branch(output.candidates, output.selected, truth)
 
 
 def drive(

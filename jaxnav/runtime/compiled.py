@@ -1,0 +1,159 @@
+"""`Navigator.step` as a car calls it: compiled once on a machine, loaded ever after.
+
+JAX's own cache spares a later process the compiler, but tracing and lowering a step take four
+times as long as loading it. So the executable itself is kept beside that cache.
+"""
+
+import hashlib
+import os
+import pickle
+import platform
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jax.experimental import serialize_executable
+
+from jaxnav.navigator import Navigator, Output, State
+from jaxnav.observation import Observation
+
+Step = Callable[[State, Observation], tuple[State, Output]]
+_config: Any = jax.config  # whose options have no types
+_KEPT = 32  # executables, of some MB each: the last ones used
+_LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
+
+
+def compiled_step(navigator: Navigator) -> Step:
+    """`jax.jit(navigator.step)`, whose first call loads what another process has compiled.
+
+    Executables lie in `steps/` under JAX's compilation cache directory; where there is none, or
+    where the navigator has parts that are not jaxnav's own, nothing is kept. They hold none of the
+    navigator's numbers: a car that was calibrated anew loads what it compiled before. Like all
+    code in that folder they are run as they are found.
+
+    The step raises TypeError when an observation's shapes or types change from call to call.
+    """
+    numbers, structure = jax.tree.flatten(navigator)
+    numbers = [jnp.asarray(number) for number in numbers]
+    ready: dict[Any, tuple[Any, Any]] = {}  # a program for each set of fields that are there
+
+    def step(state: State, obs: Observation) -> tuple[State, Output]:
+        leaves, given = jax.tree.flatten((state, obs))
+        if given not in ready:
+            inputs = jax.tree.leaves(jax.eval_shape(lambda: (state, obs)))
+            file = _file(navigator, str((structure, given)), [*numbers, *inputs])
+            ready[given] = _loaded(file, numbers, inputs) or _compiled(
+                file, structure, given, numbers, inputs
+            )
+        program, returned = ready[given]
+        result: tuple[State, Output] = jax.tree.unflatten(returned, program(numbers, leaves))
+        return result
+
+    return step
+
+
+def _compiled(
+    file: Path | None, structure: Any, given: Any, numbers: list[Any], inputs: list[Any]
+) -> tuple[Any, Any]:
+    seen: list[Any] = []
+
+    def flat(numbers: list[Any], inputs: list[Any]) -> list[Any]:
+        returned = jax.tree.unflatten(structure, numbers).step(*jax.tree.unflatten(given, inputs))
+        seen.append(returned)
+        return jax.tree.leaves(returned)
+
+    with _not_cached_by_jax():
+        program = jax.jit(flat).lower(numbers, inputs).compile()
+    shape = jax.tree.map(lambda leaf: 0, seen[0])  # whose tree could not be stored by itself
+    if file is not None:
+        _keep(file, (serialize_executable.serialize(program), shape))
+    return program, jax.tree.structure(shape)
+
+
+@contextmanager
+def _not_cached_by_jax() -> Iterator[None]:
+    """What JAX has loaded from its cache runs, but is missing its kernels once stored again."""
+    option = "jax_persistent_cache_min_compile_time_secs"
+    before = getattr(_config, option)
+    jax.config.update(option, float("inf"))
+    try:
+        yield
+    finally:
+        jax.config.update(option, before)
+
+
+def _loaded(file: Path | None, numbers: list[Any], inputs: list[Any]) -> tuple[Any, Any] | None:
+    if file is None:
+        return None
+    try:
+        stored, shape = pickle.loads(file.read_bytes())
+        program = serialize_executable.deserialize_and_load(*stored)
+        blank = [jnp.zeros(like.shape, like.dtype) for like in inputs]
+        jax.block_until_ready(program(numbers, blank))  # what is damaged shows now
+        file.touch()
+    except Exception:  # none yet, or damaged in whatever way: it is made anew
+        return None
+    return program, jax.tree.structure(shape)
+
+
+def _keep(file: Path, content: Any) -> None:
+    """All of it or nothing, and of older ones no more than `_KEPT`."""
+    try:
+        file.parent.mkdir(mode=0o700, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as part:
+            try:
+                part.write(pickle.dumps(content))
+                part.flush()
+                Path(part.name).replace(file)
+            except BaseException:
+                Path(part.name).unlink(missing_ok=True)
+                raise
+        by_use = sorted(file.parent.glob("*.step"), key=lambda path: path.stat().st_mtime)
+        for old in by_use[:-_KEPT]:
+            old.unlink(missing_ok=True)
+    except OSError:
+        return  # a full or a foreign disk: the program is there all the same
+
+
+def _file(navigator: Navigator, structures: str, leaves: list[Any]) -> Path | None:
+    """Named by all that the executable depends on."""
+    folder = _config.jax_compilation_cache_dir
+    if not folder or not _config.jax_enable_compilation_cache:
+        return None
+    if "0x" in structures or not all(_is_ours(part) for part in _parts(navigator)):
+        return None
+    device = jax.devices()[0]
+    sources = sorted(Path(__file__).resolve().parents[1].glob("*.py"))
+    depends_on = [
+        structures,
+        [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
+        [(name, version(name)) for name in _LIBRARIES],
+        (device.platform, device.device_kind, platform.machine(), platform.node()),
+        (_config.jax_enable_x64, _config.jax_default_matmul_precision),
+        (os.environ.get("XLA_FLAGS"), os.environ.get("PJRT_NPROC")),
+        [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources],
+    ]
+    return Path(folder) / "steps" / f"{hashlib.sha256(repr(depends_on).encode()).hexdigest()}.step"
+
+
+def _is_ours(part: Any) -> bool:
+    return isinstance(part, jaxlie.MatrixLieGroup) or type(part).__module__.startswith("jaxnav.")
+
+
+def _parts(module: Any) -> Iterator[Any]:
+    """A module and all that it consists of."""
+    yield module
+    parts = jax.tree.leaves(
+        list(vars(module).values()) if isinstance(module, eqx.Module) else [],
+        is_leaf=lambda part: isinstance(part, eqx.Module | jaxlie.MatrixLieGroup),
+    )
+    for part in parts:
+        if isinstance(part, eqx.Module | jaxlie.MatrixLieGroup):
+            yield from _parts(part)

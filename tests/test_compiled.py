@@ -1,0 +1,112 @@
+"""The compiled step against the jitted one: the same numbers, and nothing compiled twice."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnav.ambiguity import LowestReprojection
+from jaxnav.navigator import Navigator
+from jaxnav.runtime import compiled
+from jaxnav.runtime.compiled import compiled_step
+from tests import worlds
+
+SEEN_FROM = (0.1, -0.6, np.pi / 2)
+
+
+class OnesOwn(LowestReprojection):
+    """A selector that jaxnav knows nothing of."""
+
+
+def navigator(selector: LowestReprojection | None = None) -> Navigator:
+    rig = worlds.qcar_rig()
+    return Navigator(rig, worlds.paper_markers(), selector=selector or LowestReprojection())
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Iterator[Path]:
+    """A compilation cache of the test's own, as `configure_jax` sets one."""
+    options = {"jax_enable_compilation_cache": True, "jax_compilation_cache_dir": str(tmp_path)}
+    before = {name: getattr(jax.config, name) for name in options}
+    for name, value in options.items():
+        jax.config.update(name, value)
+    yield tmp_path
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def never(*_):
+    raise AssertionError("compiled once more")
+
+
+def test_it_is_the_step_and_is_compiled_once(cache, monkeypatch):
+    nav = navigator()
+    moved = eqx.tree_at(lambda n: n.rig.cameras.focal_px, nav, nav.rig.cameras.focal_px + 3.0)
+    obs = worlds.observe(nav.rig, nav.markers, worlds.planar(*SEEN_FROM))
+    jitted = jax.jit(lambda nav, state, obs: nav.step(state, obs))
+
+    first = compiled_step(nav)
+    state, _ = first(nav.init(), obs)
+    (file,) = (cache / "steps").iterdir()
+    assert [path.name for path in cache.iterdir()] == ["steps"]  # JAX has kept nothing of it
+    monkeypatch.setattr(compiled, "_compiled", never)
+    later, recalibrated = compiled_step(nav), compiled_step(moved)
+    for step, which in ((first, nav), (later, nav), (recalibrated, moved)):
+        for before in (nav.init(), state):  # the second call of each takes another way
+            jax.tree.map(
+                np.testing.assert_array_equal, step(before, obs), jitted(which, before, obs)
+            )
+    assert later(state, obs)[1].located
+
+    monkeypatch.undo()
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    repaired, _ = compiled_step(nav)(nav.init(), obs)
+    jax.tree.map(np.testing.assert_array_equal, repaired, state)
+    monkeypatch.setattr(compiled, "_compiled", never)
+    compiled_step(nav)(nav.init(), obs)
+
+
+def test_a_file_is_for_one_structure_shape_and_source(cache, monkeypatch, tmp_path):
+    def file(nav, shape=()):
+        structure = str(jax.tree.structure(nav))
+        return compiled._file(nav, structure, [jnp.zeros(shape)])
+
+    nav = navigator()
+    assert file(nav) == file(eqx.tree_at(lambda n: n.corner_sigma_px, nav, 2.0))
+    with jax.enable_x64(False):
+        in_float32 = file(nav)
+    shorter = Navigator(nav.rig, nav.markers, selector=LowestReprojection(), max_lm_steps=3)
+    others = [file(shorter), file(nav, (2,)), in_float32]
+    monkeypatch.setenv("XLA_FLAGS", "--another")
+    others.append(file(nav))
+    monkeypatch.undo()
+    (tmp_path / "jaxnav" / "runtime").mkdir(parents=True)
+    (tmp_path / "jaxnav" / "navigator.py").write_text("# changed")
+    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "jaxnav" / "runtime" / "compiled.py"))
+    others.append(file(nav))
+    monkeypatch.undo()
+    assert len({file(nav), *others}) == 6
+
+    # Whose source is not known can't be told apart from another of its name.
+    assert file(navigator(OnesOwn())) is None
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert file(nav) is None
+
+
+def test_old_files_go_and_a_full_disk_is_no_failure(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiled, "_KEPT", 3)
+    for number in range(5):
+        compiled._keep(tmp_path / "steps" / f"{number}.step", number)
+    assert len(list((tmp_path / "steps").iterdir())) == 3
+    assert (tmp_path / "steps" / "4.step").exists()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(compiled.pickle, "dumps", full)
+    compiled._keep(tmp_path / "steps" / "5.step", 5)
+    assert len(list((tmp_path / "steps").iterdir())) == 3  # nothing half-written either
