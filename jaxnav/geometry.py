@@ -83,14 +83,6 @@ def inverse_cayley(T: jaxlie.SE3) -> Float[Array, " 6"]:
     return jnp.concatenate([T.translation() - jnp.cross(half, T.translation()), 2 * half])
 
 
-def cayley_points(xi: Float[Array, " 6"], points: Float[Array, "*batch 3"]) -> Array:
-    """The points moved by cay(xi)."""
-    half = on_last_axis(xi[3:] / 2, points)
-    move = 2 * jnp.cross(half, points) + on_last_axis(xi[:3], points)
-    swing = jnp.cross(half, move)
-    return points + move + (swing + jnp.cross(half, swing)) / (1 + jnp.sum(xi[3:] ** 2) / 4)
-
-
 def cayley_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
     """J in cay(xi + d) = cay(xi) cay(J d) for small d."""
     half = skew(xi[3:] / 2)
