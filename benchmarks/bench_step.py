@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxnav.commands.process import configure_jax
+from jaxnav.commands.process import configure_jax, step_folder
 
 configure_jax(float64=False, threads=1)  # before the first array, as the commands do
 
@@ -281,7 +281,7 @@ def load_once(name: str) -> None:
     navigator = navigator_with(SELECTORS[name])
     state, obs = navigator.init(), observations(navigator, 1)[0]
     begin = time.perf_counter()
-    jax.block_until_ready(compiled_step(navigator)(state, obs))
+    jax.block_until_ready(compiled_step(navigator, step_folder())(state, obs))
     print(time.perf_counter() - begin)
 
 

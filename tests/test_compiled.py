@@ -1,13 +1,9 @@
 """The compiled step against the jitted one: the same numbers, and nothing compiled twice."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxnav.ambiguity import LowestReprojection
 from jaxnav.navigator import Navigator
@@ -27,34 +23,21 @@ def navigator(selector: LowestReprojection | None = None) -> Navigator:
     return Navigator(rig, worlds.paper_markers(), selector=selector or LowestReprojection())
 
 
-@pytest.fixture
-def cache(tmp_path: Path) -> Iterator[Path]:
-    """A compilation cache of the test's own, as `configure_jax` sets one."""
-    options = {"jax_enable_compilation_cache": True, "jax_compilation_cache_dir": str(tmp_path)}
-    before = {name: getattr(jax.config, name) for name in options}
-    for name, value in options.items():
-        jax.config.update(name, value)
-    yield tmp_path
-    for name, value in before.items():
-        jax.config.update(name, value)
-
-
 def never(*_):
     raise AssertionError("compiled once more")
 
 
-def test_it_is_the_step_and_is_compiled_once(cache, monkeypatch):
+def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
     nav = navigator()
     moved = eqx.tree_at(lambda n: n.rig.cameras.focal_px, nav, nav.rig.cameras.focal_px + 3.0)
     obs = worlds.observe(nav.rig, nav.markers, worlds.planar(*SEEN_FROM))
     jitted = jax.jit(lambda nav, state, obs: nav.step(state, obs))
 
-    first = compiled_step(nav)
+    first = compiled_step(nav, tmp_path)
     state, _ = first(nav.init(), obs)
-    (file,) = (cache / "steps").iterdir()
-    assert [path.name for path in cache.iterdir()] == ["steps"]  # JAX has kept nothing of it
+    (file,) = tmp_path.iterdir()
     monkeypatch.setattr(compiled, "_compiled", never)
-    later, recalibrated = compiled_step(nav), compiled_step(moved)
+    later, recalibrated = compiled_step(nav, tmp_path), compiled_step(moved, tmp_path)
     for step, which in ((first, nav), (later, nav), (recalibrated, moved)):
         for before in (nav.init(), state):  # the second call of each takes another way
             jax.tree.map(
@@ -64,16 +47,16 @@ def test_it_is_the_step_and_is_compiled_once(cache, monkeypatch):
 
     monkeypatch.undo()
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    repaired, _ = compiled_step(nav)(nav.init(), obs)
+    repaired, _ = compiled_step(nav, tmp_path)(nav.init(), obs)
     jax.tree.map(np.testing.assert_array_equal, repaired, state)
     monkeypatch.setattr(compiled, "_compiled", never)
-    compiled_step(nav)(nav.init(), obs)
+    compiled_step(nav, tmp_path)(nav.init(), obs)
 
 
-def test_a_file_is_for_one_structure_shape_and_source(cache, monkeypatch, tmp_path):
-    def file(nav, shape=()):
+def test_a_file_is_for_one_structure_shape_and_source(monkeypatch, tmp_path):
+    def file(nav, shape=(), folder=tmp_path):
         structure = str(jax.tree.structure(nav))
-        return compiled._file(nav, structure, [jnp.zeros(shape)])
+        return compiled._file(folder, nav, structure, [jnp.zeros(shape)])
 
     nav = navigator()
     assert file(nav) == file(eqx.tree_at(lambda n: n.corner_sigma_px, nav, 2.0))
@@ -93,8 +76,7 @@ def test_a_file_is_for_one_structure_shape_and_source(cache, monkeypatch, tmp_pa
 
     # Whose source is not known can't be told apart from another of its name.
     assert file(navigator(OnesOwn())) is None
-    jax.config.update("jax_compilation_cache_dir", None)
-    assert file(nav) is None
+    assert file(nav, folder=None) is None
 
 
 def test_old_files_go_and_a_full_disk_is_no_failure(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from jaxnav.ambiguity import LowestReprojection
 from jaxnav.arguments import Demo
 from jaxnav.commands.pictures import save_figure, views_of
-from jaxnav.commands.process import configure_jax
+from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.commands.rendered_world import Cameras, World
 from jaxnav.files import (
     output_folder,
@@ -51,7 +51,7 @@ def run(args: Demo) -> int:
             OURS: world.navigator(make_selector(args.selector)),
             METHOD_A: world.navigator(LowestReprojection()),
         },
-        compiled_step,
+        lambda navigator: compiled_step(navigator, step_folder()),
     )
     summaries = []
     for seed in range(args.seed, args.seed + args.seeds):

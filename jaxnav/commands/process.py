@@ -50,6 +50,12 @@ def configure_jax(float64: bool, threads: int | None = None) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
+def step_folder() -> Path | None:
+    """Where `compiled_step` may keep executables: beside the cache that `configure_jax` has set."""
+    directory = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return Path(directory) / "steps" if directory else None
+
+
 def _cache_home() -> Path:
     # The XDG specification: a relative path is invalid and to be ignored.
     configured = Path(os.environ.get("XDG_CACHE_HOME", ""))

@@ -1,7 +1,7 @@
 """`Navigator.step` as a car calls it: compiled once on a machine, loaded ever after.
 
-JAX's own cache spares a later process the compiler, but tracing and lowering a step take four
-times as long as loading it. So the executable itself is kept beside that cache.
+JAX's own cache spares a later process the compiler, but tracing and lowering a step take longer
+than loading it. So the executable itself is kept.
 """
 
 import hashlib
@@ -9,8 +9,8 @@ import os
 import pickle
 import platform
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,20 +25,21 @@ from jaxnav.navigator import Navigator, Output, State
 from jaxnav.observation import Observation
 
 Step = Callable[[State, Observation], tuple[State, Output]]
-_config: Any = jax.config  # whose options have no types
 _KEPT = 32  # executables, of some MB each: the last ones used
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 
 
-def compiled_step(navigator: Navigator) -> Step:
+def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
     """`jax.jit(navigator.step)`, whose first call loads what another process has compiled.
 
-    Executables lie in `steps/` under JAX's compilation cache directory; where there is none, or
-    where the navigator has parts that are not jaxnav's own, nothing is kept. They hold none of the
-    navigator's numbers: a car that was calibrated anew loads what it compiled before. Like all
-    code in that folder they are run as they are found.
+    Executables hold none of the navigator's numbers: a car that was calibrated anew loads what it
+    compiled before. The step raises TypeError when an observation's shapes or types change from
+    call to call.
 
-    The step raises TypeError when an observation's shapes or types change from call to call.
+    Args:
+        folder: of executables, made when it is missing, and run as they are found: nobody else may
+            write there. Without one, and where the navigator has parts that are not jaxnav's own,
+            nothing is kept.
     """
     numbers, structure = jax.tree.flatten(navigator)
     numbers = [jnp.asarray(number) for number in numbers]
@@ -48,7 +49,7 @@ def compiled_step(navigator: Navigator) -> Step:
         leaves, given = jax.tree.flatten((state, obs))
         if given not in ready:
             inputs = jax.tree.leaves(jax.eval_shape(lambda: (state, obs)))
-            file = _file(navigator, str((structure, given)), [*numbers, *inputs])
+            file = _file(folder, navigator, str((structure, given)), [*numbers, *inputs])
             ready[given] = _loaded(file, numbers, inputs) or _compiled(
                 file, structure, given, numbers, inputs
             )
@@ -69,24 +70,14 @@ def _compiled(
         seen.append(returned)
         return jax.tree.leaves(returned)
 
-    with _not_cached_by_jax():
-        program = jax.jit(flat).lower(numbers, inputs).compile()
+    # By a name that JAX's own cache has never met: what it loads runs, but lacks its kernels once
+    # stored again.
+    flat.__name__ = f"step_{time.time_ns()}" if file is not None else "step"
+    program = jax.jit(flat).lower(numbers, inputs).compile()
     shape = jax.tree.map(lambda leaf: 0, seen[0])  # whose tree could not be stored by itself
     if file is not None:
         _keep(file, (serialize_executable.serialize(program), shape))
     return program, jax.tree.structure(shape)
-
-
-@contextmanager
-def _not_cached_by_jax() -> Iterator[None]:
-    """What JAX has loaded from its cache runs, but is missing its kernels once stored again."""
-    option = "jax_persistent_cache_min_compile_time_secs"
-    before = getattr(_config, option)
-    jax.config.update(option, float("inf"))
-    try:
-        yield
-    finally:
-        jax.config.update(option, before)
 
 
 def _loaded(file: Path | None, numbers: list[Any], inputs: list[Any]) -> tuple[Any, Any] | None:
@@ -106,7 +97,7 @@ def _loaded(file: Path | None, numbers: list[Any], inputs: list[Any]) -> tuple[A
 def _keep(file: Path, content: Any) -> None:
     """All of it or nothing, and of older ones no more than `_KEPT`."""
     try:
-        file.parent.mkdir(mode=0o700, exist_ok=True)
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as part:
             try:
                 part.write(pickle.dumps(content))
@@ -122,12 +113,12 @@ def _keep(file: Path, content: Any) -> None:
         return  # a full or a foreign disk: the program is there all the same
 
 
-def _file(navigator: Navigator, structures: str, leaves: list[Any]) -> Path | None:
+def _file(
+    folder: Path | None, navigator: Navigator, structures: str, leaves: list[Any]
+) -> Path | None:
     """Named by all that the executable depends on."""
-    folder = _config.jax_compilation_cache_dir
-    if not folder or not _config.jax_enable_compilation_cache:
-        return None
-    if "0x" in structures or not all(_is_ours(part) for part in _parts(navigator)):
+    known = "0x" not in structures and all(_is_ours(part) for part in _parts(navigator))
+    if folder is None or not known:
         return None
     device = jax.devices()[0]
     sources = sorted(Path(__file__).resolve().parents[1].glob("*.py"))
@@ -136,11 +127,11 @@ def _file(navigator: Navigator, structures: str, leaves: list[Any]) -> Path | No
         [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
         [(name, version(name)) for name in _LIBRARIES],
         (device.platform, device.device_kind, platform.machine(), platform.node()),
-        (_config.jax_enable_x64, _config.jax_default_matmul_precision),
+        str(jnp.zeros(()).dtype),
         (os.environ.get("XLA_FLAGS"), os.environ.get("PJRT_NPROC")),
         [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources],
     ]
-    return Path(folder) / "steps" / f"{hashlib.sha256(repr(depends_on).encode()).hexdigest()}.step"
+    return folder / f"{hashlib.sha256(repr(depends_on).encode()).hexdigest()}.step"
 
 
 def _is_ours(part: Any) -> bool:
