@@ -161,7 +161,9 @@ class ImplicitGradient(optx.AbstractAdjoint):
     """Derivatives of N minima (n, N) by the implicit function theorem: dy = -H^-1 d(gradient).
 
     What `optimistix.ImplicitAdjoint` computes, less its check of the linear solve, which calls
-    the host and raises there. Where the Hessian is not positive definite the derivative is zero.
+    the host and raises there, and with the gradient from the derivatives that the function gives
+    as `aux`: differentiated once less. Where the Hessian is not positive definite the derivative
+    is zero.
     """
 
     def apply(
@@ -180,7 +182,13 @@ class ImplicitGradient(optx.AbstractAdjoint):
             lambda leaf: checkpoint_name(leaf, _MINIMUM) if eqx.is_array(leaf) else leaf,
             (root, residual),
         )
-        return moving_with(root, inputs, gradient=rewrite_fn, residual=residual), residual
+        return moving_with(root, inputs, gradient=_gradient, residual=residual), residual
+
+
+def _gradient(y: Array, _: PyTree, inputs: PyTree) -> Array:
+    fn, _, _, args, *_ = inputs  # as optimistix passes them to its own `rewrite_fn`
+    residual, J = fn(y, args)
+    return jnp.sum(J * residual[None], axis=1)
 
 
 @eqx.filter_custom_jvp
