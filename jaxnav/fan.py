@@ -14,6 +14,7 @@ from jaxnav.ambiguity import PoseBelief
 from jaxnav.candidates import Candidates
 from jaxnav.geometry import on_ground, rotation_matrix, safe_atan2, safe_norm, wrap_angle
 from jaxnav.observation import Snapshot
+from jaxnav.small_matrices import product, sandwich
 
 CANDIDATES = 3  # at most so many stand beside the fan
 _FAN_RAD = float(np.deg2rad(80.0))  # from the marker's normal
@@ -65,17 +66,17 @@ def fan(
     if planar:
         Ts_world_vehicle = on_ground(Ts_world_vehicle)
     axes = jnp.concatenate([axes, jnp.broadcast_to(axes[:1], (slots, *axes.shape[1:]))])
-    kept = prior.freedom @ prior.freedom.T
+    kept = product(prior.freedom, prior.freedom.T)
     range_m = safe_norm(towards)
 
     def covariance(T: jaxlie.SE3, axes: Array) -> Array:
         R = rotation_matrix(T.rotation())
         swing = jnp.cross(axes, (T.translation() - center)[None])
-        about = jnp.concatenate([swing @ R, axes @ R], axis=1)  # (axes, 6)
+        about = jnp.concatenate([product(swing, R), product(axes, R)], axis=1)  # (axes, 6)
         local = jnp.concatenate(
             [jnp.full(3, _RANGE_SIGMA * range_m), jnp.full(3, _BEARING_SIGMA_RAD)]
         )
-        return kept @ (sigma_rad**2 * about.T @ about + jnp.diag(local**2)) @ kept
+        return sandwich(kept, sigma_rad**2 * product(about.T, about) + jnp.diag(local**2))
 
     light = jnp.concatenate([jnp.zeros(count), jnp.full(slots, _CANDIDATE_LOG_WEIGHT)])
     alive = jnp.concatenate([jnp.ones(count, bool), candidates.valid[:slots]])

@@ -11,7 +11,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from jaxnav.small_matrices import product, sandwich
+from jaxnav.small_matrices import applied, product, sandwich
 
 # Of xi, and of what else is ordered (translation, rotation): on level ground a vehicle shifts along
 # its x and y and turns about its z.
@@ -121,7 +121,7 @@ def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "3 3"]:
 
 def skew(a: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """The matrix of the cross product: skew(a) @ b = a x b."""
-    return (jnp.asarray(_SKEW, a.dtype) @ a).reshape(3, 3)
+    return applied(jnp.asarray(_SKEW, a.dtype), a).reshape(3, 3)
 
 
 def on_ground(T_world_vehicle: jaxlie.SE3) -> jaxlie.SE3:
@@ -147,8 +147,8 @@ def planar_covariance(
     dpsi_dw = jnp.stack(
         [
             jnp.zeros_like(c),
-            -dpsi_dx_axis @ R_world_vehicle[:, 2],
-            dpsi_dx_axis @ R_world_vehicle[:, 1],
+            -jnp.sum(dpsi_dx_axis * R_world_vehicle[:, 2]),
+            jnp.sum(dpsi_dx_axis * R_world_vehicle[:, 1]),
         ]
     )
     jacobian = jnp.zeros((3, 6), c.dtype)

@@ -29,7 +29,7 @@ from jaxnav.fan import CANDIDATES, fan, normalised
 from jaxnav.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
 from jaxnav.map_fit import Fit, fit
 from jaxnav.observation import Snapshot
-from jaxnav.small_matrices import cholesky, product, ranks, sandwich, solve_lower
+from jaxnav.small_matrices import applied, cholesky, product, ranks, sandwich, solve_lower
 from jaxnav.trees import where
 
 
@@ -260,9 +260,9 @@ def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:
 def _apart(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, " 6"]:
     """Shift in the first pose's axes, and turn (rad, to second order), from it to the other."""
     (w, v), (w_other, v_other) = (base[0], base[1:4]), (other[0], other[1:4])
-    cosine = w * w_other + v @ v_other
+    cosine = w * w_other + jnp.sum(v * v_other)
     sine = w * v_other - w_other * v - jnp.cross(v, v_other)
-    shift = (other[4:] - base[4:]) @ rotation_matrix(jaxlie.SO3(base[:4]))
+    shift = applied(rotation_matrix(jaxlie.SO3(base[:4])).T, other[4:] - base[4:])
     return jnp.append(shift, 2 * jnp.where(cosine < 0, -1, 1) * sine)
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxnav.geometry import rotation_from_matrix, safe_norm, safe_sqrt
 from jaxnav.markers import CORNER_SIGNS
+from jaxnav.small_matrices import applied, product
 
 
 class PosePair(eqx.Module):
@@ -79,10 +80,10 @@ def _homography_at_center(corners: Array) -> tuple[Array, Array]:
     g = (twist[0] * along[1] - twist[1] * along[0]) * inverse
     h = (across[0] * twist[1] - across[1] * twist[0]) * inverse
     signs = jnp.asarray(CORNER_SIGNS[:, :2], corners.dtype)
-    weighted = corners * (1 + signs @ jnp.stack([g, h]))[:, None]
+    weighted = corners * (1 + signs[:, :1] * g + signs[:, 1:] * h)
     center = jnp.mean(weighted, axis=0)
-    ab = weighted.T @ signs / 4
-    return center, ab - jnp.outer(center, jnp.stack([g, h]))
+    ab = product(weighted.T, signs) / 4
+    return center, ab - center[:, None] * jnp.stack([g, h])[None]
 
 
 def _rotation_to(point_n: Array) -> Array:
@@ -101,9 +102,9 @@ def _rotation_to(point_n: Array) -> Array:
 def _to_line_of_sight(J: Array, center_n: Array, R_camera_sight: Array) -> Array:
     """The Jacobian as a camera looking straight at the marker's centre would see it."""
     projection = jnp.concatenate([jnp.eye(2, dtype=J.dtype), -center_n[:, None]], axis=1)
-    (a, b), (c, d) = projection @ R_camera_sight[:, :2]
+    (a, b), (c, d) = product(projection, R_camera_sight[:, :2])
     inverse = jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)
-    return inverse @ J
+    return product(inverse, J)
 
 
 def _rotation_parts(A: Array) -> tuple[Array, Array, Array]:
@@ -141,13 +142,13 @@ def _pose(
     """One pose as (wxyz, xyz), and its RMS reprojection error."""
     x_axis = jnp.concatenate([R22[:, 0], tilt[:1]])
     y_axis = jnp.concatenate([R22[:, 1], tilt[1:]])
-    x_axis, y_axis = R_camera_sight @ x_axis, R_camera_sight @ y_axis
+    x_axis, y_axis = applied(R_camera_sight, x_axis), applied(R_camera_sight, y_axis)
     R_camera_marker = jnp.stack([x_axis, y_axis, jnp.cross(x_axis, y_axis)], axis=1)
     rotation = rotation_from_matrix(R_camera_marker)
 
     # Translation: least squares of (R p + t)_xy - u (R p + t)_z over the corners.
     signs = jnp.asarray(CORNER_SIGNS, corners_n.dtype)
-    turned = half_m * signs @ R_camera_marker.T
+    turned = product(half_m * signs, R_camera_marker.T)
     defect = corners_n * turned[:, 2:] - turned[:, :2]
     offset = corners_n - mean_n[None]
     spread = jnp.sum(offset**2)
@@ -173,7 +174,7 @@ def ippe_from_rays(rays_camera: Float[Array, "4 3"], size_m: Float[Array, ""]) -
     """
     sight = jnp.mean(rays_camera, axis=0)
     R_camera_virtual = _rotation_facing(sight)
-    rays_virtual = rays_camera @ R_camera_virtual
+    rays_virtual = product(rays_camera, R_camera_virtual)
     depth = jnp.maximum(rays_virtual[:, 2:], 1e-3)
     pair = ippe_square(rays_virtual[:, :2] / depth, size_m)
     T_camera_virtual = jaxlie.SE3.from_rotation(rotation_from_matrix(R_camera_virtual))

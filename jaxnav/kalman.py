@@ -7,7 +7,7 @@ Joseph (1968), since Eq. 11's (I - K H) P loses positive definiteness in float32
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.small_matrices import cho_solve, cholesky, product, sandwich, solve_lower
+from jaxnav.small_matrices import applied, cho_solve, cholesky, product, sandwich, solve_lower
 
 # A variance never falls below this fraction of the largest one.
 _RELATIVE_FLOOR = 1e-12
@@ -38,7 +38,7 @@ def update(
     K = cho_solve(cholesky(S), HP).T
     I_KH = jnp.eye(P.shape[0], dtype=P.dtype) - product(K, H)
     posterior = symmetrise(sandwich(I_KH, P) + sandwich(K, R))
-    return K @ innovation, floored(posterior, P), S
+    return applied(K, innovation), floored(posterior, P), S
 
 
 def hide_rows(

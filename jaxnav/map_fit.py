@@ -25,6 +25,7 @@ from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM
 from jaxnav.linearised import crossed, reprojection_rows, turned
 from jaxnav.observation import Snapshot
 from jaxnav.small_matrices import (
+    applied,
     cho_solve,
     cholesky,
     log_det,
@@ -192,7 +193,7 @@ def _fused(
     u_fused = solve_upper(sigma, contradiction)
     # I - (I + R)^-1 = R (I + R)^-1, symmetric.
     C = eye - cho_solve(sigma, eye)
-    xi = spread @ u_fused
+    xi = applied(spread, u_fused)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, (C + C.T) / 2)

@@ -30,7 +30,7 @@ CORNER_SIGNS = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
 def corners_marker_m(size_m: Float[Array, "*batch"]) -> Float[Array, "*batch 4 3"]:
     """Corners of a marker of the given side in its own frame, m."""
     signs = jnp.asarray(CORNER_SIGNS, size_m.dtype)
-    return jnp.einsum("...,ci->...ci", size_m / 2, signs)
+    return size_m[..., None, None] / 2 * signs.reshape((1,) * size_m.ndim + signs.shape)
 
 
 def opencv_dictionary_name(family: str) -> str:
@@ -53,7 +53,8 @@ class MarkerMap(eqx.Module):
         """All corners in the world, m."""
         corners = corners_marker_m(self.size_m)
         R = jax.vmap(rotation_matrix)(self.Ts_world_marker.rotation())
-        return jnp.einsum("mij,mcj->mci", R, corners) + self.Ts_world_marker.translation()[:, None]
+        turned = jnp.sum(R[:, None] * corners[:, :, None], axis=3)
+        return turned + self.Ts_world_marker.translation()[:, None]
 
     def index(self, marker_id: int, family: str) -> int | None:
         """Where a marker stands in the map, None where it is not in it."""

@@ -27,7 +27,7 @@ from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
 from jaxnav.geometry import cayley_jacobian, inverse_cayley, inverse_cayley_jacobian
 from jaxnav.observation import Observation
-from jaxnav.small_matrices import cho_solve, cholesky, sandwich
+from jaxnav.small_matrices import applied, cho_solve, cholesky, sandwich
 from jaxnav.trees import where
 
 
@@ -199,7 +199,7 @@ def _and_another(
 ) -> Rejections:
     """One more, which agrees with the last one if it lies within 60 degrees of its direction."""
     both = jnp.sum(innovation**2) * jnp.sum(rejections.last**2)
-    along = innovation @ rejections.last
+    along = jnp.sum(innovation * rejections.last)
     agrees = (along > 0) & (along**2 > both / 4)
     return Rejections(
         jnp.where(rejected, jnp.where(agrees, rejections.count, 0) + 1, rejections.count),
@@ -230,7 +230,7 @@ def followed(
     """
     d = freedom.shape[1]
     away = inverse_cayley(T_world_prior.inverse() @ T_world_vehicle)
-    xi = away @ freedom
+    xi = applied(freedom.T, away)
     # Error at the prediction -> at the corrected pose, and back.
     carry = sandwich(freedom.T, cayley_jacobian(away))
     back = sandwich(freedom.T, inverse_cayley_jacobian(away))
@@ -241,7 +241,7 @@ def followed(
     carried = kalman.symmetrise(P + sandwich(gain, at_prior - P[:d, :d]))
     to_posterior = jnp.eye(P.shape[0], dtype=P.dtype).at[:d, :d].set(carry)
     carried = kalman.symmetrise(sandwich(to_posterior, carried))
-    return gain @ xi, kalman.floored(carried, P)
+    return applied(gain, xi), kalman.floored(carried, P)
 
 
 def merged(

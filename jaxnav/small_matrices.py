@@ -20,6 +20,11 @@ def product(A: Float[Array, "n k"], B: Float[Array, "k m"]) -> Float[Array, "n m
     return jnp.sum(A[:, :, None] * B[None], axis=1)
 
 
+def applied(A: Float[Array, "n k"], x: Float[Array, " k"]) -> Float[Array, " n"]:
+    """A x, likewise."""
+    return jnp.sum(A * x[None], axis=1)
+
+
 def sandwich(A: Float[Array, "n k"], P: Float[Array, "k k"]) -> Float[Array, "n n"]:
     """A P A'."""
     return product(product(A, P), A.T)
