@@ -60,7 +60,6 @@ class Methods:
 
     def __init__(self, navigators: Mapping[str, Navigator]):
         self._navigators = dict(navigators)
-        self._steps = {name: jax.jit(_judged_step(nav)) for name, nav in navigators.items()}
         self.reset()
 
     def reset(self) -> None:
@@ -77,22 +76,20 @@ class Methods:
     ) -> tuple[dict[str, Output], dict[str, Branch]]:
         """All outputs, on the host, and what the truth says of each choice."""
         outputs, branches = {}, {}
-        for name, step in self._steps.items():
-            self._states[name], outputs[name], branches[name] = step(
-                self._states[name], observation, true_pose
+        for name, navigator in self._navigators.items():
+            self._states[name], outputs[name], branches[name] = _judged_step(
+                navigator, self._states[name], observation, true_pose
             )
         return jax.device_get((outputs, branches))
 
 
-def _judged_step(navigator: Navigator) -> Callable[..., tuple[State, Output, Branch]]:
-    def step(
-        state: State, observation: Observation, true_pose: jax.Array
-    ) -> tuple[State, Output, Branch]:
-        state, output = navigator.step(state, observation)
-        truth = T_world_vehicle_from_planar(true_pose)
-        return state, output, judge_branch(output.candidates, output.selected, truth)
-
-    return step
+@jax.jit
+def _judged_step(
+    navigator: Navigator, state: State, observation: Observation, true_pose: jax.Array
+) -> tuple[State, Output, Branch]:
+    state, output = navigator.step(state, observation)
+    truth = T_world_vehicle_from_planar(true_pose)
+    return state, output, judge_branch(output.candidates, output.selected, truth)
 
 
 def drive(
