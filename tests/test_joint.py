@@ -3,6 +3,8 @@
 What a frame alone says of that must be true for joint solves as it is for single markers.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +57,7 @@ def frames():
     keys = jax.random.split(jax.random.key(0), FRAMES)
     look_all = jax.jit(jax.vmap(look, in_axes=(None, 0)))
 
+    @functools.cache
     def seen(lift_rad):
         return [np.asarray(leaf) for leaf in look_all(wall(lift_rad), keys)]
 
