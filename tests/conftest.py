@@ -39,6 +39,15 @@ CORE = sorted(
 install_import_hook(CORE, "beartype.beartype")
 
 
+# A file is one worker's: what takes minutes must not come last.
+LONG = """test_navigator test_hypotheses test_replay test_ambiguity test_demo test_rollout
+    test_study_kinds test_detection""".split()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def let_compiled_code_go() -> Iterator[None]:
     """Every executable holds some memory maps, of which Linux allows a process 65 530: past them a

@@ -61,6 +61,7 @@ def find(snapshot: Snapshot) -> Candidates:
     return find_candidates(snapshot)
 
 
+@functools.partial(jax.jit, static_argnames="count")
 def belief(T_world_vehicle: jaxlie.SE3, initialised: bool = True, count: int = 1) -> PoseBelief:
     """A car's prediction; more hypotheses than one fan out from the pose."""
     eye, fan = jnp.eye(6), jnp.linspace(0.0, 1.0, count)
@@ -78,14 +79,15 @@ def belief(T_world_vehicle: jaxlie.SE3, initialised: bool = True, count: int = 1
     )
 
 
+inverses = jax.jit(jax.vmap(lambda pose: worlds.T_world_vehicle_from_planar(pose).inverse()))
+
+
 def candidates_at(poses, e1_px2, valid=None, covariance=None) -> Candidates:
     """Candidates as given, sigma 1 px."""
     count = len(poses)
     covariance = np.broadcast_to(np.eye(6), (count, 6, 6)) if covariance is None else covariance
     return Candidates(
-        T_vehicle_world=jaxlie.SE3(
-            jnp.stack([worlds.planar(*pose).inverse().wxyz_xyz for pose in poses])
-        ),
+        T_vehicle_world=inverses(jnp.asarray(poses, float)),
         e1_px2=jnp.asarray(e1_px2, float),
         cost=jnp.asarray(e1_px2, float),
         covariance=jnp.asarray(covariance, float),
@@ -303,7 +305,7 @@ def test_ratio_test_discards_what_is_not_clear(errors_px, max_ratio, taken):
     for errors in (errors_px, errors_px[::-1]):
         candidates = candidates_at([TRUTH, (1.0, -1.5, 1.0)], np.square(errors))
         prior = belief(worlds.planar(*TRUTH))
-        selection = RatioTest(max_ratio)(prior, candidates, seen_from(TRUTH))
+        selection = select(RatioTest(max_ratio), prior, candidates, seen_from(TRUTH))
         np.testing.assert_allclose(selection.costs, np.square(errors))
         assert bool(selection.measured.taken[0]) == taken
         assert int(selection.selected) == (int(np.argmin(errors)) if taken else -1)
@@ -317,7 +319,7 @@ def test_ratio_test_takes_an_only_candidate():
         candidates_at([TRUTH], [4.0]),
         candidates_at([TRUTH, TRUTH, TRUTH], [4.0, 4.1, 4.2], [True, False, False]),
     ):
-        selection = RatioTest()(prior, candidates, snapshot)
+        selection = select(RatioTest(), prior, candidates, snapshot)
         assert int(selection.selected) == 0
         assert selection.flip_probability == 0
 
@@ -338,13 +340,13 @@ def test_object_space_is_equation_14_alone():
     snapshot = seen_from((0.2, 0.1, 0.6), one_marker=False)
     prior = worlds.planar(0.25, 0.05, 0.7)
     candidates = candidates_at([(0.5, -0.2, 0.1), (0.2, 0.1, 0.6)], [0.1, 1e4])
-    selection = ObjectSpace()(belief(prior), candidates, snapshot)
+    selection = select(ObjectSpace(), belief(prior), candidates, snapshot)
     expected = object_space_m2(candidates, prior, snapshot)
     np.testing.assert_allclose(selection.costs, expected, rtol=1e-11)
     assert expected[1] < expected[0]
     assert int(selection.selected) == 1
     # Without a prediction there is only the image.
-    first = ObjectSpace()(belief(prior, initialised=False), candidates, snapshot)
+    first = select(ObjectSpace(), belief(prior, initialised=False), candidates, snapshot)
     np.testing.assert_array_equal(first.costs, [0.1, 1e4])
     assert int(first.selected) == 0
 
@@ -377,7 +379,7 @@ def test_mahalanobis_is_the_whitened_error():
             + np.linalg.slogdet(S)[1]
         )
     expected = np.array(expected)
-    selection = Mahalanobis()(prior, candidates, seen_from(TRUTH))
+    selection = select(Mahalanobis(), prior, candidates, seen_from(TRUTH))
     np.testing.assert_allclose(selection.costs, expected, rtol=1e-9)
     best = int(np.argmin(expected))
     assert int(selection.selected) == best
@@ -385,7 +387,7 @@ def test_mahalanobis_is_the_whitened_error():
     assert selection.flip_probability == pytest.approx(1 - mass[best] / mass.sum(), abs=1e-9)
     # Before the first pose: the image, and the width of its minima.
     prior = eqx.tree_at(lambda b: b.initialised, prior, jnp.asarray([False]))
-    first = Mahalanobis()(prior, candidates, seen_from(TRUTH))
+    first = select(Mahalanobis(), prior, candidates, seen_from(TRUTH))
     np.testing.assert_allclose(first.costs, cost - np.linalg.slogdet(covariances)[1], rtol=1e-9)
 
 
@@ -399,14 +401,14 @@ def test_orientation_given_believes_the_heading():
     # Seen across the seam: -179 and 181 degrees are one.
     for heading in (TRUTH[2] + 0.05, TRUTH[2] + 0.05 - 2 * np.pi):
         snapshot = seen_from(TRUTH, heading_rad=jnp.asarray(heading), **sensed)
-        selection = OrientationGiven()(prior, candidates, snapshot)
+        selection = select(OrientationGiven(), prior, candidates, snapshot)
         gaps = np.array([TRUTH[2] + 0.05 - 1.0, 0.05]) / 0.1
         np.testing.assert_allclose(selection.costs, [1.0, 5.0] + gaps**2, rtol=1e-9)
         assert int(selection.selected) == 1
         assert selection.flip_probability < 1e-6
     for heading in (np.nan, np.inf):
         snapshot = seen_from(TRUTH, heading_rad=jnp.asarray(heading), **sensed)
-        selection = OrientationGiven()(prior, candidates, snapshot)
+        selection = select(OrientationGiven(), prior, candidates, snapshot)
         np.testing.assert_array_equal(selection.costs, [1.0, 5.0])
         assert int(selection.selected) == 0
 
@@ -425,7 +427,7 @@ def test_orientation_given_believes_the_normals():
     for broken in ([], [first], [first, second]):
         measured = tilted.at[jnp.asarray(broken, int), 0, 1].set(jnp.nan)
         snapshot = seen_from(pose, normals_camera=measured, **sensed)
-        selection = OrientationGiven()(prior, candidates, snapshot)
+        selection = select(OrientationGiven(), prior, candidates, snapshot)
         expected = [1.0, 5.0]
         for index, candidate in enumerate((other, pose)):
             believed = np.asarray(normals_at(rig, markers, candidate))
@@ -439,7 +441,7 @@ def test_orientation_given_believes_the_normals():
 def test_orientation_given_is_the_image_s_without_a_sensor():
     snapshot = seen_from(TRUTH, heading_rad=None, normals_camera=None)
     candidates = candidates_at(PAIR, [1.0, 5.0])
-    selection = OrientationGiven()(belief(worlds.planar(*TRUTH)), candidates, snapshot)
+    selection = select(OrientationGiven(), belief(worlds.planar(*TRUTH)), candidates, snapshot)
     np.testing.assert_array_equal(selection.costs, [1.0, 5.0])
 
 
@@ -464,7 +466,7 @@ def test_paper_cost_is_equations_13_and_14():
     snapshot = seen_from((0.2, 0.1, 0.6), one_marker=False)
     prior = worlds.planar(0.25, 0.05, 0.7)
     candidates = candidates_at([(0.2, 0.1, 0.6), (0.5, -0.2, 0.1)], [4.0, 3.0])
-    selection = PaperCost()(belief(prior), candidates, snapshot)
+    selection = select(PaperCost(), belief(prior), candidates, snapshot)
     metres = np.array(object_space_m2(candidates, prior, snapshot))
     np.testing.assert_allclose(selection.costs, [4.0, 3.0] + 100**2 * metres, rtol=1e-11)
     assert int(selection.selected) == 0
@@ -473,10 +475,10 @@ def test_paper_cost_is_equations_13_and_14():
 def test_before_the_first_pose_e_is_e1():
     candidates = candidates_at([TRUTH, (1.0, -1.5, 1.0)], [2.0, 1.0])
     arguments = (candidates, seen_from(TRUTH))
-    unaware = PaperCost()(belief(worlds.planar(*TRUTH), initialised=False), *arguments)
+    unaware = select(PaperCost(), belief(worlds.planar(*TRUTH), initialised=False), *arguments)
     np.testing.assert_array_equal(unaware.costs, [2.0, 1.0])
     assert int(unaware.selected) == 1
-    assert int(PaperCost()(belief(worlds.planar(*TRUTH)), *arguments).selected) == 0
+    assert int(select(PaperCost(), belief(worlds.planar(*TRUTH)), *arguments).selected) == 0
 
 
 @pytest.fixture(scope="module")
@@ -509,8 +511,8 @@ def test_the_unit_of_length_decides(ambiguous):
     assert margin > 0.3
     prior = belief(worlds.planar(TRUTH[0] + 0.05, TRUTH[1] - 0.05, TRUTH[2] + 0.05))
     lowest = LowestReprojection()(prior, *arguments)
-    centimetres = PaperCost()(prior, *arguments)
-    metres = PaperCost(length_unit_m=1.0)(prior, *arguments)
+    centimetres = select(PaperCost(), prior, *arguments)
+    metres = select(PaperCost(length_unit_m=1.0), prior, *arguments)
     assert int(lowest.selected) == 0
     assert int(centimetres.selected) == 1
     assert int(metres.selected) == 0
@@ -522,4 +524,4 @@ def test_a_misled_prediction_misleads_the_paper_s_rule(ambiguous):
     """DESIGN 3.7: near the mirror pose the rule defends it."""
     _, candidates, snapshot = ambiguous
     mirror = jaxlie.SE3(candidates.T_vehicle_world.wxyz_xyz[0]).inverse()
-    assert int(PaperCost()(belief(mirror), candidates, snapshot).selected) == 0
+    assert int(select(PaperCost(), belief(mirror), candidates, snapshot).selected) == 0

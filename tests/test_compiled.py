@@ -54,9 +54,8 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
 
 
 def test_a_file_is_for_one_structure_shape_and_source(monkeypatch, tmp_path):
-    def file(nav, shape=(), folder=tmp_path):
-        structure = str(jax.tree.structure(nav))
-        return compiled._file(folder, nav, structure, [jnp.zeros(shape)])
+    def file(nav, shape=()):
+        return compiled._file(tmp_path, str(jax.tree.structure(nav)), [jnp.zeros(shape)])
 
     nav = navigator()
     assert file(nav) == file(eqx.tree_at(lambda n: n.corner_sigma_px, nav, 2.0))
@@ -74,9 +73,15 @@ def test_a_file_is_for_one_structure_shape_and_source(monkeypatch, tmp_path):
     monkeypatch.undo()
     assert len({file(nav), *others}) == 6
 
-    # Whose source is not known can't be told apart from another of its name.
-    assert file(navigator(OnesOwn())) is None
-    assert file(nav, folder=None) is None
+
+def test_without_a_folder_or_with_foreign_parts_nothing_is_kept(monkeypatch, tmp_path):
+    """Whose source is not known can't be told apart from another of its name."""
+    monkeypatch.setattr(compiled, "_compiled", never)
+    obs = worlds.observe(worlds.qcar_rig(), worlds.paper_markers(), worlds.planar(*SEEN_FROM))
+    for nav, folder in ((navigator(), None), (navigator(OnesOwn()), tmp_path)):
+        _, out = compiled_step(nav, folder)(nav.init(), obs)
+        assert out.located
+    assert not list(tmp_path.iterdir())
 
 
 def test_old_files_go_and_a_full_disk_is_no_failure(tmp_path, monkeypatch):

@@ -541,9 +541,15 @@ def test_a_parked_car_whose_image_says_nothing_stays_undecided():
     assert np.mean(seen.flip_probability) > 0.1
 
 
-def test_a_short_drive_across_decides_for_the_truth():
+@pytest.fixture(scope="module")
+def across() -> tuple[Observation, Seen]:
+    obs = sensed(SIDEWAYS, 0.4)
+    return obs, run(car(), obs)
+
+
+def test_a_short_drive_across_decides_for_the_truth(across):
     """Two metres, of which the mirror image would have seen another side of the marker."""
-    seen = run(car(), sensed(SIDEWAYS, 0.4))
+    _, seen = across
     position_m, heading_rad = errors_of(seen, SIDEWAYS)
     assert not np.any(seen.decided[:, 0])
     assert np.all(seen.decided[:, -1])
@@ -598,11 +604,10 @@ def test_one_gross_outlier_changes_nothing():
         assert np.max(gaps_rad) < np.deg2rad(0.5)
 
 
-def test_what_the_gate_keeps_out_changes_no_verdict_either():
+def test_what_the_gate_keeps_out_changes_no_verdict_either(across):
     """An outlier long after the decision, far from the marker, where its poses lie close."""
     frame = 60
-    obs = sensed(SIDEWAYS, 0.4)
-    clean = run(car(), obs)
+    obs, clean = across
     assert np.all(clean.decided[:, frame - 1])
     moved = obs.corners_px.at[:, frame].add(jnp.asarray([60.0, -25.0]).reshape(1, 1, 1, 1, 2))
     spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, moved))

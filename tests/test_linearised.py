@@ -42,6 +42,7 @@ def sightings_of(rig: CameraRig, rng: np.random.Generator) -> Sightings:
     )
 
 
+@jax.jit
 def projected(rig: CameraRig, seen: Sightings, points: jax.Array) -> jax.Array:
     """Residuals (2, P, N) by `Camera.project`, point by point."""
     cameras = cameras_of(rig, seen)
@@ -59,6 +60,25 @@ def projected(rig: CameraRig, seen: Sightings, points: jax.Array) -> jax.Array:
     return jax.vmap(of_pose, in_axes=-1, out_axes=-1)(points)
 
 
+@jax.jit
+def projected_slopes(rig: CameraRig, seen: Sightings, points: jax.Array) -> jax.Array:
+    """By the three coordinates of all points."""
+    directions = jnp.eye(3)[:, :, None, None] * jnp.ones_like(points)[None]
+    return jax.vmap(lambda d: jax.jvp(lambda p: projected(rig, seen, p), (points,), (d,))[1])(
+        directions
+    )
+
+
+@jax.jit
+def in_vehicle(rig: CameraRig, in_camera: jax.Array) -> jax.Array:
+    return jax.vmap(lambda T, ps: jax.vmap(lambda p: T.inverse() @ p)(ps))(
+        rig.Ts_camera_vehicle, in_camera
+    )
+
+
+rows_of = jax.jit(lambda rig, seen, points: reprojection_rows(rig, seen)(points))
+
+
 @pytest.mark.parametrize(
     "lenses", [["none"], ["radtan"], ["equidistant"], ["radtan", "equidistant", "none"]]
 )
@@ -70,16 +90,11 @@ def test_residuals_and_slopes_are_those_of_the_projection(lenses, special):
     seen = sightings_of(rig, rng)
     in_camera = rng.normal(0, 0.2, (len(lenses), 4, 3)) + SIDE
     in_camera[:, 0] = special
-    points = jax.vmap(lambda T, ps: jax.vmap(lambda p: T.inverse() @ p)(ps))(
-        rig.Ts_camera_vehicle, jnp.asarray(in_camera)
-    )
+    points = in_vehicle(rig, jnp.asarray(in_camera))
     points = points.reshape(-1, 3).T[..., None] * jnp.ones((1, 1, 2))  # two poses alike
-    residual, slope = jax.jit(reprojection_rows(rig, seen))(points)
+    residual, slope = rows_of(rig, seen, points)
     np.testing.assert_allclose(residual, projected(rig, seen, points), atol=1e-8)
-    directions = jnp.eye(3)[:, :, None, None] * jnp.ones_like(points)[None]
-    expected = jax.vmap(
-        lambda d: jax.jvp(lambda p: projected(rig, seen, p), (points,), (d,))[1]
-    )(directions)  # fmt: skip
+    expected = projected_slopes(rig, seen, points)
     np.testing.assert_allclose(slope, expected, rtol=1e-6, atol=1e-5)
 
 
@@ -93,11 +108,11 @@ def test_slopes_have_derivatives_and_are_finite_at_singular_points(lens):
     check_derivatives(
         lambda p: jnp.sum(jnp.sin(rows(p.reshape(3, 4, 1))[1] / 300)), usual.T.reshape(-1)
     )
+    slopes = [jax.jit(jax.grad(lambda p, part=part: jnp.sum(rows(p)[part]))) for part in (0, 1)]
     for corner in (AXIS, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), PLANE, (1e-9, 0.0, 1.0)):
         points = usual.at[0].set(jnp.asarray(corner)).T[..., None]
-        for part in (0, 1):
-            gradient = jax.grad(lambda p, part=part: jnp.sum(rows(p)[part]))(points)
-            assert np.all(np.isfinite(gradient))
+        for slope in slopes:
+            assert np.all(np.isfinite(slope(points)))
 
 
 def test_a_pinhole_of_focal_length_one_looks_the_same():

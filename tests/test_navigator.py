@@ -117,28 +117,21 @@ def test_step_scan_and_vmap_agree():
             )
 
 
-def test_a_drive_is_traced_once():
-    nav, traces = navigator(), []
-
-    @jax.jit
-    def counted(state, obs):
-        traces.append(None)
-        return nav.step(state, obs)
-
-    obs, state = drive(blind=(3,)), nav.init()
-    for index in range(6):
-        state, _ = counted(state, at(obs, index))
-    assert len(traces) == 1
-
-
-def test_the_bound_step_can_be_jitted(precision):
-    nav, obs = navigator(), at(drive(), 0)
+def test_the_bound_step_can_be_jitted_and_is_traced_once_a_drive(precision, monkeypatch):
+    nav, readings, traces = navigator(), drive(blind=(3,)), []
+    step_of = Navigator.step
+    monkeypatch.setattr(Navigator, "step", lambda *given: traces.append(None) or step_of(*given))
     jitted = jax.jit(nav.step)
+    obs = at(readings, 0)
     state, out = jitted(nav.init(), obs)
+    later = state
+    for index in range(1, 6):
+        later, _ = jitted(later, at(readings, index))
+    assert len(traces) == 1
+    assert jitted._cache_size() == 1
+    monkeypatch.undo()
     _, expected = step(nav, nav.init(), obs)
     np.testing.assert_allclose(out.pose, expected.pose, atol=1e-4)
-    jitted(state, obs)
-    assert jitted._cache_size() == 1
     assert nav.step == nav.step
     for leaf in floats_of((state, out)):
         assert leaf.dtype == precision
@@ -196,7 +189,7 @@ def test_the_first_two_steps_by_hand():
     # Ahead and far enough: on a waypoint inside the smallest circle the controller turns no wheel.
     direction = truth[0, 2] + np.deg2rad(20.0)
     waypoint = truth[0, :2] + 3.0 * np.array([np.cos(direction), np.sin(direction)])
-    nav = navigator(corner_sigma_px=0.25, waypoints_m=[waypoint.tolist()])
+    nav = navigator(corner_sigma_px=0.25, waypoints_m=[waypoint.tolist(), (0.5, 0.65)])
     motion = nav.motion
     obs = drive(sigma_px=0.0)
     state, out = step(nav, nav.init(), at(obs, 0))
@@ -278,8 +271,16 @@ def test_state_and_command_survive_any_reading(located, odometry, corners):
     flat = spoilt[visible, 0].reshape(8)
     for index, value in enumerate(corners):
         flat[index] = flat[index] if value is None else value
-    readings = (jnp.asarray(value) for value in odometry)
-    state, out = step(nav, state, Observation(jnp.asarray(spoilt), obs.visible, *readings))
+    readings = (jnp.asarray(value, float) for value in odometry)
+    state, out = step(
+        nav,
+        state,
+        eqx.tree_at(
+            lambda o: (o.corners_px, o.speed_mps, o.steering_rad, o.dt_s),
+            obs,
+            (jnp.asarray(spoilt), *readings),
+        ),
+    )
     check_contained(state, out)
     # And it finds back.
     for _ in range(2):
@@ -322,7 +323,7 @@ def test_nan_odometry_is_a_step_without_odometry(located):
     )
     expected, _ = step(nav, state, absent)
     for field in ("speed_mps", "steering_rad"):
-        broken = eqx.tree_at(lambda o, f=field: getattr(o, f), obs, jnp.asarray(jnp.nan))
+        broken = eqx.tree_at(lambda o, f=field: getattr(o, f), obs, jnp.asarray(jnp.nan, float))
         actual, _ = step(nav, state, broken)
         np.testing.assert_array_equal(actual.belief.mean, expected.belief.mean)
         np.testing.assert_array_equal(actual.belief.covariance, expected.belief.covariance)
@@ -354,7 +355,7 @@ def test_derivatives_of_a_step():
     """With respect to corners, odometry, interval, motion noise and gains: three ways."""
     nav = navigator(max_lm_steps=40)
     obs = drive()
-    state, _ = step(nav, nav.init(), at(obs, 0))
+    state, _ = step(navigator(), nav.init(), at(obs, 0))
     second = at(obs, 1)
 
     def outcome(corners_px, speed_mps, steering_rad, dt_s, parameters):

@@ -17,12 +17,13 @@ from jaxnav.refine import refine_pose, solve_marker, solve_markers
 from jaxnav.residuals import e1
 from jaxnav.rig import CameraRig
 from tests import worlds
-from tests.derivatives import check_derivatives
+from tests.derivatives import check_derivatives, in_float32
 
 FOCAL_PX = 500.0
 VIEW = (0.2, 0.1, 0.6)  # of the room: three cameras, four markers
 
 refine = jax.jit(refine_pose, static_argnames="max_steps")
+image_error_of = jax.jit(e1)
 
 
 def opencv_refined(corners_px: np.ndarray, size_m: float) -> np.ndarray:
@@ -101,6 +102,7 @@ def room():
     return rig, markers, obs, T_world_vehicle
 
 
+@jax.jit
 def errors_of(T_world_vehicle, T_vehicle_world):
     """xi in T_world_vehicle * exp(xi) = estimate."""
     return jax.vmap(lambda T: (T_world_vehicle.inverse() @ T.inverse()).log())(T_vehicle_world)
@@ -196,12 +198,12 @@ def test_the_cost_is_e1(room, precision):
     )
     start = worlds.planar(*VIEW).inverse()
     refined = refine(rig, markers, corners, obs.visible, start)
-    image_error = e1(rig, markers, corners, obs.visible, refined.T_vehicle_world)
+    image_error = image_error_of(rig, markers, corners, obs.visible, refined.T_vehicle_world)
     assert refined.converged
     assert image_error.dtype == precision
     rtol = 2e-4 if precision == np.float32 else 1e-10
     np.testing.assert_allclose(refined.cost, image_error, rtol=rtol)
-    assert refined.cost < e1(rig, markers, corners, obs.visible, start)
+    assert refined.cost < image_error_of(rig, markers, corners, obs.visible, start)
 
 
 def test_sigma_weighs_corners(room):
@@ -286,6 +288,7 @@ def test_a_gradient_that_keeps_the_minima_searches_nothing_twice():
     np.testing.assert_allclose(slope, jax.jit(jax.grad(loss))(corners), rtol=1e-9)
 
 
+@in_float32
 def test_gradients_are_finite_without_a_sight_and_frontally(precision):
     """Exactly frontal, at the start itself and with every lane masked."""
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()

@@ -16,12 +16,18 @@ from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation
 from jaxnav.runtime.recordings import Recording, read_recording
-from jaxnav.runtime.replay import CHUNK_FRAMES, errors, frames_in_view, replay
+from jaxnav.runtime.replay import CHUNK_FRAMES, Replay, errors, frames_in_view, replay
 
 
 @pytest.fixture(scope="module")
 def test_7(data_dir) -> Recording:
     return read_recording(data_dir / "tagslam" / "test_7" / "decoded.npz")
+
+
+@pytest.fixture(scope="module")
+def alone(test_7) -> Replay:
+    """Every marker by itself, by the lowest reprojection error."""
+    return replay(test_7, LowestReprojection(), one_at_a_time=True)
 
 
 @pytest.fixture(autouse=True)
@@ -59,8 +65,8 @@ def test_all_markers_locate_the_rig_to_millimetres(
     assert "wrong branch 0.00%" in capsys.readouterr().out
 
 
-def test_one_marker_at_a_time_takes_few_wrong_branches(test_7):
-    result = replay(test_7, LowestReprojection(), one_at_a_time=True)
+def test_one_marker_at_a_time_takes_few_wrong_branches(test_7, alone):
+    result = alone
     judged = result.seen & test_7.reference.valid[:, None]
     assert judged.sum() > 2600
     np.testing.assert_array_equal(result.seen, test_7.visible.any(axis=1))
@@ -71,11 +77,10 @@ def test_one_marker_at_a_time_takes_few_wrong_branches(test_7):
     assert np.nanmedian(rotation_deg) < 0.6
 
 
-def test_the_bank_halves_the_wrong_branches_at_least(test_7):
+def test_the_bank_halves_the_wrong_branches_at_least(test_7, alone):
     """Every marker by itself, no odometry, every detection judged that has two poses or one."""
     wrong = []
-    for selector in (LowestReprojection(), MultiHypothesis()):
-        result = replay(test_7, selector, one_at_a_time=True)
+    for result in (alone, replay(test_7, MultiHypothesis(), one_at_a_time=True)):
         judged = result.seen & test_7.reference.valid[:, None]
         wrong.append(int((result.branch.wrong & judged).sum()))
         assert np.all(result.located[judged])

@@ -38,7 +38,8 @@ def test_projection_is_equation_2():
     rig = mixed_rig()
     T_vehicle_world = jaxlie.SE3.exp(jnp.asarray(rng.normal(0, 0.1, 6)))
     points_world = np.column_stack([rng.uniform(-1, 1, (20, 2)), rng.uniform(3, 6, 20)])
-    pixels = rig.project(T_vehicle_world, jnp.asarray(points_world.reshape(5, 4, 3)))
+    points = jnp.asarray(points_world.reshape(5, 4, 3))
+    pixels = jax.jit(lambda T, points: rig.project(T, points))(T_vehicle_world, points)
     assert pixels.shape == (3, 5, 4, 2)
     for j, camera in enumerate(reference_cameras(rig)):
         T_camera_world = np.asarray(

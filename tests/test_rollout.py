@@ -36,8 +36,9 @@ class Spy:
     def __init__(self, throttle=0.0, steering_rad=0.0, told=lambda obs: obs.speed_mps):
         self.throttle, self.steering_rad, self.told = throttle, steering_rad, told
 
+    # Of strong types all, or every program would be compiled twice.
     def init(self):
-        return jnp.asarray(0)
+        return jnp.zeros((), int)
 
     def step(self, frame, obs):
         one = SimpleNamespace(valid=jnp.ones(1, bool), steps=jnp.ones(1, int))
@@ -49,7 +50,9 @@ class Spy:
             decided=jnp.asarray(True),
             flip_probability=self.told(obs),
             done=jnp.asarray(False),
-            command=Command(jnp.asarray(self.steering_rad), jnp.asarray(self.throttle)),
+            command=Command(
+                jnp.asarray(self.steering_rad, float), jnp.asarray(self.throttle, float)
+            ),
         )
 
     step_by_regime = step

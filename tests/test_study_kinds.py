@@ -207,7 +207,7 @@ def test_killed_continued_elsewhere_the_bits_stay_the_same(
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2",
     }
     parts, total = tmp_path / "parts.zarr", 6 * TRIALS
-    process = command(*study, parts, "--chunk-trials", 50, **two)
+    process = command(*study, parts, "--chunk-trials", 200, **two)
     while not parts.exists() or count_done(parts) < 200:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)

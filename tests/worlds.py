@@ -104,6 +104,7 @@ def faces(rig: CameraRig, markers: MarkerMap, T_world_vehicle: jaxlie.SE3) -> ja
     return jnp.einsum("cmi,mi->cm", towards, normals) > 0
 
 
+@jax.jit
 def observe(
     rig: CameraRig,
     markers: MarkerMap,

@@ -11,6 +11,8 @@ import platform
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -41,6 +43,8 @@ def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
             write there. Without one, and where the navigator has parts that are not jaxnav's own,
             nothing is kept.
     """
+    if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
+        return partial(_step, navigator)
     numbers, structure = jax.tree.flatten(navigator)
     numbers = [jnp.asarray(number) for number in numbers]
     ready: dict[Any, tuple[Any, Any]] = {}  # a program for each set of fields that are there
@@ -49,7 +53,7 @@ def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
         leaves, given = jax.tree.flatten((state, obs))
         if given not in ready:
             inputs = jax.tree.leaves(jax.eval_shape(lambda: (state, obs)))
-            file = _file(folder, navigator, str((structure, given)), [*numbers, *inputs])
+            file = _file(folder, str((structure, given)), [*numbers, *inputs])
             ready[given] = _loaded(file, numbers, inputs) or _compiled(
                 file, structure, given, numbers, inputs
             )
@@ -60,8 +64,13 @@ def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
     return step
 
 
+@jax.jit
+def _step(navigator: Navigator, state: State, obs: Observation) -> tuple[State, Output]:
+    return navigator.step(state, obs)
+
+
 def _compiled(
-    file: Path | None, structure: Any, given: Any, numbers: list[Any], inputs: list[Any]
+    file: Path, structure: Any, given: Any, numbers: list[Any], inputs: list[Any]
 ) -> tuple[Any, Any]:
     seen: list[Any] = []
 
@@ -72,17 +81,15 @@ def _compiled(
 
     # By a name that JAX's own cache has never met: what it loads runs, but lacks its kernels once
     # stored again.
-    flat.__name__ = f"step_{time.time_ns()}" if file is not None else "step"
+    flat.__name__ = f"step_{time.time_ns()}"
     program = jax.jit(flat).lower(numbers, inputs).compile()
     shape = jax.tree.map(lambda leaf: 0, seen[0])  # whose tree could not be stored by itself
-    if file is not None:
+    with suppress(ValueError, NotImplementedError):  # of a backend that can't
         _keep(file, (serialize_executable.serialize(program), shape))
     return program, jax.tree.structure(shape)
 
 
-def _loaded(file: Path | None, numbers: list[Any], inputs: list[Any]) -> tuple[Any, Any] | None:
-    if file is None:
-        return None
+def _loaded(file: Path, numbers: list[Any], inputs: list[Any]) -> tuple[Any, Any] | None:
     try:
         stored, shape = pickle.loads(file.read_bytes())
         program = serialize_executable.deserialize_and_load(*stored)
@@ -113,13 +120,8 @@ def _keep(file: Path, content: Any) -> None:
         return  # a full or a foreign disk: the program is there all the same
 
 
-def _file(
-    folder: Path | None, navigator: Navigator, structures: str, leaves: list[Any]
-) -> Path | None:
+def _file(folder: Path, structures: str, leaves: list[Any]) -> Path:
     """Named by all that the executable depends on."""
-    known = "0x" not in structures and all(_is_ours(part) for part in _parts(navigator))
-    if folder is None or not known:
-        return None
     device = jax.devices()[0]
     sources = sorted(Path(__file__).resolve().parents[1].glob("*.py"))
     depends_on = [

@@ -3,6 +3,7 @@
 The very `Navigator.step` that runs on a vehicle is scanned over the frames, a chunk at a time.
 """
 
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from jaxnav.evaluation import Branch, judge_branch
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator, State
 from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
+from jaxnav.rig import CameraRig
 from jaxnav.runtime.recording import Recording
 
 CHUNK_FRAMES = 64
@@ -69,22 +71,24 @@ def replay(
     """
     if corner_sigma_px is None:
         corner_sigma_px = estimate_corner_sigma_px(recording)
-    step, state = _stepper(recording, selector, one_at_a_time, corner_sigma_px)
-
-    @jax.jit
-    def run_chunk(state: State, frames: _Frames, begin: Array) -> tuple[State, tuple]:
-        chunk = jax.tree.map(
-            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, begin, CHUNK_FRAMES), frames
-        )
-        return jax.lax.scan(step, state, chunk)
-
+    navigator = Navigator(
+        rig=recording.rig,
+        markers=recording.markers,
+        selector=selector,
+        motion=ConstantVelocity(),
+        corner_sigma_px=corner_sigma_px,
+    )
+    tracks = len(recording.markers.ids) if one_at_a_time else 1
+    state = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)), navigator.init()
+    )
     frames = _frames(recording)
     total = len(recording)
-    run_chunk_compiled = run_chunk.lower(state, frames, jnp.asarray(0)).compile()
+    run_chunk = _run_chunk.lower(navigator, state, _chunk(frames, 0), one_at_a_time).compile()
     started = time.perf_counter()
     chunks = []
     for begin in range(0, total, CHUNK_FRAMES):
-        state, outputs = run_chunk_compiled(state, frames, jnp.asarray(begin))
+        state, outputs = run_chunk(navigator, state, _chunk(frames, begin))
         chunks.append(jax.device_get(outputs))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
@@ -110,48 +114,46 @@ def estimate_corner_sigma_px(recording: Recording) -> float:
     corners_px = recording.corners_px[frames[picks], cameras[picks], marker_indices[picks]]
     padding = SIGMA_SAMPLES - len(picks)
 
-    @jax.jit
-    @jax.vmap
-    def best_e1_px2(corners_px: Array, camera: Array, marker: Array) -> Array:
-        seen = jnp.arange(len(recording.rig)) == camera
-        obs = Observation(jnp.broadcast_to(corners_px, (seen.shape[0], 1, 4, 2)), seen[:, None])
-        snapshot = Snapshot.create(recording.rig, _single(recording.markers, marker), obs)
-        candidates = find_candidates(snapshot)
-        return jnp.min(jnp.where(candidates.valid, candidates.e1_px2, jnp.inf))
-
     def padded(rows: np.ndarray) -> Array:
         return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)]))
 
-    e1_px2 = best_e1_px2(padded(corners_px), padded(cameras[picks]), padded(marker_indices[picks]))
+    e1_px2 = _best_e1_px2(
+        recording.rig,
+        recording.markers,
+        padded(corners_px),
+        padded(cameras[picks]),
+        padded(marker_indices[picks]),
+    )
     sigma_px = np.sqrt(np.median(np.asarray(e1_px2)[: len(picks)]) / (2 * np.log(2)))
     return float(np.hypot(sigma_px, MODEL_SIGMA_PX))
 
 
-def _stepper(
-    recording: Recording, selector: Selector, one_at_a_time: bool, corner_sigma_px: float
-) -> tuple[Callable[[State, _Frames], tuple[State, tuple]], State]:
-    """A scannable step over all tracks, and their initial state."""
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
+def _best_e1_px2(
+    rig: CameraRig, markers: MarkerMap, corners_px: Array, camera: Array, marker: Array
+) -> Array:
+    """e1 of the best pose of one marker in one camera."""
+    seen = jnp.arange(len(rig)) == camera
+    obs = Observation(jnp.broadcast_to(corners_px, (seen.shape[0], 1, 4, 2)), seen[:, None])
+    candidates = find_candidates(Snapshot.create(rig, _single(markers, marker), obs))
+    return jnp.min(jnp.where(candidates.valid, candidates.e1_px2, jnp.inf))
 
-    def navigator(markers: MarkerMap) -> Navigator:
-        return Navigator(
-            rig=recording.rig,
-            markers=markers,
-            selector=selector,
-            motion=ConstantVelocity(),
-            corner_sigma_px=corner_sigma_px,
-        )
+
+@functools.partial(jax.jit, static_argnums=3)
+def _run_chunk(
+    navigator: Navigator, state: State, chunk: _Frames, one_at_a_time: bool
+) -> tuple[State, tuple]:
+    """All tracks through the frames of a chunk; `state` has a leading axis (tracks,)."""
+    markers = navigator.markers
 
     def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, tuple]:
         obs = Observation(frame.corners_px, frame.visible, dt_s=frame.dt_s)
-        state, out = navigator(markers).step(state, obs)
+        state, out = eqx.tree_at(lambda n: n.markers, navigator, markers).step(state, obs)
         truth = jaxlie.SE3(frame.T_world_vehicle_true)
         branch = judge_branch(out.candidates, out.selected, truth)
         pose = out.T_world_vehicle.wxyz_xyz
         return state, (pose, out.selected >= 0, out.located, out.flip_probability, branch)
-
-    count = len(recording.markers.ids) if one_at_a_time else 1
-    initial = navigator(recording.markers).init()
-    state = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), initial)
 
     def step(state: State, frame: _Frames) -> tuple[State, tuple]:
         def alone(state: State, marker: Array) -> tuple[State, tuple]:
@@ -161,14 +163,15 @@ def _stepper(
                 frame.dt_s,
                 frame.T_world_vehicle_true,
             )
-            return outputs_of(_single(recording.markers, marker), state, seen_alone)
+            return outputs_of(_single(markers, marker), state, seen_alone)
 
         def together(state: State, _: Array) -> tuple[State, tuple]:
-            return outputs_of(recording.markers, state, frame)
+            return outputs_of(markers, state, frame)
 
-        return jax.vmap(alone if one_at_a_time else together)(state, jnp.arange(count))
+        tracks = jnp.arange(len(markers.ids) if one_at_a_time else 1)
+        return jax.vmap(alone if one_at_a_time else together)(state, tracks)
 
-    return step, state
+    return jax.lax.scan(step, state, chunk)
 
 
 def _single(markers: MarkerMap, index: Array) -> MarkerMap:
@@ -197,6 +200,13 @@ def _frames(recording: Recording) -> _Frames:
         visible=jnp.asarray(visible),
         dt_s=pad(np.clip(dt_s, 0, MAX_DT_S)),
         T_world_vehicle_true=pad(truth),
+    )
+
+
+@jax.jit
+def _chunk(frames: _Frames, begin: int | Array) -> _Frames:
+    return jax.tree.map(
+        lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, begin, CHUNK_FRAMES), frames
     )
 
 

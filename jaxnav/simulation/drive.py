@@ -6,6 +6,7 @@ corners with noise. Commands act `latency_s` after the stamp of the frame they s
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +54,11 @@ class Frame:
     branches: Mapping[str, Branch]
 
 
+@jax.jit
+def _step(navigator: Navigator, state: State, obs: Observation) -> tuple[State, Output]:
+    return navigator.step(state, obs)
+
+
 class Methods:
     """Navigators under comparison, each compiled once: every one gets the same observations.
 
@@ -62,7 +68,7 @@ class Methods:
     def __init__(
         self,
         navigators: Mapping[str, Navigator],
-        compiled: Callable[[Navigator], Step] = lambda navigator: jax.jit(navigator.step),
+        compiled: Callable[[Navigator], Step] = lambda navigator: partial(_step, navigator),
     ):
         self._navigators = dict(navigators)
         self._steps = {name: compiled(navigator) for name, navigator in navigators.items()}
