@@ -102,15 +102,18 @@ class MultiHypothesis(eqx.Module):
         )
         costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
         located = jnp.any(alive)
+        heir = jnp.arange(count)
+        if count > 1:
+            heir = jax.lax.cond(
+                jnp.sum(alive) > 1,
+                lambda: self._heirs(after, log_weight, alive, prior.freedom, snapshot),
+                lambda: jnp.arange(count),
+            )
         return Selection(
             measured=eqx.tree_at(lambda m: m.taken, posteriors, alive & any_seen),
             kept=alive & ~starts,
             log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
-            heir=jax.lax.cond(
-                jnp.sum(alive) > 1,
-                lambda: self._heirs(after, log_weight, alive, prior.freedom, snapshot),
-                lambda: jnp.arange(count),
-            ),
+            heir=heir,
             costs=costs,
             selected=jnp.where(jnp.any(candidates.valid) & located, jnp.argmin(costs), -1),
             flip_probability=jnp.where(located, flip_probability, 0),

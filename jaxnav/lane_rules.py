@@ -14,7 +14,17 @@ import numpy as np
 from jax import lax
 
 from jaxnav.lane_tables import arg_extreme, dynamic_slice, gather, scatter, sort, top_k
-from jaxnav.lane_values import DEAR, UNROLLED, Lane, Value, at_place, rows_of, scanned, written
+from jaxnav.lane_values import (
+    DEAR,
+    UNROLLED,
+    Lane,
+    Value,
+    at_place,
+    joined,
+    rows_of,
+    scanned,
+    written,
+)
 
 
 def elementwise(primitive: Any, args: list[Any], params: dict[str, Any], lanes: int) -> Lane:
@@ -30,11 +40,11 @@ def elementwise(primitive: Any, args: list[Any], params: dict[str, Any], lanes: 
         arg = jnp.asarray(arg)
         return lax.broadcast_in_dim(arg, full, tuple(range(arg.ndim)))
 
+    args = [
+        written(arg, 0) if isinstance(arg, Lane) and arg.shape != shape else arg for arg in args
+    ]
     work = sum(arg.work for arg in args if isinstance(arg, Lane))
     own = 0 if primitive.name in _FREE else 1 if primitive.name not in _SLOW else 8
-    for i, arg in enumerate(args):
-        if isinstance(arg, Lane) and arg.shape != shape:
-            args[i] = written(arg, 0)
     return Lane(primitive.bind(*[met(arg) for arg in args], **params), work + own)
 
 
@@ -112,13 +122,13 @@ def _slice(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
 
 
 def _concatenate(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
-    return [Lane(lax.concatenate([rows_of(arg, lanes) for arg in args], params["dimension"]), DEAR)]
+    return [joined([rows_of(arg, lanes) for arg in args], params["dimension"])]
 
 
 def _stack(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
     axis = params["axis"]
     rows = [lax.expand_dims(rows_of(arg, lanes), (axis,)) for arg in args]
-    return [Lane(lax.concatenate(rows, axis), DEAR)]
+    return [joined(rows, axis)]
 
 
 def _split(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:

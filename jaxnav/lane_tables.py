@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxnav.lane_values import DEAR, UNROLLED, Lane, Value, at_place, rows_of
+from jaxnav.lane_values import DEAR, UNROLLED, Lane, Value, at_place, barrier, rows_of
 
 
 def _windows(
@@ -243,7 +243,7 @@ def sort(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | N
     if params["num_keys"] != 1 or not params["is_stable"] or rows[0].shape[axis] > UNROLLED:
         return None
     rows = [jnp.moveaxis(r, axis, 0) for r in rows]
-    ranks = lax.optimization_barrier(_ranks(rows[0], descending=False))
+    ranks = barrier(_ranks(rows[0], descending=False))
     return [Lane(jnp.moveaxis(_placed(ranks, r, r.shape[0]), 0, axis)) for r in rows]
 
 
@@ -252,7 +252,7 @@ def top_k(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | 
     if rows.shape[axis] > UNROLLED:
         return None
     rows = jnp.moveaxis(rows, axis, 0)
-    ranks = lax.optimization_barrier(_ranks(rows, descending=True))
+    ranks = barrier(_ranks(rows, descending=True))
     index = jnp.broadcast_to(
         jnp.arange(rows.shape[0], dtype=jnp.int32).reshape((-1,) + (1,) * (rows.ndim - 1)),
         rows.shape,

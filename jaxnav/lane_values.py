@@ -1,16 +1,57 @@
 """What `over_lanes` computes with: values that differ between the lanes, and others."""
 
-from collections.abc import Callable
+import contextvars
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
 
 UNROLLED = 32  # terms of a sum, rows of a table that a lane chooses from
 # Operations a number: what is worth computing twice, and what is worth a pass over memory.
 CHEAP, DEAR = 2, 24
+
+
+_in_kernel = contextvars.ContextVar("in_kernel", default=False)
+
+
+@contextmanager
+def one_kernel() -> Iterator[None]:
+    """What is traced here becomes part of one kernel: see `lane_strips.py`."""
+    token = _in_kernel.set(True)
+    try:
+        yield
+    finally:
+        _in_kernel.reset(token)
+
+
+def barrier(rows: jax.Array) -> jax.Array:
+    """The same, computed once and not anew for whoever reads it.
+
+    Inside a kernel XLA knows no barriers, but calls, which LLVM makes a copy.
+    """
+    if not _in_kernel.get():
+        return lax.optimization_barrier(rows)
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(_same)(rows)
+
+
+def _same(rows: jax.Array) -> jax.Array:
+    return rows
+
+
+def joined(rows: list[jax.Array], axis: int) -> "Lane":
+    """Along an existing axis.
+
+    Inside a kernel by itself: fused with anything else it asks for every number where it is from.
+    """
+    if not _in_kernel.get():
+        return Lane(lax.concatenate(rows, axis), DEAR)
+    return Lane(barrier(lax.concatenate([barrier(r) for r in rows], axis)))
 
 
 class Lane:
@@ -33,7 +74,7 @@ class Lane:
         """The array itself."""
         if self.at is not None:
             fetched = self.source.at[..., self.at].get(mode="promise_in_bounds")
-            self.source, self.at = lax.optimization_barrier(fetched), None
+            self.source, self.at = barrier(fetched), None
         return self.source
 
 
@@ -45,7 +86,7 @@ def written(value: Value, cheap: int) -> Value:
     """A value that whoever needs it reads, instead of computing it once more for himself."""
     if not isinstance(value, Lane) or value.work <= cheap:
         return value
-    return Lane(lax.optimization_barrier(value.rows))
+    return Lane(barrier(value.rows))
 
 
 def known(value: Any) -> Value:
@@ -80,6 +121,6 @@ def scanned(
         config = [(0, 0, 0)] * rows.ndim
         config[axis] = (-step, step, 0) if reverse else (step, -step, 0)
         shifted = lax.pad(rows, jnp.asarray(neutral, rows.dtype), config)
-        rows = lax.optimization_barrier(combine(rows, shifted))
+        rows = barrier(combine(rows, shifted))
         step *= 2
     return rows

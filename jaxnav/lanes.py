@@ -21,6 +21,7 @@ from jax import lax
 from jax.extend import core
 
 from jaxnav.lane_rules import ELEMENTWISE, NUMPY, RULES, VIEWS, elementwise
+from jaxnav.lane_strips import CALLS, STRIP, by_itself, in_strips
 from jaxnav.lane_values import CHEAP, DEAR, Lane, Value, known, rows_of, scanned, written
 
 # What `over_lanes` writes to memory once, XLA for the CPU would compute again wherever it is read,
@@ -110,8 +111,8 @@ class _Evaluation(NamedTuple):
 
     def _apply(self, eqn: Any, args: list[Value]) -> list[Value]:
         name, params = eqn.primitive.name, eqn.params
-        if name in _CALLS:
-            closed = params[_CALLS[name]]
+        if name in CALLS:
+            closed = params[CALLS[name]]
             return self.run(closed.jaxpr, [known(c) for c in closed.consts], args)
         if name == "platform_index":
             return [_platform_index(params["platforms"])]
@@ -125,14 +126,19 @@ class _Evaluation(NamedTuple):
         if not any(isinstance(arg, Lane) for arg in args):
             outs = eqn.primitive.bind(*args, **params)
             return list(outs) if eqn.primitive.multiple_results else [outs]
+        if name == "while" and self.lanes > STRIP and by_itself(eqn):
+            strip, fixed = _Evaluation(STRIP, self.block), len(args) - len(eqn.outvars)
+            start = [rows_of(arg, self.lanes) for arg in args[fixed:]]
+            outs = in_strips(lambda args: strip._while(args, params), args[:fixed], start)
+            return [Lane(out) for out in outs]
         if name == "while":
             return self._while(args, params)
         if name == "scan":
             return self._scan(args, params)
         if name in ELEMENTWISE and name not in RULES:
             return [elementwise(eqn.primitive, args, params, self.lanes)]
-        if name not in VIEWS:
-            args = [written(arg, 0) for arg in args]
+        if name not in VIEWS:  # a sum asks for every term once
+            args = [written(arg, CHEAP if name == "reduce_sum" else 0) for arg in args]
         rule = RULES.get(name)
         outs = rule(args, params, self.lanes) if rule else None
         return self._generic(eqn.primitive, args, params) if outs is None else outs
@@ -290,13 +296,3 @@ def _platform_index(platforms: Sequence[Sequence[str] | None]) -> np.ndarray:
     here = jax.default_backend()
     fits = [i for i, names in enumerate(platforms) if names is None or here in names]
     return np.asarray(fits[0], np.int32)
-
-
-_CALLS = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-}

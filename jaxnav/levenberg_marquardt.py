@@ -26,15 +26,11 @@ KEEP_MINIMA = jax.checkpoint_policies.save_only_these_names(_MINIMUM)
 
 
 class LMState(eqx.Module):
-    """What is known at the accepted points: residual and derivative; and the damping to try next.
-
-    The loop carries J and not J'J: what it carries XLA computes once, and what is formed from it
-    at the beginning of a step as well.
-    """
+    """What is known at the accepted points: the normal equations; and the damping to try next."""
 
     cost: Float[Array, " N"]  # sum of squares
-    residual: Float[Array, "m N"]
-    J: Float[Array, "n m N"]  # one row for each unknown
+    information: Float[Array, "n n N"]  # J'J
+    gradient: Float[Array, "n N"]  # J'r
     damping: Float[Array, " N"]  # 0: none yet
     growth: Float[Array, " N"]
     steps: Int[Array, " N"]
@@ -76,8 +72,8 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         lanes = jnp.zeros(y.shape[1], y.dtype)
         return LMState(
             cost=lanes + jnp.inf,
-            residual=jnp.zeros(f_struct.shape, y.dtype),
-            J=jnp.zeros(aux_struct.shape, y.dtype),
+            information=jnp.zeros((y.shape[0], *y.shape), y.dtype),
+            gradient=jnp.zeros_like(y),
             damping=lanes,  # the first point with a derivative chooses it
             growth=lanes + 2,
             steps=lanes.astype(int),
@@ -95,21 +91,20 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         tags: frozenset[object],
     ) -> tuple[Array, LMState, PyTree]:
         """Try one damped step of every problem and learn from it."""
-        information = jnp.sum(state.J[:, None] * state.J[None], axis=2)
-        gradient = jnp.sum(state.J * state.residual[None], axis=1)
-        n = y.shape[0]
-        largest = jnp.max(jnp.stack([information[i, i] for i in range(n)]), axis=0)
+        diagonal = jnp.stack([state.information[i, i] for i in range(y.shape[0])])
+        largest = jnp.max(diagonal, axis=0)
         damping = jnp.where(
             state.damping > 0,
             jnp.maximum(state.damping, jnp.finfo(y.dtype).eps * largest),
             self.initial_damping * largest,
         )
-        eye = jnp.eye(n, dtype=y.dtype)[:, :, None]
-        move = -solve_positive(information + damping[None, None] * eye, gradient)
+        move = -solve_positive(state.information, state.gradient, damping)
         move = jnp.where(jnp.isfinite(move), move, 0)
-        promised = jnp.sum(move * (damping[None] * move - gradient), axis=0)
+        promised = jnp.sum(move * (damping[None] * move - state.gradient), axis=0)
 
         residual, J = fn(y + move, args)
+        information = jnp.sum(J[:, None] * J[None], axis=2)
+        gradient = jnp.sum(J * residual[None], axis=1)
         cost = jnp.sum(residual**2, axis=0)
         accept = (cost < state.cost) & ~state.done
         gained = (state.cost - cost) / jnp.where(promised > 0, promised, 1)
@@ -119,8 +114,8 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
             jnp.where(accept[None], y + move, y),
             LMState(
                 cost=jnp.where(accept, cost, state.cost),
-                residual=jnp.where(accept[None], residual, state.residual),
-                J=jnp.where(accept[None, None], J, state.J),
+                information=jnp.where(accept[None, None], information, state.information),
+                gradient=jnp.where(accept[None], gradient, state.gradient),
                 damping=damping * jnp.where(accept, relaxed, state.growth),
                 growth=jnp.where(accept, 2.0, 2 * state.growth),
                 steps=state.steps + ~state.done,

@@ -204,15 +204,9 @@ def _minimise(
     n, dtype = free.shape[1], chart.pivot.dtype
 
     def fn(y: Array, args: None) -> tuple[Any, Array]:
-        # Without a visible corner y itself is the residual: nothing moves, no 0 / 0.
+        # Without a visible corner there is nothing to gain: nothing moves.
         residual, J = linearised(y)
-        residual = jnp.where(constrained[None], residual, 0)
-        J = jnp.where(constrained[None, None], J, 0)
-        eye = jnp.eye(n, dtype=dtype)[:, :, None] * ~constrained[None, None]
-        return (
-            jnp.concatenate([residual, jnp.where(constrained[None], 0, y)]),
-            jnp.concatenate([J, eye], axis=1),
-        )
+        return jnp.where(constrained[None], residual, 0), jnp.where(constrained[None, None], J, 0)
 
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6  # of the cost, what is left to gain
     solution: optx.Solution = optx.least_squares(

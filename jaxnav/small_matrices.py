@@ -87,8 +87,11 @@ def log_det(L: Float[Array, "n n"]) -> Float[Array, ""]:
     return 2 * jnp.sum(jnp.log(jnp.diagonal(L)))
 
 
-def solve_positive(A: Float[Array, "n n ..."], b: Float[Array, "n ..."]) -> Array:
-    """A^-1 b, for a positive definite A; NaN for another. Every entry by itself, for all lanes.
+def solve_positive(
+    A: Float[Array, "n n ..."], b: Float[Array, "n ..."], ridge: Float[Array, "..."] | float = 0
+) -> Array:
+    """(A + ridge I)^-1 b, if that is positive definite; NaN if not. Every entry by itself, for all
+    lanes.
 
     As matrices, each column of the factor would be computed anew for every entry that asks for it.
 
@@ -103,7 +106,7 @@ def solve_positive(A: Float[Array, "n n ..."], b: Float[Array, "n ..."]) -> Arra
             for k in range(j):
                 rest = rest - L[i][k] * L[j][k]
             L[i].append(rest * L[j][j])
-        pivot, right = A[i, i], b[i]
+        pivot, right = A[i, i] + ridge, b[i]
         for k in range(i):
             pivot = pivot - L[i][k] * L[i][k]
             right = right - L[i][k] * y[k]

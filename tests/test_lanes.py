@@ -103,6 +103,34 @@ def test_loops_of_a_batch_inside_a_lane():
     same(jax.vmap(newton), 100 * drawn(3))
 
 
+@pytest.mark.parametrize("lanes", [33, 64, 100])
+def test_loops_run_in_strips(lanes):
+    """Each is one kernel, which ends with its own slowest lane; the last repeats some lanes."""
+
+    def looping(x, floor):
+        def step(carry):
+            y, total, count = carry
+            root, steps = newton(y + floor)
+            both = jnp.stack([root, y]) / 3
+            return both[0], total + jnp.outer(both, both)[0, 1], count + steps
+
+        return lax.while_loop(lambda c: c[0] > 1, step, (jnp.abs(x), 0 * x, 0))
+
+    x, floor = 100 * jnp.asarray(np.resize(drawn(), lanes)), jnp.asarray(np.resize(drawn(), lanes))
+    mapped = jax.jit(over_lanes(looping), compiler_options=COMPILER_OPTIONS)
+    assert "xla_cpu_small_call" in mapped.lower(x, floor).as_text()
+    straight = mapped(x, floor)
+    for a, b in zip(
+        jax.tree.leaves(straight), jax.tree.leaves(jax.vmap(looping)(x, floor)), strict=True
+    ):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+    order = np.random.default_rng(4).permutation(lanes)
+    for a, b in zip(
+        jax.tree.leaves(straight), jax.tree.leaves(mapped(x[order], floor[order])), strict=True
+    ):
+        np.testing.assert_array_equal(np.asarray(a)[order], b)
+
+
 def branching(which, A):
     def first(A):
         return A @ A, newton(A[0, 0])[1]
