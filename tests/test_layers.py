@@ -16,6 +16,7 @@ LAYERS = {
     "geometry": {
         "geometry",
         "lane_rules",
+        "lane_strips",
         "lane_tables",
         "lane_values",
         "lanes",
