@@ -75,6 +75,8 @@ CORE_MAY_IMPORT = {"jax", "jaxlie", "equinox", "optimistix", "lineax", "jaxtypin
     "__future__",
     "abc",
     "collections",
+    "contextlib",
+    "contextvars",
     "dataclasses",
     "enum",
     "functools",
