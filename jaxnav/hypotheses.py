@@ -102,12 +102,12 @@ class MultiHypothesis(eqx.Module):
         )
         costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
         located = jnp.any(alive)
-        heir = jnp.arange(count)
+        own = heir = jnp.arange(count)
         if count > 1:
             heir = jax.lax.cond(
                 jnp.sum(alive) > 1,
                 lambda: self._heirs(after, log_weight, alive, prior.freedom, snapshot),
-                lambda: jnp.arange(count),
+                lambda: own,
             )
         return Selection(
             measured=eqx.tree_at(lambda m: m.taken, posteriors, alive & any_seen),

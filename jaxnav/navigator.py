@@ -296,3 +296,12 @@ class Navigator(eqx.Module):
 
     # Bound methods hash their owner: by identity, so that `jax.jit(navigator.step)` works.
     __hash__ = object.__hash__
+
+
+Step = Callable[[State, Observation], tuple[State, Output]]
+
+
+@jax.jit
+def jitted_step(navigator: Navigator, state: State, obs: Observation) -> tuple[State, Output]:
+    """`navigator.step`, one program for all navigators of a structure."""
+    return navigator.step(state, obs)

@@ -10,7 +10,7 @@ import pickle
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from importlib.metadata import version
@@ -23,10 +23,9 @@ import jax.numpy as jnp
 import jaxlie
 from jax.experimental import serialize_executable
 
-from jaxnav.navigator import Navigator, Output, State
+from jaxnav.navigator import Navigator, Output, State, Step, jitted_step
 from jaxnav.observation import Observation
 
-Step = Callable[[State, Observation], tuple[State, Output]]
 _KEPT = 32  # executables, of some MB each: the last ones used
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 
@@ -44,7 +43,7 @@ def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
             nothing is kept.
     """
     if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
-        return partial(_step, navigator)
+        return partial(jitted_step, navigator)
     numbers, structure = jax.tree.flatten(navigator)
     numbers = [jnp.asarray(number) for number in numbers]
     ready: dict[Any, tuple[Any, Any]] = {}  # a program for each set of fields that are there
@@ -62,11 +61,6 @@ def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
         return result
 
     return step
-
-
-@jax.jit
-def _step(navigator: Navigator, state: State, obs: Observation) -> tuple[State, Output]:
-    return navigator.step(state, obs)
 
 
 def _compiled(

@@ -17,7 +17,7 @@ from jaxnav.control import Command
 from jaxnav.errors import BadInput
 from jaxnav.evaluation import Branch, judge_branch
 from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.navigator import Navigator, Output, State
+from jaxnav.navigator import Navigator, Output, State, Step, jitted_step
 from jaxnav.observation import Observation
 from jaxnav.simulation.plant import CarState, OdometryNoise, move_through, read_odometry
 
@@ -25,7 +25,6 @@ PASSED_M = 0.30  # a waypoint counts as passed when the true car came this close
 _SUBSTEPS = 8  # between two events: some 5 ms each
 
 PoseAt = Callable[[np.ndarray], np.ndarray]  # times_s (N,) -> T_world_vehicle (N, 7), wxyz_xyz
-Step = Callable[[State, Observation], tuple[State, Output]]
 # The true motion around a stamp, the stamp, and what the driver believes (None at first) ->
 # corners (C, M, 4, 2), visible (C, M), sigma (C, M, 4) or None.
 Look = Callable[[PoseAt, float, Output | None], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
@@ -54,11 +53,6 @@ class Frame:
     branches: Mapping[str, Branch]
 
 
-@jax.jit
-def _step(navigator: Navigator, state: State, obs: Observation) -> tuple[State, Output]:
-    return navigator.step(state, obs)
-
-
 class Methods:
     """Navigators under comparison, each compiled once: every one gets the same observations.
 
@@ -68,7 +62,7 @@ class Methods:
     def __init__(
         self,
         navigators: Mapping[str, Navigator],
-        compiled: Callable[[Navigator], Step] = lambda navigator: partial(_step, navigator),
+        compiled: Callable[[Navigator], Step] = lambda navigator: partial(jitted_step, navigator),
     ):
         self._navigators = dict(navigators)
         self._steps = {name: compiled(navigator) for name, navigator in navigators.items()}

@@ -24,7 +24,7 @@ from jaxnav.geometry import T_world_vehicle_from_planar, safe_norm, wrap_angle
 from jaxnav.kalman import nis
 from jaxnav.lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
 from jaxnav.markers import MarkerMap
-from jaxnav.navigator import Navigator, Output, State
+from jaxnav.navigator import Navigator, State, Step
 from jaxnav.observation import Observation
 from jaxnav.rig import CameraRig
 from jaxnav.simulation.corners import see
@@ -34,7 +34,6 @@ from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.single_frames import directions
 from jaxnav.trees import where
 
-_Step = Callable[[State, Observation], tuple[State, Output]]
 _jit = cast(Any, eqx.filter_jit)  # whose types know of no compiler options
 _SUBSTEPS = 4  # of either part of a frame period
 
@@ -209,7 +208,7 @@ class Rollout(eqx.Module):
             on_floor=jnp.asarray(True),
         )
 
-    def _frame(self, world: _World, step: _Step) -> tuple[_World, Trace]:
+    def _frame(self, world: _World, step: Step) -> tuple[_World, Trace]:
         """Move for a frame period, the command of the last frame after its latency; then look."""
         scenario = self.scenario
         dtype = world.car.pose.dtype
