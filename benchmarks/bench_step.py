@@ -37,7 +37,7 @@ from jaxnav.control import Command  # noqa: E402
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
 from jaxnav.geometry import T_world_vehicle_from_planar  # noqa: E402
 from jaxnav.hypotheses import MultiHypothesis  # noqa: E402
-from jaxnav.levenberg_marquardt import KEEP_MINIMA  # noqa: E402
+from jaxnav.levenberg_marquardt import KEEP_FOUND  # noqa: E402
 from jaxnav.navigator import Navigator, State  # noqa: E402
 from jaxnav.observation import Observation  # noqa: E402
 from jaxnav.runtime.compiled import compiled_step  # noqa: E402
@@ -192,7 +192,7 @@ def rollout_loss(navigator: Navigator) -> tuple[Callable[[Parameters], jax.Array
     def loss(parameters: Parameters) -> jax.Array:
         tuned = eqx.tree_at(where, navigator, parameters)
 
-        @functools.partial(jax.checkpoint, policy=KEEP_MINIMA, prevent_cse=False)
+        @functools.partial(jax.checkpoint, policy=KEEP_FOUND, prevent_cse=False)
         def frame(carry: tuple[CarState, Command, State], noise: jax.Array) -> Any:
             car, command, state = carry
             car = jax.tree.map(

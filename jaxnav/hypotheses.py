@@ -27,6 +27,7 @@ from jaxnav.ambiguity import PoseBelief, PosePosterior, Selection
 from jaxnav.candidates import Candidates
 from jaxnav.fan import CANDIDATES, fan, normalised
 from jaxnav.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
+from jaxnav.levenberg_marquardt import found
 from jaxnav.map_fit import Fit, fit
 from jaxnav.observation import Snapshot
 from jaxnav.small_matrices import applied, cholesky, product, ranks, sandwich, solve_lower
@@ -113,7 +114,7 @@ class MultiHypothesis(eqx.Module):
             measured=eqx.tree_at(lambda m: m.taken, posteriors, alive & any_seen),
             kept=alive & ~starts,
             log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
-            heir=heir,
+            heir=found(heir),
             costs=costs,
             selected=jnp.where(jnp.any(candidates.valid) & located, jnp.argmin(costs), -1),
             flip_probability=jnp.where(located, flip_probability, 0),

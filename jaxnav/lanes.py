@@ -32,7 +32,7 @@ COMPILER_OPTIONS = {
 }
 
 
-def over_lanes(fn: Callable[..., Any], block: int = 256) -> Callable[..., Any]:
+def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
     """`jax.vmap(fn, in_axes=-1, out_axes=-1)`, evaluated as the module says.
 
     Args:

@@ -19,18 +19,31 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxnav.small_matrices import solve_positive
 
-_MINIMUM = "minimum"
-# For the gradient of many steps, `jax.checkpoint(step, policy=KEEP_MINIMA)`: of a step it keeps no
-# more than its carry and where each search has ended, and searches nothing twice.
-KEEP_MINIMA = jax.checkpoint_policies.save_only_these_names(_MINIMUM)
+_FOUND = "found"
+# For the gradient of many steps, `jax.checkpoint(step, policy=KEEP_FOUND)`: of a step it keeps no
+# more than its carry and what each search has found, and searches nothing twice.
+KEEP_FOUND = jax.checkpoint_policies.save_only_these_names(_FOUND)
+
+
+def found(tree: PyTree) -> PyTree:
+    """The arrays of a tree, as what a search has found."""
+    return jax.tree.map(
+        lambda leaf: checkpoint_name(leaf, _FOUND) if eqx.is_array(leaf) else leaf, tree
+    )
+
+
+class NormalEquations(eqx.Module):
+    """What a step needs to know of N problems besides their cost."""
+
+    information: Float[Array, "n n N"]  # J'J
+    gradient: Float[Array, "n N"]  # J'r
 
 
 class LMState(eqx.Module):
-    """What is known at the accepted points: the normal equations; and the damping to try next."""
+    """What is known at the accepted points, and the damping to try next."""
 
     cost: Float[Array, " N"]  # sum of squares
-    information: Float[Array, "n n N"]  # J'J
-    gradient: Float[Array, "n N"]  # J'r
+    normal: NormalEquations
     damping: Float[Array, " N"]  # 0: none yet
     growth: Float[Array, " N"]
     steps: Int[Array, " N"]
@@ -42,7 +55,7 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt on dense normal equations with Nielsen's damping, N problems at once.
 
     The function maps unknowns (n, N) to residuals (m, N), every problem by itself, and returns
-    their derivatives (n, m, N) as `aux`. The solver ends when all problems have; one that has ended
+    their `NormalEquations` as `aux`. The solver ends when all problems have; one that has ended
     stays where it is. `solution.state` says which have, and after how many steps.
 
     Unknowns are scaled so that lambda * I suits them all, and few: J'J squares the condition
@@ -72,8 +85,7 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         lanes = jnp.zeros(y.shape[1], y.dtype)
         return LMState(
             cost=lanes + jnp.inf,
-            information=jnp.zeros((y.shape[0], *y.shape), y.dtype),
-            gradient=jnp.zeros_like(y),
+            normal=NormalEquations(jnp.zeros((y.shape[0], *y.shape), y.dtype), jnp.zeros_like(y)),
             damping=lanes,  # the first point with a derivative chooses it
             growth=lanes + 2,
             steps=lanes.astype(int),
@@ -91,20 +103,19 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         tags: frozenset[object],
     ) -> tuple[Array, LMState, PyTree]:
         """Try one damped step of every problem and learn from it."""
-        diagonal = jnp.stack([state.information[i, i] for i in range(y.shape[0])])
+        information, gradient = state.normal.information, state.normal.gradient
+        diagonal = jnp.stack([information[i, i] for i in range(y.shape[0])])
         largest = jnp.max(diagonal, axis=0)
         damping = jnp.where(
             state.damping > 0,
             jnp.maximum(state.damping, jnp.finfo(y.dtype).eps * largest),
             self.initial_damping * largest,
         )
-        move = -solve_positive(state.information, state.gradient, damping)
+        move = -solve_positive(information, gradient, damping)
         move = jnp.where(jnp.isfinite(move), move, 0)
-        promised = jnp.sum(move * (damping[None] * move - state.gradient), axis=0)
+        promised = jnp.sum(move * (damping[None] * move - gradient), axis=0)
 
-        residual, J = fn(y + move, args)
-        information = jnp.sum(J[:, None] * J[None], axis=2)
-        gradient = jnp.sum(J * residual[None], axis=1)
+        residual, normal = fn(y + move, args)
         cost = jnp.sum(residual**2, axis=0)
         accept = (cost < state.cost) & ~state.done
         gained = (state.cost - cost) / jnp.where(promised > 0, promised, 1)
@@ -114,15 +125,17 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
             jnp.where(accept[None], y + move, y),
             LMState(
                 cost=jnp.where(accept, cost, state.cost),
-                information=jnp.where(accept[None, None], information, state.information),
-                gradient=jnp.where(accept[None], gradient, state.gradient),
+                normal=NormalEquations(
+                    jnp.where(accept[None, None], normal.information, information),
+                    jnp.where(accept[None], normal.gradient, gradient),
+                ),
                 damping=damping * jnp.where(accept, relaxed, state.growth),
                 growth=jnp.where(accept, 2.0, 2 * state.growth),
                 steps=state.steps + ~state.done,
                 first=jnp.asarray(False),
                 done=state.done | (~state.first & exhausted),
             ),
-            J,
+            normal,
         )
 
     def terminate(
@@ -156,9 +169,8 @@ class ImplicitGradient(optx.AbstractAdjoint):
     """Derivatives of N minima (n, N) by the implicit function theorem: dy = -H^-1 d(gradient).
 
     What `optimistix.ImplicitAdjoint` computes, less its check of the linear solve, which calls
-    the host and raises there, and with the gradient from the derivatives that the function gives
-    as `aux`: differentiated once less. Where the Hessian is not positive definite the derivative
-    is zero.
+    the host and raises there, and with the gradient that the function gives as `aux`:
+    differentiated once less. Where the Hessian is not positive definite the derivative is zero.
     """
 
     def apply(
@@ -172,18 +184,14 @@ class ImplicitGradient(optx.AbstractAdjoint):
         fixed = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, inputs
         )
-        root, residual = optx.ImplicitAdjoint().apply(primal_fn, rewrite_fn, fixed, tags)
-        root, residual = jax.tree.map(
-            lambda leaf: checkpoint_name(leaf, _MINIMUM) if eqx.is_array(leaf) else leaf,
-            (root, residual),
-        )
+        root, residual = found(optx.ImplicitAdjoint().apply(primal_fn, rewrite_fn, fixed, tags))
         return moving_with(root, inputs, gradient=_gradient, residual=residual), residual
 
 
 def _gradient(y: Array, _: PyTree, inputs: PyTree) -> Array:
     fn, _, _, args, *_ = inputs  # as optimistix passes them to its own `rewrite_fn`
-    residual, J = fn(y, args)
-    return jnp.sum(J * residual[None], axis=1)
+    _, normal = fn(y, args)
+    return normal.gradient
 
 
 @eqx.filter_custom_jvp

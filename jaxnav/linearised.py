@@ -75,6 +75,15 @@ def pinhole_rows(
     return rows
 
 
+def wrench(
+    rows: Rows, points: Float[Array, "3 P N"]
+) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
+    """Force and torque about the origin: J'r of a shift and a turn of all points, without J."""
+    residual, slope = rows
+    force = jnp.sum(slope * residual[None], axis=1)
+    return jnp.sum(force, axis=1), jnp.sum(crossed(points, force), axis=1)
+
+
 def crossed(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Array:
     """a x b, coordinates first."""
     return jnp.stack(
@@ -99,10 +108,10 @@ def _pinhole(points: Array, coefficients: Array) -> tuple[Array, Array]:
     per_depth = 1 / jnp.where(ahead, points[2], nearest)
     image = points[:2] * per_depth[None]
     # Of the depth, or of what stands in for it.
-    axis = jnp.asarray([0.0, 0.0, 1.0], points.dtype).reshape(3, *(1,) * (points.ndim - 1))
+    axis = _axes(jnp.asarray([0.0, 0.0, 1.0], points.dtype), points)
     clamped = MIN_DEPTH_RATIO * points / jnp.maximum(length, 1e-12)[None]
     depth_slope = jnp.where(ahead[None], axis, clamped)
-    straight = jnp.eye(3, 2, dtype=points.dtype).reshape(3, 2, *(1,) * (points.ndim - 1))
+    straight = _axes(jnp.eye(3, 2, dtype=points.dtype), points)
     return image, (straight - depth_slope[:, None] * image[None]) * per_depth[None, None]
 
 
@@ -146,11 +155,16 @@ def _equidistant(points: Array, coefficients: Array) -> tuple[Array, Array]:
     ratio = jnp.where(off_axis, theta * per_radius, on_axis) * gain
     rise = rise / jnp.where(squared > 0, squared, 1)
     bend = jnp.where(off_axis, (z * rise - ratio) * per_radius**2, 0)
-    mixed = x * y * bend
-    u_slope = [ratio + x**2 * bend, mixed, -x * rise]
-    v_slope = [mixed, ratio + y**2 * bend, -y * rise]
-    slope = jnp.stack([jnp.stack(u_slope), jnp.stack(v_slope)], axis=1)
-    return points[:2] * ratio[None], slope
+    # How the ratio answers, times both coordinates; and how these do.
+    is_depth = _axes(jnp.asarray([False, False, True]), points)
+    slope = jnp.where(is_depth, -rise[None], points * bend[None])[:, None] * points[None, :2]
+    straight = _axes(jnp.eye(3, 2, dtype=points.dtype), points)
+    return points[:2] * ratio[None], slope + straight * ratio[None, None]
+
+
+def _axes(constant: Array, points: Array) -> Array:
+    """A constant for all points."""
+    return constant.reshape(*constant.shape, *(1,) * (points.ndim - 1))
 
 
 _LENSES = {"none": _pinhole, "radtan": _radtan, "equidistant": _equidistant}

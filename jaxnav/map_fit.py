@@ -21,13 +21,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.ambiguity import PoseBelief, PosePosterior
 from jaxnav.geometry import cayley, cayley_jacobian, rotation_matrix
-from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquationsLM
-from jaxnav.linearised import crossed, reprojection_rows, turned
+from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquations, NormalEquationsLM
+from jaxnav.linearised import crossed, reprojection_rows, turned, wrench
 from jaxnav.observation import Snapshot
 from jaxnav.small_matrices import (
     applied,
     cho_solve,
     cholesky,
+    gram,
     log_det,
     product,
     sandwich,
@@ -74,10 +75,11 @@ def fit(
     spread = jax.vmap(lambda L: product(freedom, L))(root)
     linearised = _linearised(T_world_prior, jnp.moveaxis(spread, 0, -1), nuisance, snapshot)
 
-    def with_prediction(u: Array, _: None) -> tuple[Any, Array]:
-        r, J = linearised(u)
-        also = jnp.broadcast_to(eye[:, :, None], (d, d, u.shape[1]))
-        return jnp.concatenate([r, u]), jnp.concatenate([J, also], axis=1)
+    def with_prediction(u: Array, _: None) -> tuple[Any, NormalEquations]:
+        r, normal = linearised(u)
+        return jnp.concatenate([r, u]), NormalEquations(
+            normal.information + eye[:, :, None], normal.gradient + u
+        )
 
     tolerance = 1e-10 if dtype == jnp.float64 else 1e-5
     solution: optx.Solution = optx.least_squares(
@@ -89,9 +91,7 @@ def fit(
         adjoint=ImplicitGradient(),
         throw=False,
     )
-    r, J = linearised(solution.value)
-    information = jnp.sum(J[:, None] * J[None], axis=2)
-    gradient = jnp.sum(J * r[None], axis=1)
+    r, normal = linearised(solution.value)
     fused: Fit = jax.vmap(
         partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 4)
     )(
@@ -101,8 +101,8 @@ def fit(
         spread,
         solution.value,
         jnp.sum(r**2, axis=0),
-        gradient,
-        information,
+        normal.gradient,
+        normal.information,
     )
     return fused
 
@@ -112,9 +112,9 @@ def _linearised(
     spread: Float[Array, "6 d K"],
     nuisance: Float[Array, "6 t"],
     snapshot: Snapshot,
-) -> Callable[[Float[Array, "d K"]], tuple[Array, Array]]:
+) -> Callable[[Float[Array, "d K"]], tuple[Array, NormalEquations]]:
     """The whitened residuals (m, K) of u (d, K) in the nuisance that suits them best, and their
-    derivatives (d, m, K)."""
+    normal equations."""
     rows = reprojection_rows(snapshot.rig, snapshot.seen)
     corners_world = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
     T_prior_world = T_world_prior.inverse()
@@ -126,10 +126,9 @@ def _linearised(
         _, slope = rows(corners)
         J_t = -jnp.sum(_answers(slope, corners)[:, None] * nuisance[:, :, None, None], axis=0)
         eye = jnp.eye(nuisance.shape[1], dtype=R.dtype)
-        information = jnp.sum(J_t[:, None] * J_t[None], axis=2) + eye[:, :, None]
-        best_t = solve_positive(information[:, :, None], J_t)
+        best_t = solve_positive((gram(J_t) + eye[:, :, None])[:, :, None], J_t)
 
-    def linearised(u: Array) -> tuple[Array, Array]:
+    def linearised(u: Array) -> tuple[Array, NormalEquations]:
         xi = jnp.sum(spread * u[None], axis=1)
         half, shift = xi[3:] / 2, xi[:3]
         per_norm = 1 / (1 + jnp.sum(half**2, axis=0))
@@ -139,14 +138,21 @@ def _linearised(
         along = spread[:3] + _swung(-half[:, None], spread[:3])
         along = along - crossed(shift[:, None] / 2, turn)
         twist = jnp.concatenate([along, turn])
-        r, slope = rows(moved)
+        residual, slope = rows(moved)
         J = -jnp.sum(_answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
-        J = jnp.concatenate([J, r.reshape(1, *J.shape[1:])])
+        r = residual.reshape(J.shape[1:])
         if nuisance.shape[1]:
             # In the best nuisance, whose own prior pays for it.
-            best = -jnp.sum(best_t[None] * J[:, None], axis=2)
-            J = jnp.concatenate([J + jnp.sum(best[:, :, None] * J_t[None], axis=1), best], axis=1)
-        return J[-1], J[:-1]
+            best = -jnp.sum(best_t.reshape(-1, *residual.shape) * residual[None], axis=(1, 2))
+            best_J = -jnp.sum(best_t[None] * J[:, None], axis=2)
+            J = jnp.concatenate(
+                [J + jnp.sum(best_J[:, :, None] * J_t[None], axis=1), best_J], axis=1
+            )
+            shifted = jnp.sum(best[:, None] * J_t, axis=0)
+            residual = residual + shifted.reshape(residual.shape)
+            r = jnp.concatenate([r + shifted, best])
+        w = jnp.concatenate(wrench((residual, slope), moved))
+        return r, NormalEquations(gram(J), -jnp.sum(twist * w[:, None], axis=0))
 
     return linearised
 

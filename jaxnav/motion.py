@@ -27,7 +27,7 @@ from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
 from jaxnav.geometry import cayley_jacobian, inverse_cayley, inverse_cayley_jacobian
 from jaxnav.observation import Observation
-from jaxnav.small_matrices import applied, cho_solve, cholesky, sandwich
+from jaxnav.small_matrices import applied, cho_solve, cholesky, product, sandwich
 from jaxnav.trees import where
 
 
@@ -270,14 +270,11 @@ def merged(
     alone = jnp.sum(member, axis=1) <= 1
 
     def common() -> tuple[Array, Array]:
-        apart = jax.vmap(lambda base: jax.vmap(lambda m: difference(m, base))(belief.mean))(
-            belief.mean
-        )
-        shift = jnp.einsum("ji,jid->jd", share, apart)
-        spread = apart - shift[:, None]
-        covariance = jnp.einsum("ji,ide->jde", share, belief.covariance) + jnp.einsum(
-            "ji,jid,jie->jde", share, spread, spread
-        )
+        apart = jax.vmap(difference)(belief.mean, belief.mean[heir])
+        shift = product(share, apart)
+        spread = apart - shift[heir]
+        second = belief.covariance + spread[:, :, None] * spread[:, None]
+        covariance = product(share, second.reshape(count, -1)).reshape(second.shape)
         return jax.vmap(moved)(belief.mean, shift), covariance
 
     # Few frames merge anything.

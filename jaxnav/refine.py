@@ -24,15 +24,16 @@ from jaxnav.ippe import PosePair, ippe_square
 from jaxnav.levenberg_marquardt import (
     ImplicitGradient,
     LMState,
+    NormalEquations,
     NormalEquationsLM,
     moving_with,
 )
-from jaxnav.linearised import Rows, crossed, pinhole_rows, reprojection_rows, turned
+from jaxnav.linearised import Rows, crossed, pinhole_rows, reprojection_rows, turned, wrench
 from jaxnav.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.observation import Sightings, sightings
 from jaxnav.pair_lanes import solve_pairs
 from jaxnav.rig import CameraRig
-from jaxnav.small_matrices import cholesky, product, solve_lower
+from jaxnav.small_matrices import cholesky, gram, product, solve_lower
 
 # An angle is known to about a radian, and a distance to about itself, before any corner is
 # looked at. Bounds the covariance where the corners say nothing.
@@ -109,14 +110,14 @@ def refine_sightings(
         constrained = constrained & wanted
     T, solution = _minimise(start, rows, free, constrained, max_steps)
     chart = _chart(T, corners_world, center_world)
-    residual, J = chart.linearised(rows, free)(
+    residual, normal = chart.linearised(rows, free)(
         jnp.zeros_like(chart.pivot, shape=(free.shape[1], chart.scale.size))
     )
     cost = jnp.sum(residual**2, axis=0)
     sigma_px = jnp.tile(seen.sigma_px.reshape(-1), 2)[:, None]
     e1_px2 = jnp.sum((residual * sigma_px) ** 2, axis=0)
     covariance = jax.vmap(partial(_body_covariance, free=free), in_axes=(-1, -1, -1))(
-        chart.pivot, chart.scale, jnp.sum(J[:, None] * J[None], axis=2)
+        chart.pivot, chart.scale, normal.information
     )
     numbers = [T.wxyz_xyz, cost[:, None], covariance.reshape(*cost.shape, -1)]
     finite = jnp.all(jnp.isfinite(jnp.concatenate(numbers, axis=1)), axis=1)
@@ -146,22 +147,27 @@ class _Chart(eqx.Module):
 
     def linearised(
         self, rows: Callable[[Array], Rows], free: Float[Array, "6 n"]
-    ) -> Callable[[Float[Array, "n N"]], tuple[Array, Array]]:
-        """Residuals (m, N) of the points moved by free @ y, and their derivatives (n, m, N)."""
+    ) -> Callable[[Float[Array, "n N"]], tuple[Array, NormalEquations]]:
+        """Residuals (m, N) of the points moved by free @ y, and their normal equations."""
 
-        def at(y: Array) -> tuple[Array, Array]:
+        def at(y: Array) -> tuple[Array, NormalEquations]:
             y = jnp.sum(free[:, :, None] * y[None], axis=1)
             half = y[3:] / 2
             arms = turned(half, self.arms)
             residual, slope = rows(arms + (self.pivot + self.scale[None] * y[:3])[:, None])
-            about = crossed(arms[:, None], slope)
-            about = about + crossed(about, half[:, None, None])
-            about = about / (1 + jnp.sum(half**2, axis=0))[None, None, None]
+            about = in_chart(crossed(arms[:, None], slope), half[:, None, None])
             J = jnp.concatenate([self.scale[None, None, None] * slope, about])
             J = J.reshape(6, -1, J.shape[-1])
+            force, torque = wrench((residual, slope), arms)
+            gradient = jnp.concatenate([self.scale[None] * force, in_chart(torque, half)])
             if free.shape[1] < 6:
                 J = jnp.sum(J[:, None] * free[:, :, None, None], axis=0)
-            return residual.reshape(-1, residual.shape[-1]), J
+                gradient = jnp.sum(gradient[:, None] * free[:, :, None], axis=0)
+            return residual.reshape(-1, residual.shape[-1]), NormalEquations(gram(J), gradient)
+
+        def in_chart(about: Array, half: Array) -> Array:
+            """Answers to a turn from here on, as answers to a change of `half`."""
+            return (about + crossed(about, half)) / (1 + jnp.sum(half**2, axis=0))[None]
 
         return at
 
@@ -203,10 +209,13 @@ def _minimise(
     linearised = chart.linearised(rows, free)
     n, dtype = free.shape[1], chart.pivot.dtype
 
-    def fn(y: Array, args: None) -> tuple[Any, Array]:
+    def fn(y: Array, args: None) -> tuple[Any, NormalEquations]:
         # Without a visible corner there is nothing to gain: nothing moves.
-        residual, J = linearised(y)
-        return jnp.where(constrained[None], residual, 0), jnp.where(constrained[None, None], J, 0)
+        residual, normal = linearised(y)
+        return jnp.where(constrained[None], residual, 0), NormalEquations(
+            jnp.where(constrained[None, None], normal.information, 0),
+            jnp.where(constrained[None], normal.gradient, 0),
+        )
 
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6  # of the cost, what is left to gain
     solution: optx.Solution = optx.least_squares(
@@ -327,5 +336,4 @@ def _at_minima(
 def _gradient_of_marker(y: Array, _: None, inputs: tuple[jaxlie.SE3, _SingleMarker]) -> Array:
     T, marker = inputs
     linearised = marker.chart(T).linearised(marker.rows, jnp.eye(6, dtype=y.dtype))
-    residual, J = linearised(y)
-    return jnp.sum(J * residual[None], axis=1)
+    return linearised(y)[1].gradient

@@ -25,6 +25,11 @@ def applied(A: Float[Array, "n k"], x: Float[Array, " k"]) -> Float[Array, " n"]
     return jnp.sum(A * x[None], axis=1)
 
 
+def gram(J: Float[Array, "n m ..."]) -> Float[Array, "n n ..."]:
+    """J J', for all lanes."""
+    return jnp.sum(J[:, None] * J[None], axis=2)
+
+
 def sandwich(A: Float[Array, "n k"], P: Float[Array, "k k"]) -> Float[Array, "n n"]:
     """A P A'."""
     return product(product(A, P), A.T)

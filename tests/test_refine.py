@@ -10,7 +10,7 @@ import optimistix
 import pytest
 from jax.extend.core import jaxprs_in_params
 
-from jaxnav.levenberg_marquardt import KEEP_MINIMA
+from jaxnav.levenberg_marquardt import KEEP_FOUND
 from jaxnav.markers import CORNER_SIGNS
 from jaxnav.observation import Observation
 from jaxnav.refine import refine_pose, solve_marker, solve_markers
@@ -283,8 +283,8 @@ def test_a_gradient_that_keeps_the_minima_searches_nothing_twice():
 
     again = gradient(jax.checkpoint_policies.nothing_saveable)
     assert searches(jax.make_jaxpr(again)(corners).jaxpr) == 2
-    assert searches(jax.make_jaxpr(gradient(KEEP_MINIMA))(corners).jaxpr) == 1
-    slope = jax.jit(gradient(KEEP_MINIMA))(corners)
+    assert searches(jax.make_jaxpr(gradient(KEEP_FOUND))(corners).jaxpr) == 1
+    slope = jax.jit(gradient(KEEP_FOUND))(corners)
     np.testing.assert_allclose(slope, jax.jit(jax.grad(loss))(corners), rtol=1e-9)
 
 
