@@ -25,10 +25,13 @@ os.environ.setdefault(
     + (" --xla_cpu_max_isa=SSE4_2" if platform.machine() == "x86_64" else ""),
 )
 jax.config.update("jax_enable_compilation_cache", False)  # not even its keys
+# Nor does anybody look where in the sources an operation is from, children neither.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+jax.config.update("jax_traceback_in_locations_limit", 0)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Tracing makes millions of small objects that are not garbage; to look for it costs a tenth.
-gc.set_threshold(100_000, 20, 50)
+gc.set_threshold(1_000_000, 50, 100)
 # The pure core is all that lies beside the package's __init__, less the shell. The hook sees what
 # is imported after it, so nothing of jaxnav may be imported above.
 CORE = sorted(

@@ -228,39 +228,42 @@ class TestEverySelector:
         if selector.hypotheses == 1 or not initialised:
             assert selection.flip_probability == 0
 
-    @in_float32
-    def test_has_finite_gradients(self, selector, precision):
-        """Of all it says by all that goes in; frontally, with and without a prior, and blind."""
-        first = seen_from(TRUTH)
 
-        @jax.jit
-        @jax.grad
-        def slope(floats, masks, started):
-            prior, candidates, corners_px = floats
-            candidates = eqx.combine(candidates, masks[0])
-            prior = eqx.tree_at(
-                lambda p: p.initialised,
-                belief(prior, True, selector.hypotheses),
-                jnp.full(selector.hypotheses, started),
-            )
-            obs = dataclasses.replace(first.obs, corners_px=corners_px, visible=masks[1])
-            snapshot = Snapshot.create(first.rig, first.markers, obs)
-            selection = selector(prior, candidates, snapshot)
-            costs = jnp.where(candidates.valid, selection.costs, 0)
-            told = (selection.measured, selection.log_weight, selection.flip_probability, costs)
-            return sum(jnp.sum(leaf) for leaf in floats_of(told))
+# The bank's are those of a step, in test_hypotheses.py.
+@pytest.mark.parametrize("selector", [s for s in SELECTORS if s.hypotheses == 1], ids=repr)
+@in_float32
+def test_selections_have_finite_gradients(selector, precision):
+    """Of all it says by all that goes in; frontally, with and without a prior, and blind."""
+    first = seen_from(TRUTH)
 
-        for pose in (TRUTH, FRONTAL, worlds.NO_VIEW):
-            snapshot = seen_from(pose)
-            candidates, masks = eqx.partition(find(snapshot), eqx.is_inexact_array)
-            # The prediction is a candidate itself: distances are 0.
-            here = jaxlie.SE3(candidates.T_vehicle_world.wxyz_xyz[0]).inverse()
-            for started in (True, False):
-                floats = (here, candidates, snapshot.obs.corners_px)
-                slopes = slope(floats, (masks, snapshot.obs.visible), started)
-                for leaf in jax.tree.leaves(slopes):
-                    assert leaf.dtype == precision
-                    assert np.all(np.isfinite(leaf))
+    @jax.jit
+    @jax.grad
+    def slope(floats, masks, started):
+        prior, candidates, corners_px = floats
+        candidates = eqx.combine(candidates, masks[0])
+        prior = eqx.tree_at(
+            lambda p: p.initialised,
+            belief(prior, True, selector.hypotheses),
+            jnp.full(selector.hypotheses, started),
+        )
+        obs = dataclasses.replace(first.obs, corners_px=corners_px, visible=masks[1])
+        snapshot = Snapshot.create(first.rig, first.markers, obs)
+        selection = selector(prior, candidates, snapshot)
+        costs = jnp.where(candidates.valid, selection.costs, 0)
+        told = (selection.measured, selection.log_weight, selection.flip_probability, costs)
+        return sum(jnp.sum(leaf) for leaf in floats_of(told))
+
+    for pose in (TRUTH, FRONTAL, worlds.NO_VIEW):
+        snapshot = seen_from(pose)
+        candidates, masks = eqx.partition(find(snapshot), eqx.is_inexact_array)
+        # The prediction is a candidate itself: distances are 0.
+        here = jaxlie.SE3(candidates.T_vehicle_world.wxyz_xyz[0]).inverse()
+        for started in (True, False):
+            floats = (here, candidates, snapshot.obs.corners_px)
+            slopes = slope(floats, (masks, snapshot.obs.visible), started)
+            for leaf in jax.tree.leaves(slopes):
+                assert leaf.dtype == precision
+                assert np.all(np.isfinite(leaf))
 
 
 OF_THE_IMAGE = [LowestReprojection(), RatioTest(1.0), ObjectSpace(), PaperCost(), Mahalanobis()]

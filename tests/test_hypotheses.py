@@ -23,6 +23,7 @@ from jaxnav.motion import Belief, followed, merged, unstarted
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation, Snapshot
 from tests import worlds
+from tests.derivatives import in_float32
 from tests.reference import kalman, paper
 from tests.reference.rigid import cayley, inverse_cayley
 
@@ -676,25 +677,37 @@ def test_it_recovers_from_being_carried_off(kidnapped):
     assert np.all(seen.decided[:, two_seconds:])
 
 
-def test_a_step_has_finite_gradients():
-    """Of the whole step with the bank, started and not, seeing and blind."""
+@in_float32
+def test_a_step_has_finite_gradients(precision):
+    """Of the whole step with the bank, started and not, seeing (from the side, and exactly
+    frontally and where it believes to be) and blind."""
     rig, markers, count = car().rig, car().markers, 8
     selector = MultiHypothesis(hypotheses=count)
     nav = Navigator(rig, markers, worlds.qcar(), selector=selector, max_candidates=2)
-    obs = jax.tree.map(lambda leaf: leaf[0, 0], sensed(SIDEWAYS, 0.4))
-    # A bank that has started: two of its members are the same to the last digit.
-    off = np.linspace(-1, 1, count)
-    off[1] = -1
-    mean = jnp.asarray(np.append(SIDEWAYS[0], [0, 0, 0]) + np.outer(off, [0.3, 0.1, 0.3, 0, 0, 0]))
-    state = eqx.tree_at(
-        lambda s: (s.belief.mean, s.belief.covariance, s.belief.initialised),
-        nav.init(),
-        (mean, jnp.tile(0.05**2 * jnp.eye(6), (count, 1, 1)), jnp.ones(count, bool)),
+    frontal = np.asarray((0.0, -0.4, np.pi / 2))
+    sideways, frontally = (
+        jax.tree.map(lambda leaf: leaf[0, 0], sensed(*view))
+        for view in ((SIDEWAYS, 0.4), (frontal, 0.0, 0.0, 0.0))
     )
+    # A bank that has started: two of its members are the same to the last digit, one is right.
+    off = np.linspace(-1, 1, count)
+    off[1], off[4] = -1, 0
+
+    def started(pose):
+        mean = np.append(pose, [0, 0, 0]) + np.outer(off, [0.3, 0.1, 0.3, 0, 0, 0])
+        return eqx.tree_at(
+            lambda s: (s.belief.mean, s.belief.covariance, s.belief.initialised),
+            nav.init(),
+            (
+                jnp.asarray(mean),
+                jnp.tile(0.05**2 * jnp.eye(6), (count, 1, 1)),
+                jnp.ones(count, bool),
+            ),
+        )
 
     @jax.jit
     @jax.grad
-    def slope(floats, state, visible):
+    def slope(floats, state, visible, steering_rad):
         corners_px, speed_mps, dt_s, sigma_px, density, mean, covariance = floats
         changed = eqx.tree_at(
             lambda n: (n.corner_sigma_px, n.motion.acceleration_density), nav, (sigma_px, density)
@@ -702,20 +715,26 @@ def test_a_step_has_finite_gradients():
         state = eqx.tree_at(
             lambda s: (s.belief.mean, s.belief.covariance), state, (mean, covariance)
         )
-        reading = Observation(corners_px, visible, speed_mps, obs.steering_rad, dt_s)
+        reading = Observation(corners_px, visible, speed_mps, steering_rad, dt_s)
         state, out = changed.step(state, reading)
         belief = state.belief
         told = (belief.mean, belief.covariance, belief.log_weight, out.flip_probability, out.nis)
         return sum(jnp.sum(leaf) for leaf in told)
 
-    for before in (nav.init(), state):
+    at_first = nav.init()
+    for before, obs in (
+        (at_first, sideways),
+        (started(SIDEWAYS[0]), sideways),
+        (at_first, frontally),
+        (started(frontal), frontally),
+    ):
         for visible in (obs.visible, jnp.zeros_like(obs.visible)):
             belief = before.belief
             floats = (
                 obs.corners_px, obs.speed_mps, obs.dt_s, nav.corner_sigma_px,
                 nav.motion.acceleration_density, belief.mean, belief.covariance,
             )  # fmt: skip
-            slopes = slope(floats, before, visible)
-            assert all(np.all(np.isfinite(leaf)) for leaf in slopes)
+            slopes = slope(floats, before, visible, obs.steering_rad)
+            assert all(leaf.dtype == precision and np.all(np.isfinite(leaf)) for leaf in slopes)
             seen_slope = np.asarray(slopes[0])[np.asarray(obs.visible)]
             assert np.any(seen_slope != 0) == bool(jnp.any(visible))

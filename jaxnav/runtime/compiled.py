@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jax.experimental import serialize_executable
 
 from jaxnav.navigator import Navigator, Output, State, Step, jitted_step
@@ -87,7 +88,7 @@ def _loaded(file: Path, numbers: list[Any], inputs: list[Any]) -> tuple[Any, Any
     try:
         stored, shape = pickle.loads(file.read_bytes())
         program = serialize_executable.deserialize_and_load(*stored)
-        blank = [jnp.zeros(like.shape, like.dtype) for like in inputs]
+        blank = [np.zeros(like.shape, like.dtype) for like in inputs]
         jax.block_until_ready(program(numbers, blank))  # what is damaged shows now
         file.touch()
     except Exception:  # none yet, or damaged in whatever way: it is made anew
