@@ -444,8 +444,14 @@ class Seen(eqx.Module):
     started: jax.Array
 
 
-@functools.cache
 def car() -> Navigator:
+    return _car(str(jnp.ones(()).dtype))
+
+
+@functools.cache
+def _car(precision: str) -> Navigator:
+    """Made once in each precision."""
+    del precision
     return Navigator(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar())
 
 
