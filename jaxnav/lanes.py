@@ -37,7 +37,7 @@ def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
 
     Args:
         fn: pure, of pytrees of arrays.
-        block: lanes that a branch of a `cond` takes at a time.
+        block: lanes that a branch of a `cond` takes at a time, however few have chosen it.
     """
 
     def batched(*args: Any) -> Any:

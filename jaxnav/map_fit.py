@@ -142,7 +142,8 @@ def _linearised(
         J = -jnp.sum(_answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
         r = residual.reshape(J.shape[1:])
         if nuisance.shape[1]:
-            # In the best nuisance, whose own prior pays for it.
+            # In the best nuisance, whose own prior pays for it. J and r each by itself: the
+            # gradient follows from r and the wrench alone, and so do its derivatives.
             best = -jnp.sum(best_t.reshape(-1, *residual.shape) * residual[None], axis=(1, 2))
             best_J = -jnp.sum(best_t[None] * J[:, None], axis=2)
             J = jnp.concatenate(

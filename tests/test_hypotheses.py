@@ -23,7 +23,6 @@ from jaxnav.motion import Belief, followed, merged, unstarted
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation, Snapshot
 from tests import worlds
-from tests.derivatives import in_float32
 from tests.reference import kalman, paper
 from tests.reference.rigid import cayley, inverse_cayley
 
@@ -683,7 +682,6 @@ def test_it_recovers_from_being_carried_off(kidnapped):
     assert np.all(seen.decided[:, two_seconds:])
 
 
-@in_float32
 def test_a_step_has_finite_gradients(precision):
     """Of the whole step with the bank, started and not, seeing (from the side, and exactly
     frontally and where it believes to be) and blind."""
