@@ -63,19 +63,27 @@ class Output(eqx.Module):
     control_log: ControlLog | None
 
 
-class _Estimate(eqx.Module):
-    """The belief after an observation, and what is reported of it; see `Output`."""
+class Believed(eqx.Module):
+    """What is reported of a belief: its heaviest hypothesis."""
 
-    belief: Belief
+    mean: Float[Array, " n"]  # as the motion model stores it
     T_world_vehicle: jaxlie.SE3
     covariance: Float[Array, "d d"]
     located: Bool[Array, ""]
+    hypothesis: Int[Array, ""]
+
+
+class Estimate(eqx.Module):
+    """The belief after an observation, and what is reported of it; see `Output`."""
+
+    belief: Belief
+    best: Believed
     costs: Float[Array, " N"]
     selected: Int[Array, ""]
-    hypothesis: Int[Array, ""]
     flip_probability: Float[Array, ""]
     decided: Bool[Array, ""]
     nis: Float[Array, ""]
+    restarted: Bool[Array, ""]  # all that was believed was contradicted too often: started anew
 
 
 class Navigator(eqx.Module):
@@ -159,8 +167,13 @@ class Navigator(eqx.Module):
         obs = obs.usable()
         snapshot = self.snapshot(obs)
         candidates = self.find_candidates(snapshot)
-        estimate = self._estimate(state.belief, snapshot, candidates)
+        estimate = self.estimate(state.belief, snapshot, candidates)
         return self._acted(state, obs, candidates, estimate)
+
+    def coast(self, belief: Belief, obs: Observation) -> Belief:
+        """The belief at an observation without a marker: prediction and odometry alone."""
+        start = self.motion.init(belief.initialised.shape[0])
+        return restarted_where_broken(self.motion.predict(belief, obs), start)
 
     def step_by_regime(self, state: State, obs: Observation) -> tuple[State, Output]:
         """`step` without the slots that are empty: the same up to rounding.
@@ -173,16 +186,16 @@ class Navigator(eqx.Module):
         candidates = self._candidates_by_regime(snapshot)
         belief, count = state.belief, state.belief.initialised.shape[0]
         if count == 1 or not isinstance(self.selector, MultiHypothesis):
-            estimate = self._estimate(belief, snapshot, candidates)
+            estimate = self.estimate(belief, snapshot, candidates)
             return self._acted(state, obs, candidates, estimate)
         starts = jnp.any(snapshot.seen.visible) & ~jnp.any(
             belief.initialised & ~self.motion.lost(belief)
         )
         empty = self.motion.init(count)
 
-        def within(size: int) -> Callable[[Belief], _Estimate]:
-            def estimate(belief: Belief) -> _Estimate:
-                found = self._estimate(leading(belief, size), snapshot, candidates)
+        def within(size: int) -> Callable[[Belief], Estimate]:
+            def estimate(belief: Belief) -> Estimate:
+                found = self.estimate(leading(belief, size), snapshot, candidates)
                 bank = followed_by(survivors_first(found.belief), empty)
                 return eqx.tree_at(lambda e: e.belief, found, bank)
 
@@ -207,49 +220,75 @@ class Navigator(eqx.Module):
             snapshot,
         )
 
-    def _estimate(self, belief: Belief, snapshot: Snapshot, candidates: Candidates) -> "_Estimate":
+    def estimate(self, belief: Belief, snapshot: Snapshot, candidates: Candidates) -> Estimate:
+        """The belief after an observation: predicted, held against the corners, corrected."""
         obs = snapshot.obs
-        start = self.motion.init(belief.initialised.shape[0])
+        before, start = belief, self.motion.init(belief.initialised.shape[0])
         prior = numbered_anew_where_empty(self.motion.predict(belief, obs))
         selection = self.selector(self.motion.poses(prior), candidates, snapshot)
         belief, nis = self.motion.update(prior, selection, obs)
         belief = restarted_where_broken(belief, start)
 
-        best = jnp.argmax(jnp.where(belief.initialised, belief.log_weight, -jnp.inf))
-        located = belief.initialised[best]
-        return _Estimate(
+        best = self._best(belief)
+        return Estimate(
             belief=belief,
+            best=self._believed(belief, best),
+            costs=selection.costs,
+            selected=selection.selected,
+            flip_probability=selection.flip_probability,
+            decided=selection.decided,
+            nis=jnp.where(belief.initialised[best], nis[best], 0),
+            restarted=jnp.any(before.initialised) & ~jnp.any(prior.initialised),
+        )
+
+    def believed(self, belief: Belief) -> Believed:
+        """The heaviest hypothesis, its covariance that of the whole bank about it."""
+        return self._believed(belief, self._best(belief))
+
+    def _best(self, belief: Belief) -> Int[Array, ""]:
+        return jnp.argmax(jnp.where(belief.initialised, belief.log_weight, -jnp.inf))
+
+    def _believed(self, belief: Belief, best: Int[Array, ""]) -> Believed:
+        return Believed(
+            mean=belief.mean[best],
             T_world_vehicle=jax.tree.map(
                 lambda leaf: leaf[best], self.motion.poses(belief).T_world_vehicle
             ),
             covariance=self.motion.error_covariance(belief, best),
-            located=located,
-            costs=selection.costs,
-            selected=selection.selected,
+            located=belief.initialised[best],
             hypothesis=belief.number[best],
-            flip_probability=selection.flip_probability,
-            decided=selection.decided,
-            nis=jnp.where(located, nis[best], 0),
         )
 
     def _acted(
-        self, state: State, obs: Observation, candidates: Candidates, estimate: "_Estimate"
+        self, state: State, obs: Observation, candidates: Candidates, estimate: Estimate
     ) -> tuple[State, Output]:
-        pose = planar_from_T_world_vehicle(estimate.T_world_vehicle)
+        control, output = self.act(state.control, obs, candidates, estimate)
+        return State(estimate.belief, control), output
+
+    def act(
+        self,
+        control: ControlState | None,
+        obs: Observation,
+        candidates: Candidates,
+        estimate: Estimate,
+    ) -> tuple[ControlState | None, Output]:
+        """What to do at the pose that is believed, and all that is reported."""
+        best = estimate.best
+        pose = planar_from_T_world_vehicle(best.T_world_vehicle)
         control, command, done, log = self._steer(
-            state.control, pose, estimate.T_world_vehicle, estimate.located, estimate.decided, obs
+            control, pose, best.T_world_vehicle, best.located, estimate.decided, obs
         )
-        return State(estimate.belief, control), Output(
+        return control, Output(
             pose=pose,
-            covariance=estimate.covariance,
-            T_world_vehicle=estimate.T_world_vehicle,
-            located=estimate.located,
+            covariance=best.covariance,
+            T_world_vehicle=best.T_world_vehicle,
+            located=best.located,
             command=command,
             done=done,
             candidates=candidates,
             costs=estimate.costs,
             selected=estimate.selected,
-            hypothesis=estimate.hypothesis,
+            hypothesis=best.hypothesis,
             flip_probability=estimate.flip_probability,
             decided=estimate.decided,
             nis=estimate.nis,

@@ -8,7 +8,7 @@ import numpy as np
 from jaxnav.ambiguity import LowestReprojection
 from jaxnav.navigator import Navigator
 from jaxnav.runtime import compiled
-from jaxnav.runtime.compiled import compiled_step
+from jaxnav.runtime.compiled import compiled_step, is_compiled
 from tests import worlds
 
 SEEN_FROM = (0.1, -0.6, np.pi / 2)
@@ -33,8 +33,13 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
     obs = worlds.observe(nav.rig, nav.markers, worlds.planar(*SEEN_FROM))
     jitted = jax.jit(lambda nav, state, obs: nav.step(state, obs))
 
+    asked = Navigator.step, nav, tmp_path, nav.init(), obs
+    assert not is_compiled(*asked)
     first = compiled_step(nav, tmp_path)
     state, _ = first(nav.init(), obs)
+    assert is_compiled(*asked)
+    assert is_compiled(Navigator.step, moved, tmp_path, state, obs)
+    assert not is_compiled(Navigator.coast, *asked[1:])
     (file,) = tmp_path.iterdir()
     monkeypatch.setattr(compiled, "_compiled", never)
     later, recalibrated = compiled_step(nav, tmp_path), compiled_step(moved, tmp_path)

@@ -45,7 +45,7 @@ LAYERS = {
         "residuals",
         "selectors",
     },
-    "navigator": {"navigator"},
+    "navigator": {"navigator", "timeline"},
     "users": {
         "calibration",
         "detection",
@@ -55,7 +55,20 @@ LAYERS = {
         "studies",
         "tuning",
     },
-    "shell": {"arguments", "cli", "commands", "plotting", "study_plotting"},
+    "plug-ins": {"testing", "vehicles"},
+    "shell": {
+        "arguments",
+        "cli",
+        "commands",
+        "drive_map_plotting",
+        "drive_plotting",
+        "drive_scenery",
+        "plotting",
+        "study_plotting",
+        "viewing",
+        "viewing_outcomes",
+        "viewing_scene",
+    },
 }
 ORDER = list(LAYERS)
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
@@ -123,7 +136,7 @@ def _may_import(top: str, target: str) -> bool:
     layer = LAYER_OF[top]
     if target in (ERRORS, ""):
         # The lazy root leads everywhere, so only the shell may go through it.
-        return layer == "shell" or (target == ERRORS and layer == "users")
+        return layer == "shell" or (target == ERRORS and layer in ("users", "plug-ins"))
     if target not in LAYER_OF:
         return False
     if layer == "users" and LAYER_OF[target] == "users":

@@ -1,4 +1,4 @@
-"""`Navigator.step` as a car calls it: compiled once on a machine, loaded ever after.
+"""What a car calls, compiled once on a machine and loaded ever after: `Navigator.step`, and others.
 
 JAX's own cache spares a later process the compiler, but tracing and lowering a step take longer
 than loading it. So the executable itself is kept.
@@ -10,9 +10,9 @@ import pickle
 import platform
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,7 @@ import jaxlie
 import numpy as np
 from jax.experimental import serialize_executable
 
-from jaxnav.navigator import Navigator, Output, State, Step, jitted_step
-from jaxnav.observation import Observation
+from jaxnav.navigator import Navigator, Step, jitted_step
 
 _KEPT = 32  # executables, of some MB each: the last ones used
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
@@ -34,43 +33,83 @@ _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
     """`jax.jit(navigator.step)`, whose first call loads what another process has compiled.
 
+    See `compiled`.
+    """
+    if folder is None:
+        return partial(jitted_step, navigator)
+    return compiled(Navigator.step, navigator, folder)
+
+
+def compiled(
+    function: Callable[..., Any], navigator: Navigator, folder: Path | None
+) -> Callable[..., Any]:
+    """`jax.jit(function)` of a navigator, whose first call loads what another process has compiled.
+
     Executables hold none of the navigator's numbers: a car that was calibrated anew loads what it
-    compiled before. The step raises TypeError when an observation's shapes or types change from
+    compiled before. The call raises TypeError when the arguments' shapes or types change from
     call to call.
 
     Args:
+        function: of a navigator and of further trees of arrays; one of jaxnav's own.
         folder: of executables, made when it is missing, and run as they are found: nobody else may
             write there. Without one, and where the navigator has parts that are not jaxnav's own,
             nothing is kept.
+
+    Returns:
+        The function of the further trees.
     """
     if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
-        return partial(jitted_step, navigator)
+        return partial(_jitted(function), navigator)
     numbers, structure = jax.tree.flatten(navigator)
     numbers = [jnp.asarray(number) for number in numbers]
     ready: dict[Any, tuple[Any, Any]] = {}  # a program for each set of fields that are there
 
-    def step(state: State, obs: Observation) -> tuple[State, Output]:
-        leaves, given = jax.tree.flatten((state, obs))
+    def call(*told: Any) -> Any:
+        leaves, given = jax.tree.flatten(told)
         if given not in ready:
-            inputs = jax.tree.leaves(jax.eval_shape(lambda: (state, obs)))
-            file = _file(folder, str((structure, given)), [*numbers, *inputs])
+            inputs = jax.tree.leaves(jax.eval_shape(lambda: told))
+            name = f"{function.__module__}.{function.__qualname__}"
+            file = _file(folder, str((name, structure, given)), [*numbers, *inputs])
             ready[given] = _loaded(file, numbers, inputs) or _compiled(
-                file, structure, given, numbers, inputs
+                function, file, structure, given, numbers, inputs
             )
         program, returned = ready[given]
-        result: tuple[State, Output] = jax.tree.unflatten(returned, program(numbers, leaves))
-        return result
+        return jax.tree.unflatten(returned, program(numbers, leaves))
 
-    return step
+    return call
+
+
+def is_compiled(
+    function: Callable[..., Any], navigator: Navigator, folder: Path, *told: Any
+) -> bool:
+    """Whether `compiled(function, navigator, folder)(*told)` finds its executable in the folder."""
+    numbers, structure = jax.tree.flatten(navigator)
+    given = jax.tree.structure(told)
+    inputs = jax.tree.leaves(jax.eval_shape(lambda: told))
+    name = f"{function.__module__}.{function.__qualname__}"
+    leaves = [*map(jnp.asarray, numbers), *inputs]
+    return _file(folder, str((name, structure, given)), leaves).is_file()
+
+
+@cache
+def _jitted(function: Callable[..., Any]) -> Callable[..., Any]:
+    """One program for all navigators of a structure."""
+    return jax.jit(function)
 
 
 def _compiled(
-    file: Path, structure: Any, given: Any, numbers: list[Any], inputs: list[Any]
+    function: Callable[..., Any],
+    file: Path,
+    structure: Any,
+    given: Any,
+    numbers: list[Any],
+    inputs: list[Any],
 ) -> tuple[Any, Any]:
     seen: list[Any] = []
 
     def flat(numbers: list[Any], inputs: list[Any]) -> list[Any]:
-        returned = jax.tree.unflatten(structure, numbers).step(*jax.tree.unflatten(given, inputs))
+        told = jax.tree.unflatten(given, inputs)
+        returned = function(jax.tree.unflatten(structure, numbers), *told)
         seen.append(returned)
         return jax.tree.leaves(returned)
 
