@@ -9,6 +9,8 @@ import numpy as np
 from jaxnav.detection.types import Detections
 from jaxnav.markers import MarkerMap
 
+SAME_PX = 1.0  # nearer to each other, two detections are one
+
 
 class Observed(NamedTuple):
     """What C cameras see of M markers. Lanes that are not visible hold zeros (sigma: ones).
@@ -18,7 +20,7 @@ class Observed(NamedTuple):
         visible: (C, M) bool.
         sigma_px: (C, M, 4), standard deviation of each corner along one axis.
         unknown: how many detections are not of the map.
-        duplicates: how many detections were dropped since their image shows their id twice.
+        duplicates: how many detections were dropped since their image shows their id elsewhere too.
     """
 
     corners_px: np.ndarray
@@ -31,8 +33,9 @@ class Observed(NamedTuple):
 def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
     """The observation of one instant, one `Detections` a camera in the rig's order.
 
-    A marker found twice in one image is dropped from it: the map has it once, so one of the
-    two is a copy or a reflection, and nothing in the image says which.
+    A marker found at two places in one image is dropped from it: the map has it once, so one of
+    the two is a copy or a reflection, and nothing in the image says which. One that was merely
+    reported twice is there once.
     """
     shape = (len(detections), len(markers.ids))
     corners_px = np.zeros((*shape, 4, 2))
@@ -41,8 +44,10 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
     unknown = duplicates = 0
     for camera, found in enumerate(detections):
         keys = list(zip(found.ids.tolist(), found.families, strict=True))
-        counts = Counter(keys)
-        for k, key in enumerate(keys):
+        told = _told_once(keys, found.corners_px)
+        counts = Counter(keys[k] for k in told)
+        for k in told:
+            key = keys[k]
             marker = markers.index(*key)
             if marker is None:
                 unknown += 1
@@ -53,3 +58,15 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
                 sigma_px[camera, marker] = found.sigma_px[k]
                 visible[camera, marker] = True
     return Observed(corners_px, visible, sigma_px, unknown, duplicates)
+
+
+def _told_once(keys: Sequence[tuple[int, str]], corners_px: np.ndarray) -> list[int]:
+    """Indices of the detections, without those that repeat another of their marker."""
+    kept: list[int] = []
+    for k, key in enumerate(keys):
+        if not any(
+            keys[other] == key and np.max(np.abs(corners_px[other] - corners_px[k])) < SAME_PX
+            for other in kept
+        ):
+            kept.append(k)
+    return kept

@@ -1,0 +1,103 @@
+"""From frames to what they tell: which to use, and what is wrong with the others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxnav.detection.observe import observe
+from jaxnav.detection.types import Detections
+from jaxnav.markers import MarkerMap
+from jaxnav.runtime.flags import Fault
+from jaxnav.runtime.history import Told
+from jaxnav.runtime.stamps import Stamps
+
+_FROZEN_AFTER = 3  # frames with the very same corners
+_NO_FAULT = Fault(0)
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """What one camera's frame shows.
+
+    Attributes:
+        camera: index in the rig.
+        stamp_ns: as the camera says.
+        detections: None where the frame could not be used.
+        faults: of the frame, found by whoever looked at its pixels.
+    """
+
+    camera: int
+    stamp_ns: int
+    detections: Detections | None
+    faults: Fault = _NO_FAULT
+
+
+class Frames:
+    """The frames of a drive, camera by camera.
+
+    Attributes:
+        newest_ns: when each camera last gave a frame that could be used, None: never.
+    """
+
+    def __init__(self, cameras: int, markers: MarkerMap, corner_sigma_px: float | None = None):
+        """Args:
+        corner_sigma_px: of every corner along one axis; by default as each detection says.
+        """
+        self.newest_ns: list[int | None] = [None] * cameras
+        self._markers, self._corner_sigma_px = markers, corner_sigma_px
+        self._stamps = [Stamps() for _ in range(cameras)]
+        self._corners: list[tuple[bytes, int]] = [(b"", 0)] * cameras  # and how often the same
+
+    def told(self, frames: Sequence[Sighted], now_ns: int) -> tuple[Told | None, int, Fault]:
+        """What frames tell, when it was true, and what is wrong with them."""
+        if not frames:
+            return None, now_ns, _NO_FAULT
+        faults = _NO_FAULT
+        empty = Detections.concatenate([])
+        found = [empty] * len(self.newest_ns)
+        taken_ns = None
+        for frame in frames:
+            faults |= frame.faults
+            stamps = self._stamps[frame.camera]
+            jumps = stamps.jumps
+            stamp_ns = stamps.take(frame.stamp_ns, now_ns)
+            if stamp_ns is None:
+                faults |= Fault.STAMP_INVALID
+                continue
+            faults |= Fault.CLOCK_JUMPED if stamps.jumps > jumps else _NO_FAULT
+            if frame.detections is None:
+                continue
+            if self._frozen(frame.camera, frame.detections):
+                faults |= Fault.FRAME_FROZEN
+                continue
+            self.newest_ns[frame.camera] = max(stamp_ns, self.newest_ns[frame.camera] or 0)
+            if len(frame.detections):
+                found[frame.camera], taken_ns = frame.detections, stamp_ns
+        seen = observe(found, self._markers)
+        faults |= Fault.UNKNOWN_MARKER if seen.unknown else _NO_FAULT
+        faults |= Fault.DUPLICATE_MARKER if seen.duplicates else _NO_FAULT
+        finite = np.isfinite(seen.corners_px).all(axis=(2, 3))
+        finite &= (np.isfinite(seen.sigma_px) & (seen.sigma_px > 0)).all(axis=2)
+        faults |= Fault.CORNERS_NOT_FINITE if np.any(seen.visible & ~finite) else _NO_FAULT
+        visible = seen.visible & finite
+        sigma_px: np.ndarray | float = seen.sigma_px
+        if self._corner_sigma_px is not None:
+            sigma_px = self._corner_sigma_px
+        if taken_ns is None or not visible.any():
+            return None, now_ns, faults
+        told = Told(
+            corners_px=np.where(visible[..., None, None], seen.corners_px, 0),
+            visible=visible,
+            sigma_px=np.where(visible[..., None], sigma_px, np.ones_like(seen.sigma_px)),
+        )
+        return told, taken_ns, faults
+
+    def _frozen(self, camera: int, detections: Detections) -> bool:
+        """Whether a camera shows the very same corners once too often."""
+        finite = np.isfinite(detections.corners_px).all()
+        shown = detections.corners_px.tobytes() if finite else b""
+        last, times = self._corners[camera]
+        times = times + 1 if shown and shown == last else 1
+        self._corners[camera] = shown, times
+        return times >= _FROZEN_AFTER

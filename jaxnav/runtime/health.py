@@ -1,0 +1,113 @@
+"""How well the vehicle is, and how fast it may go (RELIABILITY R4 and R13)."""
+
+from dataclasses import dataclass, field
+
+from jaxnav.runtime.flags import Fault, Health, Reject
+
+# From bad to better only after so many good looks in a row. What merely contradicts counts up with
+# every contradiction and down with every agreement, and is bad at ten (ArduPilot's EKF check).
+LOOKS = 10
+_OFTEN = 10
+
+SPEED_FACTOR = {
+    Health.INIT: 0.0,
+    Health.ALIGNED: 1.0,
+    Health.OK: 1.0,
+    Health.DEAD_RECKONING: 1.0,
+    Health.DEGRADED: 0.5,
+    Health.STOP: 0.0,
+}
+
+
+@dataclass(frozen=True)
+class Timeouts:
+    """When missing data count, and when they count as too much."""
+
+    camera_stale_s: float = 0.2  # PX4
+    odometry_stale_s: float = 0.1  # PX4
+    flag_s: float = 1.0  # without a marker: dead reckoning
+    slow_s: float = 2.0
+    stop_s: float = 5.0  # PX4
+    blind_s: float = 1.0  # without a marker and without odometry: nothing tells where it goes
+    position_sigma_m: float = 0.5
+    distance_m: float = 3.0  # driven without a marker
+
+
+@dataclass(frozen=True)
+class Senses:
+    """What is known of the data at one instant. Ages in s, inf: never."""
+
+    located: bool
+    decided: bool
+    fix_age_s: float  # since corners were last believed
+    odometry_age_s: float
+    cameras_age_s: tuple[float, ...]
+    position_sigma_m: float
+    distance_m: float  # driven since corners were last believed
+    faults: Fault  # that are seen elsewhere
+    rejects: Reject
+
+
+@dataclass
+class Monitor:
+    """The health of the vehicle from one look to the next."""
+
+    timeouts: Timeouts = field(default_factory=Timeouts)
+    health: Health = Health.INIT
+    _better: int = 0  # looks in a row that would allow a better state
+    _doubts: int = 0
+
+    def look(self, senses: Senses) -> tuple[Health, Fault]:
+        """The health now, and what is wrong. Call it at a steady rate."""
+        faults = senses.faults | self._missing(senses)
+        wanted = self._wanted(senses, faults)
+        if wanted >= self.health or self.health <= Health.OK:
+            self.health, self._better = wanted, 0
+        else:
+            self._better += 1
+            if self._better >= LOOKS:
+                self.health, self._better = wanted, 0
+        return self.health, faults
+
+    def corners(self, believed: bool) -> None:
+        """Count a frame's corners that were believed, or not."""
+        self._doubts = max(self._doubts - 1, 0) if believed else min(self._doubts + 1, 2 * _OFTEN)
+
+    def _missing(self, senses: Senses) -> Fault:
+        limits = self.timeouts
+        stale = [age_s > limits.camera_stale_s for age_s in senses.cameras_age_s]
+        found = Fault(0)
+        if any(stale):
+            found |= Fault.CAMERA_STALE
+        if stale and all(stale):
+            found |= Fault.CAMERAS_STALE
+        if senses.odometry_age_s > limits.odometry_stale_s:
+            found |= Fault.ODOMETRY_STALE
+        if senses.located:
+            if senses.fix_age_s > limits.flag_s:
+                found |= Fault.NO_MARKER
+            if not senses.position_sigma_m <= limits.position_sigma_m and senses.decided:
+                found |= Fault.UNSURE
+            if senses.distance_m > limits.distance_m:
+                found |= Fault.FAR_FROM_FIX
+        return found
+
+    def _wanted(self, senses: Senses, faults: Fault) -> Health:
+        limits = self.timeouts
+        if faults & (Fault.NOT_FINITE | Fault.VEHICLE_FAILED):
+            return Health.STOP
+        if not senses.located:
+            return Health.INIT
+        blind = senses.odometry_age_s > limits.blind_s and senses.fix_age_s > limits.blind_s
+        if (
+            senses.fix_age_s > limits.stop_s
+            or blind
+            or faults & (Fault.UNSURE | Fault.FAR_FROM_FIX)
+        ):
+            return Health.STOP
+        slow = Fault.CAMERAS_STALE | Fault.ODOMETRY_STALE | Fault.ODOMETRY_STUCK
+        if senses.fix_age_s > limits.slow_s or faults & slow or self._doubts >= _OFTEN:
+            return Health.DEGRADED
+        if Fault.NO_MARKER in faults:
+            return Health.DEAD_RECKONING
+        return Health.OK if senses.decided else Health.ALIGNED

@@ -1,0 +1,126 @@
+"""What a vehicle and a camera are to the loop: write these, and any car drives.
+
+A plug-in is a factory, found by an entry point of the group `jaxnav.vehicles` or
+`jaxnav.cameras`, or as `module:name`:
+
+    def open_vehicle(setup: Setup) -> Vehicle
+    def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]   # one for each of the rig
+
+`jaxnav.testing.check_vehicle` and `check_cameras` say whether it keeps its promises.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from jaxnav.bicycle import Vehicle as VehicleModel
+from jaxnav.detection.types import Detections
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a plug-in is told when it is opened."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: VehicleModel
+    start_pose: tuple[float, float, float]  # x_m, y_m, psi_rad of the route; for simulations
+    seed: int = 0  # for simulations
+    options: Mapping[str, str] = field(default_factory=dict)  # --option KEY=VALUE
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """One reading of wheel odometer and steering sensor.
+
+    Attributes:
+        stamp_ns: when it was measured, `time.monotonic_ns()` of this machine.
+        speed_mps: along the vehicle's course, negative backwards.
+        steering_rad: angle of the front wheels, positive to the left.
+        valid: False where the driver itself knows that it could not read.
+    """
+
+    stamp_ns: int
+    speed_mps: float
+    steering_rad: float
+    valid: bool = True
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What one camera saw at one instant: an image, or the markers that it found itself.
+
+    Attributes:
+        stamp_ns: middle of the exposure, `time.monotonic_ns()` of this machine.
+        image: (H, W) or (H, W, 3) in BGR order, uint8.
+        detections: of a camera that detects by itself; the image is then only shown and recorded.
+    """
+
+    stamp_ns: int
+    image: np.ndarray | None = None
+    detections: Detections | None = None
+
+
+@runtime_checkable
+class Vehicle(Protocol):
+    """A car. `read` and `write` are called by one thread, `stop` by any, at any time."""
+
+    @property
+    def timeout_s(self) -> float:
+        """After this time without a `write` the vehicle stops by itself; inf: it does not."""
+        ...
+
+    def read(self) -> Odometry:
+        """The latest reading, without waiting longer than some milliseconds.
+
+        Raises:
+            OSError: it can't be read now; the loop goes on without it and asks again.
+        """
+        ...
+
+    def write(self, steering_rad: float, throttle: float) -> None:
+        """Steer and drive, throttle in the driver's unit, until the next call.
+
+        Raises:
+            OSError: it can't be written now; the loop tries again at the next tick.
+        """
+        ...
+
+    def stop(self) -> None:
+        """Zero throttle, now. From any thread, also while another is inside `read` or `write`, any
+        number of times, also after `close`."""
+        ...
+
+    def close(self) -> None:
+        """Stop and let go of the hardware. Any number of times."""
+        ...
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """One camera, read by a thread of its own."""
+
+    @property
+    def name(self) -> str:
+        """As the rig calls it."""
+        ...
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """The next frame, never the same twice; None where there is none within the time.
+
+        Raises:
+            OSError: it can't be read now; the loop waits a little and asks again.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the hardware; a `read` that waits returns. Any number of times."""
+        ...
+
+
+OpenVehicle = Callable[[Setup], Vehicle]
+OpenCameras = Callable[[Setup, Vehicle], Sequence[Camera]]

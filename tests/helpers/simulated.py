@@ -1,0 +1,40 @@
+"""Drives of the simulated car through the pilot that all tests share, and recordings of them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from jaxnav.files import Route
+from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.runtime.messages import digest, input_message, outcome_message
+from jaxnav.runtime.pilot import Input, Outcome
+from jaxnav.runtime.recorder import Recorder
+from jaxnav.vehicles.faults import WAYPOINTS_M
+from jaxnav.vehicles.lockstep import BEGIN_NS, Step, drive
+from jaxnav.vehicles.world import World
+from tests import worlds
+
+ROUTE = Route(WAYPOINTS_M, 0.15, worlds.START_VIEW)
+
+
+def make_setup() -> DriveSetup:
+    """The paper's car on a long route. One compiled program does for whatever is changed in it."""
+    return DriveSetup(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), ROUTE, float64=True)
+
+
+def simulated(setup: DriveSetup, duration_s: float, **how) -> list[Step]:
+    """A drive in lockstep; see there."""
+    start = setup.route.start_pose
+    world = World(setup.rig, setup.markers, setup.vehicle, start, BEGIN_NS)
+    return list(drive(setup.pilot(None), world, duration_s, **how))
+
+
+def record(path: Path, header: dict[str, Any], told: Iterable[tuple[Input, Outcome]]) -> None:
+    """What the loop records of a drive."""
+    recorder = Recorder(path, header, queue_messages=100_000)
+    for given, outcome in told:
+        recorder.put(*input_message(given))
+        message = outcome_message(outcome, digest(outcome))
+        recorder.put("/outcome", given.now_ns, message)
+    recorder.close(timeout_s=60)
+    assert (recorder.dropped, recorder.failed) == (0, None)
