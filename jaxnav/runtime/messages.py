@@ -1,0 +1,155 @@
+"""Inputs and outcomes of the pilot as messages of a recorded drive, and inputs back from them.
+
+What is made here is cheap: arrays are handed on as they are, and become JSON where they are
+written. So they must not be changed afterwards.
+"""
+
+import hashlib
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+
+from jaxnav.detection.types import Detections
+from jaxnav.motion import Belief
+from jaxnav.runtime.frames import Sighted
+from jaxnav.runtime.interfaces import Odometry
+from jaxnav.runtime.message_schemas import (
+    FRAMES,
+    ODOMETRY,
+    TICK,
+    FramesMessage,
+    OdometryMessage,
+    SightedMessage,
+    TickMessage,
+)
+from jaxnav.runtime.pilot import Input, Outcome
+from jaxnav.timeline import Report
+
+_NONE = Detections.concatenate([])
+
+
+def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
+    """Topic, stamp in ns and message of an input: what `Recorder.put` takes."""
+    message: dict[str, Any] = {"now_ns": given.now_ns, "faults": given.faults}
+    if given.frames:
+        message["frames"] = [_sighted_message(frame) for frame in given.frames]
+    if given.odometry is None:
+        topic, stamp_ns = (FRAMES, given.frames[0].stamp_ns) if given.frames else (TICK, None)
+        return topic, given.now_ns if stamp_ns is None else stamp_ns, message
+    reading = given.odometry
+    message |= {
+        "stamp_ns": reading.stamp_ns,
+        "speed_mps": float(reading.speed_mps),
+        "steering_rad": float(reading.steering_rad),
+        "valid": bool(reading.valid),
+    }
+    return ODOMETRY, reading.stamp_ns, message
+
+
+def input_of(message: OdometryMessage | FramesMessage | TickMessage) -> Input:
+    """The input that a message was made of."""
+    match message:
+        case OdometryMessage():
+            reading = Odometry(
+                message.stamp_ns, message.speed_mps, message.steering_rad, message.valid
+            )
+            frames = tuple(_sighted(frame) for frame in message.frames)
+            return Input(message.now_ns, reading, frames, message.faults)
+        case FramesMessage():
+            frames = tuple(_sighted(frame) for frame in message.frames)
+            return Input(message.now_ns, frames=frames, faults=message.faults)
+    return Input(message.now_ns, faults=message.faults)
+
+
+def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
+    """The message of an outcome; see `OutcomeMessage`.
+
+    Args:
+        outcome: its report with NumPy leaves.
+        digest: of the pilot's state, for who replays the drive.
+    """
+    message: dict[str, Any] = {
+        "now_ns": outcome.now_ns,
+        "health": outcome.health,
+        "faults": outcome.faults,
+        "rejects": outcome.rejects,
+        "steering_rad": float(outcome.steering_rad),
+        "throttle": float(outcome.throttle),
+        "restarts": outcome.restarts,
+        "reason": outcome.restart_reason,
+        "digest": digest,
+        "stamp_ns": outcome.stamp_ns,
+    }
+    return message | _reported(outcome.report, outcome.moment.belief)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of an array in one list, taken by whoever writes them, not by the driving thread."""
+
+    array: Any
+    which: Any = ...
+
+    def tolist(self) -> list[Any]:
+        values: list[Any] = self.array[self.which].ravel().tolist()
+        return values
+
+
+def _reported(report: Report, belief: Belief) -> dict[str, Any]:
+    output, alive, valid = report.output, belief.initialised, report.output.candidates.valid
+    selected = int(output.selected)
+    return {
+        "pose": output.pose,
+        "covariance": _Rows(output.covariance),
+        "located": output.located,
+        "decided": output.decided,
+        "done": output.done,
+        "flip_probability": output.flip_probability,
+        "nis": output.nis,
+        "hypothesis": output.hypothesis,
+        "hypotheses": _Rows(belief.mean[:, :3], alive),
+        "log_weight": _Rows(belief.log_weight, alive),
+        "Ts_vehicle_world": _Rows(output.candidates.T_vehicle_world.wxyz_xyz, valid),
+        "costs": _Rows(output.costs, valid),
+        "selected": sum(valid[:selected].tolist()) if selected >= 0 else -1,
+    }
+
+
+def _sighted_message(frame: Sighted) -> dict[str, Any]:
+    found = _NONE if frame.detections is None else frame.detections
+    return {
+        "camera": frame.camera,
+        "stamp_ns": frame.stamp_ns,
+        "usable": frame.detections is not None,
+        "ids": found.ids,
+        "families": found.families,
+        "corners_px": _Rows(found.corners_px),
+        "sigma_px": _Rows(found.sigma_px),
+        "refined": found.refined,
+        "faults": frame.faults,
+    }
+
+
+def _sighted(message: SightedMessage) -> Sighted:
+    found = Detections(
+        ids=message.ids,
+        corners_px=message.corners_px,
+        sigma_px=message.sigma_px,
+        refined=message.refined,
+        families=tuple(message.families),
+    )
+    detections = found if message.usable else None
+    return Sighted(message.camera, message.stamp_ns, detections, message.faults)
+
+
+def digest(outcome: Outcome) -> str:
+    """Of all that was believed and commanded: two drives with the same digests are the same."""
+    output = outcome.report.output
+    told = (outcome.moment, output.pose, output.covariance, output.command)
+    state = hashlib.blake2b(digest_size=8)
+    for leaf in jax.tree.leaves(told):
+        state.update(leaf.tobytes())
+    state.update(struct.pack("<2d", outcome.steering_rad, outcome.throttle))
+    return state.hexdigest()

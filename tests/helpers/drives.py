@@ -1,0 +1,167 @@
+"""Inputs and outcomes of a drive made by hand: nothing is estimated, nothing is compiled."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from jaxnav.candidates import Candidates
+from jaxnav.control import Command
+from jaxnav.detection.types import Detections
+from jaxnav.motion import Belief, Rejections
+from jaxnav.navigator import Output
+from jaxnav.runtime.flags import Fault, Health, Reject
+from jaxnav.runtime.frames import Sighted
+from jaxnav.runtime.interfaces import Odometry
+from jaxnav.runtime.messages import input_message, outcome_message
+from jaxnav.runtime.pilot import Input, Outcome
+from jaxnav.timeline import Moment, Report
+
+BEGIN_NS = 5_000_000_123
+PERIOD_NS = 10_000_000
+
+
+def make_detections(rng: np.random.Generator, count: int) -> Detections:
+    return Detections(
+        ids=rng.integers(0, 500, count),
+        corners_px=rng.normal(300, 100, (count, 4, 2)),
+        sigma_px=rng.uniform(0.05, 0.5, (count, 4)),
+        refined=rng.random(count) < 0.5,
+        families=("tag36h11", "DICT_4X4_50")[:count],
+    )
+
+
+def make_input(index: int) -> Input:
+    """Odometry, frames of two cameras of which one is not usable, and ticks, in turn."""
+    now_ns, rng = BEGIN_NS + index * PERIOD_NS, np.random.default_rng(index)
+    if index % 3 == 0:
+        reading = Odometry(now_ns - 7, *rng.normal(size=2).tolist(), valid=index % 2 == 0)
+        return Input(now_ns, reading, faults=Fault.DEADLINE_MISSED)
+    if index % 3 == 1:
+        seen = make_detections(rng, index % 4 % 3)
+        frames = (
+            Sighted(0, now_ns - 30_000_001, seen),
+            Sighted(3, now_ns - 30_000_001, None, Fault.FRAME_UNUSABLE),
+        )
+        return Input(now_ns, frames=frames)
+    return Input(now_ns)
+
+
+def make_report(rng: np.random.Generator, dtype: type = float) -> Report:
+    """Two of three candidates valid, the second of these taken."""
+
+    def random(*shape: int) -> jax.Array:
+        return jnp.asarray(rng.normal(size=shape).astype(dtype))
+
+    candidates = Candidates(
+        T_vehicle_world=jaxlie.SE3(random(3, 7)),
+        e1_px2=random(3),
+        cost=random(3),
+        covariance=random(3, 6, 6),
+        valid=jnp.asarray([True, False, True]),
+        converged=jnp.asarray([True] * 3),
+        steps=jnp.asarray([5] * 3),
+    )
+    output = Output(
+        pose=random(3),
+        covariance=random(6, 6),
+        T_world_vehicle=jaxlie.SE3(random(7)),
+        located=jnp.asarray(True),
+        command=Command(random(), random()),
+        done=jnp.asarray(False),
+        candidates=candidates,
+        costs=jnp.asarray(np.array([0.5, np.inf, np.inf], dtype)),
+        selected=jnp.asarray(2),
+        hypothesis=jnp.asarray(7),
+        flip_probability=random(),
+        decided=jnp.asarray(True),
+        nis=random(),
+        control_log=None,
+    )
+    return _as_numpy(Report(output=output, mean=random(8)))
+
+
+def make_moment(rng: np.random.Generator, dtype: type = float) -> Moment:
+    """Two of four hypotheses alive."""
+
+    def random(*shape: int) -> jax.Array:
+        return jnp.asarray(rng.normal(size=shape).astype(dtype))
+
+    belief = Belief(
+        mean=random(4, 8),
+        covariance=random(4, 6, 6),
+        log_weight=random(4),
+        initialised=jnp.asarray([False, True, True, False]),
+        rejections=Rejections(jnp.zeros(4, int), random(4, 3), random(4)),
+        number=jnp.arange(4),
+    )
+    decided, restarts = jnp.asarray(True), jnp.asarray(1, jnp.int32)
+    return _as_numpy(Moment(belief, decided, random(), restarts))
+
+
+@functools.cache
+def _told(seed: int, dtype: type) -> tuple[Report, Moment]:
+    rng = np.random.default_rng(seed)
+    return make_report(rng, dtype), make_moment(rng, dtype)
+
+
+def _as_numpy(tree):
+    """As the pilot tells it."""
+    return jax.tree.map(np.asarray, tree)
+
+
+def make_outcome(index: int, seed: int = 0, dtype: type = float) -> Outcome:
+    """What is reported of it depends on the seed alone."""
+    now_ns = BEGIN_NS + index * PERIOD_NS
+    report, moment = _told(seed, dtype)
+    return Outcome(
+        now_ns=now_ns,
+        health=Health.DEGRADED,
+        faults=Fault.NO_MARKER | Fault.CAMERA_STALE,
+        rejects=Reject.TOO_LATE,
+        steering_rad=0.1 * index,
+        throttle=-0.1 / (index + 1),
+        report=report,
+        moment=moment,
+        told=None,
+        stamp_ns=now_ns - 3,
+        restarts=2,
+        restart_reason="the loop was away",
+    )
+
+
+def record_drive(recorder, count: int) -> None:
+    """Inputs and outcomes, and a picture every tenth."""
+    for index in range(count):
+        given = make_input(index)
+        recorder.put(*input_message(given))
+        message = outcome_message(make_outcome(index), f"digest {index}")
+        recorder.put("/outcome", given.now_ns, message)
+        if index % 10 == 0:
+            recorder.image("/camera/front", given.now_ns, make_picture(index))
+
+
+def make_picture(index: int) -> np.ndarray:
+    """(24, 32, 3) of one colour."""
+    return np.full((24, 32, 3), 20 + index % 200, np.uint8)
+
+
+def same_input(one: Input, other: Input) -> bool:
+    """Bit for bit, one NaN being as good as another."""
+    return _bits(one) == _bits(other)
+
+
+def _bits(value):
+    if dataclasses.is_dataclass(value):
+        return {
+            field.name: _bits(getattr(value, field.name)) for field in dataclasses.fields(value)
+        }
+    if isinstance(value, list | tuple):
+        return [_bits(inner) for inner in value]
+    if isinstance(value, np.ndarray):
+        same_nan = np.where(np.isnan(value), np.nan, value) if value.dtype.kind == "f" else value
+        return value.dtype.str, value.shape, same_nan.tobytes()
+    return repr(value) if isinstance(value, float) else value
