@@ -1,0 +1,12 @@
+"""Whether a plug-in keeps the promises of `jaxnav.runtime.interfaces`. Call it from pytest:
+
+    def test_my_car():
+        check_vehicle(open_vehicle, setup)
+
+It really drives: lift the car off the ground, its wheels turn at full throttle for a moment.
+"""
+
+from jaxnav.testing.cameras import check_cameras
+from jaxnav.testing.vehicle import check_vehicle
+
+__all__ = ["check_cameras", "check_vehicle"]

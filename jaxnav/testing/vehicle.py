@@ -1,0 +1,176 @@
+"""The promises of a vehicle, one by one."""
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from jaxnav.runtime.interfaces import Odometry, OpenVehicle, Setup, Vehicle
+from jaxnav.runtime.limits import Limits
+from jaxnav.runtime.plugins import missing_members
+from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, started
+
+_READ_S = 0.05  # "without waiting longer than some milliseconds"
+_STOP_S = 0.5
+_PATIENCE_S = 3.0  # until the first readings must have come
+_READINGS = 20
+_BUSY_S = 0.3
+
+
+def check_vehicle(
+    factory: OpenVehicle, setup: Setup, throttle_of: Callable[[Any], float] | None = None
+) -> None:
+    """Open a vehicle, read it, drive it, stop it and close it.
+
+    Args:
+        throttle_of: what the vehicle's motor was last told, where something knows.
+
+    Raises:
+        AssertionError: a sentence that says which promise is broken.
+    """
+    vehicle = factory(setup)
+    lacking = missing_members(vehicle, Vehicle)
+    assert not lacking, f"the vehicle has no {', '.join(lacking)}"
+    check = _Check(vehicle, Limits.of(setup.vehicle), throttle_of)
+    try:
+        check.timeout()
+        check.readings()
+        check.writes()
+        check.stops()
+        check.closed()
+    finally:
+        with contextlib.suppress(Exception):  # or it would hide what was found
+            started(vehicle.close)("close()", HANGS_S)
+        check.end()
+
+
+class _Check:
+    """One vehicle: read and written by one thread, stopped by another."""
+
+    def __init__(self, vehicle: Any, limits: Limits, throttle_of: Callable[[Any], float] | None):
+        self._vehicle, self._limits, self._throttle_of = vehicle, limits, throttle_of
+        self._driver, self._watchdog = Worker(), Worker()
+
+    def end(self) -> None:
+        """Let the threads end."""
+        self._driver.close()
+        self._watchdog.close()
+
+    def timeout(self) -> None:
+        """It is a positive number."""
+        timeout_s = self._vehicle.timeout_s
+        assert isinstance(timeout_s, int | float), f"timeout_s is no number but {timeout_s!r}"
+        assert timeout_s > 0, f"timeout_s must be positive, or inf, not {timeout_s}"
+
+    def readings(self) -> None:
+        """Of a vehicle at rest that is read faster than any driver measures."""
+        readings: list[Odometry] = []
+        slow, failure = 0, None
+        begin_s = time.monotonic()
+        while time.monotonic() - begin_s < _PATIENCE_S:
+            called_s = time.monotonic()
+            reading, failure = self._driver.call("read()", self._vehicle.read)
+            slow += time.monotonic() - called_s > _READ_S
+            if failure is None:
+                _check_reading(reading)
+                readings.append(reading)
+            if len(readings) >= _READINGS and readings[-1].stamp_ns != readings[0].stamp_ns:
+                break
+            time.sleep(0.005)
+        assert readings, f"read() raised OSError for {_PATIENCE_S:g} s: {failure}"
+        # A machine may be busy for a moment; a driver that waits does so every time.
+        assert slow <= 2, f"read() took longer than {_READ_S:g} s, {slow} times"
+        stamps = [reading.stamp_ns for reading in readings]
+        assert stamps == sorted(stamps), "the stamps of read() go back in time"
+        assert stamps[-1] > stamps[0], f"the stamps of read() stood still for {_PATIENCE_S:g} s"
+        assert any(reading.valid for reading in readings), "no reading of read() was valid"
+
+    def writes(self) -> None:
+        """At rest, then at the limits, in steps of a loop."""
+        steps = [(0, 0), (1, 0), (-1, 0), (0.5, 0.5), (0, 1), (0, -1), (0, 0)]
+        try:
+            for steering, throttle in steps:
+                self._write(steering, throttle)
+                self._read()
+                time.sleep(0.005)
+        finally:
+            self._stop()
+
+    def stops(self) -> None:
+        """While another thread drives, and that nothing follows."""
+        done = threading.Event()
+
+        def drive() -> None:
+            while not done.is_set():
+                with contextlib.suppress(OSError):
+                    self._vehicle.write(0.0, self._limits.throttle)
+                with contextlib.suppress(OSError):
+                    self._vehicle.read()
+
+        driving = self._driver.begin(drive)
+        try:
+            until_s = time.monotonic() + _BUSY_S
+            while time.monotonic() < until_s:
+                self._stop("while another thread drives")
+                time.sleep(0.005)
+        finally:
+            done.set()
+            driving("write() and read() beside stop()", HANGS_S)
+            self._stop()
+        self._stands("after stop()")
+        self._write(0, 1)
+        if self._throttle_of is not None:
+            throttle = self._throttle_of(self._vehicle)
+            assert throttle != 0, "throttle_of() says 0 after write() with full throttle"
+        self._stop()
+        for _ in range(5):
+            self._read()
+            self._stands("when it is read after stop()")
+
+    def closed(self) -> None:
+        """While it drives; and all that may be called afterwards."""
+        self._write(0, 1)
+        for what in ("close()", "a second close()"):
+            self._watchdog.begin(self._vehicle.close)(what, HANGS_S)
+        self._stands("after close()")
+        self._stop("after close()")
+        self._read(" after close()")
+        self._write(0, 1, " after close()")
+        self._stands("when it is written after close()")
+        self._stop("after close()")
+        self._watchdog.begin(self._vehicle.close)("a third close()", HANGS_S)
+
+    def _read(self, when: str = "") -> None:
+        self._driver.call(f"read(){when}", self._vehicle.read)
+
+    def _write(self, steering: float, throttle: float, when: str = "") -> None:
+        """In shares of the limits."""
+        command = steering * self._limits.steering_rad, throttle * self._limits.throttle
+        self._driver.call(f"write{command}{when}", partial(self._vehicle.write, *command))
+
+    def _stop(self, when: str = "") -> None:
+        called_s = time.monotonic()
+        self._watchdog.call(f"stop() {when}".strip(), self._vehicle.stop)
+        took_s = time.monotonic() - called_s
+        assert took_s < _STOP_S, " ".join(f"stop() took {took_s:.2g} s {when}".split())
+
+    def _stands(self, when: str) -> None:
+        if self._throttle_of is not None:
+            throttle = self._throttle_of(self._vehicle)
+            assert throttle == 0, f"the throttle is {throttle:g} {when}, it must be 0"
+
+
+def _check_reading(reading: object) -> None:
+    assert isinstance(reading, Odometry), f"read() gives {reading!r}, expected an Odometry"
+    check_stamp("an Odometry", reading.stamp_ns)
+    if not reading.valid:
+        return
+    for name in ("speed_mps", "steering_rad"):
+        value = getattr(reading, name)
+        good = isinstance(value, int | float | np.floating) and math.isfinite(value)
+        assert good, f"{name} of a valid Odometry must be a finite number, not {value!r}"

@@ -1,0 +1,332 @@
+"""The QCar's plug-in on a copy of its maker's driver, bad habits included."""
+
+import contextlib
+import math
+import sys
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxnav.errors import BadInput
+from jaxnav.runtime.limits import Limits
+from jaxnav.runtime.plugins import open_cameras as open_by_name
+from jaxnav.runtime.plugins import open_vehicle as open_vehicle_by_name
+from jaxnav.testing import check_cameras, check_vehicle
+from jaxnav.vehicles.qcar import QCarVehicle, open_cameras, open_vehicle
+from jaxnav.vehicles.servo import Servo
+from tests.helpers.fake_pal import Hardware, fake_pal
+from tests.helpers.setups import setup_with
+
+SETUP = setup_with()
+
+
+@pytest.fixture
+def hardware(monkeypatch):
+    hardware = Hardware()
+    for name, module in fake_pal(hardware).items():
+        monkeypatch.setitem(sys.modules, name, module)
+    return hardware
+
+
+@pytest.fixture
+def car(hardware):
+    vehicle = open_vehicle(SETUP)
+    yield vehicle
+    vehicle.close()
+
+
+def test_it_keeps_the_promises_of_a_vehicle(hardware):
+    check_vehicle(open_vehicle, SETUP, lambda vehicle: hardware.throttle)
+    assert "terminate" in hardware.calls
+
+
+def test_its_cameras_keep_theirs(hardware):
+    check_cameras(open_cameras, SETUP)
+    assert all(camera.terminated for camera in hardware.cameras.csi)
+
+
+def test_it_reads_the_tachometer(hardware, car):
+    hardware.tach_mps = -0.75
+    reading = car.read()
+    assert reading.speed_mps == -0.75
+    assert reading.valid
+
+
+def test_a_reading_that_repeats_is_not_valid_until_it_changes(hardware, car):
+    assert car.read().valid
+    hardware.fails = True
+    stale = [car.read()]
+    while stale[-1].valid and len(stale) < 1000:
+        time.sleep(0.005)
+        stale.append(car.read())
+    assert 5 <= len(stale) < 100
+    hardware.fails = False
+    assert car.read().valid
+
+
+def test_one_sensor_alone_may_repeat(hardware, car):
+    """A car that stands has the same encoder and the same speed all the time."""
+    for _ in range(30):
+        assert car.read().valid
+        time.sleep(0.003)
+
+
+def test_it_reports_the_steering_that_the_servo_has_reached(hardware, car):
+    begin_ns = time.monotonic_ns()
+    car.write(0.5, 0.0)  # a first command turns nowhere: no time has passed
+    time.sleep(0.05)
+    car.write(0.5, 0.0)
+    commanded_rad = hardware.steering
+    most_rad = 5.0 * (time.monotonic_ns() - begin_ns) / 1e9
+    assert 5.0 * 0.05 <= commanded_rad <= min(most_rad, 0.5)
+    assert 0 <= car.read().steering_rad < commanded_rad
+    time.sleep(0.15)
+    assert car.read().steering_rad == commanded_rad
+
+
+def test_a_servo_turns_at_its_rate():
+    servo = Servo(rate_limit_radps=5.0)
+    servo.turn_to(0.5, 1_000_000_000)
+    assert servo.angle_at(1_000_000_000) == 0
+    assert servo.angle_at(1_040_000_000) == pytest.approx(0.2)
+    servo.turn_to(-0.5, 1_060_000_000)  # at 0.3 by then
+    assert servo.angle_at(1_160_000_000) == pytest.approx(-0.2)
+    assert servo.angle_at(1_100_000_000) == pytest.approx(-0.2)  # a time that goes back
+    assert servo.angle_at(9_000_000_000) == -0.5
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(), st.floats(), st.floats(), st.floats())
+def test_no_command_is_beyond_the_limits(first_rad, steering_rad, throttle, limit):
+    hardware = Hardware()
+    car = fake_pal(hardware)["pal.products.qcar"].QCar(pwmLimit=math.inf)
+    allowed = Limits(0.5, 5.0, abs(limit) if math.isfinite(limit) else 1.0)
+    vehicle = QCarVehicle(car, allowed)
+    vehicle.write(first_rad, 0.0)
+    vehicle.write(steering_rad, throttle)
+    assert abs(hardware.throttle) <= min(allowed.throttle, 0.3)
+    assert abs(hardware.steering) <= 0.5
+    vehicle.close()
+
+
+def test_stop_does_not_wait_for_a_driver_that_hangs(hardware, car):
+    hardware.hangs = threading.Event()
+    driving = threading.Thread(target=car.write, args=(0.0, 0.2))
+    driving.start()
+    while hardware.throttle == 0:
+        time.sleep(0.001)
+    begin_s = time.monotonic()
+    car.stop()
+    assert time.monotonic() - begin_s < 1.0
+    assert hardware.throttle == 0
+    hardware.hangs.set()
+    driving.join()
+    assert hardware.throttle == 0
+
+
+def test_a_write_that_comes_late_is_undone(hardware, car, monkeypatch):
+    """The driver hangs before it sends: the stop comes first, the old throttle after it."""
+    begun, let_go = threading.Event(), threading.Event()
+    send = hardware.write
+
+    def slow(throttle, steering):
+        if throttle != 0:
+            begun.set()
+            let_go.wait(5.0)
+        send(throttle, steering)
+
+    monkeypatch.setattr(hardware, "write", slow)
+    driving = threading.Thread(target=car.write, args=(0.0, 0.2))
+    driving.start()
+    begun.wait(5.0)
+    car.stop()
+    let_go.set()
+    driving.join()
+    assert hardware.throttle == 0
+    car.read()
+    assert hardware.throttle == 0
+
+
+def test_a_stop_while_a_command_is_made_is_not_lost(hardware, car, monkeypatch):
+    """The lock is taken and nothing is sent yet: the stop comes and goes in between."""
+    begun, let_go = threading.Event(), threading.Event()
+
+    def slow(*command):
+        begun.set()
+        let_go.wait(5.0)
+        return 0.0, 0.2
+
+    monkeypatch.setattr(car, "_limits", SimpleNamespace(applied=slow))
+    driving = threading.Thread(target=car.write, args=(0.0, 0.2))
+    driving.start()
+    begun.wait(5.0)
+    car.stop()
+    let_go.set()
+    driving.join()
+    assert hardware.throttle == 0
+
+
+def test_a_write_that_overtakes_a_stop_and_hangs_is_undone(hardware, car, monkeypatch):
+    """The stop asks for the lock first, the write gets it, and sends after the stop gave up."""
+    asked, begun, let_go = threading.Event(), threading.Event(), threading.Event()
+    send = hardware.write
+
+    class Unfair(contextlib.nullcontext):
+        def acquire(self, timeout):
+            asked.set()
+            begun.wait(5.0)
+            return False
+
+    def slow(throttle, steering):
+        if throttle != 0:
+            begun.set()
+            let_go.wait(5.0)
+        send(throttle, steering)
+
+    monkeypatch.setattr(hardware, "write", slow)
+    monkeypatch.setattr(car, "_driver", Unfair())
+    stopping = threading.Thread(target=car.stop)
+    stopping.start()
+    asked.wait(5.0)
+    driving = threading.Thread(target=car.write, args=(0.0, 0.2))
+    driving.start()
+    stopping.join()
+    let_go.set()
+    driving.join()
+    assert hardware.throttle == 0
+
+
+def test_errors_of_the_driver_are_oserrors(hardware, car, monkeypatch):
+    monkeypatch.delattr(type(hardware.car), "read_write_std")
+    with pytest.raises(OSError, match="the QCar's driver: AttributeError"):
+        car.read()
+    monkeypatch.undo()
+
+
+def test_a_closed_car_says_so(hardware, car):
+    car.close()
+    with pytest.raises(OSError, match="closed"):
+        car.read()
+    with pytest.raises(OSError, match="closed"):
+        car.write(0.0, 0.1)
+    count = len(hardware.calls)
+    car.stop()
+    assert len(hardware.calls) == count  # the board belongs to somebody else by now
+
+
+def test_a_board_without_data_is_one_line(hardware, monkeypatch):
+    monkeypatch.setattr("jaxnav.vehicles.qcar._FIRST_DATA_S", 0.1)
+    hardware.fails = True
+    with pytest.raises(BadInput, match="--vehicle qcar: the board gives no data"):
+        open_vehicle(SETUP)
+    assert "terminate" in hardware.calls
+
+
+def test_options_reach_the_driver(hardware):
+    open_vehicle(setup_with(frequency="200", read_mode="1")).close()
+    assert (hardware.car.readMode, hardware.car.frequency) == (1, 200)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "problem"),
+    [
+        ("frequency", "fast", "--option frequency: expected a number from 100 to 1000, got 'fast'"),
+        ("frequency", "nan", "--option frequency: expected a number from 100 to 1000"),
+        ("frequency", "20", "--option frequency: expected a number from 100 to 1000"),
+        ("frequency", "150.5", "--option frequency: expected a whole number, got '150.5'"),
+        ("read_mode", "2", "--option read_mode: expected a number from 0 to 1"),
+    ],
+)
+def test_a_wrong_option_is_named(hardware, option, value, problem):
+    with pytest.raises(BadInput, match=problem):
+        open_vehicle(setup_with(**{option: value}))
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("frame_rate", "0"), ("latency_ms", "-1"), ("latency_ms", "inf")]
+)
+def test_a_wrong_option_of_the_cameras_is_named(hardware, option, value):
+    with pytest.raises(BadInput, match=f"--option {option}: expected a number"):
+        open_cameras(setup_with(**{option: value}), None)
+
+
+def rig_with(names=None, sizes_px=None):
+    rig = SETUP.rig
+    return type(rig)(
+        rig.cameras, rig.Ts_camera_vehicle, names or rig.names, sizes_px or rig.image_sizes_px
+    )
+
+
+@pytest.mark.parametrize(
+    ("rig", "problem"),
+    [
+        (rig_with(names=("front", "right", "rear", "top")), "has no 'top': expected front, right"),
+        (rig_with(names=("front", "back", "rear", "left")), "the rig has one camera twice"),
+        (rig_with(sizes_px=((820, 410),) * 3 + ((640, 480),)), "all images of a QCar are of one"),
+    ],
+)
+def test_a_rig_that_a_qcar_has_not_is_refused(hardware, rig, problem):
+    with pytest.raises(BadInput, match=problem):
+        open_cameras(setup_with(rig), None)
+
+
+def test_each_camera_shows_its_own_side_late_by_its_latency(hardware):
+    cameras = open_cameras(setup_with(SETUP.rig.first(2), latency_ms="20"), None)
+    try:
+        assert [camera.name for camera in cameras] == ["front", "right"]
+        assert hardware.cameras.csiLeft is None
+        assert hardware.cameras.csiBack is None
+        frame = cameras[0].read(1.0)
+        assert time.monotonic_ns() - frame.stamp_ns >= 20_000_000
+        hardware.pictures = False
+        cameras[0].read(0.05)  # what was under way
+        assert cameras[0].read(0.05) is None
+        shown = hardware.cameras.csiFront.imageData.copy()
+        hardware.pictures = True
+        assert not np.array_equal(cameras[0].read(1.0).image, shown)
+    finally:
+        for camera in cameras:
+            camera.close()
+
+
+def test_a_driver_that_repeats_its_picture_gives_no_frame(hardware, monkeypatch):
+    camera, *others = open_cameras(SETUP, None)
+    try:
+        assert camera.read(1.0) is not None
+        maker = hardware.cameras.csiFront
+        monkeypatch.setattr(maker, "read", lambda: None)  # as one that says nothing
+        camera.read(0.05)
+        assert camera.read(0.05) is None
+    finally:
+        for one in (camera, *others):
+            one.close()
+
+
+def test_without_the_makers_software_a_person_hears_where_it_is_from(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pal", None)
+    target = "jaxnav.vehicles.qcar:open_{}"
+    with pytest.raises(BadInput, match=r"--vehicle: .* needs the module pal.* Quanser's software"):
+        open_vehicle_by_name(target.format("vehicle"), SETUP)
+    with pytest.raises(BadInput, match=r"--cameras: .* needs the module pal.* Quanser's software"):
+        open_by_name(target.format("cameras"), SETUP, None)
+
+
+def test_software_that_fails_on_import_is_one_line(hardware, monkeypatch):
+    """It asks for the login name, which a service has not."""
+
+    class NoLogin:
+        def find_spec(self, name, path=None, target=None):
+            if name == "pal.products.qcar":
+                raise OSError(6, "No such device or address")
+
+    monkeypatch.delitem(sys.modules, "pal.products.qcar")
+    monkeypatch.delattr(sys.modules["pal.products"], "qcar")
+    monkeypatch.setattr(sys.modules["pal.products"], "__path__", [], raising=False)
+    monkeypatch.setattr(sys, "meta_path", [NoLogin(), *sys.meta_path])
+    with pytest.raises(BadInput, match=r"--vehicle qcar: pal.products.qcar: OSError: .*No such"):
+        open_vehicle(SETUP)
