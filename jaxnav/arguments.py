@@ -94,22 +94,43 @@ class Demo:
 
 @dataclass(frozen=True)
 class Replay:
-    """Localise a recorded camera rig in every frame, in 6 degrees of freedom.
+    """Drive a recorded drive again, or localise a recorded camera rig in every frame.
 
-    RECORDING is a folder with bags and their calibration as TagSLAM writes it, a bag alone with
-    --rig and --markers-file, or an .npz of detections. Where it holds a reference trajectory the
-    errors against it are measured. Written to --out: a TUM trajectory, a PNG and summary.json.
+    A drive is a .mcap of `jaxnav`, or a ROS bag with --topics, --rig, --markers-file, --vehicle and
+    --route. A .mcap with nothing changed is held against what was recorded, and the exit code is 1
+    where it differs.
+
+    A rig is localised in 6 degrees of freedom from a folder with bags and their calibration as
+    TagSLAM writes it, a ROS 1 bag with --rig and --markers-file, or an .npz of detections. Where
+    there is a reference trajectory the errors against it are measured.
+
+    Written to --out: a TUM trajectory, summary.json, and a PNG where something is to be compared.
     """
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
-    """Folder, ROS 1 bag (.bag, .bag.bz2) or .npz."""
+    """Drive (.mcap), ROS bag, folder of TagSLAM or .npz."""
     rig: OptionalFile = None
     """Cameras, a rig file or a Kalibr camchain, in place of the recording's own."""
     markers_file: OptionalFile = None
     """Marker map in place of the recording's own."""
+    vehicle: OptionalFile = None
+    """Vehicle in place of the drive's own."""
+    route: OptionalFile = None
+    """Waypoints in place of the drive's own."""
+    topics: OptionalFile = None
+    """Which topic of a ROS bag is what: it is a drive then."""
+    images: Switch = False
+    """Look for the markers once more in the drive's recorded images."""
+    corner_backend: CornerBackend = "aruco"
+    """Marker detector, for images. apriltag needs the extra of that name."""
+    record: Switch = False
+    """Record the drive anew, as replay.mcap."""
     markers: Literal["all", "one-at-a-time"] = "all"
     """One pose from all markers in view, or every marker alone as in the paper."""
-    selector: Selector = "multi-hypothesis"
+    selector: Annotated[
+        Selector | None,
+        tyro.conf.arg(help_behavior_hint="(default: the drive's, or multi-hypothesis)"),
+    ] = None
     """Which of the two poses of a marker is believed."""
     corner_sigma_px: Annotated[
         float | None,
@@ -120,7 +141,7 @@ class Replay:
         int | None,
         tyro.conf.arg(metavar="N", constructor=int, help_behavior_hint="(default: all)"),
     ] = None
-    """Stop after N frames."""
+    """Stop after N frames, of a drive after N inputs."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
     """Folder for the results."""
     headless: Switch = False
@@ -299,18 +320,190 @@ class Study:
 
 @dataclass(frozen=True)
 class Plot:
-    """Draw a study: flip-rate maps, curves with their intervals, reliability diagrams.
+    """Draw a study or a recorded drive.
 
-    Written to --out: PNG files, and summary.json with the measures of every cell. A study that is
-    not finished is drawn as far as it is.
+    Of a study: flip-rate maps, curves with their intervals, reliability diagrams, and summary.json
+    with the measures of every cell; if it is not finished, as far as it is. Of a drive (.mcap):
+    drive.png, a map with what happened over time, and a summary in the terminal.
     """
 
     store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STORE")]
-    """What `jaxnav study` wrote."""
+    """What `jaxnav study` wrote, or a recorded drive (.mcap)."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
     """Folder for the pictures."""
     headless: Switch = False
     """No progress bar."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Drive a vehicle through its route.
+
+    Everything is compiled before the vehicle is armed. The last that it hears, however this ends,
+    is zero throttle: at the last waypoint, on Ctrl-C and SIGTERM, when data are missing for too
+    long, and when anything hangs or fails. `--vehicle sim` is a simulated car in real time.
+
+    Exit codes: 0 arrived or out of time, 1 stopped by the watchdog, 130 and 143 by a signal.
+    """
+
+    vehicle: str = "sim"
+    """An installed vehicle (sim, qcar, ros2 and those of plug-ins), or MODULE:NAME."""
+    cameras: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="NAME", constructor=str, help_behavior_hint="(default: as --vehicle)"
+        ),
+    ] = None
+    """Installed cameras (sim, qcar, opencv and those of plug-ins), or MODULE:NAME."""
+    option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    """What the vehicle and the cameras are told, e.g. images=true for sim."""
+    rig: QCarFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers: QCarFile = None
+    """Marker map."""
+    vehicle_file: QCarFile = None
+    """Vehicle parameters and limits."""
+    route: QCarFile = None
+    """Waypoints, and where a simulated car starts."""
+    selector: Selector = "multi-hypothesis"
+    """Which of the two poses of a marker is believed."""
+    corner_backend: CornerBackend = "aruco"
+    """Marker detector. apriltag needs the extra of that name."""
+    record: Annotated[
+        Path | None, tyro.conf.arg(metavar="MCAP", help_behavior_hint="(optional)")
+    ] = None
+    """Record the drive into this file."""
+    record_images: Switch = False
+    """Record the cameras' images too, as JPEG."""
+    view: Switch = False
+    """Open Rerun and look on. Needs the extra viz."""
+    duration_s: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="S", help_behavior_hint="(default: until the last waypoint)"),
+    ] = None
+    """End after this time, s."""
+    period_s: float = 0.02
+    """Between two readings of the odometer, s."""
+    timeout_s: float = 0.2
+    """So long after the last sign of life of any thread the vehicle has been stopped, s."""
+    float64: Switch = False
+    """Estimate in double precision."""
+    seed: int = 0
+    """Of a simulated vehicle."""
+    headless: Switch = False
+    """No status line."""
+
+    def __post_init__(self) -> None:
+        _require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
+        _require(
+            0.002 <= self.period_s <= 0.1,
+            "--period-s",
+            f"must be from 0.002 to 0.1, got {self.period_s}",
+        )
+        _require(
+            0.1 <= self.timeout_s <= 10,
+            "--timeout-s",
+            f"must be from 0.1 to 10, got {self.timeout_s}",
+        )
+        if self.duration_s is not None:
+            _require_finite("--duration-s", self.duration_s)
+        _require(
+            self.record is not None or not self.record_images, "--record-images", "needs --record"
+        )
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Drive the simulated car with every fault of the fault matrix, and print what came of it.
+
+    Cameras, stamps, odometry, calibration, the world and the loop fail in some fifty ways, one at a
+    time, at corner level. Exit code 1 when one of them did not come to what it must.
+    """
+
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()
+    """Faults whose names hold one of these."""
+    rig: QCarFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers: QCarFile = None
+    """Marker map."""
+    vehicle_file: QCarFile = None
+    """Vehicle parameters and limits."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
+        None
+    )
+    """Write the table into this file too."""
+    float64: Switch = False
+    """Estimate in double precision."""
+    headless: Switch = False
+    """No progress bar."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a recorded drive in Rerun: map, cameras, candidates, health, over time.
+
+    Opens a window, or writes an .rrd file to --out. Needs the extra `viz`.
+    """
+
+    recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
+    """Recorded drive (.mcap)."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
+        None
+    )
+    """Write this file (.rrd) instead of opening a window."""
+    headless: Switch = False
+    """No progress bar."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check what a car will run with, and say what to do about each finding.
+
+    Looked at are the computer (packages, OpenCV, JAX, clock, disk), the four files, pictures that
+    the car's cameras took while it stood, and the plug-ins, which are opened and read but not
+    driven. Exit code 0: no error; 1: an error was found; 2: a file or a flag is not understood.
+    """
+
+    rig: QCarFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers: QCarFile = None
+    """Marker map."""
+    vehicle_file: QCarFile = None
+    """Vehicle parameters and limits."""
+    route: QCarFile = None
+    """Start and waypoints."""
+    vehicle: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
+    ] = None
+    """Vehicle plug-in to open and read: an installed name or module:name."""
+    cameras: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
+    ] = None
+    """Camera plug-in to open and read: an installed name or module:name."""
+    option: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """What the plug-ins are told."""
+    frame: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="CAMERA=IMAGE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """A picture by one of the rig's cameras, the car standing anywhere with a marker in view."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
+        None
+    )
+    """Write all findings into this file too."""
+
+    def __post_init__(self) -> None:
+        for flag, texts in (("--option", self.option), ("--frame", self.frame)):
+            expected = "KEY=VALUE" if flag == "--option" else "CAMERA=IMAGE"
+            keys = [text.partition("=")[0] for text in texts]
+            for text, key in zip(texts, keys, strict=True):
+                _require("=" in text and key != "", flag, f"expected {expected}, got {text!r}")
+                _require(keys.count(key) == 1, flag, f"{key} is given twice")
 
 
 Command = (
@@ -321,6 +514,10 @@ Command = (
     | Annotated[Reliability, tyro.conf.subcommand("reliability")]
     | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Plot, tyro.conf.subcommand("plot")]
+    | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Faults, tyro.conf.subcommand("faults")]
+    | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 COMMANDS = {
     "demo": Demo,
@@ -330,6 +527,10 @@ COMMANDS = {
     "reliability": Reliability,
     "study": Study,
     "plot": Plot,
+    "run": Run,
+    "faults": Faults,
+    "view": View,
+    "doctor": Doctor,
 }
 
 

@@ -1,9 +1,11 @@
-"""The command line: `jaxnav demo`, `simulate`, `study`, `plot`, `replay`, `locate`, `reliability`.
+"""The command line: `jaxnav COMMAND`.
 
 What a command does lies in `jaxnav.commands` and is imported when the command runs, so that
 `--help` stays instant; what it can be told lies in `arguments.py`.
 
-Exit codes: 0 done, 2 bad input or usage (one line on stderr), 130 interrupted.
+Exit codes: 0 done, 1 what was to be found out is not well (a replay is not what was recorded, the
+doctor found an error, a fault came to worse than it must, the watchdog stopped the car), 2 bad
+input or usage (one line on stderr), 130 interrupted.
 """
 
 import contextlib
@@ -20,12 +22,16 @@ from jaxnav.arguments import (
     COMMANDS,
     Command,
     Demo,
+    Doctor,
+    Faults,
     Locate,
     Plot,
     Reliability,
     Replay,
+    Run,
     Simulate,
     Study,
+    View,
 )
 from jaxnav.errors import BadInput
 
@@ -39,8 +45,13 @@ DESCRIPTION = (
 )
 
 
-_STUDY_PACKAGES = ("dask", "distributed", "xarray", "zarr")
-_Command = Demo | Replay | Locate | Simulate | Reliability | Study | Plot
+# Module -> its package, and the extra of ours that brings it.
+_OF_EXTRAS = {name: (name, "study") for name in ("dask", "distributed", "xarray", "zarr")} | {
+    "rerun": ("rerun-sdk", "viz")
+}
+_Command = (
+    Demo | Replay | Locate | Simulate | Reliability | Study | Plot | View | Run | Faults | Doctor
+)
 
 
 class UsageError(Exception):
@@ -85,9 +96,10 @@ def _dispatch(args: list[str]) -> int:
         module = importlib.import_module(f"jaxnav.commands.{type(command).__name__.lower()}")
         code: int = module.run(command)
     except ModuleNotFoundError as missing:
-        if missing.name not in _STUDY_PACKAGES:
+        if missing.name not in _OF_EXTRAS:
             raise
-        raise UsageError(f"needs {missing.name}: pip install 'jaxnav[study]'") from None
+        package, extra = _OF_EXTRAS[missing.name]
+        raise UsageError(f"needs {package}: pip install 'jaxnav[{extra}]'") from None
     return code
 
 

@@ -55,7 +55,7 @@ def test_the_exit_code_is_the_commands(command) -> None:
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("", "jaxnav: Expected one of {demo, replay, locate, simulate, reliability, study, plot}."),
+        ("", "jaxnav: Expected one of {demo, replay, locate, simulate, reliability, study, plot, "),
         ("fly", "jaxnav: Unrecognized options: fly; Available subcommands: demo, replay, locate"),
         ("demo --fast", "jaxnav demo: Unrecognized options: --fast"),
         ("demo --sed 3", "jaxnav demo: Unrecognized options: --sed, 3; Perhaps you meant: --seed"),

@@ -68,6 +68,32 @@ class ArucoDetector:
                 looked_at.append(read[1].corners_px)
         return refined_detections(image, found, self.family, camera)
 
+    def detect_near(
+        self,
+        image: np.ndarray,
+        camera: Camera | None,
+        quads_px: np.ndarray,
+        radius_px: np.ndarray,
+    ) -> Detections:
+        """Markers where they should be: see `RegionDetector`."""
+        image = grey(image)
+        found: list[tuple[int, np.ndarray]] = []
+        unread: list[np.ndarray] = []
+        for quad, radius in zip(quads_px, radius_px, strict=True):
+            if np.all(np.isfinite(quad)) and np.isfinite(radius):
+                margin_px = _SEARCH_SIDES * mean_side_px(quad) + float(radius)
+                read, left = self._decode_region(image, quad, margin_px)
+                found += [f for f in read if not any(_overlap(f[1], c) for _, c in found)]
+                unread += left
+        if not found:
+            lens = Lens(camera)
+            for quad in frames_first(image, _worth_a_look(unread))[:2]:
+                code = read_marker(image, quad, self.family, lens)
+                if code is not None:
+                    found.append((code[0], code[1].corners_px))
+                    break
+        return refined_detections(image, found, self.family, camera)
+
     def _decode(self, image: np.ndarray) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
         """What OpenCV read, (id, corners) each, and the quadrilaterals that it could not read."""
         quads, ids, unread = self._decoder.detectMarkers(image)
@@ -81,17 +107,26 @@ class ArucoDetector:
         self, image: np.ndarray, quad: np.ndarray
     ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
         """`_decode` of an enlarged region around a prediction."""
-        margin = _SEARCH_SIDES * mean_side_px(quad) + _SEARCH_PX
-        low = np.maximum(np.floor(quad.min(axis=0) - margin), 0).astype(int)
-        high = np.minimum(np.ceil(quad.max(axis=0) + margin), image.shape[::-1]).astype(int)
-        if np.any(high - low < 8) or mean_side_px(quad) > _ENLARGE_UP_TO_PX:
+        if mean_side_px(quad) > _ENLARGE_UP_TO_PX:
+            return [], []
+        return self._decode_region(image, quad, _SEARCH_SIDES * mean_side_px(quad) + _SEARCH_PX)
+
+    def _decode_region(
+        self, image: np.ndarray, quad: np.ndarray, margin_px: float
+    ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
+        """`_decode` of the region around a quadrilateral, a small one enlarged."""
+        low = np.maximum(np.floor(quad.min(axis=0) - margin_px), 0).astype(int)
+        high = np.minimum(np.ceil(quad.max(axis=0) + margin_px), image.shape[::-1]).astype(int)
+        if np.any(high - low < 8):
             return [], []
         region = image[low[1] : high[1], low[0] : high[0]]
-        enlarged = cv2.resize(region, None, fx=_ENLARGE, fy=_ENLARGE, interpolation=cv2.INTER_CUBIC)
-        found, unread = self._decode(enlarged)
+        scale = _ENLARGE if mean_side_px(quad) <= _ENLARGE_UP_TO_PX else 1
+        if scale > 1:
+            region = cv2.resize(region, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        found, unread = self._decode(region)
 
         def back(corners: np.ndarray) -> np.ndarray:
-            return (corners + 0.5) / _ENLARGE - 0.5 + low
+            return (corners + 0.5) / scale - 0.5 + low
 
         return [(i, back(corners)) for i, corners in found], [back(corners) for corners in unread]
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -69,6 +69,27 @@ class Detector(Protocol):
 
         Raises:
             BadInput: not such an image.
+        """
+        ...
+
+
+@runtime_checkable
+class RegionDetector(Protocol):
+    """A detector that can look at a part of an image alone."""
+
+    def detect_near(
+        self,
+        image: np.ndarray,
+        camera: Camera | None,
+        quads_px: np.ndarray,
+        radius_px: np.ndarray,
+    ) -> Detections:
+        """Markers where they should be, and nowhere else.
+
+        Args:
+            image: as of `Detector.detect`, as `camera`.
+            quads_px: (K, 4, 2), where markers are expected.
+            radius_px: (K,), how far a corner may be from there.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Rigs, cameras, markers, vehicles and routes: files in and out.
+"""Rigs, cameras, markers, vehicles, routes and topics: files in and out.
 
 What a person wrote is validated before anything is built from it; what is wrong is one
 `BadInput` line that names the file and the key. Keys carry their units.
@@ -10,11 +10,13 @@ from jaxnav.errors import BadInput
 from jaxnav.files.cameras import load_camera
 from jaxnav.files.markers import load_markers, save_markers
 from jaxnav.files.rigs import load_rig, save_rig
+from jaxnav.files.topics import TopicMap, load_topics
 from jaxnav.files.vehicles import Route, load_route, load_vehicle
 from jaxnav.files.writing import atomic_path, atomic_write, output_folder, write_json, write_tum
 
 __all__ = [
     "Route",
+    "TopicMap",
     "atomic_path",
     "atomic_write",
     "calib_dir",
@@ -22,6 +24,7 @@ __all__ = [
     "load_markers",
     "load_rig",
     "load_route",
+    "load_topics",
     "load_vehicle",
     "output_folder",
     "save_markers",

@@ -90,6 +90,15 @@ class MarkerFile(Entry):
             seen.add(key)
         return markers
 
+    def map(self) -> MarkerMap:
+        """The map, in the process's precision."""
+        return marker_map(
+            np.stack([entry.pose() for entry in self.markers]),
+            [entry.size_m for entry in self.markers],
+            [entry.id for entry in self.markers],
+            [entry.family for entry in self.markers],
+        )
+
 
 def load_markers(path: str | Path) -> MarkerMap:
     """A marker map.
@@ -98,13 +107,7 @@ def load_markers(path: str | Path) -> MarkerMap:
         BadInput: one line naming file and key.
     """
     path = Path(path)
-    entries = validate(MarkerFile, read_mapping(path), path).markers
-    return marker_map(
-        np.stack([entry.pose() for entry in entries]),
-        [entry.size_m for entry in entries],
-        [entry.id for entry in entries],
-        [entry.family for entry in entries],
-    )
+    return validate(MarkerFile, read_mapping(path), path).map()
 
 
 def marker_map(
@@ -125,6 +128,11 @@ def save_markers(path: str | Path, markers: MarkerMap) -> None:
     Raises:
         BadInput: the file can't be written.
     """
+    atomic_write(path, yaml_text(marker_data(markers)))
+
+
+def marker_data(markers: MarkerMap) -> dict[str, Any]:
+    """What a file of the map holds, in plain values, all numbers bit for bit; see `MarkerFile`."""
     entries: list[dict[str, Any]] = [
         {
             "id": marker_id,
@@ -134,7 +142,7 @@ def save_markers(path: str | Path, markers: MarkerMap) -> None:
         }
         for index, (marker_id, family) in enumerate(zip(markers.ids, markers.families, strict=True))
     ]
-    atomic_write(path, yaml_text({"markers": entries}))
+    return {"markers": entries}
 
 
 def fit_square(corners_m: np.ndarray, size_m: float) -> np.ndarray:

@@ -121,6 +121,15 @@ class RigFile(Entry):
             raise ValueError(f"the name {twice!r} is used twice")
         return cameras
 
+    def rig(self) -> CameraRig:
+        """The rig, in the process's precision."""
+        return CameraRig.create(
+            [entry.camera() for entry in self.cameras],
+            [to_se3(entry.T_camera_vehicle_pose()) for entry in self.cameras],
+            [entry.name for entry in self.cameras],
+            [(entry.image_size_px[0], entry.image_size_px[1]) for entry in self.cameras],
+        )
+
 
 def load_rig(path: str | Path) -> CameraRig:
     """A camera rig from jaxnav's own YAML, or from a Kalibr camchain with imu := vehicle.
@@ -131,13 +140,7 @@ def load_rig(path: str | Path) -> CameraRig:
     path = Path(path)
     data = read_mapping(path)
     if "cameras" in data:
-        entries = validate(RigFile, data, path).cameras
-        return CameraRig.create(
-            [entry.camera() for entry in entries],
-            [to_se3(entry.T_camera_vehicle_pose()) for entry in entries],
-            [entry.name for entry in entries],
-            [(entry.image_size_px[0], entry.image_size_px[1]) for entry in entries],
-        )
+        return validate(RigFile, data, path).rig()
     if kalibr.is_camchain(data):
         chain = kalibr.camchain(path, data)
         return CameraRig.create(
@@ -155,6 +158,11 @@ def save_rig(path: str | Path, rig: CameraRig) -> None:
     Raises:
         BadInput: the file can't be written.
     """
+    atomic_write(path, yaml_text(rig_data(rig)))
+
+
+def rig_data(rig: CameraRig) -> dict[str, Any]:
+    """What a file of the rig holds, in plain values, all numbers bit for bit; see `RigFile`."""
     entries: list[dict[str, Any]] = []
     for index, name in enumerate(rig.names):
         camera = rig.camera(index)
@@ -170,7 +178,7 @@ def save_rig(path: str | Path, rig: CameraRig) -> None:
                 "T_camera_vehicle": plain_pose(rig.Ts_camera_vehicle.wxyz_xyz[index]),
             }
         )
-    atomic_write(path, yaml_text({"cameras": entries}))
+    return {"cameras": entries}
 
 
 def pose_array(pose: QuaternionPose | Sequence[Sequence[float]]) -> np.ndarray:

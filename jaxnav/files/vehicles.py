@@ -30,6 +30,10 @@ class VehicleFile(Entry):
     speed_time_constant_s: Positive
     steering_rate_limit_radps: Positive | None = None
 
+    def vehicle(self) -> Vehicle:
+        """The vehicle, in the process's precision."""
+        return Vehicle.create(**self.model_dump(exclude_none=True))
+
 
 class StartEntry(Entry):
     """Where a drive starts."""
@@ -63,8 +67,12 @@ def load_vehicle(path: str | Path) -> Vehicle:
         BadInput: one line naming file and key.
     """
     path = Path(path)
-    entry = validate(VehicleFile, read_mapping(path), path)
-    return Vehicle.create(**entry.model_dump(exclude_none=True))
+    return validate(VehicleFile, read_mapping(path), path).vehicle()
+
+
+def vehicle_data(vehicle: Vehicle) -> dict[str, float]:
+    """What a file of the vehicle holds, all numbers bit for bit; see `VehicleFile`."""
+    return {name: float(getattr(vehicle, name)) for name in VehicleFile.model_fields}
 
 
 def load_route(path: str | Path) -> Route:

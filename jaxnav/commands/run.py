@@ -1,0 +1,130 @@
+"""`jaxnav run`: the loop that drives, with all that looks on."""
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+import numpy as np
+
+from jaxnav.arguments import Run
+from jaxnav.commands.observers import open_onlookers
+from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.detection import make_detector
+from jaxnav.errors import BadInput
+from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
+from jaxnav.runtime import plugins
+from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.runtime.guard import Guard
+from jaxnav.runtime.interfaces import Setup
+from jaxnav.runtime.loop import Loop, Observer
+from jaxnav.runtime.pilot import Pilot
+from jaxnav.runtime.seeing import Eyes, Search
+
+EXIT_STOPPED = 1  # by the watchdog, not by a person
+EXIT_SIGNAL = 128
+
+
+def run(args: Run) -> int:
+    """Drive, and say why it ended."""
+    configure_jax(float64=args.float64, threads=1)
+    options = _options(args.option)
+    setup = _setup(args)
+    searches = _searches(args, setup)
+    with ExitStack() as closing:
+        onlookers = open_onlookers(args, setup, closing)
+        pilot = _compiled(args, setup)
+        told = Setup(
+            setup.rig, setup.markers, setup.vehicle, setup.route.start_pose, args.seed, options
+        )
+        loop, eyes, reason = _drive(args, pilot, told, searches, onlookers)
+    _summarise(loop, eyes, reason)
+    for onlooker in onlookers:
+        if onlooker.told is not None:
+            print(onlooker.told)
+    if loop.guard.signal is not None:
+        return EXIT_SIGNAL + loop.guard.signal
+    return 0 if reason in ("arrived", "time is over") else EXIT_STOPPED
+
+
+def _options(given: Sequence[str]) -> dict[str, str]:
+    options = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise BadInput("--option", f"expected KEY=VALUE, got {text!r}")
+        options[key] = value
+    return options
+
+
+def _setup(args: Run) -> DriveSetup:
+    """Read all files and find all plug-ins first: bad input is found before anything is compiled,
+    let alone moves."""
+    plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
+    plugins.find("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
+    qcar = calib_dir() / "qcar"
+    return DriveSetup(
+        rig=load_rig(args.rig or qcar / "rig.yaml"),
+        markers=load_markers(args.markers or qcar / "markers.yaml"),
+        vehicle=load_vehicle(args.vehicle_file or qcar / "vehicle.yaml"),
+        route=load_route(args.route or qcar / "route.yaml"),
+        selector=args.selector,
+        float64=args.float64,
+    )
+
+
+def _searches(args: Run, setup: DriveSetup) -> list[Search]:
+    """One for each camera."""
+    families = sorted(set(setup.markers.families))
+    detectors = [make_detector(args.corner_backend, family) for family in families]
+    rig = setup.rig
+    return [Search(c, rig.image_sizes_px[c], rig.camera(c), detectors) for c in range(len(rig))]
+
+
+def _compiled(args: Run, setup: DriveSetup) -> Pilot:
+    """A pilot that need not compile any more."""
+    _say(args, "compiling")
+    began_s = time.monotonic()
+    pilot = setup.pilot(step_folder())
+    pilot.warm_up()
+    _say(args, f"compiled in {time.monotonic() - began_s:.1f} s")
+    return pilot
+
+
+def _drive(
+    args: Run, pilot: Pilot, told: Setup, searches: list[Search], onlookers: Sequence[Observer]
+) -> tuple[Loop, Eyes, str]:
+    """Open what moves, drive, stop and let go of it. Also: why it ended."""
+    duration_s = args.duration_s if args.duration_s is not None else float("inf")
+    with ExitStack() as closing:
+        vehicle = plugins.open_vehicle(args.vehicle, told)
+        guard = Guard(vehicle, pilot.limits, args.timeout_s)
+        closing.callback(guard.close)
+        guard.watch_signals()
+        cameras = plugins.open_cameras(args.cameras or args.vehicle, told, vehicle)
+        eyes = Eyes(cameras, searches, guard, workers=max(1, os.cpu_count() or 1))
+        closing.callback(eyes.close)
+        # Before the eyes are closed, for which their threads may take a while.
+        closing.callback(guard.trip, "the drive is over")
+        loop = Loop(pilot, guard, vehicle, eyes, onlookers, args.period_s)
+        reason = loop.run(duration_s)
+    return loop, eyes, reason
+
+
+def _say(args: Run, text: str) -> None:
+    if not args.headless:
+        sys.stderr.write(f"{text}\n")
+
+
+def _summarise(loop: Loop, eyes: Eyes, reason: str) -> None:
+    print(f"ended: {reason}")
+    statistics = loop.statistics
+    for name in sorted(statistics.counts):
+        median, late = (statistics.quantile_ms(name, share) for share in (0.5, 0.99))
+        count = int(statistics.counts[name].sum())
+        print(f"{name}: {count}, {median:.2f} ms median, {late:.2f} ms 99 %")
+    print(
+        f"deadlines missed: {statistics.deadlines_missed}; frames dropped: {eyes.dropped}; "
+        f"camera errors: {int(np.sum(eyes.errors))}"
+    )

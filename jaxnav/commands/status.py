@@ -1,0 +1,48 @@
+"""How a drive goes, in one line of the terminal."""
+
+import math
+
+from jaxnav.runtime.pilot import Outcome
+
+WIDTH = 100  # characters, at most
+_WIDEST_NAME = 14  # of a health
+
+
+def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen: bool) -> str:
+    """Rate, latency, health, marker, flip probability, position, command: at most 100 characters.
+
+        30 Hz   4.2 ms OK             marker flip  0.1% x  1.83 y -0.79 m 124 deg thr  0.037 ...
+
+    Every column has its place, so that the eye finds it again in the next line. What does not fit
+    into its column is shown as `#`, what is no number as `?`, a pose before the first as `-`.
+
+    Args:
+        rate_hz: of what the caller counts, outcomes or frames.
+        latency_ms: from an exposure to its command.
+        marker_seen: of late.
+    """
+    output = outcome.report.output
+    x_m, y_m, psi_rad = (float(value) for value in output.pose)
+    places = [_fixed(x_m, 6, 2), _fixed(y_m, 6, 2), _fixed(math.degrees(psi_rad), 4, 0)]
+    x, y, psi = places if bool(output.located) else [f"{'-':>{len(place)}}" for place in places]
+    flip = _fixed(100 * float(output.flip_probability), 5, 1)
+    return " ".join(
+        (
+            f"{_fixed(rate_hz, 4, 0)} Hz",
+            f"{_fixed(latency_ms, 5, 1)} ms",
+            f"{outcome.health.name:<{_WIDEST_NAME}}",
+            "marker" if marker_seen else "  --  ",
+            f"flip{flip}%",
+            f"x{x} y{y} m{psi} deg",
+            f"thr {_fixed(outcome.throttle, 6, 3)}",
+            f"str {_fixed(math.degrees(outcome.steering_rad), 5, 1)} deg",
+        )
+    )
+
+
+def _fixed(value: float, width: int, decimals: int) -> str:
+    """A number in so many characters, whatever it is."""
+    if not math.isfinite(value):
+        return f"{'?':>{width}}"
+    shown = f"{value:{width}.{decimals}f}"
+    return shown if len(shown) <= width else "#" * width

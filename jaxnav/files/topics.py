@@ -1,0 +1,81 @@
+"""Topic maps: which topic of a ROS bag is what. YAML in.
+
+    cameras: {front: /front/detections, left: /left/image_raw}   # names as in the rig
+    odometry: /odom                # nav_msgs/Odometry or ackermann_msgs/AckermannDriveStamped
+    corner_sigma_px: 0.3           # of detections in the bag; may be left out
+    first_corner: bottom_left      # of detections in the bag; may be left out
+
+AprilTag counts a marker's corners counter-clockwise from the bottom left of its own picture.
+OpenCV's picture of the same marker stands on its head. A map made for AprilTag's picture goes
+with `bottom_left`; one made for OpenCV's, which is what jaxnav's own detectors see, with
+`top_right`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator
+
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.validation import Entry, Name, Positive, validate
+
+FirstCorner = Literal["bottom_left", "top_right"]
+
+
+class TopicsFile(Entry):
+    """A topic map file."""
+
+    cameras: Annotated[dict[str, Name], Field(min_length=1, max_length=64)]
+    odometry: Name | None = None
+    corner_sigma_px: Positive = 0.3
+    first_corner: FirstCorner = "bottom_left"
+
+    @field_validator("cameras")
+    @classmethod
+    def _topics_differ(cls, cameras: dict[str, str]) -> dict[str, str]:
+        topics = [topic.strip("/") for topic in cameras.values()]
+        if len(set(topics)) < len(topics):
+            twice = next(topic for topic in topics if topics.count(topic) > 1)
+            raise ValueError(f"the topic {twice} is given to two cameras")
+        return cameras
+
+    @field_validator("odometry")
+    @classmethod
+    def _not_a_camera(cls, odometry: str | None, info: Any) -> str | None:
+        for camera, topic in info.data.get("cameras", {}).items():
+            if odometry is not None and topic.strip("/") == odometry.strip("/"):
+                raise ValueError(f"{topic} is the topic of the camera {camera!r} already")
+        return odometry
+
+
+@dataclass(frozen=True)
+class TopicMap:
+    """Which topic is what.
+
+    Attributes:
+        path: the file, for messages.
+        cameras: name in the rig -> topic of detections or of images.
+        odometry: None where the bag has none.
+        corner_sigma_px: standard deviation of a detected corner along one axis.
+        first_corner: the corner, as the marker map sees the marker, that a detection begins with;
+            from there they go counter-clockwise.
+    """
+
+    path: Path
+    cameras: Mapping[str, str]
+    odometry: str | None
+    corner_sigma_px: float
+    first_corner: FirstCorner
+
+
+def load_topics(path: str | Path) -> TopicMap:
+    """A topic map.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    path = Path(path)
+    entry = validate(TopicsFile, read_mapping(path), path)
+    return TopicMap(path, entry.cameras, entry.odometry, entry.corner_sigma_px, entry.first_corner)

@@ -1,0 +1,212 @@
+"""What a drive is driven with: all that a replay must know to come to the same bits.
+
+    setup = DriveSetup(rig, markers, vehicle, route)
+    pilot = setup.pilot(folder)
+    recorder = Recorder(path, setup.header())
+
+    log = read_drive(path)
+    setup = DriveSetup.of_header(log.header, path)
+
+The header is plain JSON and holds rig, markers and vehicle as their files do.
+"""
+
+import hashlib
+import os
+import platform
+from dataclasses import asdict, dataclass, field, fields
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+from pydantic import Field, create_model, field_validator
+
+from jaxnav.bicycle import Vehicle
+from jaxnav.errors import BadInput
+from jaxnav.files import Route
+from jaxnav.files.markers import MarkerFile, marker_data
+from jaxnav.files.rigs import RigFile, rig_data
+from jaxnav.files.validation import Entry, Number, Pair, Positive, Text, at, validate
+from jaxnav.files.vehicles import VehicleFile, vehicle_data
+from jaxnav.markers import MarkerMap
+from jaxnav.navigator import Navigator
+from jaxnav.rig import CameraRig
+from jaxnav.runtime.compiled import compiled
+from jaxnav.runtime.health import Timeouts
+from jaxnav.runtime.message_fields import Flag
+from jaxnav.runtime.pilot import Pilot
+from jaxnav.selectors import SELECTORS, make_selector
+from jaxnav.timeline import advance
+
+SETUP_VERSION = 1
+# The others need what only a simulation has: another sensor, the truth.
+PILOT_SELECTORS = tuple(name for name in SELECTORS if name not in ("orientation-given", "oracle"))
+
+_Limit = Annotated[float, Field(strict=True, ge=0)]  # also inf: never
+
+
+class RouteEntry(Entry):
+    """See `Route`."""
+
+    waypoints_m: Annotated[list[Pair], Field(min_length=1, max_length=4096)]
+    waypoint_radius_m: Positive
+    start_pose: Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+    def route(self) -> Route:
+        """The route."""
+        x_m, y_m, psi_rad = self.start_pose
+        waypoints_m = tuple((x, y) for x, y in self.waypoints_m)
+        return Route(waypoints_m, self.waypoint_radius_m, (x_m, y_m, psi_rad))
+
+
+_timeouts: dict[str, Any] = {limit.name: (_Limit, ...) for limit in fields(Timeouts)}
+TimeoutsEntry: Any = create_model("TimeoutsEntry", __base__=Entry, **_timeouts)
+
+
+class SetupEntry(Entry):
+    """The header of a recorded drive; see `DriveSetup`."""
+
+    setup_version: Annotated[int, Field(strict=True)]
+    rig: RigFile
+    markers: MarkerFile
+    vehicle: VehicleFile
+    route: RouteEntry
+    selector: Text
+    corner_sigma_px: Positive | None
+    timeouts: TimeoutsEntry
+    float64: Flag
+    made_by: dict[str, str]
+
+    @field_validator("selector")
+    @classmethod
+    def _known(cls, selector: str) -> str:
+        if selector not in PILOT_SELECTORS:
+            expected = ", ".join(PILOT_SELECTORS)
+            raise ValueError(f"unknown {selector!r}: expected one of {expected}")
+        return selector
+
+
+@dataclass(frozen=True, eq=False)
+class DriveSetup:
+    """What a drive is driven with.
+
+    Attributes:
+        selector: one of `PILOT_SELECTORS`.
+        corner_sigma_px: of every corner along one axis; None: as whoever detects it says.
+        float64: precision of the process, in which rig, markers and vehicle are made too.
+    """
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle
+    route: Route
+    selector: str = "multi-hypothesis"
+    corner_sigma_px: float | None = None
+    timeouts: Timeouts = field(default_factory=Timeouts)
+    float64: bool = False
+
+    def navigator(self) -> Navigator:
+        """What the pilot runs."""
+        return Navigator(
+            rig=self.rig,
+            markers=self.markers,
+            vehicle=self.vehicle,
+            waypoints_m=self.route.waypoints_m,
+            waypoint_radius_m=self.route.waypoint_radius_m,
+            selector=make_selector(self.selector),
+        )
+
+    def pilot(self, folder: Path | None) -> Pilot:
+        """A pilot at the beginning of a drive.
+
+        Args:
+            folder: of executables, see `compiled`.
+        """
+        navigator = self.navigator()
+        program = compiled(advance, navigator, folder)
+        return Pilot(navigator, self.timeouts, program, self.corner_sigma_px)
+
+    def header(self) -> dict[str, Any]:
+        """All of it, every number bit for bit, and what this process is."""
+        return {
+            "setup_version": SETUP_VERSION,
+            "rig": rig_data(self.rig),
+            "markers": marker_data(self.markers),
+            "vehicle": vehicle_data(self.vehicle),
+            "route": asdict(self.route),
+            "selector": self.selector,
+            "corner_sigma_px": self.corner_sigma_px,
+            "timeouts": asdict(self.timeouts),
+            "float64": self.float64,
+            "made_by": this_process(),
+        }
+
+    @staticmethod
+    def of_header(header: dict[str, Any], where: Path) -> "DriveSetup":
+        """What `header` was made of. The process must have its precision, see `needs_float64`.
+
+        Args:
+            where: the file that the header is of.
+
+        Raises:
+            BadInput: one line naming file and key; also where it is of a newer kind.
+        """
+        entry = _checked(header, where)
+        return DriveSetup(
+            rig=entry.rig.rig(),
+            markers=entry.markers.map(),
+            vehicle=entry.vehicle.vehicle(),
+            route=entry.route.route(),
+            selector=entry.selector,
+            corner_sigma_px=entry.corner_sigma_px,
+            timeouts=Timeouts(**entry.timeouts.model_dump()),
+            float64=entry.float64,
+        )
+
+
+def needs_float64(header: dict[str, Any], where: Path) -> bool:
+    """The precision of a recorded drive, without making an array.
+
+    Raises:
+        BadInput: as `DriveSetup.of_header`.
+    """
+    return _checked(header, where).float64
+
+
+def made_here(header: dict[str, Any]) -> bool:
+    """Whether a drive was recorded by what runs now, so that a replay has the same bits."""
+    return bool(header.get("made_by") == this_process())
+
+
+def this_process() -> dict[str, str]:
+    """All that the bits of a result depend on beside the setup."""
+    libraries = ("jaxnav", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax", "numpy")
+    return {name: version(name) for name in libraries} | {
+        "opencv": str(cv2.__version__),
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "host": hashlib.blake2b(platform.node().encode(), digest_size=8).hexdigest(),
+        "sources": _sources(),
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
+        "PJRT_NPROC": os.environ.get("PJRT_NPROC", ""),
+    }
+
+
+@cache
+def _sources() -> str:
+    """A digest of the package: between two releases its version does not change."""
+    package = Path(__file__).resolve().parents[1]
+    digest = hashlib.blake2b(digest_size=8)
+    for folder in (package, package / "runtime", package / "detection"):
+        for source in sorted(folder.glob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def _checked(header: dict[str, Any], where: Path) -> SetupEntry:
+    found = header.get("setup_version")
+    if isinstance(found, int) and found != SETUP_VERSION:
+        problem = f"this program reads {SETUP_VERSION}, the file has {found}"
+        raise BadInput(at(where, "header.setup_version"), problem)
+    return validate(SetupEntry, header, where, "header")

@@ -1,0 +1,84 @@
+"""Images of the simulated car's cameras, rendered by a process of their own.
+
+Rendering takes more of a core than a car's computer has to spare, and holds the interpreter while
+it does: beside the loop that would be a fault that no real camera brings.
+"""
+
+import multiprocessing
+from multiprocessing.connection import Connection
+
+import numpy as np
+
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+
+EXPOSURE_S = 0.005
+_SPREAD_S = 0.02  # before and after a stamp: what the track covers
+_POSES = 9
+
+
+def track_times_s() -> np.ndarray:
+    """Instants around a stamp at which the poses of a track are asked for, s."""
+    return np.linspace(-_SPREAD_S, _SPREAD_S, _POSES)
+
+
+class RenderingProcess:
+    """Renders one set of images after the other. For one thread."""
+
+    def __init__(self, rig: CameraRig, markers: MarkerMap, seed: int):
+        """Started when this returns; the first images cost what they cost."""
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, rig, markers, seed), name="jaxnav-rendering", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        self.render(np.tile([0.0, 0.0, 0.0], (_POSES, 1)))
+
+    def render(self, poses: np.ndarray) -> list[np.ndarray]:
+        """What every camera sees.
+
+        Args:
+            poses: (x_m, y_m, psi_rad) at `track_times_s`, (9, 3).
+
+        Raises:
+            OSError: the process is gone.
+        """
+        try:
+            self._connection.send(poses)
+            images: list[np.ndarray] = self._connection.recv()
+        except EOFError:
+            raise OSError("the process that renders is gone") from None
+        return images
+
+    def close(self) -> None:
+        """End the process. Any number of times."""
+        self._connection.close()
+        self._process.terminate()
+        self._process.join(2.0)
+
+
+def _serve(connection: Connection, rig: CameraRig, markers: MarkerMap, seed: int) -> None:
+    from jaxnav.simulation.rendering import Renderer
+    from jaxnav.simulation.scene import Scene
+    from jaxnav.simulation.sensor import Sensor, Shutter
+
+    sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0, full_well_e=6000.0)
+    renderer = Renderer(
+        Scene.create(markers, seed=seed), rig, Shutter(exposure_s=EXPOSURE_S), sensor, threads=1
+    )
+    rng, times_s = np.random.default_rng(seed), track_times_s()
+    while True:
+        try:
+            poses = connection.recv()
+        except (EOFError, OSError, KeyboardInterrupt):
+            return
+
+        def pose_at(at_s: np.ndarray, poses: np.ndarray = poses) -> np.ndarray:
+            x_m, y_m, psi_rad = (np.interp(at_s, times_s, column) for column in poses.T)
+            zero = np.zeros_like(x_m)
+            half = psi_rad / 2
+            return np.column_stack([np.cos(half), zero, zero, np.sin(half), x_m, y_m, zero])
+
+        connection.send(renderer.render(pose_at, 0.0, rng))

@@ -1,0 +1,171 @@
+"""The simulated car in real time: a vehicle and cameras like any other's.
+
+jaxnav run --vehicle sim                           # cameras that find their markers themselves
+jaxnav run --vehicle sim --option images=true      # rendered images
+"""
+
+import threading
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxnav.errors import BadInput
+from jaxnav.runtime.interfaces import Camera, Frame, Odometry, Setup, Vehicle
+from jaxnav.vehicles.options import choice, number
+from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
+from jaxnav.vehicles.world import World, WorldSettings
+
+_LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are there
+
+
+class SimVehicle:
+    """The car of a `World`, which stops by itself when it hears nothing."""
+
+    def __init__(self, world: World):
+        """For the cameras the world is there to look at."""
+        self.world = world
+        self._closed = False
+
+    @property
+    def timeout_s(self) -> float:
+        """See `Vehicle`."""
+        return self.world.settings.vehicle_timeout_s
+
+    def read(self) -> Odometry:
+        """See `Vehicle`."""
+        if self._closed:
+            raise OSError("the vehicle is closed")
+        now_ns = time.monotonic_ns()
+        return Odometry(now_ns, *self.world.odometry(now_ns))
+
+    def write(self, steering_rad: float, throttle: float) -> None:
+        """See `Vehicle`."""
+        if self._closed:
+            raise OSError("the vehicle is closed")
+        self.world.write(steering_rad, throttle, time.monotonic_ns())
+
+    def stop(self) -> None:
+        """See `Vehicle`."""
+        self.world.write(0.0, 0.0, time.monotonic_ns())
+
+    def close(self) -> None:
+        """See `Vehicle`."""
+        self._closed = True
+        self.stop()
+
+
+class _Shutter:
+    """When the cameras look, all at once, and what they see: made by a thread, once for all."""
+
+    def __init__(self, world: World, rate_hz: float, renderer: RenderingProcess | None):
+        self._world, self._renderer = world, renderer
+        self._period_ns = int(1e9 / rate_hz)
+        self._news = threading.Condition()
+        self._frames: list[Frame] = []
+        self._closed = False
+        self._error: str | None = None
+        self._thread = threading.Thread(target=self._run, name="jaxnav-sim-shutter", daemon=True)
+        self._thread.start()
+
+    def frame(self, camera: int, after_ns: int, timeout_s: float) -> Frame | None:
+        """What a camera saw last, if that is newer; else what it sees next."""
+        with self._news:
+            self._news.wait_for(lambda: self._closed or self._is_newer(after_ns), timeout_s)
+            if self._error is not None:
+                raise OSError(self._error)
+            return self._frames[camera] if self._is_newer(after_ns) else None
+
+    def close(self) -> None:
+        """Look no more."""
+        with self._news:
+            self._closed = True
+            self._news.notify_all()
+        self._thread.join(1.0)
+        if self._renderer is not None:
+            self._renderer.close()
+
+    def _is_newer(self, than_ns: int) -> bool:
+        return bool(self._frames) and self._frames[0].stamp_ns > than_ns
+
+    def _run(self) -> None:
+        stamp_ns = time.monotonic_ns()
+        while not self._closed:
+            now_ns = time.monotonic_ns()
+            time.sleep(max(stamp_ns + _LATENCY_NS - now_ns, 0) / 1e9)
+            try:
+                frames = self._looked(stamp_ns)
+            except OSError as error:
+                self._error = None if self._closed else str(error)
+                return
+            with self._news:
+                self._frames = frames
+                self._news.notify_all()
+            behind = max(time.monotonic_ns() - stamp_ns - _LATENCY_NS, 0) // self._period_ns
+            stamp_ns += (behind + 1) * self._period_ns
+
+    def _looked(self, stamp_ns: int) -> list[Frame]:
+        if self._renderer is None:
+            return [Frame(stamp_ns, None, found) for found in self._world.detections(stamp_ns)]
+        times_ns = stamp_ns + (1e9 * track_times_s()).astype(int)
+        poses = np.array([self._world.state(int(t))[:3] for t in times_ns])
+        return [Frame(stamp_ns, image) for image in self._renderer.render(poses)]
+
+
+class SimCamera:
+    """One camera of the simulated car."""
+
+    def __init__(self, name: str, camera: int, shutter: _Shutter):
+        """Args:
+        camera: its index in the rig.
+        """
+        self._name, self._camera, self._shutter = name, camera, shutter
+        self._last_ns = 0
+
+    @property
+    def name(self) -> str:
+        """See `Camera`."""
+        return self._name
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """See `Camera`."""
+        frame = self._shutter.frame(self._camera, self._last_ns, timeout_s)
+        if frame is not None:
+            self._last_ns = frame.stamp_ns
+        return frame
+
+    def close(self) -> None:
+        """See `Camera`. The others close with it: they look together."""
+        self._shutter.close()
+
+
+def open_vehicle(setup: Setup) -> SimVehicle:
+    """The simulated car, at the start of its route.
+
+    Options: corner_sigma_px (0.3).
+    """
+    settings = WorldSettings(
+        corner_sigma_px=number(setup.options, "corner_sigma_px", 0.3, 0.0, 10.0)
+    )
+    now_ns = time.monotonic_ns()
+    world = World(
+        setup.rig, setup.markers, setup.vehicle, setup.start_pose, now_ns, settings, setup.seed
+    )
+    world.state(now_ns + 1)  # compiled now, and not while somebody waits
+    world.detections(now_ns + 1)
+    return SimVehicle(world)
+
+
+def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
+    """The cameras that look at the world of the simulated car.
+
+    Options: rate_hz (30), images (false).
+    """
+    if not isinstance(vehicle, SimVehicle):
+        raise BadInput("--cameras", "sim looks at the world of --vehicle sim alone")
+    renderer = None
+    if choice(setup.options, "images", ("false", "true")) == "true":
+        renderer = RenderingProcess(setup.rig, setup.markers, setup.seed)
+    rate_hz = number(setup.options, "rate_hz", 30.0, 1.0, 240.0)
+    shutter = _Shutter(vehicle.world, rate_hz, renderer)
+    return [SimCamera(name, c, shutter) for c, name in enumerate(setup.rig.names)]

@@ -1,0 +1,159 @@
+"""A simulated car in its world, asked at any instant: of real time, or of a test's."""
+
+import threading
+from collections import deque
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.bicycle import Vehicle as VehicleModel
+from jaxnav.control import Command
+from jaxnav.detection.types import Detections
+from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+from jaxnav.simulation.corners import see
+from jaxnav.simulation.plant import CarState, OdometryNoise, move
+
+_SUBSTEP_NS = 5_000_000
+_KEPT = 400  # substeps: two seconds into the past
+
+
+@jax.jit
+def _moved(vehicle: VehicleModel, row: jax.Array, command: jax.Array, dt_s: jax.Array) -> jax.Array:
+    """`move`, of plain arrays: (x_m, y_m, psi_rad, speed_mps, steering_rad)."""
+    car = CarState(row[:3], row[3], row[4])
+    car = move(vehicle, car, Command(command[0], command[1]), dt_s)
+    return jnp.concatenate([car.pose, jnp.stack([car.speed_mps, car.steering_rad])])
+
+
+@jax.jit
+def _seen(rig: CameraRig, markers: MarkerMap, pose: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return see(rig, markers, T_world_vehicle_from_planar(pose))
+
+
+@dataclass(frozen=True)
+class WorldSettings:
+    """What the simulated sensors are like."""
+
+    corner_sigma_px: float = 0.3
+    odometry: OdometryNoise = field(default_factory=OdometryNoise)
+    actuation_delay_s: float = 0.01
+    vehicle_timeout_s: float = 0.2  # without a command the car stops by itself
+
+
+class World:
+    """The car and where it has been. For several threads."""
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        markers: MarkerMap,
+        vehicle: VehicleModel,
+        start_pose: tuple[float, float, float],
+        begin_ns: int,
+        settings: WorldSettings | None = None,
+        seed: int = 0,
+    ):
+        """At rest at its start."""
+        self.rig, self.markers, self.vehicle = rig, markers, vehicle
+        self.settings = settings or WorldSettings()
+        self.rng = np.random.default_rng(seed)
+        self._lock = threading.Lock()
+        self._dtype = np.asarray(vehicle.wheelbase_m).dtype
+        self._row = np.array([*start_pose, 0.0, 0.0], self._dtype)
+        self._time_ns = begin_ns
+        self._track: deque[tuple[int, np.ndarray]] = deque([(begin_ns, self._row)], maxlen=_KEPT)
+        # What was commanded, and when it acts: the last one that is due is obeyed.
+        self._commands: deque[tuple[int, float, float]] = deque([(begin_ns, 0.0, 0.0)])
+        self._written_ns = begin_ns
+
+    def write(self, steering_rad: float, throttle: float, now_ns: int) -> None:
+        """A command that acts soon."""
+        with self._lock:
+            self._advance(now_ns)
+            due_ns = now_ns + int(self.settings.actuation_delay_s * 1e9)
+            self._commands.append((due_ns, steering_rad, throttle))
+            self._written_ns = now_ns
+
+    def carry_off(self, by: tuple[float, float, float]) -> None:
+        """Somebody takes the car elsewhere: m, m, rad in the world."""
+        with self._lock:
+            self._row = self._row + np.array([*by, 0.0, 0.0], self._dtype)
+
+    def move_markers(self, by_m: tuple[float, float, float]) -> None:
+        """Somebody takes the markers elsewhere, by so much in the world."""
+        with self._lock:
+            Ts = self.markers.Ts_world_marker
+            moved = Ts.wxyz_xyz.at[:, 4:].add(jnp.asarray(by_m, Ts.wxyz_xyz.dtype)[None])
+            self.markers = eqx.tree_at(lambda m: m.Ts_world_marker.wxyz_xyz, self.markers, moved)
+
+    def state(self, at_ns: int) -> np.ndarray:
+        """(x_m, y_m, psi_rad, speed_mps, steering_rad) at an instant, of the last two seconds."""
+        with self._lock:
+            self._advance(at_ns)
+            newer = self._track[-1]
+            for older in reversed(self._track):
+                if older[0] <= at_ns:
+                    break
+                newer = older
+        if older[0] >= at_ns or newer[0] == older[0]:
+            return older[1]
+        share = (at_ns - older[0]) / (newer[0] - older[0])
+        return np.asarray(older[1] + share * (newer[1] - older[1]))
+
+    def pose(self, at_ns: int) -> np.ndarray:
+        """T_world_vehicle (7,), wxyz_xyz, at an instant."""
+        x_m, y_m, psi_rad = self.state(at_ns)[:3]
+        return np.array([np.cos(psi_rad / 2), 0, 0, np.sin(psi_rad / 2), x_m, y_m, 0])
+
+    def odometry(self, at_ns: int) -> tuple[float, float]:
+        """(speed_mps, steering_rad) as the sensors report them."""
+        noise, state = self.settings.odometry, self.state(at_ns)
+        with self._lock:
+            errors = self.rng.standard_normal(2)
+        return (
+            float(noise.speed_scale * state[3] + noise.speed_sigma_mps * errors[0]),
+            float(state[4] + noise.steering_sigma_rad * errors[1]),
+        )
+
+    def detections(self, at_ns: int) -> list[Detections]:
+        """What each camera sees of the markers, corners with noise."""
+        pose = self.state(at_ns)[:3]
+        corners_px, visible = jax.device_get(_seen(self.rig, self.markers, pose))
+        sigma_px = self.settings.corner_sigma_px
+        with self._lock:
+            noise_px = sigma_px * self.rng.standard_normal(corners_px.shape)
+        return [
+            self._detections(corners_px[c] + noise_px[c], visible[c]) for c in range(len(self.rig))
+        ]
+
+    def _detections(self, corners_px: np.ndarray, visible: np.ndarray) -> Detections:
+        index = np.flatnonzero(visible)
+        return Detections(
+            ids=np.array([self.markers.ids[m] for m in index], int),
+            corners_px=corners_px[index],
+            sigma_px=np.full((len(index), 4), max(self.settings.corner_sigma_px, 0.05)),
+            refined=np.ones(len(index), bool),
+            families=tuple(self.markers.families[m] for m in index),
+        )
+
+    def _advance(self, until_ns: int) -> None:
+        while self._time_ns < until_ns:
+            step_ns = min(_SUBSTEP_NS, until_ns - self._time_ns)
+            steering_rad, throttle = self._obeyed(self._time_ns)
+            command = np.array([steering_rad, throttle], self._dtype)
+            dt_s = np.asarray(step_ns / 1e9, self._dtype)
+            self._row = np.asarray(_moved(self.vehicle, self._row, command, dt_s))
+            self._time_ns += step_ns
+            self._track.append((self._time_ns, self._row))
+
+    def _obeyed(self, time_ns: int) -> tuple[float, float]:
+        while len(self._commands) > 1 and self._commands[1][0] <= time_ns:
+            self._commands.popleft()
+        _, steering_rad, throttle = self._commands[0]
+        silent_s = (time_ns - self._written_ns) / 1e9
+        return steering_rad, 0.0 if silent_s > self.settings.vehicle_timeout_s else throttle

@@ -1,0 +1,211 @@
+"""What a drive was driven with comes back from its header bit for bit, or not at all."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxnav.bicycle import Vehicle
+from jaxnav.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.errors import BadInput
+from jaxnav.files import Route
+from jaxnav.files.markers import marker_map
+from jaxnav.rig import CameraRig
+from jaxnav.runtime.drive_format import decode, encode
+from jaxnav.runtime.drive_setup import (
+    PILOT_SELECTORS,
+    DriveSetup,
+    made_here,
+    needs_float64,
+)
+from jaxnav.runtime.health import Timeouts
+from tests import worlds
+
+WHERE = Path("drive.mcap")
+ROUTE = Route(((1.3, 0.1), (0.5, 0.65)), 0.15, (2.0, -1.0, 2.18))
+
+
+def qcar_setup(**changes) -> DriveSetup:
+    parts = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), ROUTE
+    return dataclasses.replace(DriveSetup(*parts, float64=True), **changes)
+
+
+def bits(setup: DriveSetup) -> list:
+    """Everything in a setup, comparable."""
+    arrays = setup.rig, setup.markers, setup.vehicle
+    leaves, structure = jax.tree.flatten(arrays)
+    plain = [getattr(setup, name) for name in ("route", "selector", "corner_sigma_px", "timeouts")]
+    told = [(leaf.dtype.name, leaf.shape, np.asarray(leaf).tobytes()) for leaf in leaves]
+    return [str(structure), told, plain, setup.float64]
+
+
+small = st.floats(-10, 10)
+positive = st.floats(1e-5, 1e8)  # in float32 too
+quaternions = st.lists(st.floats(-0.4, 0.4), min_size=4, max_size=4)
+poses = st.tuples(quaternions, st.lists(small, min_size=3, max_size=3))
+cameras = st.sampled_from(sorted(LENS_COEFFICIENTS)).flatmap(
+    lambda lens: st.tuples(
+        st.tuples(positive, positive),
+        st.tuples(small, small),
+        st.just(lens),
+        st.lists(small, min_size=LENS_COEFFICIENTS[lens], max_size=LENS_COEFFICIENTS[lens]),
+    )
+)
+sizes_px = st.tuples(st.integers(1, 65536), st.integers(1, 65536))
+placed_markers = st.tuples(
+    poses, positive, st.integers(0, 29), st.sampled_from(["tag36h11", "4x4_50"])
+)
+vehicles = st.tuples(positive, st.floats(0.01, 1.5), *[positive] * 4)
+routes = st.builds(
+    Route,
+    st.lists(st.tuples(small, small), min_size=1, max_size=4).map(tuple),
+    positive,
+    st.tuples(small, small, small),
+)
+timeouts = st.builds(Timeouts, *[st.floats(0, allow_infinity=True)] * 8)
+
+
+def wxyz_xyz(pose: tuple[list[float], list[float]]) -> np.ndarray:
+    wxyz = np.array([1.0, 0, 0, 0]) + pose[0]
+    return np.concatenate([wxyz / np.linalg.norm(wxyz), pose[1]])
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_a_setup_comes_back_bit_for_bit(double):
+    @settings(max_examples=25, deadline=None, derandomize=True)
+    @given(
+        st.lists(st.tuples(cameras, poses, sizes_px), min_size=1, max_size=3),
+        st.lists(placed_markers, min_size=1, max_size=3, unique_by=lambda marker: marker[2:]),
+        vehicles,
+        st.tuples(routes, st.sampled_from(PILOT_SELECTORS), st.none() | positive, timeouts),
+    )
+    def check(rig, markers, vehicle, others) -> None:
+        lenses, placed, images = zip(*rig, strict=True)
+        setup = DriveSetup(
+            CameraRig.create(
+                [Camera.create(*lens) for lens in lenses],
+                [jaxlie.SE3(jnp.asarray(wxyz_xyz(pose), float)) for pose in placed],
+                ["front", "a/b", "c.d"][: len(rig)],
+                images,
+            ),
+            marker_map(
+                np.stack([wxyz_xyz(pose) for pose, *_ in markers]),
+                *map(list, zip(*(marker[1:] for marker in markers), strict=True)),
+            ),
+            Vehicle.create(*vehicle),
+            *others,
+            double,
+        )
+        back = DriveSetup.of_header(decode(encode(setup.header())), WHERE)
+        assert bits(back) == bits(setup)
+
+    with jax.enable_x64(double):
+        check()
+
+
+def test_a_header_says_who_recorded_it():
+    setup = qcar_setup(timeouts=Timeouts(stop_s=math.inf), corner_sigma_px=0.25)
+    header = decode(encode(setup.header()))
+    assert header["made_by"]["jax"] == jax.__version__
+    assert made_here(header)
+    assert needs_float64(header, WHERE)
+    assert not made_here(header | {"made_by": header["made_by"] | {"jaxlib": "0.0"}})
+    assert not made_here({})
+
+
+def test_a_setup_makes_its_navigator():
+    setup = qcar_setup(selector="ratio-test")
+    navigator = setup.navigator()
+    assert type(navigator.selector).__name__ == "RatioTest"
+    np.testing.assert_array_equal(navigator.controller.waypoints_m, ROUTE.waypoints_m)
+    assert float(navigator.controller.waypoint_radius_m) == 0.15
+
+
+def _without(header: dict, key: str) -> dict:
+    return {name: value for name, value in header.items() if name != key}
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda h: h | {"setup_version": 2}, "setup_version: this program reads 1, the file has 2"),
+        (lambda h: _without(h, "setup_version"), "setup_version: missing"),
+        (lambda h: _without(h, "rig"), "rig: missing"),
+        (lambda h: h | {"colour": "red"}, "colour: unknown key: expected setup_version, rig"),
+        (lambda h: h | {"selector": "oracle"}, "selector: unknown 'oracle': expected one of multi"),
+        (lambda h: h | {"corner_sigma_px": 0}, "corner_sigma_px: must be > 0, got 0"),
+        (lambda h: h | {"float64": 1}, "float64: "),
+        (
+            lambda h: h | {"timeouts": h["timeouts"] | {"stop_s": math.nan}},
+            "timeouts.stop_s: must be >= 0, got nan",
+        ),
+        (
+            lambda h: h | {"rig": {"cameras": [h["rig"]["cameras"][0] | {"lens": "fish"}]}},
+            "rig.cameras.front.lens: must be 'none', 'radtan' or 'equidistant', got",
+        ),
+        (
+            lambda h: h | {"route": h["route"] | {"start_pose": [1.0]}},
+            "route.start_pose: must have at least 3 entries, got 1",
+        ),
+    ],
+)
+def test_a_bad_header_is_named_with_its_key(change, line):
+    header = decode(encode(qcar_setup().header()))
+    with pytest.raises(BadInput) as error:
+        DriveSetup.of_header(change(header), WHERE)
+    assert str(error.value).startswith(f"drive.mcap: header.{line}")
+    assert "\n" not in str(error.value)
+
+
+TEXT = encode(qcar_setup().header())
+values = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just([]),
+    st.just({}), st.lists(st.integers(0, 3), max_size=4),
+)  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.lists(st.integers(0, 10), min_size=1, max_size=6), values, st.booleans())
+def test_any_change_of_a_value_gives_a_setup_or_bad_input(path, value, removes):
+    header = json.loads(TEXT)
+    place, steps = header, []
+    for step in path:
+        keys = list(place) if isinstance(place, dict) else list(range(len(place)))
+        if not keys:
+            break
+        steps.append((place, keys[step % len(keys)]))
+        place = place[steps[-1][1]]
+        if not isinstance(place, dict | list):
+            break
+    holder, key = steps[-1]
+    if removes:
+        del holder[key]
+    else:
+        holder[key] = value
+    try:
+        assert isinstance(DriveSetup.of_header(header, WHERE), DriveSetup)
+    except BadInput as error:
+        assert str(error).startswith("drive.mcap: header.")  # noqa: PT017
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.integers(0, len(TEXT) - 1), st.binary(max_size=3), st.integers(0, 4))
+def test_any_change_of_a_byte_gives_a_setup_or_bad_input(where, new, out):
+    raw = bytearray(TEXT)
+    raw[where : where + out] = new
+    try:
+        header = decode(bytes(raw))
+    except ValueError:
+        return
+    try:
+        assert isinstance(DriveSetup.of_header(header, WHERE), DriveSetup)
+    except BadInput as error:
+        assert str(error).startswith("drive.mcap: header.")  # noqa: PT017

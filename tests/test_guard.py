@@ -1,0 +1,252 @@
+"""The watchdog: whatever happens, the last that a vehicle hears is zero throttle, and soon."""
+
+import math
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxnav.runtime.guard import TIMEOUT_S, Guard
+from jaxnav.runtime.limits import Limits
+
+LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)
+SLACK_S = 0.15  # of a machine that does something else
+
+
+class Car:
+    """Remembers what it was told, and when."""
+
+    timeout_s = math.inf
+
+    def __init__(self):
+        self.told = []
+        self.steered = []
+        self.lock = threading.Lock()
+        self.hangs = threading.Event()
+        self.let_go = threading.Event()
+        self.fails = 0
+
+    def write(self, steering_rad, throttle):
+        if self.hangs.is_set():
+            self.let_go.wait(5)
+        if self.fails:
+            self.fails -= 1
+            raise OSError("not now")
+        self.told.append((time.monotonic(), steering_rad, throttle))
+        self.steered.append(steering_rad)
+
+    def stop(self):
+        if self.fails:
+            self.fails -= 1
+            raise OSError("not now")
+        self.told.append((time.monotonic(), 0.0, 0.0))
+
+    def close(self):
+        self.stop()
+
+
+@pytest.fixture
+def car():
+    return Car()
+
+
+@pytest.fixture
+def guard(car):
+    guard = Guard(car, LIMITS)
+    yield guard
+    car.let_go.set()
+    guard.close()
+
+
+def drive(guard, duration_s, **beats):
+    end = time.monotonic() + duration_s
+    while time.monotonic() < end:
+        guard.write(0.1, 0.2)
+        for name, alive in beats.items():
+            if alive:
+                guard.beat(name)
+        time.sleep(0.01)
+
+
+def stopped_after(car, since):
+    """Seconds until zero throttle, after which nothing else came."""
+    zero = [index for index, (_, _, throttle) in enumerate(car.told) if throttle != 0][-1] + 1
+    return car.told[zero][0] - since
+
+
+def test_nothing_gets_through_before_it_is_armed(car, guard):
+    guard.write(0.3, 0.3)
+    assert [throttle for _, _, throttle in car.told] == [0.0]
+    time.sleep(2 * TIMEOUT_S)
+    assert not guard.tripped
+    guard.arm()
+    guard.write(0.0, 0.3)
+    assert car.told[-1][2] == 0.3
+
+
+def test_a_loop_that_falls_silent_is_stopped_in_time(car, guard):
+    guard.arm()
+    drive(guard, 0.3)
+    assert not guard.tripped
+    since = car.told[-1][0]
+    assert guard.wait(1.0)
+    assert stopped_after(car, since) < TIMEOUT_S + SLACK_S
+    assert "no fresh command" in guard.reason
+
+
+def test_it_does_not_arm_again(car, guard):
+    guard.arm()
+    guard.trip("told to")
+    guard.arm()
+    assert not guard.write(0.1, 0.2)
+    assert car.told[-1][2] == 0
+    assert guard.reason == "told to"
+
+
+@pytest.mark.parametrize(
+    "command", [(math.nan, 0.1), (0.1, math.nan), (math.inf, 0), (0, -math.inf)]
+)
+def test_a_command_that_is_no_number_stops_it(car, guard, command):
+    guard.arm()
+    drive(guard, 0.05)
+    assert not guard.write(*command)
+    assert guard.tripped
+    assert car.told[-1][2] == 0
+    assert "no number" in guard.reason
+
+
+def test_a_watched_thread_that_hangs_stops_it(car, guard):
+    guard.arm()
+    drive(guard, 0.1, detector=True, camera=True)
+    since = time.monotonic()
+    drive(guard, 0.5, detector=True)
+    assert guard.tripped
+    assert "camera hangs" in guard.reason
+    assert stopped_after(car, since) < TIMEOUT_S + SLACK_S
+
+
+def test_a_thread_that_ends_as_it_should_is_not_missed(car, guard):
+    guard.arm()
+    drive(guard, 0.1, detector=True)
+    guard.leave("detector")
+    drive(guard, 0.4)
+    assert not guard.tripped
+
+
+def test_a_driver_that_hangs_is_stopped_around_it(car, guard):
+    guard.arm()
+    drive(guard, 0.05)
+    since = time.monotonic()
+    car.hangs.set()
+    writer = threading.Thread(target=guard.write, args=(0.1, 0.2), daemon=True)
+    writer.start()
+    assert guard.wait(1.0)
+    assert car.told[-1][2] == 0
+    assert car.told[-1][0] - since < TIMEOUT_S + SLACK_S
+    car.let_go.set()
+    writer.join()
+
+
+def test_a_stop_that_fails_is_tried_again(car, guard):
+    guard.arm()
+    drive(guard, 0.05)
+    car.fails = 2
+    guard.trip("told to")
+    assert car.told[-1][2] == 0
+
+
+def test_a_write_that_fails_now_is_none_and_the_next_may_succeed(car, guard):
+    guard.arm()
+    car.fails = 1
+    assert not guard.write(0.0, 0.1)
+    assert guard.write(0.0, 0.1)
+    assert car.told[-1][2] == 0.1
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.lists(st.tuples(st.floats(), st.floats()), max_size=20))
+def test_what_reaches_the_vehicle_is_inside_the_limits(commands):
+    car, now_ns = Car(), [0]
+    guard = Guard(car, LIMITS, timeout_s=1e6, now_ns=lambda: now_ns[0])
+    guard.arm()
+    for steering_rad, throttle in commands:
+        now_ns[0] += 20_000_000
+        guard.write(steering_rad, throttle)
+    guard.close()
+    told = np.array([(steering, throttle) for _, steering, throttle in car.told])
+    assert np.all(np.isfinite(told))
+    assert np.all(np.abs(told[:, 0]) <= LIMITS.steering_rad)
+    assert np.all(np.abs(told[:, 1]) <= LIMITS.throttle)
+    turns = np.abs(np.diff(car.steered))
+    assert np.all(turns <= LIMITS.steering_rate_radps * 0.02 + 1e-12)
+
+
+PROGRAM = """
+import math, signal, sys, threading, time
+sys.path.insert(0, {root!r})
+from jaxnav.runtime.guard import Guard
+from jaxnav.runtime.limits import Limits
+
+class Car:
+    timeout_s = math.inf
+    def say(self, throttle):
+        print(time.monotonic_ns(), throttle, flush=True)
+    def write(self, steering_rad, throttle):
+        self.say(throttle)
+    def stop(self):
+        self.say(0.0)
+    def close(self):
+        self.stop()
+
+guard = Guard(Car(), Limits(0.5, 5.0, 0.3))
+guard.watch_signals()
+guard.arm()
+end = time.monotonic() + 0.3
+while time.monotonic() < end:
+    guard.write(0.0, 0.2)
+    time.sleep(0.01)
+{ending}
+"""
+
+ENDINGS = {
+    "exception": "raise RuntimeError('somewhere')",
+    "sys.exit": "sys.exit(3)",
+    "end of the program": "",
+    # The main thread sleeps inside the C library and sees no signal for a second.
+    "SIGTERM": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
+    "SIGINT": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
+    "SIGTERM in a hang": "import re\nre.match('(a+)+b', 'a' * 24)\ntime.sleep(1)",
+}
+
+
+@pytest.mark.parametrize("name", ENDINGS)
+def test_however_a_program_ends_zero_throttle_is_the_last_word(name):
+    root = str(Path(__file__).resolve().parents[1])
+    source = textwrap.dedent(PROGRAM).format(root=root, ending=ENDINGS[name])
+    process = subprocess.Popen(
+        [sys.executable, "-c", source], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    since_ns = None
+    if name.startswith("SIG"):
+        for _ in range(30):
+            process.stdout.readline()
+        time.sleep(0.15 if "hang" in name else 0)
+        since_ns = time.monotonic_ns()
+        process.send_signal(getattr(signal, name.split()[0]))
+    output, _ = process.communicate(timeout=30)
+    rows = [line.split() for line in output.splitlines() if len(line.split()) == 2]
+    assert float(rows[-1][1]) == 0.0
+    if since_ns is not None:
+        driven = [int(stamp) for stamp, throttle in rows if float(throttle) != 0]
+        zero = min(int(stamp) for stamp, throttle in rows if float(throttle) == 0)
+        last_ns = max([since_ns, *driven])
+        assert (zero - since_ns) / 1e9 < TIMEOUT_S + SLACK_S
+        assert (last_ns - since_ns) / 1e9 < TIMEOUT_S + SLACK_S

@@ -1,0 +1,290 @@
+"""The loop with its threads: what it does when any of them fails, hangs, or is told to stop."""
+
+import dataclasses
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from jaxnav.detection.types import Detections
+from jaxnav.navigator import Navigator
+from jaxnav.runtime.flags import Fault
+from jaxnav.runtime.frames import Sighted
+from jaxnav.runtime.guard import TIMEOUT_S, Guard
+from jaxnav.runtime.interfaces import Frame, Odometry
+from jaxnav.runtime.loop import Loop
+from jaxnav.runtime.pilot import Input, Pilot
+from jaxnav.runtime.seeing import Eyes, Region, Search, Seen, groups, image_fault
+from tests import worlds
+
+SLACK_S = 0.3  # of a machine that does something else
+NONE = Detections.concatenate([])
+
+
+class Car:
+    """Stands where it is, and remembers what it was told."""
+
+    timeout_s = math.inf
+
+    def __init__(self):
+        self.told = []
+        self.act = lambda: None
+
+    def read(self):
+        self.act()
+        return Odometry(time.monotonic_ns(), 0.001 * len(self.told), 0.0)
+
+    def write(self, steering_rad, throttle):
+        self.told.append((time.monotonic(), throttle))
+
+    def stop(self):
+        self.told.append((time.monotonic(), 0.0))
+
+    def close(self):
+        self.stop()
+
+
+class Eye:
+    """A camera that sees no marker, 50 times a second."""
+
+    def __init__(self, name):
+        self.name = name
+        self.act = lambda: None
+        self.closed = threading.Event()
+
+    def read(self, timeout_s):
+        self.act()
+        if self.closed.wait(0.02):
+            return None
+        return Frame(time.monotonic_ns(), None, NONE)
+
+    def close(self):
+        self.closed.set()
+
+
+class Look:
+    """A search that finds what the camera brings."""
+
+    def __init__(self):
+        self.act = lambda: None
+
+    def warm_up(self):
+        pass
+
+    def look(self, frame, region):
+        self.act()
+        return Sighted(0, frame.stamp_ns, frame.detections)
+
+
+class Throttle:
+    """A pilot of which only the time counts: full throttle always."""
+
+    def __init__(self, pilot):
+        self.pilot, self.navigator, self.limits = pilot, pilot.navigator, pilot.limits
+        self.handled = []
+        self.act = lambda: None
+
+    def handle(self, given: Input):
+        self.act()
+        self.handled.append(given)
+        return dataclasses.replace(self.outcome, throttle=0.2, now_ns=given.now_ns)
+
+
+@pytest.fixture(scope="module")
+def standing() -> Throttle:
+    pilot = Pilot(
+        Navigator(
+            rig=worlds.qcar_rig(),
+            markers=worlds.paper_markers(),
+            vehicle=worlds.qcar(),
+            waypoints_m=worlds.WAYPOINTS_M,
+        )
+    )
+    throttle = Throttle(pilot)
+    throttle.outcome = pilot.handle(Input(1_000_000_000))
+    return throttle
+
+
+class Drive:
+    """A loop that runs in a thread of its own."""
+
+    def __init__(self, pilot):
+        self.car, self.pilot = Car(), pilot
+        pilot.act = lambda: None
+        pilot.handled.clear()
+        self.cameras = [Eye(name) for name in ("front", "right", "rear", "left")]
+        self.looks = [Look() for _ in self.cameras]
+        self.guard = Guard(self.car, pilot.limits)
+        self.eyes = Eyes(self.cameras, self.looks, self.guard)
+        self.loop = Loop(pilot, self.guard, self.car, self.eyes)
+        self.ended = None
+        self.thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self):
+        try:
+            self.ended = self.loop.run(3.0)
+        except Exception as error:
+            self.ended = error
+        finally:
+            self.guard.trip("the loop is over")
+
+    def __enter__(self):
+        self.thread.start()
+        time.sleep(0.4)
+        assert not self.guard.tripped, self.guard.reason
+        assert self.car.told[-1][1] == pytest.approx(0.2)
+        return self
+
+    def __exit__(self, *_):
+        self.guard.trip("the test is over")
+        self.eyes.close()
+        self.guard.close()
+        self.thread.join(5)
+
+    def stopped_after(self, since):
+        """Seconds until the last throttle that was not zero."""
+        assert self.guard.wait(2.0)
+        time.sleep(0.1)
+        assert self.car.told[-1][1] == 0
+        return max(told[0] for told in self.car.told if told[1] != 0) - since
+
+
+def hang():
+    time.sleep(1.5)
+
+
+def fail():
+    raise RuntimeError("somewhere")
+
+
+@pytest.mark.parametrize("act", [hang, fail])
+@pytest.mark.parametrize("who", ["camera", "detector", "vehicle", "pilot"])
+def test_whoever_hangs_or_fails_the_vehicle_stands_in_time(standing, who, act):
+    with Drive(standing) as drive:
+        since = time.monotonic()
+        whom = {
+            "camera": drive.cameras[2],
+            "detector": drive.looks[1],
+            "vehicle": drive.car,
+            "pilot": drive.pilot,
+        }[who]
+        whom.act = act
+        assert drive.stopped_after(since) < TIMEOUT_S + SLACK_S
+        said = drive.guard.reason
+        if act is fail and who in ("camera", "detector"):
+            assert "RuntimeError: somewhere" in said
+        if act is hang:
+            assert "hangs" in said or "no fresh command" in said
+
+
+def test_a_camera_or_a_vehicle_that_can_not_be_read_now_is_no_reason_to_stop(standing):
+    def unplugged():
+        raise OSError("unplugged")
+
+    with Drive(standing) as drive:
+        drive.cameras[0].act = drive.car.act = unplugged
+        time.sleep(0.5)
+        assert not drive.guard.tripped
+        assert drive.eyes.errors[0] > 0
+        assert any(Fault.VEHICLE_FAILED in given.faults for given in drive.pilot.handled)
+
+
+def test_frames_that_show_nothing_reach_the_pilot_with_the_next_tick(standing):
+    with Drive(standing) as drive:
+        time.sleep(0.2)
+        seen = {s.camera for given in drive.pilot.handled for s in given.frames}
+        assert seen == {0}
+        assert all(given.odometry for given in drive.pilot.handled)
+        assert drive.loop.statistics.handled == len(drive.pilot.handled)
+
+
+def test_it_ends_when_its_time_is_over(standing):
+    with Drive(standing) as drive:
+        drive.thread.join(5)
+        assert drive.ended == "time is over"
+        assert drive.loop.statistics.quantile_ms("handle odometry", 0.5) < 100
+
+
+def found(count, shift=0.0):
+    corners = np.tile([[0.0, 0], [9, 0], [9, 9], [0, 9]], (count, 1, 1)) + shift
+    return Detections(
+        np.arange(count), corners, np.ones((count, 4)), np.ones(count, bool), ("tag36h11",) * count
+    )
+
+
+def seen(camera, stamp_ns, count):
+    sighted = Sighted(camera, stamp_ns, found(count))
+    return Seen(sighted, Frame(stamp_ns, None, sighted.detections), str(camera))
+
+
+def test_sightings_of_one_instant_go_together_and_the_empty_ones_apart():
+    shows, blank = groups([seen(0, 5, 1), seen(1, 5, 1), seen(2, 5, 0), seen(0, 9, 2)])
+    assert [[s.camera for s in group] for group in shows] == [[0, 1], [0]]
+    assert [s.camera for s in blank] == [2]
+    assert groups([]) == ([], ())
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        None,
+        np.zeros((410, 820), np.uint8),
+        np.full((410, 820, 3), 255, np.uint8),
+        np.zeros((410, 820), np.float32),
+        np.zeros((820, 410), np.uint8),
+        np.zeros((410, 820, 4), np.uint8),
+        np.zeros((0, 0), np.uint8),
+        "no image",
+    ],
+)
+def test_an_image_that_can_not_be_used_is_said_to_be_so(image):
+    assert image_fault(image, (820, 410)) == Fault.FRAME_UNUSABLE
+
+
+def test_noise_and_half_an_image_are_looked_at():
+    noise = np.random.default_rng(0).integers(0, 256, (410, 820), dtype=np.uint8)
+    half = noise.copy()
+    half[:, 410:] = 0
+    assert image_fault(noise, (820, 410)) == image_fault(half, (820, 410)) == Fault(0)
+
+
+class Finder:
+    """A detector that counts where it is asked to look."""
+
+    family = "tag36h11"
+
+    def __init__(self, near):
+        self.near, self.asked = near, []
+
+    def detect(self, image, camera=None, predicted_corners_px=None):
+        self.asked.append("everywhere")
+        return found(1)
+
+    def detect_near(self, image, camera, quads_px, radius_px):
+        self.asked.append("near")
+        return found(self.near)
+
+
+@pytest.mark.parametrize(
+    ("near", "region", "asked"),
+    [
+        (1, "some", ["near"] * 9 + ["everywhere"]),  # the whole image now and then
+        (0, "some", ["near", "everywhere"] * 10),  # and when it is not there
+        (1, None, ["everywhere"] * 10),  # nobody knows where
+        (1, "elsewhere", ["everywhere"]),  # in the image of another camera
+    ],
+)
+def test_where_it_is_expected_is_where_it_is_looked_for_first(near, region, asked):
+    finder = Finder(near)
+    search = Search(0, (820, 410), None, [finder])
+    image = np.random.default_rng(0).integers(0, 256, (410, 820), dtype=np.uint8)
+    regions = {
+        "some": Region(np.zeros((1, 4, 2)), np.ones(1)),
+        "elsewhere": Region(np.zeros((0, 4, 2)), np.ones(0)),
+    }
+    for number in range(10):
+        sighted = search.look(Frame(number, image), regions.get(region))
+        assert sighted.detections is not None
+    assert finder.asked == asked

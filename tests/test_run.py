@@ -1,0 +1,229 @@
+"""`jaxnav run` as a person runs it, in processes of its own: it arrives, or it stands."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxnav.runtime.drive_log import read_drive
+from jaxnav.runtime.flags import Health
+from jaxnav.vehicles.world import World
+from tests import worlds
+from tests.helpers import recorded_vehicle
+from tests.helpers.recorded_vehicle import Word, words
+
+ROOT = Path(__file__).resolve().parents[1]
+MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
+STOPS_S = 0.2  # after a signal, at the latest
+SLACK_S = 0.3  # of a machine that does something else
+START_S = 120.0  # until it drives: the first one compiles, on a machine that is busy
+LITTLE_BYTES = 12_000  # more than the vehicle is told in a drive, less than is recorded of one
+ROUTE = """
+waypoints_m: [[0.0, 0.0]]
+waypoint_radius_m: 0.15
+start: {x_m: 0.0, y_m: -0.5, psi_deg: 90.0}
+"""
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """A short route, and the cache that all drives share."""
+
+    folder: Path
+
+    def environment(self) -> dict[str, str]:
+        return os.environ | {"XDG_CACHE_HOME": str(self.folder), "PYTHONPATH": str(ROOT)}
+
+    def command(self, *arguments: object) -> list[str]:
+        return [sys.executable, "-c", MAIN, "run", *map(str, arguments)]
+
+    def driving(self, log: Path, record: Path) -> list[str]:
+        """With a watchdog that is patient with a busy machine."""
+        return self.command(
+            *("--vehicle", recorded_vehicle.NAME, "--cameras", "sim", "--option", f"log={log}"),
+            *("--route", self.folder / "route.yaml", "--record", record),
+            *("--headless", "--timeout-s", 3),
+        )
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A drive that is over."""
+
+    code: int
+    out: str
+    err: str
+    told: list[Word]
+
+
+@dataclass(frozen=True)
+class Running:
+    """A drive that goes on."""
+
+    process: subprocess.Popen
+    log: Path
+    record: Path
+
+    def ended(self) -> Ended:
+        out, err = self.process.communicate(timeout=60)
+        return Ended(self.process.returncode, out, err, words(self.log))
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory) -> Workplace:
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "route.yaml").write_text(ROUTE)
+    return Workplace(folder)
+
+
+@contextmanager
+def driving(workplace: Workplace, folder: Path) -> Iterator[Running]:
+    """A drive, from when the vehicle has been told to move."""
+    log, record = folder / "told", folder / "drive.mcap"
+    process = subprocess.Popen(
+        workplace.driving(log, record),
+        cwd=folder,
+        env=workplace.environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with process:
+        try:
+            end_s = time.monotonic() + START_S
+            while sum(word.throttle != 0 for word in words(log)) < 3:
+                if process.poll() is not None or time.monotonic() > end_s:
+                    pytest.fail(f"does not drive: {process.communicate(timeout=1)}")
+                time.sleep(0.02)
+            yield Running(process, log, record)
+        finally:
+            process.kill()
+
+
+def assert_arrived(ended: Ended) -> None:
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out.startswith("ended: arrived\n")
+    assert ended.told[-1].throttle == 0
+
+
+def test_it_arrives_and_leaves_a_whole_recording(workplace, tmp_path):
+    with driving(workplace, tmp_path) as drive:
+        ended = drive.ended()
+    assert_arrived(ended)
+    log = read_drive(drive.record)
+    assert not log.truncated
+    assert log.outcomes.done[-1]
+    assert np.hypot(*log.outcomes.pose[-1, :2]) < 0.2
+    assert Health.OK in log.outcomes.health
+    assert len(log.inputs) == len(log.outcomes.now_ns) > 50
+    count = len(log.inputs) + len(log.outcomes.now_ns)
+    assert f"recorded {count} messages in {drive.record}" in ended.out
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_the_vehicle_at_once(workplace, tmp_path, number):
+    with driving(workplace, tmp_path) as drive:
+        signalled_ns = time.monotonic_ns()
+        drive.process.send_signal(number)
+        ended = drive.ended()
+    assert (ended.code, ended.err) == (128 + number, "")
+    assert ended.out.startswith(f"ended: {number.name}\n")
+    assert ended.told[-1].throttle == 0
+    stood_ns = min(
+        word.stamp_ns
+        for index, word in enumerate(ended.told)
+        if all(later.throttle == 0 for later in ended.told[index:])
+    )
+    assert (stood_ns - signalled_ns) / 1e9 < STOPS_S + SLACK_S
+    log = read_drive(drive.record)
+    assert not log.truncated
+    assert log.outcomes.throttle.any()
+
+
+def test_of_a_drive_that_is_killed_the_recording_lacks_less_than_the_last_second(
+    workplace, tmp_path
+):
+    with driving(workplace, tmp_path) as drive:
+        time.sleep(0.5)
+        killed_ns = time.monotonic_ns()
+        drive.process.kill()
+        ended = drive.ended()
+    assert ended.code == -signal.SIGKILL
+    log = read_drive(drive.record)
+    assert log.truncated
+    assert log.outcomes.throttle.any()
+    assert 0 <= (killed_ns - log.outcomes.now_ns[-1]) / 1e9 < 1.0
+
+
+def test_a_vehicle_that_nobody_writes_to_any_more_stands():
+    begin_ns, ms = 1_000_000_000, 1_000_000
+    world = World(
+        worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), worlds.START_VIEW, begin_ns
+    )
+    for number in range(50):
+        world.write(0.0, 0.05, begin_ns + 20 * number * ms)
+    last_ns = begin_ns + 980 * ms
+    timeout_ns = int(world.settings.vehicle_timeout_s * 1e9)
+    speeds = [world.state(last_ns + after_ns)[3] for after_ns in (0, timeout_ns)]
+    assert min(speeds) > 0.4
+    # From the timeout on it rolls out: a thousandth is left after seven time constants.
+    rolled_out_ns = int(7 * 0.3e9)
+    assert world.state(last_ns + timeout_ns + rolled_out_ns)[3] < 1e-3 * speeds[1]
+    # And it obeys again.
+    world.write(0.0, 0.05, last_ns + timeout_ns + rolled_out_ns)
+    assert world.state(last_ns + timeout_ns + rolled_out_ns + timeout_ns)[3] > 0.2
+
+
+def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tmp_path):
+    with driving(workplace, tmp_path) as drive:
+        # No file of the process may grow beyond this any more.
+        size = drive.record.stat().st_size + LITTLE_BYTES
+        resource.prlimit(drive.process.pid, resource.RLIMIT_FSIZE, (size, size))
+        ended = drive.ended()
+    assert_arrived(ended)
+    assert "left out; " in ended.out
+    assert f"{drive.record}: can't be written: file too large" in ended.out
+    log = read_drive(drive.record)
+    assert log.truncated
+
+
+def refused(workplace: Workplace, folder: Path, *arguments: object) -> Ended:
+    """A drive that does not come to pass."""
+    log = folder / "told"
+    done = subprocess.run(
+        workplace.command("--option", f"log={log}", "--headless", *arguments),
+        cwd=folder,
+        env=workplace.environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    return Ended(done.returncode, done.stdout, done.stderr, words(log))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--vehicle", "bicycle"], "--vehicle: there is no 'bicycle': expected qcar, ros2, sim or"),
+        (["--option", "images"], "--option: expected KEY=VALUE, got 'images'"),
+        (["--record", "nowhere/drive.mcap"], "nowhere/drive.mcap: can't be written: no such file"),
+        (["--record", "/dev/full"], "/dev/full: can't be written: no space left on device"),
+        (["--record-images"], "--record-images: needs --record"),
+        (["--period-s", "5"], "--period-s: must be from 0.002 to 0.1, got 5.0"),
+    ],
+)
+def test_bad_input_gets_one_line_and_nothing_moves(workplace, tmp_path, arguments, line):
+    vehicle = () if "--vehicle" in arguments else ("--vehicle", recorded_vehicle.NAME)
+    ended = refused(workplace, tmp_path, *vehicle, "--cameras", "sim", *arguments)
+    assert (ended.code, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert ended.err.startswith(f"jaxnav run: {line}")
+    assert ended.told == []  # it was not even opened

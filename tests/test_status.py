@@ -1,0 +1,64 @@
+"""The line that a person watches while the car drives keeps its width and its places."""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxnav.commands.status import WIDTH, status_line
+from jaxnav.runtime.flags import Health
+from tests.helpers.drives import make_outcome
+
+FLOATS = st.floats() | st.floats(-500, 500) | st.sampled_from([-0.0, 1e308, -1e308, 5e-324])
+
+
+def outcome_of(pose, flip, located, health=Health.OK, throttle=0.0371, steering_rad=-0.1):
+    outcome = make_outcome(1)
+    report = eqx.tree_at(
+        lambda r: (r.output.pose, r.output.flip_probability, r.output.located),
+        outcome.report,
+        (np.array(pose), np.array(flip), np.array(located)),
+    )
+    return dataclasses.replace(
+        outcome, report=report, health=health, throttle=throttle, steering_rad=steering_rad
+    )
+
+
+def test_a_line_reads_as_it_is_meant():
+    outcome = outcome_of([1.833, -0.791, math.radians(124)], 0.0012, True, Health.DEAD_RECKONING)
+    assert status_line(outcome, 30.4, 4.21, True) == (
+        "  30 Hz   4.2 ms DEAD_RECKONING marker flip  0.1% x  1.83 y -0.79 m 124 deg "
+        "thr  0.037 str  -5.7 deg"
+    )
+    lost = outcome_of([0.0, 0.0, 0.0], math.nan, False, Health.INIT, 0.0, 0.0)
+    assert status_line(lost, 12345.0, math.inf, False) == (
+        "#### Hz     ? ms INIT             --   flip    ?% x     - y     - m   - deg "
+        "thr  0.000 str   0.0 deg"
+    )
+
+
+USUAL = status_line(outcome_of([1.0, 2.0, 3.0], 0.5, True), 30.0, 5.0, True)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    pose=st.tuples(FLOATS, FLOATS, FLOATS),
+    flip=FLOATS,
+    located=st.booleans(),
+    health=st.sampled_from(Health),
+    throttle=FLOATS,
+    steering_rad=FLOATS,
+    rate_hz=FLOATS,
+    latency_ms=FLOATS,
+    marker_seen=st.booleans(),
+)
+def test_every_line_has_the_same_width(rate_hz, latency_ms, marker_seen, **drive):
+    line = status_line(outcome_of(**drive), rate_hz, latency_ms, marker_seen)
+    assert len(line) == len(USUAL) <= WIDTH
+    assert line.isascii()
+    assert line.isprintable()
+    for unit in (" Hz ", " ms ", "% x", " m", " deg thr ", " str "):
+        assert line.index(unit) == USUAL.index(unit)
