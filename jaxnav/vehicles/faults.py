@@ -1,0 +1,223 @@
+"""The fault matrix: what can go wrong on a drive, and what must come of it (RELIABILITY).
+
+    for row in matrix():
+        print(line(run_trial(row, trial)))
+
+All at corner level: drives of the simulated car through a loop of waypoints, in lockstep. What a
+fault does to images is tried where frames are looked at, threads and signals where the loop is.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from jaxnav.bicycle import Vehicle
+from jaxnav.markers import MarkerMap
+from jaxnav.navigator import Navigator
+from jaxnav.rig import CameraRig
+from jaxnav.runtime.estimator import Program
+from jaxnav.runtime.flags import Fault, Health, Reject, names
+from jaxnav.runtime.pilot import Pilot
+from jaxnav.vehicles.lockstep import BEGIN_NS, Change, Rates, Step, drive
+from jaxnav.vehicles.world import World
+
+BEGIN_S, END_S = 2.5, 4.0  # of most faults
+SETTLE_S = 2.0  # after a fault: then the position must be right again (R3)
+WAYPOINTS_M = (
+    (1.3, 0.0), (0.3, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5),
+    (0.5, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5), (0.5, 0.2),
+)  # fmt: skip
+
+Happens = Callable[[int, World], None]
+
+
+def _unchanged() -> Change:
+    return lambda given: [given]
+
+
+def _nothing_happens() -> Happens:
+    return lambda now_ns, world: None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fault, and what is asked of a drive with it.
+
+    Attributes:
+        name: as RELIABILITY calls it.
+        change: what happens to the data on their way, made anew for each drive.
+        happens: what happens to the world, the same.
+        faults, rejects: one of these at least must be seen while it lasts; none: nothing is asked.
+        at_least, at_most: the worst health that it costs lies between these.
+        error_m: largest error of a decided position while it lasts and SETTLE_S after.
+        error_after_m: the largest thereafter.
+        begins_s, ends_s: of the fault; inf: it lasts.
+        drive_s: of the whole drive.
+        telling: how the navigator's rig and markers differ from the true ones.
+    """
+
+    name: str
+    change: Callable[[], Change] = _unchanged
+    happens: Callable[[], Happens] = _nothing_happens
+    faults: Fault = Fault(0)  # noqa: RUF009
+    rejects: Reject = Reject(0)  # noqa: RUF009
+    at_least: Health = Health.OK
+    at_most: Health = Health.OK
+    error_m: float = 0.05
+    error_after_m: float = 0.05
+    begins_s: float = BEGIN_S
+    ends_s: float = END_S
+    drive_s: float = 7.0
+    rates: Rates = field(default_factory=Rates)
+    telling: str = ""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of it."""
+
+    row: Row
+    faults: Fault
+    rejects: Reject
+    worst: Health
+    error_m: float
+    error_after_m: float
+    recovered_s: float  # after the end until health was OK for good; inf: never, or it lasts
+    restarts: int
+    broken: tuple[str, ...]  # promises that were not kept
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The car that the faults happen to."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle
+    start_pose: tuple[float, float, float] = (2.0, -1.0, math.radians(125.0))
+    seed: int = 0
+    program: Callable[[Navigator], Program] | None = None  # see `Pilot`; by default by `jax.jit`
+
+
+def run_trial(row: Row, trial: Trial) -> Result:
+    """A drive with the fault in it."""
+    navigator = Navigator(
+        rig=told_rig(trial.rig, row.telling),
+        markers=trial.markers,
+        vehicle=trial.vehicle,
+        waypoints_m=WAYPOINTS_M,
+        waypoint_radius_m=0.15,
+    )
+    pilot = Pilot(navigator, program=trial.program and trial.program(navigator))
+    world = World(
+        trial.rig, trial.markers, trial.vehicle, trial.start_pose, BEGIN_NS, seed=trial.seed
+    )
+    steps = list(drive(pilot, world, row.drive_s, row.change(), row.rates, row.happens()))
+    return judge(row, steps, pilot)
+
+
+def told_rig(rig: CameraRig, telling: str) -> CameraRig:
+    """What the navigator is told of the cameras: their calibration, or a wrong one."""
+    Ts = rig.Ts_camera_vehicle
+    if telling == "focal":
+        return eqx.tree_at(lambda r: r.cameras.focal_px, rig, 1.02 * rig.cameras.focal_px)
+    if telling == "swapped":
+        order = np.array([0, *range(len(rig) - 1, 0, -1)])
+        return eqx.tree_at(lambda r: r.Ts_camera_vehicle.wxyz_xyz, rig, Ts.wxyz_xyz[order])
+    if telling == "extrinsics":
+        directions = np.random.default_rng(0).standard_normal((len(rig), 2, 3))
+        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+        xi = np.concatenate([0.01 * directions[:, 0], np.deg2rad(1.0) * directions[:, 1]], axis=1)
+        moved = Ts @ jaxlie.SE3.exp(jnp.asarray(xi, Ts.wxyz_xyz.dtype))
+        return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, moved)
+    return rig
+
+
+def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
+    """What a drive shows, held against what is asked."""
+    times_s = np.array([(step.input.now_ns - BEGIN_NS) / 1e9 for step in steps])
+    outcomes = [step.outcome for step in steps]
+    healths = np.array([outcome.health for outcome in outcomes])
+    errors_m = np.array([_error_m(step) for step in steps])
+    lasts = (times_s >= row.begins_s) & (times_s < row.ends_s)
+    shaken = (times_s >= row.begins_s) & (times_s < row.ends_s + SETTLE_S)
+    faults, rejects = Fault(0), Reject(0)
+    for index in np.flatnonzero(shaken):
+        faults |= outcomes[index].faults
+        rejects |= outcomes[index].rejects
+    after = times_s >= row.ends_s
+    well = np.flatnonzero(after & (healths == Health.OK))
+    ill = np.flatnonzero(after & (healths != Health.OK))
+    recovered_s = math.inf
+    if len(well) and (not len(ill) or ill[-1] < well[-1]):
+        first = well[0] if not len(ill) else well[well > ill[-1]][0]
+        recovered_s = float(times_s[first] - row.ends_s)
+    result = Result(
+        row,
+        faults,
+        rejects,
+        Health(int(healths[lasts | shaken].max(initial=0))),
+        float(np.nanmax(errors_m[shaken], initial=0.0)),
+        float(np.nanmax(errors_m[times_s >= row.ends_s + SETTLE_S], initial=0.0)),
+        recovered_s,
+        outcomes[-1].restarts,
+        (),
+    )
+    return dataclasses.replace(result, broken=tuple(_broken(result, steps, pilot)))
+
+
+def _error_m(step: Step) -> float:
+    """Of a position that is acted upon; NaN where there is none."""
+    output = step.outcome.report.output
+    if not output.decided or step.outcome.throttle == 0:
+        return math.nan
+    return float(np.hypot(*(output.pose[:2] - step.truth[:2])))
+
+
+def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:
+    row, said = result.row, []
+    if row.faults and not result.faults & row.faults:
+        said.append(f"no {'/'.join(names(row.faults))}")
+    if row.rejects and not result.rejects & row.rejects:
+        said.append(f"no {'/'.join(names(row.rejects))}")
+    if not row.at_least <= result.worst <= row.at_most:
+        said.append(f"health {result.worst.name}")
+    if result.error_m > row.error_m:
+        said.append(f"error {result.error_m:.3f} m")
+    if result.error_after_m > row.error_after_m:
+        said.append(f"error afterwards {result.error_after_m:.3f} m")
+    if math.isfinite(row.ends_s) and result.recovered_s > SETTLE_S:
+        said.append(f"recovered after {result.recovered_s:.1f} s")
+    limits = pilot.limits
+    for step in steps:
+        steering_rad, throttle = step.outcome.steering_rad, step.outcome.throttle
+        if not (abs(steering_rad) <= limits.steering_rad and abs(throttle) <= limits.throttle):
+            said.append(f"command {steering_rad}, {throttle}")
+            break
+        if step.outcome.health in (Health.STOP, Health.INIT) and throttle != 0:
+            said.append("drives in STOP")
+            break
+    return said
+
+
+HEADER = (
+    "| fault | seen | worst health | error m | afterwards | recovered s | restarts | kept |\n"
+    "|---|---|---|---|---|---|---|---|"
+)
+
+
+def line(result: Result) -> str:
+    """A row of the table."""
+    seen = ", ".join([*names(result.faults), *names(result.rejects)]).lower() or "-"
+    recovered = "-" if math.isinf(result.recovered_s) else f"{result.recovered_s:.2f}"
+    kept = "; ".join(result.broken) or "yes"
+    return (
+        f"| {result.row.name} | {seen} | {result.worst.name} | {result.error_m:.3f} | "
+        f"{result.error_after_m:.3f} | {recovered} | {result.restarts} | {kept} |"
+    )

@@ -1,0 +1,363 @@
+"""The rows of the fault matrix (RELIABILITY), and what each must come to."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from jaxnav.detection.types import Detections
+from jaxnav.runtime.flags import Fault, Health, Reject
+from jaxnav.runtime.interfaces import Odometry
+from jaxnav.vehicles import injections as inject
+from jaxnav.vehicles.faults import BEGIN_S, END_S, Happens, Row
+from jaxnav.vehicles.lockstep import BEGIN_NS, Change, Rates
+from jaxnav.vehicles.world import World
+
+_LATEST = np.inf  # to the end of the drive
+_SLOW = Health.DEGRADED
+_BLIND_S = (0.2, 1.0, 5.0, 20.0)
+
+
+def matrix() -> list[Row]:
+    """All rows."""
+    return [
+        Row("none"),
+        *_cameras(),
+        *_frames(),
+        *_markers(),
+        *_stamps(),
+        *_odometry(),
+        *_calibration(),
+        *_world(),
+        *_loop(),
+    ]
+
+
+def _for(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
+    return lambda: inject.between(BEGIN_S, end_s, change())
+
+
+def _cameras() -> list[Row]:
+    rows = [
+        Row(
+            f"camera {camera} out",
+            _for(partial(_frames_of, camera)),
+            faults=Fault.CAMERA_STALE,
+            at_most=_SLOW,
+            error_m=0.10,
+        )
+        for camera in (0, 2)
+    ]
+    for duration_s in _BLIND_S:
+        costs = _cost(duration_s)
+        for name, edit, flag in (
+            ("all cameras out", inject.gone, Fault.CAMERAS_STALE),
+            ("tunnel", inject.nothing_seen, Fault.NO_MARKER),
+        ):
+            stale = flag if duration_s > 1 or (duration_s > 0.2 and "all" in name) else Fault(0)
+            rows.append(
+                Row(
+                    f"{name}, {duration_s:g} s",
+                    _for(partial(inject.frames, edit), BEGIN_S + duration_s),
+                    faults=stale,
+                    at_least=costs,
+                    at_most=max(costs, _SLOW if "all" in name else Health.DEAD_RECKONING),
+                    error_m=0.05 + 0.06 * min(duration_s, 5.0),
+                    ends_s=BEGIN_S + duration_s,
+                    drive_s=BEGIN_S + duration_s + 3,
+                )
+            )
+    return rows
+
+
+def _frames_of(camera: int) -> Change:
+    return inject.frames(inject.only_camera(camera, inject.gone))
+
+
+def _cost(blind_s: float) -> Health:
+    if blind_s >= 5:
+        return Health.STOP
+    if blind_s > 2:
+        return Health.DEGRADED
+    return Health.OK
+
+
+def _frames() -> list[Row]:
+    def frozen() -> Change:
+        kept: dict[int, Detections] = {}
+
+        def edit(frame: inject.Sighted) -> inject.Sighted:
+            if frame.detections is not None:
+                kept.setdefault(frame.camera, frame.detections)
+            return dataclasses.replace(frame, detections=kept[frame.camera])
+
+        return inject.frames(edit)
+
+    return [
+        Row(
+            "None or wrong-size frames",
+            _for(lambda: inject.frames(inject.unusable)),
+            faults=Fault.FRAME_UNUSABLE,
+            at_most=_SLOW,
+            error_m=0.15,
+        ),
+        Row(
+            "frozen images, new stamps",
+            _for(frozen),
+            faults=Fault.FRAME_FROZEN,
+            at_most=_SLOW,
+            error_m=0.15,
+        ),
+        Row(
+            "NaN in corners",
+            _for(lambda: inject.frames(inject.corners(lambda c: c * np.nan))),
+            faults=Fault.CORNERS_NOT_FINITE,
+            at_most=_SLOW,
+            error_m=0.15,
+        ),
+        Row(
+            "inf in corners",
+            _for(lambda: inject.frames(inject.corners(lambda c: c + np.inf))),
+            faults=Fault.CORNERS_NOT_FINITE,
+            at_most=_SLOW,
+            error_m=0.15,
+        ),
+    ]
+
+
+def _markers() -> list[Row]:
+    def renamed(found: Detections) -> Detections:
+        return dataclasses.replace(found, ids=found.ids + 7)
+
+    def doubled(shift_px: float) -> Callable[[Detections], Detections]:
+        def edit(found: Detections) -> Detections:
+            other = dataclasses.replace(found, corners_px=found.corners_px + shift_px)
+            return Detections.concatenate([found, other])
+
+        return edit
+
+    def mirrored(c: np.ndarray) -> np.ndarray:
+        center = c.mean(axis=1, keepdims=True)
+        return np.stack([2 * center[..., 0] - c[..., 0], c[..., 1]], axis=-1)[:, [1, 0, 3, 2]]
+
+    return [
+        Row(
+            "unknown id",
+            _for(lambda: inject.frames(inject.detections(renamed))),
+            faults=Fault.UNKNOWN_MARKER,
+            at_most=_SLOW,
+            error_m=0.15,
+        ),
+        Row(
+            "two markers of one id",
+            _for(lambda: inject.frames(inject.detections(doubled(60.0)))),
+            faults=Fault.DUPLICATE_MARKER,
+            at_most=_SLOW,
+            error_m=0.15,
+        ),
+        Row(
+            "duplicate detection",
+            _for(lambda: inject.frames(inject.detections(doubled(0.0)))),
+        ),
+        Row(
+            "mirrored corners, 5 frames",
+            _for(lambda: inject.frames(inject.corners(mirrored)), BEGIN_S + 0.17),
+            at_most=_SLOW,
+            error_m=0.10,
+            ends_s=BEGIN_S + 0.17,
+        ),
+        Row(
+            "corners turned by 90 deg, 5 frames",
+            _for(
+                lambda: inject.frames(inject.corners(lambda c: np.roll(c, 1, axis=1))),
+                BEGIN_S + 0.17,
+            ),
+            rejects=Reject.INNOVATION,
+            at_most=_SLOW,
+            error_m=0.10,
+            ends_s=BEGIN_S + 0.17,
+        ),
+    ]
+
+
+def _stamps() -> list[Row]:
+    def shifted(by_s: float) -> Callable[[], Change]:
+        return lambda: inject.frames(inject.stamps(lambda ns: ns + int(by_s * 1e9)))
+
+    def constant(stamp_ns: int) -> Callable[[], Change]:
+        return lambda: inject.frames(inject.stamps(lambda ns: stamp_ns))
+
+    def drifting(ns: int) -> int:
+        return ns + int((ns - BEGIN_NS) * 100e-6)
+
+    def drifting_odometry(reading: Odometry) -> Odometry:
+        return dataclasses.replace(reading, stamp_ns=drifting(reading.stamp_ns))
+
+    def both(given: inject.Input) -> list[inject.Input]:
+        edited = inject.frames(inject.stamps(drifting))(given)
+        return inject.odometry(drifting_odometry)(edited[0])
+
+    refused: dict[str, Any] = {"faults": Fault.STAMP_INVALID, "at_most": _SLOW, "error_m": 0.15}
+    return [
+        Row("stamps jump by +1 s", _for(shifted(1.0)), **refused),
+        Row("stamps jump by -1 s", _for(shifted(-1.0)), **refused),
+        Row("frames 50 ms late, each other", _for(lambda: inject.late(0.05, 2))),
+        Row("frames 500 ms late, each third", _for(lambda: inject.late(0.5, 3)), at_most=_SLOW),
+        Row("equal stamps", _for(constant(BEGIN_NS + 1)), **refused),
+        Row("zero stamps", _for(constant(0)), **refused),
+        Row("negative stamps", _for(constant(-5)), **refused),
+        Row("clocks that drift by 100 ppm", lambda: both, begins_s=2.0, ends_s=_LATEST),
+        Row(
+            "cameras skewed by 30 ms",
+            rates=Rates(camera_skew_s=0.03),
+            begins_s=2.0,
+            ends_s=_LATEST,
+        ),
+    ]
+
+
+def _odometry() -> list[Row]:
+    def scaled(by: float) -> Callable[[], Change]:
+        return lambda: inject.odometry(
+            lambda reading: dataclasses.replace(reading, speed_mps=by * reading.speed_mps)
+        )
+
+    def spikes() -> Change:
+        count = 0
+
+        def edit(reading: Odometry) -> Odometry:
+            nonlocal count
+            count += 1
+            by = 10.0 if count % 5 == 0 else 1.0
+            return dataclasses.replace(reading, speed_mps=by * reading.speed_mps)
+
+        return inject.odometry(edit)
+
+    def wrapped(reading: Odometry) -> Odometry:
+        # Of 2^32 counts, each 1 / 15 000 m, in 20 ms.
+        return dataclasses.replace(reading, speed_mps=reading.speed_mps - 2**32 / 15e3 / 0.02)
+
+    def invalid(reading: Odometry) -> Odometry:
+        return dataclasses.replace(reading, valid=False)
+
+    return [
+        Row("odometry x10, each fifth", _for(spikes), rejects=Reject.ODOMETRY),
+        Row(
+            "odometry of the other sign",
+            _for(scaled(-1.0)),
+            rejects=Reject.ODOMETRY,
+            at_most=_SLOW,
+            error_m=0.08,
+        ),
+        Row("odometry 30 % off", _for(scaled(1.3)), at_most=_SLOW, error_m=0.08),
+        Row(
+            "odometry stuck",
+            _for(lambda: inject.odometry(inject.repeated())),
+            faults=Fault.ODOMETRY_STUCK,
+            at_most=_SLOW,
+            error_m=0.08,
+        ),
+        Row(
+            "odometry invalid",
+            _for(lambda: inject.odometry(invalid)),
+            faults=Fault.ODOMETRY_INVALID,
+            at_least=_SLOW,
+            at_most=_SLOW,
+            error_m=0.08,
+        ),
+        Row(
+            "odometry out",
+            _for(lambda: inject.odometry(inject.gone)),
+            faults=Fault.ODOMETRY_STALE,
+            at_least=_SLOW,
+            at_most=_SLOW,
+            error_m=0.08,
+        ),
+        Row(
+            "odometry wraps around",
+            _for(lambda: inject.odometry(wrapped), BEGIN_S + 0.03),
+            rejects=Reject.ODOMETRY,
+            ends_s=BEGIN_S + 0.03,
+        ),
+        Row(
+            "NaN and inf in odometry",
+            _for(lambda: inject.odometry(inject.with_values(inject.NOT_FINITE))),
+            faults=Fault.ODOMETRY_INVALID,
+            at_most=_SLOW,
+            error_m=0.08,
+        ),
+        Row(
+            "blind and without odometry",
+            _for(lambda: lambda given: [dataclasses.replace(given, odometry=None, frames=())]),
+            faults=Fault.CAMERAS_STALE,
+            at_least=Health.STOP,
+            at_most=Health.STOP,
+            error_m=0.30,
+        ),
+    ]
+
+
+def _calibration() -> list[Row]:
+    lasting: dict[str, Any] = {"begins_s": 2.0, "ends_s": _LATEST, "drive_s": 6.0}
+    return [
+        Row("cameras off by 1 deg, 1 cm", telling="extrinsics", error_m=0.15, at_most=_SLOW,
+            **lasting),
+        Row("focal length off by 2 %", telling="focal", error_m=0.15, at_most=_SLOW, **lasting),
+        Row("cameras swapped", telling="swapped", error_m=np.inf, at_most=Health.STOP,
+            rejects=Reject.INNOVATION, **lasting),
+    ]  # fmt: skip
+
+
+def _world() -> list[Row]:
+    def once(act: Callable[[World], None]) -> Callable[[], Happens]:
+        def made() -> Happens:
+            done = False
+
+            def happens(now_ns: int, world: World) -> None:
+                nonlocal done
+                if not done and now_ns >= BEGIN_NS + int(BEGIN_S * 1e9):
+                    done = True
+                    act(world)
+
+            return happens
+
+        return made
+
+    return [
+        Row(
+            "marker moved by 5 cm",
+            happens=once(lambda world: world.move_markers((0.05, 0.0, 0.0))),
+            error_m=0.15,
+            error_after_m=0.10,
+            at_most=_SLOW,
+            ends_s=BEGIN_S + 0.1,
+        ),
+        Row(
+            "kidnapped: 1 m, 90 deg",
+            happens=once(lambda world: world.carry_off((-0.7, -0.7, np.pi / 2))),
+            faults=Fault.RESTARTED,
+            rejects=Reject.INNOVATION,
+            error_m=1.2,
+            error_after_m=0.10,
+            at_most=Health.STOP,
+            ends_s=BEGIN_S + 0.1,
+        ),
+    ]
+
+
+def _loop() -> list[Row]:
+    rows = []
+    for stall_s in (0.05, 0.5, 1.5):
+        rows.append(
+            Row(
+                f"the loop stalls for {stall_s * 1e3:.0f} ms",
+                partial(inject.stalled, BEGIN_S, stall_s),
+                faults=Fault.CLOCK_JUMPED if stall_s > 1 else Fault(0),
+                at_most=_SLOW if stall_s < 1 else Health.STOP,
+                error_m=0.15,
+                ends_s=BEGIN_S + stall_s,
+            )
+        )
+    return rows
