@@ -47,6 +47,11 @@ LONG = """test_navigator test_hypotheses test_replay test_ambiguity test_demo te
     test_study_kinds test_detection""".split()
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    told = "write the recorded drives of tests/data anew, for the diff to be reviewed"
+    parser.addoption("--update-refs", action="store_true", help=told)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.stem not in LONG)
 

@@ -1,5 +1,6 @@
-"""`jaxnav replay`: a recorded rig localised in every frame."""
+"""`jaxnav replay`: a recorded rig localised in every frame, or a drive driven again."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,8 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from jaxnav.arguments import Replay as Arguments
+from jaxnav.arguments import Selector
+from jaxnav.commands import replay_drive
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
@@ -16,11 +19,15 @@ from jaxnav.runtime.recordings import Recording, read_recording
 from jaxnav.runtime.replay import Replay, errors, frames_in_view, replay
 from jaxnav.selectors import make_selector
 
+DEFAULT_SELECTOR: Selector = "multi-hypothesis"
 SETTLED_FRAMES = 5  # of an appearance: a choice made later has had a history
 
 
 def run(args: Arguments) -> int:
     """Localise, write the trajectory, and measure it where there is a reference."""
+    if replay_drive.is_for(args):
+        return replay_drive.run(args)
+    args = dataclasses.replace(args, selector=args.selector or DEFAULT_SELECTOR)
     configure_jax(float64=True, threads=1)
     recording = read_recording(
         args.recording,
@@ -41,7 +48,7 @@ def run(args: Arguments) -> int:
 
         result = replay(
             recording,
-            make_selector(args.selector),
+            make_selector(str(args.selector)),
             one_at_a_time=args.markers == "one-at-a-time",
             corner_sigma_px=args.corner_sigma_px,
             progress=advance,

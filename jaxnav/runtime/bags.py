@@ -56,7 +56,7 @@ def read_bag(path: Path) -> Bag:
     Raises:
         BadInput: not a bag, or one that ends too early.
     """
-    with _decompressed(path) as plain:
+    with decompressed(path) as plain:
         try:
             return _read(plain)
         except Exception as error:
@@ -66,7 +66,7 @@ def read_bag(path: Path) -> Bag:
 
 
 @contextmanager
-def _decompressed(path: Path) -> Iterator[Path]:
+def decompressed(path: Path) -> Iterator[Path]:
     """The bag itself, or a temporary copy that is gone afterwards."""
     try:
         with path.open("rb"):

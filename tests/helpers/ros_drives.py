@@ -1,0 +1,64 @@
+"""A small drive in a ROS bag, and how tests read one."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxnav.errors import BadInput
+from jaxnav.files import TopicMap, load_topics
+from jaxnav.markers import MarkerMap
+from jaxnav.runtime.pilot import Input
+from jaxnav.runtime.ros_drives import read_ros_drive
+from tests.helpers.ros_bags import Bag
+from tests.worlds import qcar, qcar_rig, room_markers
+
+BEGIN_NS = 1_700_000_000_123_456_789  # a float64 would lose its last digits
+MS = 1_000_000
+SQUARE_PX = np.array([[10.25, 30], [30, 30.5], [31, 10], [10, 10.75]])  # BL BR TR TL
+OTHER_PX = SQUARE_PX + 70.0
+TOPICS = """
+cameras: {front: /front/detections, left: /left/tags}
+odometry: /odom
+corner_sigma_px: 0.25
+"""
+
+
+def drive(kind: str) -> Bag:
+    """Two cameras, one of apriltag_ros and one of TagSLAM, and odometry."""
+    bag = Bag(kind)
+    t = BEGIN_NS
+    bag.odometry("/odom", t, t - MS, 0.5, 0.4)
+    bag.apriltags(
+        "/front/detections",
+        t + 30 * MS,
+        t,
+        [("tag36h11", 2, SQUARE_PX), ("tag25h9", 1, OTHER_PX)],
+    )
+    bag.odometry("/odom", t + 31 * MS, t + 30 * MS, 0.0, 0.3)
+    bag.tagslam("/left/tags", t + 35 * MS, t, [(0, OTHER_PX), (99, SQUARE_PX)])
+    bag.tagslam("/left/tags", t + 70 * MS, t + 40 * MS, [])
+    return bag
+
+
+def topic_map(folder: Path, text: str) -> TopicMap:
+    """A topic map from a file."""
+    path = folder / "topics.yaml"
+    path.write_text(text)
+    return load_topics(path)
+
+
+def read(path: Path, topics: TopicMap, markers: MarkerMap | None = None) -> list[Input]:
+    """The inputs of a bag, with the QCar and its cameras."""
+    return read_ros_drive(path, topics, qcar_rig(), markers or room_markers(), qcar())
+
+
+def problem(*args: Any) -> str:
+    """The one line that a person gets from `read`."""
+    with pytest.raises(BadInput) as caught:
+        read(*args)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert len(line) < 1000
+    return line
