@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = (
     "#000000",
@@ -85,17 +86,8 @@ def drive_report(
     known = np.isfinite(truth.poses[:, 0])
     plane.plot(*truth.poses[known][0, :2], "o", color=BLACK, ms=6)
     plane.annotate("start", truth.poses[known][0, :2], xytext=(6, -10), textcoords="offset points")
-    for number, (x_m, y_m) in enumerate(waypoints_m, 1):
-        circle = np.linspace(0, 2 * np.pi, 60)
-        plane.plot(
-            x_m + waypoint_radius_m * np.cos(circle),
-            y_m + waypoint_radius_m * np.sin(circle),
-            color=GREEN,
-        )
-        plane.annotate(
-            f"waypoint {number}", (x_m, y_m), ha="center", va="center", fontsize=8, color=GREEN
-        )
-    _draw_markers(plane, markers_m)
+    draw_waypoints(plane, waypoints_m, waypoint_radius_m)
+    draw_markers(plane, markers_m)
     plane.set(xlabel="x (m)", ylabel="y (m)")
     plane.set_aspect("equal", adjustable="datalim")
     plane.grid(alpha=0.3)
@@ -243,10 +235,21 @@ def _fit_view(axes: Axes, points: np.ndarray) -> None:
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
 
 
-def _draw_markers(axes: Axes, markers_m: np.ndarray) -> None:
+def draw_markers(axes: Axes, markers_m: np.ndarray) -> None:
+    """Markers on a map, seen from above: (M, 4, 3) corners in the world."""
     for index, corners in enumerate(markers_m):
         label = "marker" if index == 0 else None
         axes.plot(corners[:, 0], corners[:, 1], color=VERMILION, lw=5, label=label)
+
+
+def draw_waypoints(axes: Axes, waypoints_m: np.ndarray, radius_m: float) -> None:
+    """Waypoints (W, 2) on a map, each with the circle within which it is reached."""
+    circle = np.linspace(0, 2 * np.pi, 60)
+    for number, (x_m, y_m) in enumerate(waypoints_m, 1):
+        axes.plot(x_m + radius_m * np.cos(circle), y_m + radius_m * np.sin(circle), color=GREEN)
+        text = axes.annotate(f"waypoint {number}", (x_m, y_m), ha="center", va="center")
+        text.set(fontsize=8, color=GREEN, zorder=6)
+        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
 def _show(axes: Axes, view: View) -> None:

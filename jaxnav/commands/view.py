@@ -1,0 +1,53 @@
+"""`jaxnav view`: a recorded drive in Rerun, or as a file for it."""
+
+from contextlib import ExitStack
+
+from tqdm import tqdm
+
+from jaxnav.arguments import View as Arguments
+from jaxnav.commands.drive_pictures import read_outcomes
+from jaxnav.drive_scenery import Scenery
+from jaxnav.files import atomic_path, output_folder
+from jaxnav.runtime.drive_log import DriveLog
+from jaxnav.viewing import RerunView, import_rerun
+from jaxnav.viewing_outcomes import Shown
+
+
+def run(args: Arguments) -> int:
+    """Show the whole drive, and leave the window open."""
+    import_rerun()
+    log = read_outcomes(args.recording)
+    scenery = Scenery.of(log.header)
+    if args.out is not None:
+        output_folder(args.out.parent)
+    with ExitStack() as stack:
+        save = None if args.out is None else stack.enter_context(atomic_path(args.out))
+        view = RerunView(
+            scenery.rig,
+            scenery.markers,
+            scenery.waypoints_m,
+            live=save is None,
+            save=save,
+            waits=True,
+        )
+        stack.callback(view.close)
+        show_drive(view, log, scenery, args.headless)
+    if args.out is not None:
+        print(f"written to {args.out}: rerun {args.out} opens it")
+    if view.dropped:
+        print(f"{view.dropped} outcomes or images could not be shown")
+    return 0
+
+
+def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool) -> None:
+    """All outcomes, all frames, all images."""
+    outcomes = log.outcomes
+    names = () if scenery.rig is None else scenery.rig.names
+    for index in tqdm(range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False):
+        view.show(Shown.of_row(outcomes, index))
+    for frame in (frame for given in log.inputs for frame in given.frames):
+        name = names[frame.camera] if frame.camera < len(names) else f"camera_{frame.camera}"
+        if frame.detections is not None:
+            view.image(name, frame.stamp_ns, None, frame.detections.corners_px)
+    for image in log.images():
+        view.image(image.topic.rpartition("/")[2], image.stamp_ns, image.jpeg, None)

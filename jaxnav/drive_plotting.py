@@ -1,0 +1,186 @@
+"""The picture of a recorded drive: a map, and below it what happened, over time.
+
+One function, one Figure; nothing is shown or saved here.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from jaxnav.bicycle_kalman import BicycleKalman
+from jaxnav.drive_map_plotting import HEALTH_COLORS, PURPLE, draw_drive_map
+from jaxnav.drive_scenery import Scenery
+from jaxnav.plotting import BLACK, BLUE, GREEN, VERMILION
+from jaxnav.runtime.drive_log import DriveLog, Outcomes
+from jaxnav.runtime.flags import Fault, Health, Reject
+
+_FAULT = "#444444"  # apart from all colours of health
+_JOIN_S = 0.15  # a flag that is down for less was up all the while: not every event can raise it
+_LETTER = 0.012  # its width on the time axis, as a part of it
+_SMALLEST_FLIP = 1e-6  # the end of its axis
+_WIDTH_IN, _MAP_IN, _LANE_IN, _PANEL_IN = 8.0, 4.7, 0.17, 1.05
+
+
+def drive_log_report(log: DriveLog, title: str = "") -> Figure:
+    """A recorded drive: where it went, and health, doubts, commands and ages over time.
+
+    Args:
+        log: with one outcome at least.
+        title: above everything.
+
+    Raises:
+        ValueError: without any outcome.
+    """
+    outcomes = log.outcomes
+    if not len(outcomes.now_ns):
+        raise ValueError("a drive without outcomes can't be drawn")
+    lanes = list(_lanes(outcomes))
+    ages = list(_ages_ms(log))
+    panels = [_draw_doubt, _draw_nis, _draw_commands, _draw_sigma]
+    heights = [_MAP_IN, 0.35 + _LANE_IN * len(lanes), *[_PANEL_IN] * (len(panels) + bool(ages))]
+    figure = Figure(figsize=(_WIDTH_IN, sum(heights) + 0.5), layout="constrained")
+    figure.suptitle(title, fontsize=10)
+    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
+    draw_drive_map(figure.add_subplot(grid[0]), outcomes, Scenery.of(log.header))
+    first = figure.add_subplot(grid[1])
+    _draw_lanes(first, outcomes, lanes)
+    below = [figure.add_subplot(grid[row], sharex=first) for row in range(2, len(heights))]
+    for draw, axes in zip(panels, below, strict=False):
+        draw(axes, outcomes)
+    if ages:
+        _draw_ages(below[-1], ages)
+    end_s = float(outcomes.times_s[-1])
+    first.set_xlim(0, end_s if end_s > 0 else 1)
+    for axes in (first, *below):
+        axes.grid(alpha=0.3)
+        axes.tick_params(labelsize=8, labelbottom=axes is below[-1])
+        axes.yaxis.label.set_fontsize(8)
+    below[-1].set_xlabel("time (s)", fontsize=9)
+    figure.align_ylabels(below)
+    return figure
+
+
+def _lanes(outcomes: Outcomes) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Name, colour and bars (begin s, duration s) of each flag that ever was up."""
+    for kinds, values, color in (
+        (Fault, outcomes.faults, _FAULT),
+        (Reject, outcomes.rejects, PURPLE),
+    ):
+        for flag in kinds:
+            up = (values & flag.value) > 0
+            if up.any():
+                yield flag.name or "", color, _bars(outcomes.times_s, up)
+
+
+def _bars(times_s: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(K, 2): begin and duration, wide enough to be seen."""
+    ends_s = np.append(times_s[1:], times_s[-1])
+    begins_s, ends_s = times_s[up], ends_s[up]
+    apart = np.append(True, begins_s[1:] - ends_s[:-1] > _JOIN_S)
+    first = np.flatnonzero(apart)
+    last = np.append(first[1:] - 1, len(begins_s) - 1)
+    least_s = 0.003 * float(times_s[-1] - times_s[0])
+    return np.column_stack([begins_s[first], np.maximum(ends_s[last] - begins_s[first], least_s)])
+
+
+def _draw_lanes(axes: Axes, outcomes: Outcomes, lanes: list[tuple[str, str, np.ndarray]]) -> None:
+    """Health on top, below it a lane for each fault and reject."""
+    for state in Health:
+        bars = _runs(outcomes.times_s, outcomes.health == state)
+        axes.broken_barh(bars, (-0.4, 0.8), color=HEALTH_COLORS[state], lw=0)
+        for begin_s, length_s in bars:
+            if length_s > _LETTER * len(state.name) * outcomes.times_s[-1]:
+                middle_s = begin_s + length_s / 2
+                axes.text(
+                    middle_s, 0, state.name, color="white", fontsize=7, ha="center", va="center"
+                )
+    for row, (_, color, lane) in enumerate(lanes, 1):
+        axes.broken_barh([(bar[0], bar[1]) for bar in lane], (row - 0.35, 0.7), color=color, lw=0)
+    axes.set_yticks(range(len(lanes) + 1), ["health", *(name for name, _, _ in lanes)])
+    axes.set_ylim(len(lanes) + 0.6, -0.6)
+    axes.set_axisbelow(True)
+
+
+def _runs(times_s: np.ndarray, up: np.ndarray) -> list[tuple[float, float]]:
+    """Begin and duration of each run of events, up to the next event."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], up.astype(int), [0]])))
+    ends_s = np.append(times_s, times_s[-1])
+    return [
+        (float(times_s[begin]), float(ends_s[end] - times_s[begin]))
+        for begin, end in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def _draw_doubt(axes: Axes, outcomes: Outcomes) -> None:
+    flip = np.clip(outcomes.flip_probability, _SMALLEST_FLIP, 1)
+    axes.semilogy(outcomes.times_s, flip, color=BLUE, lw=1.2)
+    axes.set_ylim(_SMALLEST_FLIP / 2, 2)
+    axes.set_yticks([_SMALLEST_FLIP, 1e-3, 1], [f"<{_SMALLEST_FLIP:g}", "0.001", "1"])
+    axes.minorticks_off()
+    axes.set_ylabel("flip\nprobability", color=BLUE)
+    count = [len(bank) for bank in outcomes.hypotheses]
+    right = _right_of(axes, "hypotheses")
+    right.step(outcomes.times_s, count, where="post", color=VERMILION, lw=1.2, ls="--")
+    right.set_ylim(0, max(count) + 1)
+    right.yaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
+
+
+def _draw_nis(axes: Axes, outcomes: Outcomes) -> None:
+    gate = float(BicycleKalman.gate_nis)
+    fused = outcomes.nis > 0
+    above = outcomes.nis > gate
+    for which, style in ((fused & ~above, {"color": BLUE}), (above, {"color": VERMILION})):
+        nis = np.minimum(outcomes.nis[which], 1e6)
+        axes.semilogy(outcomes.times_s[which], nis, ".", ms=3, **style)
+    axes.axhline(gate, color=BLACK, lw=1, ls="--")
+    axes.text(0.005, gate * 1.3, f"gate {gate:g}", fontsize=7, transform=axes.get_yaxis_transform())
+    axes.set_ylim(1e-2, max(300.0, 3 * float(np.max(outcomes.nis[above], initial=0.0))))
+    axes.set_ylabel("NIS")
+
+
+def _draw_commands(axes: Axes, outcomes: Outcomes) -> None:
+    axes.step(outcomes.times_s, outcomes.throttle, where="post", color=BLUE, lw=1.2)
+    axes.set_ylabel("throttle", color=BLUE)
+    right = _right_of(axes, "steering (deg)")
+    steering_deg = np.rad2deg(outcomes.steering_rad)
+    right.step(outcomes.times_s, steering_deg, where="post", color=VERMILION, lw=1.2, ls="--")
+
+
+def _draw_sigma(axes: Axes, outcomes: Outcomes) -> None:
+    variances_m2 = np.trace(outcomes.covariance[:, :2, :2], axis1=1, axis2=2)
+    shown = outcomes.located & (variances_m2 > 0)
+    sigma_mm = 1e3 * np.sqrt(np.where(shown, variances_m2, np.nan))
+    axes.semilogy(outcomes.times_s, sigma_mm, color=GREEN, lw=1.2)
+    axes.set_ylabel("position\nsigma (mm)")
+
+
+def _ages_ms(log: DriveLog) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Name, colour and (N, 2) time s and age ms of what was handled, where there was any."""
+    begin_ns = int(log.outcomes.now_ns[0])
+    frames = [(given.now_ns, given.frames[0].stamp_ns) for given in log.inputs if given.frames]
+    readings = [(i.now_ns, i.odometry.stamp_ns) for i in log.inputs if i.odometry is not None]
+    for name, color, stamps_ns in (("frames", BLUE, frames), ("odometry", VERMILION, readings)):
+        rows = [((now - begin_ns) / 1e9, (now - stamp) / 1e6) for now, stamp in stamps_ns]
+        if rows:
+            yield name, color, np.array(rows)
+
+
+def _draw_ages(axes: Axes, ages: list[tuple[str, str, np.ndarray]]) -> None:
+    """How old data were when they were handled; a clock that jumped is beyond the axis."""
+    for name, color, rows in ages:
+        axes.plot(rows[:, 0], rows[:, 1], ".", ms=2.5, color=color, label=name)
+    usual_ms = max(float(np.median(np.abs(rows[:, 1]))) for _, _, rows in ages)
+    largest_ms = max(float(np.max(rows[:, 1])) for _, _, rows in ages)
+    axes.set_ylim(-0.1 * usual_ms - 1, 1.5 * min(largest_ms, 20 * usual_ms + 100) + 1)
+    axes.set_ylabel("age when\nhandled (ms)")
+    axes.legend(loc="upper right", fontsize=7, ncols=2, markerscale=3)
+
+
+def _right_of(axes: Axes, label: str) -> Axes:
+    right = axes.twinx()
+    right.set_ylabel(label, color=VERMILION, fontsize=8)
+    right.tick_params(labelsize=8)
+    return right

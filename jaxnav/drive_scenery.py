@@ -1,0 +1,91 @@
+"""What stood where in a recorded drive, for those who draw it: cameras, markers, waypoints.
+
+It is read from the header of the recording, in the words of the rig, marker and route files. What
+is missing there, or of another form, is left out of the picture.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from jaxnav.files.markers import MarkerFile, marker_map
+from jaxnav.files.rigs import RigFile, to_se3
+from jaxnav.files.validation import Pair
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """What a drive took place among.
+
+    Attributes:
+        rig, markers: None where they are not known.
+        waypoints_m: (W, 2) in the world.
+        waypoint_radius_m: a waypoint is reached within this.
+    """
+
+    rig: CameraRig | None
+    markers: MarkerMap | None
+    waypoints_m: np.ndarray
+    waypoint_radius_m: float
+
+    @property
+    def markers_m(self) -> np.ndarray:
+        """(M, 4, 3) corners in the world."""
+        if self.markers is None:
+            return np.zeros((0, 4, 3))
+        return np.asarray(self.markers.corners_world_m, float)
+
+    @staticmethod
+    def of(header: dict[str, Any]) -> "Scenery":
+        """From the header of a recording."""
+        rig = _read(RigFile, header.get("rig"))
+        markers = _read(MarkerFile, header.get("markers"))
+        route = _read(_RouteEntry, header.get("route")) or _RouteEntry()
+        return Scenery(
+            rig=None if rig is None else _rig(rig),
+            markers=None if markers is None else _markers(markers),
+            waypoints_m=np.array(route.waypoints_m, float).reshape(-1, 2),
+            waypoint_radius_m=route.waypoint_radius_m,
+        )
+
+
+class _RouteEntry(BaseModel):
+    """Of a route, what is drawn."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    waypoints_m: list[Pair] = Field(default_factory=list)
+    waypoint_radius_m: float = Field(default=math.nan, strict=True)
+
+
+def _read(model: type[_Model], value: Any) -> _Model | None:
+    try:
+        return model.model_validate(yaml.safe_load(value) if isinstance(value, str) else value)
+    except (ValidationError, yaml.YAMLError):
+        return None
+
+
+def _rig(file: RigFile) -> CameraRig:
+    return CameraRig.create(
+        [entry.camera() for entry in file.cameras],
+        [to_se3(entry.T_camera_vehicle_pose()) for entry in file.cameras],
+        [entry.name for entry in file.cameras],
+        [(entry.image_size_px[0], entry.image_size_px[1]) for entry in file.cameras],
+    )
+
+
+def _markers(file: MarkerFile) -> MarkerMap:
+    return marker_map(
+        np.stack([entry.pose() for entry in file.markers]),
+        [entry.size_m for entry in file.markers],
+        [entry.id for entry in file.markers],
+        [entry.family for entry in file.markers],
+    )

@@ -1,0 +1,75 @@
+"""Of an outcome of the pilot, what is shown: of one just made, or of one that was recorded."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxnav.runtime.drive_log import Outcomes
+from jaxnav.runtime.flags import Fault, Health, Reject
+from jaxnav.runtime.pilot import Outcome
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Of an outcome, what is shown; see `Outcomes`. Poses and candidates are NumPy's."""
+
+    now_ns: int
+    health: Health
+    faults: Fault
+    rejects: Reject
+    steering_rad: float
+    throttle: float
+    pose: np.ndarray
+    covariance: np.ndarray
+    located: bool
+    flip_probability: float
+    nis: float
+    hypotheses: np.ndarray
+    log_weight: np.ndarray
+    Ts_vehicle_world: np.ndarray
+    selected: int
+
+    @staticmethod
+    def of(outcome: Outcome) -> "Shown":
+        """What the pilot gave."""
+        output, belief = outcome.report.output, outcome.moment.belief
+        alive, valid = np.asarray(belief.initialised), np.asarray(output.candidates.valid)
+        selected = int(output.selected)
+        return Shown(
+            now_ns=outcome.now_ns,
+            health=outcome.health,
+            faults=outcome.faults,
+            rejects=outcome.rejects,
+            steering_rad=outcome.steering_rad,
+            throttle=outcome.throttle,
+            pose=np.asarray(output.pose),
+            covariance=np.asarray(output.covariance),
+            located=bool(output.located),
+            flip_probability=float(output.flip_probability),
+            nis=float(output.nis),
+            hypotheses=np.asarray(belief.mean)[alive, :3],
+            log_weight=np.asarray(belief.log_weight)[alive],
+            Ts_vehicle_world=np.asarray(output.candidates.T_vehicle_world.wxyz_xyz)[valid],
+            selected=int(valid[:selected].sum()) if selected >= 0 else -1,
+        )
+
+    @staticmethod
+    def of_row(outcomes: Outcomes, index: int) -> "Shown":
+        """One outcome of a recorded drive."""
+        return Shown(
+            now_ns=int(outcomes.now_ns[index]),
+            health=Health(int(outcomes.health[index])),
+            faults=Fault(int(outcomes.faults[index])),
+            rejects=Reject(int(outcomes.rejects[index])),
+            steering_rad=float(outcomes.steering_rad[index]),
+            throttle=float(outcomes.throttle[index]),
+            pose=outcomes.pose[index],
+            covariance=outcomes.covariance[index],
+            located=bool(outcomes.located[index]),
+            flip_probability=float(outcomes.flip_probability[index]),
+            nis=float(outcomes.nis[index]),
+            hypotheses=outcomes.hypotheses[index],
+            log_weight=outcomes.log_weight[index],
+            Ts_vehicle_world=outcomes.Ts_vehicle_world[index],
+            selected=int(outcomes.selected[index]),
+        )

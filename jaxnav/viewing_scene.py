@@ -1,0 +1,255 @@
+"""A drive in the words of Rerun: what stands still, outcomes of the pilot, camera frames.
+
+    world                     markers, waypoints, track, ellipse, hypotheses, candidates
+    world/vehicle             moves; below it its cameras with their images and detections
+    plots/...                 numbers over time
+    health                    a line where health, faults or rejects change
+
+The images of a wide lens are shown as if it were none: they bend where Rerun draws straight lines.
+"""
+
+import math
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from jaxnav.files import poses
+from jaxnav.markers import MarkerMap
+from jaxnav.plotting import BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.rig import CameraRig
+from jaxnav.runtime.flags import Health, names
+from jaxnav.viewing_outcomes import Shown
+
+TIMELINE = "drive"  # seconds since the first event
+_CHI2_2DOF_95 = 5.991
+_ARROW_M = 0.15
+_IMAGE_PLANE_M = 0.12  # before its camera an image is drawn
+
+
+class Scene:
+    """A stream of Rerun, and what was last said to it. For one thread."""
+
+    def __init__(
+        self,
+        rerun: ModuleType,
+        stream: Any,
+        rig: CameraRig | None,
+        markers: MarkerMap | None,
+        waypoints_m: np.ndarray,
+    ):
+        """Args:
+        rerun: the module.
+        stream: its `RecordingStream`.
+        """
+        self._rerun, self._stream = rerun, stream
+        self._names = () if rig is None else rig.names
+        self._begin_ns: int | None = None
+        self._told = ""
+        self._last_m: np.ndarray | None = None
+        self._still("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
+        if rig is not None:
+            self._lay_out_cameras(rig)
+        if markers is not None:
+            corners_m = np.asarray(markers.corners_world_m, float)
+            strips = [np.vstack([corners, corners[:1]]) for corners in corners_m]
+            labels = [str(marker_id) for marker_id in markers.ids]
+            self._still(
+                "world/markers", rerun.LineStrips3D(strips, colors=_rgb(VERMILION), labels=labels)
+            )
+        if len(waypoints_m):
+            places_m = np.column_stack([waypoints_m, np.zeros(len(waypoints_m))])
+            labels = [f"waypoint {number}" for number in range(1, len(places_m) + 1)]
+            self._still(
+                "world/waypoints",
+                rerun.Points3D(places_m, colors=_rgb(GREEN), labels=labels, radii=0.03),
+            )
+        stream.send_blueprint(self._blueprint())
+
+    def show(self, shown: Shown) -> None:
+        """What the pilot made of an event."""
+        self._at(shown.now_ns)
+        if shown.located and np.isfinite(shown.pose).all():
+            self._show_vehicle(shown.pose, shown.covariance)
+        self._show_hypotheses(shown)
+        if len(shown.Ts_vehicle_world):
+            self._show_candidates(shown)
+        self._show_numbers(shown)
+        told = [shown.health.name, *names(shown.faults), *names(shown.rejects)]
+        if (text := " ".join(told)) != self._told:
+            self._told = text
+            level = "INFO" if shown.health <= Health.OK else "WARN"
+            self._say("health", self._rerun.TextLog(text, level=level))
+
+    def image(
+        self,
+        camera: str,
+        stamp_ns: int,
+        image: bytes | np.ndarray | None,
+        corners_px: np.ndarray | None,
+    ) -> None:
+        """A frame of a camera: JPEG or BGR or grey pixels, and detected corners (N, 4, 2). What is
+        None stays as it is."""
+        rerun = self._rerun
+        self._at(stamp_ns)
+        entity = f"world/vehicle/{camera}"
+        if isinstance(image, bytes):
+            self._say(
+                f"{entity}/image", rerun.EncodedImage(contents=image, media_type="image/jpeg")
+            )
+        elif image is not None:
+            model = "L" if image.ndim == 2 else "BGR"
+            self._say(f"{entity}/image", rerun.Image(image, model).compress())
+        if corners_px is not None:
+            strips = [np.vstack([corners, corners[:1]]) for corners in corners_px]
+            finite = [strip for strip in strips if np.isfinite(strip).all()]
+            self._say(f"{entity}/markers", rerun.LineStrips2D(finite, colors=_rgb(GREEN), radii=1))
+
+    def _lay_out_cameras(self, rig: CameraRig) -> None:
+        rerun = self._rerun
+        axes_m = 0.5 * _ARROW_M * np.eye(3)
+        self._still(
+            "world/vehicle/axes",
+            rerun.Arrows3D(vectors=axes_m, colors=[_rgb(c) for c in (VERMILION, GREEN, BLUE)]),
+        )
+        for index, name in enumerate(rig.names):
+            T_vehicle_camera = poses.inverse(
+                np.asarray(rig.Ts_camera_vehicle.wxyz_xyz[index], float)
+            )
+            entity = f"world/vehicle/{name}"
+            self._still(entity, self._transform(T_vehicle_camera))
+            self._still(
+                entity,
+                rerun.Pinhole(
+                    image_from_camera=np.asarray(rig.camera(index).K),
+                    resolution=rig.image_sizes_px[index],
+                    camera_xyz=rerun.ViewCoordinates.RDF,
+                    image_plane_distance=_IMAGE_PLANE_M,
+                ),
+            )
+
+    def _show_vehicle(self, pose: np.ndarray, covariance: np.ndarray) -> None:
+        rerun = self._rerun
+        place_m = np.array([pose[0], pose[1], 0.0])
+        half_rad = pose[2] / 2
+        self._say(
+            "world/vehicle",
+            self._transform(np.array([math.cos(half_rad), 0, 0, math.sin(half_rad), *place_m])),
+        )
+        if self._last_m is not None:
+            piece = rerun.LineStrips3D([[self._last_m, place_m]], colors=_rgb(BLUE))
+            self._say("world/track", piece)
+        self._last_m = place_m
+        if np.isfinite(covariance[:2, :2]).all() and covariance.shape[0] >= 2:
+            values, vectors = np.linalg.eigh(covariance[:2, :2])
+            scales_m = np.sqrt(_CHI2_2DOF_95 * np.maximum(values, 0))
+            angles_rad = np.linspace(0, 2 * np.pi, 49)
+            circle = np.stack([np.cos(angles_rad), np.sin(angles_rad)])
+            ellipse_m = place_m[:2] + (vectors @ (scales_m[:, None] * circle)).T
+            strip = np.column_stack([ellipse_m, np.zeros(len(ellipse_m))])
+            self._say("world/ellipse", rerun.LineStrips3D([strip], colors=_rgb(SKY)))
+
+    def _show_hypotheses(self, shown: Shown) -> None:
+        usable = np.isfinite(shown.hypotheses).all(axis=1) & np.isfinite(shown.log_weight)
+        rows, log_weight = shown.hypotheses[usable], shown.log_weight[usable]
+        shares = np.exp(log_weight - np.max(log_weight, initial=-np.inf))
+        alphas = np.round(255 * np.maximum(shares, 0.1)).astype(int)
+        self._say(
+            "world/hypotheses",
+            self._rerun.Arrows3D(
+                origins=np.column_stack([rows[:, :2], np.zeros(len(rows))]),
+                vectors=_ahead(rows[:, 2]),
+                colors=[(*_rgb(SKY), alpha) for alpha in alphas],
+                radii=0.012 * np.sqrt(np.maximum(shares, 0.1)),
+            ),
+        )
+
+    def _show_candidates(self, shown: Shown) -> None:
+        Ts = [poses.inverse(T) for T in shown.Ts_vehicle_world if np.isfinite(T).all()]
+        taken = [index == shown.selected for index in range(len(Ts))]
+        self._say(
+            "world/candidates",
+            self._rerun.Arrows3D(
+                origins=[T[4:] for T in Ts],
+                vectors=[_ARROW_M * _x_axis(T[:4]) for T in Ts],
+                colors=[_rgb(BLUE if is_taken else ORANGE) for is_taken in taken],
+                radii=0.006,
+            ),
+        )
+
+    def _show_numbers(self, shown: Shown) -> None:
+        sigma_m = math.sqrt(max(float(np.trace(shown.covariance[:2, :2])), 0.0))
+        for entity, value in (
+            ("flip_probability", shown.flip_probability),
+            ("hypotheses", float(len(shown.hypotheses))),
+            ("nis", shown.nis if shown.nis > 0 else math.nan),
+            ("throttle", shown.throttle),
+            ("steering_rad", shown.steering_rad),
+            ("position_sigma_m", sigma_m if shown.located else math.nan),
+        ):
+            if math.isfinite(value):
+                self._say(f"plots/{entity}", self._rerun.Scalars(value))
+
+    def _blueprint(self) -> Any:
+        blueprint = self._rerun.blueprint
+        whole_past = blueprint.VisibleTimeRanges(
+            timeline=TIMELINE,
+            start=blueprint.TimeRangeBoundary.infinite(),
+            end=blueprint.TimeRangeBoundary.cursor_relative(),
+        )
+        plots = [
+            blueprint.TimeSeriesView(
+                origin=f"plots/{name}", name=name, plot_legend=blueprint.PlotLegend(visible=False)
+            )
+            for name in ("flip_probability", "hypotheses", "nis", "position_sigma_m")
+        ]
+        commands = ["plots/throttle", "plots/steering_rad"]
+        cameras = [
+            blueprint.Spatial2DView(origin=f"world/vehicle/{name}", name=name)
+            for name in self._names
+        ]
+        space = blueprint.Spatial3DView(
+            origin="world", name="map", overrides={"world/track": whole_past}
+        )
+        return blueprint.Blueprint(
+            blueprint.Horizontal(
+                blueprint.Vertical(space, *([blueprint.Grid(*cameras)] if cameras else [])),
+                blueprint.Vertical(
+                    blueprint.TextLogView(origin="health", name="health"),
+                    *plots,
+                    blueprint.TimeSeriesView(origin="plots", contents=commands, name="commands"),
+                    row_shares=[2, *(1 for _ in plots), 1],
+                ),
+                column_shares=[3, 2],
+            ),
+            collapse_panels=True,
+        )
+
+    def _transform(self, wxyz_xyz: np.ndarray) -> Any:
+        w, x, y, z, *place_m = wxyz_xyz.tolist()
+        rotation = self._rerun.Quaternion(xyzw=[x, y, z, w])
+        return self._rerun.Transform3D(translation=place_m, quaternion=rotation)
+
+    def _at(self, stamp_ns: int) -> None:
+        self._begin_ns = stamp_ns if self._begin_ns is None else self._begin_ns
+        self._stream.set_time(TIMELINE, duration=(stamp_ns - self._begin_ns) / 1e9)
+
+    def _say(self, entity: str, what: Any) -> None:
+        self._stream.log(entity, what)
+
+    def _still(self, entity: str, what: Any) -> None:
+        self._stream.log(entity, what, static=True)
+
+
+def _rgb(color: str) -> tuple[int, int, int]:
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
+
+
+def _ahead(psi_rad: np.ndarray) -> np.ndarray:
+    return _ARROW_M * np.column_stack([np.cos(psi_rad), np.sin(psi_rad), np.zeros(len(psi_rad))])
+
+
+def _x_axis(wxyz: np.ndarray) -> np.ndarray:
+    """Where a rotation turns the x axis."""
+    w, x, y, z = wxyz
+    return np.array([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)])
