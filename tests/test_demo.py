@@ -47,7 +47,7 @@ def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):
     )
     (tmp_path / "route.yaml").write_text(
         "{waypoints_m: [[0.3, -0.2]], waypoint_radius_m: 0.2,"
-        " start: {x_m: 0.5, y_m: -0.65, psi_deg: 110}}\n"
+        " start: {x_m: 0.42, y_m: -0.5, psi_deg: 112}}\n"
     )
     out = tmp_path / "out"
     files = ["--markers", str(tmp_path / "markers.yaml"), "--route", str(tmp_path / "route.yaml")]

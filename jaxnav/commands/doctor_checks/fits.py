@@ -1,0 +1,264 @@
+"""Poses of a standing car, and errors of its files, fitted to the corners in its pictures.
+
+The pose may be anywhere, or nearly level on the ground; sizes, places and lenses are as the files
+say, or a few of them are unknown too. Unknowns are counted in their own prior sigma. SciPy
+minimises: each fit is another problem, and but one small program has to be compiled for all.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from scipy.optimize import least_squares
+
+from jaxnav.camera import Camera
+from jaxnav.detection.observe import Observed
+from jaxnav.ippe import ippe_from_rays
+from jaxnav.markers import MarkerMap
+from jaxnav.observation import MODEL_SIGMA_PX
+from jaxnav.rig import CameraRig
+
+MOST_ERRORS = 6  # numbers that may be unknown beside the pose
+_HEIGHT_SIGMA_M = 0.01  # how well a floor is level and a car stands on it,
+_TILT_SIGMA_RAD = np.deg2rad(0.5)  # with what a tape leaves in the cameras' places
+_FREE_M, _FREE_RAD = 10.0, 3.0
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """What C cameras see of the M markers that they see at all, in the order of the map.
+
+    Attributes:
+        corners_px: (C, M, 4, 2).
+        visible: (C, M).
+        sigma_px: (C, M, 4), with what a calibration leaves.
+    """
+
+    rig: CameraRig
+    markers: MarkerMap
+    corners_px: np.ndarray
+    visible: np.ndarray
+    sigma_px: np.ndarray
+
+    @staticmethod
+    def of(rig: CameraRig, markers: MarkerMap, seen: Observed, most: int) -> "Sighted":
+        """Of all markers that are seen so many, the largest ones."""
+        diagonals_px = seen.corners_px[..., :2, :] - seen.corners_px[..., 2:, :]
+        area_px2 = np.abs(
+            diagonals_px[..., 0, 0] * diagonals_px[..., 1, 1]
+            - diagonals_px[..., 0, 1] * diagonals_px[..., 1, 0]
+        )
+        largest = np.where(seen.visible, area_px2, 0).max(axis=0)
+        count = min(int((largest > 0).sum()), most)
+        kept = np.sort(np.argsort(-largest, kind="stable")[:count])
+        chosen = MarkerMap(
+            jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[kept]),
+            markers.size_m[kept],
+            tuple(markers.ids[i] for i in kept),
+            tuple(markers.families[i] for i in kept),
+        )
+        sigma_px = np.hypot(seen.sigma_px[:, kept], MODEL_SIGMA_PX)
+        return Sighted(rig, chosen, seen.corners_px[:, kept], seen.visible[:, kept], sigma_px)
+
+    def only(self, marker: int) -> "Sighted":
+        """The same with one marker in view."""
+        alone = np.arange(self.visible.shape[1]) == marker
+        visible = self.visible & alone
+        return Sighted(self.rig, self.markers, self.corners_px, visible, self.sigma_px)
+
+    def reordered(self, marker: int, order: tuple[int, ...]) -> "Sighted":
+        """The same with the corners of one marker in another order."""
+        corners_px, sigma_px = self.corners_px.copy(), self.sigma_px.copy()
+        corners_px[:, marker] = corners_px[:, marker, list(order)]
+        sigma_px[:, marker] = sigma_px[:, marker, list(order)]
+        return Sighted(self.rig, self.markers, corners_px, self.visible, sigma_px)
+
+    @property
+    def numbers(self) -> int:
+        """How many coordinates of corners there are."""
+        return 8 * int(self.visible.sum())
+
+    @property
+    def allowed_px(self) -> float:
+        """RMS of the corners' sigma."""
+        return float(np.sqrt(np.mean(self.sigma_px[self.visible] ** 2)))
+
+
+class Unknowns(eqx.Module):
+    """What may differ from the files, or the sigma of it: 0 where it is no unknown."""
+
+    pose: np.ndarray  # (6,) xi in T_world_vehicle * exp(xi)
+    size: np.ndarray  # (M,) logarithm of true over written
+    moved: np.ndarray  # (M, 6) xi in T_world_marker * exp(xi)
+    focal: np.ndarray  # (C,) logarithm of true over written
+    turned: np.ndarray  # (C, 3) rotation vector of each camera in its own frame, rad
+
+    @staticmethod
+    def of_pose(seen: Sighted, level: bool, **others: np.ndarray) -> "Unknowns":
+        """Prior sigmas of a pose anywhere in space, or on the ground; and of what else is given."""
+        C, M = seen.visible.shape
+        on_ground = [_HEIGHT_SIGMA_M, _TILT_SIGMA_RAD, _TILT_SIGMA_RAD]
+        z_m, roll_rad, pitch_rad = on_ground if level else [_FREE_M, _FREE_RAD, _FREE_RAD]
+        none = {
+            "size": np.zeros(M),
+            "moved": np.zeros((M, 6)),
+            "focal": np.zeros(C),
+            "turned": np.zeros((C, 3)),
+        }
+        pose = np.array([_FREE_M, _FREE_M, z_m, roll_rad, pitch_rad, _FREE_RAD])
+        return Unknowns(pose, **(none | others))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What fits best.
+
+    Attributes:
+        T_world_vehicle: (4, 4).
+        cost: chi-square of corners and priors.
+        error_px: RMS of all coordinates.
+        value: of the unknowns.
+        sigma: of the unknowns.
+        pose_covariance: (6, 6), of xi in T_world_vehicle * exp(xi).
+    """
+
+    T_world_vehicle: np.ndarray
+    cost: float
+    error_px: float
+    value: Unknowns
+    sigma: Unknowns
+    pose_covariance: np.ndarray
+
+    @property
+    def planar(self) -> tuple[float, float, float]:
+        """x m, y m, psi rad."""
+        T = self.T_world_vehicle
+        return float(T[0, 3]), float(T[1, 3]), float(np.arctan2(T[1, 0], T[0, 0]))
+
+    @property
+    def tilt_rad(self) -> float:
+        """Between the vehicle's z axis and the world's."""
+        return float(np.arccos(np.clip(self.T_world_vehicle[2, 2], -1, 1)))
+
+
+def poses_by_each(seen: Sighted) -> list[np.ndarray]:
+    """Both poses (7,) of T_world_vehicle by each marker in each camera, wxyz_xyz."""
+    both = np.asarray(_both(seen.rig, seen.markers, jnp.asarray(seen.corners_px)))
+    return list(both[seen.visible].reshape(-1, 7))
+
+
+@jax.jit
+def _both(rig: CameraRig, markers: MarkerMap, corners_px: jax.Array) -> jax.Array:
+    def one(
+        camera: Camera,
+        T_camera_vehicle: jaxlie.SE3,
+        T_world_marker: jaxlie.SE3,
+        size_m: jax.Array,
+        corners_px: jax.Array,
+    ) -> jax.Array:
+        Ts_camera_marker = ippe_from_rays(camera.unproject(corners_px), size_m)
+        Ts_world_vehicle = jax.vmap(
+            lambda T_camera_marker: T_world_marker @ T_camera_marker.inverse() @ T_camera_vehicle
+        )(Ts_camera_marker)
+        return Ts_world_vehicle.wxyz_xyz
+
+    of_markers = jax.vmap(one, in_axes=(None, None, 0, 0, 0))
+    of_cameras = jax.vmap(of_markers, in_axes=(0, 0, None, None, 0))
+    return of_cameras(
+        rig.cameras, rig.Ts_camera_vehicle, markers.Ts_world_marker, markers.size_m, corners_px
+    )
+
+
+def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: Unknowns) -> Fit:
+    """The best fit from several starts.
+
+    Args:
+        starts: T_world_vehicle, (7,) wxyz_xyz each. The prior of the pose is about them.
+        prior_sigma: of each unknown.
+    """
+    fits = [_fit(seen, start, prior_sigma) for start in starts]
+    return min(fits, key=lambda each: each.cost)
+
+
+def _fit(seen: Sighted, start: np.ndarray, prior_sigma: Unknowns) -> Fit:
+    flat_sigma, unravel = ravel_pytree(prior_sigma)
+    asked = np.flatnonzero(flat_sigma)
+    slots = np.full(6 + MOST_ERRORS, flat_sigma.size)  # past the end where fewer are asked for
+    slots[: len(asked)] = asked
+    given: Any = (seen.rig, seen.markers, seen.corners_px, seen.visible, seen.sigma_px)
+    latest: list[Any] = [None, None]
+
+    def look(u: np.ndarray) -> Any:
+        if latest[0] is None or not np.array_equal(latest[0], u):
+            latest[:] = u.copy(), jax.device_get(_errors(*given, start, prior_sigma, slots, u))
+        return latest[1]
+
+    def residuals(u: np.ndarray) -> np.ndarray:
+        return np.append(look(u)[0], u)
+
+    def jacobian(u: np.ndarray) -> np.ndarray:
+        return np.vstack([look(u)[1], np.eye(slots.size)])
+
+    found = least_squares(residuals, np.zeros(slots.size), jacobian, method="lm", max_nfev=200)
+    whitened, J, wxyz_xyz = look(found.x)
+    covariance = np.linalg.inv(J.T @ J + np.eye(slots.size))
+    value, sigma = np.zeros(flat_sigma.size), np.zeros(flat_sigma.size)
+    mine = slice(len(asked))
+    value[asked] = found.x[mine] * flat_sigma[asked]
+    sigma[asked] = np.sqrt(np.diag(covariance)[mine]) * flat_sigma[asked]
+    pose_sigma = np.asarray(prior_sigma.pose)
+    sigmas_px = np.repeat(seen.sigma_px.reshape(-1), 2)
+    return Fit(
+        np.asarray(jaxlie.SE3(jnp.asarray(wxyz_xyz)).as_matrix()),
+        cost=float(2 * found.cost),
+        error_px=float(np.sqrt(np.sum((whitened * sigmas_px) ** 2) / max(seen.numbers, 1))),
+        value=unravel(jnp.asarray(value)),
+        sigma=unravel(jnp.asarray(sigma)),
+        pose_covariance=covariance[:6, :6] * np.outer(pose_sigma, pose_sigma),
+    )
+
+
+@jax.jit
+def _errors(
+    rig: CameraRig,
+    markers: MarkerMap,
+    corners_px: jax.Array,
+    visible: jax.Array,
+    sigma_px: jax.Array,
+    start: jax.Array,
+    prior_sigma: Unknowns,
+    slots: jax.Array,
+    u: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Errors of corners in their sigma, their derivatives by u, and T_world_vehicle at u."""
+    flat_sigma, unravel = ravel_pytree(prior_sigma)
+
+    def errors(u: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        y = unravel(jnp.zeros_like(flat_sigma).at[slots].set(u, mode="drop") * flat_sigma)
+        T_world_vehicle = jaxlie.SE3(start) @ jaxlie.SE3.exp(y.pose)
+        Ts_world_marker = jax.vmap(lambda T, xi: T @ jaxlie.SE3.exp(xi))(
+            markers.Ts_world_marker, y.moved
+        )
+        Ts_camera_vehicle = jax.vmap(
+            lambda T, turn: jaxlie.SE3.from_rotation(jaxlie.SO3.exp(turn)) @ T
+        )(rig.Ts_camera_vehicle, y.turned)
+        size_m = markers.size_m * jnp.exp(y.size)
+        there = MarkerMap(Ts_world_marker, size_m, markers.ids, markers.families)
+        seeing = eqx.tree_at(
+            lambda rig: (rig.cameras.focal_px, rig.Ts_camera_vehicle.wxyz_xyz),
+            rig,
+            (rig.cameras.focal_px * jnp.exp(y.focal)[:, None], Ts_camera_vehicle.wxyz_xyz),
+        )
+        seen_px = seeing.project(T_world_vehicle.inverse(), there.corners_world_m)
+        whitened = (seen_px - corners_px) / sigma_px[..., None]
+        whitened = jnp.where(visible[..., None, None], whitened, 0).reshape(-1)
+        return whitened, (whitened, T_world_vehicle.wxyz_xyz)
+
+    J, (whitened, wxyz_xyz) = jax.jacfwd(errors, has_aux=True)(u)
+    return whitened, J, wxyz_xyz

@@ -1,0 +1,126 @@
+"""What cameras see from where: the few compiled programs that the checks of files share."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from jaxnav.camera import Camera
+from jaxnav.geometry import T_world_vehicle_from_planar, transform_points
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+
+_SAME_RAY = 1e-3  # between a ray and that through its own pixel: one-to-one there
+_PIXELS = 256  # are looked through at a time, so that it is compiled once
+
+
+@jax.jit
+def _through_lens(cameras: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Rays (C, N, 3) through pixels (C, N, 2) of C cameras, and how far they miss them, px."""
+
+    def one(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
+        rays = camera.unproject(pixels)
+        return rays, jnp.linalg.norm(camera.project(rays) - pixels, axis=-1)
+
+    return jax.vmap(one)(cameras, pixels)
+
+
+def through_lens(rig: CameraRig, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where pixels look.
+
+    Args:
+        pixels: (C, N, 2), N up to 256.
+
+    Returns:
+        Unit rays in each camera (C, N, 3), and how far the lens model sends them from their
+        pixel, (C, N) px: next to nothing where it can be inverted.
+    """
+    count = pixels.shape[1]
+    padded = np.pad(pixels, ((0, 0), (0, _PIXELS - count), (0, 0)), mode="edge")
+    rays, error_px = jax.device_get(_through_lens(rig.cameras, jnp.asarray(padded, float)))
+    return rays[:, :count], error_px[:, :count]
+
+
+@jax.jit
+def _sees_directions(rig: CameraRig, directions_vehicle: jax.Array) -> jax.Array:
+    def one(camera: Camera, T_camera_vehicle: jaxlie.SE3, size_px: jax.Array) -> jax.Array:
+        turn = jaxlie.SE3.from_rotation(T_camera_vehicle.rotation())
+        rays = transform_points(turn, directions_vehicle)
+        pixels = camera.project(rays)
+        inside = jnp.all((pixels >= -0.5) & (pixels <= size_px[None] - 0.5), axis=-1)
+        # A lens that folds sends rays from far outside into the image again.
+        same = jnp.linalg.norm(camera.unproject(pixels) - rays, axis=-1) < _SAME_RAY
+        return inside & same & camera.in_front(rays)
+
+    sizes_px = jnp.asarray(rig.image_sizes_px, directions_vehicle.dtype)
+    return jax.vmap(one)(rig.cameras, rig.Ts_camera_vehicle, sizes_px)
+
+
+def sees_directions(rig: CameraRig, directions_vehicle: np.ndarray) -> np.ndarray:
+    """Which cameras see what is far away in unit directions (N, 3) of the vehicle: (C, N) bool."""
+    return np.asarray(_sees_directions(rig, jnp.asarray(directions_vehicle, float)))
+
+
+def Ts_vehicle_camera(rig: CameraRig) -> np.ndarray:
+    """(C, 4, 4)."""
+    return np.linalg.inv(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))
+
+
+@dataclass(frozen=True)
+class Views:
+    """Every marker in every camera from P poses.
+
+    Attributes:
+        side_px: (P, C, M), the side of a square of the marker's area in the image; 0 where the
+            marker does not lie in the image whole with its printed side towards the camera.
+        behind: (P, M), whether the vehicle is on the side of the marker that is not printed.
+        range_m: (P, C, M), from camera to marker.
+    """
+
+    side_px: np.ndarray
+    behind: np.ndarray
+    range_m: np.ndarray
+
+
+@jax.jit
+def _corners(rig: CameraRig, markers: MarkerMap, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def one(pose: jax.Array) -> tuple[jax.Array, jax.Array]:
+        T_vehicle_world = T_world_vehicle_from_planar(pose).inverse()
+        corners_world_m = markers.corners_world_m
+        inside = jnp.all(rig.sees(T_vehicle_world, corners_world_m), axis=-1)
+        return rig.project(T_vehicle_world, corners_world_m), inside
+
+    return jax.vmap(one)(poses)
+
+
+def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> Views:
+    """What is seen from planar poses (P, 3): x m, y m, psi rad."""
+    corners_px, inside = jax.device_get(_corners(rig, markers, jnp.asarray(poses, float)))
+    diagonals_px = corners_px[..., :2, :] - corners_px[..., 2:, :]
+    # Clockwise as the reader sees them, and y down in the image: positive from the front.
+    area_px2 = (
+        diagonals_px[..., 0, 0] * diagonals_px[..., 1, 1]
+        - diagonals_px[..., 0, 1] * diagonals_px[..., 1, 0]
+    ) / 2
+    side_px = np.sqrt(np.where(inside & (area_px2 > 0), area_px2, 0))
+    Ts_world_vehicle = planar_matrices(poses)
+    positions_world_m = np.einsum("pij,cj->pci", Ts_world_vehicle, Ts_vehicle_camera(rig)[:, :, 3])[
+        ..., :3
+    ]
+    Ts_world_marker = np.asarray(markers.Ts_world_marker.as_matrix())
+    centers_world_m, normals = Ts_world_marker[:, :3, 3], Ts_world_marker[:, :3, 2]
+    arms_m = positions_world_m[:, :, None] - centers_world_m
+    to_vehicle_m = Ts_world_vehicle[:, None, :2, 3] - centers_world_m[:, :2]
+    behind = np.einsum("pmi,mi->pm", to_vehicle_m, normals[:, :2]) < 0
+    return Views(side_px, behind, np.linalg.norm(arms_m, axis=-1))
+
+
+def planar_matrices(poses: np.ndarray) -> np.ndarray:
+    """T_world_vehicle (P, 4, 4) of planar poses (P, 3)."""
+    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
+    T[:, :2, 3] = poses[:, :2]
+    return T

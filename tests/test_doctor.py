@@ -1,0 +1,191 @@
+"""`jaxnav doctor` from the command line: what it says, what it exits with, and what it survives."""
+
+import json
+import sys
+from collections import namedtuple
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from jaxnav import cli
+from jaxnav.commands import doctor
+from jaxnav.commands.doctor_checks.findings import Finding, Report
+from jaxnav.errors import BadInput
+from jaxnav.files import calib_dir
+
+CHECKS = "jaxnav.commands.doctor_checks"
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """The settings of the process stay, and the clock is looked at elsewhere."""
+    monkeypatch.setattr("jaxnav.commands.process.configure_jax", lambda **kwargs: None)
+    monkeypatch.setattr(f"{CHECKS}.machine.clock", lambda: [Finding("clock", "ok", "ticks")])
+    monkeypatch.setattr(f"{CHECKS}.machine.disk", lambda folder: [Finding("disk", "ok", "turns")])
+
+
+def lines_with(out: str, *words: str) -> list[str]:
+    return [line for line in out.splitlines() if all(word in line for word in words)]
+
+
+def test_the_qcars_own_files_are_in_order(capsys, tmp_path):
+    assert cli.main(["doctor", "--json", str(tmp_path / "found.json")]) == 0
+    out = capsys.readouterr().out
+    assert not lines_with(out, "ERROR")
+    assert not lines_with(out, "could not be looked at")
+    assert lines_with(out, "ok ", "sight", "the start: marker 0 is 16 px")
+    told = json.loads((tmp_path / "found.json").read_text())
+    assert told["exit_code"] == 0
+    names = {finding["name"] for finding in told["findings"]}
+    assert names == {
+        "packages", "OpenCV", "JAX", "clock", "CPU", "disk", "rig", "markers", "vehicle", "route",
+        "sight", "compile cache",
+    }  # fmt: skip
+    # Aligned: what was found begins in the same column everywhere.
+    (clock,), (route,) = lines_with(out, "clock", "ticks"), lines_with(out, "route", "waypoints,")
+    assert clock.index("ticks") == route.index("2 waypoints")
+    assert out.splitlines()[-1].endswith(" ok")
+
+
+def test_an_unreadable_file_is_exit_code_2_and_hides_nothing(capsys, tmp_path):
+    (tmp_path / "rig.yaml").write_text("cameras: [")
+    (tmp_path / "vehicle.yaml").write_text("wheelbase_m: 0\n")
+    bad = ["--rig", str(tmp_path / "rig.yaml"), "--vehicle-file", str(tmp_path / "vehicle.yaml")]
+    bad += ["--route", str(tmp_path / "gone.yaml"), "--frame", "front=x.png", "--vehicle", "sim"]
+    assert cli.main(["doctor", *bad]) == cli.EXIT_BAD_INPUT
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert lines_with(out, "ERROR", "rig.yaml: is not valid YAML")
+    assert lines_with(out, "ERROR", "vehicle.yaml: wheelbase_m: must be > 0")
+    assert lines_with(out, "ERROR", "gone.yaml: can't be read")
+    assert lines_with(out, "ok ", "corners of 1 are squares")
+    assert lines_with(out, "note", "picture", "not looked at")
+    assert lines_with(out, "note", "plug-ins", "not opened")
+
+
+def test_a_map_that_the_loader_refuses_is_explained(capsys, tmp_path):
+    text = (calib_dir() / "qcar" / "markers.yaml").read_text().replace("0.172", "0.150")
+    (tmp_path / "markers.yaml").write_text(text)
+    assert cli.main(["doctor", "--markers", str(tmp_path / "markers.yaml")]) == 2
+    out = capsys.readouterr().out
+    assert lines_with(out, "ERROR", "markers.yaml: markers[0].corners_world_m")
+    assert lines_with(out, "ERROR", "0.1720 m apart, size_m says 0.1500")
+    assert lines_with(out, "do: measure the black square")
+
+
+def test_an_error_that_was_found_is_exit_code_1(capsys, tmp_path):
+    text = (calib_dir() / "qcar" / "rig.yaml").read_text().replace("0.0953]", "-0.0953]")
+    (tmp_path / "rig.yaml").write_text(text)
+    assert cli.main(["doctor", "--rig", str(tmp_path / "rig.yaml")]) == 1
+    assert lines_with(capsys.readouterr().out, "ERROR", "front is -0.0953 m above the ground")
+
+
+def test_a_check_that_breaks_hides_no_other(capsys, monkeypatch):
+    def breaks(*args):
+        yield Finding("OpenCV", "ok", "half of it is there")
+        raise AttributeError("module 'cv2' has no attribute 'x'")
+
+    monkeypatch.setattr(f"{CHECKS}.software.opencv", breaks)
+    monkeypatch.setitem(sys.modules, f"{CHECKS}.markers_file", None)  # can't be imported
+    assert cli.main(["doctor"]) == 1
+    out = capsys.readouterr().out
+    assert lines_with(out, "ok ", "half of it is there")
+    assert lines_with(out, "ERROR", "OpenCV", "could not be looked at: AttributeError: module")
+    assert lines_with(out, "ERROR", "markers", "could not be looked at: ModuleNotFoundError")
+    assert lines_with(out, "ok ", "route", "2 waypoints")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ("--frame front", "jaxnav doctor: --frame: expected CAMERA=IMAGE, got 'front'"),
+        ("--frame =a.png", "jaxnav doctor: --frame: expected CAMERA=IMAGE"),
+        ("--option speed", "jaxnav doctor: --option: expected KEY=VALUE, got 'speed'"),
+        ("--option a=1 --option a=2", "jaxnav doctor: --option: a is given twice"),
+        ("--speed", "jaxnav doctor: Unrecognized options: --speed"),
+    ],
+)
+def test_wrong_usage_is_one_line(capsys, arguments, line):
+    assert cli.main(["doctor", *arguments.split()]) == cli.EXIT_BAD_INPUT
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(line)
+
+
+def test_pictures_are_named_by_their_cameras(capsys, tmp_path):
+    image = tmp_path / "a=b.png"
+    cv2.imwrite(str(image), np.full((410, 820), 90, np.uint8))
+    assert cli.main(["doctor", "--frame", f"front={image}"]) == 0
+    assert lines_with(capsys.readouterr().out, "WARNING", "picture", "no marker of the map (0 of")
+    assert cli.main(["doctor", "--frame", f"top={image}"]) == 2
+    assert lines_with(capsys.readouterr().out, "the rig has no camera 'top': expected one of front")
+    assert cli.main(["doctor", "--frame", f"front={tmp_path / 'gone.png'}"]) == 2
+    assert lines_with(capsys.readouterr().out, "gone.png: can't be read")
+
+
+def test_plug_ins_get_their_options(capsys, monkeypatch):
+    told = []
+    monkeypatch.setattr(
+        f"{CHECKS}.plug_ins.plug_ins", lambda report, setup, *names: told.append((setup, names))
+    )
+    arguments = "--vehicle car:open --cameras eyes:open --option a=1 --option b=x=y"
+    assert cli.main(["doctor", *arguments.split()]) == 0
+    ((setup, names),) = told
+    assert names == ("car:open", "eyes:open")
+    assert setup.options == {"a": "1", "b": "x=y"}
+    assert setup.start_pose[:2] == (2.0, -1.0)
+
+
+def test_whether_the_step_is_compiled_is_looked_up(monkeypatch, tmp_path, capsys):
+    asked = []
+    fields = "stamps_us corners_px visible corner_sigma_px speed_mps steering_rad has_odometry"
+    # The tests' hook insists on JAX's arrays, the loop on NumPy's.
+    monkeypatch.setattr("jaxnav.runtime.estimator.Events", namedtuple("Events", fields))
+
+    def file(folder, structures, leaves):
+        asked.append((folder, "advance" in structures))
+        return tmp_path / "the.step"
+
+    monkeypatch.setattr("jaxnav.commands.process.step_folder", lambda: tmp_path)
+    monkeypatch.setattr("jaxnav.runtime.compiled._file", file)
+    monkeypatch.setattr(f"{CHECKS}.software.compile_cache", lambda directory, compiled: [
+        Finding("compile cache", "ok", f"compiled: {compiled}")
+    ])  # fmt: skip
+    assert cli.main(["doctor"]) == 0
+    assert lines_with(capsys.readouterr().out, "compiled: False")
+    assert asked == [(tmp_path, True)]
+    (tmp_path / "the.step").write_bytes(b"")
+    assert cli.main(["doctor"]) == 0
+    assert lines_with(capsys.readouterr().out, "compiled: True")
+
+
+def test_the_report():
+    shown: list[Finding] = []
+    report = Report(shown.append)
+    assert (report.exit_code, report.summary()) == (0, "")
+    report.examine("a", lambda: [Finding("a", "note", "x"), Finding("a", "warning", "y")])
+    assert report.exit_code == 0
+    assert report.read("b", lambda: 3) == 3
+
+    def wrong():
+        raise BadInput("--flag", "is wrong")
+
+    report.add(Finding("c", "error", "broken"))
+    assert report.exit_code == 1
+    assert report.read("d", wrong) is None
+    assert report.exit_code == 2
+    assert [finding.what for finding in shown] == ["x", "y", "broken", "--flag: is wrong"]
+    assert report.summary() == "2 errors, 1 warning, 1 note"
+    assert (
+        str(Finding("a", "error", "x\ny", "z"))
+        == "ERROR    a              x y\n" + " " * 9 + "do: z"
+    )
+
+
+def test_the_checks_are_imported_only_when_they_run():
+    """What is ill must not keep the doctor from coming."""
+    source = Path(doctor.__file__).read_text()
+    top = [line for line in source.splitlines() if line.startswith(("import", "from"))]
+    assert not any(name in line for line in top for name in ("jax.", "cv2", "numpy", "runtime"))

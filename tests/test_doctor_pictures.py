@@ -1,0 +1,204 @@
+"""Rendered pictures of a standing car, held against maps and rigs with a mistake in them."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from jaxnav.commands.doctor_checks.fits import Sighted
+from jaxnav.commands.doctor_checks.orders import in_their_order
+from jaxnav.commands.doctor_checks.photographs import examine_pictures
+from jaxnav.detection import Observed
+from jaxnav.files import Route
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+from jaxnav.simulation.rendering import Renderer
+from jaxnav.simulation.scene import Scene
+from jaxnav.simulation.sensor import Sensor
+from tests.helpers.findings import all_well, the_problem
+from tests.worlds import marker_map, observe, planar, qcar_rig, upright
+
+RIG = qcar_rig()
+POSE = (0.2, 0.3, 1.3)
+ROUTE = Route(((0.4, 0.6),), 0.15, POSE)
+SIZES_M = [0.172, 0.172, 0.25]
+# Two of them low ahead, the third high on the left.
+ROOM = marker_map(
+    [
+        (upright(-np.pi / 2), [0.1, 1.6, 0.25]),
+        (upright(-np.pi / 2 - 0.5), [0.9, 1.5, 0.3]),
+        (upright(0.2), [-0.9, 0.4, 0.55]),
+    ],
+    SIZES_M,
+)
+LOW, HIGH = 0, 2
+SENSOR = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0, full_well_e=6000.0)
+Turn = jaxlie.SE3.from_rotation
+
+
+@pytest.fixture(scope="module")
+def images() -> dict[str, np.ndarray]:
+    renderer = Renderer(Scene.create(ROOM, seed=0), RIG, sensor=SENSOR)
+    pictures = renderer.render_still(np.asarray(planar(*POSE).wxyz_xyz), np.random.default_rng(0))
+    return dict(zip(RIG.names, pictures, strict=True))
+
+
+def moved(marker: int, T_old_new: jaxlie.SE3) -> MarkerMap:
+    """The map with one marker elsewhere, in its own frame."""
+    wxyz_xyz = ROOM.Ts_world_marker.wxyz_xyz
+    there = jaxlie.SE3(wxyz_xyz[marker]) @ T_old_new
+    return eqx.tree_at(
+        lambda m: m.Ts_world_marker.wxyz_xyz, ROOM, wxyz_xyz.at[marker].set(there.wxyz_xyz)
+    )
+
+
+def sized(*factors: float) -> MarkerMap:
+    return eqx.tree_at(lambda m: m.size_m, ROOM, ROOM.size_m * jnp.asarray(factors))
+
+
+def alone(markers: MarkerMap, index: int) -> MarkerMap:
+    """A map of one marker."""
+    return MarkerMap(
+        jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[index : index + 1]),
+        markers.size_m[index : index + 1],
+        markers.ids[index : index + 1],
+        markers.families[index : index + 1],
+    )
+
+
+def examine(images, markers=ROOM, rig: CameraRig = RIG, route: Route | None = ROUTE):
+    return list(examine_pictures(rig, markers, route, images))
+
+
+def test_a_true_map_is_in_order(images):
+    found = examine(images)
+    assert all_well(found)
+    told = [finding.what for finding in found]
+    assert "0 in front" in told[0]
+    assert "2 in left" in told[0]
+    assert "the car stands at x 0.20 m, y 0.30 m, psi 74 deg: 0.00 m and +0 deg" in told[-2]
+    assert told[-1].startswith("3 markers together: corners are 0.0")
+
+
+@pytest.mark.parametrize(
+    ("turn", "words", "right"),
+    [
+        (jaxlie.SO3.from_z_radians(np.pi / 2), "by 270 deg: the first one in the map is the"
+         " printed bottom-left", "2 3 4 1"),
+        (jaxlie.SO3.from_z_radians(-np.pi / 2), "by 90 deg: the first one in the map is the"
+         " printed top-right", "4 1 2 3"),
+        (jaxlie.SO3.from_z_radians(np.pi), "by 180 deg", "3 4 1 2"),
+        (jaxlie.SO3.from_y_radians(np.pi), "the wrong way round", "2 1 4 3"),
+        (jaxlie.SO3.from_x_radians(np.pi), "the wrong way round", "4 3 2 1"),
+    ],
+)  # fmt: skip
+def test_corners_in_another_order_are_named(images, turn, words, right):
+    found = [f for f in examine(images, moved(LOW, Turn(turn))) if f.level != "ok"]
+    (problem,) = found  # and the markers agree once their corners are in order
+    assert problem.level == "error"
+    assert problem.what.startswith("marker 0: the corners are ")
+    assert words in problem.what
+    assert f"in the order of the present entries {right};" in problem.do
+
+
+def test_the_named_order_is_the_right_one(images):
+    """What the doctor says, done to the corners."""
+    wrong = moved(LOW, Turn(jaxlie.SO3.from_z_radians(np.pi / 2)))
+    problem = the_problem(examine(images, wrong), "error")
+    entries = [int(word) - 1 for word in problem.do.split("entries ")[1].split(";")[0].split()]
+    corners = np.asarray(wrong.corners_world_m)[LOW][entries]
+    np.testing.assert_allclose(corners, np.asarray(ROOM.corners_world_m)[LOW], atol=1e-12)
+
+
+def test_a_size_that_is_wrong_by_10_percent_is_told_by_the_other_markers(images):
+    problem = the_problem(examine(images, sized(1, 1.1, 1)), "error")
+    assert "if marker 1 is 0.909 of its size in the map" in problem.what
+    assert "is it 0.1720 m instead of 0.1892?" in problem.do
+
+
+def test_a_size_that_is_wrong_by_10_percent_is_told_by_the_height_of_one_marker(images):
+    found = examine(images, alone(sized(1, 1, 1.1), HIGH))
+    problem = [f for f in found if f.level == "warning"][-1]
+    factor, sigma = (float(problem.what.split()[i].strip("()")) for i in (3, 5))
+    assert abs(factor - 1 / 1.1) < 0.02
+    assert sigma < 0.04
+    assert "instead of 0.2750?" in problem.do
+
+
+def test_one_true_marker_is_content_and_says_how_sure_it_is(images):
+    found = examine(images, alone(ROOM, HIGH))
+    assert [f.level for f in found if f.level != "ok"] == ["note"]  # two that the map lacks
+    assert found[-1].what.startswith("marker 2 is 1.00 (+- 0.0")
+    assert "markers that are not in the map: 0 of tag36h11 in front, 1 of" in found[0].what
+
+
+def test_a_page_that_was_scaled(images):
+    problem = the_problem(examine(images, sized(1.03, 1.03, 1.03)), "error")
+    assert "0 0.971, 1 0.971, 2 0.971 times" in problem.what
+
+
+def test_a_marker_that_was_moved_by_5_cm(images):
+    shifted = moved(LOW, jaxlie.SE3.from_translation(jnp.array([0.05, 0.0, 0.0])))
+    problem = the_problem(examine(images, shifted), "error")
+    assert "if marker 0 is moved by 0.050 m and 0 deg" in problem.what
+
+
+def test_a_focal_length_that_is_off_by_2_percent(images):
+    problem = the_problem(examine(images, rig=RIG.with_focal_px(319 * 1.02)), "error")
+    assert "focal lengths are other than in the rig: front 0.98" in problem.what
+
+
+def rig_with(camera: str, turn: jaxlie.SO3) -> CameraRig:
+    index = RIG.names.index(camera)
+    wxyz_xyz = RIG.Ts_camera_vehicle.wxyz_xyz
+    turned = (Turn(turn) @ jaxlie.SE3(wxyz_xyz[index])).wxyz_xyz
+    return eqx.tree_at(
+        lambda rig: rig.Ts_camera_vehicle.wxyz_xyz, RIG, wxyz_xyz.at[index].set(turned)
+    )
+
+
+def test_a_camera_that_looks_8_degrees_up_lifts_the_car(images):
+    up = rig_with("left", jaxlie.SO3.from_x_radians(np.deg2rad(8.0)))
+    problem, *_ = (f for f in examine(images, alone(ROOM, HIGH), up) if f.level == "warning")
+    assert problem.what.startswith("marker 2 alone: the car is ")
+    tilt_deg = float(problem.what.split("tilted by ")[1].split()[0])
+    assert tilt_deg == pytest.approx(8, abs=0.5)
+
+
+def test_a_file_that_is_wrong_in_several_ways_is_explained_by_none(images):
+    shifted = moved(LOW, jaxlie.SE3.from_translation(jnp.array([0.08, 0.03, 0.0])))
+    twice = eqx.tree_at(lambda m: m.size_m, shifted, shifted.size_m * jnp.array([1, 1.3, 0.8]))
+    found = [f for f in examine(images, twice) if "together" in f.what]
+    assert the_problem(found, "warning").what.endswith("and no single error explains it")
+
+
+def test_pictures_without_markers_of_another_size_or_shown_twice(images):
+    other = MarkerMap(ROOM.Ts_world_marker, ROOM.size_m, (7, 8, 9), ROOM.families)
+    note, warning = examine(images, other)
+    assert (note.level, warning.level) == ("note", "warning")
+    assert "no marker of the map (7, 8, 9 of tag36h11) is found" in warning.what
+
+    grey = {"front": np.full((410, 820), 90, np.uint8)}
+    assert "is found" in the_problem(examine(grey), "warning").what
+
+    small = {"front": np.zeros((205, 410), np.uint8), "left": images["left"]}
+    problem = the_problem(examine(small), "error")
+    assert problem.what == "front: 410 x 205 px, the rig says 820 x 410"
+
+    halves = {"front": np.tile(images["front"][:, 210:620], (1, 2))}
+    problems = [f for f in examine(halves) if "twice" in f.what]
+    assert "seen twice in one picture: 0 in front" in the_problem(problems, "warning").what
+
+
+@pytest.mark.parametrize(("bent_px", "level"), [(0.0, "ok"), (3.0, "warning")])
+def test_corners_of_curled_paper_are_those_of_no_square(bent_px, level):
+    markers = alone(ROOM, HIGH)
+    seen = observe(RIG, markers, planar(*POSE))
+    corners_px = np.array(seen.corners_px)
+    corners_px[:, :, 0] += bent_px
+    told = Observed(corners_px, np.asarray(seen.visible), np.full((4, 1, 4), 0.1), 0, 0)
+    _, (pose,), findings = in_their_order(Sighted.of(RIG, markers, told, 6), ROUTE)
+    assert findings[-1].level == level
+    assert ("off those of any square" in findings[-1].what) == (level == "warning")
+    assert (pose.error_px < 1e-6) == (level == "ok")
