@@ -306,7 +306,7 @@ def _calibration() -> list[Row]:
             **lasting),
         Row("focal length off by 2 %", telling="focal", error_m=0.15, at_most=_SLOW, **lasting),
         Row("cameras swapped", telling="swapped", error_m=np.inf, at_most=Health.STOP,
-            rejects=Reject.INNOVATION, **lasting),
+            rejects=Reject.INNOVATION, **(lasting | {"drive_s": 12.0})),  # to a side camera's view
     ]  # fmt: skip
 
 
