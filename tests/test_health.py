@@ -19,7 +19,6 @@ WELL = Senses(
     position_sigma_m=0.01,
     distance_m=0.02,
     faults=Fault(0),
-    rejects=Reject(0),
 )
 
 
@@ -102,7 +101,6 @@ senses = st.builds(
     position_sigma_m=st.floats(),
     distance_m=ages,
     faults=st.sampled_from([Fault(0), *Fault]),
-    rejects=st.sampled_from([Reject(0), *Reject]),
 )
 
 

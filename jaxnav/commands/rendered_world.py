@@ -9,7 +9,7 @@ import numpy as np
 from jaxnav.ambiguity import Selector
 from jaxnav.arguments import Demo
 from jaxnav.bicycle import Vehicle
-from jaxnav.detection import Detections, Detector, make_detector, observe
+from jaxnav.detection import Detections, Detector, make_detectors, observe
 from jaxnav.errors import BadInput
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.geometry import T_world_vehicle_from_planar
@@ -61,10 +61,7 @@ class World:
             vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
             route=load_route(args.route or qcar / "route.yaml"),
             renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, SENSOR),
-            detectors=[
-                make_detector(args.corner_backend, family)
-                for family in sorted(set(markers.families))
-            ],
+            detectors=make_detectors(markers, args.corner_backend),
         )
 
     def navigator(self, selector: Selector) -> Navigator:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxnav.arguments import Run
 from jaxnav.commands.observers import open_onlookers
 from jaxnav.commands.process import configure_jax, step_folder
-from jaxnav.detection import make_detector
+from jaxnav.detection import make_detectors
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.runtime import plugins
@@ -76,8 +76,7 @@ def _setup(args: Run) -> DriveSetup:
 
 def _searches(args: Run, setup: DriveSetup) -> list[Search]:
     """One for each camera."""
-    families = sorted(set(setup.markers.families))
-    detectors = [make_detector(args.corner_backend, family) for family in families]
+    detectors = make_detectors(setup.markers, args.corner_backend)
     rig = setup.rig
     return [Search(c, rig.image_sizes_px[c], rig.camera(c), detectors) for c in range(len(rig))]
 

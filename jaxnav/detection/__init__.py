@@ -14,6 +14,7 @@ from jaxnav.detection.families import marker_cells
 from jaxnav.detection.observe import Observed, observe
 from jaxnav.detection.types import Detections, Detector
 from jaxnav.errors import BadInput
+from jaxnav.markers import MarkerMap
 
 __all__ = [
     "AprilTagDetector",
@@ -22,6 +23,7 @@ __all__ = [
     "Detector",
     "Observed",
     "make_detector",
+    "make_detectors",
     "marker_cells",
     "observe",
 ]
@@ -42,3 +44,8 @@ def make_detector(backend: str = "aruco", family: str = "tag36h11") -> Detector:
     if backend not in BACKENDS:
         raise BadInput("detector", f"unknown {backend!r}: expected one of {', '.join(BACKENDS)}")
     return BACKENDS[backend](family)
+
+
+def make_detectors(markers: MarkerMap, backend: str = "aruco") -> list[Detector]:
+    """A detector for each family of a map: see `make_detector`."""
+    return [make_detector(backend, family) for family in sorted(set(markers.families))]

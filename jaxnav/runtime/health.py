@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from jaxnav.runtime.flags import Fault, Health, Reject
+from jaxnav.runtime.flags import Fault, Health
 
 # From bad to better only after so many good looks in a row. What merely contradicts counts up with
 # every contradiction and down with every agreement, and is bad at ten (ArduPilot's EKF check).
@@ -45,7 +45,6 @@ class Senses:
     position_sigma_m: float
     distance_m: float  # driven since corners were last believed
     faults: Fault  # that are seen elsewhere
-    rejects: Reject
 
 
 @dataclass

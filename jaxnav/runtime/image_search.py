@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxnav.camera import Camera
-from jaxnav.detection import Detections, make_detector
+from jaxnav.detection import Detections, make_detectors
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
@@ -19,8 +19,7 @@ class ImageSearch:
             BadInput: as `make_detector`.
         """
         self._rig = rig
-        families = sorted(set(markers.families))
-        self._detectors = [make_detector(corner_backend, family) for family in families]
+        self._detectors = make_detectors(markers, corner_backend)
         self._lenses: dict[int, Camera] = {}
 
     def size_problem(self, camera: int, image: np.ndarray) -> str | None:

@@ -97,6 +97,7 @@ class Loop:
         self._odometry_ns: int | None = None
         self._blank: tuple[Sighted, ...] = ()  # frames that show nothing and wait for the next tick
         self._belief: tuple[np.ndarray, np.ndarray] | None = None
+        self._expectation: tuple[tuple[np.ndarray, np.ndarray], Expected] | None = None  # of it
         dtype = np.asarray(pilot.navigator.corner_sigma_px).dtype
         self._min_covariance = _MIN_COVARIANCE.astype(dtype)
         # Compiled now: whoever looks for markers is watched.
@@ -172,10 +173,15 @@ class Loop:
             )
         self._outcome = outcome
         output = outcome.report.output
-        self._belief = None
-        if output.decided:
-            covariance = output.covariance[:3, :3] + self._min_covariance
-            self._belief = np.asarray(output.T_world_vehicle.wxyz_xyz), np.asarray(covariance)
+        # In one go: who looks for markers reads it at any time.
+        self._belief = (
+            (
+                np.asarray(output.T_world_vehicle.wxyz_xyz),
+                np.asarray(output.covariance[:3, :3] + self._min_covariance),
+            )
+            if output.decided
+            else None
+        )
         for observer in self._observers:
             observer.handled(given, outcome)
 
@@ -190,9 +196,10 @@ class Loop:
         belief = self._belief
         if belief is None:
             return None
-        quads_px, visible, radius_px = (
-            np.asarray(part)[camera] for part in self._expected(*belief)
-        )
+        known = self._expectation
+        if known is None or known[0] is not belief:  # the same for all cameras of a set
+            known = self._expectation = belief, self._expected(*belief)
+        quads_px, visible, radius_px = (np.asarray(part)[camera] for part in known[1])
         return Region(quads_px[visible], radius_px[visible])
 
     def _expected(self, wxyz_xyz: np.ndarray, covariance: np.ndarray) -> Expected:

@@ -168,7 +168,7 @@ class Pilot:
             self._left = self._report
         self._arrived_elsewhere(fused.report)
         self._report, self._now_ns = fused.report, now_ns
-        health, faults = self._monitor.look(self._senses(now_ns, faults, rejects))
+        health, faults = self._monitor.look(self._senses(now_ns, faults))
         steering_rad, throttle = self._limited(health, now_ns, elapsed_ns)
         return Outcome(
             now_ns,
@@ -218,7 +218,7 @@ class Pilot:
         self._commanded_ns = now_ns
         return self._command
 
-    def _senses(self, now_ns: int, faults: Fault, rejects: Reject) -> Senses:
+    def _senses(self, now_ns: int, faults: Fault) -> Senses:
         assert self._report is not None
         began_ns = self._began_ns if self._began_ns is not None else now_ns
         output = self._report.output
@@ -235,7 +235,6 @@ class Pilot:
             position_sigma_m=float(np.sqrt(np.trace(output.covariance[:2, :2]))),
             distance_m=self._distance_m,
             faults=faults,
-            rejects=rejects,
         )
 
     def _slept(self, now_ns: int) -> Fault:

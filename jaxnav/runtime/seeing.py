@@ -225,7 +225,9 @@ class Eyes:
                     continue
                 index, frame = taken
                 try:
-                    sighted = self._searches[index].look(frame, self.expected(index))
+                    # A camera that detects by itself needs not be told where to look.
+                    region = self.expected(index) if frame.detections is None else None
+                    sighted = self._searches[index].look(frame, region)
                 finally:
                     self._busy[index] = False
                 seen = Seen(sighted, frame, self._cameras[index].name)

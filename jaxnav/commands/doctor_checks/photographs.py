@@ -10,7 +10,7 @@ from jaxnav.commands.doctor_checks.findings import Finding, listed
 from jaxnav.commands.doctor_checks.fits import Sighted
 from jaxnav.commands.doctor_checks.orders import in_their_order
 from jaxnav.commands.doctor_checks.together import together
-from jaxnav.detection import Detections, make_detector, observe
+from jaxnav.detection import Detections, make_detectors, observe
 from jaxnav.files import Route
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
@@ -37,7 +37,7 @@ def _detections(
     rig: CameraRig, markers: MarkerMap, images: Mapping[str, np.ndarray]
 ) -> list[Detections]:
     """All markers of the map's families in the picture of each camera that has one."""
-    detectors = [make_detector("aruco", family) for family in sorted(set(markers.families))]
+    detectors = make_detectors(markers)
     return [
         Detections.concatenate(
             [
