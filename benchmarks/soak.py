@@ -21,9 +21,9 @@ from tqdm import tqdm
 from jaxnav.commands.process import configure_jax
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.navigator import Navigator
+from jaxnav.runtime.estimator import advance_packed
 from jaxnav.runtime.flags import Fault, Health
 from jaxnav.runtime.pilot import Input, Pilot
-from jaxnav.timeline import advance
 from jaxnav.vehicles.faults import WAYPOINTS_M
 from jaxnav.vehicles.lockstep import BEGIN_NS, drive
 from jaxnav.vehicles.world import World
@@ -64,7 +64,7 @@ def main() -> None:
     def program(*told):
         nonlocal traces
         traces += 1
-        return advance(navigator, *told)
+        return advance_packed(navigator, *told)
 
     world = World(rig, markers, vehicle, (2.0, -1.0, np.deg2rad(125.0)), BEGIN_NS)
     recorder = Pilot(navigator, program=program)

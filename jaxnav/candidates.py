@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.camera import Camera
@@ -38,6 +39,20 @@ class Candidates(eqx.Module):
     valid: Bool[Array, " N"]
     converged: Bool[Array, " N"]
     steps: Int[Array, " N"]
+
+    @staticmethod
+    def none(count: int, dtype: DTypeLike) -> "Candidates":
+        """So many lanes, none of them valid."""
+        zeros = jnp.zeros(count, dtype)
+        return Candidates(
+            T_vehicle_world=jaxlie.SE3(jnp.zeros((count, 7), dtype).at[:, 0].set(1)),
+            e1_px2=zeros,
+            cost=zeros,
+            covariance=jnp.zeros((count, 6, 6), dtype),
+            valid=zeros > 0,
+            converged=zeros > 0,
+            steps=jnp.zeros(count, int),
+        )
 
     def padded(self, count: int) -> "Candidates":
         """So many lanes; those that are added are not valid."""

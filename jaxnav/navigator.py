@@ -29,7 +29,7 @@ from jaxnav.motion import (
     restarted_where_broken,
     survivors_first,
 )
-from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
+from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
 from jaxnav.rig import CameraRig
 
 # Slots of the banks that `step_by_regime` keeps compiled beside the whole one: nine frames of ten
@@ -309,6 +309,11 @@ class Navigator(eqx.Module):
     def find_candidates(self, snapshot: Snapshot) -> Candidates:
         """Both poses of every marker in view, refined."""
         return find_candidates(snapshot, self.max_candidates, self.max_lm_steps, self.ground_plane)
+
+    def no_candidates(self) -> Candidates:
+        """What `find_candidates` returns where nothing is in view."""
+        count = min(self.max_candidates, 2 * slots(self.rig, self.markers, self.max_sightings))
+        return Candidates.none(count, self.rig.cameras.focal_px.dtype)
 
     def _steer(
         self,

@@ -132,6 +132,12 @@ def sightings(
     )
 
 
+def slots(rig: CameraRig, markers: MarkerMap, max_sightings: int | None) -> int:
+    """How many sightings are used, the largest: by default two of every marker, 16 at most."""
+    count = len(markers.ids)
+    return min(max_sightings or min(2 * count, 16), len(rig) * count)
+
+
 class Snapshot(eqx.Module):
     """One observation by a rig in a map: all that a pose can be held against."""
 
@@ -155,12 +161,12 @@ class Snapshot(eqx.Module):
             corner_sigma_px: for observations that bring no sigma of their own.
             model_sigma_px: what lens calibration and rolling shutter leave in a corner, added
                 in quadrature to the sigma that an observation brings.
-            max_sightings: the largest ones are used; by default two of every marker, 16 at most.
+            max_sightings: see `slots`.
         """
         sigma_px = corner_sigma_px
         if obs.corner_sigma_px is not None:
             sigma_px = jnp.sqrt(obs.corner_sigma_px**2 + model_sigma_px**2)
-        count = max_sightings or min(2 * len(markers.ids), 16)
+        count = slots(rig, markers, max_sightings)
         seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, count)
         return Snapshot(rig, markers, obs, seen)
 

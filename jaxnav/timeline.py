@@ -32,26 +32,40 @@ from jaxnav.observation import Observation
 FRESH_US = 1000
 
 
+class Corners(eqx.Module):
+    """What C cameras show of M markers in N readings."""
+
+    corners_px: Float[Array, "N C M 4 2"]
+    visible: Bool[Array, "N C M"]
+    corner_sigma_px: Float[Array, "N C M 4"]
+
+
 class Events(eqx.Module):
     """N readings in the order of their stamps: odometry, the corners of some cameras, or both."""
 
     stamps_us: Int[Array, " N"]  # int32, since the moment that they are fused from
-    corners_px: Float[Array, "N C M 4 2"]
-    visible: Bool[Array, "N C M"]
-    corner_sigma_px: Float[Array, "N C M 4"]
     speed_mps: Float[Array, " N"]  # the last known where there is no odometry, NaN: never known
     steering_rad: Float[Array, " N"]
     has_odometry: Bool[Array, " N"]
+    # None where none of them has any: a program without cameras, a third of the time of the other.
+    corners: Corners | None
 
-    def at(self, index: Int[Array, ""], dt_s: Float[Array, ""]) -> Observation:
-        """One of them, as `step` takes it."""
+    def at(
+        self, index: Int[Array, ""], dt_s: Float[Array, ""], lanes: tuple[int, int]
+    ) -> Observation:
+        """One of them, as `step` takes it.
+
+        Args:
+            lanes: how many cameras and markers there are.
+        """
+        seen = self.corners
         return Observation(
-            corners_px=self.corners_px[index],
-            visible=self.visible[index],
+            corners_px=jnp.zeros((*lanes, 4, 2)) if seen is None else seen.corners_px[index],
+            visible=jnp.zeros(lanes, bool) if seen is None else seen.visible[index],
             speed_mps=self.speed_mps[index],
             steering_rad=self.steering_rad[index],
             dt_s=dt_s,
-            corner_sigma_px=self.corner_sigma_px[index],
+            corner_sigma_px=None if seen is None else seen.corner_sigma_px[index],
             has_odometry=self.has_odometry[index],
         )
 
@@ -118,13 +132,14 @@ def advance(
         What is believed after the last event, what was after the new one, the controller's state,
         and what is to be told.
     """
-    nothing = _nothing(navigator, events)
+    nothing, lanes = _nothing(navigator, moment), _lanes(navigator)
 
     def fuse(carry: tuple[Array, Moment, Moment, _Found]) -> tuple[Array, Moment, Moment, _Found]:
         index, before, then, found = carry
         previous_us = jnp.where(index > 0, events.stamps_us[jnp.maximum(index - 1, 0)], 0)
         dt_s = _seconds(navigator, events.stamps_us[index] - previous_us)
-        after, of_this = _after(navigator, before, events.at(index, dt_s).usable(), nothing)
+        obs = events.at(index, dt_s, lanes).usable()
+        after, of_this = _after(navigator, before, obs, nothing, events.corners is None)
         then, found = jax.tree.map(
             lambda a, b: jnp.where(index == new, a, b), (after, of_this), (then, found)
         )
@@ -135,16 +150,20 @@ def advance(
     )
     last = jnp.maximum(count - 1, 0)
     age_us = jnp.where(count > 0, now_us - events.stamps_us[last], now_us)
-    obs = events.at(new, _seconds(navigator, elapsed_us))
+    obs = events.at(new, _seconds(navigator, elapsed_us), lanes)
     obs = dataclasses.replace(obs, has_odometry=jnp.asarray(True))
     control, report = _reported(navigator, moment, control, obs.usable(), found, age_us)
     return moment, then, control, report
 
 
 def _after(
-    navigator: Navigator, before: Moment, obs: Observation, nothing: _Found
+    navigator: Navigator, before: Moment, obs: Observation, nothing: _Found, blind: bool
 ) -> tuple[Moment, _Found]:
-    """What is believed after an observation."""
+    """What is believed after an observation.
+
+    Args:
+        blind: no event of the call shows corners.
+    """
 
     def looked() -> tuple[Moment, _Found]:
         snapshot = navigator.snapshot(obs)
@@ -168,23 +187,17 @@ def _after(
             before.restarts + given_up,
         ), nothing
 
+    if blind:
+        return coasted()
     after: tuple[Moment, _Found] = jax.lax.cond(jnp.any(obs.visible), looked, coasted)
     return after
 
 
-def _nothing(navigator: Navigator, events: Events) -> _Found:
+def _nothing(navigator: Navigator, moment: Moment) -> _Found:
     """What an event without corners tells."""
-
-    def looked() -> tuple[Candidates, Array, Array]:
-        obs = events.at(jnp.asarray(0), jnp.zeros((), events.speed_mps.dtype))
-        snapshot = navigator.snapshot(obs)
-        candidates = navigator.find_candidates(snapshot)
-        estimate = navigator.estimate(navigator.init().belief, snapshot, candidates)
-        return candidates, estimate.costs, estimate.nis
-
-    blank = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(looked))
-    candidates, costs, nis = blank
-    return _Found(candidates, jnp.full_like(costs, jnp.inf), jnp.asarray(-1), nis)
+    candidates = navigator.no_candidates()
+    costs = jnp.full_like(candidates.cost, jnp.inf)
+    return _Found(candidates, costs, jnp.asarray(-1), jnp.zeros((), moment.belief.mean.dtype))
 
 
 def _reported(
@@ -217,6 +230,11 @@ def _reported(
     )
     control, output = navigator.act(control, obs, found.candidates, present)
     return control, Report(output, best.mean)
+
+
+def _lanes(navigator: Navigator) -> tuple[int, int]:
+    """Cameras and markers."""
+    return len(navigator.rig), len(navigator.markers.ids)
 
 
 def _seconds(navigator: Navigator, microseconds: Array) -> Array:

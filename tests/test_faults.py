@@ -8,27 +8,28 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
+from jaxnav.runtime.estimator import advance_packed
 from jaxnav.runtime.flags import Fault, Health
-from jaxnav.timeline import advance
 from jaxnav.vehicles.faults import Row, Trial, line, run_trial
 from jaxnav.vehicles.matrix import matrix
 from tests import worlds
 
 
 class Compiled:
-    """`advance`, compiled once for all navigators of a structure, and to run fast."""
+    """`advance_packed`, compiled once for all navigators of a structure, and to run fast."""
 
     def __init__(self):
-        self.executable = None
+        self.executables = {}  # for events with corners, and for those without
 
     def __call__(self, navigator):
         return partial(self.run, navigator)
 
     def run(self, *told):
-        if self.executable is None:
+        kind = jax.tree.structure(told)
+        if kind not in self.executables:
             options = {"xla_backend_optimization_level": 2}
-            self.executable = jax.jit(advance).lower(*told).compile(options)
-        return self.executable(*told)
+            self.executables[kind] = jax.jit(advance_packed).lower(*told).compile(options)
+        return self.executables[kind](*told)
 
 
 @pytest.fixture(scope="module")

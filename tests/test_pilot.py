@@ -72,6 +72,17 @@ def test_the_same_inputs_give_the_same_bits(setup, steps, inputs):
     assert [digest(outcome) for outcome in again] == [digest(step.outcome) for step in steps]
 
 
+def test_odometry_means_the_same_to_the_program_without_cameras(setup, steps, inputs, monkeypatch):
+    """Nobody can tell which of the two was called."""
+    seeing = Estimator._events
+    monkeypatch.setattr(
+        Estimator, "_events", lambda self, rows, base_ns, _: seeing(self, rows, base_ns, True)
+    )
+    _, always = handled(setup, inputs)
+    for outcome, step in zip(always, steps, strict=True):
+        assert_same_belief(outcome, step.outcome, atol=1e-9)
+
+
 def test_to_warm_up_leaves_no_trace(setup, steps, inputs):
     pilot = setup.pilot(None)
     pilot.warm_up()
@@ -273,17 +284,18 @@ def test_numbers_beyond_float32_are_left_out_by_the_filter():
     """They come as inf, which it does not look at, and nobody is warned again and again."""
     given = []
 
-    def program(moment, control, events, *numbers):
-        given.append(events)
-        return moment, moment, control, ()
+    def program(moment, control, events, numbers):
+        given.append(events.unpacked())
+        return moment, moment, control, moment
 
     with jax.enable_x64(False):
         estimator = Estimator(make_setup().navigator(), program)
         told = Told((0.1, 1e300), np.full((4, 1, 4, 2), -1e300), *np.ones((2, 4, 1), bool))
         told = dataclasses.replace(told, sigma_px=np.full((4, 1, 4), 1e300))
         assert not estimator.fuse(told, BEGIN_NS, BEGIN_NS, 0).refused
-    assert given[0].corners_px.dtype == np.float32
-    assert np.isneginf(given[0].corners_px[0]).all()
+    corners_px = given[0].corners.corners_px
+    assert corners_px.dtype == np.float32
+    assert np.isneginf(corners_px[0]).all()
     assert given[0].steering_rad[0] == np.inf
 
 

@@ -112,8 +112,7 @@ def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
 
     from jaxnav.navigator import Navigator
     from jaxnav.runtime.compiled import is_compiled
-    from jaxnav.runtime.estimator import Estimator
-    from jaxnav.timeline import advance
+    from jaxnav.runtime.estimator import Estimator, advance_packed
 
     with jax.enable_x64(False):
         rig, markers, vehicle = jax.tree.map(
@@ -127,9 +126,9 @@ def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
             waypoints_m=patient.route.waypoints_m,
             waypoint_radius_m=patient.route.waypoint_radius_m,
         )
-        asked: list[Any] = []  # with what the estimator would call it
-        Estimator(navigator, program=lambda *told: asked.extend(told)).warm_up()  # type: ignore
-        return is_compiled(advance, navigator, folder, *asked)
+        asked: list[tuple[Any, ...]] = []  # with what the estimator would call it
+        Estimator(navigator, program=lambda *told: asked.append(told)).warm_up()  # type: ignore
+        return all(is_compiled(advance_packed, navigator, folder, *told) for told in asked)
 
 
 def _pictures(args: Doctor, patient: SimpleNamespace) -> Iterable[Finding]:

@@ -33,11 +33,11 @@ from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.compiled import compiled
+from jaxnav.runtime.estimator import advance_packed
 from jaxnav.runtime.health import Timeouts
 from jaxnav.runtime.message_fields import Flag
 from jaxnav.runtime.pilot import Pilot
 from jaxnav.selectors import SELECTORS, make_selector
-from jaxnav.timeline import advance
 
 SETUP_VERSION = 1
 # The others need what only a simulation has: another sensor, the truth.
@@ -124,7 +124,7 @@ class DriveSetup:
             folder: of executables, see `compiled`.
         """
         navigator = self.navigator()
-        program = compiled(advance, navigator, folder)
+        program = compiled(advance_packed, navigator, folder)
         return Pilot(navigator, self.timeouts, program, self.corner_sigma_px)
 
     def header(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The filter as the loop calls it: one compiled program, and the history of what it was told."""
+"""The filter as the loop calls it: one compiled call an event, and the history of what was told."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,18 +7,42 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
-from jaxnav.control import ControlState
 from jaxnav.navigator import Navigator
 from jaxnav.runtime.compiled import compiled
 from jaxnav.runtime.history import EVENTS, History, Told
-from jaxnav.timeline import Events, Moment, Report, advance, begin
+from jaxnav.runtime.packing import Layout, Packed
+from jaxnav.timeline import Corners, Events, Moment, Report, advance, begin
 
 _NOTHING = Told()
 
+# (moment, control, events, numbers) -> (moment, then, control, report), see `advance_packed`
+Program = Callable[..., tuple[Packed, Packed, Packed, Packed]]
 
-# (moment, control, events, count, new, now_us, elapsed_us) -> (moment, then, control, report)
-Program = Callable[..., tuple[Moment, Moment, ControlState | None, Report]]
+
+def advance_packed(
+    navigator: Navigator,
+    moment: Packed,
+    control: Packed,
+    events: Packed,
+    numbers: Int[Array, "4"],
+) -> tuple[Packed, Packed, Packed, Packed]:
+    """`advance`, whose arguments and results are few vectors.
+
+    Args:
+        numbers: count, new, now_us, elapsed_us.
+    """
+    given = (part.unpacked() for part in (moment, control, events))
+    returned = advance(navigator, *given, *numbers)
+    moment, then, control, report = (Layout.of(part).pack(part) for part in returned)
+    return moment, then, control, report
+
+
+def _beginning(navigator: Navigator) -> tuple[Packed, Packed]:
+    """Moment and control at the start of a drive."""
+    moment, control = begin(navigator), navigator.init().control
+    return Layout.of(moment).pack(moment), Layout.of(control).pack(control)
 
 
 @dataclass(frozen=True)
@@ -37,25 +61,26 @@ class Estimator:
     def __init__(self, navigator: Navigator, program: Program | None = None):
         """Args:
         navigator: what to run.
-        program: `advance` of the navigator, compiled; by default by `jax.jit`, see `compiled`.
+        program: `advance_packed` of the navigator, compiled; by default by `jax.jit`, see
+            `compiled`.
         """
-        self._navigator = navigator
-        self._program = program or compiled(advance, navigator, None)
-        self._first = begin(navigator)
-        self._blank = _blank(navigator)
+        self._program = program or compiled(advance_packed, navigator, None)
+        self._first, self._control = compiled(_beginning, navigator, None)()
+        self._layouts = {seeing: _layout(navigator, seeing) for seeing in (False, True)}
         self._odometry = (np.nan, np.nan)  # speed_mps, steering_rad: the last
         self.reset()
-        self._control = navigator.init().control
 
     def reset(self) -> None:
         """Forget what was sensed; the route goes on."""
         self._history: History | None = None
-        self._moment: Moment = self._first
+        self._moment = self._first
         self._moment_ns = 0
 
     def warm_up(self) -> None:
-        """Compile, and leave no trace of it."""
-        self._call(self._first, [], 0, 0, 0, 0)
+        """Compile, once for events with corners and once for those without."""
+        for seeing in (False, True):
+            numbers = np.zeros(4, np.int32)
+            self._program(self._first, self._control, self._events([], 0, seeing), numbers)
 
     def fuse(self, told: Told | None, stamp_ns: int, now_ns: int, elapsed_ns: int) -> Fused:
         """Take an event in, or none.
@@ -75,43 +100,40 @@ class Estimator:
             placed = self._history.place(stamp_ns, told)
         if placed is None:
             base_ns = self._moment_ns if self._history is not None else now_ns
-            result = self._call(self._moment, [], base_ns, 0, now_ns, elapsed_ns)
-            return self._kept(result, told is not None, 0)
+            moment, _, report = self._call(self._moment, [], base_ns, 0, now_ns, elapsed_ns)
+            return _fused(report, moment, told is not None, 0)
         base, entries = placed
         assert base.moment is not None
         assert self._history is not None
         new = next(index for index, entry in enumerate(entries) if entry.told is told)
         rows = [(entry.stamp_ns, entry.told or _NOTHING) for entry in entries]
-        result = self._call(base.moment, rows, base.stamp_ns, new, now_ns, elapsed_ns)
-        self._moment, self._moment_ns = result[0], entries[-1].stamp_ns
-        self._history.fused(self._moment, entries[new], result[1])
-        return self._kept(result, False, len(entries))
-
-    def _kept(self, result: tuple[Any, ...], refused: bool, events: int) -> Fused:
-        moment, _, self._control, report = result
-        report, moment = jax.tree.map(np.asarray, (report, moment))
-        return Fused(report, moment, refused, events)
+        moment, then, report = self._call(base.moment, rows, base.stamp_ns, new, now_ns, elapsed_ns)
+        self._moment, self._moment_ns = moment, entries[-1].stamp_ns
+        self._history.fused(moment, entries[new], then)
+        return _fused(report, moment, False, len(entries))
 
     def _call(
         self,
-        moment: Moment,
+        moment: Packed,
         rows: Sequence[tuple[int, Told]],
         base_ns: int,
         new: int,
         now_ns: int,
         elapsed_ns: int,
-    ) -> tuple[Any, ...]:
-        events = self._events(rows, base_ns)
-        numbers = (len(rows), new, _us_between(base_ns, now_ns), elapsed_ns // 1000)
-        scalars = [_int32(number) for number in numbers]
-        return self._program(moment, self._control, events, *scalars)
+    ) -> tuple[Packed, Packed, Packed]:
+        seeing = any(told.corners_px is not None for _, told in rows)
+        events = self._events(rows, base_ns, seeing)
+        now_us, elapsed_us = _us_between(base_ns, now_ns), elapsed_ns // 1000
+        numbers = np.array([len(rows), new, _int32(now_us), _int32(elapsed_us)], np.int32)
+        moment, then, self._control, report = self._program(moment, self._control, events, numbers)
+        return moment, then, report
 
-    def _events(self, rows: Sequence[tuple[int, Told]], base_ns: int) -> Events:
-        events: Events = jax.tree.map(np.copy, self._blank)
+    def _events(self, rows: Sequence[tuple[int, Told]], base_ns: int, seeing: bool) -> Packed:
+        packed, events = self._layouts[seeing].room()
         # What float32 can't hold is infinite, and so left out by the filter.
         with np.errstate(over="ignore"):
             self._fill(events, rows, base_ns)
-        return events
+        return packed
 
     def _fill(self, into: Any, rows: Sequence[tuple[int, Told]], base_ns: int) -> None:
         into.speed_mps[:], into.steering_rad[:] = self._odometry
@@ -121,26 +143,35 @@ class Estimator:
                 into.speed_mps[index], into.steering_rad[index] = told.odometry
                 into.has_odometry[index] = True
             if told.corners_px is not None:
-                into.corners_px[index] = told.corners_px
-                into.visible[index] = told.visible
-                into.corner_sigma_px[index] = told.sigma_px
+                into.corners.corners_px[index] = told.corners_px
+                into.corners.visible[index] = told.visible
+                into.corners.corner_sigma_px[index] = told.sigma_px
 
 
-def _blank(navigator: Navigator) -> Events:
-    """Room for `EVENTS`; of NumPy's arrays, which JAX takes as its own."""
+def _fused(report: Packed, moment: Packed, refused: bool, events: int) -> Fused:
+    return Fused(report.fetched().unpacked(), moment.fetched().unpacked(), refused, events)
+
+
+def _layout(navigator: Navigator, seeing: bool) -> Layout:
+    """Of `EVENTS`, with room for corners or without."""
     lanes = EVENTS, len(navigator.rig), len(navigator.markers.ids)
     dtype = navigator.corner_sigma_px.dtype
-    events = Events(
-        stamps_us=jnp.zeros(EVENTS, jnp.int32),
-        corners_px=jnp.zeros((*lanes, 4, 2), dtype),
-        visible=jnp.zeros(lanes, bool),
-        corner_sigma_px=jnp.ones((*lanes, 4), dtype),
-        speed_mps=jnp.zeros(EVENTS, dtype),
-        steering_rad=jnp.zeros(EVENTS, dtype),
-        has_odometry=jnp.zeros(EVENTS, bool),
-    )
-    blank: Events = jax.tree.map(np.asarray, events)
-    return blank
+
+    def events() -> Events:
+        corners = Corners(
+            corners_px=jnp.zeros((*lanes, 4, 2), dtype),
+            visible=jnp.zeros(lanes, bool),
+            corner_sigma_px=jnp.zeros((*lanes, 4), dtype),
+        )
+        return Events(
+            stamps_us=jnp.zeros(EVENTS, jnp.int32),
+            speed_mps=jnp.zeros(EVENTS, dtype),
+            steering_rad=jnp.zeros(EVENTS, dtype),
+            has_odometry=jnp.zeros(EVENTS, bool),
+            corners=corners if seeing else None,
+        )
+
+    return Layout.of(jax.eval_shape(events))
 
 
 def _us_between(earlier_ns: int, later_ns: int) -> int:
@@ -148,6 +179,6 @@ def _us_between(earlier_ns: int, later_ns: int) -> int:
     return later_ns // 1000 - earlier_ns // 1000
 
 
-def _int32(number: int) -> np.int32:
+def _int32(number: int) -> int:
     """Inside of what it can be: half an hour, in us, within which nothing came."""
-    return np.int32(min(max(number, 0), 2**31 - 1))
+    return min(max(number, 0), 2**31 - 1)

@@ -14,6 +14,7 @@ from jaxnav.runtime.stamps import Stamps
 
 _FROZEN_AFTER = 3  # frames with the very same corners
 _NO_FAULT = Fault(0)
+_NONE = Detections.concatenate([])
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,7 @@ class Frames:
         if not frames:
             return None, now_ns, _NO_FAULT
         faults = _NO_FAULT
-        empty = Detections.concatenate([])
-        found = [empty] * len(self.newest_ns)
+        found = [_NONE] * len(self.newest_ns)
         taken_ns = None
         for frame in frames:
             faults |= frame.faults

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxnav.timeline import Moment
+from jaxnav.runtime.packing import Packed
 
 EVENTS = 64  # half a second of odometry at 50 Hz, and of frames at 30 Hz in two cameras
 
@@ -29,13 +29,13 @@ class Entry:
 
     stamp_ns: int
     told: Told | None  # None: where everything began
-    moment: Moment | None
+    moment: Packed | None
 
 
 class History:
     """The events of one drive."""
 
-    def __init__(self, moment: Moment, begin_ns: int, events: int = EVENTS):
+    def __init__(self, moment: Packed, begin_ns: int, events: int = EVENTS):
         """With nothing sensed, at some instant."""
         self._events = events
         self._entries = [Entry(begin_ns, None, moment)]
@@ -61,7 +61,7 @@ class History:
             entry.moment = None
         return entries[base], entries[base + 1 :]
 
-    def fused(self, moment: Moment, new: Entry, then: Moment) -> None:
+    def fused(self, moment: Packed, new: Entry, then: Packed) -> None:
         """Keep what is believed, and no more events than there is room.
 
         Args:

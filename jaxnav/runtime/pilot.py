@@ -10,6 +10,7 @@ R11). Every event is one call of one compiled program.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,6 +64,40 @@ class Outcome:
     restart_reason: str
 
 
+class _Known(NamedTuple):
+    """What the pilot looks at in a report: an attribute of an equinox module takes a us."""
+
+    pose: np.ndarray  # x_m, y_m, psi_rad
+    covariance: np.ndarray
+    located: bool
+    decided: bool
+    selected: int
+    nis: float
+    steering_rad: float
+    throttle: float
+    mean: np.ndarray
+
+    @staticmethod
+    def of(report: Report) -> "_Known":
+        output = report.output
+        assert output.command is not None
+        return _Known(
+            np.asarray(output.pose),
+            np.asarray(output.covariance),
+            bool(output.located),
+            bool(output.decided),
+            int(output.selected),
+            float(output.nis),
+            float(output.command.steering_rad),
+            float(output.command.throttle),
+            np.asarray(report.mean),
+        )
+
+    def sigma(self, *states: int) -> float:
+        """Of several states together."""
+        return math.sqrt(max(sum(float(self.covariance[state, state]) for state in states), 0.0))
+
+
 class Pilot:
     """One drive. Not for several threads."""
 
@@ -76,7 +111,7 @@ class Pilot:
         """Args:
         navigator: with a vehicle and waypoints.
         timeouts: see there.
-        program: `advance` of the navigator, compiled; by default by `jax.jit`.
+        program: `advance_packed` of the navigator, compiled; by default by `jax.jit`.
         corner_sigma_px: of every corner along one axis; by default as each detection says.
         """
         if navigator.controller is None:
@@ -94,10 +129,10 @@ class Pilot:
         self._distance_m = 0.0
         self._now_ns: int | None = None
         self._began_ns: int | None = None
-        self._report: Report | None = None
+        self._known: _Known | None = None
         self._restarts = self._restarts_before = 0
         self._restart_reason = ""
-        self._left: Report | None = None  # what was believed before a restart
+        self._left: _Known | None = None  # what was believed before a restart
         self._command = (0.0, 0.0)
         self._commanded_ns: int | None = None
 
@@ -153,23 +188,23 @@ class Pilot:
     ) -> Outcome:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
         fused = self._estimator.fuse(told, stamp_ns, now_ns, elapsed_ns)
-        output = fused.report.output
-        finite = all(np.isfinite(part).all() for part in (output.pose, output.covariance))
+        known = _Known.of(fused.report)
+        finite = all(np.isfinite(part).all() for part in (known.pose, known.covariance))
         if not finite:
             faults |= Fault.NOT_FINITE
             self._begin_anew("the estimate was no number")
         rejects |= Reject.TOO_LATE if fused.refused else _NO_REJECT
         if told is not None and told.corners_px is not None and not fused.refused:
-            rejects |= self._judge(fused.report, stamp_ns)
+            rejects |= self._judge(known, stamp_ns)
         restarts = self._restarts_before + int(fused.moment.restarts)
         if finite and restarts > self._restarts:
             self._restarts, self._restart_reason = restarts, "contradicted by the corners"
             faults |= Fault.RESTARTED
-            self._left = self._report
-        self._arrived_elsewhere(fused.report)
-        self._report, self._now_ns = fused.report, now_ns
-        health, faults = self._monitor.look(self._senses(now_ns, faults))
-        steering_rad, throttle = self._limited(health, now_ns, elapsed_ns)
+            self._left = self._known
+        self._arrived_elsewhere(known)
+        self._known, self._now_ns = known, now_ns
+        health, faults = self._monitor.look(self._senses(known, now_ns, faults))
+        steering_rad, throttle = self._limited(known, health, now_ns, elapsed_ns)
         return Outcome(
             now_ns,
             health,
@@ -185,54 +220,50 @@ class Pilot:
             self._restart_reason,
         )
 
-    def _arrived_elsewhere(self, report: Report) -> None:
+    def _arrived_elsewhere(self, known: _Known) -> None:
         """After a restart, once the pose is known again: how far it is from what was believed."""
-        if self._left is None or not report.output.decided:
+        if self._left is None or not known.decided:
             return
-        x_m, y_m, psi_rad = report.output.pose - self._left.output.pose
+        x_m, y_m, psi_rad = known.pose - self._left.pose
         psi_deg = math.degrees(math.remainder(float(psi_rad), math.tau))
         self._restart_reason += f"; {math.hypot(x_m, y_m):.2f} m and {psi_deg:.0f} deg away"
         self._left = None
 
-    def _judge(self, report: Report, stamp_ns: int) -> Reject:
+    def _judge(self, known: _Known, stamp_ns: int) -> Reject:
         """Whether the corners were believed."""
-        gate = self._gate_nis
-        nis = float(report.output.nis)
-        believed = bool(report.output.selected >= 0) and nis <= gate
+        gate, nis = self._gate_nis, known.nis
+        believed = known.selected >= 0 and nis <= gate
         self._monitor.corners(believed)
         if believed:
             self._fix_ns, self._distance_m = max(stamp_ns, self._fix_ns or 0), 0.0
             return Reject.INNOVATION_LARGE if nis > gate / 2 else _NO_REJECT
         return Reject.INNOVATION
 
-    def _limited(self, health: Health, now_ns: int, elapsed_ns: int) -> tuple[float, float]:
-        assert self._report is not None
-        command = self._report.output.command
-        assert command is not None
+    def _limited(
+        self, known: _Known, health: Health, now_ns: int, elapsed_ns: int
+    ) -> tuple[float, float]:
         self._command = self.limits.applied(
-            float(command.steering_rad),
-            float(command.throttle) * SPEED_FACTOR[health],
+            known.steering_rad,
+            known.throttle * SPEED_FACTOR[health],
             self._command[0],
             elapsed_ns / 1e9,
         )
         self._commanded_ns = now_ns
         return self._command
 
-    def _senses(self, now_ns: int, faults: Fault) -> Senses:
-        assert self._report is not None
+    def _senses(self, known: _Known, now_ns: int, faults: Fault) -> Senses:
         began_ns = self._began_ns if self._began_ns is not None else now_ns
-        output = self._report.output
 
         def age_s(stamp_ns: int | None) -> float:
             return max(now_ns - (began_ns if stamp_ns is None else stamp_ns), 0) / 1e9
 
         return Senses(
-            located=bool(output.located),
-            decided=bool(output.decided),
+            located=known.located,
+            decided=known.decided,
             fix_age_s=age_s(self._fix_ns),
             odometry_age_s=age_s(self._odometer_ns),
             cameras_age_s=tuple(age_s(stamp_ns) for stamp_ns in self._frames.newest_ns),
-            position_sigma_m=float(np.sqrt(np.trace(output.covariance[:2, :2]))),
+            position_sigma_m=known.sigma(0, 1),
             distance_m=self._distance_m,
             faults=faults,
         )
@@ -251,7 +282,7 @@ class Pilot:
         self._restarts += 1
         self._restarts_before, self._restart_reason = self._restarts, reason
         self._fix_ns, self._distance_m = None, 0.0
-        self._left = self._report
+        self._left = self._known
 
     def _seeing(self, now_ns: int) -> bool:
         """Whether corners tell of late how fast the vehicle is."""
@@ -259,10 +290,10 @@ class Pilot:
 
     def _speed(self) -> tuple[float, float] | None:
         """Speed along the course and its sigma, m/s, as far as they are known."""
-        if self._report is None or not self._report.output.decided:
+        known = self._known
+        if known is None or not known.decided:
             return None
-        velocity = np.asarray(self._report.mean[3:5], float)
-        heading = float(self._report.mean[2])
+        heading, *velocity = map(float, known.mean[2:5])
         forward = math.cos(heading) * velocity[0] + math.sin(heading) * velocity[1]
-        speed = math.copysign(float(np.hypot(*velocity)), forward)
-        return speed, float(np.sqrt(np.trace(self._report.output.covariance[3:5, 3:5])))
+        speed = math.copysign(math.hypot(*velocity), forward)
+        return speed, known.sigma(3, 4)
