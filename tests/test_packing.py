@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -24,6 +24,7 @@ def trees(draw):
     return {"first": leaves[:2], "others": tuple(leaves[2:]), "none": None}
 
 
+@settings(max_examples=20, deadline=None)
 @given(trees())
 def test_a_tree_is_found_again_bit_for_bit(tree):
     layout = Layout.of(tree)
@@ -37,6 +38,7 @@ def test_a_tree_is_found_again_bit_for_bit(tree):
             assert np.asarray(one).tobytes() == other.tobytes()
 
 
+@settings(max_examples=20, deadline=None)
 @given(trees())
 def test_what_is_written_to_the_room_is_in_the_vectors(tree):
     packed, views = Layout.of(tree).room()
