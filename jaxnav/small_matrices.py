@@ -126,6 +126,23 @@ def solve_positive(
     return jnp.stack(x)
 
 
+def eliminated(A: Float[Array, "n n"], B: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """A^-1 B for a positive definite A; NaN or inf where a pivot is 0.
+
+    For more unknowns than are worth unrolling, one kernel each.
+
+    Source: Golub, Van Loan (2013), section 4.2: elimination without pivoting, Gauss and Jordan's.
+    """
+    rows = jnp.arange(A.shape[0])[:, None]
+
+    def pivoted(k: Int[Array, ""], rest: Array) -> Array:
+        row = rest[k] / rest[k, k]
+        return jnp.where(rows == k, row[None], rest - rest[:, k][:, None] * row[None])
+
+    both = jnp.concatenate([A, B], axis=1)
+    return jax.lax.fori_loop(0, A.shape[0], pivoted, both)[:, A.shape[0] :]
+
+
 def ranks(values: Float[Array, " n"]) -> Int[Array, " n"]:
     """The place of each of a handful of values from the highest down, equal ones in their order.
 

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnav import executables
 from jaxnav.ambiguity import LowestReprojection
 from jaxnav.navigator import Navigator
-from jaxnav.runtime import compiled
 from jaxnav.runtime.compiled import compiled_step, is_compiled
 from tests import worlds
 
@@ -41,7 +41,7 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
     assert is_compiled(Navigator.step, moved, tmp_path, state, obs)
     assert not is_compiled(Navigator.coast, *asked[1:])
     (file,) = tmp_path.iterdir()
-    monkeypatch.setattr(compiled, "_compiled", never)
+    monkeypatch.setattr(executables, "_compiled", never)
     later, recalibrated = compiled_step(nav, tmp_path), compiled_step(moved, tmp_path)
     for step, which in ((first, nav), (later, nav), (recalibrated, moved)):
         for before in (nav.init(), state):  # the second call of each takes another way
@@ -54,13 +54,13 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     repaired, _ = compiled_step(nav, tmp_path)(nav.init(), obs)
     jax.tree.map(np.testing.assert_array_equal, repaired, state)
-    monkeypatch.setattr(compiled, "_compiled", never)
+    monkeypatch.setattr(executables, "_compiled", never)
     compiled_step(nav, tmp_path)(nav.init(), obs)
 
 
 def test_a_file_is_for_one_structure_shape_and_source(monkeypatch, tmp_path):
     def file(nav, shape=()):
-        return compiled._file(tmp_path, str(jax.tree.structure(nav)), [jnp.zeros(shape)])
+        return executables._file(tmp_path, str(jax.tree.structure(nav)), [jnp.zeros(shape)])
 
     nav = navigator()
     assert file(nav) == file(eqx.tree_at(lambda n: n.corner_sigma_px, nav, 2.0))
@@ -71,17 +71,18 @@ def test_a_file_is_for_one_structure_shape_and_source(monkeypatch, tmp_path):
     monkeypatch.setenv("XLA_FLAGS", "--another")
     others.append(file(nav))
     monkeypatch.undo()
-    (tmp_path / "jaxnav" / "runtime").mkdir(parents=True)
-    (tmp_path / "jaxnav" / "navigator.py").write_text("# changed")
-    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "jaxnav" / "runtime" / "compiled.py"))
-    others.append(file(nav))
+    monkeypatch.setattr(executables, "__file__", str(tmp_path / "executables.py"))
+    for folder in (tmp_path, tmp_path / "detection", tmp_path / "runtime"):
+        folder.mkdir(exist_ok=True)
+        (folder / "one.py").write_text("# changed")
+        others.append(file(nav))
     monkeypatch.undo()
-    assert len({file(nav), *others}) == 6
+    assert len({file(nav), *others}) == 8
 
 
 def test_without_a_folder_or_with_foreign_parts_nothing_is_kept(monkeypatch, tmp_path):
     """Whose source is not known can't be told apart from another of its name."""
-    monkeypatch.setattr(compiled, "_compiled", never)
+    monkeypatch.setattr(executables, "_compiled", never)
     obs = worlds.observe(worlds.qcar_rig(), worlds.paper_markers(), worlds.planar(*SEEN_FROM))
     for nav, folder in ((navigator(), None), (navigator(OnesOwn()), tmp_path)):
         _, out = compiled_step(nav, folder)(nav.init(), obs)
@@ -90,15 +91,44 @@ def test_without_a_folder_or_with_foreign_parts_nothing_is_kept(monkeypatch, tmp
 
 
 def test_old_files_go_and_a_full_disk_is_no_failure(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled, "_KEPT", 3)
+    monkeypatch.setattr(executables, "_KEPT", 3)
     for number in range(5):
-        compiled._keep(tmp_path / "steps" / f"{number}.step", number)
+        executables._keep(tmp_path / "steps" / f"{number}.step", number)
     assert len(list((tmp_path / "steps").iterdir())) == 3
     assert (tmp_path / "steps" / "4.step").exists()
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(compiled.pickle, "dumps", full)
-    compiled._keep(tmp_path / "steps" / "5.step", 5)
+    monkeypatch.setattr(executables.pickle, "dumps", full)
+    executables._keep(tmp_path / "steps" / "5.step", 5)
     assert len(list((tmp_path / "steps").iterdir())) == 3  # nothing half-written either
+
+
+def test_a_kept_function_is_the_jitted_one_and_is_traced_once(tmp_path):
+    traces = []
+
+    def moved(camera, points):
+        """Of other shapes, another program."""
+        traces.append(points.shape)
+        return camera.project(points) + 1.0, {"none": None}
+
+    camera = worlds.qcar_rig().camera(0)
+    points = [np.random.default_rng(0).random((n, 3)) + 0.5 for n in (4, 7, 4)]
+    wanted = [jax.jit(moved)(camera, some) for some in points]
+    traces.clear()
+    executables.keep_in(tmp_path)
+    try:
+        for start in range(2):  # as another process would
+            ours = executables.kept(moved)
+            for some, same in zip(points, wanted, strict=True):
+                jax.tree.map(np.testing.assert_array_equal, ours(camera, some), same)
+            assert traces == [(4, 3), (7, 3)], start
+        assert len(list(tmp_path.iterdir())) == 2
+        slope = jax.jacobian(lambda some: ours(camera, some)[0])(points[0])  # of tracers: jitted
+        assert np.isfinite(slope).all()
+        assert ours.__doc__ == moved.__doc__
+        executables.kept(jnp.linalg.inv)(np.eye(3))  # LAPACK's functions are not kept
+        assert len(list(tmp_path.iterdir())) == 2
+    finally:
+        executables.keep_in(None)

@@ -18,6 +18,7 @@ from jaxnav.navigator import Navigator
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.flags import Fault
 from jaxnav.runtime.interfaces import Frame
+from jaxnav.runtime.packing import Layout
 from jaxnav.runtime.pilot import Input, Pilot, Sighted
 from jaxnav.runtime.seeing import Region, Search
 from jaxnav.simulation.rendering import Renderer
@@ -214,8 +215,9 @@ class Drive:
         )
         made = make_report(np.random.default_rng(0))
         report = eqx.tree_at(lambda r: r.output.covariance, made, 1e-4 * np.eye(6))
+        packed = Layout.of(report).pack(report)
         self.pilot = Pilot(
-            navigator, program=lambda moment, control, *_: (moment, moment, control, report)
+            navigator, program=lambda moment, control, *_: (moment, moment, control, packed)
         )
         self.now_ns = BEGIN_NS
 

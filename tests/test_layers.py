@@ -49,6 +49,7 @@ LAYERS = {
     "users": {
         "calibration",
         "detection",
+        "executables",
         "files",
         "runtime",
         "simulation",
@@ -77,7 +78,9 @@ PURE_CORE = set(ORDER[: ORDER.index("users")])
 BETWEEN_USERS = {
     ("studies", "simulation"),
     ("tuning", "simulation"),
+    ("detection", "executables"),
     ("runtime", "detection"),
+    ("runtime", "executables"),
     ("runtime", "files"),
 }
 # `errors` is what the outside world gets: the pure core reports failure by value.

@@ -70,6 +70,16 @@ def test_many_positive_systems_side_by_side(n):
     assert not np.any(np.isfinite(small.solve_positive(-jnp.eye(n), jnp.ones(n))))
 
 
+@pytest.mark.parametrize("n", [1, 5, 11])
+def test_elimination_solves_for_all_right_sides_like_lapack(n):
+    rng = np.random.default_rng(n)
+    root = rng.normal(size=(n, n + 2)) * np.geomspace(1, 1e3, n)[:, None]
+    A, B = root @ root.T, rng.normal(size=(n, 4))
+    X = jax.jit(small.eliminated)(A, B)
+    np.testing.assert_allclose(X, np.linalg.solve(A, B), rtol=1e-6, atol=1e-10)
+    assert not np.all(np.isfinite(small.eliminated(jnp.zeros((n, n)), jnp.ones((n, 1)))))
+
+
 @pytest.mark.parametrize("values", [[3.0, 1.0, 2.0], [1.0, 1.0, 1.0], [-np.inf, 5.0, -np.inf, 5.0]])
 def test_ranks_are_those_of_a_stable_sort(values):
     order = np.argsort(-np.asarray(values), kind="stable")

@@ -13,6 +13,7 @@ from jaxnav.commands.observers import open_onlookers
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.detection import make_detectors
 from jaxnav.errors import BadInput
+from jaxnav.executables import keep_in
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.runtime import plugins
 from jaxnav.runtime.drive_setup import DriveSetup
@@ -29,6 +30,7 @@ EXIT_SIGNAL = 128
 def run(args: Run) -> int:
     """Drive, and say why it ended."""
     configure_jax(float64=args.float64, threads=1)
+    keep_in(step_folder())
     options = _options(args.option)
     setup = _setup(args)
     searches = _searches(args, setup)

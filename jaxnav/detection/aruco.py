@@ -14,6 +14,8 @@ from jaxnav.detection.types import Detections, grey, refined_detections
 _CLOSER_LOOK_PX = (8.0, 150.0)
 _ENLARGE_UP_TO_PX = 40.0
 _ENLARGE = 3
+_PERIMETER_RATE = 0.03  # OpenCV's, of the longer side of the image
+_SMALLEST = 0.6  # part of the predicted perimeter
 # A prediction may be off by this part of its side, and by some pixels.
 _SEARCH_SIDES, _SEARCH_PX = 0.5, 8
 
@@ -34,11 +36,7 @@ class ArucoDetector:
         """
         self.family = family
         self._closer_looks = closer_looks
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-        # By default the outline of the white paper swallows the marker on it: 3 of 10 frames lost.
-        parameters.minMarkerDistanceRate = 0.02
-        self._decoder = cv2.aruco.ArucoDetector(dictionary(family), parameters)
+        self._decoders: dict[float, cv2.aruco.ArucoDetector] = {}
 
     def detect(
         self,
@@ -94,9 +92,24 @@ class ArucoDetector:
                     break
         return refined_detections(image, found, self.family, camera)
 
-    def _decode(self, image: np.ndarray) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
+    def _decoder(self, perimeter_rate: float) -> cv2.aruco.ArucoDetector:
+        """For quadrilaterals whose perimeter is at least that part of the image's longer side."""
+        if perimeter_rate not in self._decoders:
+            parameters = cv2.aruco.DetectorParameters()
+            parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+            # By default the outline of the white paper swallows the marker: 3 of 10 frames lost.
+            parameters.minMarkerDistanceRate = 0.02
+            parameters.minMarkerPerimeterRate = max(perimeter_rate, _PERIMETER_RATE)
+            self._decoders[perimeter_rate] = cv2.aruco.ArucoDetector(
+                dictionary(self.family), parameters
+            )
+        return self._decoders[perimeter_rate]
+
+    def _decode(
+        self, image: np.ndarray, perimeter_rate: float = 0.0
+    ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
         """What OpenCV read, (id, corners) each, and the quadrilaterals that it could not read."""
-        quads, ids, unread = self._decoder.detectMarkers(image)
+        quads, ids, unread = self._decoder(perimeter_rate).detectMarkers(image)
         found_ids = [] if ids is None else [int(i) for i in ids.ravel()]
         found = [
             (i, quad.reshape(4, 2).astype(float)) for i, quad in zip(found_ids, quads, strict=True)
@@ -120,10 +133,13 @@ class ArucoDetector:
         if np.any(high - low < 8):
             return [], []
         region = image[low[1] : high[1], low[0] : high[0]]
-        scale = _ENLARGE if mean_side_px(quad) <= _ENLARGE_UP_TO_PX else 1
+        side_px = mean_side_px(quad)
+        # Its cells are no markers: to find out takes OpenCV over 1 ms for each.
+        perimeter_rate = _SMALLEST * 4 * side_px / max(high - low)
+        scale = _ENLARGE if side_px <= _ENLARGE_UP_TO_PX else 1
         if scale > 1:
             region = cv2.resize(region, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        found, unread = self._decode(region)
+        found, unread = self._decode(region, np.floor(10 * perimeter_rate) / 10)
 
         def back(corners: np.ndarray) -> np.ndarray:
             return (corners + 0.5) / scale - 0.5 + low

@@ -27,6 +27,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
+from jaxnav.executables import kept
+from jaxnav.small_matrices import eliminated
 
 PIXELS = 1024  # of one fit: the rest are masked
 _STEPS = 20
@@ -81,7 +83,7 @@ def step_corners(cells: np.ndarray) -> np.ndarray:
     return np.diff(np.diff(np.pad(1 - cells, 1), axis=0), axis=1)
 
 
-@jax.jit
+@kept
 def fit_edges(
     rays: Float[Array, "3 N"],
     rays_px: Float[Array, "2 3 N"],
@@ -112,7 +114,7 @@ def fit_edges(
     def attempt(s: _State) -> _State:
         diagonal = jnp.diagonal(s.hessian)
         ridge = jnp.diag(s.damping * diagonal + 1e-6 * jnp.max(diagonal[:8]))
-        step = jnp.linalg.solve(s.hessian + ridge, s.gradient)
+        step = eliminated(s.hessian + ridge, s.gradient[:, None])[:, 0]
         size = jnp.max(jnp.abs(_CORNER_MOTION @ step[:8]))
         step = step * jnp.minimum(1, _MAX_STEP / jnp.maximum(size, 1e-9))
         M, blur = _moved(s.M, s.blur, step)
@@ -134,7 +136,8 @@ def fit_edges(
     freedom = jnp.maximum(jnp.sum(weight) - 16, 1)
     noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
     ridge = jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(s.hessian), 1e-6 * jnp.max(s.hessian)))
-    covariance = jnp.linalg.inv(s.hessian + ridge)[:8, :8] * noise**2
+    units = jnp.eye(s.hessian.shape[0], dtype=one.dtype)
+    covariance = eliminated(s.hessian + ridge, units)[:8, :8] * noise**2
     return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, s.residual, s.converged)
 
 
@@ -161,7 +164,7 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     weighted = light * weight[None]
     prior = jnp.zeros((5, 5), dark.dtype).at[4, 4].set(_FAR_PRIOR)
     gram = weighted @ light.T + prior
-    solved = jnp.linalg.solve(
+    solved = eliminated(
         gram,
         jnp.concatenate([(weighted @ patch.levels)[:, None], weighted @ jacobian.T], axis=1),
     )
@@ -187,7 +190,9 @@ def _dark(xy: Array, variance: Array, split: Array, K: Array) -> tuple[Array, Ar
     columns, rows = (
         _hermite_terms(xy[i : i + 1] - knots, sigma[i : i + 1], split[i : i + 1]) for i in (0, 1)
     )
+    # A product is computed once; all else once more for each of the two dozen sums below.
     rows = [K.T @ term for term in rows]
+    columns = [jnp.eye(K.shape[0], dtype=K.dtype) @ term for term in columns]
 
     def derivative(i: int, j: int) -> Array:
         value, factor = jnp.zeros_like(covariance), jnp.ones_like(covariance)

@@ -10,14 +10,15 @@ import numpy as np
 
 from jaxnav.camera import Camera
 from jaxnav.detection.edges import PIXELS
+from jaxnav.executables import kept
 
 
-@jax.jit
+@kept
 def _rays_and_jacobians(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
     return camera.unproject(pixels), jax.vmap(jax.jacfwd(camera.unproject))(pixels)
 
 
-@jax.jit
+@kept
 def _project(camera: Camera, points_camera: jax.Array) -> jax.Array:
     return camera.project(points_camera)
 

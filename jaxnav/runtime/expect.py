@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from jaxnav.executables import kept
 from jaxnav.geometry import on_last_axis, rotation_matrix, safe_norm, safe_sqrt, transform_points
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
@@ -19,6 +20,7 @@ from jaxnav.rig import CameraRig
 SIGMAS = 3.0
 # The corner's own noise, and how far a corner moves while the exposure lasts.
 MARGIN_PX = 4.0
+_SPENT = 1e-6  # of a variance is rounding
 
 
 class Expected(NamedTuple):
@@ -36,7 +38,7 @@ class Expected(NamedTuple):
     radius_px: Float[Array, "C M"]
 
 
-@jax.jit
+@kept
 def expected(
     rig: CameraRig,
     markers: MarkerMap,
@@ -46,7 +48,7 @@ def expected(
 ) -> Expected:
     """Where each marker should appear.
 
-    With a_k the principal axes of the pose's covariance, each one sigma long, and u(x) a corner,
+    With vectors a_k whose sum of a_k a_k' is the pose's covariance, and u(x) a corner,
 
         radius = sqrt(sum over k of max |u(x +- 3 a_k) - u(x)|^2) + margin.
 
@@ -60,8 +62,7 @@ def expected(
         margin_px: added to every radius.
     """
     mean = jaxlie.SE3(T_world_vehicle)
-    variances, axes = jnp.linalg.eigh((covariance + covariance.T) / 2)
-    offsets = SIGMAS * (axes * safe_sqrt(variances)[None]).T
+    offsets = SIGMAS * _axes(covariance)
     # Half a turn further the vehicle would look where it looked before.
     limit = jnp.asarray([jnp.inf, jnp.inf, jnp.pi / 2], offsets.dtype)
     offsets = jnp.clip(offsets, -limit[None], limit[None])
@@ -75,7 +76,20 @@ def expected(
     spread_px = safe_norm(jnp.moveaxis(jnp.max(shifts_px, axis=0), 0, -1))
     radius_px = jnp.max(spread_px, axis=-1) + margin_px
     visible = _inside(rig, quads_px, radius_px) & _towards(rig, markers, mean)
-    return Expected(quads_px, visible & jnp.isfinite(radius_px), radius_px)
+    finite = jnp.isfinite(radius_px) & jnp.all(jnp.isfinite(covariance))
+    return Expected(quads_px, visible & finite, radius_px)
+
+
+def _axes(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Rows a_k: Cholesky's columns, none where a variance is spent. No call of LAPACK, which a
+    program that is loaded from a disk does not find."""
+    rows: list[Array] = []
+    for k in range(3):
+        rest = covariance[k] - sum((row[k] * row for row in rows), jnp.zeros_like(covariance[k]))
+        spent = ~(rest[k] > _SPENT * covariance[k, k])
+        row = rest * jnp.where(spent, 0, 1 / safe_sqrt(jnp.where(spent, 1, rest[k])))
+        rows.append(jnp.where(jnp.arange(3) < k, 0, row))
+    return jnp.stack(rows)
 
 
 def _moved(T_world_vehicle: jaxlie.SE3, offset: Float[Array, " 3"]) -> jaxlie.SE3:
