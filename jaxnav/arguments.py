@@ -341,20 +341,23 @@ class Run:
 
     Everything is compiled before the vehicle is armed. The last that it hears, however this ends,
     is zero throttle: at the last waypoint, on Ctrl-C and SIGTERM, when data are missing for too
-    long, and when anything hangs or fails. `--vehicle sim` is a simulated car in real time.
+    long, and when anything hangs or fails. `--vehicle sim` is a simulated car in real time;
+    `--vehicle replay --option drive=FILE` is a recorded drive, with its own rig, markers, vehicle
+    and route.
 
-    Exit codes: 0 arrived or out of time, 1 stopped by the watchdog, 130 and 143 by a signal.
+    Exit codes: 0 arrived, out of time or recording, 1 stopped by the watchdog, 130 and 143 by a
+    signal.
     """
 
     vehicle: str = "sim"
-    """An installed vehicle (sim, qcar, ros2 and those of plug-ins), or MODULE:NAME."""
+    """An installed vehicle (sim, qcar, ros2, replay and those of plug-ins), or MODULE:NAME."""
     cameras: Annotated[
         str | None,
         tyro.conf.arg(
             metavar="NAME", constructor=str, help_behavior_hint="(default: as --vehicle)"
         ),
     ] = None
-    """Installed cameras (sim, qcar, opencv and those of plug-ins), or MODULE:NAME."""
+    """Installed cameras (sim, qcar, opencv, replay and those of plug-ins), or MODULE:NAME."""
     option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE")] = ()
     """What the vehicle and the cameras are told, e.g. images=true for sim."""
     rig: QCarFile = None

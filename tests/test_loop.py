@@ -110,8 +110,8 @@ def standing() -> Throttle:
 class Drive:
     """A loop that runs in a thread of its own."""
 
-    def __init__(self, pilot):
-        self.car, self.pilot = Car(), pilot
+    def __init__(self, pilot, car=None):
+        self.car, self.pilot = car or Car(), pilot
         pilot.act = lambda: None
         pilot.handled.clear()
         self.cameras = [Eye(name) for name in ("front", "right", "rear", "left")]
@@ -205,6 +205,29 @@ def test_it_ends_when_its_time_is_over(standing):
         drive.thread.join(5)
         assert drive.ended == "time is over"
         assert drive.loop.statistics.quantile_ms("handle odometry", 0.5) < 100
+        assert not drive.loop.stopped
+
+
+class Recorded(Car):
+    """Has nothing more to drive, some time."""
+
+    over = None
+
+
+def test_it_ends_in_good_order_when_the_vehicle_has_nothing_more_to_drive(standing):
+    with Drive(standing, Recorded()) as drive:
+        drive.car.over = "the tape is over"
+        drive.thread.join(1)
+        assert drive.ended == "the tape is over"
+        assert not drive.loop.stopped
+
+
+def test_a_drive_that_the_guard_ends_was_stopped(standing):
+    with Drive(standing, Recorded()) as drive:
+        drive.guard.trip("enough")
+        drive.thread.join(1)
+        assert drive.ended == "enough"
+        assert drive.loop.stopped
 
 
 def found(count, shift=0.0):

@@ -213,7 +213,7 @@ def refused(workplace: Workplace, folder: Path, *arguments: object) -> Ended:
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["--vehicle", "bicycle"], "--vehicle: there is no 'bicycle': expected qcar, ros2, sim or"),
+        (["--vehicle", "bicycle"], "--vehicle: there is no 'bicycle': expected qcar, "),
         (["--option", "images"], "--option: expected KEY=VALUE, got 'images'"),
         (["--record", "nowhere/drive.mcap"], "nowhere/drive.mcap: can't be written: no such file"),
         (["--record", "/dev/full"], "/dev/full: can't be written: no space left on device"),

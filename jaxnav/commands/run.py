@@ -3,8 +3,10 @@
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_veh
 from jaxnav.runtime import plugins
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.guard import Guard
-from jaxnav.runtime.interfaces import Setup
+from jaxnav.runtime.interfaces import HasOwnFiles, Setup
 from jaxnav.runtime.loop import Loop, Observer
 from jaxnav.runtime.pilot import Pilot
 from jaxnav.runtime.seeing import Eyes, Search
@@ -32,7 +34,7 @@ def run(args: Run) -> int:
     configure_jax(float64=args.float64, threads=1)
     keep_in(step_folder())
     options = _options(args.option)
-    setup = _setup(args)
+    setup = _setup(args, options)
     searches = _searches(args, setup)
     with ExitStack() as closing:
         onlookers = open_onlookers(args, setup, closing)
@@ -47,7 +49,7 @@ def run(args: Run) -> int:
             print(onlooker.told)
     if loop.guard.signal is not None:
         return EXIT_SIGNAL + loop.guard.signal
-    return 0 if reason in ("arrived", "time is over") else EXIT_STOPPED
+    return EXIT_STOPPED if loop.stopped else 0
 
 
 def _options(given: Sequence[str]) -> dict[str, str]:
@@ -60,17 +62,24 @@ def _options(given: Sequence[str]) -> dict[str, str]:
     return options
 
 
-def _setup(args: Run) -> DriveSetup:
+def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     """Read all files and find all plug-ins first: bad input is found before anything is compiled,
     let alone moves."""
-    plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
+    factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
     plugins.find("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
+    own = factory.own_files(options) if isinstance(factory, HasOwnFiles) else None
     qcar = calib_dir() / "qcar"
+
+    def chosen(name: str, path: Path | None, load: Callable[[Path], Any]) -> Any:
+        if path is None and own is not None:
+            return getattr(own, name)
+        return load(path or qcar / f"{name}.yaml")
+
     return DriveSetup(
-        rig=load_rig(args.rig or qcar / "rig.yaml"),
-        markers=load_markers(args.markers or qcar / "markers.yaml"),
-        vehicle=load_vehicle(args.vehicle_file or qcar / "vehicle.yaml"),
-        route=load_route(args.route or qcar / "route.yaml"),
+        rig=chosen("rig", args.rig, load_rig),
+        markers=chosen("markers", args.markers, load_markers),
+        vehicle=chosen("vehicle", args.vehicle_file, load_vehicle),
+        route=chosen("route", args.route, load_route),
         selector=args.selector,
         float64=args.float64,
     )

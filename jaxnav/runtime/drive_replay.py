@@ -23,7 +23,7 @@ from jaxnav.runtime.drive_log import DriveLog, Outcomes
 from jaxnav.runtime.drive_setup import DriveSetup, made_here
 from jaxnav.runtime.flags import Fault, Health, Reject, names
 from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.image_search import ImageSearch
+from jaxnav.runtime.image_search import ImageSearch, size_problem
 from jaxnav.runtime.messages import digest
 from jaxnav.runtime.pilot import Input, Outcome
 
@@ -190,7 +190,7 @@ def inputs_from_images(
         pixels = cv2.imdecode(np.frombuffer(image.jpeg, np.uint8), cv2.IMREAD_COLOR)
         if pixels is None:
             raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
-        if problem := search.size_problem(camera, pixels):
+        if problem := size_problem(setup.rig, camera, pixels):
             raise BadInput(f"{log.path}: {image.topic}", problem)
         found[camera, image.stamp_ns] = search.detections(camera, pixels)
     if not found:

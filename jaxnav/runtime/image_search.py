@@ -22,18 +22,6 @@ class ImageSearch:
         self._detectors = make_detectors(markers, corner_backend)
         self._lenses: dict[int, Camera] = {}
 
-    def size_problem(self, camera: int, image: np.ndarray) -> str | None:
-        """What is wrong with the size of an image of a camera; None: nothing."""
-        height, width = image.shape[:2]
-        expected = self._rig.image_sizes_px[camera]
-        if (width, height) == expected:
-            return None
-        name = self._rig.names[camera]
-        return (
-            f"the images are {width} x {height} px, but the rig's {name!r} has "
-            f"{expected[0]} x {expected[1]} px"
-        )
-
     def detections(self, camera: int, image: np.ndarray) -> Detections:
         """All markers of the map's families in a camera's image.
 
@@ -45,3 +33,15 @@ class ImageSearch:
             self._lenses[camera] = self._rig.camera(camera)
         lens = self._lenses[camera]
         return Detections.concatenate([found.detect(image, lens) for found in self._detectors])
+
+
+def size_problem(rig: CameraRig, camera: int, image: np.ndarray) -> str | None:
+    """What is wrong with the size of an image of a rig's camera; None: nothing."""
+    height, width = image.shape[:2]
+    expected = rig.image_sizes_px[camera]
+    if (width, height) == expected:
+        return None
+    return (
+        f"the images are {width} x {height} px, but the rig's {rig.names[camera]!r} has "
+        f"{expected[0]} x {expected[1]} px"
+    )

@@ -6,7 +6,8 @@ A plug-in is a factory, found by an entry point of the group `jaxnav.vehicles` o
     def open_vehicle(setup: Setup) -> Vehicle
     def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]   # one for each of the rig
 
-`jaxnav.testing.check_vehicle` and `check_cameras` say whether it keeps its promises.
+`jaxnav.testing.check_vehicle` and `check_cameras` say whether it keeps its promises. A vehicle may
+also be `Ending`, and its factory may have `HasOwnFiles`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,7 @@ import numpy as np
 
 from jaxnav.bicycle import Vehicle as VehicleModel
 from jaxnav.detection.types import Detections
+from jaxnav.files import Route
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
@@ -101,6 +103,16 @@ class Vehicle(Protocol):
 
 
 @runtime_checkable
+class Ending(Protocol):
+    """What a vehicle may have beside: its drive can be over by itself, as a recording's is."""
+
+    @property
+    def over(self) -> str | None:
+        """Why there is nothing more to drive, which ends the loop in good order; None: there is."""
+        ...
+
+
+@runtime_checkable
 class Camera(Protocol):
     """One camera, read by a thread of its own."""
 
@@ -124,3 +136,27 @@ class Camera(Protocol):
 
 OpenVehicle = Callable[[Setup], Vehicle]
 OpenCameras = Callable[[Setup, Vehicle], Sequence[Camera]]
+
+
+@dataclass(frozen=True)
+class OwnFiles:
+    """What a vehicle brings with it."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: VehicleModel
+    route: Route
+
+
+@runtime_checkable
+class HasOwnFiles(Protocol):
+    """What the factory of a vehicle, a class perhaps, may have beside: where no flag names a file,
+    the vehicle's own is taken."""
+
+    def own_files(self, options: Mapping[str, str]) -> OwnFiles:
+        """Called before anything is opened, in the precision of the drive.
+
+        Raises:
+            BadInput: an option is wrong, or what it names.
+        """
+        ...

@@ -19,7 +19,7 @@ from jaxnav.runtime.expect import Expected, expected
 from jaxnav.runtime.flags import Fault
 from jaxnav.runtime.frames import Sighted
 from jaxnav.runtime.guard import Guard
-from jaxnav.runtime.interfaces import Frame, Vehicle
+from jaxnav.runtime.interfaces import Ending, Frame, Vehicle
 from jaxnav.runtime.pilot import Input, Outcome, Pilot
 from jaxnav.runtime.seeing import Eyes, Region, groups
 
@@ -71,7 +71,11 @@ class Statistics:
 
 
 class Loop:
-    """One drive."""
+    """One drive.
+
+    Attributes:
+        stopped: whether it was the guard that ended it.
+    """
 
     def __init__(
         self,
@@ -90,6 +94,7 @@ class Loop:
         period_s: between two readings of the odometer.
         """
         self.pilot, self.guard, self.statistics = pilot, guard, Statistics()
+        self.stopped = False
         self._vehicle, self._eyes, self._observers = vehicle, eyes, list(observers)
         self._period_ns = int(period_s * 1e9)
         self._now_ns = now_ns
@@ -104,11 +109,12 @@ class Loop:
         self._expected(np.array([1, 0, 0, 0, 0, 0, 0], dtype), self._min_covariance)
 
     def run(self, duration_s: float = float("inf")) -> str:
-        """Drive until the last waypoint, the guard's word, or the end of the time.
+        """Drive until the last waypoint, the guard's word, or the end of the time or the vehicle.
 
         Returns:
-            Why it ended: "arrived", "time is over", or the guard's reason.
+            Why it ended: "arrived", "time is over", what an `Ending` vehicle or the guard says.
         """
+        ending = self._vehicle if isinstance(self._vehicle, Ending) else None
         self._eyes.expected = self._region
         self._eyes.start()
         begin_ns = self._now_ns()
@@ -128,11 +134,14 @@ class Loop:
             self.guard.beat(_THREAD)
             if (now_ns - begin_ns) / 1e9 > duration_s:
                 return "time is over"
+            if ending is not None and (why := ending.over) is not None:
+                return why
             if self._outcome is not None and self._outcome.report.output.done:
                 arrived_ns = arrived_ns or now_ns
                 if now_ns - arrived_ns > _STAYS_S * 1e9:
                     return "arrived"
             self._eyes.wait((due_ns - self._now_ns()) / 1e9)
+        self.stopped = True
         return self.guard.reason or "stopped"
 
     def _tick(self, faults: Fault) -> None:

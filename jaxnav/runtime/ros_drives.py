@@ -22,7 +22,7 @@ from jaxnav.rig import CameraRig
 from jaxnav.runtime import ros_messages
 from jaxnav.runtime.flags import Fault
 from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.image_search import ImageSearch
+from jaxnav.runtime.image_search import ImageSearch, size_problem
 from jaxnav.runtime.pilot import Input
 from jaxnav.runtime.ros_bags import Received, one_line, read_messages
 
@@ -169,7 +169,7 @@ class _Reader:
         if image is None:
             return None
         self._images = self._images or ImageSearch(self.rig, self.markers, self.corner_backend)
-        if problem := self._images.size_problem(camera, image):
+        if problem := size_problem(self.rig, camera, image):
             raise BadInput(self.path, f"{received.topic}: {problem}")
         return self._images.detections(camera, image)
 

@@ -1,0 +1,274 @@
+"""A recorded drive as a vehicle, in real time: nothing moves, all comes once more as it came.
+
+jaxnav run --vehicle replay --option drive=drive.mcap                  # detections as recorded
+jaxnav run --vehicle replay --option drive=drive.mcap images=true      # the recorded images
+
+What was handed over at an instant of the recording is handed over so long after the first look at
+it, as old as it was then; its stamps are moved into the present. Readings and frames that were
+invalid are so again, and a reading that failed fails. The whole drive is held in memory, with its
+JPEGs where they are asked for.
+"""
+
+import contextlib
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jaxnav.errors import BadInput
+from jaxnav.rig import CameraRig
+from jaxnav.runtime.drive_log import DriveLog, read_drive
+from jaxnav.runtime.drive_replay import check_inputs
+from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.runtime.flags import Fault
+from jaxnav.runtime.frames import Sighted
+from jaxnav.runtime.image_search import size_problem
+from jaxnav.runtime.interfaces import Camera, Frame, Odometry, OwnFiles, Setup, Vehicle
+from jaxnav.vehicles.options import choice
+
+_WAITS_NS = 50_000_000  # so long a reading waits its turn when several came between two looks
+_LINGERS_NS = 50_000_000  # after the last input, until whoever looks for markers is done with it
+
+
+class Clock:
+    """What time it is in a recording, which begins when it is first asked. For several threads."""
+
+    def __init__(self, begin_ns: int):
+        """Args:
+        begin_ns: of the recording, on its own clock.
+        """
+        self._begin_ns = begin_ns
+        self._shift_ns: int | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it was asked."""
+        return self._shift_ns is not None
+
+    def recorded_ns(self) -> int:
+        """Now, on the recording's clock."""
+        shift_ns = self._shift()
+        return time.monotonic_ns() - shift_ns
+
+    def present_ns(self, stamp_ns: int) -> int:
+        """A stamp of the recording on the clock of today; one that never was one stays wrong."""
+        return stamp_ns + self._shift() if stamp_ns > 0 else stamp_ns
+
+    def _shift(self) -> int:
+        with self._lock:
+            if self._shift_ns is None:
+                self._shift_ns = time.monotonic_ns() - self._begin_ns
+            return self._shift_ns
+
+
+class ReplayVehicle:
+    """The car of a recording: it is read as it was read then, and whatever it is told is counted.
+
+    Attributes:
+        recorded: the recording.
+        camera_names: of its cameras, in the order of its rig.
+        clock: of all that is read from it.
+        writes: how many commands it was told.
+        throttle: the last one's; 0 once it was stopped.
+    """
+
+    def __init__(self, setup: Setup):
+        """Options: drive, the recording; images (false).
+
+        Raises:
+            BadInput: the recording is missing, none, empty or damaged, or an option is wrong.
+        """
+        self.recorded, own = _recorded(setup.options)
+        self.camera_names = own.rig.names
+        self.clock = Clock(self.recorded.inputs[0].now_ns)
+        self.writes, self.throttle = 0, 0.0
+        self._end_ns = self.recorded.inputs[-1].now_ns + _LINGERS_NS
+        # When each look at the vehicle was, and what it gave; None: it failed.
+        self._readings = [
+            (given.now_ns, given.odometry)
+            for given in self.recorded.inputs
+            if given.odometry is not None or Fault.VEHICLE_FAILED in given.faults
+        ]
+        self._next = 0
+        self._reading: Odometry | None = None
+        self._closed = False
+
+    @staticmethod
+    def own_files(options: Mapping[str, str]) -> OwnFiles:
+        """See `HasOwnFiles`: those that the drive was recorded with."""
+        _, own = _recorded(options)
+        return OwnFiles(own.rig, own.markers, own.vehicle, own.route)
+
+    @property
+    def timeout_s(self) -> float:
+        """See `Vehicle`. It stands, whatever it is told; any time is true."""
+        return 0.2
+
+    @property
+    def over(self) -> str | None:
+        """See `Ending`. Whoever asks does not look: the recording does not begin by it."""
+        is_over = self.clock.is_running and self.clock.recorded_ns() > self._end_ns
+        return "the recording is over" if is_over else None
+
+    def read(self) -> Odometry:
+        """See `Vehicle`. Those that came since the last look come one by one, if not too late; at
+        the end the last one comes again and again.
+
+        Raises:
+            OSError: it could not be read then, or not yet; it is closed.
+        """
+        now_ns = self.clock.recorded_ns()
+        while self._next < len(self._readings) and self._readings[self._next][0] <= now_ns:
+            due_ns, self._reading = self._readings[self._next]
+            self._next += 1
+            if now_ns - due_ns < _WAITS_NS:
+                break
+        if self._closed or self._reading is None:
+            raise OSError("the vehicle is closed" if self._closed else "nothing was read")
+        reading = self._reading
+        return Odometry(
+            self.clock.present_ns(reading.stamp_ns),
+            reading.speed_mps,
+            reading.steering_rad,
+            reading.valid,
+        )
+
+    def write(self, steering_rad: float, throttle: float) -> None:
+        """See `Vehicle`. It goes nowhere."""
+        if self._closed:
+            raise OSError("the vehicle is closed")
+        self.writes, self.throttle = self.writes + 1, throttle
+
+    def stop(self) -> None:
+        """See `Vehicle`."""
+        self.throttle = 0.0
+
+    def close(self) -> None:
+        """See `Vehicle`."""
+        self._closed = True
+        self.stop()
+
+
+class ReplayCamera:
+    """One camera of the recording."""
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        frames: Sequence[tuple[int, Sighted]],
+        jpegs: Mapping[int, bytes],
+    ):
+        """Args:
+        frames: when they were handled, ns of the recording, in that order.
+        jpegs: stamp of the recording in ns -> what is to be shown in place of detections.
+        """
+        self._name, self._clock = name, clock
+        self._frames, self._jpegs = frames, jpegs
+        self._next = 0
+        self._closed = threading.Event()
+
+    @property
+    def name(self) -> str:
+        """See `Camera`."""
+        return self._name
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """See `Camera`. A frame that could not be used has no image."""
+        left_s = np.inf
+        if self._next < len(self._frames):
+            due_ns, sighted = self._frames[self._next]
+            left_s = max(due_ns - self._clock.recorded_ns(), 0) / 1e9
+        if self._closed.wait(min(left_s, timeout_s)) or left_s > timeout_s:
+            return None
+        self._next += 1
+        stamp_ns = self._clock.present_ns(sighted.stamp_ns)
+        if sighted.stamp_ns in self._jpegs:
+            return Frame(stamp_ns, _decoded(self._jpegs[sighted.stamp_ns]))
+        return Frame(stamp_ns, None, sighted.detections)
+
+    def close(self) -> None:
+        """See `Camera`."""
+        self._closed.set()
+
+
+def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
+    """The recording's cameras, by their names in the rig.
+
+    Options: images (false): show the recorded images, in which markers are then looked for.
+
+    Raises:
+        BadInput: another vehicle; a camera that was not recorded; images that are missing, can't be
+            decoded or have another size than the rig's.
+    """
+    if not isinstance(vehicle, ReplayVehicle):
+        raise BadInput("--cameras", "replay shows what --vehicle replay has recorded")
+    log, rig = vehicle.recorded, setup.rig
+    for name in rig.names:
+        if name not in vehicle.camera_names:
+            problem = f"{log.path} has no camera {name!r}: it has {', '.join(vehicle.camera_names)}"
+            raise BadInput("--rig", problem)
+    frames: dict[str, list[tuple[int, Sighted]]] = {name: [] for name in vehicle.camera_names}
+    for given in log.inputs:
+        for sighted in given.frames:
+            frames[vehicle.camera_names[sighted.camera]].append((given.now_ns, sighted))
+    jpegs = _jpegs(log, rig) if _shows_images(setup.options) else {name: {} for name in rig.names}
+    return [ReplayCamera(name, vehicle.clock, frames[name], jpegs[name]) for name in rig.names]
+
+
+def _shows_images(options: Mapping[str, str]) -> bool:
+    return choice(options, "images", ("false", "true")) == "true"
+
+
+def _recorded(options: Mapping[str, str]) -> tuple[DriveLog, DriveSetup]:
+    """The recording, and with what it was driven; in the precision of this process."""
+    if not options.get("drive"):
+        raise BadInput("--option drive", "missing: the recorded drive (.mcap)")
+    path, written_ns = Path(options["drive"]), 0
+    with contextlib.suppress(OSError):
+        written_ns = path.stat().st_mtime_ns
+    log = _read(path, written_ns)
+    own = DriveSetup.of_header(log.header, path)
+    if not log.inputs:
+        raise BadInput(path, "holds no input")
+    check_inputs(log.inputs, own, path)
+    if _shows_images(options):
+        topics = [f"/camera/{name}" for name in own.rig.names]
+        if not any(image.topic in topics for image in log.images()):
+            raise BadInput(path, f"holds no image on {', '.join(topics)}")
+    return log, own
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, written_ns: int) -> DriveLog:
+    """Once for its files and once for its drive."""
+    return read_drive(path)
+
+
+def _jpegs(log: DriveLog, rig: CameraRig) -> dict[str, dict[int, bytes]]:
+    """For each camera of a rig, its images by their stamps."""
+    found: dict[str, dict[int, bytes]] = {name: {} for name in rig.names}
+    for image in log.images():
+        name = image.topic.removeprefix("/camera/")
+        if name not in found:
+            continue
+        if not found[name]:
+            pixels = _decoded(image.jpeg)
+            if pixels is None:
+                raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
+            if problem := size_problem(rig, rig.names.index(name), pixels):
+                raise BadInput(f"{log.path}: {image.topic}", problem)
+        found[name][image.stamp_ns] = image.jpeg
+    return found
+
+
+def _decoded(jpeg: bytes) -> np.ndarray | None:
+    """(H, W, 3) BGR; None: it is damaged."""
+    if not jpeg:
+        return None
+    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)

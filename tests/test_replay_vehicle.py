@@ -1,0 +1,370 @@
+"""A recorded drive as a vehicle: what was recorded comes once more, at its pace, into the loop."""
+
+import dataclasses
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxnav import cli
+from jaxnav.detection.types import Detections
+from jaxnav.errors import BadInput
+from jaxnav.files import save_rig
+from jaxnav.runtime.drive_log import Outcomes, read_drive
+from jaxnav.runtime.flags import Fault, Health
+from jaxnav.runtime.frames import Sighted
+from jaxnav.runtime.interfaces import Ending, HasOwnFiles, Odometry, Vehicle
+from jaxnav.runtime.messages import input_message
+from jaxnav.runtime.pilot import Input
+from jaxnav.runtime.recorder import Recorder
+from jaxnav.testing import check_cameras, check_vehicle
+from jaxnav.vehicles.replay import ReplayVehicle, open_cameras
+from tests.helpers.drives import BEGIN_NS, make_detections, make_picture
+from tests.helpers.setups import GoodVehicle, setup_with
+from tests.helpers.simulated import make_setup
+
+PLAIN = Path(__file__).parent / "data" / "drives" / "plain.mcap"
+SETUP = make_setup()
+FRONT, REAR = 0, 2
+MS = 1_000_000
+SLACK_NS = 150 * MS  # of a machine that does something else
+NAMES = (
+    "--vehicle",
+    f"{ReplayVehicle.__module__}:ReplayVehicle",
+    "--cameras",
+    f"{ReplayVehicle.__module__}:open_cameras",
+)
+
+
+@pytest.fixture(autouse=True)
+def keep_the_compile_cache(monkeypatch):
+    """Commands choose a cache of their own; tests keep theirs."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
+
+
+def seen(camera: int, stamp_ns: int, count: int = 1) -> Sighted:
+    return Sighted(camera, stamp_ns, make_detections(np.random.default_rng(camera), count))
+
+
+def at(after_ms: int) -> int:
+    return BEGIN_NS + after_ms * MS
+
+
+INPUTS = (
+    Input(at(0), Odometry(at(-3), 0.1, 0.2)),
+    Input(at(40), frames=(seen(FRONT, at(10)), seen(REAR, at(10)))),
+    Input(at(60), Odometry(at(55), float("nan"), -0.3, valid=False)),
+    Input(at(80), Odometry(0, 0.4, 0.0), (Sighted(FRONT, at(50), None, Fault.FRAME_UNUSABLE),)),
+    Input(at(100), faults=Fault.VEHICLE_FAILED),
+    Input(at(110), frames=(seen(FRONT, at(90)),)),
+    Input(at(120), Odometry(at(119), 0.5, 0.1)),
+)
+
+
+def recorded(path: Path, inputs=INPUTS, images=(), header=None) -> Path:
+    """A recording, without what the pilot made of it.
+
+    Args:
+        images: topic, stamp in ns and picture.
+    """
+    recorder = Recorder(path, SETUP.header() if header is None else header)
+    for topic, stamp_ns, picture in images:
+        recorder.image(topic, stamp_ns, picture)
+    for given in inputs:
+        recorder.put(*input_message(given))
+    recorder.close()
+    assert recorder.failed is None
+    return path
+
+
+@pytest.fixture
+def drive(tmp_path) -> Path:
+    return recorded(tmp_path / "drive.mcap")
+
+
+def opened(path: Path, **options: str) -> ReplayVehicle:
+    return ReplayVehicle(setup_with(drive=str(path), **options))
+
+
+def test_it_keeps_the_promises_of_a_vehicle_and_of_cameras():
+    setup = setup_with(drive=str(PLAIN))
+    check_vehicle(ReplayVehicle, setup, lambda vehicle: vehicle.throttle)
+    check_cameras(open_cameras, setup, ReplayVehicle(setup))
+    assert isinstance(ReplayVehicle, HasOwnFiles)
+    assert not isinstance(GoodVehicle, HasOwnFiles)
+    assert isinstance(ReplayVehicle(setup), Ending)
+    assert not isinstance(GoodVehicle(setup), Ending)
+
+
+class Now:
+    """A clock that stands until it is moved."""
+
+    def __init__(self):
+        self.ns = 77_000 * MS
+
+    def monotonic_ns(self) -> int:
+        return self.ns
+
+
+@pytest.fixture
+def now(monkeypatch) -> Now:
+    now = Now()
+    monkeypatch.setattr("jaxnav.vehicles.replay.time", now)
+    return now
+
+
+def test_readings_come_when_they_came_and_as_old_as_they_were(drive, now):
+    vehicle = opened(drive)
+    assert isinstance(vehicle, Vehicle)
+    now.ns += 500 * MS
+    assert vehicle.over is None  # nobody has looked yet
+    shift_ns = now.ns - BEGIN_NS
+    came: dict[int, str] = {}
+    for after_ms in range(171):
+        try:
+            said = repr(vehicle.read())
+        except OSError as error:
+            said = str(error)
+        if said not in came.values():
+            came[after_ms] = said
+        assert vehicle.over is None
+        now.ns += MS
+
+    def shifted(reading: Odometry, to_ns: int) -> str:
+        return repr(dataclasses.replace(reading, stamp_ns=to_ns))
+
+    assert came == {
+        0: shifted(INPUTS[0].odometry, at(-3) + shift_ns),
+        60: shifted(INPUTS[2].odometry, at(55) + shift_ns),
+        80: shifted(INPUTS[3].odometry, 0),  # never was a stamp
+        100: "nothing was read",
+        120: shifted(INPUTS[6].odometry, at(119) + shift_ns),
+    }
+    assert vehicle.over == "the recording is over"
+    assert repr(vehicle.read()) == came[120]
+
+
+def test_readings_that_came_at_once_come_one_by_one_but_not_too_late(tmp_path, now):
+    readings = [Input(at(i), Odometry(at(i), 0.01 * i, 0.0)) for i in range(0, 200, 5)]
+    vehicle = opened(recorded(tmp_path / "fast.mcap", readings))
+
+    def read(elapsed_ms: int) -> list[int]:
+        now.ns += elapsed_ms * MS
+        return [round(100 * vehicle.read().speed_mps) for _ in range(3)]
+
+    assert read(0) == [0, 0, 0]
+    assert read(17) == [5, 10, 15]
+    assert read(1) == [15, 15, 15]
+    assert read(132) == [105, 110, 115]
+    assert read(900) == [195, 195, 195]
+
+
+def test_what_it_is_told_is_counted_and_moves_nothing(drive):
+    vehicle = opened(drive)
+    vehicle.write(0.1, 0.2)
+    vehicle.write(0.1, 0.3)
+    assert (vehicle.writes, vehicle.throttle) == (2, 0.3)
+    vehicle.stop()
+    assert (vehicle.writes, vehicle.throttle) == (2, 0)
+    assert vehicle.read().speed_mps == 0.1
+    vehicle.close()
+    vehicle.close()
+    for call in (vehicle.read, lambda: vehicle.write(0, 0)):
+        with pytest.raises(OSError, match="the vehicle is closed"):
+            call()
+    assert vehicle.writes == 2
+
+
+def frames_of(camera, count: int) -> list:
+    return [camera.read(1.0) for _ in range(count)]
+
+
+def test_cameras_show_what_was_found_when_it_was_found(drive):
+    setup = setup_with(drive=str(drive))
+    vehicle = ReplayVehicle(setup)
+    cameras = open_cameras(setup, vehicle)
+    assert [camera.name for camera in cameras] == list(SETUP.rig.names)
+    begin_ns = time.monotonic_ns()
+    assert cameras[FRONT].read(0.0) is None
+    first, unusable, last = frames_of(cameras[FRONT], 3)
+    came_ns = time.monotonic_ns() - begin_ns
+    assert 110 * MS <= came_ns < 110 * MS + SLACK_NS
+    assert [f.stamp_ns - first.stamp_ns for f in (unusable, last)] == [40 * MS, 80 * MS]
+    assert abs(first.stamp_ns - begin_ns - 10 * MS) < SLACK_NS
+    for frame, original in ((first, INPUTS[1].frames[0]), (last, INPUTS[5].frames[0])):
+        assert frame.image is None
+        assert np.array_equal(frame.detections.corners_px, original.detections.corners_px)
+    assert (unusable.image, unusable.detections) == (None, None)  # a frame that can't be used
+    rear = cameras[REAR].read(0.0)
+    assert rear.stamp_ns == first.stamp_ns
+    assert cameras[1].read(0.01) is None  # it was not recorded
+    assert cameras[FRONT].read(0.01) is None  # it is over
+    cameras[FRONT].close()
+    assert cameras[FRONT].read(60.0) is None
+
+
+def test_cameras_come_by_their_names_in_whatever_rig(drive):
+    order = [2, 0]
+    rig = SETUP.rig.first(3)
+    swapped = dataclasses.replace(rig.first(2), names=tuple(rig.names[c] for c in order))
+    setup = dataclasses.replace(setup_with(drive=str(drive)), rig=swapped)
+    cameras = open_cameras(setup, ReplayVehicle(setup))
+    assert [camera.name for camera in cameras] == list(swapped.names)
+    shown = [frames_of(camera, 1)[0].detections for camera in cameras]
+    for found, original in zip(shown, INPUTS[1].frames[::-1], strict=True):
+        assert np.array_equal(found.corners_px, original.detections.corners_px)
+
+
+def pictures(topic="/camera/front", size_px=(820, 410), last: object = b"no jpeg"):
+    """Of the first two frames of the front camera and, damaged, of the last."""
+    picture = np.resize(make_picture(0), (size_px[1], size_px[0], 3))
+    return [(topic, at(10), picture), (topic, at(50), picture), (topic, at(90), last)]
+
+
+def test_cameras_show_the_recorded_images_where_that_is_asked_for(tmp_path):
+    path = recorded(tmp_path / "images.mcap", images=pictures())
+    setup = setup_with(drive=str(path), images="true")
+    front, _, rear, _ = open_cameras(setup, ReplayVehicle(setup))
+    first, second, damaged = frames_of(front, 3)
+    assert first.image.shape == second.image.shape == (410, 820, 3)
+    assert abs(float(first.image.mean()) - 20) < 2
+    assert (first.detections, second.detections) == (None, None)
+    assert (damaged.image, damaged.detections) == (None, None)
+    # Of this camera no image was recorded: what was found in it then is shown.
+    assert isinstance(rear.read(0.0).detections, Detections)
+
+
+@pytest.mark.parametrize(
+    ("images", "problem"),
+    [
+        ([], "holds no image on /camera/front, /camera/right, /camera/rear, /camera/left"),
+        (pictures("/camera/top"), "holds no image on /camera/front"),
+        (pictures()[2:], "/camera/front: an image can't be decoded"),
+        ([("/camera/front", at(10), b"")], "/camera/front: an image can't be decoded"),
+        (pictures(size_px=(32, 24)), "/camera/front: the images are 32 x 24 px, but the rig's"),
+    ],
+)
+def test_images_that_are_not_there_or_not_the_rigs_are_refused(tmp_path, images, problem):
+    path = recorded(tmp_path / "images.mcap", images=images)
+    setup = setup_with(drive=str(path), images="true")
+    with pytest.raises(BadInput) as caught:
+        open_cameras(setup, ReplayVehicle(setup))
+    assert str(path) in str(caught.value)
+    assert problem in str(caught.value)
+
+
+def test_cameras_that_were_not_recorded_are_refused(drive):
+    setup = setup_with(drive=str(drive))
+    with pytest.raises(BadInput, match="--cameras: replay shows what --vehicle replay has"):
+        open_cameras(setup, GoodVehicle(setup))
+    other = dataclasses.replace(SETUP.rig.first(1), names=("top",))
+    other_setup = dataclasses.replace(setup, rig=other)
+    with pytest.raises(BadInput, match=r"--rig: .*drive.mcap has no camera 'top': it has front,"):
+        open_cameras(other_setup, ReplayVehicle(other_setup))
+
+
+def test_its_own_files_are_those_that_it_was_recorded_with(drive):
+    own = ReplayVehicle.own_files({"drive": str(drive)})
+    assert own.rig.names == SETUP.rig.names
+    assert own.route == SETUP.route
+    assert np.array_equal(own.markers.corners_world_m, SETUP.markers.corners_world_m)
+    assert own.vehicle.wheelbase_m == SETUP.vehicle.wheelbase_m
+
+
+BACKWARDS = (INPUTS[1], INPUTS[0])
+STRANGER = (Input(at(0), frames=(seen(9, at(0)),)),)
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ([], "--option drive: missing: the recorded drive (.mcap)"),
+        (["drive="], "--option drive: missing"),
+        (["drive={tmp}/gone.mcap"], "{tmp}/gone.mcap: can't be read: no such file"),
+        (["drive={tmp}"], "{tmp}: is a folder"),
+        (["drive={tmp}/text.mcap"], "{tmp}/text.mcap: is not an MCAP file"),
+        (["drive={tmp}/empty.mcap"], "{tmp}/empty.mcap: holds no input"),
+        (["drive={tmp}/back.mcap"], "{tmp}/back.mcap: now_ns[1]: is less than"),
+        (["drive={tmp}/strange.mcap"], "{tmp}/strange.mcap: /frames.camera: must be from 0 to 3"),
+        (["drive={tmp}/header.mcap"], "{tmp}/header.mcap: header.setup_version: missing"),
+        (["drive={tmp}/good.mcap", "images=yes"], "--option images: expected false or true"),
+        (["drive={tmp}/good.mcap", "images=true"], "{tmp}/good.mcap: holds no image"),
+    ],
+)
+def test_bad_input_gets_one_line_before_anything_is_compiled(
+    tmp_path, monkeypatch, capsys, options, line
+):
+    monkeypatch.setattr("jaxnav.commands.run._compiled", lambda *told: pytest.fail("compiles"))
+    recorded(tmp_path / "good.mcap")
+    (tmp_path / "text.mcap").write_text("a drive?\n" * 9)
+    recorded(tmp_path / "empty.mcap", [])
+    recorded(tmp_path / "back.mcap", BACKWARDS)
+    recorded(tmp_path / "strange.mcap", STRANGER)
+    recorded(tmp_path / "header.mcap", header={"rig": {}})
+    given = ["--option", *(option.format(tmp=tmp_path) for option in options)] if options else []
+    assert cli.main(["run", "--float64", "--headless", *NAMES, *given]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith(f"jaxnav run: {line.format(tmp=tmp_path)}")
+    assert told.err.count("\n") == 1
+
+
+def at_readings(log) -> dict[int, int]:
+    """Stamp of a reading, since that of the first -> index of its outcome."""
+    index = np.searchsorted(log.outcomes.now_ns, [i.now_ns for i in log.inputs], side="right") - 1
+    read = [(i.odometry.stamp_ns, k) for i, k in zip(log.inputs, index, strict=True) if i.odometry]
+    return {stamp_ns - read[0][0]: k for stamp_ns, k in read}
+
+
+def test_the_real_loop_comes_to_what_was_recorded(tmp_path, capsys):
+    """The first second and a half of a drive.
+
+    The same readings and corners are fused, at their own stamps, whatever the threads make of their
+    order: at a reading the two differ at most by a set of frames that is a tick late in one of
+    them. So no decided pose may be farther off than the sigma that the recording claims for it,
+    three times, and half of them only by a small part of it.
+    """
+    whole = read_drive(PLAIN)
+    inputs = [i for i in whole.inputs if i.now_ns - whole.inputs[0].now_ns < 1_500 * MS]
+    short, again = recorded(tmp_path / "short.mcap", inputs, header=whole.header), tmp_path / "b"
+    options = ("--option", f"drive={short}", "--record", str(again), "--timeout-s", "3")
+    assert cli.main(["run", "--float64", "--headless", *NAMES, *options]) == 0
+    assert capsys.readouterr().out.startswith("ended: the recording is over\n")
+    log = read_drive(again)
+    before, now = at_readings(whole), at_readings(log)
+    assert len(now) > 0.7 * len(at_readings(read_drive(short)))  # on a machine that is busy
+    common = [(before[stamp], now[stamp]) for stamp in before.keys() & now.keys()]
+    assert len(common) == len(now)
+    off_m, sigma_m = off(whole.outcomes, log.outcomes, np.array(common).T)
+    assert len(off_m) > 0.5 * len(common)
+    assert np.all(off_m < 3 * sigma_m)
+    assert np.median(off_m / sigma_m) < 0.3
+    assert log.outcomes.health[-1] == Health.OK
+    assert log.header["rig"] == whole.header["rig"]
+    assert log.header["route"] == whole.header["route"]
+
+
+def off(before: Outcomes, now: Outcomes, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far positions that were decided in both are apart, and their sigma before, m."""
+    i, k = pairs
+    decided = before.decided[i] & now.decided[k]
+    i, k = i[decided], k[decided]
+    off_m = np.hypot(*(now.pose[k, :2] - before.pose[i, :2]).T)
+    return off_m, np.sqrt(np.trace(before.covariance[i, :2, :2], axis1=1, axis2=2))
+
+
+def test_flags_go_before_the_recordings_own_files(tmp_path, drive, monkeypatch):
+    given = []
+
+    def compiled(args, setup):
+        given.append(setup)
+        raise BadInput("--nothing", "is compiled here")
+
+    monkeypatch.setattr("jaxnav.commands.run._compiled", compiled)
+    save_rig(tmp_path / "rig.yaml", SETUP.rig.first(1))
+    options = ("--option", f"drive={drive}", "--rig", str(tmp_path / "rig.yaml"))
+    assert cli.main(["run", "--float64", "--headless", *NAMES, *options]) == 2
+    assert given[0].rig.names == ("front",)
+    assert given[0].route == SETUP.route
+    assert given[0].selector == "multi-hypothesis"
