@@ -28,6 +28,7 @@ import numpy as np
 from jax.experimental import serialize_executable
 
 _KEPT = 64  # executables, of some MB each: the last ones used
+_CHECKSUM_BYTES = 32  # at the beginning of the file, of what follows
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 _SOURCES = ("*.py", "detection/*.py", "runtime/*.py")  # of all that is kept
 
@@ -115,12 +116,16 @@ def _compiled(
 
 def _loaded(file: Path, inputs: list[Any]) -> tuple[Any, Any] | None:
     try:
-        stored, shape = pickle.loads(file.read_bytes())
+        raw = file.read_bytes()
+        # Machine code that was damaged may do anything: it must not even be looked at.
+        if _checksum(raw[_CHECKSUM_BYTES:]) != raw[:_CHECKSUM_BYTES]:
+            return None
+        stored, shape = pickle.loads(raw[_CHECKSUM_BYTES:])
         run = serialize_executable.deserialize_and_load(*stored)
         blank = [np.zeros(like.shape, like.dtype) for like in inputs]
-        jax.block_until_ready(run(blank))  # what is damaged shows now
+        jax.block_until_ready(run(blank))  # what does not run here shows now
         file.touch()
-    except Exception:  # none yet, or damaged in whatever way: it is made anew
+    except Exception:  # none yet, or none for this machine: it is made anew
         return None
     return run, jax.tree.structure(shape)
 
@@ -131,7 +136,8 @@ def _keep(file: Path, content: Any) -> None:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as part:
             try:
-                part.write(pickle.dumps(content))
+                raw = pickle.dumps(content)
+                part.write(_checksum(raw) + raw)
                 part.flush()
                 Path(part.name).replace(file)
             except BaseException:
@@ -142,6 +148,10 @@ def _keep(file: Path, content: Any) -> None:
             old.unlink(missing_ok=True)
     except OSError:
         return  # a full or a foreign disk: the program is there all the same
+
+
+def _checksum(raw: bytes) -> bytes:
+    return hashlib.sha256(raw).digest()
 
 
 def _file(folder: Path, structures: str, leaves: list[Any]) -> Path:

@@ -24,7 +24,14 @@ def navigator(selector: LowestReprojection | None = None) -> Navigator:
 
 
 def never(*_):
-    raise AssertionError("compiled once more")
+    raise AssertionError("must not be called")
+
+
+def damaged(raw: bytes) -> list[bytes]:
+    """Cut, or with one bit flipped; half of it is the last."""
+    places = np.random.default_rng(0).integers(0, len(raw), 20)
+    flipped = [raw[:k] + bytes([raw[k] ^ 1]) + raw[k + 1 :] for k in (0, 31, 32, *places)]
+    return [*flipped, b"", raw[:31], raw[:32], raw + b"\0", raw[: len(raw) // 2]]
 
 
 def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
@@ -51,7 +58,11 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
     assert later(state, obs)[1].located
 
     monkeypatch.undo()
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    for raw in damaged(file.read_bytes()):
+        file.write_bytes(raw)
+        with monkeypatch.context() as unopened:
+            unopened.setattr(executables.pickle, "loads", never)
+            assert executables._loaded(file, []) is None
     repaired, _ = compiled_step(nav, tmp_path)(nav.init(), obs)
     jax.tree.map(np.testing.assert_array_equal, repaired, state)
     monkeypatch.setattr(executables, "_compiled", never)

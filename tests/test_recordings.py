@@ -317,7 +317,12 @@ def test_a_folder_with_transforms_takes_its_poses_from_them(folder):
         ("cameras", "tagtopic", "topic", "cameras.yaml: cam0.tagtopic: missing"),
         ("camera_poses", "cam0", "cam1", "camera_poses.yaml: cam0: missing, and no /tf from cart"),
         ("camera_poses", "x: 0.1", "x: ten", "cam0.pose.position.x: must be a number"),
-        ("tagslam", "pose: {position: {x: 2", "p: {position: {x: 2", "tagslam.yaml: has no static"),
+        (
+            "tagslam",
+            "pose: {position: {x: 2",
+            "p: {position: {x: 2",
+            "tagslam.yaml: bodies: has no static",
+        ),
         ("tagslam", "size: 0.25", "size: -1", "bodies[0].wall.tags[0].size: must be > 0, got -1"),
         ("tagslam", "bodies:", "body:", "tagslam.yaml: bodies: missing"),
     ],

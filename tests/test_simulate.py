@@ -118,6 +118,52 @@ def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path):
     assert json.loads(file.read_text())["drives"] == 3
 
 
+MEASURED = (
+    "success_rate",
+    "wrong_branch_fraction_after_2s",
+    "wrong_once_decided_fraction",
+    "median_position_error_m",
+    "anees",
+)
+
+
+def kept(tmp_path, capsys, change=lambda result: None) -> tuple[int, str, str]:
+    """Resume what is all there, of drives that never decided: their numbers are missing."""
+    run = {
+        "scenario": "paper",
+        "selector": "oracle",
+        "corner_noise_px": 1.0,
+        "told_noise_px": 1.0,
+        "seeds": [0, 2],
+        "rig": None,
+        "markers": None,
+        "vehicle": None,
+    }
+    missing = {"value": None}
+    result = {"run": run, "time_to_decide_s": {"median": missing, "p95": missing}}
+    result |= dict.fromkeys(MEASURED, missing)
+    change(result)
+    (tmp_path / "s.json").write_text(json.dumps({"runs": [result]}))
+    arguments = ["--seeds", "3", "--selector", "oracle", "--resume", "--headless"]
+    code = main(["simulate", *arguments, "--json", str(tmp_path / "s.json")])
+    told = capsys.readouterr()
+    return code, told.out, told.err
+
+
+def test_numbers_that_are_missing_are_kept(tmp_path, capsys):
+    code, out, _ = kept(tmp_path, capsys)
+    assert code == 0
+    assert out.splitlines()[-1] == "| oracle | 1 | nan% | nan% | nan / nan | nan% | nan | nan |"
+
+
+def test_a_result_that_lacks_something_is_not_resumed(tmp_path, capsys):
+    code, _, err = kept(tmp_path, capsys, lambda result: result.pop("anees"))
+    assert (code, err.count("\n")) == (2, 1)
+    assert "s.json: runs[0].anees: missing" in err
+    code, _, err = kept(tmp_path, capsys, lambda result: result.update(anees={"value": "3"}))
+    assert "s.json: runs[0].anees.value: must be a number, got the text '3'" in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

@@ -132,7 +132,9 @@ def test_a_config_is_complete_and_reads_back() -> None:
     )
     assert some.axes == {"a_m": [0.1, 0.2, 0.3, 0.4, 0.5]}
     assert some.fixed == {"b": 2, "c_deg": "random", "selector": "x"}
-    assert Config.from_dict(json.loads(json.dumps(some.to_dict()))).to_dict() == some.to_dict()
+    stored = json.loads(json.dumps(some.to_dict()))
+    kind, files = stored.pop("kind"), stored.pop("files")
+    assert Config.parse(kind, PARAMETERS, stored, "store", files) == some
     spaced = config(axes={"a_m": {"from": 0.1, "to": 10, "count": 3, "scale": "log"}})
     assert spaced.axes == {"a_m": [0.1, 1.0, 10.0]}
 

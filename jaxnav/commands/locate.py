@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -20,6 +19,7 @@ from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.detection import Detections, make_detector
 from jaxnav.errors import BadInput
 from jaxnav.files import load_camera
+from jaxnav.files.images import decoded_image
 from jaxnav.markers import MarkerMap
 from jaxnav.observation import Observation, Snapshot
 from jaxnav.plotting import View, photo_with_poses
@@ -66,13 +66,13 @@ def read_image(path: Path) -> np.ndarray:
         BadInput: missing, unreadable, or not an image.
     """
     try:
-        raw = np.frombuffer(path.read_bytes(), np.uint8)
+        raw = path.read_bytes()
     except OSError as error:
         raise BadInput(path, f"can't be read: {(error.strerror or str(error)).lower()}") from None
-    image = cv2.imdecode(raw, cv2.IMREAD_COLOR) if raw.size else None
+    image = decoded_image(raw)
     if image is None:
         raise BadInput(path, "is not an image that OpenCV can read")
-    return np.asarray(image)
+    return image
 
 
 @jax.jit

@@ -2,11 +2,13 @@
 
 import itertools
 import json
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+from pydantic import Field
 from tqdm import tqdm
 
 from jaxnav.arguments import Simulate as Arguments
@@ -15,6 +17,8 @@ from jaxnav.bicycle_kalman import BicycleKalman
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
+from jaxnav.files.reading import read_text
+from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
 from jaxnav.rig import CameraRig
@@ -22,6 +26,8 @@ from jaxnav.selectors import SELECTORS, make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
+
+_MAX_BYTES = 64 * 2**20
 
 
 def run(args: Arguments) -> int:
@@ -110,13 +116,45 @@ def _key(args: Arguments, name: str, noise_px: float) -> dict[str, Any]:
 def _resumed(args: Arguments) -> list[dict[str, Any]]:
     if not args.resume or args.json is None or not args.json.exists():
         return []
+    text = read_text(args.json, _MAX_BYTES)
     try:
-        kept = json.loads(args.json.read_text())
-        runs: list[dict[str, Any]] = kept.get("runs", [kept])
-        assert all("run" in one for one in runs)
-    except (OSError, ValueError, KeyError, TypeError, AssertionError, AttributeError):
-        raise BadInput(args.json, "is not a result of jaxnav simulate; can't resume") from None
+        kept = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BadInput(args.json, f"is not valid JSON: {error}; can't resume") from None
+    if not isinstance(kept, dict) or not kept.keys() & {"run", "runs"}:
+        problem = "is not a result of jaxnav simulate, which has `run` or `runs`; can't resume"
+        raise BadInput(args.json, problem)
+    runs = kept.get("runs", [kept])
+    if not isinstance(runs, list):
+        raise BadInput(f"{args.json}: runs", "must be a list; can't resume")
+    for index, one in enumerate(runs):
+        validate(_Kept, one, args.json, f"runs[{index}]" if "runs" in kept else "")
     return runs
+
+
+class _Measure(ForeignEntry):
+    """A number, null where there was none."""
+
+    value: Annotated[float, Field(strict=True)] | None
+
+
+class _Quantiles(ForeignEntry):
+    """Of a distribution."""
+
+    median: _Measure
+    p95: _Measure
+
+
+class _Kept(ForeignEntry):
+    """What is read of a row of an earlier result."""
+
+    run: dict[str, Any]
+    success_rate: _Measure
+    wrong_branch_fraction_after_2s: _Measure
+    wrong_once_decided_fraction: _Measure
+    time_to_decide_s: _Quantiles
+    median_position_error_m: _Measure
+    anees: _Measure
 
 
 _HEADER = (
@@ -127,12 +165,17 @@ _HEADER = (
 
 def _row(result: dict[str, Any]) -> str:
     run, decide = result["run"], result["time_to_decide_s"]
+
+    def number(measure: dict[str, Any]) -> float:
+        value = measure["value"]
+        return math.nan if value is None else float(value)
+
     return (
         f"| {run['selector']} | {run['corner_noise_px']:g} | "
-        f"{result['success_rate']['value']:.1%} | "
-        f"{result['wrong_branch_fraction_after_2s']['value']:.3%} | "
-        f"{decide['median']['value']:.2f} / {decide['p95']['value']:.2f} | "
-        f"{result['wrong_once_decided_fraction']['value']:.3%} | "
-        f"{result['median_position_error_m']['value'] * 100:.2f} | "
-        f"{result['anees']['value']:.2f} |"
+        f"{number(result['success_rate']):.1%} | "
+        f"{number(result['wrong_branch_fraction_after_2s']):.3%} | "
+        f"{number(decide['median']):.2f} / {number(decide['p95']):.2f} | "
+        f"{number(result['wrong_once_decided_fraction']):.3%} | "
+        f"{number(result['median_position_error_m']) * 100:.2f} | "
+        f"{number(result['anees']):.2f} |"
     )

@@ -13,6 +13,7 @@ from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.files.reading import read_mapping
 from jaxnav.studies.ambiguity import AmbiguityStudy
 from jaxnav.studies.config import Config
+from jaxnav.studies.damage import check_layout, check_trials, reading
 from jaxnav.studies.drives import DriveStudy
 from jaxnav.studies.store import count_done, read_attributes, read_dataset, read_layout
 from jaxnav.studies.study import Grid, Study
@@ -71,11 +72,25 @@ def summary_of(path: Path, bar: Any) -> tuple[str, int, xr.Dataset]:
     Raises:
         BadInput: it is not a store of a study.
     """
-    config = Config.from_dict(read_attributes(path)["config"])
-    layout = read_layout(path)
+    grid = _stored_grid(path)
+    layout, trials = read_layout(path), read_dataset(path)
+    check_layout(path, layout, grid)
+    check_trials(path, trials, grid)
     bar.reset(total=layout.trials)
-    grid = Grid(KINDS[config.kind].schema, config)
-    return config.kind, count_done(path), summarise(read_dataset(path), grid, layout, bar.update)
+    with reading(path):  # box by box, while it is summed up
+        summary = summarise(trials, grid, layout, bar.update)
+    return grid.config.kind, count_done(path), summary
+
+
+def _stored_grid(path: Path) -> Grid:
+    """What a store says that it is the result of, checked as if a person had written it."""
+    stored = read_attributes(path)["config"]
+    kind = stored.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise BadInput(f"{path}: config.kind", f"must be {' or '.join(KINDS)}, got {kind!r}")
+    schema = KINDS[kind].schema
+    data = {key: value for key, value in stored.items() if key not in ("kind", "files")}
+    return Grid(schema, Config.parse(kind, schema.parameters, data, f"{path}: config"))
 
 
 def _calibration(data: Mapping[str, Any], path: Path, kind: str) -> dict[str, Path]:

@@ -125,7 +125,8 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
     raise BadInput(
         path,
         "is no camera file that jaxnav knows: expected a rig (`cameras:`), a Kalibr camchain "
-        "(`cam0:`), ROS's camera_info, OpenCV's FileStorage or PhotonVision's JSON",
+        "(`cam0:`), ROS's camera_info (`distortion_model:`), OpenCV's FileStorage "
+        "(`camera_matrix:`) or PhotonVision's JSON (`cameraIntrinsics`)",
     )
 
 

@@ -120,7 +120,7 @@ def _key(location: tuple[int | str, ...], data: Any) -> str:
             inside = data[part]
         name = inside.get("name") if isinstance(inside, dict) else None
         if isinstance(part, int):
-            key += f".{name}" if isinstance(name, str) and name else f"[{part}]"
+            key += f".{name}" if isinstance(name, str) and 0 < len(name) < 60 else f"[{part}]"
         else:
             key += f".{part}"
         data = inside

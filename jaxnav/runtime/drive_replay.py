@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from jaxnav.detection import Detections
 from jaxnav.errors import BadInput
+from jaxnav.files.images import decoded_image
 from jaxnav.runtime.drive_log import DriveLog, Outcomes
 from jaxnav.runtime.drive_setup import DriveSetup, made_here
 from jaxnav.runtime.flags import Fault, Health, Reject, names
@@ -187,7 +187,7 @@ def inputs_from_images(
         if image.topic not in camera_of:
             continue
         camera = camera_of[image.topic]
-        pixels = cv2.imdecode(np.frombuffer(image.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        pixels = decoded_image(image.jpeg)
         if pixels is None:
             raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
         if problem := size_problem(setup.rig, camera, pixels):

@@ -24,6 +24,7 @@ from jaxnav.runtime.message_fields import (
     Base64,
     Faults,
     Flag,
+    Index,
     Now,
     Real,
     Stamp,
@@ -114,12 +115,12 @@ class OutcomeMessage(Entry):
     done: Flag = False
     flip_probability: Real | None = None
     nis: Real | None = None
-    hypothesis: Annotated[int, Field(strict=True)] | None = None
+    hypothesis: Index | None = None
     hypotheses: Annotated[np.ndarray, Array("number", (-1, 3))] | None = None
     log_weight: Annotated[np.ndarray, Array("number")] | None = None
     Ts_vehicle_world: Annotated[np.ndarray, Array("number", (-1, 7))] | None = None
     costs: Annotated[np.ndarray, Array("number")] | None = None
-    selected: Annotated[int, Field(strict=True, ge=-1)] | None = None
+    selected: Index | None = None
 
     @model_validator(mode="after")
     def _is_whole(self) -> "OutcomeMessage":

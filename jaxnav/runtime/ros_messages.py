@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from jaxnav.detection.types import Detections
+from jaxnav.files.images import decoded_image
 from jaxnav.files.topics import FirstCorner
 from jaxnav.runtime.interfaces import Odometry
 
@@ -152,7 +153,7 @@ def grey_image(kind: str, message: Any) -> np.ndarray | None:
     """
     data = np.asarray(message.data, np.uint8)
     if kind == COMPRESSED:
-        return _decoded(data)
+        return decoded_image(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if message.encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
         raise ValueError(f"the encoding {message.encoding!r} is none of {known}")
@@ -165,11 +166,3 @@ def grey_image(kind: str, message: Any) -> np.ndarray | None:
         pixels = pixels.reshape(height, width, channels)
     pixels = np.ascontiguousarray(pixels)
     return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
-
-
-def _decoded(data: np.ndarray) -> np.ndarray | None:
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        return None
-    return None if image is None else np.asarray(image)

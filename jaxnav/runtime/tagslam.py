@@ -166,7 +166,8 @@ def _markers(path: Path, edges: Edges) -> MarkerMap:
                 T_world_marker = poses.compose(body.pose.pose(), tag.pose.pose())
                 Ts_world_marker[tag_id] = (name, T_world_marker)
     if not Ts_world_marker:
-        raise BadInput(file, "has no static body with a tag of known pose, and no /tf has tags")
+        problem = "has no static body with a tag of known pose, and no /tf has tags"
+        raise BadInput(at(file, "bodies"), problem)
     ids = sorted(Ts_world_marker)
     sizes_m = []
     for tag_id in ids:

@@ -82,11 +82,6 @@ class Config:
             files=dict(files or {}),
         )
 
-    @staticmethod
-    def from_dict(data: Mapping[str, Any]) -> "Config":
-        """What `to_dict` gave."""
-        return Config(**data)
-
     def to_dict(self) -> dict[str, Any]:
         """As plain data: equal for equal studies."""
         return {

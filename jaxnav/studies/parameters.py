@@ -1,6 +1,7 @@
 """What a study can vary: parameters with a unit, a default and bounds, and values of an axis."""
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -47,8 +48,8 @@ class Parameter:
         if isinstance(value, bool) or not isinstance(value, int | float):
             also = f" or {' or '.join(self.words)}" if self.words else ""
             raise BadInput(where, f"must be a number{also}, got {value!r}")
-        if not math.isfinite(value):
-            raise BadInput(where, f"must be finite, got {value}")
+        if not _is_finite(value):
+            raise BadInput(where, f"must be finite, got {str(value)[:40]}")
         if self.whole and value != int(value):
             raise BadInput(where, f"must be a whole number, got {value}")
         if not self.low <= value <= self.high or (self.open_low and value == self.low):
@@ -98,6 +99,11 @@ def told_noise_px(told_px: float | None, noise_px: float) -> float:
     return max(noise_px, _LEAST_TOLD_PX) if told_px is None else told_px
 
 
+def _is_finite(value: float) -> bool:
+    """Whether a float can hold it: whole numbers of a file may be larger."""
+    return abs(value) <= sys.float_info.max
+
+
 def _spaced(given: Mapping[str, Any], where: str) -> list[float]:
     """The values of `{from, to, count}`, or with `scale: log`, evenly spaced, ends included."""
     unknown = set(given) - {"from", "to", "count", "scale"}
@@ -110,13 +116,15 @@ def _spaced(given: Mapping[str, Any], where: str) -> list[float]:
         value = given.get(key)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise BadInput(f"{where}.{key}", f"must be a number, got {value!r}")
+        if not _is_finite(value):
+            raise BadInput(f"{where}.{key}", f"must be finite, got {str(value)[:40]}")
         ends.append(value)
     begin, end, count = ends
-    if count != int(count) or not 1 <= count <= _MAX_VALUES:
+    if not 1 <= count <= _MAX_VALUES or count != int(count):
         raise BadInput(
             f"{where}.count", f"must be a whole number from 1 to {_MAX_VALUES}, got {count}"
         )
-    if count > 1 and not (math.isfinite(begin) and math.isfinite(end) and begin < end):
+    if count > 1 and not begin < end:
         raise BadInput(f"{where}.to", f"must be larger than `from`, got {begin} and {end}")
     scale = given.get("scale", "linear")
     if scale not in ("linear", "log"):

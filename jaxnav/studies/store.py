@@ -17,13 +17,17 @@ import jax
 import numpy as np
 import xarray as xr
 import zarr
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from jaxnav.errors import BadInput
 from jaxnav.studies.config import difference
+from jaxnav.studies.damage import check_layout, layout_of, reading
 from jaxnav.studies.layout import Layout
 from jaxnav.studies.study import Study, Variable
 
 _DONE = "done"
+# Both with checksums: a number that a disk has changed is not to be taken for a result.
+_CHECKED, _COMPRESSED = Crc32cCodec(), ZstdCodec(level=0, checksum=True)
 _PACKAGES = ("jaxnav", "jax", "jaxlib", "equinox", "optimistix", "numpy")
 Box = tuple[int, ...]
 
@@ -41,13 +45,23 @@ class StudyStore:
         self.path = path
         self.study = study
         self._group = _open_group(path, "r+")
-        self._arrays: dict[str, Any] = dict(self._group.arrays())
+        with reading(path):
+            self._arrays: dict[str, Any] = dict(self._group.arrays())
         self.layout = read_layout(path)
+        check_layout(path, self.layout, study.grid)
+        for name in study.schema.variables:
+            if name not in self._arrays:
+                raise BadInput(f"{path}: {name}", "missing")
 
     def missing(self) -> Iterator[Box]:
-        """The boxes that are not done, in order."""
-        done = np.asarray(self._arrays[_DONE][...])
-        for index in np.argwhere(done == 0):
+        """The boxes that are not done, in order.
+
+        Raises:
+            BadInput: which are done is damaged.
+        """
+        with reading(self.path):
+            done = np.asarray(self._arrays[_DONE][...])
+        for index in np.argwhere(done != 1):
             yield tuple(int(i) for i in index)
 
     def write(self, box: Box, found: Mapping[str, np.ndarray]) -> None:
@@ -101,10 +115,15 @@ def read_attributes(path: Path) -> dict[str, Any]:
         BadInput: it is not a store of a study.
     """
     attributes: dict[str, Any] = dict(_open_group(path, "r").attrs)
-    try:
-        return {key: json.loads(attributes[key]) for key in ("config", "versions")}
-    except (KeyError, TypeError, ValueError):
-        raise BadInput(path, "is not a store of jaxnav study") from None
+    found = {}
+    for key in ("config", "versions"):
+        try:
+            found[key] = json.loads(attributes[key])
+        except (KeyError, TypeError, ValueError, RecursionError):
+            raise BadInput(path, "is not a store of jaxnav study") from None
+        if not isinstance(found[key], dict):
+            raise BadInput(f"{path}: {key}", "must be a mapping")
+    return found
 
 
 def read_dataset(path: Path) -> xr.Dataset:
@@ -114,8 +133,9 @@ def read_dataset(path: Path) -> xr.Dataset:
         BadInput: it is not a store of a study.
     """
     read_attributes(path)
-    whole = xr.open_zarr(path, chunks=None, consolidated=False, mask_and_scale=False)
-    return whole.drop_vars(_DONE)
+    with reading(path):
+        whole = xr.open_zarr(path, chunks=None, consolidated=False, mask_and_scale=False)
+        return whole.drop_vars(_DONE)
 
 
 def read_layout(path: Path) -> Layout:
@@ -124,8 +144,9 @@ def read_layout(path: Path) -> Layout:
     Raises:
         BadInput: it is not a store of a study.
     """
-    cut = dict(_open_group(path, "r")[_DONE].attrs)
-    return Layout(tuple(cut["shape"]), tuple(cut["box"]))  # type: ignore[arg-type]
+    with reading(path):
+        done: Any = _open_group(path, "r")[_DONE]
+        return layout_of(path, dict(done.attrs), done.shape)
 
 
 def count_done(path: Path) -> int:
@@ -134,9 +155,11 @@ def count_done(path: Path) -> int:
     Raises:
         BadInput: it is not a store of a study.
     """
-    done: Any = _open_group(path, "r")[_DONE]
     layout = read_layout(path)
-    return sum(layout.size(box) for box in np.argwhere(done[...] == 1).tolist())
+    with reading(path):
+        done: Any = _open_group(path, "r")[_DONE]
+        boxes = np.argwhere(done[...] == 1).tolist()
+    return sum(layout.size(box) for box in boxes)
 
 
 def _open_group(path: Path, mode: Any) -> zarr.Group:
@@ -144,10 +167,11 @@ def _open_group(path: Path, mode: Any) -> zarr.Group:
         raise BadInput(path, "doesn't exist")
     try:
         group = zarr.open_group(path, mode=mode)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        is_ours = _DONE in group
+    except Exception as error:  # of whatever bytes it holds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadInput(path, f"is not a store of jaxnav study ({reason})") from None
-    if _DONE not in group:
+    if not is_ours:
         raise BadInput(path, "is not a store of jaxnav study")
     return group
 
@@ -182,7 +206,7 @@ def _create(path: Path, study: Study, most: int) -> None:
                 dtype="int8",
                 fill_value=0,
                 dimension_names=[f"{name}_box" for name in (*axes, "trial")],
-                compressors=None,
+                compressors=_CHECKED,
             )
             done.attrs.update({"shape": list(layout.shape), "box": list(layout.box)})
             if path.exists():
@@ -200,7 +224,12 @@ def _coordinate(
 ) -> None:
     dtype: Any = "string" if values.dtype == object else values.dtype
     array = group.create_array(
-        name, shape=values.shape, chunks=values.shape, dtype=dtype, dimension_names=[name]
+        name,
+        shape=values.shape,
+        chunks=values.shape,
+        dtype=dtype,
+        dimension_names=[name],
+        compressors=_CHECKED,
     )
     array[...] = values
     array.attrs.update({"units": unit or "1", "long_name": description})
@@ -226,6 +255,7 @@ def _empty(group: zarr.Group, name: str, variable: Variable, study: Study, layou
         dtype=dtype,
         fill_value=missing,
         dimension_names=dimensions,
+        compressors=_COMPRESSED,
     )
     attributes: dict[str, Any] = {"units": variable.unit or "1", "long_name": variable.description}
     if variable.outcomes:

@@ -16,10 +16,10 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from jaxnav.errors import BadInput
+from jaxnav.files.images import decoded_image
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.drive_log import DriveLog, read_drive
 from jaxnav.runtime.drive_replay import check_inputs
@@ -189,7 +189,7 @@ class ReplayCamera:
         self._next += 1
         stamp_ns = self._clock.present_ns(sighted.stamp_ns)
         if sighted.stamp_ns in self._jpegs:
-            return Frame(stamp_ns, _decoded(self._jpegs[sighted.stamp_ns]))
+            return Frame(stamp_ns, decoded_image(self._jpegs[sighted.stamp_ns]))
         return Frame(stamp_ns, None, sighted.detections)
 
     def close(self) -> None:
@@ -258,17 +258,10 @@ def _jpegs(log: DriveLog, rig: CameraRig) -> dict[str, dict[int, bytes]]:
         if name not in found:
             continue
         if not found[name]:
-            pixels = _decoded(image.jpeg)
+            pixels = decoded_image(image.jpeg)
             if pixels is None:
                 raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
             if problem := size_problem(rig, rig.names.index(name), pixels):
                 raise BadInput(f"{log.path}: {image.topic}", problem)
         found[name][image.stamp_ns] = image.jpeg
     return found
-
-
-def _decoded(jpeg: bytes) -> np.ndarray | None:
-    """(H, W, 3) BGR; None: it is damaged."""
-    if not jpeg:
-        return None
-    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)

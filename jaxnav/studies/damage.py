@@ -1,0 +1,93 @@
+"""Is a store still what was written: damaged bytes, and parts that do not fit together, named."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from jaxnav.errors import BadInput
+from jaxnav.studies.layout import Layout
+from jaxnav.studies.study import Grid
+
+_LONGEST = 200  # characters of what a library says about broken bytes; it may quote them all
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """What the block reads of a store.
+
+    Raises:
+        BadInput: what was to be read is damaged.
+    """
+    try:
+        yield
+    except BadInput:
+        raise
+    except Exception as error:
+        # Zarr, its codecs and xarray meet whatever bytes the files hold.
+        said = f"{type(error).__name__}: {error}"
+        shown = said if len(said) <= _LONGEST else f"{said[:_LONGEST]}..."
+        raise BadInput(path, f"is damaged ({shown})") from None
+
+
+def layout_of(path: Path, attributes: Mapping[str, Any], counts: tuple[int, ...]) -> Layout:
+    """How a store says that it is cut.
+
+    Args:
+        attributes: of the array that says which boxes are done.
+        counts: its shape.
+
+    Raises:
+        BadInput: that can't be.
+    """
+    sizes: dict[str, tuple[int, ...]] = {}
+    for key in ("shape", "box"):
+        given = attributes.get(key)
+        are_sizes = isinstance(given, list) and all(type(n) is int and n > 0 for n in given)
+        if not isinstance(given, list) or not are_sizes or len(given) != len(counts):
+            problem = f"must be {len(counts)} whole numbers above 0, got {given!r}"
+            raise BadInput(f"{path}: done.{key}", problem)
+        sizes[key] = tuple(given)
+    layout = Layout(**sizes)
+    if layout.counts != counts:
+        problem = f"does not fit its attributes, which make {layout.counts}: it has {counts}"
+        raise BadInput(f"{path}: done", problem)
+    return layout
+
+
+def check_layout(path: Path, layout: Layout, grid: Grid) -> None:
+    """Whether a store is cut from the grid of its config.
+
+    Raises:
+        BadInput: it isn't.
+    """
+    expected = (*map(len, grid.outer_axes.values()), grid.config.trials)
+    if layout.shape != expected:
+        problem = f"must be {list(expected)}, as the config says, got {list(layout.shape)}"
+        raise BadInput(f"{path}: done.shape", problem)
+
+
+def check_trials(path: Path, trials: xr.Dataset, grid: Grid) -> None:
+    """Whether a store holds what its config says: axes and variables, not yet their numbers.
+
+    Raises:
+        BadInput: naming what does not fit.
+    """
+    axes = grid.config.axes
+    for name, values in axes.items():
+        with reading(path):
+            found = trials.coords[name].values.tolist() if name in trials.coords else None
+        if found != list(values):
+            raise BadInput(f"{path}: {name}", "is not the axis that the config says")
+    sizes = {name: len(values) for name, values in axes.items()} | {"trial": grid.config.trials}
+    for name, variable in grid.schema.variables.items():
+        dims = grid.dimensions(variable)
+        wanted = dims, tuple(sizes[dim] for dim in dims), np.dtype(variable.dtype)
+        if name not in trials:
+            raise BadInput(f"{path}: {name}", "missing")
+        found = trials[name].dims, trials[name].shape, trials[name].dtype
+        if found != wanted:
+            raise BadInput(f"{path}: {name}", f"must be {wanted}, got {found}")

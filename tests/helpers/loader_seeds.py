@@ -1,0 +1,249 @@
+"""Every loader of jaxnav with a file that it reads: the beginning of all damage."""
+
+import bz2
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxnav import files
+from jaxnav.arguments import Simulate
+from jaxnav.commands import simulate
+from jaxnav.commands.locate import read_image
+from jaxnav.commands.studies import load_study, summary_of
+from jaxnav.runtime.drive_log import read_drive
+from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.runtime.recorder import Recorder
+from jaxnav.runtime.recordings import read_recording
+from jaxnav.runtime.ros_drives import read_ros_drive
+from jaxnav.studies.store import open_store
+from tests.helpers.drives import record_drive
+from tests.helpers.ros_bags import FORMATS, Bag
+from tests.helpers.ros_drives import BEGIN_NS, MS, SQUARE_PX, TOPICS
+from tests.helpers.ros_drives import drive as ros_drive
+from tests.helpers.seed_texts import (
+    AMBIGUITY,
+    CAMERA_INFO,
+    DRIVE,
+    KALIBR,
+    OPENCV,
+    PHOTONVISION,
+    SIMULATED,
+    STUDY,
+    TAGSLAM,
+)
+from tests.helpers.simulated import make_setup
+from tests.worlds import qcar, qcar_rig, room_markers
+
+QCAR = files.calib_dir() / "qcar"
+
+
+@dataclass(frozen=True)
+class Loader:
+    """What reads a file, and such a file.
+
+    Attributes:
+        make: writes the file, and what it refers to, into a folder that is empty.
+        load: reads all of it, from the path that `make` gave.
+    """
+
+    make: Callable[[Path], Path]
+    load: Callable[[Path], Any]
+
+
+def _written(name: str, content: str | bytes) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        path = folder / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return make
+
+
+def _saved(name: str, save: Callable[[Path, Any], None], thing: Callable[[], Any]) -> Any:
+    def make(folder: Path) -> Path:
+        save(folder / name, thing())
+        return folder / name
+
+    return make
+
+
+def _tagslam(name: str) -> Loader:
+    def make(folder: Path) -> Path:
+        for other, text in TAGSLAM.items():
+            (folder / other).write_text(text)
+        _seen_bag("bag", "/a/tags").write(folder)
+        return folder / name
+
+    return Loader(make, lambda path: read_recording(path.parent))
+
+
+def _seen_bag(kind: str, *topics: str) -> Bag:
+    """Two frames of each camera."""
+    bag = Bag(kind)
+    for topic in topics:
+        for index in range(2):
+            t = BEGIN_NS + 30 * index * MS
+            bag.tagslam(topic, t, t, [(3, SQUARE_PX), (4, SQUARE_PX + 50)])
+    return bag
+
+
+CAMERAS = ("front", "right", "rear", "left")
+
+
+def _bag(folder: Path) -> Path:
+    return _seen_bag("bag", *CAMERAS).write(folder)
+
+
+def _compressed_bag(folder: Path) -> Path:
+    plain = _bag(folder)
+    path = folder / "drive.bag.bz2"
+    path.write_bytes(bz2.compress(plain.read_bytes()))
+    plain.unlink()
+    return path
+
+
+def _from_bag(path: Path) -> Any:
+    return read_recording(path, qcar_rig(), room_markers())
+
+
+def _ros(kind: str, which: str) -> Loader:
+    def make(folder: Path) -> Path:
+        (folder / "topics.yaml").write_text(TOPICS)
+        path = ros_drive(kind).write(folder)
+        return path if path.is_file() else next(path.glob(which))
+
+    def load(path: Path) -> Any:
+        folder = path.parent if kind == "bag" else path.parent.parent
+        topics = files.load_topics(folder / "topics.yaml")
+        bag = path if kind == "bag" else path.parent
+        return read_ros_drive(bag, topics, qcar_rig(), room_markers(), qcar())
+
+    return Loader(make, load)
+
+
+def _decoded(folder: Path) -> Path:
+    eye = np.eye(4)
+    np.savez(
+        folder / "decoded.npz",
+        stamp_ns=np.array([10, 10, 20]),
+        cam=np.array([0, 1, 1]),
+        tag_id=np.array([3, 3, 9]),
+        corners_px=np.tile(SQUARE_PX, (3, 1, 1)),
+        cam_names=np.array(["a", "b"]),
+        K=np.array([[400.0, 400, 320, 240]] * 2),
+        dist=np.zeros((2, 5)),
+        dist_model=np.array(["equidistant", "none"]),
+        T_rig_cam=np.stack([eye, eye]),
+        map_ids=np.array([3]),
+        map_size=np.array([0.2]),
+        T_map_tag=eye[None],
+        rig_stamp=np.array([20, 10]),
+        T_map_rig=np.stack([eye, eye]),
+    )
+    return folder / "decoded.npz"
+
+
+def _drive(folder: Path) -> Path:
+    recorder = Recorder(folder / "drive.mcap", make_setup().header())
+    record_drive(recorder, 12)
+    recorder.close()
+    return recorder.path
+
+
+def _whole_drive(path: Path) -> Any:
+    """All that a command reads of it."""
+    log = read_drive(path)
+    return log, DriveSetup.of_header(log.header, path), list(log.images())
+
+
+STORED = ("zarr.json", "done/zarr.json", "done/c/0/0", "outcome/zarr.json", "outcome/c/0/0/0")
+
+
+def _stored(which: str) -> Loader:
+    """A file of a study's store."""
+
+    def make(folder: Path) -> Path:
+        (folder / "study.yaml").write_text(STUDY)
+        store = open_store(folder / "s.zarr", load_study("ambiguity", folder / "study.yaml"))
+        rng = np.random.default_rng(0)
+        for box in list(store.missing()):
+            *outer, trials = (part.stop - part.start for part in store.layout.region(box))
+            found = {}
+            for name, variable in store.study.schema.variables.items():
+                inner = (2,) if variable.of_selector else ()
+                most = len(variable.outcomes) or 2
+                numbers = rng.uniform(0, most, (math.prod(outer), *inner, trials))
+                found[name] = numbers.astype(variable.dtype)
+            store.write(box, found)
+        return store.path / which
+
+    def load(path: Path) -> Any:
+        """As `jaxnav plot` and as `jaxnav study` that goes on."""
+        folder = path
+        while folder.name != "s.zarr":
+            folder = folder.parent
+        bar = SimpleNamespace(reset=lambda total: None, update=lambda done: None)
+        kind, done, _ = summary_of(folder, bar)
+        study = load_study("ambiguity", folder.parent / "study.yaml")
+        store = open_store(folder, study)
+        assert (kind, done + 12 * len(list(store.missing()))) == ("ambiguity", 12)
+        return None
+
+    return Loader(make, load)
+
+
+def _resumed(path: Path) -> None:
+    """As `jaxnav simulate --resume`."""
+    simulate._resumed(Simulate(json=path, resume=True))
+
+
+def _picture(extension: str) -> Callable[[Path], Path]:
+    pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
+    return _written(f"photo{extension}", cv2.imencode(extension, pixels)[1].tobytes())
+
+
+STRUCTURED = {
+    "rig": Loader(_written("rig.yaml", (QCAR / "rig.yaml").read_bytes()), files.load_rig),
+    "saved rig": Loader(_saved("rig.yaml", files.save_rig, qcar_rig), files.load_rig),
+    "markers": Loader(
+        _written("markers.yaml", (QCAR / "markers.yaml").read_bytes()), files.load_markers
+    ),
+    "saved markers": Loader(
+        _saved("markers.yaml", files.save_markers, room_markers), files.load_markers
+    ),
+    "vehicle": Loader(
+        _written("vehicle.yaml", (QCAR / "vehicle.yaml").read_bytes()), files.load_vehicle
+    ),
+    "route": Loader(_written("route.yaml", (QCAR / "route.yaml").read_bytes()), files.load_route),
+    "topics": Loader(_written("topics.yaml", TOPICS), files.load_topics),
+    "Kalibr rig": Loader(_written("chain.yaml", KALIBR), files.load_rig),
+    "Kalibr camera": Loader(
+        _written("chain.yaml", KALIBR), lambda path: files.load_camera(path, "cam1")
+    ),
+    "camera_info": Loader(_written("camera.yaml", CAMERA_INFO), files.load_camera),
+    "OpenCV": Loader(_written("camera.yml", OPENCV), files.load_camera),
+    "PhotonVision": Loader(_written("camera.json", PHOTONVISION), files.load_camera),
+    "ambiguity study": Loader(
+        _written("study.yaml", AMBIGUITY), lambda path: load_study("ambiguity", path)
+    ),
+    "drive study": Loader(_written("study.yaml", DRIVE), lambda path: load_study("drive", path)),
+    **{f"TagSLAM {name}": _tagslam(name) for name in TAGSLAM},
+    "simulation": Loader(_written("s.json", json.dumps(SIMULATED)), _resumed),
+}
+BINARY = {
+    "drive": Loader(_drive, _whole_drive),
+    "bag": Loader(_bag, _from_bag),
+    "compressed bag": Loader(_compressed_bag, _from_bag),
+    **{f"ROS {kind}": _ros(kind, f"*.{kind}") for kind in FORMATS},
+    "ROS metadata": _ros("db3", "metadata.yaml"),
+    **{f"store {which}": _stored(which) for which in STORED},
+    "arrays": Loader(_decoded, read_recording),
+    **{extension: Loader(_picture(extension), read_image) for extension in (".png", ".jpg")},
+}

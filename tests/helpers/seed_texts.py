@@ -1,0 +1,112 @@
+"""Files of persons and of other tools that are read without an objection."""
+
+KALIBR = """
+cam0:
+  camera_model: pinhole
+  distortion_model: equi
+  distortion_coeffs: [-0.01, 0, 0.01, 0]
+  intrinsics: [470, 471.5, 639.7, 524.4]
+  resolution: [1280, 1024]
+  T_cam_imu: [[0, -1, 0, 0.1], [0, 0, -1, 0.2], [1, 0, 0, 0.3], [0, 0, 0, 1]]
+cam1:
+  camera_model: pinhole
+  distortion_model: radtan
+  distortion_coeffs: [0.1, -0.02, 0.001, 0.002]
+  intrinsics: [400.0, 401.0, 320.0, 240.0]
+  resolution: [640, 480]
+  T_cn_cnm1: [[0, 0, 1, 0.5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
+"""
+CAMERA_INFO = """
+image_width: 640
+image_height: 480
+camera_name: narrow
+camera_matrix: {rows: 3, cols: 3, data: [400.5, 0.0, 320.0, 0.0, 401.0, 240.0, 0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.02, 0.001, 0.002, 0.003]}
+"""
+OPENCV = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 4.0e+02, 0., 3.2e+02, 0., 4.01e+02, 2.4e+02, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ 1.0e-01, -2.0e-02, 1.0e-03, 2.0e-03, 0. ]
+"""
+PHOTONVISION = """{"resolution": {"width": 640.0, "height": 480.0},
+"cameraIntrinsics": {"rows": 3, "cols": 3, "type": 6, "data": [400, 0, 320, 0, 401, 240, 0, 0, 1]},
+"distCoeffs": {"rows": 1, "cols": 5, "type": 6, "data": [0.1, -0.02, 0.001, 0.002, 0.0]},
+"lensmodel": "LENSMODEL_OPENCV", "observations": []}
+"""
+AMBIGUITY = """
+trials: 50
+seed: 3
+precision: float64
+axes:
+  cameras: [1, 2]
+  corner_noise_px: {from: 0.1, to: 3, count: 9, scale: log}
+  selector: [lowest-reprojection, mahalanobis]
+fixed: {range_m: 2.5, view_angle_deg: 30}
+rig: qcar
+"""
+DRIVE = """
+trials: 20
+axes:
+  corner_noise_px: [0.3, 1]
+fixed: {selector: paper-cost}
+"""
+TAGSLAM = {
+    "cameras.yaml": """
+cam0:
+  camera_model: pinhole
+  intrinsics: [400, 400, 320, 240]
+  distortion_model: equidistant
+  distortion_coeffs: [0, 0, 0, 0]
+  resolution: [640, 480]
+  tagtopic: /a/tags
+  rig_body: cart
+""",
+    "tagslam.yaml": """
+default_body: wall
+bodies:
+ - wall:
+     is_static: true
+     default_tag_size: 0.5
+     pose: {position: {x: 1, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 1.5707963267948966}}
+     tags:
+       - {id: 3, size: 0.25, pose: {position: {x: 2, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}}
+       - {id: 4}
+ - cart: {is_static: false}
+""",
+    "camera_poses.yaml": """
+cam0: {pose: {position: {x: 0.1, y: 0, z: 0}, rotation: {x: 0, y: 3.14, z: 0}}}
+""",
+}
+STUDY = """
+trials: 6
+axes: {corner_noise_px: [0.1, 1], selector: [lowest-reprojection, mahalanobis]}
+"""
+_MEASURE = {"value": 0.5, "interval": [0.4, 0.6]}
+_MEASURES = (
+    "success_rate",
+    "wrong_branch_fraction_after_2s",
+    "wrong_once_decided_fraction",
+    "median_position_error_m",
+    "anees",
+)
+SIMULATED = {
+    "runs": [
+        {
+            "run": {"scenario": "paper", "selector": "oracle", "corner_noise_px": 1.0},
+            "drives": 3,
+            "time_to_decide_s": {"median": _MEASURE, "p95": {"value": None}},
+        }
+        | dict.fromkeys(_MEASURES, _MEASURE)
+    ]
+}

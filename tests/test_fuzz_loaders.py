@@ -1,0 +1,217 @@
+"""Whatever is done to a file: it is read as something sound, or one line names file and key (R14).
+
+JAXNAV_FUZZ=3000 pytest tests/test_fuzz_loaders.py      # so many examples for each loader
+"""
+
+import json
+import math
+import os
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from jaxnav.commands.drive_pictures import summary_lines
+from jaxnav.errors import BadInput
+from jaxnav.files.reading import read_mapping
+from jaxnav.runtime.drive_format import HEADER, PROFILE, encode
+from jaxnav.runtime.drive_log import read_drive
+from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.runtime.interfaces import Setup
+from jaxnav.runtime.message_schemas import MESSAGES, OUTCOME
+from jaxnav.runtime.messages import input_message, outcome_message
+from jaxnav.runtime.recordings import Recording
+from jaxnav.vehicles import replay
+from jaxnav.vehicles.options import number, whole_number
+from tests.helpers.drives import make_input, make_outcome
+from tests.helpers.loader_seeds import BINARY, STRUCTURED, Loader
+from tests.helpers.mutations import Changed, edited, restructured
+from tests.helpers.simulated import make_setup
+
+EXAMPLES = int(os.environ.get("JAXNAV_FUZZ", "8"))
+HANGS_S = 2.0  # of the processor, so that a machine that is busy does not count
+LONGEST = 1200  # characters of a line for a person
+
+fuzzed = settings(
+    max_examples=EXAMPLES,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    phases=[Phase.generate, Phase.shrink],
+    suppress_health_check=list(HealthCheck),
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Iterator[Path]:
+    """Where a loader's file lies; beside it is where temporary files would."""
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    folder = tmp_path / "files"
+    folder.mkdir()
+    yield folder
+    assert list(temporary.iterdir()) == []
+
+
+def told(loader: Loader, path: Path, folder: Path) -> str | None:
+    """The line that a person gets, or None: what was read is sound."""
+    before = sorted(folder.rglob("*"))
+    began_s = time.process_time()
+    try:
+        loaded = loader.load(path)
+    except BadInput as bad:
+        line = str(bad)
+        assert str(folder) in line or line.startswith("--"), line
+        assert "\n" not in line
+        assert len(line) < LONGEST, line[:LONGEST]
+    else:
+        line = None
+        assert_sound(loaded)
+    assert time.process_time() - began_s < HANGS_S
+    assert sorted(folder.rglob("*")) == before
+    return line
+
+
+def assert_sound(loaded: Any) -> None:
+    """Numbers of what came out of a file are finite; poses are poses."""
+    if isinstance(loaded, Recording):
+        lanes = (len(loaded.stamps_ns), len(loaded.rig), len(loaded.markers.ids))
+        assert loaded.corners_px.shape == (*lanes, 4, 2)
+        assert loaded.visible.shape == lanes
+        assert np.all(np.diff(loaded.stamps_ns) > 0)
+        assert np.isfinite(loaded.corners_px).all()
+        loaded = (loaded.rig, loaded.markers)
+    for leaf in jax.tree.leaves(loaded):
+        if isinstance(leaf, jax.Array | float):
+            assert np.isfinite(np.asarray(leaf)).all()
+        if isinstance(leaf, jax.Array) and leaf.ndim and leaf.shape[-1] == 7:
+            assert np.allclose(np.linalg.norm(leaf[..., :4], axis=-1), 1, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", [*STRUCTURED, *BINARY])
+def test_bytes_of_a_file_that_change_are_noticed_or_do_not_matter(name, folder):
+    loader = (STRUCTURED | BINARY)[name]
+    path = loader.make(folder)
+    whole = path.read_bytes()
+    assert told(loader, path, folder) is None
+
+    @fuzzed
+    @given(edited(whole))
+    def check(raw: bytes) -> None:
+        path.write_bytes(raw)
+        told(loader, path, folder)
+
+    check()
+
+
+@pytest.mark.parametrize("name", STRUCTURED)
+def test_a_value_that_changes_is_noticed_by_its_key_or_does_not_matter(name, folder):
+    loader = STRUCTURED[name]
+    path = loader.make(folder)
+    dump = json.dumps if path.suffix == ".json" else dumped
+
+    @fuzzed
+    @given(restructured(read_mapping(path)))
+    def check(changed: Changed) -> None:
+        path.write_text(dump(changed.data))
+        line = told(loader, path, folder)
+        assert line is None or changed.is_named_in(line), line
+
+    check()
+
+
+def write_drive(path: Path, data: dict[str, Any]) -> None:
+    """A recorded drive with sound checksums, as another program could write it.
+
+    Args:
+        data: the header, and a message for each topic.
+    """
+    text = json.dumps(data.get("header"))
+    crc32 = f"{zlib.crc32(text.encode()):08x}"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile=PROFILE, library="fuzz")
+        writer.add_metadata(HEADER, {"format_version": "1", "header": text, "crc32": crc32})
+        for topic, message in data.items():
+            if topic in MESSAGES:
+                schema = writer.register_schema(MESSAGES[topic][0], "jsonschema", b"{}")
+                channel = writer.register_channel(topic, "json", schema)
+                writer.add_message(channel, 1, json.dumps(message).encode(), 1)
+        writer.finish()
+
+
+def used_drive(path: Path) -> None:
+    """All that the commands make of a drive before they drive or draw it."""
+    replay._read.cache_clear()  # two files may be written in one tick of the disk's clock
+    log = read_drive(path)
+    setup = DriveSetup.of_header(log.header, path)
+    assert_sound((setup.rig, setup.markers, setup.vehicle))
+    if len(log.outcomes.now_ns):
+        assert all(isinstance(line, str) for line in summary_lines(log))
+    told = Setup(setup.rig, setup.markers, setup.vehicle, (0, 0, 0), options={"drive": str(path)})
+    replay.open_cameras(told, replay.ReplayVehicle(told))
+
+
+def test_a_value_of_a_drive_that_changes_is_noticed_by_its_key_or_does_not_matter(folder):
+    messages = [input_message(make_input(index))[::2] for index in range(3)]
+    messages.append((OUTCOME, outcome_message(make_outcome(0))))
+    parts = [("header", make_setup().header()), *messages]
+    whole = {name: json.loads(encode(part)) for name, part in parts}
+    path, loader = folder / "drive.mcap", Loader(lambda folder: folder, used_drive)
+    write_drive(path, whole)
+    assert told(loader, path, folder) is None
+
+    @settings(fuzzed, max_examples=5 * EXAMPLES)
+    @given(restructured(whole))
+    def check(changed: Changed) -> None:
+        write_drive(path, changed.data)
+        line = told(loader, path, folder)
+        # Of a camera that is gone the frames are told that have none.
+        assert line is None or changed.is_named_in(line) or "/frames.camera" in line, line
+
+    check()
+
+
+@fuzzed
+@given(st.text(max_size=9) | st.floats().map(str) | st.integers().map(str))
+def test_an_option_is_a_number_within_its_bounds_or_bad_input(text):
+    for read, kind in ((number, float), (whole_number, int)):
+        try:
+            value = read({"key": text}, "key", 1, 0, 10)
+        except BadInput as bad:
+            assert str(bad).startswith("--option key: expected a ")  # noqa: PT017
+        else:
+            assert type(value) is kind
+            assert 0 <= value <= 10
+
+
+class _Dumper(yaml.SafeDumper):
+    """Without aliases, which are refused, and with numbers as YAML 1.2 reads them."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _number(dumper: _Dumper, value: float) -> yaml.ScalarNode:
+    words = {math.inf: ".inf", -math.inf: "-.inf"}
+    text = words.get(value, ".nan" if math.isnan(value) else repr(value))
+    return dumper.represent_scalar("tag:yaml.org,2002:float", text)
+
+
+_Dumper.add_representer(float, _number)
+
+
+def dumped(data: Any) -> str:
+    """YAML."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False)
