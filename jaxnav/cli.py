@@ -1,7 +1,7 @@
 """The command line: `jaxnav COMMAND`.
 
 What a command does lies in `jaxnav.commands` and is imported when the command runs, so that
-`--help` stays instant; what it can be told lies in `arguments.py`.
+`--help` stays instant; what it can be told lies in `jaxnav.arguments`.
 
 Exit codes: 0 done, 1 what was to be found out is not well (a replay is not what was recorded, the
 doctor found an error, a fault came to worse than it must, the watchdog stopped the car), 2 bad

@@ -37,7 +37,7 @@ gc.set_threshold(1_000_000, 50, 100)
 CORE = sorted(
     f"jaxnav.{path.stem}"
     for path in (Path(__file__).resolve().parents[1] / "jaxnav").glob("*.py")
-    if path.stem not in ("__init__", "arguments", "cli", "errors", "plotting")
+    if path.stem not in ("__init__", "cli", "errors", "plotting")
 )
 install_import_hook(CORE, "beartype.beartype")
 

@@ -1,0 +1,53 @@
+"""Kinds of values that several commands are told, and what is asked of them."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jaxnav.errors import BadInput
+
+Selector = Literal[
+    "multi-hypothesis",
+    "lowest-reprojection",
+    "ratio-test",
+    "object-space",
+    "paper-cost",
+    "mahalanobis",
+]
+# These need what only a simulation has: another sensor, the truth.
+SimulatedSelector = Literal[Selector, "orientation-given", "oracle", "all"]
+Scenario = Literal[
+    "paper",
+    "static",
+    "approach",
+    "orbit",
+    "tunnel",
+    "kidnapped",
+    "slip",
+    "miscalibrated",
+    "blur",
+]
+StudyKind = Literal["ambiguity", "drive"]
+CornerBackend = Literal["aruco", "apriltag"]
+Switch = tyro.conf.FlagCreatePairsOff[bool]
+QCarFile = Annotated[
+    Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: the QCar's)")
+]
+OptionalFile = Annotated[
+    Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")
+]
+
+
+def require(condition: bool, flag: str, problem: str) -> None:
+    """Raise BadInput where a condition does not hold."""
+    if not condition:
+        raise BadInput(flag, problem)
+
+
+def require_finite(flag: str, value: float, zero_allowed: bool = False) -> None:
+    """Raise BadInput where a number is not positive, or not finite."""
+    large_enough = value >= 0 if zero_allowed else value > 0
+    bound = "not be negative" if zero_allowed else "be positive"
+    require(math.isfinite(value) and large_enough, flag, f"must {bound} and finite, got {value}")
