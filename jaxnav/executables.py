@@ -30,7 +30,7 @@ from jax.experimental import serialize_executable
 _KEPT = 64  # executables, of some MB each: the last ones used
 _CHECKSUM_BYTES = 32  # at the beginning of the file, of what follows
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
-_SOURCES = ("*.py", "detection/*.py", "runtime/*.py")  # of all that is kept
+_FOLDERS = (".", "detection", "runtime", "simulation", "vehicles")  # of all that is kept
 
 _folders: list[Path] = []  # the last one counts
 
@@ -157,7 +157,7 @@ def _checksum(raw: bytes) -> bytes:
 def _file(folder: Path, structures: str, leaves: list[Any]) -> Path:
     """Named by all that the executable depends on."""
     device, package = jax.devices()[0], Path(__file__).resolve().parent
-    sources = sorted(source for pattern in _SOURCES for source in package.glob(pattern))
+    sources = sorted(source for folder in _FOLDERS for source in (package / folder).glob("*.py"))
     depends_on = [
         structures,
         [(leaf.shape, str(leaf.dtype)) for leaf in leaves],

@@ -1,13 +1,16 @@
 """`jaxnav run`: the loop that drives, with all that looks on."""
 
+import gc
 import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxnav.arguments import Run
@@ -38,7 +41,7 @@ def run(args: Run) -> int:
     searches = _searches(args, setup)
     with ExitStack() as closing:
         onlookers = open_onlookers(args, setup, closing)
-        pilot = _compiled(args, setup)
+        pilot = _compiled(args, setup, searches)
         told = Setup(
             setup.rig, setup.markers, setup.vehicle, setup.route.start_pose, args.seed, options
         )
@@ -88,16 +91,19 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
 def _searches(args: Run, setup: DriveSetup) -> list[Search]:
     """One for each camera."""
     detectors = make_detectors(setup.markers, args.corner_backend)
-    rig = setup.rig
+    rig = jax.device_get(setup.rig)  # of which NumPy takes a camera without compiling anything
     return [Search(c, rig.image_sizes_px[c], rig.camera(c), detectors) for c in range(len(rig))]
 
 
-def _compiled(args: Run, setup: DriveSetup) -> Pilot:
-    """A pilot that need not compile any more."""
+def _compiled(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot:
+    """A pilot that need not compile any more, nor need those who look for markers."""
     _say(args, "compiling")
     began_s = time.monotonic()
-    pilot = setup.pilot(step_folder())
-    pilot.warm_up()
+    with ThreadPoolExecutor(1) as beside:
+        looked = beside.submit(searches[0].warm_up)
+        pilot = setup.pilot(step_folder())
+        pilot.warm_up()
+        looked.result()
     _say(args, f"compiled in {time.monotonic() - began_s:.1f} s")
     return pilot
 
@@ -108,6 +114,9 @@ def _drive(
     """Open what moves, drive, stop and let go of it. Also: why it ended."""
     duration_s = args.duration_s if args.duration_s is not None else float("inf")
     with ExitStack() as closing:
+        # Python looks through all objects now and then: not through those of JAX, 50 ms a time.
+        gc.freeze()
+        closing.callback(gc.unfreeze)
         vehicle = plugins.open_vehicle(args.vehicle, told)
         guard = Guard(vehicle, pilot.limits, args.timeout_s)
         closing.callback(guard.close)

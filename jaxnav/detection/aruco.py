@@ -37,6 +37,7 @@ class ArucoDetector:
         self.family = family
         self._closer_looks = closer_looks
         self._decoders: dict[float, cv2.aruco.ArucoDetector] = {}
+        self._decoder(0.0)
 
     def detect(
         self,

@@ -12,6 +12,7 @@ import numpy as np
 from jaxnav.bicycle import Vehicle as VehicleModel
 from jaxnav.control import Command
 from jaxnav.detection.types import Detections
+from jaxnav.executables import kept
 from jaxnav.geometry import T_world_vehicle_from_planar
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
@@ -22,7 +23,7 @@ _SUBSTEP_NS = 5_000_000
 _KEPT = 400  # substeps: two seconds into the past
 
 
-@jax.jit
+@kept
 def _moved(vehicle: VehicleModel, row: jax.Array, command: jax.Array, dt_s: jax.Array) -> jax.Array:
     """`move`, of plain arrays: (x_m, y_m, psi_rad, speed_mps, steering_rad)."""
     car = CarState(row[:3], row[3], row[4])
@@ -30,7 +31,7 @@ def _moved(vehicle: VehicleModel, row: jax.Array, command: jax.Array, dt_s: jax.
     return jnp.concatenate([car.pose, jnp.stack([car.speed_mps, car.steering_rad])])
 
 
-@jax.jit
+@kept
 def _seen(rig: CameraRig, markers: MarkerMap, pose: jax.Array) -> tuple[jax.Array, jax.Array]:
     return see(rig, markers, T_world_vehicle_from_planar(pose))
 
