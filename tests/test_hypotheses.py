@@ -23,6 +23,8 @@ from jaxnav.motion import Belief, followed, merged, unstarted
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation, Snapshot
 from tests import worlds
+from tests.derivatives import in_float32
+from tests.helpers.compiling import jit_to_run
 from tests.reference import kalman, paper
 from tests.reference.rigid import cayley, inverse_cayley
 
@@ -454,7 +456,7 @@ def _car(precision: str) -> Navigator:
     return Navigator(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar())
 
 
-@jax.jit
+@jit_to_run
 @functools.partial(jax.vmap, in_axes=(None, 0))
 def run(nav: Navigator, obs: Observation) -> Seen:
     def step(state, obs):
@@ -682,6 +684,7 @@ def test_it_recovers_from_being_carried_off(kidnapped):
     assert np.all(seen.decided[:, two_seconds:])
 
 
+@in_float32
 def test_a_step_has_finite_gradients(precision):
     """Of the whole step with the bank, started and not, seeing (from the side, and exactly
     frontally and where it believes to be) and blind."""

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxnav.ippe import ippe_from_rays, ippe_square
 from jaxnav.markers import CORNER_SIGNS
 from tests import worlds
-from tests.derivatives import check_derivatives
+from tests.derivatives import check_derivatives, in_float32
 
 GENERIC = 10_000
 solve = jax.jit(jax.vmap(ippe_square))
@@ -171,6 +171,7 @@ def awkward_corners() -> np.ndarray:
     )
 
 
+@in_float32
 def test_gradients_are_finite_everywhere(precision):
     corners = jnp.asarray(awkward_corners())
     size = jnp.full(len(corners), 0.2)

@@ -18,6 +18,7 @@ from jaxnav.navigator import Navigator
 from jaxnav.observation import Snapshot
 from jaxnav.simulation.statistics import Reliability
 from tests import worlds
+from tests.helpers.compiling import jit_to_run
 
 FRAMES, NOISE_PX, SIZE_M = 4000, 1.0, 0.12
 RIG = worlds.qcar_rig()
@@ -34,7 +35,6 @@ def wall(lift_rad: float = 0.0):
     )
 
 
-@jax.jit
 def look(markers, key):
     """One random place some 3 m away; (probability, flipped, whether there were two poses)."""
     place, noise = jax.random.split(key)
@@ -55,7 +55,7 @@ def look(markers, key):
 @pytest.fixture(scope="module")
 def frames():
     keys = jax.random.split(jax.random.key(0), FRAMES)
-    look_all = jax.jit(jax.vmap(look, in_axes=(None, 0)))
+    look_all = jit_to_run(jax.vmap(look, in_axes=(None, 0)))
 
     @functools.cache
     def seen(lift_rad, count=FRAMES):

@@ -1,5 +1,6 @@
 """Algorithm 1 as one pure step: the same alone, scanned, mapped, differentiated and spoilt."""
 
+import functools
 from typing import ClassVar
 
 import equinox as eqx
@@ -14,9 +15,10 @@ from hypothesis import strategies as st
 from jaxnav.ambiguity import PaperCost, PoseBelief, PoseMeasurement, Selection
 from jaxnav.candidates import Candidates
 from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.markers import CORNER_SIGNS
+from jaxnav.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.navigator import Navigator, Output, State
 from jaxnav.observation import Observation, Snapshot
+from jaxnav.rig import CameraRig
 from tests import worlds
 from tests.derivatives import check_derivatives, in_float32
 from tests.reference import kalman, paper
@@ -52,15 +54,16 @@ def drive(sigma_px: float = 0.2, seed: int = 0, blind: tuple[int, ...] = ()) -> 
     sees = np.ones(STEPS, bool)
     sees[list(blind)] = False
 
-    @jax.jit
-    @jax.vmap
-    def look(pose, noise, sees):
-        T_world_vehicle = worlds.T_world_vehicle_from_planar(pose)
-        odometry = {"speed_mps": SPEED_MPS, "steering_rad": STEERING_RAD, "dt_s": DT_S}
-        obs = worlds.observe(rig, markers, T_world_vehicle, noise, **odometry)
-        return eqx.tree_at(lambda o: o.visible, obs, obs.visible & sees)
+    return look(rig, markers, *map(jnp.asarray, (true_poses(), noise, sees)))
 
-    return look(jnp.asarray(true_poses()), jnp.asarray(noise), jnp.asarray(sees))
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
+def look(rig: CameraRig, markers: MarkerMap, pose, noise, sees) -> Observation:
+    T_world_vehicle = worlds.T_world_vehicle_from_planar(pose)
+    odometry = {"speed_mps": SPEED_MPS, "steering_rad": STEERING_RAD, "dt_s": DT_S}
+    obs = worlds.observe(rig, markers, T_world_vehicle, noise, **odometry)
+    return eqx.tree_at(lambda o: o.visible, obs, obs.visible & sees)
 
 
 def at(tree, index):
@@ -117,6 +120,7 @@ def test_step_scan_and_vmap_agree():
             )
 
 
+@in_float32
 def test_the_bound_step_can_be_jitted_and_is_traced_once_a_drive(precision, monkeypatch):
     nav, readings, traces = navigator(), drive(blind=(3,)), []
     step_of = Navigator.step

@@ -17,7 +17,7 @@ from jaxnav.refine import refine_pose, solve_marker, solve_markers
 from jaxnav.residuals import e1
 from jaxnav.rig import CameraRig
 from tests import worlds
-from tests.derivatives import check_derivatives
+from tests.derivatives import check_derivatives, in_float32
 
 FOCAL_PX = 500.0
 VIEW = (0.2, 0.1, 0.6)  # of the room: three cameras, four markers
@@ -288,6 +288,7 @@ def test_a_gradient_that_keeps_the_minima_searches_nothing_twice():
     np.testing.assert_allclose(slope, jax.jit(jax.grad(loss))(corners), rtol=1e-9)
 
 
+@in_float32
 def test_gradients_are_finite_without_a_sight_and_frontally(precision):
     """Exactly frontal, at the start itself and with every lane masked."""
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()

@@ -15,8 +15,10 @@ from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation
+from jaxnav.runtime import replay as replays
 from jaxnav.runtime.recordings import Recording, read_recording
 from jaxnav.runtime.replay import CHUNK_FRAMES, Replay, errors, frames_in_view, replay
+from tests.helpers.compiling import jit_to_run
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +38,13 @@ def keep_the_compile_cache(monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
 
 
+@pytest.fixture
+def run_banks_fast(monkeypatch):
+    """A bank takes longer over a whole recording than to be optimised."""
+    chunk = jit_to_run(replays._run_chunk.__wrapped__, static_argnums=3)
+    monkeypatch.setattr(replays, "_run_chunk", chunk)
+
+
 @pytest.mark.parametrize(
     ("name", "frames", "selector", "median_m", "p95_m"),
     [
@@ -44,7 +53,7 @@ def keep_the_compile_cache(monkeypatch):
     ],
 )
 def test_all_markers_locate_the_rig_to_millimetres(
-    data_dir, tmp_path, capsys, name, frames, selector, median_m, p95_m
+    data_dir, tmp_path, capsys, run_banks_fast, name, frames, selector, median_m, p95_m
 ):
     folder = data_dir / "tagslam" / name
     arguments = ["replay", str(folder), "--selector", selector, "--out", str(tmp_path)]
@@ -77,7 +86,7 @@ def test_one_marker_at_a_time_takes_few_wrong_branches(test_7, alone):
     assert np.nanmedian(rotation_deg) < 0.6
 
 
-def test_the_bank_halves_the_wrong_branches_at_least(test_7, alone):
+def test_the_bank_halves_the_wrong_branches_at_least(test_7, alone, run_banks_fast):
     """Every marker by itself, no odometry, every detection judged that has two poses or one."""
     wrong = []
     for result in (alone, replay(test_7, MultiHypothesis(), one_at_a_time=True)):

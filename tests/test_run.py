@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxnav.cli import EXIT_BAD_INPUT, main
 from jaxnav.runtime.drive_log import read_drive
 from jaxnav.runtime.flags import Health
 from jaxnav.vehicles.world import World
@@ -196,20 +197,6 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
     assert log.truncated
 
 
-def refused(workplace: Workplace, folder: Path, *arguments: object) -> Ended:
-    """A drive that does not come to pass."""
-    log = folder / "told"
-    done = subprocess.run(
-        workplace.command("--option", f"log={log}", "--headless", *arguments),
-        cwd=folder,
-        env=workplace.environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    return Ended(done.returncode, done.stdout, done.stderr, words(log))
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -221,9 +208,14 @@ def refused(workplace: Workplace, folder: Path, *arguments: object) -> Ended:
         (["--period-s", "5"], "--period-s: must be from 0.002 to 0.1, got 5.0"),
     ],
 )
-def test_bad_input_gets_one_line_and_nothing_moves(workplace, tmp_path, arguments, line):
-    vehicle = () if "--vehicle" in arguments else ("--vehicle", recorded_vehicle.NAME)
-    ended = refused(workplace, tmp_path, *vehicle, "--cameras", "sim", *arguments)
-    assert (ended.code, ended.out, ended.err.count("\n")) == (2, "", 1)
-    assert ended.err.startswith(f"jaxnav run: {line}")
-    assert ended.told == []  # it was not even opened
+def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys, arguments, line):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jaxnav.commands.run.configure_jax", lambda **_: None)
+    vehicle = [] if "--vehicle" in arguments else ["--vehicle", recorded_vehicle.NAME]
+    log = tmp_path / "told"
+    options = [*vehicle, "--cameras", "sim", "--option", f"log={log}", "--headless"]
+    assert main(["run", *options, *arguments]) == EXIT_BAD_INPUT
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith(f"jaxnav run: {line}")
+    assert words(log) == []  # it was not even opened
