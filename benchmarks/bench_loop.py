@@ -16,9 +16,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy, as the command does
+
 from jaxnav.commands.process import configure_jax, step_folder
 
-configure_jax(float64=False, threads=1)  # before the first array, as the command does
+configure_jax(float64=False, threads=1)
 
 import cv2  # noqa: E402
 import jax  # noqa: E402

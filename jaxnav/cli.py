@@ -92,6 +92,10 @@ def _dispatch(args: list[str]) -> int:
     command = _parse(args)
     if command is None:
         return 0
+    if isinstance(command, Run):
+        # NumPy's own threads, which it asks for once: those that look for markers have matrices so
+        # small that sharing one out takes longer than it does, and the cores are theirs.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         module = importlib.import_module(f"jaxnav.commands.{type(command).__name__.lower()}")
         code: int = module.run(command)

@@ -280,6 +280,17 @@ def test_where_it_is_expected_it_is_found_as_in_the_whole_image(
     assert_found(near, whole.corners_px, 0.05)
 
 
+@pytest.mark.parametrize("size", [0.7, 1.5])
+def test_it_may_be_larger_or_smaller_than_expected(camera, image, corners_px, size):
+    """By as much as the radius says: near, and not by way of the whole image."""
+    center = corners_px.mean(axis=1, keepdims=True)
+    expected = center + size * (corners_px - center)
+    radius_px = np.linalg.norm(expected - corners_px, axis=-1).max(axis=-1) + 1
+    detector = make_detector("aruco", FAMILY)
+    found = detector.detect_near(image, camera, expected, radius_px)
+    assert_found(found, corners_px, 0.1)
+
+
 def test_where_it_is_not_the_whole_image_is_looked_at(camera, image, corners_px):
     elsewhere = around(corners_px + np.array([250.0, 0.0]))
     detector = make_detector("aruco", FAMILY)

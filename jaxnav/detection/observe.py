@@ -45,6 +45,8 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
     sigma_px = np.ones((*shape, 4))
     unknown = duplicates = 0
     for camera, found in enumerate(detections):
+        if not len(found):
+            continue
         keys = list(zip(found.ids.tolist(), found.families, strict=True))
         told = _told_once(keys, found.corners_px)
         counts = Counter(keys[k] for k in told)

@@ -65,7 +65,8 @@ class Frames:
             if stamp_ns is None:
                 faults |= Fault.STAMP_INVALID
                 continue
-            faults |= Fault.CLOCK_JUMPED if stamps.jumps > jumps else _NO_FAULT
+            if stamps.jumps > jumps:
+                faults |= Fault.CLOCK_JUMPED
             if frame.detections is None:
                 continue
             if self._frozen(frame.camera, frame.detections):
@@ -95,8 +96,8 @@ class Frames:
 
     def _frozen(self, camera: int, detections: Detections) -> bool:
         """Whether a camera shows the very same corners once too often."""
-        finite = np.isfinite(detections.corners_px).all()
-        shown = detections.corners_px.tobytes() if finite else b""
+        is_comparable = len(detections) and np.isfinite(detections.corners_px).all()
+        shown = detections.corners_px.tobytes() if is_comparable else b""
         last, times = self._corners[camera]
         times = times + 1 if shown and shown == last else 1
         self._corners[camera] = shown, times
