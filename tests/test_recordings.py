@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from jaxnav import files
 from jaxnav.errors import BadInput
 from jaxnav.runtime.recordings import Recording, read_recording
+from tests.helpers import seed_texts
 
 DECODED = {"test_5": (2716, 28062, 2715), "test_7": (347, 3235, 347)}  # frames, used, referenced
 FRAMES = {"test_5": 2751, "test_7": 454}
@@ -238,30 +239,8 @@ def test_a_bag_alone_names_the_missing_flag(tmp_path, rig):
     assert problem(bag, rig).startswith("--markers-file: missing")
 
 
-CAMERAS = """
-cam0:
-  camera_model: pinhole
-  intrinsics: [400, 400, 320, 240]
-  distortion_model: equidistant
-  distortion_coeffs: [0, 0, 0, 0]
-  resolution: [640, 480]
-  tagtopic: /a/tags
-  rig_body: cart
-"""
-TAGSLAM = """
-default_body: wall
-bodies:
- - wall:
-     is_static: true
-     default_tag_size: 0.5
-     pose: {position: {x: 1, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 1.5707963267948966}}
-     tags:
-       - {id: 3, size: 0.25, pose: {position: {x: 2, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}}
-       - {id: 4}
- - cart: {is_static: false}
-"""
-POSES = (
-    "cam0: {pose: {position: {x: 0.1, y: 0, z: 0}, rotation: {x: 0, y: 3.141592653589793, z: 0}}}"
+CAMERAS, TAGSLAM, POSES = (
+    seed_texts.TAGSLAM[name] for name in ("cameras.yaml", "tagslam.yaml", "camera_poses.yaml")
 )
 UNIT = (1.0, 0.0, 0.0, 0.0)
 

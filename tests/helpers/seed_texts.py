@@ -85,7 +85,7 @@ bodies:
  - cart: {is_static: false}
 """,
     "camera_poses.yaml": """
-cam0: {pose: {position: {x: 0.1, y: 0, z: 0}, rotation: {x: 0, y: 3.14, z: 0}}}
+cam0: {pose: {position: {x: 0.1, y: 0, z: 0}, rotation: {x: 0, y: 3.141592653589793, z: 0}}}
 """,
 }
 STUDY = """
