@@ -357,7 +357,7 @@ def off(before: Outcomes, now: Outcomes, pairs: np.ndarray) -> tuple[np.ndarray,
 def test_flags_go_before_the_recordings_own_files(tmp_path, drive, monkeypatch):
     given = []
 
-    def compiled(args, setup):
+    def compiled(args, setup, searches):
         given.append(setup)
         raise BadInput("--nothing", "is compiled here")
 

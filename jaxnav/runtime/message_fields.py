@@ -98,7 +98,7 @@ def square(array: np.ndarray) -> np.ndarray:
 Now = Annotated[int, Field(strict=True, ge=0, lt=2**63)]  # ns, the loop's own clock
 Index = Annotated[int, Field(strict=True, ge=-1, le=2**31)]  # -1: none
 # ns, whatever a driver says, if a float can hold it.
-Stamp = Annotated[int, Field(strict=True, ge=-(2**100), le=2**100)]
+Stamp = Annotated[int, Field(strict=True, ge=-(2**1000), le=2**1000)]
 Real = Annotated[float, Field(strict=True)]  # also NaN and infinite
 Flag = Annotated[bool, Field(strict=True)]
 Word = Annotated[str, Field(strict=True)]
