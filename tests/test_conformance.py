@@ -191,7 +191,7 @@ class CloseOnce(GoodVehicle):
         (NeverValid, r"no reading of read\(\) was valid"),
         (RaisesValueError, r"write\(0.*\) raised ValueError: too fast; only OSError is allowed"),
         (StopWaits, r"stop\(\) took .* s"),
-        (StopHangs, r"stop\(\) did not return within 0.5 s"),
+        (StopHangs, r"stop\(\) did not return within 1.2 s"),
         (OneThreadOnly, r"stop\(\) raised RuntimeError: wrong thread"),
         (StopForgets, r"the throttle is 0.3 after stop\(\), it must be 0"),
         (ReadDrivesOn, "the throttle is 0.3 when it is read after stop"),
@@ -205,8 +205,8 @@ def test_a_broken_promise_of_a_vehicle_is_named(broken, sentence, monkeypatch):
     monkeypatch.setattr("jaxnav.testing.vehicle._BUSY_S", 0.03)
     monkeypatch.setattr("jaxnav.testing.vehicle._STOP_S", 0.2)
     monkeypatch.setattr("jaxnav.testing.vehicle._READINGS", 6)
-    monkeypatch.setattr("jaxnav.testing.vehicle.HANGS_S", 0.5)
-    monkeypatch.setattr("jaxnav.testing.calls.HANGS_S", 0.5)
+    monkeypatch.setattr("jaxnav.testing.vehicle.HANGS_S", 1.2)
+    monkeypatch.setattr("jaxnav.testing.calls.HANGS_S", 1.2)
     with pytest.raises(AssertionError, match=sentence):
         check_vehicle(broken, SETUP, throttle_of)
 
