@@ -302,7 +302,7 @@ def test_bad_input_gets_one_line_before_anything_is_compiled(
     recorded(tmp_path / "back.mcap", BACKWARDS)
     recorded(tmp_path / "strange.mcap", STRANGER)
     recorded(tmp_path / "header.mcap", header={"rig": {}})
-    given = ["--option", *(option.format(tmp=tmp_path) for option in options)] if options else []
+    given = [part for text in options for part in ("--option", text.format(tmp=tmp_path))]
     assert cli.main(["run", "--float64", "--headless", *NAMES, *given]) == 2
     told = capsys.readouterr()
     assert told.out == ""

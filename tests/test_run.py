@@ -202,6 +202,7 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
     [
         (["--vehicle", "bicycle"], "--vehicle: there is no 'bicycle': expected qcar, "),
         (["--option", "images"], "--option: expected KEY=VALUE, got 'images'"),
+        (["--option", "a=1", "--option", "a=2"], "--option: a is given twice"),
         (["--record", "nowhere/drive.mcap"], "nowhere/drive.mcap: can't be written: no such file"),
         (["--record", "/dev/full"], "/dev/full: can't be written: no space left on device"),
         (["--record-images"], "--record-images: needs --record"),

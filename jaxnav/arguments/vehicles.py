@@ -39,7 +39,10 @@ class Run:
         ),
     ] = None
     """Installed cameras (sim, qcar, opencv, replay and those of plug-ins), or MODULE:NAME."""
-    option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    option: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
+    ] = ()
     """What the vehicle and the cameras are told, e.g. images=true for sim."""
     rig: QCarFile = None
     """Cameras: a rig file or a Kalibr camchain."""

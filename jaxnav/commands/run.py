@@ -61,6 +61,8 @@ def _options(given: Sequence[str]) -> dict[str, str]:
         key, equals, value = text.partition("=")
         if not equals or not key:
             raise BadInput("--option", f"expected KEY=VALUE, got {text!r}")
+        if key in options:
+            raise BadInput("--option", f"{key} is given twice")
         options[key] = value
     return options
 

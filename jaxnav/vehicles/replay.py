@@ -1,7 +1,7 @@
 """A recorded drive as a vehicle, in real time: nothing moves, all comes once more as it came.
 
-jaxnav run --vehicle replay --option drive=drive.mcap                  # detections as recorded
-jaxnav run --vehicle replay --option drive=drive.mcap images=true      # the recorded images
+jaxnav run --vehicle replay --option drive=drive.mcap       # detections as recorded
+    --option images=true                                    # the recorded images
 
 What was handed over at an instant of the recording is handed over so long after the first look at
 it, as old as it was then; its stamps are moved into the present. Readings and frames that were
