@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import update_wrapper
+from functools import cache, update_wrapper
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ _KEPT = 64  # executables, of some MB each: the last ones used
 _CHECKSUM_BYTES = 32  # at the beginning of the file, of what follows
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 _FOLDERS = (".", "detection", "runtime", "simulation", "vehicles")  # of all that is kept
+_PACKAGE = Path(__file__).resolve().parent
 
 _folders: list[Path] = []  # the last one counts
 
@@ -81,6 +82,17 @@ def is_kept(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -
     """Whether `program` finds what it looks for."""
     given, inputs = _asked(told)
     return _file(folder, _name(function, given), inputs).is_file()
+
+
+@cache
+def sources_digest(package: Path, folders: tuple[str, ...]) -> str:
+    """Of the sources in some folders of a package, as they are when a process first asks: between
+    two releases a version does not change."""
+    digest = hashlib.blake2b(digest_size=8)
+    for folder in folders:
+        for source in sorted((package / folder).glob("*.py")):
+            digest.update(f"{folder}/{source.name} ".encode() + source.read_bytes())
+    return digest.hexdigest()
 
 
 def _asked(told: tuple[Any, ...]) -> tuple[Any, list[Any]]:
@@ -156,8 +168,7 @@ def _checksum(raw: bytes) -> bytes:
 
 def _file(folder: Path, structures: str, leaves: list[Any]) -> Path:
     """Named by all that the executable depends on."""
-    device, package = jax.devices()[0], Path(__file__).resolve().parent
-    sources = sorted(source for folder in _FOLDERS for source in (package / folder).glob("*.py"))
+    device = jax.devices()[0]
     depends_on = [
         structures,
         [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
@@ -165,6 +176,6 @@ def _file(folder: Path, structures: str, leaves: list[Any]) -> Path:
         (device.platform, device.device_kind, platform.machine(), platform.node()),
         str(jnp.zeros(()).dtype),
         (os.environ.get("XLA_FLAGS"), os.environ.get("PJRT_NPROC")),
-        [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources],
+        sources_digest(_PACKAGE, _FOLDERS),
     ]
     return folder / f"{hashlib.sha256(repr(depends_on).encode()).hexdigest()}.step"

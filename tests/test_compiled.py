@@ -82,10 +82,11 @@ def test_a_file_is_for_one_structure_shape_and_source(monkeypatch, tmp_path):
     monkeypatch.setenv("XLA_FLAGS", "--another")
     others.append(file(nav))
     monkeypatch.undo()
-    monkeypatch.setattr(executables, "__file__", str(tmp_path / "executables.py"))
+    monkeypatch.setattr(executables, "_PACKAGE", tmp_path)
     for folder in (tmp_path, tmp_path / "detection", tmp_path / "runtime"):
         folder.mkdir(exist_ok=True)
         (folder / "one.py").write_text("# changed")
+        executables.sources_digest.cache_clear()  # as in another process
         others.append(file(nav))
     monkeypatch.undo()
     assert len({file(nav), *others}) == 8

@@ -14,7 +14,6 @@ import hashlib
 import os
 import platform
 from dataclasses import asdict, dataclass, field, fields
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +23,7 @@ from pydantic import Field, create_model, field_validator
 
 from jaxnav.bicycle import Vehicle
 from jaxnav.errors import BadInput
+from jaxnav.executables import sources_digest
 from jaxnav.files import Route
 from jaxnav.files.markers import MarkerFile, marker_data
 from jaxnav.files.rigs import RigFile, rig_data
@@ -40,6 +40,7 @@ from jaxnav.runtime.pilot import Pilot
 from jaxnav.selectors import SELECTORS, make_selector
 
 SETUP_VERSION = 1
+_DECIDING = (".", "runtime", "detection")  # what the bits of a drive depend on
 # The others need what only a simulation has: another sensor, the truth.
 PILOT_SELECTORS = tuple(name for name in SELECTORS if name not in ("orientation-given", "oracle"))
 
@@ -187,21 +188,10 @@ def this_process() -> dict[str, str]:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "host": hashlib.blake2b(platform.node().encode(), digest_size=8).hexdigest(),
-        "sources": _sources(),
+        "sources": sources_digest(Path(__file__).resolve().parents[1], _DECIDING),
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
         "PJRT_NPROC": os.environ.get("PJRT_NPROC", ""),
     }
-
-
-@cache
-def _sources() -> str:
-    """A digest of the package: between two releases its version does not change."""
-    package = Path(__file__).resolve().parents[1]
-    digest = hashlib.blake2b(digest_size=8)
-    for folder in (package, package / "runtime", package / "detection"):
-        for source in sorted(folder.glob("*.py")):
-            digest.update(source.read_bytes())
-    return digest.hexdigest()
 
 
 def _checked(header: dict[str, Any], where: Path) -> SetupEntry:
