@@ -27,7 +27,7 @@ from jaxnav.geometry import (
     safe_norm,
     wrap_angle,
 )
-from jaxnav.observation import Snapshot
+from jaxnav.observation import Snapshot, log_sigmas
 from jaxnav.residuals import e2
 from jaxnav.small_matrices import cholesky, log_det, solve_lower
 
@@ -51,8 +51,9 @@ class PoseMeasurement(eqx.Module):
     """What each hypothesis takes as measured. Lanes that take nothing hold finite numbers."""
 
     T_world_vehicle: jaxlie.SE3  # batch axis (K,)
-    covariance: Float[Array, "K 6 6"]  # of xi in T_world_vehicle * exp(xi)
-    taken: Bool[Array, " K"]
+    covariance: Float[Array, "*K 6 6"]  # of xi in T_world_vehicle * exp(xi)
+    log_misfit: Float[Array, "*K"]  # how probable what is left of the corners is, up to a constant
+    taken: Bool[Array, "*K"]
 
 
 class PosePosterior(eqx.Module):
@@ -68,6 +69,7 @@ class PosePosterior(eqx.Module):
     # What the covariance was multiplied with: so much more contradiction the gate lets pass. It is
     # counted all the same.
     inflation: Float[Array, "*K"]
+    log_likelihood: Float[Array, "*K"]  # of the corners given the prediction, up to a constant
     taken: Bool[Array, "*K"]
 
 
@@ -110,7 +112,7 @@ class LowestReprojection(eqx.Module):
     hypotheses: ClassVar[int] = 1
 
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
-        return _cheapest(prior, candidates, candidates.e1_px2)
+        return _cheapest(prior, candidates, snapshot, candidates.e1_px2)
 
 
 class RatioTest(eqx.Module):
@@ -130,7 +132,7 @@ class RatioTest(eqx.Module):
         costs = jnp.where(candidates.valid, candidates.e1_px2, jnp.inf)
         best, second = jnp.sort(costs)[:2] if costs.shape[0] > 1 else (costs[0], jnp.inf)
         clear = best <= self.max_ratio**2 * second
-        return _cheapest(prior, candidates, candidates.e1_px2, accepted=clear)
+        return _cheapest(prior, candidates, snapshot, candidates.e1_px2, accepted=clear)
 
 
 class ObjectSpace(eqx.Module):
@@ -147,7 +149,7 @@ class ObjectSpace(eqx.Module):
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
         started = prior.initialised[0]
         costs = jnp.where(started, _object_space_m2(prior, candidates, snapshot), candidates.e1_px2)
-        return _cheapest(prior, candidates, costs)
+        return _cheapest(prior, candidates, snapshot, costs)
 
 
 class PaperCost(eqx.Module):
@@ -166,7 +168,7 @@ class PaperCost(eqx.Module):
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
         object_space = _object_space_m2(prior, candidates, snapshot) / self.length_unit_m**2
         e2_units = jnp.where(prior.initialised[0], object_space, 0)
-        return _cheapest(prior, candidates, candidates.e1_px2 + e2_units)
+        return _cheapest(prior, candidates, snapshot, candidates.e1_px2 + e2_units)
 
 
 class Mahalanobis(eqx.Module):
@@ -199,7 +201,7 @@ class Mahalanobis(eqx.Module):
 
         far = jax.vmap(distance)(candidates.T_vehicle_world, candidates.covariance, asked)
         costs = candidates.cost - volume + jnp.where(prior.initialised[0], far, 0)
-        return _cheapest(prior, candidates, costs, _doubt(candidates.valid, costs))
+        return _cheapest(prior, candidates, snapshot, costs, _doubt(candidates.valid, costs))
 
 
 class OrientationGiven(eqx.Module):
@@ -230,7 +232,7 @@ class OrientationGiven(eqx.Module):
             costs = costs + jax.vmap(lambda T: _normals_error(T, snapshot))(
                 candidates.T_vehicle_world
             )
-        return _cheapest(prior, candidates, costs, _doubt(candidates.valid, costs))
+        return _cheapest(prior, candidates, snapshot, costs, _doubt(candidates.valid, costs))
 
 
 class Oracle(eqx.Module):
@@ -245,12 +247,13 @@ class Oracle(eqx.Module):
         turns = jax.vmap(lambda T: rotation_error_rad(T.inverse(), T_true))(
             candidates.T_vehicle_world
         )
-        return _cheapest(prior, candidates, turns, doubts=jnp.zeros_like(turns))
+        return _cheapest(prior, candidates, snapshot, turns, doubts=jnp.zeros_like(turns))
 
 
 def _cheapest(
     prior: PoseBelief,
     candidates: Candidates,
+    snapshot: Snapshot,
     costs: Float[Array, " N"],
     doubts: Float[Array, " N"] | None = None,
     accepted: Bool[Array, ""] | bool = True,
@@ -266,12 +269,14 @@ def _cheapest(
         doubts = _doubt(candidates.valid, candidates.cost - volume)
     costs = jnp.where(candidates.valid, costs, jnp.inf)
     cheapest = jnp.argmin(costs)
+    misfit = jnp.where(jnp.isfinite(candidates.cost[cheapest]), candidates.cost[cheapest], 0)
     any_valid = jnp.any(candidates.valid) & accepted
     T_vehicle_world = jax.tree.map(lambda leaf: leaf[cheapest], candidates.T_vehicle_world)
     return Selection(
         measured=PoseMeasurement(
             jaxlie.SE3(T_vehicle_world.inverse().wxyz_xyz[None]),
             candidates.covariance[cheapest][None],
+            (-misfit / 2 - log_sigmas(snapshot.seen))[None],
             any_valid[None],
         ),
         kept=prior.initialised,

@@ -18,7 +18,7 @@ from jaxnav.geometry import (
 )
 from jaxnav.motion import Belief, Motion, Offer, contradicted, followed, forgotten, unstarted
 from jaxnav.observation import Observation
-from jaxnav.small_matrices import sandwich
+from jaxnav.small_matrices import cholesky, log_det, sandwich
 
 
 class BicycleKalman(Motion):
@@ -30,20 +30,22 @@ class BicycleKalman(Motion):
     * The odometry's v (cos(beta + psi), sin(beta + psi)) depends on the state's own heading. Its
       innovation uses the predicted psi, and H carries the derivative, so a correction of
       the heading turns the velocity along and the drift of the position corrects the heading.
+    * Q and the odometry's noise are given in the vehicle's axes, since wheels slip along and across
+      themselves: numbers learned on one course hold on another.
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
       floor, since errors of successive frames are correlated (RELIABILITY R8).
     """
 
     vehicle: Vehicle
-    acceleration_density: Float[Array, " 3"] = eqx.field(
+    acceleration_density: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.1**2, 0.1**2, 0.3**2])
-    )  # (m/s^2)^2/Hz twice, (rad/s^2)^2/Hz
-    vision_floor: Float[Array, " 3"] = eqx.field(
+    )  # along, across, turning: (m/s^2)^2/Hz twice, (rad/s^2)^2/Hz; or the matrix
+    vision_floor: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.005, 0.005, 0.005])
-    )  # standard deviations, m m rad
-    odometry_sigma: Float[Array, " 3"] = eqx.field(
+    )  # x, y, psi: standard deviations, m m rad; or their covariance
+    odometry_sigma: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.01, 0.01, 0.01])
-    )  # standard deviations, m/s m/s rad/s
+    )  # along, across, turning: standard deviations, m/s m/s rad/s; or their covariance
     initial_velocity_sigma: Float[Array, " 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0, 1.0, 2.0])
     )  # before the first odometry, m/s m/s rad/s
@@ -62,17 +64,9 @@ class BicycleKalman(Motion):
 
         A hypothesis that the gate has contradicted too often or too long is forgotten.
         """
-        dtype, dt_s = belief.mean.dtype, jnp.asarray(obs.dt_s, belief.mean.dtype)
-        eye, zero = jnp.eye(3, dtype=dtype), jnp.zeros((3, 3), dtype)
-        A = jnp.block([[eye, dt_s * eye], [zero, eye]])
-        Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
-
-        def one(mean: Array, P: Array) -> tuple[Array, Array]:
-            mean = jnp.sum(A * mean[None], axis=1)
-            mean = mean.at[2].set(wrap_angle(mean[2]))
-            return self._with_odometry(mean, kalman.predict_covariance(P, A, Q), obs)
-
-        mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
+        mean, covariance = jax.vmap(lambda x, P: self._with_odometry(*self._later(x, P, obs), obs))(
+            belief.mean, belief.covariance
+        )
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
         return forgotten(predicted, self.lost(belief))
 
@@ -89,8 +83,7 @@ class BicycleKalman(Motion):
         nuisance = jnp.asarray(OFF_GROUND, dtype) * jnp.asarray(tilt, dtype)[None]
 
         def body_covariance(pose: Array, P: Array) -> Array:
-            to_body = jnp.eye(3, dtype=P.dtype).at[:2, :2].set(_turn(-pose[2]))
-            return sandwich(freedom, sandwich(to_body, P[:3, :3]))
+            return sandwich(freedom, sandwich(_turn(-pose[2]), P[:3, :3]))
 
         return PoseBelief(
             T_world_vehicle,
@@ -107,12 +100,17 @@ class BicycleKalman(Motion):
         P = belief.covariance
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         R = planar_covariance(measured.T_world_vehicle, measured.covariance)
-        R = R + jnp.diag(self.vision_floor**2)
+        # Height, roll and pitch were fitted as well, or were not free: then their variances are 0.
+        fitted = measured.covariance
+        fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
+        log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
+        R = R + kalman.as_covariance(self.vision_floor)
         innovation = self.difference(pose, belief.mean[:3])
         correction, posterior, S = kalman.update(P, innovation, jnp.eye(3, 6, dtype=P.dtype), R)
         return Offer(
             kalman.whitened(innovation, S),
             gate_nis=self.gate_nis,
+            log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
             first=self._first(pose, R, obs),
             posterior=(self.moved(belief.mean, correction), posterior),
         )
@@ -122,8 +120,8 @@ class BicycleKalman(Motion):
         T = measured.T_world_vehicle
         pose = planar_from_T_world_vehicle(T)
         eye = jnp.eye(6, dtype=belief.mean.dtype)
-        to_body = eye.at[:2, :2].set(_turn(-belief.mean[2]))
-        to_world = eye.at[:2, :2].set(_turn(pose[2]))
+        to_body = eye.at[:3, :3].set(_turn(-belief.mean[2]))
+        to_world = eye.at[:3, :3].set(_turn(pose[2]))
         correction, P = followed(
             jnp.where(belief.initialised, sandwich(to_body, belief.covariance), eye),
             T_world_vehicle_from_planar(belief.mean[:3]),
@@ -134,6 +132,7 @@ class BicycleKalman(Motion):
         return Offer(
             measured.innovation,
             gate_nis=self.gate_nis,
+            log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
             first=self._first(pose, planar_covariance(T, measured.covariance), obs),
             posterior=(jnp.append(pose, belief.mean[3:] + correction[3:]), sandwich(to_world, P)),
@@ -159,6 +158,17 @@ class BicycleKalman(Motion):
             obs,
         )
 
+    def _later(self, mean: Array, P: Array, obs: Observation) -> tuple[Array, Array]:
+        """The state `dt_s` later (Eq. 9)."""
+        dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
+        eye, zero = jnp.eye(3, dtype=dtype), jnp.zeros((3, 3), dtype)
+        A = jnp.block([[eye, dt_s * eye], [zero, eye]])
+        density = sandwich(_turn(mean[2]), kalman.as_matrix(self.acceleration_density))
+        Q = kalman.white_acceleration(density, dt_s).astype(dtype)
+        mean = jnp.sum(A * mean[None], axis=1)
+        mean = mean.at[2].set(wrap_angle(mean[2]))
+        return mean, kalman.predict_covariance(P, A, Q)
+
     def _with_odometry(self, mean: Array, P: Array, obs: Observation) -> tuple[Array, Array]:
         """The state after speed and steering were measured, at its own heading."""
         dtype = mean.dtype
@@ -170,12 +180,15 @@ class BicycleKalman(Motion):
         )
         turned_velocity = jnp.stack([-velocity[1], velocity[0], jnp.zeros_like(speed_mps)])
         H = jnp.eye(3, 6, k=3, dtype=dtype).at[:, 2].set(-turned_velocity)
-        R = jnp.diag(self.odometry_sigma**2).astype(dtype)
+        R = sandwich(_turn(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(dtype)
         present = jnp.full(3, jnp.asarray(obs.has_odometry, dtype))
-        correction, P, _ = kalman.update(P, *kalman.hide_rows(velocity - mean[3:], H, R, present))
+        seen = kalman.hide_rows(velocity - mean[3:], H, R, present)
+        correction, P, _ = kalman.update(P, *seen)
         return self.moved(mean, correction), P
 
 
 def _turn(angle_rad: Array) -> Array:
-    c, s = jnp.cos(angle_rad), jnp.sin(angle_rad)
-    return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
+    """(x, y, psi) turned about z."""
+    c, s, zero, one = jnp.cos(angle_rad), jnp.sin(angle_rad), angle_rad * 0, angle_rad * 0 + 1
+    rows = ([c, -s, zero], [s, c, zero], [zero, zero, one])
+    return jnp.stack([jnp.stack(row) for row in rows])

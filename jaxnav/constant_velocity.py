@@ -11,6 +11,7 @@ from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
 from jaxnav.geometry import cayley, inverse_cayley
 from jaxnav.motion import Belief, Motion, Offer, contradicted, followed, forgotten, unstarted
 from jaxnav.observation import Observation
+from jaxnav.small_matrices import cholesky, log_det
 
 
 class ConstantVelocity(Motion):
@@ -21,12 +22,12 @@ class ConstantVelocity(Motion):
     odometry. Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
     """
 
-    acceleration_density: Float[Array, " 6"] = eqx.field(
+    acceleration_density: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0**2] * 3 + [2.0**2] * 3)
-    )  # (m/s^2)^2/Hz three times, (rad/s^2)^2/Hz three times
-    vision_floor: Float[Array, " 6"] = eqx.field(
+    )  # (m/s^2)^2/Hz three times, (rad/s^2)^2/Hz three times; or the matrix
+    vision_floor: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.002] * 3 + [0.002] * 3)
-    )  # standard deviations, m and rad
+    )  # standard deviations, m and rad; or their covariance
     initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
     )  # m/s and rad/s
@@ -85,12 +86,14 @@ class ConstantVelocity(Motion):
         """The offer to one hypothesis whose selector has chosen a candidate, in 6 dof."""
         mean, P = belief.mean, belief.covariance
         wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
-        R = measured.covariance + jnp.diag(self.vision_floor**2)
+        log_volume = log_det(cholesky(measured.covariance)) / 2
+        R = measured.covariance + kalman.as_covariance(self.vision_floor)
         innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
         correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, 12, dtype=P.dtype), R)
         return Offer(
             kalman.whitened(innovation, S),
             gate_nis=self.gate_nis,
+            log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
             first=self._first(wxyz_xyz, R),
             posterior=(self.moved(mean, correction), posterior),
         )
@@ -108,6 +111,7 @@ class ConstantVelocity(Motion):
         return Offer(
             measured.innovation,
             gate_nis=self.gate_nis,
+            log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
             first=self._first(T.wxyz_xyz, measured.covariance),
             posterior=(jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:]), P),

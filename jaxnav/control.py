@@ -58,6 +58,9 @@ class Exploration(eqx.Module):
 class Controller(eqx.Module):
     """Ackermann arc to the waypoint, PI throttle on the distance to it.
 
+    Two numbers that the paper does not have change nothing at their default, infinity:
+    `lookahead_m` and `slows_at_rad`.
+
     The paper's sum of distances (Eq. 19) never decreases: here it is an integral over time, held
     inside `integral_limit_ms`, and starts anew at every waypoint. After the last waypoint the
     throttle is zero, and so it is before the first pose and where the pose is no number. From a
@@ -72,6 +75,10 @@ class Controller(eqx.Module):
     proportional_per_m: Float[Array, ""]  # p1, throttle per metre
     integral_per_ms: Float[Array, ""]  # p2, throttle per metre second
     integral_limit_ms: Float[Array, ""]
+    # From afar it steers as towards a point no farther than this; inf: towards the waypoint.
+    lookahead_m: Float[Array, ""] | float = np.inf
+    # The throttle is half of it where the waypoint lies so far off the course; inf: nowhere.
+    slows_at_rad: Float[Array, ""] | float = np.inf
     exploration: Exploration = Exploration()
 
     def init(self) -> ControlState:
@@ -105,17 +112,30 @@ class Controller(eqx.Module):
         Returns:
             The next state, the command, whether the last waypoint is reached, and the log.
         """
-        count = self.waypoints_m.shape[0]
-        arrived = (
-            located
-            & decided
-            & (self._distance(state.waypoint_index, pose) <= self.waypoint_radius_m)
+        count, index = self.waypoints_m.shape[0], state.waypoint_index
+        short_m = self.short_of(index, pose)
+        arrived = located & decided & (short_m <= 0)
+        index = jnp.minimum(index + (arrived & (index < count)), count)
+        integral_ms = jnp.where(arrived, 0, state.integral_ms)
+        state = ControlState(index, integral_ms, state.explored_s, state.side)
+        return self.towards(
+            state, pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps
         )
-        index = jnp.minimum(
-            state.waypoint_index + (arrived & (state.waypoint_index < count)), count
-        )
-        done = index >= count
 
+    def towards(
+        self,
+        state: ControlState,
+        pose: Float[Array, " 3"],
+        located: Bool[Array, ""],
+        steering_rad: Float[Array, ""],
+        dt_s: Float[Array, ""],
+        decided: Bool[Array, ""] | bool = True,
+        to_marker_m: Float[Array, " 2"] | None = None,
+        speed_mps: Float[Array, ""] | float = np.nan,
+    ) -> tuple[ControlState, Command, Bool[Array, ""], ControlLog]:
+        """One command towards the waypoint of the state, whether it is reached or not."""
+        count, index = self.waypoints_m.shape[0], state.waypoint_index
+        done = index >= count
         to_waypoint = self.waypoints_m[jnp.minimum(index, count - 1)] - pose[:2]
         distance_m = safe_norm(to_waypoint)
         steering_limit = self.vehicle.steering_limit_rad
@@ -125,12 +145,15 @@ class Controller(eqx.Module):
         drives = located & ~done & jnp.isfinite(distance_m) & jnp.isfinite(alpha_rad)
         dt_s = jnp.where(jnp.isfinite(dt_s) & (dt_s > 0), dt_s, 0)
 
-        steering = self._steering(alpha_rad, distance_m, beta_rad)
+        ahead_m = distance_m / (1 + distance_m / self.lookahead_m)
+        steering = self._steering(alpha_rad, ahead_m, beta_rad)
         steering = jnp.where(self._orbited(alpha_rad, distance_m), 0, steering)
-        integral_ms = jnp.where(arrived, 0, state.integral_ms)
-        integral_ms = integral_ms + jnp.where(drives & decided, distance_m * dt_s, 0)
+        integral_ms = state.integral_ms + jnp.where(drives & decided, distance_m * dt_s, 0)
         integral_ms = jnp.clip(integral_ms, 0, self.integral_limit_ms)
         throttle = self.proportional_per_m * distance_m + self.integral_per_ms * integral_ms
+        # Clipped, or a heading of 1e270 rad would leave inf / inf.
+        off_course = jnp.clip(alpha_rad, -jnp.pi, jnp.pi) / self.slows_at_rad
+        throttle = throttle / (1 + off_course**2)
         limit = self.vehicle.throttle_limit
         state, explore = self._explore(state, decided, to_marker_m, beta_rad, speed_mps, dt_s)
         steering = jnp.where(decided, steering, explore.steering_rad)
@@ -176,9 +199,10 @@ class Controller(eqx.Module):
             jnp.where(decided, 0, side),
         ), Command(steering, jnp.where(goes, throttle, 0))
 
-    def _distance(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
+    def short_of(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
+        """How far it is to where a waypoint counts as reached, m; negative beyond."""
         waypoint_m = self.waypoints_m[jnp.minimum(index, self.waypoints_m.shape[0] - 1)]
-        return safe_norm(waypoint_m - pose[:2])
+        return safe_norm(waypoint_m - pose[:2]) - self.waypoint_radius_m
 
     def _orbited(
         self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""]

@@ -55,6 +55,7 @@ class MultiHypothesis(eqx.Module):
     forget_log_weight: float = -20.0  # lighter ones are dropped
     outlier_log_evidence: float = -12.0  # what a single frame can say against a hypothesis
     max_inflation: float = 10.0  # of a covariance, where prediction and corners disagree
+    max_misfit: float = np.inf  # times a corner's sigma, where no pose explains the corners
     gate: float = 30.0  # whitened squared distance to the corners' own minimum; above: an outlier
     far_rad: float = float(np.deg2rad(20.0))
     decided_mass: float = 3e-5
@@ -68,7 +69,7 @@ class MultiHypothesis(eqx.Module):
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
         """Weigh the hypotheses by the corners, and say what pose each has measured."""
         any_seen = jnp.any(snapshot.seen.visible)
-        snapshot = _trusted(snapshot, candidates)
+        snapshot = self._trusted(snapshot, candidates)
         starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
         count, bank = prior.log_weight.shape[0], prior
         if count == self.hypotheses:  # else whoever left the rest away knows that none starts
@@ -122,6 +123,19 @@ class MultiHypothesis(eqx.Module):
             & (far < self.decided_mass)
             & (sigmas_rad[best] < self.decided_sigma_rad),
         )
+
+    def _trusted(self, snapshot: Snapshot, candidates: Candidates) -> Snapshot:
+        """The corners, trusted no more than their own misfit allows.
+
+        Where not even the best pose explains them within three sigmas of chi-square, their sigma is
+        larger than they say: a blurred, bent or half hidden marker.
+        """
+        seen = snapshot.seen
+        misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+        freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
+        scale = jnp.sqrt(_excess(jnp.where(jnp.isfinite(misfit), misfit, 0), freedom))
+        scale = jnp.minimum(scale, self.max_misfit)
+        return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, seen.sigma_px * scale)
 
     def _inflation(
         self, fits: Fit, alive: Bool[Array, " K"], starts: Array, freedom: int
@@ -224,19 +238,6 @@ def _inflated(posteriors: PosePosterior, inflation: Float[Array, ""]) -> PosePos
         posteriors,
         (posteriors.covariance * inflation, posteriors.inflation * inflation),
     )
-
-
-def _trusted(snapshot: Snapshot, candidates: Candidates) -> Snapshot:
-    """The corners, trusted no more than their own misfit allows.
-
-    Where not even the best pose explains them within three sigmas of chi-square, their sigma is
-    larger than they say: a blurred, bent or half hidden marker.
-    """
-    seen = snapshot.seen
-    misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
-    freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
-    scale = jnp.sqrt(_excess(jnp.where(jnp.isfinite(misfit), misfit, 0), freedom))
-    return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, seen.sigma_px * scale)
 
 
 def _excess(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:

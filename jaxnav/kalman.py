@@ -7,7 +7,15 @@ Joseph (1968), since Eq. 11's (I - K H) P loses positive definiteness in float32
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.small_matrices import applied, cho_solve, cholesky, product, sandwich, solve_lower
+from jaxnav.small_matrices import (
+    applied,
+    cho_solve,
+    cholesky,
+    log_det,
+    product,
+    sandwich,
+    solve_lower,
+)
 
 # A variance never falls below this fraction of the largest one.
 _RELATIVE_FLOOR = 1e-12
@@ -62,6 +70,12 @@ def nis(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, 
     return jnp.sum(whitened(innovation, S) ** 2)
 
 
+def log_likelihood(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
+    """log N(innovation; 0, S) but for its constant, -m log(2 pi) / 2."""
+    factor = cholesky(S)
+    return -(jnp.sum(solve_lower(factor, innovation) ** 2) + log_det(factor)) / 2
+
+
 def floored(posterior: Float[Array, "n n"], prior: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A covariance kept positive definite next to the prior's largest variance."""
     floor = _RELATIVE_FLOOR * jnp.max(jnp.diagonal(prior))
@@ -73,16 +87,26 @@ def symmetrise(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return (P + P.T) / 2
 
 
+def as_covariance(sigma: Float[Array, " d"] | Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """The covariance that stands for itself, or of which standard deviations are given."""
+    return jnp.diag(sigma**2) if sigma.ndim == 1 else sigma
+
+
+def as_matrix(density: Float[Array, " d"] | Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """The matrix itself, or the one with that diagonal."""
+    return jnp.diag(density) if density.ndim == 1 else density
+
+
 def white_acceleration(
-    density: Float[Array, " d"], dt_s: Float[Array, ""] | float
+    density: Float[Array, " d"] | Float[Array, "d d"], dt_s: Float[Array, ""] | float
 ) -> Float[Array, "2*d 2*d"]:
     """Q of a position-velocity state driven by white acceleration.
 
     Args:
-        density: power spectral density of each axis, (m/s^2)^2/Hz or (rad/s^2)^2/Hz.
+        density: power spectral density, (m/s^2)^2/Hz or (rad/s^2)^2/Hz: of each axis, or a matrix.
         dt_s: sample period.
 
     Source: Bar-Shalom, Li, Kirubarajan (2001), Eq. 6.2.2-12.
     """
-    D = jnp.diag(density)
+    D = as_matrix(density)
     return jnp.block([[D * dt_s**3 / 3, D * dt_s**2 / 2], [D * dt_s**2 / 2, D * dt_s]])

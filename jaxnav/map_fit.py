@@ -23,7 +23,7 @@ from jaxnav.ambiguity import PoseBelief, PosePosterior
 from jaxnav.geometry import cayley, cayley_jacobian, rotation_matrix
 from jaxnav.levenberg_marquardt import ImplicitGradient, NormalEquations, NormalEquationsLM
 from jaxnav.linearised import crossed, reprojection_rows, turned, wrench
-from jaxnav.observation import Snapshot
+from jaxnav.observation import Snapshot, log_sigmas
 from jaxnav.small_matrices import (
     applied,
     cho_solve,
@@ -73,7 +73,9 @@ def fit(
     usable = jnp.all(jnp.isfinite(P), axis=(1, 2)) & (jnp.min(variances, axis=1) > 0)
     root = jax.vmap(cholesky)(jnp.where(usable[:, None, None], P, eye[None]))
     spread = jax.vmap(lambda L: product(freedom, L))(root)
-    linearised = _linearised(T_world_prior, jnp.moveaxis(spread, 0, -1), nuisance, snapshot)
+    linearised, log_nuisance = _linearised(
+        T_world_prior, jnp.moveaxis(spread, 0, -1), nuisance, snapshot
+    )
 
     def with_prediction(u: Array, _: None) -> tuple[Any, NormalEquations]:
         r, normal = linearised(u)
@@ -93,7 +95,7 @@ def fit(
     )
     r, normal = linearised(solution.value)
     fused: Fit = jax.vmap(
-        partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 4)
+        partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 5)
     )(
         T_world_prior,
         usable,
@@ -103,6 +105,7 @@ def fit(
         jnp.sum(r**2, axis=0),
         normal.gradient,
         normal.information,
+        log_nuisance - log_sigmas(snapshot.seen),
     )
     return fused
 
@@ -112,21 +115,25 @@ def _linearised(
     spread: Float[Array, "6 d K"],
     nuisance: Float[Array, "6 t"],
     snapshot: Snapshot,
-) -> Callable[[Float[Array, "d K"]], tuple[Array, NormalEquations]]:
-    """The whitened residuals (m, K) of u (d, K) in the nuisance that suits them best, and their
-    normal equations."""
+) -> tuple[Callable[[Float[Array, "d K"]], tuple[Array, NormalEquations]], Float[Array, " K"]]:
+    """The whitened residuals (m, K) of u (d, K) in the nuisance that suits them best, with their
+    normal equations, and the logarithm of how much of its prior the corners leave the nuisance."""
     rows = reprojection_rows(snapshot.rig, snapshot.seen)
     corners_world = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
     T_prior_world = T_world_prior.inverse()
     R = jnp.moveaxis(jax.vmap(rotation_matrix)(T_prior_world.rotation()), 0, -1)
     shift = T_prior_world.translation().T[:, None]
     corners = jnp.sum(R[:, :, None] * corners_world.T[None, :, :, None], axis=1) + shift
+    log_nuisance = jnp.zeros_like(corners[0, 0])
     if nuisance.shape[1]:
         # The nuisance is small: residuals are linear in it.
         _, slope = rows(corners)
         J_t = -jnp.sum(_answers(slope, corners)[:, None] * nuisance[:, :, None, None], axis=0)
         eye = jnp.eye(nuisance.shape[1], dtype=R.dtype)
-        best_t = solve_positive((gram(J_t) + eye[:, :, None])[:, :, None], J_t)
+        information = gram(J_t) + eye[:, :, None]
+        best_t = solve_positive(information[:, :, None], J_t)
+        factors = jax.vmap(cholesky, in_axes=-1)(information)
+        log_nuisance = -jax.vmap(log_det)(factors) / 2
 
     def linearised(u: Array) -> tuple[Array, NormalEquations]:
         xi = jnp.sum(spread * u[None], axis=1)
@@ -155,7 +162,7 @@ def _linearised(
         w = jnp.concatenate(wrench((residual, slope), moved))
         return r, NormalEquations(gram(J), -jnp.sum(twist * w[:, None], axis=0))
 
-    return linearised
+    return linearised, log_nuisance
 
 
 def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
@@ -179,6 +186,7 @@ def _fused(
     cost: Float[Array, ""],
     gradient: Float[Array, " d"],
     information: Float[Array, "d d"],
+    log_scale: Float[Array, ""],
     *,
     freedom: Float[Array, "6 d"],
     floor: Float[Array, " 6"],
@@ -200,6 +208,11 @@ def _fused(
     u_fused = solve_upper(sigma, contradiction)
     # I - (I + R)^-1 = R (I + R)^-1, symmetric.
     C = eye - cho_solve(sigma, eye)
+    # The corners given the prediction: what fits to no pose, and the pose that fits best.
+    misfit = cost - jnp.sum(gradient * (u - u_alone))
+    log_likelihood = (
+        log_scale - (misfit + log_det(alone) + jnp.sum(contradiction**2) + log_det(sigma)) / 2
+    )
     xi = applied(spread, u_fused)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
@@ -212,6 +225,7 @@ def _fused(
             jnp.where(finite, posterior_covariance, jnp.eye(6, dtype=dtype)),
             jnp.where(finite, contradiction, jnp.inf),
             jnp.ones((), dtype),
+            jnp.where(finite, log_likelihood, 0),
             finite,
         ),
         cost=jnp.where(finite, cost, jnp.inf),

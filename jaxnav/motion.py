@@ -5,7 +5,7 @@ All share one interface, so that `step` and the selectors know nothing of the st
     belief = motion.init(hypotheses)
     belief = motion.predict(belief, obs)                         # dt, and odometry where there is
     prior  = motion.poses(belief)                                # what a selector sees
-    belief, nis = motion.update(belief, selection, obs)
+    belief, nis, log_likelihood = motion.update(belief, selection, obs)
     covariance = motion.error_covariance(belief, best)           # of the pose that is reported
 
 A belief is a bank of K hypotheses along the leading axis of every leaf. `bicycle_kalman.py` is for
@@ -15,7 +15,7 @@ cars, `constant_velocity.py` for everything else.
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -57,6 +57,7 @@ class Offer(NamedTuple):
     first: tuple[Array, Array]  # mean and covariance, if it starts here
     posterior: tuple[Array, Array]  # mean and covariance, if it takes the pose
     gate_nis: Float[Array, ""] | float  # a larger NIS is a contradiction, and counted
+    log_likelihood: Float[Array, ""]  # of what was measured given the prediction
     inflation: Float[Array, ""] | float = 1.0  # times the gate, NIS is kept out
 
 
@@ -97,21 +98,27 @@ class Motion(eqx.Module):
 
     def update(
         self, belief: Belief, selection: Selection, obs: Observation
-    ) -> tuple[Belief, Float[Array, " K"]]:
-        """The posterior of every hypothesis (Eqs. 10 and 11), equal ones merged, and their NIS.
+    ) -> tuple[Belief, Float[Array, " K"], Float[Array, " K"]]:
+        """The posterior of every hypothesis (Eqs. 10 and 11), equal ones merged; their NIS, and the
+        log-likelihood of what each was offered given what it predicted, up to a constant.
 
         A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
-        NIS is above the gate. Without a pose the NIS is 0.
+        NIS is above the gate. Without a pose, or without a prediction of it, both numbers are 0.
         """
         belief = eqx.tree_at(
             lambda b: (b.log_weight, b.initialised), belief, (selection.log_weight, selection.kept)
         )
         measured = selection.measured
         offer = self.follow if isinstance(measured, PosePosterior) else self.measure
-        belief, nis = jax.vmap(lambda b, m: gated(b, offer(b, m, obs), m.taken, obs.dt_s))(
-            belief, measured
-        )
-        return merged(belief, selection.heir, self.difference, self.moved), nis
+
+        def one(before: Belief, measured: Any) -> tuple[Belief, Array, Array]:
+            offered = offer(before, measured, obs)
+            after, nis = gated(before, offered, measured.taken, obs.dt_s)
+            compared = measured.taken & before.initialised
+            return after, nis, jnp.where(compared, offered.log_likelihood, 0)
+
+        belief, nis, log_likelihood = jax.vmap(one)(belief, measured)
+        return merged(belief, selection.heir, self.difference, self.moved), nis, log_likelihood
 
     def error_covariance(self, belief: Belief, index: Int[Array, ""]) -> Float[Array, "d d"]:
         """What is to be expected of a hypothesis' error: the spread of the whole bank about it.
@@ -289,6 +296,16 @@ def merged(
         log_weight=jnp.where(stays, jnp.log(jnp.where(total > 0, total, 1)), belief.log_weight),
         initialised=stays,
     )
+
+
+def of_mixture(belief: Belief, log_values: Float[Array, " K"]) -> Float[Array, ""]:
+    """log sum_k w_k exp(log_value_k) of hypotheses that live; 0 where none does."""
+    lives = belief.initialised
+    log_weight = jnp.where(lives, belief.log_weight, 0)
+    total = jax.nn.logsumexp(log_weight, where=lives)
+    value = jax.nn.logsumexp(log_weight + jnp.where(lives, log_values, 0), where=lives)
+    any_lives = jnp.any(lives)
+    return jnp.where(any_lives, value, 0) - jnp.where(any_lives, total, 0)
 
 
 def leading(belief: Belief, count: int) -> Belief:

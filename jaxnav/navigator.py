@@ -26,6 +26,7 @@ from jaxnav.motion import (
     followed_by,
     leading,
     numbered_anew_where_empty,
+    of_mixture,
     restarted_where_broken,
     survivors_first,
 )
@@ -84,6 +85,8 @@ class Estimate(eqx.Module):
     decided: Bool[Array, ""]
     nis: Float[Array, ""]
     restarted: Bool[Array, ""]  # all that was believed was contradicted too often: started anew
+    # Of the corners given what the whole bank had predicted, up to a constant; 0 at a start.
+    log_likelihood: Float[Array, ""]
 
 
 class Navigator(eqx.Module):
@@ -226,7 +229,7 @@ class Navigator(eqx.Module):
         before, start = belief, self.motion.init(belief.initialised.shape[0])
         prior = numbered_anew_where_empty(self.motion.predict(belief, obs))
         selection = self.selector(self.motion.poses(prior), candidates, snapshot)
-        belief, nis = self.motion.update(prior, selection, obs)
+        belief, nis, log_likelihood = self.motion.update(prior, selection, obs)
         belief = restarted_where_broken(belief, start)
 
         best = self._best(belief)
@@ -238,6 +241,7 @@ class Navigator(eqx.Module):
             flip_probability=selection.flip_probability,
             decided=selection.decided,
             nis=jnp.where(belief.initialised[best], nis[best], 0),
+            log_likelihood=of_mixture(prior, log_likelihood),
             restarted=jnp.any(before.initialised) & ~jnp.any(prior.initialised),
         )
 

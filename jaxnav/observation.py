@@ -176,6 +176,11 @@ class Snapshot(eqx.Module):
         return dataclasses.replace(self, seen=seen)
 
 
+def log_sigmas(seen: Sightings) -> Float[Array, ""]:
+    """The sum over all visible coordinates: what a likelihood pays for doubting them."""
+    return 2 * jnp.sum(jnp.where(seen.visible[:, None], jnp.log(seen.sigma_px), 0))
+
+
 def cameras_of(rig: CameraRig, seen: Sightings) -> Camera:
     """The camera of every sighting, batch axis (D,)."""
     return jax.tree.map(lambda leaf: leaf[seen.camera_index], rig.cameras)

@@ -227,6 +227,7 @@ def _reported(
         decided=moment.decided & best.located,
         nis=found.nis,
         restarted=jnp.asarray(False),
+        log_likelihood=jnp.zeros((), belief.mean.dtype),
     )
     control, output = navigator.act(control, obs, found.candidates, present)
     return control, Report(output, best.mean)

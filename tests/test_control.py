@@ -378,6 +378,7 @@ WHATEVER = controller()
 @example(0.0, 0.0, np.inf, 0.0, 0.1, 0.0)
 @example(1e300, 0.0, 0.0, 0.0, 0.0, 0.0)
 @example(0.0, 0.0, 0.0, np.nan, -np.inf, 0.0)
+@example(0.0, 0.0, 5.36e278, 0.0, 0.0, 0.0)
 @example(1.3, 0.0, 0.0, np.pi / 2, 0.1, 0.0)
 def test_limits_hold_for_any_input(x_m, y_m, psi_rad, steering_rad, dt_s, integral_ms):
     integral_ms = integral_ms if 0 <= integral_ms <= 5 else 0.0

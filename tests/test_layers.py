@@ -45,7 +45,7 @@ LAYERS = {
         "residuals",
         "selectors",
     },
-    "navigator": {"navigator", "timeline"},
+    "navigator": {"navigator", "parameters", "timeline"},
     "users": {
         "calibration",
         "detection",
@@ -66,6 +66,7 @@ LAYERS = {
         "drive_scenery",
         "plotting",
         "study_plotting",
+        "tuning_plotting",
         "viewing",
         "viewing_outcomes",
         "viewing_scene",

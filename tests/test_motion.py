@@ -29,6 +29,7 @@ def chosen(prior: Belief, T_world_vehicle: jaxlie.SE3, covariance, taken) -> Sel
         measured=PoseMeasurement(
             T_world_vehicle=jaxlie.SE3(jnp.tile(T_world_vehicle.wxyz_xyz, (count, 1))),
             covariance=jnp.tile(jnp.asarray(covariance, float), (count, 1, 1)),
+            log_misfit=jnp.zeros(count),
             taken=jnp.full(count, taken),
         ),
         kept=prior.initialised,
@@ -57,7 +58,7 @@ def drive_step(motion, belief, pose, covariance, taken, obs):
     """Prediction and update with a planar pose."""
     prior = motion.predict(belief, obs)
     selection = chosen(prior, worlds.planar(*pose), covariance, taken)
-    posterior, nis = motion.update(prior, selection, obs)
+    posterior, nis, _ = motion.update(prior, selection, obs)
     return prior, posterior, nis
 
 
@@ -340,11 +341,14 @@ def test_hypotheses_are_filters_of_their_own(kind):
             selection = dataclasses.replace(
                 chosen(prior, worlds.planar(0.0, 0.0, 0.0), R, True),
                 measured=PoseMeasurement(
-                    Ts, jnp.tile(R, (len(poses), 1, 1)), jnp.ones(len(poses), bool)
+                    Ts,
+                    jnp.tile(R, (len(poses), 1, 1)),
+                    jnp.zeros(len(poses)),
+                    jnp.ones(len(poses), bool),
                 ),
                 kept=prior.initialised & kept,
             )
-            belief, nis = motion.update(prior, selection, reading(0.2, 0.1))
+            belief, nis, _ = motion.update(prior, selection, reading(0.2, 0.1))
         return belief, nis
 
     kept = jnp.asarray([True, False, True])
@@ -366,7 +370,7 @@ def test_hypotheses_are_filters_of_their_own(kind):
 def first_step(motion, pose, taken):
     """The belief after one look, its NIS, and the poses a selector sees."""
     prior = motion.predict(motion.init(), reading())
-    belief, nis = motion.update(prior, chosen(prior, pose, 1e-4 * jnp.eye(6), taken), reading())
+    belief, nis, _ = motion.update(prior, chosen(prior, pose, 1e-4 * jnp.eye(6), taken), reading())
     return belief, nis, motion.poses(belief)
 
 
@@ -426,7 +430,8 @@ def test_broken_hypotheses_start_anew():
 def free_step(motion, belief, dt_s, wxyz_xyz, covariance, taken):
     obs = reading(dt_s=dt_s)
     prior = motion.predict(belief, obs)
-    return motion.update(prior, chosen(prior, jaxlie.SE3(wxyz_xyz), covariance, taken), obs)
+    selection = chosen(prior, jaxlie.SE3(wxyz_xyz), covariance, taken)
+    return motion.update(prior, selection, obs)[:2]
 
 
 def test_constant_velocity_carries_its_covariance_as_samples_do():
@@ -525,7 +530,7 @@ def test_gradients_are_finite_at_rest_and_at_the_prediction(precision, kind):
 
         def look(prior, taken):
             here = chosen(prior, jaxlie.SE3(wxyz_xyz), 1e-4 * jnp.eye(6), taken)
-            return motion.update(prior, here, obs)
+            return motion.update(prior, here, obs)[:2]
 
         belief, _ = look(motion.init(), True)
         for _ in range(2):

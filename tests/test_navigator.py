@@ -405,7 +405,10 @@ class EachItsOwn(eqx.Module):
         log_weight = prior.log_weight - jnp.where(valid, cost, 20.0) / 2
         return Selection(
             measured=PoseMeasurement(
-                jaxlie.SE3(Ts_world_vehicle.wxyz_xyz[:2]), candidates.covariance[:2], valid
+                jaxlie.SE3(Ts_world_vehicle.wxyz_xyz[:2]),
+                candidates.covariance[:2],
+                jnp.where(valid, -cost / 2, 0),
+                valid,
             ),
             kept=prior.initialised,
             log_weight=log_weight,

@@ -1,0 +1,128 @@
+"""The numbers of a navigator that drives and recordings can teach, by name.
+
+    values = parameters_of(navigator)                 # {"motion.odometry_sigma": ..., ...}
+    navigator = with_parameters(navigator, values)    # others stay as they are
+
+A name is the path of the attribute. Everything else about a navigator is known otherwise: cameras
+and wheelbase are measured, limits are the vehicle's.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnav.navigator import Navigator
+
+
+@dataclass(frozen=True)
+class Tunable:
+    """What a number of a navigator means.
+
+    Attributes:
+        meaning: one line.
+        unit: of its entries.
+        typical: what it may be where nothing better is known; tuning starts there where the
+            number is 0 or infinite.
+        matrix: None for numbers that are positive each by itself. Else the number may be a matrix,
+            symmetric and positive definite, instead of the vector whose entries are, "sigma", the
+            square roots of its diagonal or, "variance", that diagonal itself.
+    """
+
+    meaning: str
+    unit: str
+    typical: float
+    matrix: str | None = None
+
+
+TUNABLES: dict[str, Tunable] = {
+    "motion.acceleration_density": Tunable(
+        "Q: power spectral density of the acceleration, in the body's axes",
+        "(m/s^2)^2/Hz, (rad/s^2)^2/Hz",
+        0.1,
+        "variance",
+    ),
+    "motion.vision_floor": Tunable(
+        "R: what a pose gets wrong beside its corners' noise; not looked at by multi-hypothesis",
+        "m, rad",
+        0.005,
+        "sigma",
+    ),
+    "motion.odometry_sigma": Tunable(
+        "R: odometry, along and across the vehicle, and its turn rate",
+        "m/s, m/s, rad/s",
+        0.01,
+        "sigma",
+    ),
+    "motion.initial_velocity_sigma": Tunable(
+        "P0: the velocity before anything tells it", "m/s, rad/s", 1.0
+    ),
+    "motion.tilt_sigma_rad": Tunable("roll and pitch of the cameras", "rad", 0.005),
+    "motion.height_sigma_m": Tunable("height of the cameras", "m", 0.002),
+    "selector.floor_m": Tunable("R: what successive frames get wrong alike", "m", 1e-3),
+    "selector.floor_rad": Tunable("R: what successive frames get wrong alike", "rad", 1e-3),
+    "corner_sigma_px": Tunable("R: corners that come without a sigma of their own", "px", 1.0),
+    "model_sigma_px": Tunable("R: added to the sigma that corners come with", "px", 0.15),
+    "controller.proportional_per_m": Tunable("p1: throttle per distance", "1/m", 0.03),
+    "controller.integral_per_ms": Tunable("p2: throttle per distance and time", "1/(m s)", 0.005),
+    "controller.integral_limit_ms": Tunable("bound of the integral", "m s", 5.0),
+    "controller.lookahead_m": Tunable("steers as if no waypoint were farther", "m", 10.0),
+    "controller.slows_at_rad": Tunable("halves the throttle this far off the course", "rad", 5.0),
+    "controller.exploration.speed_mps": Tunable("speed while the pose is undecided", "m/s", 0.5),
+    "controller.exploration.settle_s": Tunable("how soon it is at that speed", "s", 0.1),
+    "controller.exploration.angle_rad": Tunable("course to the line of sight", "rad", 1.0),
+    "controller.exploration.reach_m": Tunable("how sharply it turns onto it", "m", 0.4),
+}
+
+
+def parameters_of(navigator: Navigator) -> dict[str, Float[Array, "*shape"]]:
+    """What can be tuned of a navigator, in the order of `TUNABLES`."""
+    return {name: jnp.asarray(_get(navigator, name), float) for name in _names(navigator)}
+
+
+def with_parameters(
+    navigator: Navigator, values: Mapping[str, Float[Array, "*shape"]]
+) -> Navigator:
+    """The navigator with other numbers.
+
+    Raises:
+        ValueError: a name that this navigator does not have, or numbers of another shape.
+    """
+    known = parameters_of(navigator)
+    for name, value in values.items():
+        if name not in known:
+            raise ValueError(f"{name}: unknown: expected one of {', '.join(known)}")
+        shapes = allowed_shapes(name, known[name].shape)
+        if jnp.shape(value) not in shapes:
+            expected = " or ".join(str(shape) for shape in shapes)
+            raise ValueError(f"{name}: must have the shape {expected}, got {jnp.shape(value)}")
+    if not values:
+        return navigator
+    names = list(values)
+    changed: Navigator = eqx.tree_at(
+        lambda n: [_get(n, name) for name in names],
+        navigator,
+        [jnp.asarray(values[name], known[name].dtype) for name in names],
+    )
+    return changed
+
+
+def allowed_shapes(name: str, shape: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """What shapes a number may have that has one of them in a navigator."""
+    if TUNABLES[name].matrix is None:
+        return [shape]
+    return [shape[:1], (*shape[:1], *shape[:1])]
+
+
+def _names(navigator: Navigator) -> Iterator[str]:
+    for name in TUNABLES:
+        if _get(navigator, name) is not None:
+            yield name
+
+
+def _get(navigator: Any, name: str) -> Any:
+    return reduce(lambda part, key: getattr(part, key, None), name.split("."), navigator)
