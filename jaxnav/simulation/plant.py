@@ -64,11 +64,15 @@ def move_through(
 
 
 def read_odometry(
-    state: CarState, noise: OdometryNoise, key: Array
+    state: CarState,
+    noise: OdometryNoise,
+    key: Array,
+    speed_scale: Float[Array, ""] | float | None = None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(speed_mps, steering_rad) as the sensors report them."""
+    """(speed_mps, steering_rad) as the sensors report them; the scale is the noise's by default."""
+    speed_scale = noise.speed_scale if speed_scale is None else speed_scale
     speed_error, steering_error = jax.random.normal(key, (2,), state.speed_mps.dtype)
     return (
-        noise.speed_scale * state.speed_mps + noise.speed_sigma_mps * speed_error,
+        speed_scale * state.speed_mps + noise.speed_sigma_mps * speed_error,
         state.steering_rad + noise.steering_sigma_rad * steering_error,
     )

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 _Z = 1.959963984540054  # 95 % of a normal distribution lies within
 
@@ -48,3 +49,27 @@ class Reliability:
         """
         gaps = np.abs(self.predicted - self.observed)
         return float(np.sum(self.counts * gaps) / np.sum(self.counts))
+
+
+def resampled(
+    sums: np.ndarray, counts: np.ndarray, draws: int = 1000
+) -> tuple[float, float, float]:
+    """A mean over the frames of all drives, and its 95 % interval: the bootstrap over drives.
+
+    Args:
+        sums, counts: (S,), of every drive's frames.
+    """
+    picks = np.random.default_rng(0).integers(0, len(sums), (draws, len(sums)))
+    means = sums[picks].sum(axis=1) / np.maximum(counts[picks].sum(axis=1), 1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(sums.sum() / max(int(counts.sum()), 1)), float(low), float(high)
+
+
+def anees_band(drives: int, freedom: int, share: float = 0.999) -> tuple[float, float]:
+    """Where the ANEES of a consistent filter lies, drives counted once each.
+
+    Source: Bar-Shalom, Li, Kirubarajan (2001), Eq. 5.4.2-14.
+    """
+    tail = (1 - share) / 2
+    low, high = (float(chi2.ppf(p, freedom * drives)) / drives for p in (tail, 1 - tail))
+    return low, high

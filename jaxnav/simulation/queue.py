@@ -1,0 +1,87 @@
+"""Lanes that take the next seed where a drive has ended: long drives keep nobody waiting."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from jaxnav.simulation.kept import Kept
+from jaxnav.trees import where
+
+
+def run_lanes(
+    keys: Key[Array, " S"],
+    start: Callable[[Key[Array, " lanes"]], Any],
+    advance: Callable[[Any], tuple[Any, Any]],
+    lanes: int,
+    threads: int,
+    kept: Kept,
+    progress: Callable[[int], object] = lambda ended: None,
+) -> Kept:
+    """Every drive from its start until its world has `ended`.
+
+    Args:
+        keys: a drive for each; a key's drive does not depend on the others.
+        start: the worlds of as many keys as there are lanes, leading axis (lanes,).
+        advance: the worlds some frames later, and what is to be kept of each, leading axes (lanes,
+            entries) with as many entries as `kept` expects of a chunk.
+        threads: that have so many lanes each; where there are several devices, one for each.
+        kept: what takes it.
+        progress: called with the number of drives that have ended since the last call.
+    """
+    devices = jax.local_devices()
+    if len(devices) > 1:
+        threads = len(devices)  # every device has one, and runs what another would run
+    waiting, lock = deque(range(len(keys))), threading.Lock()
+    compiling = threading.Lock()  # one thread does it for all
+
+    over_all = threading.Event()
+
+    def work() -> None:
+        owner = np.full(lanes, -1)
+        worlds = start(keys[np.zeros(lanes, int)])
+        over = np.ones(lanes, bool)
+        turn: Any = compiling
+        while True:
+            with lock:
+                owner[over] = [waiting.popleft() if waiting else -1 for _ in range(over.sum())]
+            if over_all.is_set() or not np.any(owner >= 0):
+                return
+            starts = over & (owner >= 0)
+            if np.any(starts):
+                fresh = start(keys[np.maximum(owner, 0)])
+                worlds = where(jnp.asarray(starts), fresh, worlds)
+            with turn:
+                worlds, chunk = advance(worlds)
+            turn = nullcontext()
+            chunk, ended = jax.device_get((chunk, worlds.ended))
+            over = ended & (owner >= 0)
+            with lock:
+                kept.take(owner, chunk)
+                progress(int(over.sum()))
+
+    threads = max(1, min(threads, -(-len(keys) // lanes)))
+    if threads == 1:
+        work()
+        return kept
+    float64 = jnp.zeros(()).dtype == jnp.float64  # which a thread would not know
+
+    def work_alike(number: int) -> None:
+        with jax.enable_x64(float64), jax.default_device(devices[number % len(devices)]):
+            work()
+
+    with ThreadPoolExecutor(threads) as pool:
+        working = [pool.submit(work_alike, number) for number in range(threads)]
+        try:
+            for one in working:
+                one.result()
+        finally:
+            over_all.set()  # an interruption or a failure ends all of them
+    return kept

@@ -1,0 +1,91 @@
+"""One drive of a rollout: what its seed drew, and where it stands."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.bicycle import Vehicle
+from jaxnav.control import Command
+from jaxnav.navigator import State
+from jaxnav.rig import CameraRig
+from jaxnav.simulation.plant import CarState
+from jaxnav.simulation.scenarios import Scenario
+
+
+class Truth(eqx.Module):
+    """The car of one drive, as it is: the navigator is not told."""
+
+    vehicle: Vehicle
+    odometer_scale: Float[Array, ""]  # what it reports over what is true
+    latency_s: Float[Array, ""]  # from the stamp of a frame until its command acts
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far the cars of different drives are from what is believed: each number is drawn evenly
+    from its range, (low, high).
+
+    The first three are factors of the vehicle's or the scenario's own numbers; the latency is what
+    is added to the scenario's, within 0 and a frame period.
+    """
+
+    speed_per_throttle: tuple[float, float] = (0.8, 1.2)
+    speed_time_constant: tuple[float, float] = (0.5, 1.5)
+    odometer_scale: tuple[float, float] = (0.95, 1.05)
+    latency_s: tuple[float, float] = (-0.02, 0.03)
+
+    def draw(self, key: Array, truth: Truth, longest_s: float) -> Truth:
+        """A car of its own, from the nominal one.
+
+        Args:
+            longest_s: that a command can be under way, the frame period.
+        """
+        dtype = truth.latency_s.dtype
+        ranges = (
+            self.speed_per_throttle,
+            self.speed_time_constant,
+            self.odometer_scale,
+            self.latency_s,
+        )
+        low, high = (jnp.asarray(ends, dtype) for ends in zip(*ranges, strict=True))
+        gain, lag, scale, later_s = low + (high - low) * jax.random.uniform(key, (4,), dtype)
+        vehicle = eqx.tree_at(
+            lambda v: (v.speed_per_throttle_mps, v.speed_time_constant_s),
+            truth.vehicle,
+            (
+                truth.vehicle.speed_per_throttle_mps * gain,
+                truth.vehicle.speed_time_constant_s * lag,
+            ),
+        )
+        latency_s = jnp.clip(truth.latency_s + later_s, 0, longest_s)
+        return Truth(vehicle, truth.odometer_scale * scale, latency_s)
+
+
+class World(eqx.Module):
+    """What one seed drew, and where its drive stands."""
+
+    key: Array
+    rig: CameraRig  # the true one
+    truth: Truth
+    bias: Float[Array, "C M 4 2"]  # directions in the image
+    start_pose: Float[Array, " 3"]
+    car: CarState
+    acting: Command  # until the latency of the next one is over
+    command: Command
+    state: State
+    frame: Int[Array, ""]  # the next one
+    passed: Int[Array, ""]
+    ended: Bool[Array, ""]
+    on_floor: Bool[Array, ""]
+
+
+def nominal(vehicle: Vehicle, scenario: Scenario, dtype: jnp.dtype) -> Truth:
+    """The car that the scenario is about."""
+    return Truth(
+        jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle),
+        jnp.asarray(scenario.odometry.speed_scale, dtype),
+        jnp.asarray(scenario.latency_s, dtype),
+    )
