@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from jaxnav.errors import BadInput as BadInput
     from jaxnav.files import load_camera as load_camera
     from jaxnav.files import load_markers as load_markers
+    from jaxnav.files import load_params as load_params
     from jaxnav.files import load_rig as load_rig
     from jaxnav.files import load_route as load_route
     from jaxnav.files import load_vehicle as load_vehicle
@@ -71,6 +72,7 @@ _MODULE_OF = {
     "ippe_square": "ippe",
     "load_camera": "files",
     "load_markers": "files",
+    "load_params": "files",
     "load_rig": "files",
     "load_route": "files",
     "load_vehicle": "files",

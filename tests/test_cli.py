@@ -35,13 +35,25 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], list]:
 
 def test_arguments_reach_the_command(command) -> None:
     received = command(lambda: 0)
-    assert cli.main("demo --seed 3 --no-blur --exposure-ms 2 --rig a.yaml --out x".split()) == 0
+    assert (
+        cli.main(
+            "demo --seed 3 --no-blur --exposure-ms 2 --rig a.yaml --out x --params p.yaml".split()
+        )
+        == 0
+    )
     assert (
         cli.main("replay --limit 5 --markers one-at-a-time --markers-file m.yaml bag".split()) == 0
     )
     assert cli.main("locate a.png --camera c.yaml --marker-size-m 0.1 --json".split()) == 0
     assert received == [
-        Demo(seed=3, blur=False, exposure_ms=2.0, rig=Path("a.yaml"), out=Path("x")),
+        Demo(
+            seed=3,
+            blur=False,
+            exposure_ms=2.0,
+            rig=Path("a.yaml"),
+            out=Path("x"),
+            params=Path("p.yaml"),
+        ),
         Replay(Path("bag"), limit=5, markers="one-at-a-time", markers_file=Path("m.yaml")),
         Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, json=True),
     ]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.files import calib_dir
+from jaxnav.files import calib_dir, write_params
 
 QCAR = calib_dir() / "qcar"
 
@@ -49,8 +49,12 @@ def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):
         "{waypoints_m: [[0.3, -0.2]], waypoint_radius_m: 0.2,"
         " start: {x_m: 0.42, y_m: -0.5, psi_deg: 112}}\n"
     )
+    # Of a bank, and of a filter: either method takes its own.
+    params = {"selector.floor_m": 0.001, "motion.odometry_sigma": [0.02, 0.02, 0.02]}
+    write_params(tmp_path / "params.yaml", params)
     out = tmp_path / "out"
     files = ["--markers", str(tmp_path / "markers.yaml"), "--route", str(tmp_path / "route.yaml")]
+    files += ["--params", str(tmp_path / "params.yaml")]
     # fmt: off
     flags = ["--seeds", "2", "--seed", "3", "--selector", "lowest-reprojection", "--no-blur",
              "--no-rolling-shutter", "--corner-noise-px", "0.05", "--headless"]
@@ -62,7 +66,10 @@ def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):
     assert [drive["seed"] for drive in overall["drives"]] == [3, 4]
     for seed in (3, 4):
         assert (out / f"seed_{seed}" / "report.png").exists()
-    assert "reached in 2 of 2 drives" in capsys.readouterr().out
+    assert overall["drives"][0]["params"] == str(tmp_path / "params.yaml")
+    told = capsys.readouterr().out
+    assert told.startswith(f"2 parameters from {tmp_path / 'params.yaml'}\n")
+    assert "reached in 2 of 2 drives" in told
 
 
 @pytest.mark.parametrize(
@@ -71,6 +78,8 @@ def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):
         (["--rig", "missing.yaml"], "missing.yaml"),
         (["--markers", "{qcar}/rig.yaml"], "rig.yaml"),
         (["--vehicle", "{tmp}/vehicle.yaml"], "vehicle.yaml: wheelbase_m"),
+        (["--params", "missing.yaml"], "missing.yaml"),
+        (["--params", "{tmp}/params.yaml"], "parameters.motion.vision_floor: must have 3 entries"),
         (["--exposure-ms", "60"], "--exposure-ms: the last row would be read after"),
         (["--exposure-ms", "-1"], "--exposure-ms"),
         (["--corner-noise-px", "nan"], "--corner-noise-px"),
@@ -82,6 +91,7 @@ def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, flags, message):
     vehicle = (QCAR / "vehicle.yaml").read_text().replace("wheelbase_m: 0.256", "wheelbase_m: -1")
     (tmp_path / "vehicle.yaml").write_text(vehicle)
+    write_params(tmp_path / "params.yaml", {"motion.vision_floor": [1] * 6})
     out = [] if "--out" in flags else ["--out", str(tmp_path / "out")]
     code = main(["demo", *(flag.format(tmp=tmp_path, qcar=QCAR) for flag in flags), *out])
     error = capsys.readouterr().err

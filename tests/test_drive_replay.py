@@ -14,7 +14,7 @@ from jaxnav.cli import EXIT_BAD_INPUT, main
 from jaxnav.commands.process import configure_jax
 from jaxnav.detection import marker_cells
 from jaxnav.errors import BadInput
-from jaxnav.files import calib_dir
+from jaxnav.files import calib_dir, write_params
 from jaxnav.runtime.drive_log import DriveLog, read_drive
 from jaxnav.runtime.drive_replay import (
     check_inputs,
@@ -56,6 +56,23 @@ def drive(setup, tmp_path_factory) -> tuple[Path, list[tuple[Input, Outcome]]]:
     """A good second, recorded."""
     told = [(step.input, step.outcome) for step in simulated(setup, 1.3)]
     path = tmp_path_factory.mktemp("drive") / "drive.mcap"
+    record(path, setup.header(), told)
+    return path, told
+
+
+TUNED = {
+    "motion.odometry_sigma": [[4e-4, 1e-4, 0.0], [1e-4, 4e-4, 0.0], [0.0, 0.0, 9e-4]],
+    "selector.floor_m": 2e-4,
+    "controller.proportional_per_m": 0.05,
+}
+
+
+@pytest.fixture(scope="module")
+def tuned(setup, tmp_path_factory) -> tuple[Path, list[tuple[Input, Outcome]]]:
+    """Half a second with other parameters."""
+    setup = dataclasses.replace(setup, parameters=TUNED)
+    told = [(step.input, step.outcome) for step in simulated(setup, 0.5)]
+    path = tmp_path_factory.mktemp("tuned") / "drive.mcap"
     record(path, setup.header(), told)
     return path, told
 
@@ -270,6 +287,24 @@ def test_with_something_changed_both_tracks_are_drawn(drive, tmp_path, capsys):
     assert "off the recorded track by" in capsys.readouterr().out
 
 
+def test_a_drive_with_parameters_of_its_own_is_replayed_bit_for_bit(tuned, tmp_path, capsys):
+    path, told = tuned
+    code, summary = replayed(tmp_path / "own", path)
+    assert code == 0
+    assert summary["bit_for_bit"]
+    assert summary["compared"] == len(told)
+    assert summary["parameters"] == TUNED
+    # Others, in place of all of its own: the same number, and one that it had is gone.
+    params = tmp_path / "params.yaml"
+    write_params(params, {"controller.proportional_per_m": 0.05}, {"loss": 0.5})
+    code, summary = replayed(tmp_path / "others", path, "--params", params)
+    assert code == 0
+    assert summary["changed"] == ["params"]
+    assert summary["parameters"] == {"controller.proportional_per_m": 0.05}
+    assert summary["rms_position_difference_m"] > 0
+    assert f"1 parameter from {params} (loss: 0.5)\n" in capsys.readouterr().out
+
+
 def test_images_may_be_searched_anew(with_images, tmp_path):
     code, summary = replayed(tmp_path, with_images, "--images")
     assert code == 0
@@ -331,6 +366,7 @@ def test_flags_that_do_not_go_together_are_one_line(drive, tmp_path, capsys):
         ([tmp_path / "x.mcap"], "there is no such file or folder"),
         ([foreign, "--topics", topics], "--rig: missing: a ROS bag"),
         ([drive[0], "--route", tmp_path / "none.yaml"], "none.yaml: can't be read"),
+        ([drive[0], "--params", tmp_path / "none.yaml"], "none.yaml: can't be read"),
         ([drive[0], "--images"], "holds no image on /camera/front, /camera/right"),
     ]:
         assert main(["replay", *map(str, arguments), "--headless"]) == EXIT_BAD_INPUT

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from jaxnav.bicycle import Vehicle
 from jaxnav.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.errors import BadInput
-from jaxnav.files import Route
+from jaxnav.files import Params, Route
 from jaxnav.files.markers import marker_map
+from jaxnav.parameters import parameters_of
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.drive_format import decode, encode
 from jaxnav.runtime.drive_setup import (
@@ -42,7 +43,8 @@ def bits(setup: DriveSetup) -> list:
     """Everything in a setup, comparable."""
     arrays = setup.rig, setup.markers, setup.vehicle
     leaves, structure = jax.tree.flatten(arrays)
-    plain = [getattr(setup, name) for name in ("route", "selector", "corner_sigma_px", "timeouts")]
+    names = ("route", "selector", "corner_sigma_px", "timeouts", "parameters")
+    plain = [getattr(setup, name) for name in names]
     told = [(leaf.dtype.name, leaf.shape, np.asarray(leaf).tobytes()) for leaf in leaves]
     return [str(structure), told, plain, setup.float64]
 
@@ -70,6 +72,15 @@ routes = st.builds(
     positive,
     st.tuples(small, small, small),
 )
+sound = st.floats(1e-18, 1e9)
+parameters = st.fixed_dictionaries(
+    {},
+    optional={
+        "controller.proportional_per_m": sound,
+        "motion.odometry_sigma": st.lists(sound, min_size=3, max_size=3),
+        "motion.vision_floor": st.tuples(sound, sound, sound).map(lambda d: np.diag(d).tolist()),
+    },
+)
 timeouts = st.builds(Timeouts, *[st.floats(0, allow_infinity=True)] * 8)
 
 
@@ -86,8 +97,9 @@ def test_a_setup_comes_back_bit_for_bit(double):
         st.lists(placed_markers, min_size=1, max_size=3, unique_by=lambda marker: marker[2:]),
         vehicles,
         st.tuples(routes, st.sampled_from(PILOT_SELECTORS), st.none() | positive, timeouts),
+        parameters,
     )
-    def check(rig, markers, vehicle, others) -> None:
+    def check(rig, markers, vehicle, others, parameters) -> None:
         lenses, placed, images = zip(*rig, strict=True)
         setup = DriveSetup(
             CameraRig.create(
@@ -103,6 +115,7 @@ def test_a_setup_comes_back_bit_for_bit(double):
             Vehicle.create(*vehicle),
             *others,
             double,
+            parameters,
         )
         back = DriveSetup.of_header(decode(encode(setup.header())), WHERE)
         assert bits(back) == bits(setup)
@@ -129,6 +142,26 @@ def test_a_setup_makes_its_navigator():
     assert float(navigator.controller.waypoint_radius_m) == 0.15
 
 
+def test_parameters_reach_the_navigator_and_come_with_the_header():
+    setup = qcar_setup()
+    assert "parameters" not in setup.header()  # as older programs read it
+    values = {"motion.odometry_sigma": [0.1, 0.2, 0.3], "selector.floor_m": 1e-3}
+    tuned = setup.with_params(Params.of(values, WHERE))
+    back = DriveSetup.of_header(decode(encode(tuned.header())), WHERE)
+    for one in (tuned, back):
+        found = parameters_of(one.navigator())
+        np.testing.assert_array_equal(found["motion.odometry_sigma"], [0.1, 0.2, 0.3])
+        assert float(found["selector.floor_m"]) == 1e-3
+        assert float(found["motion.tilt_sigma_rad"]) == 0.005
+    # Another selector may lack a number; another file takes the place of the whole one.
+    assert dataclasses.replace(back, selector="paper-cost").navigator()
+    assert back.with_params(Params.of({"corner_sigma_px": 2}, WHERE)).parameters == {
+        "corner_sigma_px": 2.0
+    }
+    with pytest.raises(BadInput, match=r"^drive.mcap: parameters.motion.vision_floor: must have 3"):
+        setup.with_params(Params.of({"motion.vision_floor": [1] * 6}, WHERE))
+
+
 def _without(header: dict, key: str) -> dict:
     return {name: value for name, value in header.items() if name != key}
 
@@ -143,6 +176,19 @@ def _without(header: dict, key: str) -> dict:
         (lambda h: h | {"selector": "oracle"}, "selector: unknown 'oracle': expected one of multi"),
         (lambda h: h | {"corner_sigma_px": 0}, "corner_sigma_px: must be > 0, got 0"),
         (lambda h: h | {"float64": 1}, "float64: "),
+        (lambda h: h | {"parameters": [1]}, "parameters: must be a mapping, got [1]"),
+        (
+            lambda h: h | {"parameters": {"motion.speed": 1}},
+            "parameters.motion.speed: unknown: expected one of motion.acceleration_density, ",
+        ),
+        (
+            lambda h: h | {"parameters": {"motion.odometry_sigma": [1, -1, 1]}},
+            "parameters.motion.odometry_sigma[1]: must be > 0, got -1",
+        ),
+        (
+            lambda h: h | {"parameters": {"motion.odometry_sigma": [1, 1]}},
+            "parameters.motion.odometry_sigma: must have 3 entries or 3 rows of 3, got 2 entries",
+        ),
         (
             lambda h: h | {"timeouts": h["timeouts"] | {"stop_s": math.nan}},
             "timeouts.stop_s: must be >= 0, got nan",
@@ -165,7 +211,7 @@ def test_a_bad_header_is_named_with_its_key(change, line):
     assert "\n" not in str(error.value)
 
 
-TEXT = encode(qcar_setup().header())
+TEXT = encode(qcar_setup(parameters={"motion.odometry_sigma": [0.1, 0.2, 0.3]}).header())
 values = st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just([]),
     st.just({}), st.lists(st.integers(0, 3), max_size=4),
@@ -173,7 +219,7 @@ values = st.one_of(
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
-@given(st.lists(st.integers(0, 10), min_size=1, max_size=6), values, st.booleans())
+@given(st.lists(st.integers(0, 11), min_size=1, max_size=6), values, st.booleans())
 def test_any_change_of_a_value_gives_a_setup_or_bad_input(path, value, removes):
     header = json.loads(TEXT)
     place, steps = header, []

@@ -3,6 +3,7 @@
 JAXNAV_FUZZ=3000 pytest tests/test_fuzz_loaders.py      # so many examples for each loader
 """
 
+import dataclasses
 import json
 import math
 import os
@@ -36,6 +37,7 @@ from jaxnav.vehicles.options import number, whole_number
 from tests.helpers.drives import make_input, make_outcome
 from tests.helpers.loader_seeds import BINARY, STRUCTURED, Loader
 from tests.helpers.mutations import Changed, edited, restructured
+from tests.helpers.seed_texts import PARAMETERS
 from tests.helpers.simulated import make_setup
 
 EXAMPLES = int(os.environ.get("JAXNAV_FUZZ", "8"))
@@ -166,7 +168,8 @@ def used_drive(path: Path) -> None:
 def test_a_value_of_a_drive_that_changes_is_noticed_by_its_key_or_does_not_matter(folder):
     messages = [input_message(make_input(index))[::2] for index in range(3)]
     messages.append((OUTCOME, outcome_message(make_outcome(0))))
-    parts = [("header", make_setup().header()), *messages]
+    header = dataclasses.replace(make_setup(), parameters=PARAMETERS).header()
+    parts = [("header", header), *messages]
     whole = {name: json.loads(encode(part)) for name, part in parts}
     path, loader = folder / "drive.mcap", Loader(lambda folder: folder, used_drive)
     write_drive(path, whole)

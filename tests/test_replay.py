@@ -12,6 +12,7 @@ import pytest
 from jaxnav.ambiguity import LowestReprojection, PaperCost
 from jaxnav.cli import main
 from jaxnav.constant_velocity import ConstantVelocity
+from jaxnav.files import write_params
 from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation
@@ -152,6 +153,26 @@ def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
     assert len(list(tmp_path.glob("trajectory_marker_*.tum"))) == 9
 
 
+def test_parameters_go_before_what_the_recording_tells(test_7, tmp_path, monkeypatch, capsys):
+    short = test_7.first(20)
+    monkeypatch.setattr("jaxnav.commands.replay.read_recording", lambda *_: short)
+    values = {"corner_sigma_px": 3.0, "motion.vision_floor": [1.0] * 6, "controller.lookahead_m": 1}
+    write_params(tmp_path / "p.yaml", values, {"loss": 0.5})
+    command = ["replay", "whatever", "--selector", "lowest-reprojection", "--headless"]
+    command += ["--out", str(tmp_path), "--params", str(tmp_path / "p.yaml")]
+    tracks = []
+    for flags, sigma_px in (([], 3.0), (["--corner-sigma-px", "2"], 2.0)):
+        assert main([*command, *flags]) == 0
+        summary = json.loads((tmp_path / "summary.json").read_text())
+        assert summary["params"] == str(tmp_path / "p.yaml")
+        assert summary["corner_sigma_px"] == sigma_px
+        tracks.append(np.loadtxt(tmp_path / "trajectory.tum"))
+    assert "(loss: 0.5)\n" in capsys.readouterr().out
+    # A pose that measures nothing is followed late.
+    own = replay(short, LowestReprojection(), corner_sigma_px=3.0)
+    assert np.abs(tracks[0][-1, 1:4] - own.T_world_vehicle[-1, 0, 4:]).max() > 1e-4
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [
@@ -160,6 +181,8 @@ def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
         (["{tmp}/x.txt"], "is no recording"),
         (["{data}/test_7/tag_detections.bag.bz2"], "--rig: missing"),
         (["{data}/test_7", "--rig", "nowhere.yaml"], "nowhere.yaml"),
+        (["{data}/test_7", "--params", "nowhere.yaml"], "nowhere.yaml"),
+        (["{data}/test_7", "--params", "{tmp}/p.yaml"], "odometry_sigma: this navigator has no su"),
         (["{data}/test_7", "--limit", "0"], "--limit: must be at least 1, got 0"),
         (["{data}/test_7", "--selector", "none"], "--selector"),
         (["{data}/test_7", "--out", "{tmp}/x.txt"], "is a file, not a folder"),
@@ -167,6 +190,7 @@ def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
 )
 def test_bad_input_is_one_line_and_exit_code_2(data_dir, tmp_path, capsys, args, message):
     (tmp_path / "x.txt").write_text("no recording")
+    write_params(tmp_path / "p.yaml", {"motion.odometry_sigma": [1.0] * 3})  # of a car
     places = {"tmp": tmp_path, "data": data_dir / "tagslam"}
     out = [] if "--out" in args else ["--out", str(tmp_path / "out")]
     code = main(["replay", *(arg.format(**places) for arg in args), *out])

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import EXIT_BAD_INPUT, main
+from jaxnav.files import write_params
 from jaxnav.runtime.drive_log import read_drive
 from jaxnav.runtime.flags import Health
 from jaxnav.vehicles.world import World
@@ -34,6 +35,8 @@ waypoint_radius_m: 0.15
 start: {x_m: 0.0, y_m: -0.5, psi_deg: 90.0}
 """
 
+TUNED = {"motion.odometry_sigma": [0.02, 0.02, 0.03], "controller.proportional_per_m": 0.04}
+
 
 @dataclass(frozen=True)
 class Workplace:
@@ -48,10 +51,11 @@ class Workplace:
         return [sys.executable, "-c", MAIN, "run", *map(str, arguments)]
 
     def driving(self, log: Path, record: Path) -> list[str]:
-        """With a watchdog that is patient with a busy machine."""
+        """With a watchdog that is patient with a busy machine, and parameters of its own."""
         return self.command(
             *("--vehicle", recorded_vehicle.NAME, "--cameras", "sim", "--option", f"log={log}"),
             *("--route", self.folder / "route.yaml", "--record", record),
+            *("--params", self.folder / "params.yaml"),
             *("--headless", "--timeout-s", 3),
         )
 
@@ -83,6 +87,7 @@ class Running:
 def workplace(tmp_path_factory) -> Workplace:
     folder = tmp_path_factory.mktemp("run")
     (folder / "route.yaml").write_text(ROUTE)
+    write_params(folder / "params.yaml", TUNED)
     return Workplace(folder)
 
 
@@ -123,6 +128,7 @@ def test_it_arrives_and_leaves_a_whole_recording(workplace, tmp_path):
     log = read_drive(drive.record)
     assert not log.truncated
     assert log.outcomes.done[-1]
+    assert log.header["parameters"] == TUNED
     assert np.hypot(*log.outcomes.pose[-1, :2]) < 0.2
     assert Health.OK in log.outcomes.health
     assert len(log.inputs) == len(log.outcomes.now_ns) > 50
@@ -205,12 +211,15 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
         (["--option", "a=1", "--option", "a=2"], "--option: a is given twice"),
         (["--record", "nowhere/drive.mcap"], "nowhere/drive.mcap: can't be written: no such file"),
         (["--record", "/dev/full"], "/dev/full: can't be written: no space left on device"),
+        (["--params", "nowhere.yaml"], "nowhere.yaml: can't be read: no such file or directory"),
+        (["--params", "p.yaml"], "p.yaml: parameters.motion.vision_floor: must have 3 entries or"),
         (["--record-images"], "--record-images: needs --record"),
         (["--period-s", "5"], "--period-s: must be from 0.002 to 0.1, got 5.0"),
     ],
 )
 def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys, arguments, line):
     monkeypatch.chdir(tmp_path)
+    write_params("p.yaml", {"motion.vision_floor": [1.0] * 6})
     monkeypatch.setattr("jaxnav.commands.run.configure_jax", lambda **_: None)
     vehicle = [] if "--vehicle" in arguments else ["--vehicle", recorded_vehicle.NAME]
     log = tmp_path / "told"

@@ -8,7 +8,11 @@ import sys
 import numpy as np
 import pytest
 
+from jaxnav.arguments import Simulate as Arguments
 from jaxnav.cli import main
+from jaxnav.commands.simulate import _World
+from jaxnav.files import write_params
+from jaxnav.parameters import parameters_of
 from jaxnav.simulation.rollout import Trace
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
@@ -118,6 +122,49 @@ def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path):
     assert json.loads(file.read_text())["drives"] == 3
 
 
+def test_parameters_drive_and_are_what_a_result_belongs_to(tmp_path, capsys, monkeypatch):
+    file, params = tmp_path / "s.json", tmp_path / "params.yaml"
+    gains = ("controller.proportional_per_m", "controller.integral_per_ms")
+    write_params(params, dict.fromkeys(gains, 1e-6) | {"corner_sigma_px": 3.0})
+    arguments = ["--seeds", "2", "--selector", "oracle", "--json", str(file), "--headless"]
+    arguments += ["--scenario", "approach", "--params", str(params)]
+    assert main(["simulate", *arguments]) == 0
+    assert capsys.readouterr().out.startswith(f"3 parameters from {params}\n| selector |")
+    result = json.loads(file.read_text())
+    assert result["run"]["params"] == str(params)
+    assert result["run"]["told_noise_px"] == 3.0
+    assert result["success_rate"]["value"] == 0  # it hardly moves
+
+    def drive(_args, _world, key: dict) -> dict:
+        driven.append(key)
+        return {name: value for name, value in result.items() if name != "run"}
+
+    driven: list[dict] = []
+    monkeypatch.setattr("jaxnav.commands.simulate._drive", drive)
+    assert main(["simulate", *arguments, "--resume"]) == 0
+    assert driven == []
+    for others, told_px in (([], 1.0), (["--params", str(params), "--told-noise-px", "2"], 2.0)):
+        assert main(["simulate", *arguments[:-2], *others, "--resume"]) == 0
+        assert driven[-1] == result["run"] | {
+            "params": str(params) if others else None,
+            "told_noise_px": told_px,
+        }
+    assert len(json.loads(file.read_text())["runs"]) == 3
+
+
+@pytest.mark.parametrize("px", [1.0, 2.0])
+def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
+    write_params(
+        tmp_path / "p.yaml",
+        {"corner_sigma_px": 3.0, "motion.tilt_sigma_rad": 0.5, "motion.height_sigma_m": 0.25},
+    )
+    world = _World.load(Arguments(params=tmp_path / "p.yaml"))
+    found = parameters_of(world.navigator("paper", "mahalanobis", px))
+    assert float(found["corner_sigma_px"]) == px
+    assert float(found["motion.tilt_sigma_rad"]) == 0.5  # before what the scenario tells
+    assert float(found["motion.height_sigma_m"]) == 0.25
+
+
 MEASURED = (
     "success_rate",
     "wrong_branch_fraction_after_2s",
@@ -174,6 +221,7 @@ def test_a_result_that_lacks_something_is_not_resumed(tmp_path, capsys):
         (["simulate", "--resume"], "--resume"),
         (["simulate", "--scenario", "moon"], "moon"),
         (["simulate", "--markers", "nowhere.yaml"], "nowhere.yaml"),
+        (["simulate", "--params", "nowhere.yaml"], "nowhere.yaml"),
         (["reliability", "--frames", "0"], "--frames"),
         (["reliability", "nowhere.bag"], "nowhere.bag"),
     ],

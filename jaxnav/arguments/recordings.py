@@ -41,6 +41,8 @@ class Replay:
     """Vehicle in place of the drive's own."""
     route: OptionalFile = None
     """Waypoints in place of the drive's own."""
+    params: OptionalFile = None
+    """Tuned parameters, of a drive in place of all of its own; --corner-sigma-px goes before."""
     topics: OptionalFile = None
     """Which topic of a ROS bag is what: it is a drive then."""
     images: Switch = False

@@ -8,6 +8,7 @@ import tyro
 
 from jaxnav.arguments.kinds import (
     CornerBackend,
+    OptionalFile,
     QCarFile,
     Scenario,
     Selector,
@@ -43,6 +44,8 @@ class Demo:
     """Vehicle parameters and limits."""
     route: QCarFile = None
     """Start and waypoints."""
+    params: OptionalFile = None
+    """Tuned parameters, for both methods: the noise of their filter is the same."""
     blur: bool = True
     """Integrate each image over its exposure while the car moves."""
     exposure_ms: float = 10.0
@@ -97,6 +100,8 @@ class Simulate:
     """Marker map."""
     vehicle: QCarFile = None
     """Bicycle parameters and limits."""
+    params: OptionalFile = None
+    """Tuned parameters, before what the scenario tells; --told-noise-px goes before both."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
         None
     )

@@ -8,6 +8,7 @@ import tyro
 
 from jaxnav.arguments.kinds import (
     CornerBackend,
+    OptionalFile,
     QCarFile,
     Selector,
     Switch,
@@ -52,6 +53,8 @@ class Run:
     """Vehicle parameters and limits."""
     route: QCarFile = None
     """Waypoints, and where a simulated car starts."""
+    params: OptionalFile = None
+    """Tuned parameters of filter and controller."""
     selector: Selector = "multi-hypothesis"
     """Which of the two poses of a marker is believed."""
     corner_backend: CornerBackend = "aruco"

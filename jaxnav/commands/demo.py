@@ -45,14 +45,14 @@ def run(args: Demo) -> int:
     """Drive, report, and say in one line how it went."""
     configure_jax(float64=True, threads=1)
     world = World.load(args)
+    navigators = {
+        OURS: world.navigator(make_selector(args.selector)),
+        METHOD_A: world.navigator(LowestReprojection()),
+    }
     out = output_folder(args.out)
-    methods = Methods(
-        {
-            OURS: world.navigator(make_selector(args.selector)),
-            METHOD_A: world.navigator(LowestReprojection()),
-        },
-        lambda navigator: compiled_step(navigator, step_folder()),
-    )
+    if world.params is not None:
+        print(world.params.told())
+    methods = Methods(navigators, lambda navigator: compiled_step(navigator, step_folder()))
     summaries = []
     for seed in range(args.seed, args.seed + args.seeds):
         record = _drive(args, world, methods, seed)
@@ -127,6 +127,7 @@ def _summary(args: Demo, world: World, record: Record, seed: int) -> dict[str, A
         "steps": len(record.frames),
         "seed": seed,
         "selector": args.selector,
+        "params": args.params,
         "corner_backend": args.corner_backend,
         "exposure_ms": args.exposure_ms if args.blur else 0.0,
         "rolling_shutter": args.rolling_shutter,

@@ -11,7 +11,17 @@ from jaxnav.arguments import Demo
 from jaxnav.bicycle import Vehicle
 from jaxnav.detection import Detections, Detector, make_detectors, observe
 from jaxnav.errors import BadInput
-from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_route, load_vehicle
+from jaxnav.files import (
+    Params,
+    Route,
+    apply_params,
+    calib_dir,
+    load_markers,
+    load_params,
+    load_rig,
+    load_route,
+    load_vehicle,
+)
 from jaxnav.geometry import T_world_vehicle_from_planar
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator, Output
@@ -35,6 +45,7 @@ class World:
     markers: MarkerMap
     vehicle: Vehicle
     route: Route
+    params: Params | None
     renderer: Renderer
     detectors: list[Detector]
 
@@ -60,13 +71,18 @@ class World:
             markers=markers,
             vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
             route=load_route(args.route or qcar / "route.yaml"),
+            params=None if args.params is None else load_params(args.params),
             renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, SENSOR),
             detectors=make_detectors(markers, args.corner_backend),
         )
 
     def navigator(self, selector: Selector) -> Navigator:
-        """A navigator for this world."""
-        return Navigator(
+        """A navigator for this world.
+
+        Raises:
+            BadInput: a parameter that does not fit it.
+        """
+        navigator = Navigator(
             rig=self.rig,
             markers=self.markers,
             vehicle=self.vehicle,
@@ -74,6 +90,7 @@ class World:
             waypoint_radius_m=self.route.waypoint_radius_m,
             selector=selector,
         )
+        return navigator if self.params is None else apply_params(navigator, self.params)
 
     def floor_m(self) -> tuple[float, float, float, float]:
         """The part of the world the car may use: x_min, x_max, y_min, y_max."""

@@ -13,7 +13,16 @@ from jaxnav.commands import replay_drive
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
-from jaxnav.files import load_markers, load_rig, output_folder, write_json, write_tum
+from jaxnav.files import (
+    apply_params,
+    load_markers,
+    load_params,
+    load_rig,
+    output_folder,
+    write_json,
+    write_tum,
+)
+from jaxnav.navigator import Navigator
 from jaxnav.plotting import localisation_report
 from jaxnav.runtime.recordings import Recording, read_recording
 from jaxnav.runtime.replay import Replay, errors, frames_in_view, replay
@@ -29,6 +38,7 @@ def run(args: Arguments) -> int:
         return replay_drive.run(args)
     args = dataclasses.replace(args, selector=args.selector or DEFAULT_SELECTOR)
     configure_jax(float64=True, threads=1)
+    params = None if args.params is None else load_params(args.params)
     recording = read_recording(
         args.recording,
         None if args.rig is None else load_rig(args.rig),
@@ -38,7 +48,11 @@ def run(args: Arguments) -> int:
         recording = recording.first(args.limit)
     if not len(recording):
         raise BadInput(args.recording, "holds no frame")
+    if params is not None:  # bad input shows before the folder is made
+        apply_params(Navigator(recording.rig, recording.markers), params)
     out = output_folder(args.out)
+    if params is not None:
+        print(params.told())
     with tqdm(total=len(recording), unit="frame", disable=args.headless) as bar:
         bar.set_postfix_str("compiling")
 
@@ -52,6 +66,7 @@ def run(args: Arguments) -> int:
             one_at_a_time=args.markers == "one-at-a-time",
             corner_sigma_px=args.corner_sigma_px,
             progress=advance,
+            params=params,
         )
     summary = summarise(args, recording, result)
     _write_tracks(args, recording, result)
@@ -68,6 +83,7 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
         "recording": recording.name,
         "markers": args.markers,
         "selector": args.selector,
+        "params": args.params,
         "frames": len(recording),
         "frames_located": int(result.seen.any(axis=1).sum()),
         "detections": int(recording.visible.sum()),

@@ -15,7 +15,9 @@ from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.errors import BadInput
 from jaxnav.files import (
+    Params,
     load_markers,
+    load_params,
     load_rig,
     load_route,
     load_topics,
@@ -43,7 +45,10 @@ from jaxnav.runtime.ros_drives import read_ros_drive
 
 EXIT_DIFFERS = 1
 _FOR_DRIVES = ("vehicle", "route", "images", "record")
-_OVERRIDES = ("rig", "markers_file", "vehicle", "route", "selector", "corner_sigma_px", "images")
+_OVERRIDES = (
+    *("rig", "markers_file", "vehicle", "route", "params"),
+    *("selector", "corner_sigma_px", "images"),
+)
 
 
 def is_for(args: Arguments) -> bool:
@@ -69,7 +74,9 @@ def is_for(args: Arguments) -> bool:
 
 def run(args: Arguments) -> int:
     """Drive again, compare, and write what came of it."""
-    log, setup, inputs = _ros_drive(args) if args.topics is not None else _own_drive(args)
+    params = None if args.params is None else load_params(args.params)
+    load = _own_drive if args.topics is None else _ros_drive
+    log, setup, inputs = load(args, params)
     inputs = inputs[: args.limit]
     if not inputs:
         raise BadInput(args.recording, "holds no input")
@@ -77,8 +84,15 @@ def run(args: Arguments) -> int:
     changed = [name for name in _OVERRIDES if getattr(args, name)]
     comparison = Comparison(log) if log is not None and not changed else None
     out = output_folder(args.out)
+    if params is not None:
+        print(params.told())
     track = _replayed(args, setup, inputs, comparison)
-    summary = {"recording": str(args.recording), "selector": setup.selector} | track.summary()
+    summary: dict[str, Any] = {
+        "recording": str(args.recording),
+        "selector": setup.selector,
+        "parameters": setup.parameters,
+    }
+    summary |= track.summary()
     if log is not None:
         summary |= {"changed": changed, "missing": log.missing, "truncated": log.truncated}
         summary |= track.against(log.outcomes)
@@ -98,16 +112,19 @@ def run(args: Arguments) -> int:
     return EXIT_DIFFERS if comparison is not None and comparison.first else 0
 
 
-def _own_drive(args: Arguments) -> tuple[DriveLog | None, DriveSetup, Sequence[Input]]:
+_Drive = tuple[DriveLog | None, DriveSetup, Sequence[Input]]
+
+
+def _own_drive(args: Arguments, params: Params | None) -> _Drive:
     log = read_drive(args.recording)
     configure_jax(float64=needs_float64(log.header, args.recording), threads=1)
-    setup = _overridden(DriveSetup.of_header(log.header, args.recording), args)
+    setup = _overridden(DriveSetup.of_header(log.header, args.recording), args, params)
     if args.images:
         return log, setup, inputs_from_images(log, setup, args.corner_backend)[0]
     return log, setup, log.inputs
 
 
-def _ros_drive(args: Arguments) -> tuple[DriveLog | None, DriveSetup, Sequence[Input]]:
+def _ros_drive(args: Arguments, params: Params | None) -> _Drive:
     configure_jax(float64=True, threads=1)
     path = args.recording
 
@@ -128,6 +145,7 @@ def _ros_drive(args: Arguments) -> tuple[DriveLog | None, DriveSetup, Sequence[I
             float64=True,
         ),
         dataclasses.replace(args, rig=None, markers_file=None, vehicle=None, route=None),
+        params,
     )
     inputs = read_ros_drive(
         path, load_topics(args.topics), setup.rig, setup.markers, setup.vehicle, args.corner_backend
@@ -135,7 +153,7 @@ def _ros_drive(args: Arguments) -> tuple[DriveLog | None, DriveSetup, Sequence[I
     return None, setup, inputs
 
 
-def _overridden(setup: DriveSetup, args: Arguments) -> DriveSetup:
+def _overridden(setup: DriveSetup, args: Arguments, params: Params | None) -> DriveSetup:
     changes: dict[str, Any] = {}
     for field, path, load in (
         ("rig", args.rig, load_rig),
@@ -148,7 +166,8 @@ def _overridden(setup: DriveSetup, args: Arguments) -> DriveSetup:
     for field in ("selector", "corner_sigma_px"):
         if getattr(args, field) is not None:
             changes[field] = getattr(args, field)
-    return dataclasses.replace(setup, **changes)
+    setup = dataclasses.replace(setup, **changes)
+    return setup if params is None else setup.with_params(params)
 
 
 def _replayed(

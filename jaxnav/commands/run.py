@@ -19,7 +19,7 @@ from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.detection import make_detectors
 from jaxnav.errors import BadInput
 from jaxnav.executables import keep_in
-from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
+from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.runtime import plugins
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.guard import Guard
@@ -38,6 +38,10 @@ def run(args: Run) -> int:
     keep_in(step_folder())
     options = _options(args.option)
     setup = _setup(args, options)
+    if args.params is not None:
+        params = load_params(args.params)
+        setup = setup.with_params(params)
+        _say(args, params.told())
     searches = _searches(args, setup)
     with ExitStack() as closing:
         onlookers = open_onlookers(args, setup, closing)

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from pydantic import Field
@@ -16,7 +17,16 @@ from jaxnav.bicycle import Vehicle
 from jaxnav.bicycle_kalman import BicycleKalman
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
-from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
+from jaxnav.files import (
+    Params,
+    apply_params,
+    calib_dir,
+    load_markers,
+    load_params,
+    load_rig,
+    load_vehicle,
+    write_json,
+)
 from jaxnav.files.reading import read_text
 from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.markers import MarkerMap
@@ -37,10 +47,13 @@ def run(args: Arguments) -> int:
     wanted = list(itertools.product(names, args.corner_noise_px))
     done = _resumed(args)
     world = _World.load(args)
+    if world.params is not None:
+        print(world.params.told())
     print(_HEADER)
     for name, noise_px in wanted:
-        key = _key(args, name, noise_px)
-        found = [one for one in done if one["run"] == key]
+        key = _key(args, world, name, noise_px)
+        # A result of a version that knew no parameters had none.
+        found = [one for one in done if {"params": None} | one["run"] == key]
         result = found[0] if found else {"run": key} | _drive(args, world, key)
         if not found:
             done.append(result)
@@ -58,34 +71,53 @@ class _World:
     rig: CameraRig
     markers: MarkerMap
     vehicle: Vehicle
+    params: Params | None
 
     @staticmethod
     def load(args: Arguments) -> "_World":
         qcar = calib_dir() / "qcar"
-        return _World(
+        world = _World(
             rig=load_rig(args.rig or qcar / "rig.yaml"),
             markers=load_markers(args.markers or qcar / "markers.yaml"),
             vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
+            params=None if args.params is None else load_params(args.params),
         )
+        world.navigator(args.scenario, "multi-hypothesis", told_noise_px=1.0)  # bad input shows
+        return world
+
+    def navigator(self, scenario: str, selector: str, told_noise_px: float) -> Navigator:
+        """What drives in a scenario. Parameters go before what the scenario tells.
+
+        Args:
+            told_noise_px: `corner_sigma_px`, in place of that of the parameters.
+
+        Raises:
+            BadInput: a parameter that does not fit it.
+        """
+        told = scenarios()[scenario]
+        navigator = Navigator(
+            rig=self.rig,
+            markers=self.markers,
+            vehicle=self.vehicle,
+            waypoints_m=told.waypoints_m,
+            selector=make_selector(selector),
+            motion=BicycleKalman(
+                self.vehicle,
+                tilt_sigma_rad=told.told_tilt_sigma_rad,
+                height_sigma_m=told.told_height_sigma_m,
+            ),
+        )
+        if self.params is not None:
+            navigator = apply_params(navigator, self.params)
+        told_sigma_px = jnp.asarray(told_noise_px, navigator.corner_sigma_px.dtype)
+        return eqx.tree_at(lambda n: n.corner_sigma_px, navigator, told_sigma_px)
 
 
 def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any]:
     """All drives of one row of the table."""
     name, noise_px = key["selector"], key["corner_noise_px"]
     scenario = scenarios()[args.scenario]
-    navigator = Navigator(
-        rig=world.rig,
-        markers=world.markers,
-        vehicle=world.vehicle,
-        waypoints_m=scenario.waypoints_m,
-        selector=make_selector(name),
-        motion=BicycleKalman(
-            world.vehicle,
-            tilt_sigma_rad=scenario.told_tilt_sigma_rad,
-            height_sigma_m=scenario.told_height_sigma_m,
-        ),
-        corner_sigma_px=key["told_noise_px"],
-    )
+    navigator = world.navigator(args.scenario, name, key["told_noise_px"])
     rollout = Rollout(navigator, world.vehicle, world.markers, scenario, noise_px)
     with tqdm(
         total=args.seeds,
@@ -99,17 +131,21 @@ def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any
     return Drives.of(trace, scenario).summary()
 
 
-def _key(args: Arguments, name: str, noise_px: float) -> dict[str, Any]:
+def _key(args: Arguments, world: _World, name: str, noise_px: float) -> dict[str, Any]:
     """What a result belongs to."""
+    told_noise_px = noise_px
+    if world.params is not None and "corner_sigma_px" in world.params.values:
+        told_noise_px = float(world.params.values["corner_sigma_px"])
     return {
         "scenario": args.scenario,
         "selector": name,
         "corner_noise_px": noise_px,
-        "told_noise_px": noise_px if args.told_noise_px is None else args.told_noise_px,
+        "told_noise_px": told_noise_px if args.told_noise_px is None else args.told_noise_px,
         "seeds": [args.seed, args.seed + args.seeds - 1],
         "rig": None if args.rig is None else str(args.rig),
         "markers": None if args.markers is None else str(args.markers),
         "vehicle": None if args.vehicle is None else str(args.vehicle),
+        "params": None if args.params is None else str(args.params),
     }
 
 

@@ -1,4 +1,4 @@
-"""Rigs, cameras, markers, vehicles, routes and topics: files in and out.
+"""Rigs, cameras, markers, vehicles, routes, topics, tuned parameters: files in and out.
 
 What a person wrote is validated before anything is built from it; what is wrong is one
 `BadInput` line that names the file and the key. Keys carry their units.
@@ -9,19 +9,23 @@ from pathlib import Path
 from jaxnav.errors import BadInput
 from jaxnav.files.cameras import load_camera
 from jaxnav.files.markers import load_markers, save_markers
+from jaxnav.files.params import Params, apply_params, load_params, write_params
 from jaxnav.files.rigs import load_rig, save_rig
 from jaxnav.files.topics import TopicMap, load_topics
 from jaxnav.files.vehicles import Route, load_route, load_vehicle
 from jaxnav.files.writing import atomic_path, atomic_write, output_folder, write_json, write_tum
 
 __all__ = [
+    "Params",
     "Route",
     "TopicMap",
+    "apply_params",
     "atomic_path",
     "atomic_write",
     "calib_dir",
     "load_camera",
     "load_markers",
+    "load_params",
     "load_rig",
     "load_route",
     "load_topics",
@@ -30,6 +34,7 @@ __all__ = [
     "save_markers",
     "save_rig",
     "write_json",
+    "write_params",
     "write_tum",
 ]
 

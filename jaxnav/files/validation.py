@@ -128,7 +128,7 @@ def _key(location: tuple[int | str, ...], data: Any) -> str:
 
 
 def _problem(error: Any, model: type[BaseModel]) -> str:
-    kind, context, got = error["type"], error.get("ctx", {}), _shown(error["input"])
+    kind, context, got = error["type"], error.get("ctx", {}), shown(error["input"])
     if kind == "missing":
         return "missing"
     if kind == "extra_forbidden":
@@ -172,6 +172,7 @@ _BOUNDS = {
 }
 
 
-def _shown(value: Any) -> str:
-    shown = repr(value) if not isinstance(value, str) else f"the text {value!r}"
-    return shown if len(shown) <= 60 else f"{shown[:57]}..."
+def shown(value: Any) -> str:
+    """What was found, short enough for a line."""
+    text = repr(value) if not isinstance(value, str) else f"the text {value!r}"
+    return text if len(text) <= 60 else f"{text[:57]}..."

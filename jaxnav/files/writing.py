@@ -73,7 +73,7 @@ def write_json(path: str | Path, data: Any) -> None:
     Raises:
         BadInput: it can't be written.
     """
-    atomic_write(path, json.dumps(_plain(data), indent=2, allow_nan=False) + "\n")
+    atomic_write(path, json.dumps(plain_data(data), indent=2, allow_nan=False) + "\n")
 
 
 def write_tum(path: str | Path, stamps_s: np.ndarray, Ts_world_vehicle: np.ndarray) -> None:
@@ -96,13 +96,14 @@ def write_tum(path: str | Path, stamps_s: np.ndarray, Ts_world_vehicle: np.ndarr
     atomic_write(path, "".join(lines))
 
 
-def _plain(value: Any) -> Any:
+def plain_data(value: Any) -> Any:
+    """NumPy, JAX and paths as plain values, what is not finite as None; the rest as it is."""
     if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
+        return {str(key): plain_data(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [plain_data(inner) for inner in value]
     if hasattr(value, "tolist"):  # arrays and their scalars
-        return _plain(value.tolist())
+        return plain_data(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Path):

@@ -7,13 +7,13 @@
     log = read_drive(path)
     setup = DriveSetup.of_header(log.header, path)
 
-The header is plain JSON and holds rig, markers and vehicle as their files do.
+The header is plain JSON and holds rig, markers, vehicle and parameters as their files do.
 """
 
 import hashlib
 import os
 import platform
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +24,7 @@ from pydantic import Field, create_model, field_validator
 from jaxnav.bicycle import Vehicle
 from jaxnav.errors import BadInput
 from jaxnav.executables import sources_digest
-from jaxnav.files import Route
+from jaxnav.files import Params, Route, apply_params
 from jaxnav.files.markers import MarkerFile, marker_data
 from jaxnav.files.rigs import RigFile, rig_data
 from jaxnav.files.validation import Entry, Number, Pair, Positive, Text, at, validate
@@ -75,6 +75,7 @@ class SetupEntry(Entry):
     route: RouteEntry
     selector: Text
     corner_sigma_px: Positive | None
+    parameters: dict[str, Any] = Field(default_factory=dict)  # older drives have none
     timeouts: TimeoutsEntry
     float64: Flag
     made_by: dict[str, str]
@@ -96,6 +97,8 @@ class DriveSetup:
         selector: one of `PILOT_SELECTORS`.
         corner_sigma_px: of every corner along one axis; None: as whoever detects it says.
         float64: precision of the process, in which rig, markers and vehicle are made too.
+        parameters: name -> number or nested lists, in place of the navigator's own; see
+            `with_params`.
     """
 
     rig: CameraRig
@@ -106,10 +109,20 @@ class DriveSetup:
     corner_sigma_px: float | None = None
     timeouts: Timeouts = field(default_factory=Timeouts)
     float64: bool = False
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def with_params(self, params: Params) -> "DriveSetup":
+        """The setup with these parameters, and none of those that it had.
+
+        Raises:
+            BadInput: a parameter that does not fit the navigator; names file and key.
+        """
+        apply_params(replace(self, parameters={}).navigator(), params)
+        return replace(self, parameters=params.plain())
 
     def navigator(self) -> Navigator:
         """What the pilot runs."""
-        return Navigator(
+        navigator = Navigator(
             rig=self.rig,
             markers=self.markers,
             vehicle=self.vehicle,
@@ -117,6 +130,7 @@ class DriveSetup:
             waypoint_radius_m=self.route.waypoint_radius_m,
             selector=make_selector(self.selector),
         )
+        return apply_params(navigator, Params.of(self.parameters, Path("DriveSetup")))
 
     def pilot(self, folder: Path | None) -> Pilot:
         """A pilot at the beginning of a drive.
@@ -130,7 +144,7 @@ class DriveSetup:
 
     def header(self) -> dict[str, Any]:
         """All of it, every number bit for bit, and what this process is."""
-        return {
+        header = {
             "setup_version": SETUP_VERSION,
             "rig": rig_data(self.rig),
             "markers": marker_data(self.markers),
@@ -142,6 +156,8 @@ class DriveSetup:
             "float64": self.float64,
             "made_by": this_process(),
         }
+        # Without them any version of the program reads it.
+        return header | ({"parameters": dict(self.parameters)} if self.parameters else {})
 
     @staticmethod
     def of_header(header: dict[str, Any], where: Path) -> "DriveSetup":
@@ -154,7 +170,7 @@ class DriveSetup:
             BadInput: one line naming file and key; also where it is of a newer kind.
         """
         entry = _checked(header, where)
-        return DriveSetup(
+        setup = DriveSetup(
             rig=entry.rig.rig(),
             markers=entry.markers.map(),
             vehicle=entry.vehicle.vehicle(),
@@ -164,6 +180,9 @@ class DriveSetup:
             timeouts=Timeouts(**entry.timeouts.model_dump()),
             float64=entry.float64,
         )
+        if not entry.parameters:
+            return setup
+        return setup.with_params(Params.of(entry.parameters, where, prefix="header"))
 
 
 def needs_float64(header: dict[str, Any], where: Path) -> bool:

@@ -19,6 +19,7 @@ from jaxnav.ambiguity import Selector
 from jaxnav.candidates import find_candidates
 from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.evaluation import Branch, judge_branch
+from jaxnav.files import Params, apply_params
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator, State
 from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
@@ -58,6 +59,7 @@ def replay(
     one_at_a_time: bool = False,
     corner_sigma_px: float | None = None,
     progress: Callable[[int], object] = lambda frames: None,
+    params: Params | None = None,
 ) -> Replay:
     """Localise the rig in every frame.
 
@@ -65,19 +67,28 @@ def replay(
         recording: frames, rig and map.
         selector: which candidate is believed.
         one_at_a_time: every marker for itself, as if it were the only one; M tracks.
-        corner_sigma_px: standard deviation of a corner coordinate, by default as the recording
-            itself tells, see `estimate_corner_sigma_px`.
+        corner_sigma_px: standard deviation of a corner coordinate, by default that of `params`,
+            or as the recording itself tells, see `estimate_corner_sigma_px`.
         progress: called with the number of frames done since the last call.
+        params: in place of the navigator's own.
+
+    Raises:
+        BadInput: a parameter that does not fit a rig that moves freely.
     """
-    if corner_sigma_px is None:
+    params = Params.of({}, "") if params is None else params
+    if corner_sigma_px is not None:
+        params = params.without("corner_sigma_px")
+    elif "corner_sigma_px" not in params.values:
         corner_sigma_px = estimate_corner_sigma_px(recording)
     navigator = Navigator(
         rig=recording.rig,
         markers=recording.markers,
         selector=selector,
         motion=ConstantVelocity(),
-        corner_sigma_px=corner_sigma_px,
+        corner_sigma_px=1.0 if corner_sigma_px is None else corner_sigma_px,
     )
+    navigator = apply_params(navigator, params)
+    corner_sigma_px = float(navigator.corner_sigma_px)
     tracks = len(recording.markers.ids) if one_at_a_time else 1
     state = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)), navigator.init()

@@ -17,6 +17,8 @@ from jaxnav.arguments import Simulate
 from jaxnav.commands import simulate
 from jaxnav.commands.locate import read_image
 from jaxnav.commands.studies import load_study, summary_of
+from jaxnav.navigator import Navigator
+from jaxnav.parameters import parameters_of
 from jaxnav.runtime.drive_log import read_drive
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.recorder import Recorder
@@ -33,6 +35,7 @@ from tests.helpers.seed_texts import (
     DRIVE,
     KALIBR,
     OPENCV,
+    PARAMS,
     PHOTONVISION,
     SIMULATED,
     STUDY,
@@ -204,6 +207,15 @@ def _resumed(path: Path) -> None:
     simulate._resumed(Simulate(json=path, resume=True))
 
 
+def _applied(path: Path) -> Any:
+    """What a car takes from a file of tuned parameters."""
+    params = files.load_params(path)
+    assert params.told().isprintable()
+    car = Navigator(qcar_rig(), room_markers(), qcar(), [(0.0, 0.0)])
+    taken = parameters_of(files.apply_params(car, params))
+    return {name: taken[name] for name in params.values}
+
+
 def _picture(extension: str) -> Callable[[Path], Path]:
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
     return _written(f"photo{extension}", cv2.imencode(extension, pixels)[1].tobytes())
@@ -222,6 +234,7 @@ STRUCTURED = {
         _written("vehicle.yaml", (QCAR / "vehicle.yaml").read_bytes()), files.load_vehicle
     ),
     "route": Loader(_written("route.yaml", (QCAR / "route.yaml").read_bytes()), files.load_route),
+    "params": Loader(_written("params.yaml", PARAMS), _applied),
     "topics": Loader(_written("topics.yaml", TOPICS), files.load_topics),
     "Kalibr rig": Loader(_written("chain.yaml", KALIBR), files.load_rig),
     "Kalibr camera": Loader(

@@ -1,5 +1,7 @@
 """Files of persons and of other tools that are read without an objection."""
 
+import json
+
 KALIBR = """
 cam0:
   camera_model: pinhole
@@ -88,6 +90,15 @@ bodies:
 cam0: {pose: {position: {x: 0.1, y: 0, z: 0}, rotation: {x: 0, y: 3.141592653589793, z: 0}}}
 """,
 }
+PARAMETERS = {
+    "motion.odometry_sigma": [[1e-4, 5e-5, 0.0], [5e-5, 1e-4, 0.0], [0.0, 0.0, 4e-4]],
+    "motion.acceleration_density": [0.02, 0.01, 0.09],
+    "controller.proportional_per_m": 0.05,
+}
+PARAMS = f"""
+parameters: {json.dumps(PARAMETERS)}
+provenance: {{command: jaxnav tune, loss: 0.5, versions: {{jax: 0.10.0}}, data: [a, b]}}
+"""
 STUDY = """
 trials: 6
 axes: {corner_noise_px: [0.1, 1], selector: [lowest-reprojection, mahalanobis]}

@@ -1,0 +1,217 @@
+"""Tuned parameters of a navigator: YAML, in and out.
+
+    parameters:
+      motion.acceleration_density: [0.01, 0.01, 0.09]   # a number, a list, or a matrix as its rows
+      controller.proportional_per_m: 0.05
+    provenance:                                         # where they come from; may be left out
+      command: jaxnav tune drive.mcap
+      loss: 0.12
+
+`jaxnav.parameters.TUNABLES` has the names, units and meanings. What is not named stays as it is:
+so a number that a navigator has as infinity, which no file may hold, is left out. The provenance
+is kept and shown, and decides nothing.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from textwrap import indent
+from typing import Annotated, Any
+
+import jax.numpy as jnp
+import numpy as np
+import yaml
+from pydantic import Field
+
+from jaxnav.errors import BadInput
+from jaxnav.files.param_values import param_array
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.validation import Entry, at, validate
+from jaxnav.files.writing import atomic_write, plain_data
+from jaxnav.navigator import Navigator
+from jaxnav.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
+
+_LONGEST_SHOWN = 300  # characters of a provenance in a line
+
+
+class ParamsFile(Entry):
+    """A file of tuned parameters; what they may be is for `Params.of` to say."""
+
+    parameters: Annotated[dict[str, Any], Field(min_length=1)]
+    provenance: dict[str, Any] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Params:
+    """Tuned parameters, each sound by itself.
+
+    Attributes:
+        values: name -> float64, (), (d,) or (d, d), in the order of the file.
+        provenance: plain values.
+        path: the file, for messages.
+        prefix: the key in the file that holds `parameters`; empty: none does.
+    """
+
+    values: dict[str, np.ndarray]
+    provenance: dict[str, Any]
+    path: Path
+    prefix: str = field(default="", kw_only=True)
+
+    @staticmethod
+    def of(
+        values: Mapping[str, Any],
+        path: str | Path,
+        provenance: Mapping[str, Any] | None = None,
+        prefix: str = "",
+    ) -> "Params":
+        """Checked.
+
+        Args:
+            values: name -> number, or nested lists or an array of numbers.
+            path, prefix: where they stand, for messages.
+
+        Raises:
+            BadInput: an unknown name, or a value that no parameter can have; names file and key.
+        """
+        params = Params({}, dict(provenance or {}), Path(path), prefix=prefix)
+        for name, value in values.items():
+            where = params.where(name)
+            if name not in TUNABLES:
+                raise BadInput(where, f"unknown: expected one of {', '.join(TUNABLES)}")
+            params.values[name] = param_array(value, where, TUNABLES[name].matrix is not None)
+        return params
+
+    def where(self, name: str) -> str:
+        """File and key of a parameter."""
+        return at(self.path, self.prefix, "parameters", name)
+
+    def without(self, name: str) -> "Params":
+        """The others: where something else tells this one."""
+        values = {other: value for other, value in self.values.items() if other != name}
+        return replace(self, values=values)
+
+    def plain(self) -> dict[str, Any]:
+        """Numbers and nested lists, bit for bit; `of` makes the same parameters of them."""
+        return {name: value.tolist() for name, value in self.values.items()}
+
+    def told(self) -> str:
+        """One line for a person: the file, how many there are, and where they come from."""
+        # As JSON, for a terminal obeys some of the characters that a file may hold.
+        origin = "; ".join(
+            f"{json.dumps(key)[1:-1]}: {json.dumps(value)}"
+            for key, value in self.provenance.items()
+        )
+        if len(origin) > _LONGEST_SHOWN:
+            origin = f"{origin[:_LONGEST_SHOWN]}..."
+        count = f"{len(self.values)} parameter{'s' if len(self.values) > 1 else ''}"
+        return f"{count} from {self.path}" + (f" ({origin})" if origin else "")
+
+
+def load_params(path: str | Path) -> Params:
+    """Tuned parameters, each sound by itself; `apply_params` knows whether they fit a navigator.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    path = Path(path)
+    entry = validate(ParamsFile, read_mapping(path), path)
+    return Params.of(entry.parameters, path, entry.provenance)
+
+
+def write_params(
+    path: str | Path, values: Mapping[str, Any], provenance: Mapping[str, Any] | None = None
+) -> None:
+    """Write tuned parameters; `load_params` gives back the same numbers, bit for bit.
+
+    Args:
+        path: what it is called must not end in .json.
+        values: name -> number, nested lists or array; written in the order of `TUNABLES`.
+        provenance: of texts, numbers, lists and mappings by texts. What is not finite in it is
+            written as null.
+
+    Raises:
+        BadInput: the file can't be written, or `load_params` could not read it.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".json":
+        raise BadInput(path, "must not be called .json: it is written as YAML")
+    params = Params.of(values, path, plain_data(dict(provenance or {})))
+    plain = params.plain()
+    validate(ParamsFile, {"parameters": plain}, path)
+    text = "parameters:\n"
+    for name, tunable in TUNABLES.items():
+        if name in plain:
+            comment = f"# {tunable.meaning} [{tunable.unit}]\n"
+            text += indent(comment + _yaml_text({name: plain[name]}), "  ")
+    if params.provenance:
+        text += _yaml_text({"provenance": params.provenance})
+    atomic_write(path, text)
+
+
+def apply_params(navigator: Navigator, params: Params) -> Navigator:
+    """The navigator with other numbers; those that are not named stay as they are.
+
+    One file serves the car, a simulation of it and every selector, so these are passed over:
+    `controller.*` where nothing is driven, and `selector.*` that this selector does not have. A
+    `motion.*` that the motion model does not have is of another body, and an error.
+
+    Raises:
+        BadInput: a number that this navigator does not have, or not in this shape; names file and
+            key.
+    """
+    known = parameters_of(navigator)
+    values = {}
+    for name, value in params.values.items():
+        if name in known:
+            shapes = allowed_shapes(name, known[name].shape)
+            if value.shape not in shapes:
+                expected = " or ".join(_counted(shape) for shape in shapes)
+                verb = "have" if known[name].ndim else "be"
+                problem = f"must {verb} {expected}, got {_counted(value.shape)}"
+                raise BadInput(params.where(name), problem)
+            values[name] = jnp.asarray(value, known[name].dtype)
+        elif not _is_passed_over(name, navigator):
+            model = type(navigator.motion).__name__
+            problem = f"this navigator has no such number (its motion model is {model})"
+            raise BadInput(params.where(name), f"{problem}: expected one of {', '.join(known)}")
+    return with_parameters(navigator, values)
+
+
+def _is_passed_over(name: str, navigator: Navigator) -> bool:
+    part = name.partition(".")[0]
+    return part == "selector" or (part == "controller" and navigator.controller is None)
+
+
+def _counted(shape: tuple[int, ...]) -> str:
+    if not shape:
+        return "a number"
+    if len(shape) == 1:
+        return f"{shape[0]} entries" if shape[0] != 1 else "1 entry"
+    return f"{shape[0]} rows of {shape[1]}"
+
+
+class _Dumper(yaml.SafeDumper):
+    """Without aliases, with rows on one line each, and with texts that nobody takes for numbers."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
+    # A number of YAML 1.2, such as 1e-5 or 08, may be a word to PyYAML; it begins like a number.
+    style = None if text[:1].isalpha() else '"'
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+def _list(dumper: _Dumper, entries: list[Any]) -> yaml.SequenceNode:
+    is_row = not any(isinstance(entry, list | dict) for entry in entries)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", entries, flow_style=is_row)
+
+
+_Dumper.add_representer(str, _text)
+_Dumper.add_representer(list, _list)
+
+
+def _yaml_text(data: dict[str, Any]) -> str:
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=200)
