@@ -1,0 +1,162 @@
+"""Which of a marker's poses was true, told in hindsight: the discrete choice made before a descent.
+
+The whole estimator runs over a recording, from a cold start. Where it has decided, it knows which
+pose the vehicle had all the time before: carried back to the first frame by odometry, that pose is
+so wide a prior for one hypothesis that it says no more than which valley is the true one. From
+there the filter is smooth in its noise parameters.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.bicycle import advance
+from jaxnav.bicycle_kalman import BicycleKalman
+from jaxnav.geometry import (
+    T_world_vehicle_from_planar,
+    planar_from_T_world_vehicle,
+)
+from jaxnav.kalman import nis
+from jaxnav.motion import Belief, Motion
+from jaxnav.navigator import Navigator, State
+from jaxnav.observation import Observation
+from jaxnav.tuning.recorded import Recorded
+
+# How far off a pose may be that was carried back: m and rad, a third of what lies between the two
+# poses of a marker where they can be mistaken for each other.
+_CARRIED_SIGMA = 0.3
+_LEAST_SHARE = 1e-4  # of the variances, in any direction
+
+
+class Estimated(eqx.Module):
+    """What the whole estimator said of every frame of B sequences."""
+
+    T_world_vehicle: Float[Array, "*B T 7"]
+    square_m2: Float[Array, "*B T"]  # squared position error
+    nees: Float[Array, "*B T"]
+    decided: Bool[Array, "*B T"]
+
+
+@eqx.filter_jit
+def estimated(navigator: Navigator, recorded: Recorded) -> Estimated:
+    """Cold starts, all sequences side by side. What was not used or judged means nothing."""
+
+    def one(recorded: Recorded) -> Estimated:
+        local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
+
+        def frame(state: State, now: tuple[Observation, Array, Array]) -> tuple[State, Estimated]:
+            obs, used, truth = now
+            after, out = local.step(state, obs)
+            after = jax.tree.map(lambda a, b: jnp.where(used, a, b), after, state)
+            error = error_of(local.motion, after.belief.mean[out_index(after)], jaxlie.SE3(truth))
+            d = error.shape[0]
+            return after, Estimated(
+                out.T_world_vehicle.wxyz_xyz,
+                jnp.sum(error[: position_states(d)] ** 2),
+                nees(error, out.covariance[:d, :d]),
+                out.decided & out.located & used,
+            )
+
+        def out_index(state: State) -> Array:
+            belief = state.belief
+            return jnp.argmax(jnp.where(belief.initialised, belief.log_weight, -jnp.inf))
+
+        frames = (recorded.obs, recorded.used, recorded.T_world_vehicle_true)
+        return jax.lax.scan(frame, local.init(), frames)[1]
+
+    return jax.vmap(one)(recorded)
+
+
+def error_of(motion: Motion, mean: Float[Array, " n"], T_true: jaxlie.SE3) -> Float[Array, " d"]:
+    """Of a state's pose, as its covariance counts it: (3,) of a car, (6,) of a free body."""
+    planar = isinstance(motion, BicycleKalman)
+    pose = planar_from_T_world_vehicle(T_true) if planar else T_true.wxyz_xyz
+    true = jnp.concatenate([pose, mean[pose.shape[0] :]])
+    return motion.difference(true, mean)[: 3 if planar else 6]
+
+
+def nees(error: Float[Array, " d"], P: Float[Array, "d d"]) -> Float[Array, ""]:
+    """Normalised error squared, through the correlations: variances may differ by any order.
+
+    Seen from afar a turn and a shift can hardly be told apart: what float32 leaves of such a
+    correlation is kept positive definite by a hundredth of a sigma.
+    """
+    sigma = jnp.sqrt(jnp.diagonal(P))
+    correlation = P / (sigma[:, None] * sigma[None])
+    return nis(error / sigma, correlation + _LEAST_SHARE * jnp.eye(P.shape[0], dtype=P.dtype))
+
+
+def position_states(pose_states: int) -> int:
+    """How many of a pose's error states are lengths."""
+    return 2 if pose_states == 3 else 3
+
+
+class Started(eqx.Module):
+    """Where each of B sequences begins: one hypothesis, in the valley that was found to be true."""
+
+    belief: Belief
+    chosen: Bool[Array, "*B"]  # False: nothing was ever decided, the sequence tells nothing
+
+
+def started(navigator: Navigator, recorded: Recorded) -> Started:
+    """The choice for every sequence, by this navigator."""
+    seen = estimated(navigator, recorded)
+    chosen = jnp.any(seen.decided, axis=1)
+    first = jnp.argmax(seen.decided, axis=1)
+    rows = jnp.arange(len(recorded))
+    poses = _carried_back(navigator, recorded.obs, seen.T_world_vehicle[rows, first], first)
+    return Started(_around(navigator, poses), chosen)
+
+
+@eqx.filter_jit
+def _carried_back(
+    navigator: Navigator, obs: Observation, T_world_vehicle: Array, frames: Array
+) -> Float[Array, "B 7"]:
+    """Where each vehicle was in its first frame, if it was there in a later one.
+
+    A body without odometry is taken to have stood still: it decides within a few frames.
+    """
+    if not isinstance(navigator.motion, BicycleKalman):
+        return T_world_vehicle
+    wheelbase_m = navigator.motion.vehicle.wheelbase_m
+
+    def one(obs: Observation, pose: Array, frame: Array) -> Array:
+        def back(pose: Array, now: tuple[Observation, Array]) -> tuple[Array, None]:
+            obs, index = now[0].usable(), now[1]
+            speed_mps, steering_rad, dt_s = (
+                jnp.asarray(x, pose.dtype) for x in (obs.speed_mps, obs.steering_rad, obs.dt_s)
+            )
+            before = advance(pose, -speed_mps, steering_rad, dt_s, wheelbase_m)
+            return jnp.where((index > 0) & (index <= frame), before, pose), None
+
+        indices = jnp.arange(obs.visible.shape[0])
+        return jax.lax.scan(back, pose, (obs, indices), reverse=True)[0]
+
+    planar = jax.vmap(one)(obs, planar_from_T_world_vehicle(jaxlie.SE3(T_world_vehicle)), frames)
+    return T_world_vehicle_from_planar(planar).wxyz_xyz
+
+
+@eqx.filter_jit
+def _around(navigator: Navigator, T_world_vehicle: Float[Array, "B 7"]) -> Belief:
+    """One hypothesis each, wide about a pose and at rest."""
+    motion = navigator.motion
+    empty = motion.init(1)
+    velocity_sigma = motion.initial_velocity_sigma  # type: ignore[attr-defined]
+    sigma = jnp.concatenate([jnp.full_like(velocity_sigma, _CARRIED_SIGMA), velocity_sigma])
+
+    def one(T: Array) -> Belief:
+        pose = T
+        if isinstance(motion, BicycleKalman):
+            pose = planar_from_T_world_vehicle(jaxlie.SE3(T))
+        mean = jnp.concatenate([pose, jnp.zeros_like(empty.mean[0, pose.shape[0] :])])
+        belief: Belief = eqx.tree_at(
+            lambda b: (b.mean, b.covariance, b.initialised),
+            empty,
+            (mean[None], jnp.diag(sigma**2)[None], jnp.ones(1, bool)),
+        )
+        return belief
+
+    beliefs: Belief = jax.vmap(one)(T_world_vehicle)
+    return beliefs

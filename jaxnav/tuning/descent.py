@@ -1,0 +1,133 @@
+"""One step of an optimiser at a time, so that a person can look on, stop it, and go on.
+
+    descent = Smooth(loss) or Noisy(evaluate, learning_rate)
+    state = descent.init(x)
+    state = descent.step(state, batch, softness)       # until state.over
+
+`loss(x, batch, softness)` is a number; x is a flat vector. `Smooth` is optimistix's BFGS, for a
+loss that is the same function in every step; `Noisy` is optax's Adam, for one that is drawn anew.
+
+A loss or a gradient that is not a finite number is never stepped on: the state says so and stays.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, PyTree
+
+Loss = Callable[[Float[Array, " n"], Any, Float[Array, ""]], Float[Array, ""]]
+
+
+class Descent(eqx.Module):
+    """Where an optimiser stands."""
+
+    x: Float[Array, " n"]
+    asked_x: Float[Array, " n"]  # where the last loss and gradient are, also if they are no number
+    loss: Float[Array, ""]  # at x, or of the batch that led to it; inf before the first step
+    gradient: Float[Array, " n"]  # likewise
+    finite: Bool[Array, ""]  # False: loss or gradient was no number, and nothing moved
+    over: Bool[Array, ""]  # no step is worth taking any more
+    inner: PyTree  # the optimiser's own
+
+
+class Smooth(eqx.Module):
+    """BFGS with a backtracking line search; a step is one evaluation.
+
+    Source: Nocedal, Wright (2006), "Numerical optimization", algorithm 6.1.
+    """
+
+    loss: Loss
+    rtol: float = 1e-4
+    atol: float = 1e-4
+
+    @property
+    def _solver(self) -> optx.BFGS:
+        return optx.BFGS(self.rtol, self.atol)
+
+    def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
+        """At x, nothing known."""
+        return _smooth_init(self, x, batch, softness)
+
+    def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
+        """One more evaluation, at a point that is kept where it lowers the loss enough."""
+        return _smooth_step(self, state, batch, softness)
+
+
+class Noisy(eqx.Module):
+    """Adam, its steps bounded by clipping the gradient's norm, shorter from step to step.
+
+    Source: Kingma, Ba (2015), "Adam: a method for stochastic optimization", algorithm 1.
+    """
+
+    # (x, batch, softness) -> loss and gradient; not compiled here.
+    evaluate: Callable[[Array, Any, Array], tuple[Array, Array]]
+    learning_rate: float = 0.05
+    steps: int = 100  # after which the learning rate is a tenth
+    longest: float = 1.0  # norm of a gradient, above which it is shortened
+
+    @property
+    def _solver(self) -> optax.GradientTransformation:
+        rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=0.1)
+        return optax.chain(optax.clip_by_global_norm(self.longest), optax.adam(rate, b2=0.99))
+
+    def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
+        """At x, nothing known."""
+        return _unknown(x, self._solver.init(x))
+
+    def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
+        """Along the gradient of this batch."""
+        loss, gradient = self.evaluate(state.x, batch, softness)
+        return _moved(self._solver, state, loss, gradient)
+
+
+def _unknown(x: Array, inner: PyTree) -> Descent:
+    yes, no = jnp.asarray(True), jnp.asarray(False)
+    return Descent(x, x, jnp.full((), jnp.inf, x.dtype), jnp.zeros_like(x), yes, no, inner)
+
+
+def _fn(loss: Loss) -> Callable[..., tuple[Array, None]]:
+    return lambda x, args: (loss(x, *args), None)
+
+
+@eqx.filter_jit
+def _smooth_init(smooth: Smooth, x: Array, batch: Any, softness: Array) -> Descent:
+    scalar = jax.ShapeDtypeStruct((), x.dtype)
+    state = smooth._solver.init(
+        _fn(smooth.loss), x, (batch, softness), {}, scalar, None, frozenset()
+    )
+    return _unknown(x, eqx.filter(state, eqx.is_array))
+
+
+@eqx.filter_jit
+def _smooth_step(smooth: Smooth, state: Descent, batch: Any, softness: Array) -> Descent:
+    solver, args, tags = smooth._solver, (batch, softness), frozenset[object]()
+    fn, scalar = _fn(smooth.loss), jax.ShapeDtypeStruct((), state.x.dtype)
+    form = solver.init(fn, state.x, args, {}, scalar, None, tags)
+    before = eqx.combine(state.inner, eqx.filter(form, eqx.is_array, inverse=True))
+    x, after, _ = solver.step(fn, state.x, args, {}, before, tags)
+    over, _ = solver.terminate(fn, x, args, {}, after, tags)
+    f, gradient = after.f_info.f, after.f_info.grad
+    finite = jnp.all(jnp.isfinite(jnp.append(gradient, f)))
+    moved = Descent(x, x, f, gradient, finite, over, eqx.filter(after, eqx.is_array))
+    kept = Descent(state.x, x, state.loss, gradient, finite, finite, state.inner)
+    chosen: Descent = jax.tree.map(lambda a, b: jnp.where(finite, a, b), moved, kept)
+    return chosen
+
+
+@eqx.filter_jit
+def _moved(
+    solver: optax.GradientTransformation, state: Descent, loss: Array, gradient: Array
+) -> Descent:
+    finite = jnp.all(jnp.isfinite(jnp.append(gradient, loss)))
+    update, inner = solver.update(jnp.where(finite, gradient, 0), state.inner, state.x)
+    no = jnp.asarray(False)
+    x = optax.apply_updates(state.x, update)
+    moved = Descent(x, state.x, loss, gradient, finite, no, inner)
+    kept = Descent(state.x, state.x, state.loss, gradient, finite, no, state.inner)
+    chosen: Descent = jax.tree.map(lambda a, b: jnp.where(finite, a, b), moved, kept)
+    return chosen

@@ -1,0 +1,81 @@
+"""The filter's noise as something to tune: by what the cameras see, or by where the vehicle was."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnav.motion import Belief
+from jaxnav.navigator import Navigator
+from jaxnav.parameters import with_parameters
+from jaxnav.tuning.branches import started
+from jaxnav.tuning.following import follow, trusting
+from jaxnav.tuning.objective import Batch
+from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.unconstrained import Space
+
+LOSSES = {
+    "likelihood": "minus the log-likelihood of the corners given what was predicted; asks no truth",
+    "score": "minus the log density of the true pose under what is believed",
+    "error": "the squared position error, cm^2: says nothing of the covariance's size",
+}
+_CM2_PER_M2 = 1e4
+
+
+class Item(NamedTuple):
+    """One sequence; or many, leaves leading with (B,)."""
+
+    start: Belief
+    recorded: Recorded
+
+
+class FilterCost(eqx.Module):
+    """What each frame of a sequence costs, at any noise parameters.
+
+    The likelihood is that of the corners alone, each frame's given all frames before and its own
+    odometry. That of the odometry itself is left out: how a car speeds up and turns is no white
+    noise, and a filter that explains it best is too sure of everything else (see
+    benchmarks/README-tuning.md).
+    """
+
+    navigator: Navigator
+    space: Space
+    loss: str = eqx.field(static=True)
+
+    def __call__(
+        self, x: Float[Array, " n"], item: Item, softness: Float[Array, ""]
+    ) -> Float[Array, " T"]:
+        del softness  # the choice of the branch is fixed
+        navigator = trusting(with_parameters(self.navigator, self.space.values(x)))
+        followed = follow(navigator, item.start, item.recorded)
+        if self.loss == "likelihood":
+            return -followed.log_likelihood
+        if self.loss == "score":
+            return -followed.log_score
+        return _CM2_PER_M2 * followed.square_m2
+
+    def batch(self, x: Float[Array, " n"], recorded: Recorded) -> Batch:
+        """What the recordings say of branches at these parameters, fixed from here on."""
+        navigator = with_parameters(self.navigator, self.space.values(x))
+        start = started(navigator, recorded)
+        usable = eqx.tree_at(
+            lambda r: (r.used, r.judged),
+            recorded,
+            (recorded.used & start.chosen[:, None], recorded.judged & start.chosen[:, None]),
+        )
+        counted = usable.used if self.loss == "likelihood" else usable.judged
+        frames = jnp.maximum(jnp.sum(counted), 1).astype(x.dtype)
+        return Batch(Item(start.belief, usable), frames)
+
+    def mean(self, x: Float[Array, " n"], batch: Batch) -> Float[Array, ""]:
+        """The mean cost of a frame."""
+        return _mean(self, x, batch)
+
+
+@eqx.filter_jit
+def _mean(cost: FilterCost, x: Array, batch: Batch) -> Array:
+    zero = jnp.zeros((), x.dtype)
+    costs = jax.vmap(lambda item: cost(x, item, zero))(batch.items)
+    return jnp.sum(costs) / batch.frames

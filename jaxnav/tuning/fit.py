@@ -1,0 +1,197 @@
+"""A descent from its beginning to its end, and what is kept so that it can go on after a break.
+
+    fit = Fit.begin(x, problem)
+    while not fit.over:
+        fit = advanced(fit, problem)       # one step; `fit` is all there is to save
+
+Stages: a problem may be posed anew where a descent has ended (branches chosen again, by the
+parameters that were found), until that changes nothing. What counts is the loss on held-out
+drives: the best x by that is what a fit has found, and it ends when `patience` steps found none
+better.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnav.tuning.descent import Descent, Noisy, Smooth
+from jaxnav.tuning.objective import Batch, NotFinite
+
+_SAME = 1e-3  # a loss that differs by less is the same, of its size and of 1
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is asked of a fit.
+
+    Attributes:
+        optimiser: makes the steps.
+        batch: (x at which the stage began, stage, step in all) -> what the next step is made on.
+        held_out: (x, x at which the stage began, stage) -> loss on drives that no step is made on.
+        softness: (step) -> of the discrete choices.
+        explain: (x, batch, softness) -> where a gradient is not finite.
+        steps, stages: at most so many.
+        patience: steps without a better held-out loss, after which it is over.
+        same_batch: the batch is the same throughout a stage.
+    """
+
+    optimiser: Smooth | Noisy
+    batch: Callable[[Array, int, int], Batch]
+    held_out: Callable[[Array, Array, int], float]
+    explain: Callable[[Array, Batch, Array], NotFinite | None] = lambda x, batch, softness: None
+    softness: Callable[[int], float] = lambda step: 0.0
+    steps: int = 100
+    stages: int = 1
+    patience: int = 20
+    same_batch: bool = True
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a fit stands.
+
+    `history` has a row for the beginning of every stage, its loss NaN, and one for every step that
+    was made: loss, held-out loss, and x.
+    """
+
+    descent: Descent
+    stage_x: Float[Array, " n"]
+    best_x: Float[Array, " n"]
+    best_loss: float = np.inf
+    best_of_stage: float = np.inf
+    step: int = 0
+    stage: int = 0
+    stale: int = 0
+    refused: int = 0  # steps not made since a gradient was not finite
+    over: bool = False
+    ended: str = ""  # why
+    history: tuple[np.ndarray, ...] = field(default=())
+
+    @staticmethod
+    def begin(x: Float[Array, " n"], problem: Problem) -> "Fit":
+        """At x, nothing known."""
+        batch, softness = problem.batch(x, 0, 0), jnp.asarray(problem.softness(0), x.dtype)
+        loss = _known(problem.held_out(x, x, 0))
+        descent = problem.optimiser.init(x, batch, softness)
+        return Fit(descent, x, x, loss, loss, history=(_row(np.nan, loss, x),))
+
+
+def advanced(fit: Fit, problem: Problem) -> Fit:
+    """One step more."""
+    x = fit.descent.x
+    softness = jnp.asarray(problem.softness(fit.step), x.dtype)
+    batch = problem.batch(fit.stage_x, fit.stage, fit.step)
+    descent = problem.optimiser.step(fit.descent, batch, softness)
+    step = fit.step + 1
+    if not descent.finite:
+        refused = fit.refused + 1
+        hopeless = problem.same_batch or refused >= problem.patience
+        over = hopeless or step >= problem.steps
+        ended = "a gradient is not finite" if over else ""
+        return dataclasses.replace(
+            fit, descent=descent, step=step, refused=refused, over=over, ended=ended
+        )
+    moved = bool(jnp.any(descent.x != x))
+    loss = float(fit.history[-1][1])
+    if moved:
+        loss = _known(problem.held_out(descent.x, fit.stage_x, fit.stage))
+    better = loss < fit.best_loss
+    row = _row(float(descent.loss), loss, descent.x)
+    fit = dataclasses.replace(
+        fit,
+        descent=descent,
+        step=step,
+        best_x=descent.x if better else fit.best_x,
+        best_loss=min(loss, fit.best_loss),
+        stale=0 if better else fit.stale + 1,
+        refused=0,
+        history=(*fit.history, row),
+    )
+    if step >= problem.steps:
+        return dataclasses.replace(fit, over=True, ended=f"{step} steps are done")
+    if bool(descent.over) or fit.stale >= problem.patience:
+        return _next_stage(fit, problem)
+    return fit
+
+
+def _next_stage(fit: Fit, problem: Problem) -> Fit:
+    gained = fit.best_of_stage - fit.best_loss
+    little = fit.stage > 0 and gained < _SAME * max(1.0, abs(fit.best_loss))
+    if little or fit.stage + 1 >= problem.stages:
+        ended = "converged" if bool(fit.descent.over) else "no better on held-out drives"
+        return dataclasses.replace(fit, over=True, ended=ended)
+    stage, x = fit.stage + 1, fit.best_x
+    softness = jnp.asarray(problem.softness(fit.step), x.dtype)
+    descent = problem.optimiser.init(x, problem.batch(x, stage, fit.step), softness)
+    # Other branches, another loss: what was best by the old one is not comparable.
+    loss = _known(problem.held_out(x, x, stage))
+    return dataclasses.replace(
+        fit,
+        descent=descent,
+        stage=stage,
+        stage_x=x,
+        best_loss=loss,
+        best_of_stage=loss,
+        stale=0,
+        history=(*fit.history, _row(np.nan, loss, x)),
+    )
+
+
+def _row(loss: float, held_out: float, x: Array) -> np.ndarray:
+    return np.concatenate([[loss, held_out], np.asarray(x)])
+
+
+def _known(loss: float) -> float:
+    """A loss that is no number is worse than any other."""
+    return np.inf if np.isnan(loss) else float(loss)
+
+
+def arrays_of(fit: Fit) -> dict[str, np.ndarray]:
+    """All of it, as a file of arrays holds it."""
+    leaves = jax.tree.leaves(fit.descent)
+    inner = {f"descent_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    plain = {
+        name: np.asarray(getattr(fit, name))
+        for name in ("stage_x", "best_x", "best_loss", "best_of_stage", "step", "stage", "stale")
+    }
+    rest = {name: np.asarray(getattr(fit, name)) for name in ("refused", "over", "ended")}
+    return inner | plain | rest | {"history": np.array(fit.history)}
+
+
+def fit_of(arrays: dict[str, np.ndarray], like: Fit) -> Fit:
+    """What `arrays_of` was made of.
+
+    Args:
+        like: a fit of the same problem.
+
+    Raises:
+        KeyError, ValueError: arrays of something else.
+    """
+    leaves, form = jax.tree.flatten(like.descent)
+    found = [arrays[f"descent_{i}"] for i in range(len(leaves))]
+    for leaf, array in zip(leaves, found, strict=True):
+        if leaf.shape != array.shape or leaf.dtype != array.dtype:
+            raise ValueError(f"{leaf.shape} {leaf.dtype} became {array.shape} {array.dtype}")
+    x = like.best_x
+    shapes = [arrays[name].shape for name in ("stage_x", "best_x")]
+    if arrays["history"].shape[1:] != like.history[0].shape or shapes != [x.shape] * 2:
+        raise ValueError("another number of parameters")
+    return Fit(
+        descent=jax.tree.unflatten(form, [jnp.asarray(array) for array in found]),
+        stage_x=jnp.asarray(arrays["stage_x"], x.dtype),
+        best_x=jnp.asarray(arrays["best_x"], x.dtype),
+        best_loss=float(arrays["best_loss"]),
+        best_of_stage=float(arrays["best_of_stage"]),
+        step=int(arrays["step"]),
+        stage=int(arrays["stage"]),
+        stale=int(arrays["stale"]),
+        refused=int(arrays["refused"]),
+        over=bool(arrays["over"]),
+        ended=str(arrays["ended"]),
+        history=tuple(arrays["history"]),
+    )

@@ -1,0 +1,85 @@
+"""The filter along a sequence from a start that is chosen: smooth in its noise parameters.
+
+The estimator is the car's, `Navigator.estimate`, frame by frame, with one hypothesis: of the poses
+that a marker admits the other ones are left out, for good (`branches.py` says which). Selectors
+that choose anew in every frame do so, and no gradient flows through that choice.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from jaxnav.constant_velocity import ConstantVelocity
+from jaxnav.hypotheses import MultiHypothesis
+from jaxnav.kalman import log_likelihood
+from jaxnav.levenberg_marquardt import KEEP_FOUND
+from jaxnav.motion import Belief
+from jaxnav.navigator import Navigator
+from jaxnav.observation import Observation
+from jaxnav.tuning.branches import error_of, nees, position_states
+from jaxnav.tuning.recorded import Recorded
+
+
+class Followed(eqx.Module):
+    """What is known of every frame; 0 where nothing was used, or nothing judged.
+
+    Where numbers have overflowed and the hypothesis is lost, there is nothing worse: parameters
+    that break the filter are none to step to.
+    """
+
+    log_likelihood: Float[Array, "*B T"]  # of the corners given what was predicted
+    log_score: Float[Array, "*B T"]  # log density of the true pose under what is believed
+    square_m2: Float[Array, "*B T"]  # squared position error
+    nees: Float[Array, "*B T"]
+
+
+def trusting(navigator: Navigator) -> Navigator:
+    """The same without its guards against outliers, which hide what is wrong with Q and R."""
+    motion, selector = navigator.motion, navigator.selector
+    navigator = eqx.tree_at(lambda n: n.motion.gate_nis, navigator, float("inf"))
+    if isinstance(motion, ConstantVelocity):
+        navigator = eqx.tree_at(lambda n: n.motion.lost_sigma_m, navigator, float("inf"))
+    if isinstance(selector, MultiHypothesis):
+        navigator = eqx.tree_at(
+            lambda n: (n.selector.max_inflation, n.selector.max_misfit), navigator, (1.0, 1.0)
+        )
+    return navigator
+
+
+def follow(navigator: Navigator, start: Belief, recorded: Recorded) -> Followed:
+    """One sequence (no batch axis), frame by frame."""
+    local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
+    # A hypothesis that goes on asks no candidate.
+    goes_on = isinstance(navigator.selector, MultiHypothesis)
+
+    @functools.partial(jax.checkpoint, policy=KEEP_FOUND)
+    def frame(
+        belief: Belief, now: tuple[Observation, Array, Array, Array]
+    ) -> tuple[Belief, Followed]:
+        obs, used, truth, judged = now
+        snapshot = local.snapshot(obs.usable())
+        candidates = local.no_candidates() if goes_on else local.find_candidates(snapshot)
+        estimate = local.estimate(belief, snapshot, candidates)
+        after: Belief = jax.tree.map(lambda a, b: jnp.where(used, a, b), estimate.belief, belief)
+        error = error_of(local.motion, after.mean[0], jaxlie.SE3(truth))
+        d = error.shape[0]
+        P = after.covariance[0, :d, :d]
+        lives, worst = after.initialised[0], jnp.asarray(jnp.inf, P.dtype)
+
+        def told(counts: Array, value: Array, otherwise: Array) -> Array:
+            return jnp.where(counts, jnp.where(lives, value, otherwise), 0)
+
+        judged = judged & used
+        return after, Followed(
+            log_likelihood=told(used, estimate.log_likelihood, -worst),
+            log_score=told(judged, log_likelihood(error, P), -worst),
+            square_m2=told(judged, jnp.sum(error[: position_states(d)] ** 2), worst),
+            nees=told(judged, nees(error, P), worst),
+        )
+
+    frames = (recorded.obs, recorded.used, recorded.T_world_vehicle_true, recorded.judged)
+    return jax.lax.scan(frame, start, frames)[1]

@@ -1,0 +1,92 @@
+"""What was sensed on many drives: what a filter is tuned on, and held against afterwards."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.markers import MarkerMap
+from jaxnav.navigator import Output, State
+from jaxnav.observation import Observation
+from jaxnav.simulation.rollout import Rollout
+
+
+class Recorded(eqx.Module):
+    """B sequences of T frames; every leaf leads with (B,)."""
+
+    markers: MarkerMap
+    obs: Observation  # (B, T, ...)
+    used: Bool[Array, "*B T"]  # False: there was no such frame
+    T_world_vehicle_true: Float[Array, "*B T 7"]
+    judged: Bool[Array, "*B T"]  # the true pose is known, and an estimate is held against it
+
+    def __len__(self) -> int:
+        return len(self.used)
+
+    def rows(self, rows: slice | np.ndarray) -> "Recorded":
+        """Some of them."""
+        some: Recorded = jax.tree.map(lambda leaf: leaf[rows], self)
+        return some
+
+    @staticmethod
+    def together(parts: "list[Recorded]") -> "Recorded":
+        """One after the other; shorter ones are padded with frames that are not used."""
+        length = max(part.used.shape[1] for part in parts)
+        padded = [part.padded(length) for part in parts]
+        joined: Recorded = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *padded)
+        return joined
+
+    def padded(self, length: int) -> "Recorded":
+        """So many frames, the last one repeated and not used."""
+        more = length - self.used.shape[1]
+        frames = (self.obs, self.used, self.T_world_vehicle_true, self.judged)
+        obs, used, truth, judged = jax.tree.map(
+            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:, -1:], more, axis=1)], axis=1),
+            frames,
+        )
+        known = jnp.arange(length)[None] < self.used.shape[1]
+        return Recorded(self.markers, obs, used & known, truth, judged & known)
+
+
+def simulated(rollout: Rollout, keys: Key[Array, " B"]) -> Recorded:
+    """Closed-loop drives from a cold start, judged from the frame on in which the navigator that
+    drove had decided where it was."""
+    obs, true_poses, decided, active = jax.device_get(_drives(rollout, keys))
+    count, length = len(active), int(active.sum(axis=1).max())
+    judged = np.maximum.accumulate(decided & active, axis=1) & active
+    poses = T_world_vehicle_from_planar(jnp.asarray(true_poses[:, :length]))
+    return Recorded(
+        markers=jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))),
+            rollout.navigator.markers,
+        ),
+        obs=jax.tree.map(lambda leaf: jnp.asarray(leaf[:, :length]), obs),
+        used=jnp.asarray(active[:, :length]),
+        T_world_vehicle_true=poses.wxyz_xyz,
+        judged=jnp.asarray(judged[:, :length]),
+    )
+
+
+@eqx.filter_jit
+def _drives(rollout: Rollout, keys: Key[Array, " B"]) -> tuple[Observation, Array, Array, Array]:
+    """Observations, true poses, what was decided and what was still under way; (B, frames)."""
+
+    def drive(key: Array) -> tuple[Observation, Array, Array, Array]:
+        def frame(world: Any, _: None) -> tuple[Any, tuple[Observation, Array, Array, Array]]:
+            seen: list[Observation] = []
+
+            def step(state: State, obs: Observation) -> tuple[State, Output]:
+                seen.append(dataclasses.replace(obs, T_world_vehicle_true=None, heading_rad=None))
+                return rollout.navigator.step(state, obs)
+
+            world, trace = rollout.frame(world, step)
+            return world, (seen[0], trace.true_pose, trace.decided, trace.active)
+
+        return jax.lax.scan(frame, rollout.first(key), length=rollout.scenario.frames)[1]
+
+    return jax.vmap(drive)(keys)
