@@ -31,6 +31,7 @@ from jaxnav.arguments import (
     Run,
     Simulate,
     Study,
+    Tune,
     View,
 )
 from jaxnav.errors import BadInput
@@ -47,10 +48,22 @@ DESCRIPTION = (
 
 # Module -> its package, and the extra of ours that brings it.
 _OF_EXTRAS = {name: (name, "study") for name in ("dask", "distributed", "xarray", "zarr")} | {
-    "rerun": ("rerun-sdk", "viz")
+    "rerun": ("rerun-sdk", "viz"),
+    "optax": ("optax", "tune"),
 }
 _Command = (
-    Demo | Replay | Locate | Simulate | Reliability | Study | Plot | View | Run | Faults | Doctor
+    Demo
+    | Replay
+    | Locate
+    | Simulate
+    | Reliability
+    | Study
+    | Plot
+    | View
+    | Run
+    | Faults
+    | Doctor
+    | Tune
 )
 
 
@@ -164,5 +177,6 @@ def _one_line(box: str) -> str:
 
 def _listed(lines: list[str]) -> str:
     head = " ".join(line for line in lines if not line.startswith(" "))
-    items = ", ".join(line.strip() for line in lines if line.startswith(" "))
+    indented = (line.strip() for line in lines if line.startswith(" "))
+    items = ", ".join(item for item in indented if item != "[...]")
     return f"{head} {items}".strip()

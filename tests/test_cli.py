@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from jaxnav import cli
-from jaxnav.arguments import COMMANDS, Demo, Locate, Replay
+from jaxnav.arguments import COMMANDS, Demo, Locate, Replay, TuneController, TuneFilter
 from jaxnav.errors import BadInput
 
 JAXNAV = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
@@ -147,17 +147,26 @@ def test_a_defect_keeps_its_traceback(command) -> None:
         cli.main(["demo"])
 
 
-POSITIONAL = {"kind": r"\{ambiguity,drive\}"}
+POSITIONALS = ("recording", "image", "store", "config", "kind", "recordings")
+POSITIONAL = {"recordings": "RECORDING", "kind": r"\{ambiguity,drive\}"}
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+# `jaxnav tune` has two commands of its own.
+HELPED = {name: ([name], fields) for name, fields in COMMANDS.items() if name != "tune"} | {
+    "tune filter": (["tune", "filter"], TuneFilter),
+    "tune controller": (["tune", "controller"], TuneController),
+}
+
+
+@pytest.mark.parametrize("name", HELPED)
 def test_help_explains_every_flag(name, capsys) -> None:
-    assert cli.main([name, "--help"]) == 0
+    words, command = HELPED[name]
+    assert cli.main([*words, "--help"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
     assert "{None}" not in out
-    for field in dataclasses.fields(COMMANDS[name]):
-        is_positional = field.name in ("recording", "image", "store", "config", "kind")
+    for field in dataclasses.fields(command):
+        is_positional = field.name in POSITIONALS
         flag = (
             POSITIONAL.get(field.name, field.name.upper())
             if is_positional

@@ -11,6 +11,7 @@ from jaxnav.arguments.kinds import Selector
 from jaxnav.arguments.recordings import Locate, Replay, View
 from jaxnav.arguments.simulations import Demo, Faults, Simulate
 from jaxnav.arguments.studies import Plot, Reliability, Study
+from jaxnav.arguments.tuning import Tune, TuneController, TuneFilter
 from jaxnav.arguments.vehicles import Doctor, Run
 
 __all__ = [
@@ -27,6 +28,9 @@ __all__ = [
     "Selector",
     "Simulate",
     "Study",
+    "Tune",
+    "TuneController",
+    "TuneFilter",
     "View",
 ]
 
@@ -42,6 +46,7 @@ Command = (
     | Annotated[Faults, tyro.conf.subcommand("faults")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[Tune, tyro.conf.subcommand("tune")]
 )
 COMMANDS = {
     "demo": Demo,
@@ -55,4 +60,5 @@ COMMANDS = {
     "faults": Faults,
     "view": View,
     "doctor": Doctor,
+    "tune": Tune,
 }

@@ -1,0 +1,226 @@
+"""What tuning reaches, as tables: `python benchmarks/bench_tuning.py [filter] [controller] [rivals]
+[recordings] [cost] [--out DIR]`, all of them by default.
+
+`filter`, `controller` and `recordings` run the commands that a person runs, and read their
+summaries. An interrupted one goes on where it was. `rivals` holds BFGS with gradients against
+Nelder-Mead and CMA-ES on one loss; `cost` holds gradients against forward passes.
+"""
+
+import argparse
+import itertools
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TEST_SEEDS = 500
+TAGSLAM = Path("../shared/data/tagslam")
+Q = {"motion.acceleration_density": [0.01, 0.01, 0.09]}
+R_SIGMA = {"motion.odometry_sigma": [0.01, 0.01, 0.01], "corner_sigma_px": 1.0}
+ROUNDS = 15
+
+
+def main() -> None:
+    """Print the tables that are asked for."""
+    sections: dict[str, Callable[[Path], None]] = {
+        "filter": filter_table,
+        "controller": controller_table,
+        "rivals": rivals_table,
+        "recordings": recordings_table,
+        "cost": cost_table,
+    }
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sections", nargs="*", help=", ".join(sections))
+    parser.add_argument("--out", type=Path, default=Path("out/bench_tuning"))
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    for name in args.sections or sections:
+        print(f"\n## {name}\n", flush=True)
+        sections[name](args.out)
+
+
+def tuned(*arguments: str, out: Path) -> dict[str, Any]:
+    """The summary of `jaxnav tune ...`."""
+    command = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
+    subprocess.run([*command, "tune", *arguments, "--out", str(out), "--headless"], check=True)
+    summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
+    return summary
+
+
+def wrong_by(q: float, r: float) -> dict[str, Any]:
+    """Q and R as covariances, so many times what they are by default."""
+    sigmas = {name: np.multiply(value, np.sqrt(r)).tolist() for name, value in R_SIGMA.items()}
+    return {name: np.multiply(value, q).tolist() for name, value in Q.items()} | sigmas
+
+
+def filter_table(out: Path) -> None:
+    """From Q and R wrong by 10, without truth; and what truth would have made of it."""
+    rows = []
+    starts = [(1.0, 1.0, loss) for loss in ("likelihood", "score", "error")]
+    starts += [(q, r, "likelihood") for q, r in itertools.product((10.0, 0.1), repeat=2)]
+    for q, r, loss in starts:
+        name = f"filter_{loss}_{q:g}_{r:g}"
+        params = out / f"{name}.yaml"
+        params.write_text(json.dumps({"parameters": wrong_by(q, r)}))
+        summary = tuned(
+            *("filter", "--loss", loss, "--params", str(params)),
+            *("--test-seeds", str(TEST_SEEDS)),
+            out=out / name,
+        )
+        (judged,) = summary["test"].values()
+        rows.append((q, r, loss, judged["before"], judged["after"], summary))
+    known = [judged for row in rows for judged in row[3:5]]
+    best = min(judged["position_rmse_m"]["value"] for judged in known)
+    low, high = known[0]["anees_consistent"]
+    print(f"{TEST_SEEDS} drives never seen; ANEES of {low:.2f} to {high:.2f} is consistent\n")
+    print("| Q | R | loss | RMSE before cm | after cm | against the best | ANEES before | after |")
+    print("|---|---|---|---|---|---|---|---|")
+    for q, r, loss, before, after, _ in rows:
+        rmse = [100 * judged["position_rmse_m"]["value"] for judged in (before, after)]
+        ends = [100 * end for end in after["position_rmse_m"]["interval"]]
+        print(
+            f"| x {q:g} | x {r:g} | {loss} | {rmse[0]:.2f} | {rmse[1]:.2f} ({ends[0]:.2f} to "
+            f"{ends[1]:.2f}) | {rmse[1] / (100 * best) - 1:+.1%} | "
+            f"{before['anees']['value']:.3g} | {after['anees']['value']:.2f} |"
+        )
+
+
+def controller_table(out: Path) -> None:
+    """The gains that are shipped, and tuned ones."""
+    summary = tuned("controller", "--test-seeds", str(TEST_SEEDS), out=out / "controller")
+    print(f"{TEST_SEEDS} drives of each, never seen: shipped -> tuned\n")
+    print("| scenario | loss | | time to the last waypoint s | success |\n|---|---|---|---|---|")
+    for name, judged in summary["test"].items():
+        was, now = judged["before"], judged["after"]
+        change = now["loss"]["value"] / was["loss"]["value"] - 1
+        low, high = now["loss"]["interval"]
+        print(
+            f"| {name} | {was['loss']['value']:.3f} -> {now['loss']['value']:.3f} "
+            f"({low:.3f} to {high:.3f}) | {change:+.1%} | {was['time_s']['value']:.2f} -> "
+            f"{now['time_s']['value']:.2f} | {was['success_rate']['value']:.1%} -> "
+            f"{now['success_rate']['value']:.1%} |"
+        )
+    after = summary["parameters"]["after"]
+    print("\n" + ", ".join(f"{name} {value:.4g}" for name, value in after.items()))
+
+
+def recordings_table(out: Path) -> None:
+    """The constant-velocity prior of a hand-held rig, one marker at a time."""
+    learned = str(TAGSLAM / "test_5")
+    summary = tuned(
+        *("filter", learned, "--part", "0", "0.5", "--test", str(TAGSLAM / "test_7")),
+        out=out / "recordings",
+    )
+    print("| never seen | median cm | RMSE cm | ANEES (6 dof) |\n|---|---|---|---|")
+    for name, judged in summary["test"].items():
+        cells = []
+        for pick in (
+            lambda j: 100 * j["position_median_m"],
+            lambda j: 100 * j["position_rmse_m"]["value"],
+            lambda j: j["anees"]["value"],
+        ):
+            was, now = pick(judged["before"]), pick(judged["after"])
+            cells.append(f"{was:.3g} -> {now:.3g} ({now / was - 1:+.1%})")
+        print(f"| {name} | {' | '.join(cells)} |")
+
+
+def rivals_table(out: Path) -> None:
+    """Rollouts until a loss is reached that BFGS has reached; a gradient counts as four."""
+    import cma
+    import jax
+    import jax.numpy as jnp
+    from scipy.optimize import minimize
+
+    from jaxnav.tuning.descent import Smooth
+
+    objective, batch, start = _filter_loss()
+    soft = jnp.zeros((), start.dtype)
+    value = jax.jit(lambda x: objective(x, batch, soft))
+    descent = Smooth(objective)
+    state, path = descent.init(start, batch, soft), []
+    while not bool(state.over) and len(path) < 150:
+        state = descent.step(state, batch, soft)
+        path.append(float(value(state.x)))
+    reached = path[-1]
+    goals = {"the last loss": reached + 1e-4, "1e-2 above it": reached + 1e-2}
+    print(f"{len(start)} parameters, {len(batch.items.recorded)} drives a rollout\n")
+    traces: dict[str, list[float]] = {"BFGS": list(np.repeat(path, 4))}
+
+    def counted(name: str) -> Callable[[np.ndarray], float]:
+        traces[name] = []
+
+        def function(x: np.ndarray) -> float:
+            traces[name].append(float(np.nan_to_num(value(jnp.asarray(x, start.dtype)), nan=1e9)))
+            return traces[name][-1]
+
+        return function
+
+    x, budget = np.asarray(start, float), 40 * len(path)
+    options = {"maxfev": budget, "xatol": 1e-6, "fatol": 1e-8, "adaptive": True}
+    minimize(counted("Nelder-Mead"), x, method="Nelder-Mead", options=options)
+    cma.fmin2(
+        counted("CMA-ES"), x, 1.0, {"maxfevals": budget, "verbose": -9, "seed": 1, "tolfun": 1e-8}
+    )
+    print("| | rollouts to " + " | to ".join(goals) + " | best |\n|---|---|---|---|")
+    for name, losses in traces.items():
+        cells = []
+        for goal in goals.values():
+            hits = np.flatnonzero(np.array(losses) <= goal)
+            cells.append(str(hits[0] + 1) if len(hits) else f"not in {len(losses)}")
+        print(f"| {name} | {' | '.join(cells)} | {min(losses):.5f} |")
+
+
+def cost_table(out: Path) -> None:
+    """Gradient over forward pass, medians of interleaved runs."""
+    import jax
+    import jax.numpy as jnp
+
+    objective, batch, start = _filter_loss()
+    soft = jnp.zeros((), start.dtype)
+    forward = jax.jit(lambda x: objective(x, batch, soft))
+    gradient = jax.jit(lambda x: jax.value_and_grad(objective)(x, batch, soft))
+    seconds: list[list[float]] = [[], []]
+    for function in (forward, gradient):
+        jax.block_until_ready(function(start))
+    for _ in range(ROUNDS):
+        for function, times in zip((forward, gradient), seconds, strict=True):
+            begin = time.perf_counter()
+            jax.block_until_ready(function(start))
+            times.append(time.perf_counter() - begin)
+    ratio = np.median(np.array(seconds[1]) / np.array(seconds[0]))
+    drives = len(batch.items.recorded)
+    milliseconds = [1e3 * np.median(times) / drives for times in seconds]
+    print("| a drive | forward ms | gradient ms | ratio |\n|---|---|---|---|")
+    print(f"| filter | {milliseconds[0]:.2f} | {milliseconds[1]:.2f} | {ratio:.2f} |")
+
+
+def _filter_loss() -> tuple[Any, Any, Any]:
+    """The likelihood of 32 drives, Q ten times too large and R ten times too small."""
+    from jaxnav.arguments import TuneFilter
+    from jaxnav.commands.process import configure_jax
+
+    configure_jax(float64=False)
+    import jax.numpy as jnp
+
+    from jaxnav.commands.tune_data import read_data
+    from jaxnav.commands.tune_filter import space_of
+    from jaxnav.parameters import with_parameters
+    from jaxnav.tuning.filter import FilterCost
+    from jaxnav.tuning.objective import Objective
+
+    args = TuneFilter(seeds=32, held_out_seeds=1, headless=True)
+    data = read_data(args)
+    values = {name: jnp.asarray(value) for name, value in wrong_by(10.0, 0.1).items()}
+    space = space_of(args, with_parameters(data.navigator, values), data.learned)
+    cost = FilterCost(data.navigator, space, "likelihood")
+    right = space_of(args, data.navigator, data.learned)
+    return Objective(cost), cost.batch(right.start, data.learned), space.start
+
+
+if __name__ == "__main__":
+    main()

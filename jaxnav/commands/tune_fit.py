@@ -1,0 +1,177 @@
+"""A fit under the eyes of a person: a bar, the best so far in a file, and a way to go on."""
+
+import dataclasses
+import datetime
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Collection
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from tqdm import tqdm
+
+from jaxnav.errors import BadInput
+from jaxnav.files import write_params
+from jaxnav.files.writing import atomic_write
+from jaxnav.tuning.fit import Fit, Problem, advanced, arrays_of, fit_of
+from jaxnav.tuning.unconstrained import Space
+
+# What a fit doesn't depend on.
+_OF_THE_REPORT = ("out", "headless", "test", "test_seeds")
+
+
+def plain_key(command: str, args: Any) -> dict[str, Any]:
+    """All that a result depends on: what was told, and by what it was computed."""
+    told = {
+        name: _plain(value)
+        for name, value in dataclasses.asdict(args).items()
+        if name not in _OF_THE_REPORT
+    }
+    versions = {name: version(name) for name in ("jaxnav", "jax", "optimistix", "optax")}
+    return {"command": command} | told | {"versions": versions}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+# What NumPy and zipfile raise where a byte is wrong: a flag says "encrypted", a length is absurd.
+_DAMAGED = (
+    KeyError, ValueError, TypeError, EOFError, OSError, RuntimeError, MemoryError, struct.error,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+
+
+class Fitting:
+    """A fit in a folder.
+
+    Args:
+        folder: of params.yaml and checkpoint.npz.
+        key: all that the result depends on, plain values; a checkpoint of another key is refused.
+        prior_sigma: see `Objective`; what the loss asks of parameters that no drive depends on.
+        named: parameters that a person asks for, who is told where no drive depends on one; None:
+            all.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        key: dict[str, Any],
+        problem: Problem,
+        space: Space,
+        prior_sigma: float = np.inf,
+        told: Callable[[str], object] = print,
+        named: Collection[str] | None = None,
+    ):
+        self._folder, self._key, self._problem = folder, key, problem
+        self._space, self._prior_sigma, self._told = space, prior_sigma, told
+        self._named = set(space.labels if named is None else named)
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where the fit stands."""
+        return self._folder / "checkpoint.npz"
+
+    def run(self, headless: bool) -> Fit:
+        """To the end, or on from where it was left.
+
+        Raises:
+            BadInput: a checkpoint of something else, or a parameter that the loss doesn't ask.
+            KeyboardInterrupt: what was reached is kept.
+        """
+        fit = Fit.begin(self._space.start, self._problem)
+        kept = self._kept(fit)
+        if kept is not None:
+            fit = kept
+            self._told(f"{self.checkpoint}: going on after step {fit.step}")
+        with tqdm(
+            total=self._problem.steps, initial=fit.step, unit="step", disable=headless
+        ) as bar:
+            bar.set_postfix_str("compiling")
+            while not fit.over:
+                before, fit = fit, advanced(fit, self._problem)
+                if fit.step == 1:
+                    self._refuse_without_gradient(fit)
+                if not bool(fit.descent.finite):
+                    bar.clear()
+                    self._told(self._where(before, fit.descent.asked_x))
+                # Not by the losses: those of another stage are others.
+                if fit.step == 1 or bool(jnp.any(fit.best_x != before.best_x)):
+                    self.write(fit)
+                self._keep(fit)
+                bar.set_postfix_str(f"held out {fit.history[-1][1]:.5g}, best {fit.best_loss:.5g}")
+                bar.update(1)
+        return fit
+
+    def write(self, fit: Fit) -> None:
+        """The best parameters so far."""
+        values = {name: np.asarray(value) for name, value in self._space.values(fit.best_x).items()}
+        write_params(self._folder / "params.yaml", values, self._provenance(fit))
+
+    def _provenance(self, fit: Fit) -> dict[str, Any]:
+        return self._key | {
+            "step": fit.step,
+            "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
+            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        }
+
+    def _where(self, before: Fit, x: Array) -> str:
+        """What is said of a gradient at x that is not finite."""
+        step = before.step
+        softness = jnp.asarray(self._problem.softness(step), x.dtype)
+        batch = self._problem.batch(before.stage_x, before.stage, step)
+        found = self._problem.explain(x, batch, softness)
+        if found is None:
+            return f"step {step + 1}: the loss is not finite; not stepped on"
+        return found.told(self._space.labels, step + 1)
+
+    def _refuse_without_gradient(self, fit: Fit) -> None:
+        """Raise BadInput where the loss does not depend on a parameter at all."""
+        batch = self._problem.batch(fit.stage_x, 0, 0)
+        x, slope = self._space.start, fit.descent.gradient
+        prior = x / self._prior_sigma**2 / batch.frames
+        of_frames = np.asarray(slope - prior)
+        tiny = 1e-6 * np.maximum(np.abs(np.asarray(prior)), 1e-12)
+        labels = np.array(self._space.labels)
+        for name in sorted(self._named):
+            if np.all(np.abs(of_frames[labels == name]) <= tiny[labels == name]):
+                raise BadInput("--train", f"the loss does not depend on {name}")
+
+    def _keep(self, fit: Fit) -> None:
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, run=json.dumps(self._key), **arrays_of(fit))
+        atomic_write(self.checkpoint, buffer.getvalue())
+
+    def _kept(self, like: Fit) -> Fit | None:
+        if not self.checkpoint.exists():
+            return None
+        try:
+            raw = io.BytesIO(self.checkpoint.read_bytes())
+            with np.load(raw, allow_pickle=False) as arrays:
+                found = dict(arrays)
+            key = dict(json.loads(str(found.pop("run"))))
+        except _DAMAGED as error:
+            raise self._damaged(error) from None
+        for name in self._key | key:
+            if self._key.get(name) != key.get(name):
+                problem = (
+                    f"is of another run, whose {name} is {key.get(name)!r} and not "
+                    f"{self._key.get(name)!r}: choose another --out"
+                )
+                raise BadInput(self.checkpoint, problem)
+        try:
+            return fit_of(found, like)
+        except _DAMAGED as error:
+            raise self._damaged(error) from None
+
+    def _damaged(self, error: Exception) -> BadInput:
+        return BadInput(self.checkpoint, f"is damaged ({error}): delete it to begin anew")

@@ -1,0 +1,113 @@
+"""Recordings as sequences of equal length: cut, padded, and put one beside the other."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.errors import BadInput
+from jaxnav.markers import MarkerMap
+from jaxnav.navigator import Navigator
+from jaxnav.tuning.recorded import Recorded
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # wxyz xyz
+
+
+class Named(NamedTuple):
+    """The sequences of one recording."""
+
+    name: str  # of the file, for a person
+    navigator: Navigator  # that goes with them
+    recorded: Recorded
+
+
+def bounds(count: int, part: tuple[float, float]) -> tuple[int, int]:
+    """First and end of a part of `count` rows; parts that adjoin share none."""
+    begin, end = (round(share * count) for share in part)
+    return begin, end
+
+
+def cut(indices: Int[np.ndarray, " N"], length: int) -> list[Int[np.ndarray, " T"]]:
+    """Pieces of at most `length`, as few as will do, that differ by one at most."""
+    if not len(indices):
+        return []
+    return np.array_split(indices, -(-len(indices) // length))
+
+
+def runs(
+    indices: Int[np.ndarray, " N"], stamps_ns: Int[np.ndarray, " F"], gap_s: float
+) -> list[Int[np.ndarray, " T"]]:
+    """Rising indices apart where more than `gap_s` lies between the stamps of two neighbours."""
+    if not len(indices):
+        return []
+    apart_s = np.diff(stamps_ns[indices]) / 1e9
+    return np.split(indices, np.flatnonzero(apart_s > gap_s) + 1)
+
+
+def side_by_side(
+    pieces: Sequence[Int[np.ndarray, " N"]],
+) -> tuple[Int[np.ndarray, "B T"], Bool[np.ndarray, "B T"]]:
+    """Pieces padded to the longest with their last index, and what is no padding."""
+    length = max(len(piece) for piece in pieces)
+    indices = np.array([np.pad(piece, (0, length - len(piece)), mode="edge") for piece in pieces])
+    lengths = np.array([len(piece) for piece in pieces])
+    return indices, np.arange(length) < lengths[:, None]
+
+
+def maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
+    """A map a sequence, (B,), of some markers each. Who they are, no estimate asks."""
+
+    def some(wxyz_xyz: Float[Array, "N 7"], size_m: Float[Array, " N"]) -> MarkerMap:
+        ids = tuple(range(len(size_m)))
+        return MarkerMap(jaxlie.SE3(wxyz_xyz), size_m, ids, families=("",) * len(ids))
+
+    found: MarkerMap = jax.vmap(some)(markers.Ts_world_marker.wxyz_xyz[rows], markers.size_m[rows])
+    return found
+
+
+def joined(recordings: Sequence[Named]) -> Recorded:
+    """The sequences of all recordings, padded to the longest.
+
+    Raises:
+        BadInput: names the two that one estimator can't take.
+    """
+    first = recordings[0]
+    for other in recordings[1:]:
+        if problem := _apart(first, other):
+            raise BadInput(f"{first.name}, {other.name}", problem)
+    return Recorded.together([named.recorded for named in recordings])
+
+
+def _apart(one: Named, other: Named) -> str | None:
+    """What keeps two recordings from one estimator."""
+    lanes, lanes_other = (named.recorded.obs.visible.shape[2:] for named in (one, other))
+    for what, here, there in zip(("cameras", "markers"), lanes, lanes_other, strict=True):
+        if here != there:
+            return f"must have as many {what} to be tuned on together, got {here} and {there}"
+    if not _alike(one.recorded, other.recorded):
+        return "must be of one kind to be tuned on together, drives or recordings of a rig"
+    for what, flag, here, there in (
+        ("rig", "--rig", _rig(one.navigator), _rig(other.navigator)),
+        ("vehicle", "--vehicle", _vehicle(one.navigator), _vehicle(other.navigator)),
+    ):
+        if not eqx.tree_equal(here, there, rtol=1e-6, atol=1e-6):
+            return f"must have the same {what} to be tuned on together; {flag} gives them one"
+    return None
+
+
+def _rig(navigator: Navigator) -> Any:
+    """What poses depend on; image sizes may be guessed from what was seen."""
+    return navigator.rig.cameras, navigator.rig.Ts_camera_vehicle
+
+
+def _vehicle(navigator: Navigator) -> Any:
+    return getattr(navigator.motion, "vehicle", None)
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two trees have the same leaves, whatever is in them."""
+    return bool(eqx.tree_equal(*(jax.tree.map(lambda _: 0, tree) for tree in (one, other))))

@@ -1,0 +1,96 @@
+"""`jaxnav tune`: from the command line to the files it leaves, and what bad input gets."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jaxnav.ambiguity import LowestReprojection
+from jaxnav.cli import main
+from jaxnav.files import load_params
+
+
+@pytest.fixture(autouse=True)
+def keep_the_settings_of_jax(monkeypatch):
+    """Commands choose a precision and a cache of their own; tests keep theirs."""
+    for command in ("tune_filter", "tune_controller"):
+        name = f"jaxnav.commands.{command}.configure_jax"
+        monkeypatch.setattr(name, lambda float64: None)
+
+
+def told(capsys, *arguments: str) -> str:
+    """The one line that bad input gets."""
+    assert main(["tune", *arguments, "--headless"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    return err
+
+
+FEW = ("--seeds", "2", "--held-out-seeds", "1", "--test-seeds", "2")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("filter", "--seeds", "0"), "--seeds: must be at least 1"),
+        (("filter", "--seed", "-1"), "--seed: must be from 0"),
+        (("filter", "--part", "0.5", "0.5"), "--part: must be two parts"),
+        (("filter", "--corner-noise-px", "nan"), "--corner-noise-px: must be positive"),
+        (("filter", "nowhere.mcap"), "nowhere.mcap: "),
+        (("filter", "--params", "nowhere.yaml"), "nowhere.yaml: "),
+        (("controller", "--steps", "0"), "--steps: must be at least 1"),
+        (("controller", "--effort", "-1"), "--effort: must not be negative"),
+        (("controller", "--learning-rate", "inf"), "--learning-rate: must be positive"),
+        (("controller", "--test-scenario", "static"), "--scenario: nothing drives in static"),
+        (("controller", "--train", "controller.fame"), "--train: there is no controller.fame"),
+        (
+            ("controller", *(f"--{name}=0" for name in ("time", "cross-track", "effort")),
+             "--smoothness=0"),
+            "nothing to lower",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_input_gets_one_line(capsys, arguments, says):
+    assert says in told(capsys, *arguments)
+
+
+def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch):
+    """A better loss on what was held out; the same command has nothing left to do, another one is
+    refused, and so are parameters that nothing can be learned about."""
+    # A driver and a selector without a bank compile in a fifth of the time.
+    monkeypatch.setattr("jaxnav.commands.tune_data.MultiHypothesis", LowestReprojection)
+    few = (*FEW, "--selector", "lowest-reprojection", "--corner-noise-px", "0.3")
+    start = tmp_path / "start.yaml"
+    start.write_text("parameters:\n  motion.acceleration_density: [0.1, 0.1, 0.9]\n")
+    out = tmp_path / "tuned"
+    command = (
+        *("tune", "filter", *few, "--params", str(start), "--out", str(out), "--steps", "12"),
+        *("--train", "motion.acceleration_density", "corner_sigma_px", "--headless"),
+    )
+    assert main(list(command)) == 0
+    text = capsys.readouterr().out
+    assert "motion.acceleration_density: [0.1, 0.1, 0.9] -> " in text
+    params = load_params(out / "params.yaml")
+    assert np.all(params.values["motion.acceleration_density"] != [0.1, 0.1, 0.9])
+    assert params.provenance["command"] == "tune filter"
+    assert params.provenance["params"] == str(start)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["held_out_loss"]["after"] < summary["held_out_loss"]["before"]
+    (judged,) = summary["test"].values()
+    assert 0 < judged["after"]["position_rmse_m"]["value"] < 0.5
+    assert (out / "report.png").stat().st_size > 10_000
+    kept = (out / "params.yaml").read_bytes()
+    assert main(list(command)) == 0
+    assert "going on after step" in capsys.readouterr().out
+    assert (out / "params.yaml").read_bytes() == kept
+    assert main([*command, "--seed", "5"]) == 2
+    assert "is of another run, whose seed is 0 and not 5" in capsys.readouterr().err
+    for name, says in (
+        ("motion.fame", "--train: there is no motion.fame in this filter"),
+        ("controller.lookahead_m", "--train: there is no controller.lookahead_m in this filter"),
+        ("selector.floor_m", "--train: there is no selector.floor_m in this filter"),
+    ):
+        line = told(capsys, "filter", *few, "--train", name, "--out", str(tmp_path / "other"))
+        assert says in line
+    line = told(capsys, "filter", *few, "--full", "corner_sigma_px", "--out", str(tmp_path / "o"))
+    assert "--full: corner_sigma_px: is no covariance" in line

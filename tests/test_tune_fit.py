@@ -1,0 +1,270 @@
+"""A fit in a folder: what is written, what goes on, and what is refused in one line."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnav.commands.tune_fit import Fitting
+from jaxnav.errors import BadInput
+from jaxnav.files import load_params
+from jaxnav.navigator import Navigator
+from jaxnav.parameters import with_parameters
+from jaxnav.tuning.descent import Noisy, Smooth
+from jaxnav.tuning.fit import Fit, Problem, arrays_of
+from jaxnav.tuning.objective import Batch, Objective, where_not_finite
+from jaxnav.tuning.unconstrained import Space
+from tests import worlds
+
+NAVIGATOR = with_parameters(
+    Navigator(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()),
+    {"corner_sigma_px": jnp.asarray(2.0), "selector.floor_m": jnp.asarray(0.004)},
+)
+NAMES = ["corner_sigma_px", "motion.odometry_sigma", "selector.floor_m"]
+SPACE = Space.of(NAVIGATOR, dict.fromkeys(NAMES, True), frozenset(NAMES[1:2]))
+SIZE = SPACE.start.size
+TARGETS = jnp.asarray(np.random.default_rng(0).normal(size=(3, SIZE)))
+KEY = {"command": "tune filter", "seeds": 3, "train": NAMES, "params": None}
+
+
+def cost(x, item, softness):
+    """Four frames. What is above a covariance's diagonal costs as well: nothing is left out."""
+    return jnp.ones(4) * jnp.sum(jnp.arange(1, SIZE + 1) * (x - item) ** 2)
+
+
+def held_out(x, stage_x, stage) -> float:
+    return float(np.sum((np.asarray(x) - np.asarray(TARGETS).mean(axis=0)) ** 2))
+
+
+@jax.jit
+def evaluate(x, batch, softness):
+    return jax.value_and_grad(Objective(cost))(x, batch, softness)
+
+
+def batch_of(x, stage, step) -> Batch:
+    return Batch(TARGETS + 0.1 * np.sin(step), jnp.asarray(12.0))
+
+
+def asked(cost=cost, **changes) -> Problem:
+    common = {
+        "optimiser": Smooth(Objective(cost)),
+        "batch": lambda x, stage, step: Batch(TARGETS, jnp.asarray(12.0)),
+        "held_out": held_out,
+        "explain": lambda x, batch, soft: where_not_finite(cost, x, batch.items, soft),
+        "steps": 12,
+    }
+    return Problem(**common | changes)
+
+
+NOISY = {"optimiser": Noisy(evaluate, 0.3), "batch": batch_of, "same_batch": False}
+
+
+class Run:
+    """A fit in a folder, and the lines that it told."""
+
+    def __init__(self, folder: Path, problem: Problem, key=KEY, cost=cost, space=SPACE):
+        self.lines = []
+        sigma = Objective(cost).prior_sigma
+        self.fitting = Fitting(folder, key, problem, space, sigma, self.lines.append)
+        self.params = folder / "params.yaml"
+
+    def __call__(self) -> Fit:
+        return self.fitting.run(headless=True)
+
+
+def written(run: Run) -> dict[str, np.ndarray]:
+    return load_params(run.params).values
+
+
+def assert_written(run: Run, fit: Fit) -> None:
+    expected = SPACE.values(fit.best_x)
+    assert written(run).keys() == expected.keys()
+    for name, value in written(run).items():
+        np.testing.assert_array_equal(value, expected[name])
+
+
+@pytest.mark.parametrize("changes", [{}, NOISY], ids=["smooth", "noisy"])
+def test_the_best_is_written(tmp_path, changes):
+    run = Run(tmp_path, asked(**changes))
+    fit = run()
+    assert fit.over
+    assert fit.best_loss < held_out(SPACE.start, None, 0)
+    assert_written(run, fit)
+    provenance = load_params(run.params).provenance
+    assert provenance["seeds"] == 3
+    assert provenance["held_out_loss"]["after"] == fit.best_loss
+    assert provenance["held_out_loss"]["before"] == held_out(SPACE.start, None, 0)
+    assert run.fitting.checkpoint.exists()
+    assert run.lines == []
+    with_parameters(NAVIGATOR, {name: jnp.asarray(v) for name, v in written(run).items()})
+
+
+def test_nothing_better_is_written_as_it_was(tmp_path):
+    run = Run(tmp_path, asked(held_out=lambda x, *_: -held_out(x, *_), patience=3))
+    fit = run()
+    np.testing.assert_array_equal(fit.best_x, SPACE.start)
+    assert_written(run, fit)
+
+
+def test_what_a_stage_found_in_its_last_step_is_written(tmp_path):
+    """By another stage's loss it looks worse than what was written before."""
+
+    def by_stage(x, stage_x, stage):
+        return held_out(x, stage_x, stage) + 1000 * stage
+
+    run = Run(tmp_path, asked(held_out=by_stage, stages=2, steps=99))
+    fit = run()
+    assert fit.stage == 1
+    assert held_out(fit.best_x, None, 0) < held_out(SPACE.start, None, 0) / 10
+    assert_written(run, fit)
+
+
+@pytest.mark.parametrize("changes", [{"stages": 2, "steps": 40}, NOISY], ids=["smooth", "noisy"])
+@pytest.mark.parametrize("calls", [1, 2, 5])
+def test_an_interrupted_fit_goes_on_to_the_same_bits(tmp_path, changes, calls):
+    whole = Run(tmp_path, asked(**changes))
+    expected = arrays_of(whole())
+    folder = tmp_path / "interrupted"
+    folder.mkdir()
+    left = iter(range(calls))
+
+    def interrupted(*of):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return held_out(*of)
+
+    run = Run(folder, asked(**changes | {"held_out": interrupted}))
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert run.fitting.checkpoint.exists() == run.params.exists()
+    assert run.fitting.checkpoint.exists() or calls == 1
+    again = Run(folder, asked(**changes))
+    found = arrays_of(again())
+    assert found.keys() == expected.keys()
+    for name in found:
+        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+    assert written(again).keys() == written(whole).keys()
+    for name, value in written(again).items():
+        np.testing.assert_array_equal(value, written(whole)[name])
+    if calls > 1:
+        assert len(again.lines) == 1
+        assert "going on after step" in again.lines[0]
+    # Once it has ended there is nothing to do.
+    assert Run(folder, asked(**changes))().step == int(expected["step"])
+
+
+@pytest.mark.parametrize(
+    ("key", "told"),
+    [
+        (KEY | {"seeds": 4}, r"whose seeds is 3 and not 4: choose another --out$"),
+        (KEY | {"loss": "score"}, r"whose loss is None and not 'score'"),
+        (
+            {k: v for k, v in KEY.items() if k != "train"},
+            r"whose train is \['corner_sig.* not None",
+        ),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused(tmp_path, key, told):
+    run = Run(tmp_path, asked(steps=1))
+    run()
+    before = run.fitting.checkpoint.read_bytes()
+    with pytest.raises(BadInput, match=told) as caught:
+        Run(tmp_path, asked(steps=1), key=key)()
+    assert str(caught.value).startswith(f"{run.fitting.checkpoint}: is of another run, whose ")
+    assert "\n" not in str(caught.value)
+    assert run.fitting.checkpoint.read_bytes() == before
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path):
+    """Cut off, overwritten, with flipped bytes anywhere: one line, or the very same fit."""
+    run = Run(tmp_path, asked(steps=3))
+    expected = arrays_of(run())
+    checkpoint, rng = run.fitting.checkpoint, np.random.default_rng(0)
+    whole = checkpoint.read_bytes()
+    damaged = [b"", b"x" * 200, whole[:1], *(whole[: len(whole) * k // 8] for k in range(1, 8))]
+    with (tmp_path / "one.npy").open("wb") as file:
+        np.save(file, np.arange(3.0))
+    damaged.append((tmp_path / "one.npy").read_bytes())
+    for at in rng.integers(0, len(whole), 150):
+        damaged.append(whole[:at] + bytes([whole[at] ^ rng.integers(1, 256)]) + whole[at + 1 :])
+    for name, array in (("best_x", np.zeros(2)), ("step", np.array("three")), ("run", "[3, 4]")):
+        arrays = dict(np.load(checkpoint, allow_pickle=False)) | {name: array}
+        np.savez(tmp_path / "changed.npz", allow_pickle=False, **arrays)
+        damaged.append((tmp_path / "changed.npz").read_bytes())
+    fresh = Fit.begin(SPACE.start, asked(steps=3))
+    refused = 0
+    for raw in damaged:
+        checkpoint.write_bytes(raw)
+        try:
+            fit = run.fitting._kept(fresh)
+        except BadInput as error:
+            refused += 1
+            told = str(error)
+            assert told.startswith(f"{checkpoint}: is ")
+            assert "damaged" in told or "of another run" in told
+            assert "\n" not in told
+            continue
+        found = arrays_of(fit)
+        for name in expected:
+            np.testing.assert_array_equal(found[name], expected[name])
+    assert refused > 100
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_parameter_that_nothing_depends_on_is_refused(tmp_path, name):
+    counts = jnp.asarray(np.array(SPACE.labels) != name)
+
+    def blind(x, item, softness):
+        return cost(jnp.where(counts, x, 0), jnp.where(counts, item, 0), softness)
+
+    run = Run(tmp_path, asked(blind), cost=blind)
+    with pytest.raises(BadInput, match=rf"^--train: the loss does not depend on {name}$"):
+        run()
+    assert not run.params.exists()
+
+
+def test_a_covariance_may_have_entries_that_nothing_depends_on(tmp_path):
+    """Those above its diagonal."""
+    moves = np.ones(SIZE, bool)
+    moves[1:10] = np.tri(3, dtype=bool).reshape(-1)
+    counts = jnp.asarray(moves)
+
+    def lower(x, item, softness):
+        return cost(jnp.where(counts, x, 0), jnp.where(counts, item, 0), softness)
+
+    assert Run(tmp_path, asked(lower, steps=2), cost=lower)().step == 2
+
+
+LAST = SPACE.labels.index("selector.floor_m")
+
+
+def breaking(x, item, softness):
+    """From the third frame of the second drive on: a root's slope at 0, once the floor is small."""
+    late = (jnp.arange(4) >= 2) & (item[0] == TARGETS[1, 0])
+    small = jnp.where(late, jnp.maximum(x[LAST] - 0.2, 0), 1)
+    return cost(x, item, softness) + 0 * jnp.sqrt(small)
+
+
+@pytest.mark.parametrize("kind", ["smooth", "noisy"])
+def test_a_gradient_that_is_not_finite_is_told(tmp_path, kind):
+    """The step, the parameter, the drive and the frame; and the best so far stays."""
+    assert SPACE.start[LAST] > 0.5 > 0.2 > TARGETS[:, LAST].mean()
+    objective = Objective(breaking)
+
+    @jax.jit
+    def evaluate(x, batch, softness):
+        return jax.value_and_grad(objective)(x, batch, softness)
+
+    changes = {"optimiser": Noisy(evaluate, 0.5)} if kind == "noisy" else {}
+    run = Run(tmp_path, asked(breaking, **changes), cost=breaking)
+    fit = run()
+    assert fit.ended == "a gradient is not finite"
+    assert fit.step > 1
+    assert run.lines == [
+        f"step {fit.step}: the gradient with respect to selector.floor_m is not finite in drive 1 "
+        "from frame 2 on; not stepped on"
+    ]
+    assert_written(run, fit)
+    assert np.all(np.isfinite(fit.best_x))
