@@ -42,7 +42,7 @@ class Recorded(eqx.Module):
         return joined
 
     def padded(self, length: int) -> "Recorded":
-        """So many frames, the last one repeated and not used."""
+        """So many frames, the last one repeated, blind and not used."""
         more = length - self.used.shape[1]
         frames = (self.obs, self.used, self.T_world_vehicle_true, self.judged)
         obs, used, truth, judged = jax.tree.map(
@@ -50,6 +50,9 @@ class Recorded(eqx.Module):
             frames,
         )
         known = jnp.arange(length)[None] < self.used.shape[1]
+        shows = (obs.visible & known[..., None, None], jnp.where(known, obs.dt_s, 0))
+        heard = known & obs.has_odometry
+        obs = eqx.tree_at(lambda o: (o.visible, o.dt_s, o.has_odometry), obs, (*shows, heard))
         return Recorded(self.markers, obs, used & known, truth, judged & known)
 
 
