@@ -124,9 +124,14 @@ def recordings_table(out: Path) -> None:
             lambda j: 100 * j["position_rmse_m"]["value"],
             lambda j: j["anees"]["value"],
         ):
-            was, now = pick(judged["before"]), pick(judged["after"])
-            cells.append(f"{was:.3g} -> {now:.3g} ({now / was - 1:+.1%})")
+            cells.append(_change(pick(judged["before"]), pick(judged["after"])))
         print(f"| {name} | {' | '.join(cells)} |")
+
+
+def _change(was: float | None, now: float | None) -> str:
+    """A figure before and after; JSON's null is one that is no number."""
+    told = ["no number" if value is None else f"{value:.3g}" for value in (was, now)]
+    return " -> ".join(told) + (f" ({now / was - 1:+.1%})" if was and now else "")
 
 
 def rivals_table(out: Path) -> None:
@@ -184,19 +189,45 @@ def cost_table(out: Path) -> None:
     soft = jnp.zeros((), start.dtype)
     forward = jax.jit(lambda x: objective(x, batch, soft))
     gradient = jax.jit(lambda x: jax.value_and_grad(objective)(x, batch, soft))
+    drives = len(batch.items.recorded)
+    print("| a drive | parameters | forward ms | gradient ms | ratio |\n|---|---|---|---|---|")
+    _print_cost("filter", len(start), drives, lambda: forward(start), lambda: gradient(start))
+
+    from jaxnav.arguments import TuneController
+    from jaxnav.commands.tune_controller import closed_loop, gains_of
+
+    args = TuneController(headless=True)
+    loop = closed_loop(args, args.scenario)
+    space = gains_of(args, loop.rollout.navigator)
+    keys = jax.vmap(jax.random.key)(jnp.arange(args.seeds))
+    _print_cost(
+        "controller",
+        len(space.start),
+        args.seeds,
+        lambda: loop.value(space.values(space.start), keys)[0],
+        lambda: loop.value_and_grad(space.start, space, keys),
+    )
+
+
+def _print_cost(
+    name: str,
+    parameters: int,
+    drives: int,
+    forward: Callable[[], Any],
+    gradient: Callable[[], Any],
+) -> None:
+    import jax
+
     seconds: list[list[float]] = [[], []]
-    for function in (forward, gradient):
-        jax.block_until_ready(function(start))
-    for _ in range(ROUNDS):
+    for round_ in range(1 + ROUNDS):  # the first one compiles
         for function, times in zip((forward, gradient), seconds, strict=True):
             begin = time.perf_counter()
-            jax.block_until_ready(function(start))
-            times.append(time.perf_counter() - begin)
+            jax.block_until_ready(function())
+            if round_:
+                times.append(time.perf_counter() - begin)
     ratio = np.median(np.array(seconds[1]) / np.array(seconds[0]))
-    drives = len(batch.items.recorded)
-    milliseconds = [1e3 * np.median(times) / drives for times in seconds]
-    print("| a drive | forward ms | gradient ms | ratio |\n|---|---|---|---|")
-    print(f"| filter | {milliseconds[0]:.2f} | {milliseconds[1]:.2f} | {ratio:.2f} |")
+    told = " | ".join(f"{1e3 * np.median(times) / drives:.2f}" for times in seconds)
+    print(f"| {name} | {parameters} | {told} | {ratio:.2f} |", flush=True)
 
 
 def _filter_loss() -> tuple[Any, Any, Any]:

@@ -8,6 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxnav.geometry import safe_sinc
+
 
 class Vehicle(eqx.Module):
     """What the estimator, the controller and the simulated car know of one vehicle."""
@@ -85,7 +87,7 @@ def advance(
     """
     distance_m = speed_mps * dt_s
     half_turn = distance_m * curvature_per_m(steering_rad, wheelbase_m) / 2
-    chord_m = distance_m * jnp.sinc(half_turn / jnp.pi)
+    chord_m = distance_m * safe_sinc(half_turn)
     direction = pose[2] + sideslip_rad(steering_rad) + half_turn
     return pose + jnp.stack(
         [chord_m * jnp.cos(direction), chord_m * jnp.sin(direction), 2 * half_turn]

@@ -166,6 +166,21 @@ def safe_atan2(y: Float[Array, "*batch"], x: Float[Array, "*batch"]) -> Float[Ar
     return jnp.where(undefined, 0, jnp.arctan2(y, jnp.where(undefined, 1, x)))
 
 
+def safe_sinc(angle_rad: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """sin(a) / a, with derivatives as exact as the value at any angle.
+
+    Those of the quotient, cos(a) / a - sin(a) / a^2, lose all digits next to 0, and become NaN
+    where a^2 underflows: below 0.5 rad it is the series.
+    """
+    small = jnp.abs(angle_rad) < 0.5
+    squared = jnp.where(small, angle_rad, 0) ** 2
+    series = jnp.ones_like(squared)
+    for factors in (14 * 15, 12 * 13, 10 * 11, 8 * 9, 6 * 7, 4 * 5, 2 * 3):
+        series = 1 - squared * series / factors
+    large = jnp.where(small, 1, angle_rad)
+    return jnp.where(small, series, jnp.sin(large) / large)
+
+
 def rotation_error_rad(T_a_b: jaxlie.SE3, T_a_c: jaxlie.SE3) -> Float[Array, ""]:
     """Angle between two orientations, rad, 0 to pi; its gradient is zero between equal ones."""
     w, x, y, z = (T_a_b.rotation().inverse() @ T_a_c.rotation()).wxyz

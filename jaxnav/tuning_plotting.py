@@ -85,7 +85,9 @@ def controller_report(
     figure = Figure(figsize=(11, 8), layout="constrained")
     grid = figure.add_gridspec(2, 2 * (1 + len(driven)))
     half = 1 + len(driven)
-    draw_losses(figure.add_subplot(grid[0, :half]), fit)
+    losses = figure.add_subplot(grid[0, :half])
+    draw_losses(losses, fit)
+    losses.set_ylabel("loss of a drive")
     draw_parameters(figure.add_subplot(grid[0, half:]), fit, space)
     below = [figure.add_subplot(grid[1, 2 * i : 2 * i + 2]) for i in range(1 + len(driven))]
     _draw_parts(below[0], driven)
@@ -109,7 +111,7 @@ def _draw_parts(axes: Axes, driven: Mapping[str, tuple[Driven, Driven]]) -> None
         foot += heights
     axes.set_xticks(np.arange(len(pairs)), names, rotation=90, fontsize="x-small")
     axes.set(ylabel="loss, drives never seen before")
-    axes.legend(fontsize="x-small")
+    axes.legend(fontsize="x-small", ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
 
 def draw_losses(axes: Axes, fit: Fit) -> None:

@@ -114,6 +114,20 @@ def test_guarded_functions_elsewhere_are_the_plain_ones():
     check_derivatives(geometry.safe_norm, jnp.asarray(values))
 
 
+def test_sinc_and_its_slope_keep_their_digits(precision):
+    """Against the integrals of cos(a t) and -t sin(a t) over t from 0 to 1, in which nothing
+    cancels: from where squares underflow to where the sine has turned often."""
+    angles = np.geomspace(1e-37, 20.0, 200).astype(precision)
+    angles = np.concatenate([-angles, np.zeros(1, precision), angles])
+    values, slopes = jax.vmap(jax.value_and_grad(geometry.safe_sinc))(jnp.asarray(angles))
+    assert values.dtype == precision
+    nodes, weights = np.polynomial.legendre.leggauss(100)
+    t, turned = (nodes + 1) / 2, np.outer(angles.astype(float), (nodes + 1) / 2)
+    near = {"rtol": 0, "atol": 8 * np.finfo(precision).eps}
+    np.testing.assert_allclose(values, np.cos(turned) @ weights / 2, **near)
+    np.testing.assert_allclose(slopes, -(t * np.sin(turned)) @ weights / 2, **near)
+
+
 def test_guarded_functions_do_not_hide_what_is_no_number():
     nan = jnp.asarray(jnp.nan)
     assert np.isnan(geometry.safe_sqrt(nan))

@@ -132,9 +132,9 @@ class TuneController:
     """Weight of the time to the last waypoint, 1/s."""
     cross_track: float = 2.0
     """Weight of the RMS distance from the straight lines, 1/m."""
-    effort: float = 0.14
+    effort: float = 0.13
     """Weight of the squared commands, in parts of their limits, over time, 1/s."""
-    smoothness: float = 0.05
+    smoothness: float = 0.045
     """Weight of the squared changes of the commands from frame to frame."""
     train: _Names = ()
     """Parameters to learn; by default p1, p2, its bound, look-ahead and slowing down in turns."""

@@ -62,9 +62,9 @@ def run(args: Arguments) -> int:
     """Learn, report, and say in a few lines what came of it."""
     configure_jax(float64=False)
     params = None if args.params is None else load_params(args.params)
-    loop, *tests = (_loop(args, name, params) for name in (args.scenario, *_tests(args)))
+    loop, *tests = (closed_loop(args, name, params) for name in (args.scenario, *_tests(args)))
     navigator = loop.rollout.navigator
-    space = _space(args, navigator)
+    space = gains_of(args, navigator)
     gains = Gains(args, loop, dict(zip(_tests(args), tests, strict=True)), space)
     out = output_folder(args.out)
     key = plain_key("tune controller", args)
@@ -89,8 +89,12 @@ def _tests(args: Arguments) -> list[str]:
     return list(dict.fromkeys(args.test_scenario))
 
 
-def _loop(args: Arguments, name: str, params: Params | None) -> ClosedLoop:
-    """Drives of a scenario, each by a car of its own."""
+def closed_loop(args: Arguments, name: str, params: Params | None = None) -> ClosedLoop:
+    """Drives of a scenario, each by a car of its own.
+
+    Raises:
+        BadInput: a file that is no good, or a scenario in which nothing drives.
+    """
     qcar = calib_dir() / "qcar"
     rig = load_rig(args.rig or qcar / "rig.yaml")
     markers = load_markers(args.markers or qcar / "markers.yaml")
@@ -117,7 +121,12 @@ def _loop(args: Arguments, name: str, params: Params | None) -> ClosedLoop:
     return ClosedLoop(rollout, DriveLoss(args.time, args.cross_track, args.effort, args.smoothness))
 
 
-def _space(args: Arguments, navigator: Navigator) -> Space:
+def gains_of(args: Arguments, navigator: Navigator) -> Space:
+    """What is to be learned, where a navigator stands.
+
+    Raises:
+        BadInput: names that its controller does not have.
+    """
     known = [name for name in parameters_of(navigator) if name.startswith("controller.")]
     for name in args.train:
         if name not in known:
