@@ -7,6 +7,7 @@ Nelder-Mead and CMA-ES on one loss; `cost` holds gradients against forward passe
 """
 
 import argparse
+import dataclasses
 import itertools
 import json
 import subprocess
@@ -143,18 +144,22 @@ def rivals_table(out: Path) -> None:
 
     from jaxnav.tuning.descent import Smooth
 
-    objective, batch, start = _filter_loss()
+    objective, batch, start = _filter_loss(seeds=32)
     soft = jnp.zeros((), start.dtype)
     value = jax.jit(lambda x: objective(x, batch, soft))
     descent = Smooth(objective)
-    state, path = descent.init(start, batch, soft), []
-    while not bool(state.over) and len(path) < 150:
-        state = descent.step(state, batch, soft)
-        path.append(float(value(state.x)))
+    x, path, gained = start, [], np.inf
+    while gained > 1e-3:  # anew where it has ended, as the command does
+        state = descent.init(x, batch, soft)
+        while not bool(state.over):
+            state = descent.step(state, batch, soft)
+            path.append(float(value(state.x)))
+        gained, x = float(value(x)) - path[-1], state.x
     reached = path[-1]
     goals = {"the last loss": reached + 1e-4, "1e-2 above it": reached + 1e-2}
     print(f"{len(start)} parameters, {len(batch.items.recorded)} drives a rollout\n")
-    traces: dict[str, list[float]] = {"BFGS": list(np.repeat(path, 4))}
+    # What a gradient has found is known when its four rollouts are done.
+    traces: dict[str, list[float]] = {"BFGS": [x for loss in path for x in (*[np.inf] * 3, loss)]}
 
     def counted(name: str) -> Callable[[np.ndarray], float]:
         traces[name] = []
@@ -165,11 +170,14 @@ def rivals_table(out: Path) -> None:
 
         return function
 
-    x, budget = np.asarray(start, float), 40 * len(path)
+    origin, budget = np.asarray(start, float), 40 * len(path)
     options = {"maxfev": budget, "xatol": 1e-6, "fatol": 1e-8, "adaptive": True}
-    minimize(counted("Nelder-Mead"), x, method="Nelder-Mead", options=options)
+    minimize(counted("Nelder-Mead"), origin, method="Nelder-Mead", options=options)
     cma.fmin2(
-        counted("CMA-ES"), x, 1.0, {"maxfevals": budget, "verbose": -9, "seed": 1, "tolfun": 1e-8}
+        counted("CMA-ES"),
+        origin,
+        1.0,
+        {"maxfevals": budget, "verbose": -9, "seed": 1, "tolfun": 1e-8},
     )
     print("| | rollouts to " + " | to ".join(goals) + " | best |\n|---|---|---|---|")
     for name, losses in traces.items():
@@ -181,11 +189,12 @@ def rivals_table(out: Path) -> None:
 
 
 def cost_table(out: Path) -> None:
-    """Gradient over forward pass, medians of interleaved runs."""
+    """Gradient over forward pass, medians of interleaved runs: as many drives as the commands take
+    by default, through the same kind of program."""
     import jax
     import jax.numpy as jnp
 
-    objective, batch, start = _filter_loss()
+    objective, batch, start = _filter_loss(seeds=64)
     soft = jnp.zeros((), start.dtype)
     forward = jax.jit(lambda x: objective(x, batch, soft))
     gradient = jax.jit(lambda x: jax.value_and_grad(objective)(x, batch, soft))
@@ -198,6 +207,8 @@ def cost_table(out: Path) -> None:
 
     args = TuneController(headless=True)
     loop = closed_loop(args, args.scenario)
+    rollout = dataclasses.replace(loop.rollout, many=loop.many, many_lanes=loop.many_lanes)
+    loop = dataclasses.replace(loop, rollout=rollout)
     space = gains_of(args, loop.rollout.navigator)
     keys = jax.vmap(jax.random.key)(jnp.arange(args.seeds))
     _print_cost(
@@ -230,8 +241,8 @@ def _print_cost(
     print(f"| {name} | {parameters} | {told} | {ratio:.2f} |", flush=True)
 
 
-def _filter_loss() -> tuple[Any, Any, Any]:
-    """The likelihood of 32 drives, Q ten times too large and R ten times too small."""
+def _filter_loss(seeds: int) -> tuple[Any, Any, Any]:
+    """The likelihood of drives, Q ten times too large and R ten times too small."""
     from jaxnav.arguments import TuneFilter
     from jaxnav.commands.process import configure_jax
 
@@ -244,7 +255,7 @@ def _filter_loss() -> tuple[Any, Any, Any]:
     from jaxnav.tuning.filter import FilterCost
     from jaxnav.tuning.objective import Objective
 
-    args = TuneFilter(seeds=32, held_out_seeds=1, headless=True)
+    args = TuneFilter(seeds=seeds, held_out_seeds=1, headless=True)
     data = read_data(args)
     values = {name: jnp.asarray(value) for name, value in wrong_by(10.0, 0.1).items()}
     space = space_of(args, with_parameters(data.navigator, values), data.learned)

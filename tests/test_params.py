@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from jaxnav.ambiguity import PaperCost
 from jaxnav.errors import BadInput
-from jaxnav.files import Params, apply_params, load_params, write_params
+from jaxnav.files import Params, apply_params, calib_dir, load_params, write_params
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import TUNABLES, parameters_of
 from tests import worlds
@@ -148,6 +148,14 @@ plain = st.recursive(
                                                                 max_size=3),
     max_leaves=6,
 )  # fmt: skip
+
+
+def test_the_shipped_gains_are_for_the_shipped_car():
+    params = load_params(calib_dir() / "qcar/tuned.yaml")
+    reached = parameters_of(apply_params(CAR, params))
+    assert all(name.startswith("controller.") for name in params.values)
+    for name, value in params.values.items():
+        np.testing.assert_allclose(reached[name], value)
 
 
 def test_provenance_is_kept_and_shown(tmp_path):

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from jaxnav.ambiguity import LowestReprojection
+from jaxnav.arguments import TuneController
 from jaxnav.cli import main
 from jaxnav.files import load_params
+from jaxnav.tuning.drive_loss import DriveLoss
 
 
 @pytest.fixture(autouse=True)
@@ -52,6 +54,11 @@ FEW = ("--seeds", "2", "--held-out-seeds", "1", "--test-seeds", "2")
 )  # fmt: skip
 def test_bad_input_gets_one_line(capsys, arguments, says):
     assert says in told(capsys, *arguments)
+
+
+def test_the_command_weighs_as_the_loss_does_by_default():
+    args = TuneController()
+    assert DriveLoss(args.time, args.cross_track, args.effort, args.smoothness) == DriveLoss()
 
 
 def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch):

@@ -122,6 +122,7 @@ class Tested:
     anees: tuple[float, float, float]
     band: tuple[float, float]  # in which ANEES is consistent, 99.9 %
     error_m: np.ndarray  # of every judged frame
+    indefinite: int  # judged frames whose covariance is none, by rounding; not in ANEES
 
 
 def _tested(
@@ -153,18 +154,19 @@ def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object
         progress(kept)
     judged = np.asarray(test.judged)
     square_m2, nees = (np.concatenate(leaf) for leaf in zip(*parts, strict=True))
-    counts = judged.sum(axis=1)
+    definite = judged & ~np.isnan(nees)
 
-    def mean(values: np.ndarray) -> tuple[float, float, float]:
-        return resampled(np.where(judged, values, 0).sum(axis=1), counts)
+    def mean(values: np.ndarray, counted: np.ndarray) -> tuple[float, float, float]:
+        return resampled(np.where(counted, values, 0).sum(axis=1), counted.sum(axis=1))
 
-    rmse_m = tuple(float(np.sqrt(value)) for value in mean(square_m2))
+    rmse_m = tuple(float(np.sqrt(value)) for value in mean(square_m2, judged))
     freedom = 3 if isinstance(navigator.motion, BicycleKalman) else 6
     return Tested(
         rmse_m=(rmse_m[0], rmse_m[1], rmse_m[2]),
-        anees=mean(nees),
+        anees=mean(nees, definite),
         band=anees_band(len(test), freedom),
         error_m=np.sqrt(square_m2[judged]),
+        indefinite=int(np.sum(judged & ~definite)),
     )
 
 
@@ -177,6 +179,7 @@ def _summary(
             "position_rmse_m": {"value": tested.rmse_m[0], "interval": list(tested.rmse_m[1:])},
             "anees": {"value": tested.anees[0], "interval": list(tested.anees[1:])},
             "anees_consistent": list(tested.band),
+            "frames": {"judged": len(tested.error_m), "covariance_indefinite": tested.indefinite},
         }
 
     def plain(x: Array) -> dict[str, Any]:
@@ -214,10 +217,12 @@ def _text(summary: dict[str, Any]) -> str:
 def _judgement(of: dict[str, Any]) -> str:
     rmse, anees = of["position_rmse_m"], of["anees"]
     low, high = (100 * end for end in rmse["interval"])
+    frames, without = of["frames"]["judged"], of["frames"]["covariance_indefinite"]
+    less = f", without {without} of {frames} frames whose covariance is indefinite"
     return (
         f"position RMSE {100 * rmse['value']:.2f} cm ({low:.2f} to {high:.2f}), median "
         f"{100 * of['position_median_m']:.2f} cm, ANEES {anees['value']:.2f} "
-        f"({anees['interval'][0]:.2f} to {anees['interval'][1]:.2f})"
+        f"({anees['interval'][0]:.2f} to {anees['interval'][1]:.2f}{less if without else ''})"
     )
 
 
