@@ -10,7 +10,7 @@ import pytest
 
 from jaxnav.arguments import Simulate as Arguments
 from jaxnav.cli import main
-from jaxnav.commands.simulate import _World
+from jaxnav.commands.simulate import _load, _navigator
 from jaxnav.files import write_params
 from jaxnav.parameters import parameters_of
 from jaxnav.simulation.rollout import Trace
@@ -158,8 +158,8 @@ def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
         tmp_path / "p.yaml",
         {"corner_sigma_px": 3.0, "motion.tilt_sigma_rad": 0.5, "motion.height_sigma_m": 0.25},
     )
-    world = _World.load(Arguments(params=tmp_path / "p.yaml"))
-    found = parameters_of(world.navigator("paper", "mahalanobis", px))
+    car = _load(Arguments(params=tmp_path / "p.yaml"))
+    found = parameters_of(_navigator(car, "paper", "mahalanobis", px))
     assert float(found["corner_sigma_px"]) == px
     assert float(found["motion.tilt_sigma_rad"]) == 0.5  # before what the scenario tells
     assert float(found["motion.height_sigma_m"]) == 0.25

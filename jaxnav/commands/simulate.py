@@ -3,7 +3,6 @@
 import itertools
 import json
 import math
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -13,25 +12,13 @@ from pydantic import Field
 from tqdm import tqdm
 
 from jaxnav.arguments import Simulate as Arguments
-from jaxnav.bicycle import Vehicle
-from jaxnav.bicycle_kalman import BicycleKalman
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.errors import BadInput
-from jaxnav.files import (
-    Params,
-    apply_params,
-    calib_dir,
-    load_markers,
-    load_params,
-    load_rig,
-    load_vehicle,
-    write_json,
-)
+from jaxnav.files import load_params, write_json
 from jaxnav.files.reading import read_text
 from jaxnav.files.validation import ForeignEntry, validate
-from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
-from jaxnav.rig import CameraRig
 from jaxnav.selectors import SELECTORS, make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
@@ -46,15 +33,15 @@ def run(args: Arguments) -> int:
     names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
     wanted = list(itertools.product(names, args.corner_noise_px))
     done = _resumed(args)
-    world = _World.load(args)
-    if world.params is not None:
-        print(world.params.told())
+    car = _load(args)
+    if car.params is not None:
+        print(car.params.told())
     print(_HEADER)
     for name, noise_px in wanted:
-        key = _key(args, world, name, noise_px)
+        key = _key(args, car, name, noise_px)
         # A result of a version that knew no parameters had none.
         found = [one for one in done if {"params": None} | one["run"] == key]
-        result = found[0] if found else {"run": key} | _drive(args, world, key)
+        result = found[0] if found else {"run": key} | _drive(args, car, key)
         if not found:
             done.append(result)
         if args.json is not None:
@@ -64,61 +51,26 @@ def run(args: Arguments) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class _World:
-    """What all drives have in common."""
-
-    rig: CameraRig
-    markers: MarkerMap
-    vehicle: Vehicle
-    params: Params | None
-
-    @staticmethod
-    def load(args: Arguments) -> "_World":
-        qcar = calib_dir() / "qcar"
-        world = _World(
-            rig=load_rig(args.rig or qcar / "rig.yaml"),
-            markers=load_markers(args.markers or qcar / "markers.yaml"),
-            vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
-            params=None if args.params is None else load_params(args.params),
-        )
-        world.navigator(args.scenario, "multi-hypothesis", told_noise_px=1.0)  # bad input shows
-        return world
-
-    def navigator(self, scenario: str, selector: str, told_noise_px: float) -> Navigator:
-        """What drives in a scenario. Parameters go before what the scenario tells.
-
-        Args:
-            told_noise_px: `corner_sigma_px`, in place of that of the parameters.
-
-        Raises:
-            BadInput: a parameter that does not fit it.
-        """
-        told = scenarios()[scenario]
-        navigator = Navigator(
-            rig=self.rig,
-            markers=self.markers,
-            vehicle=self.vehicle,
-            waypoints_m=told.waypoints_m,
-            selector=make_selector(selector),
-            motion=BicycleKalman(
-                self.vehicle,
-                tilt_sigma_rad=told.told_tilt_sigma_rad,
-                height_sigma_m=told.told_height_sigma_m,
-            ),
-        )
-        if self.params is not None:
-            navigator = apply_params(navigator, self.params)
-        told_sigma_px = jnp.asarray(told_noise_px, navigator.corner_sigma_px.dtype)
-        return eqx.tree_at(lambda n: n.corner_sigma_px, navigator, told_sigma_px)
+def _load(args: Arguments) -> ScenarioCar:
+    params = None if args.params is None else load_params(args.params)
+    car = ScenarioCar.load(args, params)
+    _navigator(car, args.scenario, "multi-hypothesis", told_noise_px=1.0)  # bad input shows
+    return car
 
 
-def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any]:
+def _navigator(car: ScenarioCar, scenario: str, selector: str, told_noise_px: float) -> Navigator:
+    """What drives, and takes its corners for so good whatever its parameters say."""
+    navigator = car.navigator(scenarios()[scenario], make_selector(selector))
+    told_sigma_px = jnp.asarray(told_noise_px, navigator.corner_sigma_px.dtype)
+    return eqx.tree_at(lambda n: n.corner_sigma_px, navigator, told_sigma_px)
+
+
+def _drive(args: Arguments, car: ScenarioCar, key: dict[str, Any]) -> dict[str, Any]:
     """All drives of one row of the table."""
     name, noise_px = key["selector"], key["corner_noise_px"]
     scenario = scenarios()[args.scenario]
-    navigator = world.navigator(args.scenario, name, key["told_noise_px"])
-    rollout = Rollout(navigator, world.vehicle, world.markers, scenario, noise_px)
+    navigator = _navigator(car, args.scenario, name, key["told_noise_px"])
+    rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px)
     with tqdm(
         total=args.seeds,
         unit="drive",
@@ -131,11 +83,11 @@ def _drive(args: Arguments, world: _World, key: dict[str, Any]) -> dict[str, Any
     return Drives.of(trace, scenario).summary()
 
 
-def _key(args: Arguments, world: _World, name: str, noise_px: float) -> dict[str, Any]:
+def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[str, Any]:
     """What a result belongs to."""
     told_noise_px = noise_px
-    if world.params is not None and "corner_sigma_px" in world.params.values:
-        told_noise_px = float(world.params.values["corner_sigma_px"])
+    if car.params is not None and "corner_sigma_px" in car.params.values:
+        told_noise_px = float(car.params.values["corner_sigma_px"])
     return {
         "scenario": args.scenario,
         "selector": name,

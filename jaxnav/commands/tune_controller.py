@@ -12,23 +12,13 @@ from jaxtyping import Array, Key
 from tqdm import tqdm
 
 from jaxnav.arguments import TuneController as Arguments
-from jaxnav.bicycle_kalman import BicycleKalman
 from jaxnav.cli import EXIT_INTERRUPTED
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.tune_fit import Fitting, plain_key
+from jaxnav.commands.scenario_car import ScenarioCar
+from jaxnav.commands.tune_fit import Fitting, measure, plain_key, summary_of
 from jaxnav.errors import BadInput
-from jaxnav.files import (
-    Params,
-    apply_params,
-    calib_dir,
-    load_markers,
-    load_params,
-    load_rig,
-    load_vehicle,
-    output_folder,
-    write_json,
-)
+from jaxnav.files import Params, load_params, output_folder, write_json
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
 from jaxnav.selectors import make_selector
@@ -76,8 +66,13 @@ def run(args: Arguments) -> int:
         print(f"interrupted: the best so far is in {out}; the same command goes on")
         return EXIT_INTERRUPTED
     known = parameters_of(navigator)
-    before = {name: known[name] for name in space.free}
-    summary = _summary(args, space, before, fit, found)
+    summary = summary_of(
+        key,
+        fit,
+        {name: known[name] for name in space.free},
+        space.values(fit.best_x),
+        {name: (_told(before), _told(after)) for name, (before, after) in found.items()},
+    )
     write_json(out / "summary.json", summary)
     save_figure(controller_report(fit, space, found), out / "report.png")
     print(_text(summary))
@@ -95,29 +90,13 @@ def closed_loop(args: Arguments, name: str, params: Params | None = None) -> Clo
     Raises:
         BadInput: a file that is no good, or a scenario in which nothing drives.
     """
-    qcar = calib_dir() / "qcar"
-    rig = load_rig(args.rig or qcar / "rig.yaml")
-    markers = load_markers(args.markers or qcar / "markers.yaml")
-    vehicle = load_vehicle(args.vehicle or qcar / "vehicle.yaml")
     scenario = scenarios()[name]
     if not scenario.drives:
         raise BadInput("--scenario", f"nothing drives in {name}")
-    navigator = Navigator(
-        rig=rig,
-        markers=markers,
-        vehicle=vehicle,
-        waypoints_m=scenario.waypoints_m,
-        selector=make_selector(args.selector),
-        motion=BicycleKalman(
-            vehicle,
-            tilt_sigma_rad=scenario.told_tilt_sigma_rad,
-            height_sigma_m=scenario.told_height_sigma_m,
-        ),
-    )
-    if params is not None:
-        navigator = apply_params(navigator, params)
+    car = ScenarioCar.load(args, params)
+    navigator = car.navigator(scenario, make_selector(args.selector))
     noise_px = jnp.asarray(args.corner_noise_px)
-    rollout = Rollout(navigator, vehicle, markers, scenario, noise_px, spread=_CARS)
+    rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px, spread=_CARS)
     return ClosedLoop(rollout, DriveLoss(args.time, args.cross_track, args.effort, args.smoothness))
 
 
@@ -241,37 +220,12 @@ def _keys(first: int, count: int) -> Key[Array, " S"]:
     return keys
 
 
-def _summary(
-    args: Arguments,
-    space: Space,
-    before: Mapping[str, Array],
-    fit: Fit,
-    found: dict[str, tuple[Tested, Tested]],
-) -> dict[str, Any]:
-    def measure(value: tuple[float, float, float]) -> dict[str, Any]:
-        return {"value": value[0], "interval": list(value[1:])}
-
-    def told(tested: Tested) -> dict[str, Any]:
-        return {
-            "loss": measure(tested.loss),
-            "parts": tested.parts,
-            "time_s": measure(tested.time_s),
-            "success_rate": measure(tested.success),
-        }
-
-    def plain(values: Mapping[str, Array]) -> dict[str, Any]:
-        return {name: np.asarray(v).tolist() for name, v in values.items()}
-
+def _told(tested: Tested) -> dict[str, Any]:
     return {
-        "run": plain_key("tune controller", args),
-        "steps": fit.step,
-        "ended": fit.ended,
-        "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
-        "parameters": {"before": plain(before), "after": plain(space.values(fit.best_x))},
-        "test": {
-            name: {"before": told(before), "after": told(after)}
-            for name, (before, after) in found.items()
-        },
+        "loss": measure(tested.loss),
+        "parts": tested.parts,
+        "time_s": measure(tested.time_s),
+        "success_rate": measure(tested.success),
     }
 
 

@@ -9,14 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.ambiguity import Selector
 from jaxnav.arguments import TuneFilter as Arguments
-from jaxnav.bicycle_kalman import BicycleKalman
+from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.commands.tune_drives import drives
 from jaxnav.commands.tune_recordings import navigator_of, tracks
 from jaxnav.commands.tune_sequences import Named, joined
 from jaxnav.errors import BadInput
-from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
+from jaxnav.files import load_markers, load_rig
 from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
 from jaxnav.runtime.drive_log import read_drive
@@ -65,29 +64,11 @@ def read_data(args: Arguments) -> Data:
 
 
 def _simulated(args: Arguments) -> Data:
-    qcar = calib_dir() / "qcar"
-    rig = load_rig(args.rig or qcar / "rig.yaml")
-    markers = load_markers(args.markers or qcar / "markers.yaml")
-    vehicle = load_vehicle(args.vehicle or qcar / "vehicle.yaml")
-    scenario = scenarios()[args.scenario]
-
-    def navigator(selector: Selector) -> Navigator:
-        return Navigator(
-            rig=rig,
-            markers=markers,
-            vehicle=vehicle,
-            waypoints_m=scenario.waypoints_m,
-            selector=selector,
-            motion=BicycleKalman(
-                vehicle,
-                tilt_sigma_rad=scenario.told_tilt_sigma_rad,
-                height_sigma_m=scenario.told_height_sigma_m,
-            ),
-        )
-
-    driver = navigator(MultiHypothesis())  # whoever is tuned, the drives are the same
+    car, scenario = ScenarioCar.load(args), scenarios()[args.scenario]
+    # Whoever is tuned, the drives are the same.
+    driver = car.navigator(scenario, MultiHypothesis())
     noise_px = jnp.asarray(args.corner_noise_px)
-    rollout = Rollout(driver, vehicle, markers, scenario, noise_px)
+    rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px)
 
     def drive(first: int, count: int, progress: Progress) -> Recorded:
         """In batches of one size, of which the last repeats its last drive."""
@@ -102,7 +83,7 @@ def _simulated(args: Arguments) -> Data:
     count = args.seeds + args.held_out_seeds
     with tqdm(total=count, unit="drive", desc="drive", disable=args.headless, leave=False) as bar:
         known = drive(args.seed, count, bar.update)
-    own = navigator(make_selector(args.selector))
+    own = car.navigator(scenario, make_selector(args.selector))
     return Data(
         navigator=own,
         learned=known.rows(slice(0, args.seeds)),

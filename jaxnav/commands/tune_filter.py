@@ -15,7 +15,7 @@ from jaxnav.cli import EXIT_INTERRUPTED
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.tune_data import AT_A_TIME, Data, read_data
-from jaxnav.commands.tune_fit import Fitting, plain_key
+from jaxnav.commands.tune_fit import Fitting, measure, plain_key, summary_of
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, load_params, output_folder, write_json
 from jaxnav.hypotheses import MultiHypothesis
@@ -45,17 +45,21 @@ def run(args: Arguments) -> int:
     objective = Objective(cost)
     out = output_folder(args.out)
     problem = _problem(args, cost, objective, data)
-    fitting = Fitting(
-        *(out, plain_key("tune filter", args), problem, space, objective.prior_sigma),
-        named=args.train,
-    )
+    key = plain_key("tune filter", args)
+    fitting = Fitting(out, key, problem, space, objective.prior_sigma, named=args.train)
     try:
         fit = fitting.run(args.headless)
     except KeyboardInterrupt:
         print(f"interrupted: the best so far is in {out}; the same command goes on")
         return EXIT_INTERRUPTED
     found = _tested(args, data, params, space, fit)
-    summary = _summary(args, space, fit, found)
+    summary = summary_of(
+        key,
+        fit,
+        space.values(space.start),
+        space.values(fit.best_x),
+        {name: (_told(before), _told(after)) for name, (before, after) in found.items()},
+    )
     write_json(out / "summary.json", summary)
     save_figure(tuning_report(fit, space, found), out / "report.png")
     print(_text(summary))
@@ -170,32 +174,13 @@ def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object
     )
 
 
-def _summary(
-    args: Arguments, space: Space, fit: Fit, found: dict[str, tuple[Tested, Tested]]
-) -> dict[str, Any]:
-    def told(tested: Tested) -> dict[str, Any]:
-        return {
-            "position_median_m": float(np.median(tested.error_m)),
-            "position_rmse_m": {"value": tested.rmse_m[0], "interval": list(tested.rmse_m[1:])},
-            "anees": {"value": tested.anees[0], "interval": list(tested.anees[1:])},
-            "anees_consistent": list(tested.band),
-            "frames": {"judged": len(tested.error_m), "covariance_indefinite": tested.indefinite},
-        }
-
-    def plain(x: Array) -> dict[str, Any]:
-        return {name: np.asarray(v).tolist() for name, v in space.values(x).items()}
-
+def _told(tested: Tested) -> dict[str, Any]:
     return {
-        "run": plain_key("tune filter", args),
-        "steps": fit.step,
-        "stages": fit.stage + 1,
-        "ended": fit.ended,
-        "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
-        "parameters": {"before": plain(space.start), "after": plain(fit.best_x)},
-        "test": {
-            name: {"before": told(before), "after": told(after)}
-            for name, (before, after) in found.items()
-        },
+        "position_median_m": float(np.median(tested.error_m)),
+        "position_rmse_m": measure(tested.rmse_m),
+        "anees": measure(tested.anees),
+        "anees_consistent": list(tested.band),
+        "frames": {"judged": len(tested.error_m), "covariance_indefinite": tested.indefinite},
     }
 
 

@@ -7,7 +7,7 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from jaxnav.errors import BadInput
 from jaxnav.files import write_params
-from jaxnav.files.writing import atomic_write
+from jaxnav.files.writing import atomic_write, plain_data
 from jaxnav.tuning.fit import Fit, Problem, advanced, arrays_of, fit_of
 from jaxnav.tuning.unconstrained import Space
 
@@ -30,7 +30,7 @@ _OF_THE_REPORT = ("out", "headless", "test", "test_seeds")
 def plain_key(command: str, args: Any) -> dict[str, Any]:
     """All that a result depends on: what was told, and by what it was computed."""
     told = {
-        name: _plain(value)
+        name: plain_data(value)
         for name, value in dataclasses.asdict(args).items()
         if name not in _OF_THE_REPORT
     }
@@ -38,10 +38,32 @@ def plain_key(command: str, args: Any) -> dict[str, Any]:
     return {"command": command} | told | {"versions": versions}
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
-    return str(value) if isinstance(value, Path) else value
+def summary_of(
+    key: dict[str, Any],
+    fit: Fit,
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
+    test: Mapping[str, tuple[Any, Any]],
+) -> dict[str, Any]:
+    """What came of a fit: parameters by name, and what is told of each test before and after."""
+
+    def plain(values: Mapping[str, Array]) -> dict[str, Any]:
+        return {name: np.asarray(value).tolist() for name, value in values.items()}
+
+    return {
+        "run": key,
+        "steps": fit.step,
+        "stages": fit.stage + 1,
+        "ended": fit.ended,
+        "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
+        "parameters": {"before": plain(before), "after": plain(after)},
+        "test": {name: {"before": was, "after": now} for name, (was, now) in test.items()},
+    }
+
+
+def measure(value: tuple[float, float, float]) -> dict[str, Any]:
+    """A mean with its interval, as a summary tells it."""
+    return {"value": value[0], "interval": list(value[1:])}
 
 
 # What NumPy and zipfile raise where a byte is wrong: a flag says "encrypted", a length is absurd.

@@ -1,0 +1,70 @@
+"""The car that drives in the scenarios of `simulate` and `tune`, from its files."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from jaxnav.ambiguity import Selector
+from jaxnav.bicycle import Vehicle
+from jaxnav.bicycle_kalman import BicycleKalman
+from jaxnav.files import Params, apply_params, calib_dir, load_markers, load_rig, load_vehicle
+from jaxnav.markers import MarkerMap
+from jaxnav.navigator import Navigator
+from jaxnav.rig import CameraRig
+from jaxnav.simulation.scenarios import Scenario
+
+
+class _Files(Protocol):
+    """Whatever names a car's files; None is the QCar's."""
+
+    @property
+    def rig(self) -> Path | None: ...
+    @property
+    def markers(self) -> Path | None: ...
+    @property
+    def vehicle(self) -> Path | None: ...
+
+
+@dataclass(frozen=True)
+class ScenarioCar:
+    """What all drives have in common, whatever happens in them."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle
+    params: Params | None
+
+    @staticmethod
+    def load(files: _Files, params: Params | None = None) -> "ScenarioCar":
+        """A car as its files say.
+
+        Raises:
+            BadInput: a file that is no good.
+        """
+        qcar = calib_dir() / "qcar"
+        return ScenarioCar(
+            rig=load_rig(files.rig or qcar / "rig.yaml"),
+            markers=load_markers(files.markers or qcar / "markers.yaml"),
+            vehicle=load_vehicle(files.vehicle or qcar / "vehicle.yaml"),
+            params=params,
+        )
+
+    def navigator(self, scenario: Scenario, selector: Selector) -> Navigator:
+        """What drives in a scenario. Parameters go before what the scenario tells.
+
+        Raises:
+            BadInput: a parameter that does not fit it.
+        """
+        navigator = Navigator(
+            rig=self.rig,
+            markers=self.markers,
+            vehicle=self.vehicle,
+            waypoints_m=scenario.waypoints_m,
+            selector=selector,
+            motion=BicycleKalman(
+                self.vehicle,
+                tilt_sigma_rad=scenario.told_tilt_sigma_rad,
+                height_sigma_m=scenario.told_height_sigma_m,
+            ),
+        )
+        return navigator if self.params is None else apply_params(navigator, self.params)
