@@ -201,13 +201,12 @@ def _fused(
     alone = cholesky(information + ridge * eye)
     u_alone = u - cho_solve(alone, gradient)
     unspread = solve_lower(root, eye)
-    R = cho_solve(alone, eye)
-    R = R + sandwich(unspread, sandwich(freedom.T, jnp.diag(floor**2)))
+    N = sandwich(unspread, sandwich(freedom.T, jnp.diag(floor**2)))
+    R = cho_solve(alone, eye) + N
     sigma = cholesky(R + eye)  # of u_alone about the prediction
     contradiction = solve_lower(sigma, u_alone)
     u_fused = solve_upper(sigma, contradiction)
-    # I - (I + R)^-1 = R (I + R)^-1, symmetric.
-    C = eye - cho_solve(sigma, eye)
+    C = _between(information + ridge * eye, N)
     # The corners given the prediction: what fits to no pose, and the pose that fits best.
     misfit = cost - jnp.sum(gradient * (u - u_alone))
     log_likelihood = (
@@ -216,7 +215,7 @@ def _fused(
     xi = applied(spread, u_fused)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
-    posterior_covariance = sandwich(carry, (C + C.T) / 2)
+    posterior_covariance = sandwich(carry, C)
     numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], contradiction]
     finite = usable & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
     return Fit(
@@ -232,3 +231,15 @@ def _fused(
         log_evidence=jnp.where(finite, log_evidence, -jnp.inf),
         finite=finite,
     )
+
+
+def _between(A: Float[Array, "d d"], N: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """R (I + R)^-1 for R = A^-1 + N: the covariance between a prediction I and a measurement R.
+
+    As sums of squares, which no rounding makes indefinite, however much surer than the prediction
+    the measurement is: with M = (I + N)^-1 it is M (A + M)^-1 M + M (N + N^2) M.
+    """
+    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+    M = gram(solve_lower(cholesky(eye + N), eye).T)
+    corners = solve_lower(cholesky(A + M), M)
+    return gram(corners.T) + sandwich(M, N) + gram(product(M, N))

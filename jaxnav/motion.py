@@ -25,9 +25,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav import kalman
 from jaxnav.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
-from jaxnav.geometry import cayley_jacobian, inverse_cayley, inverse_cayley_jacobian
+from jaxnav.geometry import inverse_cayley, inverse_cayley_jacobian
 from jaxnav.observation import Observation
-from jaxnav.small_matrices import applied, cho_solve, cholesky, product, sandwich
+from jaxnav.small_matrices import (
+    applied,
+    cho_solve,
+    cholesky,
+    gram,
+    product,
+    sandwich,
+    solve_lower,
+)
 from jaxnav.trees import where
 
 
@@ -238,17 +246,19 @@ def followed(
     d = freedom.shape[1]
     away = inverse_cayley(T_world_prior.inverse() @ T_world_vehicle)
     xi = applied(freedom.T, away)
-    # Error at the prediction -> at the corrected pose, and back.
-    carry = sandwich(freedom.T, cayley_jacobian(away))
+    # Error at the corrected pose -> at the prediction.
     back = sandwich(freedom.T, inverse_cayley_jacobian(away))
     posterior = sandwich(freedom.T, covariance)
     factor = cholesky(P[:d, :d])
-    gain = cho_solve(factor, P[:d]).T  # (n, d), identity on top
-    at_prior = sandwich(back, posterior)
-    carried = kalman.symmetrise(P + sandwich(gain, at_prior - P[:d, :d]))
-    to_posterior = jnp.eye(P.shape[0], dtype=P.dtype).at[:d, :d].set(carry)
-    carried = kalman.symmetrise(sandwich(to_posterior, carried))
-    return applied(gain, xi), kalman.floored(carried, P)
+    gain = cho_solve(factor, P[:d, d:]).T  # of the rest on the pose, (n - d, d)
+    # Block by block: as P plus a correction the pose would keep the rounding of its prediction,
+    # which may be thousands of times as wide.
+    explained = gram(solve_lower(factor, P[:d, d:]).T)
+    moves = product(gain, back)
+    cross = product(moves, posterior)
+    rest = P[d:, d:] - explained + sandwich(moves, posterior)
+    after = kalman.symmetrise(jnp.block([[posterior, cross.T], [cross, rest]]))
+    return jnp.append(xi, applied(gain, xi)), kalman.floored(after, P)
 
 
 def merged(

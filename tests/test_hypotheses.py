@@ -19,6 +19,7 @@ from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.fan import fan
 from jaxnav.geometry import on_ground
 from jaxnav.hypotheses import MultiHypothesis
+from jaxnav.map_fit import fit
 from jaxnav.motion import Belief, followed, merged, unstarted
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation, Snapshot
@@ -155,6 +156,36 @@ def test_a_fit_is_the_minimum_of_the_whitened_e(exact, lane):
     alone = u - R @ J.T @ r
     nis = alone @ np.linalg.solve(P + R, alone)
     assert np.sum(selection.measured.innovation[lane] ** 2) == pytest.approx(nis, rel=1e-4)
+
+
+def correlations(covariance, freedom) -> np.ndarray:
+    P = np.einsum("ia,kij,jb->kab", freedom, np.asarray(covariance, float), freedom)
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    return P / (sigma[:, :, None] * sigma[:, None])
+
+
+@pytest.mark.parametrize("freedom", [PLANAR, EYE])
+@pytest.mark.parametrize("floor", [0.0, 1e-4])
+def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(freedom, floor):
+    """A drive's first frames: nothing known to a metre, corners known to a fiftieth of a pixel."""
+    snapshot, prior = view(NEAR, 0.02), priors(NEAR, freedom, scale=20.0)
+    here = jnp.tile(worlds.planar(*NEAR).wxyz_xyz, (8, 1))
+    floors = jnp.full(6, floor)
+
+    def covariance(here, prior, snapshot, floors):
+        found = fit(jaxlie.SE3(here), prior.covariance, prior, snapshot, floors, 20)
+        return found.posterior.covariance
+
+    exact = correlations(jit_to_run(covariance)(here, prior, snapshot, floors), freedom)
+    narrow = {np.float64: np.float32, np.int64: np.int32}
+    with jax.enable_x64(False):
+        rounded = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, narrow.get(leaf.dtype.type, leaf.dtype)),
+            jax.tree.map(np.asarray, (here, prior, snapshot, floors)),
+        )
+        found = correlations(jit_to_run(covariance)(*rounded), freedom)
+    np.testing.assert_allclose(found, exact, atol=0.01)
+    assert np.all(np.linalg.eigvalsh(found) > 0)
 
 
 @pytest.mark.parametrize("most", [1.0, 1.5, 1e9])
