@@ -20,6 +20,7 @@ import tyro
 
 from jaxnav.arguments import (
     COMMANDS,
+    Calibrate,
     Command,
     Demo,
     Doctor,
@@ -64,6 +65,7 @@ _Command = (
     | Faults
     | Doctor
     | Tune
+    | Calibrate
 )
 
 

@@ -12,8 +12,9 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import MarkerFile, marker_map
-from jaxnav.files.rigs import RigFile, to_se3
+from jaxnav.files.rigs import RigFile
 from jaxnav.files.validation import Pair
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig

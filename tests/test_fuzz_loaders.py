@@ -5,7 +5,6 @@ JAXNAV_FUZZ=3000 pytest tests/test_fuzz_loaders.py      # so many examples for e
 
 import dataclasses
 import json
-import math
 import os
 import tempfile
 import time
@@ -17,7 +16,6 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-import yaml
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
@@ -39,6 +37,7 @@ from tests.helpers.loader_seeds import BINARY, STRUCTURED, Loader
 from tests.helpers.mutations import Changed, edited, restructured
 from tests.helpers.seed_texts import PARAMETERS
 from tests.helpers.simulated import make_setup
+from tests.helpers.yaml_numbers import dumped
 
 EXAMPLES = int(os.environ.get("JAXNAV_FUZZ", "8"))
 HANGS_S = 2.0  # of the processor, so that a machine that is busy does not count
@@ -197,24 +196,3 @@ def test_an_option_is_a_number_within_its_bounds_or_bad_input(text):
         else:
             assert type(value) is kind
             assert 0 <= value <= 10
-
-
-class _Dumper(yaml.SafeDumper):
-    """Without aliases, which are refused, and with numbers as YAML 1.2 reads them."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
-def _number(dumper: _Dumper, value: float) -> yaml.ScalarNode:
-    words = {math.inf: ".inf", -math.inf: "-.inf"}
-    text = words.get(value, ".nan" if math.isnan(value) else repr(value))
-    return dumper.represent_scalar("tag:yaml.org,2002:float", text)
-
-
-_Dumper.add_representer(float, _number)
-
-
-def dumped(data: Any) -> str:
-    """YAML."""
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from jaxnav.arguments.calibration import Calibrate
 from jaxnav.arguments.kinds import Selector
 from jaxnav.arguments.recordings import Locate, Replay, View
 from jaxnav.arguments.simulations import Demo, Faults, Simulate
@@ -16,6 +17,7 @@ from jaxnav.arguments.vehicles import Doctor, Run
 
 __all__ = [
     "COMMANDS",
+    "Calibrate",
     "Command",
     "Demo",
     "Doctor",
@@ -47,6 +49,7 @@ Command = (
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Tune, tyro.conf.subcommand("tune")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
 )
 COMMANDS = {
     "demo": Demo,
@@ -61,4 +64,5 @@ COMMANDS = {
     "view": View,
     "doctor": Doctor,
     "tune": Tune,
+    "calibrate": Calibrate,
 }

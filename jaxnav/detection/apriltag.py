@@ -5,15 +5,17 @@ import importlib
 import numpy as np
 
 from jaxnav.camera import Camera
+from jaxnav.conventions import (
+    APRILTAG_FAMILIES,
+    APRILTAG_FIRST_CORNER_ON_OPENCV,
+    APRILTAG_PIXEL_EDGE_PX,
+    TL_TR_BR_BL,
+)
 from jaxnav.detection.families import dictionary
 from jaxnav.detection.types import Detections, grey, refined_detections
 from jaxnav.errors import BadInput
 
-# Families that both AprilTag and OpenCV have. On OpenCV's picture of a marker AprilTag starts at
-# the top right and goes on anticlockwise: so measured, the same for all of them.
-_FAMILIES = ("tag16h5", "tag25h9", "tag36h11")
-_TL_TR_BR_BL = [1, 0, 3, 2]
-_PIXEL_EDGE_PX = 0.5  # AprilTag counts from the image's edge, not from a pixel's centre
+_TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER_ON_OPENCV]
 _MIN_DECISION_MARGIN = 10.0  # grey levels; what noise decodes to stays below
 
 
@@ -23,10 +25,9 @@ class AprilTagDetector:
     def __init__(self, family: str = "tag36h11"):
         """See `make_detector`."""
         dictionary(family)
-        if family not in _FAMILIES:
-            raise BadInput(
-                "family", f"{family!r} is none of the apriltag detector's: {', '.join(_FAMILIES)}"
-            )
+        if family not in APRILTAG_FAMILIES:
+            known = ", ".join(APRILTAG_FAMILIES)
+            raise BadInput("family", f"{family!r} is none of the apriltag detector's: {known}")
         try:
             pyapriltags = importlib.import_module("pyapriltags")
         except ImportError as error:
@@ -49,7 +50,7 @@ class AprilTagDetector:
         del predicted_corners_px
         image = grey(image)
         found = [
-            (int(tag.tag_id), np.asarray(tag.corners, float)[_TL_TR_BR_BL] - _PIXEL_EDGE_PX)
+            (int(tag.tag_id), np.asarray(tag.corners, float)[_TO_OURS] - APRILTAG_PIXEL_EDGE_PX)
             for tag in self._decoder.detect(np.ascontiguousarray(image))
             if tag.decision_margin > _MIN_DECISION_MARGIN
         ]

@@ -1,96 +1,66 @@
-"""One calibrated camera, from the files of whichever tool calibrated it.
+"""Calibrated cameras, from the files of whichever tool calibrated them.
 
 Read: jaxnav's own rig YAML, Kalibr's camchain, ROS's camera_info YAML, OpenCV's FileStorage YAML
-(as its calibration sample and most scripts write it) and PhotonVision's JSON.
+(as its calibration sample and most scripts write it) and PhotonVision's JSON. Which of them a file
+is, its keys tell.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal, NamedTuple
 
-from pydantic import AliasChoices, Field, field_validator
-
-from jaxnav.camera import LENSES, Camera
+from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr
-from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import RigFile
-from jaxnav.files.validation import (
-    Count,
-    ForeignEntry,
-    ImageSize,
-    Number,
-    Pixels,
-    Text,
-    at,
-    validate,
+from jaxnav.files.figures import CameraFigures
+from jaxnav.files.opencv_storage import is_opencv, opencv_figures, opencv_left_out
+from jaxnav.files.photonvision import (
+    is_photonvision,
+    photonvision_figures,
+    photonvision_left_out,
 )
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import RigFile, rig_left_out
+from jaxnav.files.ros_camera_info import (
+    camera_info_figures,
+    camera_info_left_out,
+    is_camera_info,
+)
+from jaxnav.files.validation import validate
 
 ImageSizePx = tuple[int, int]  # width, height
-
-_COEFFICIENTS = "k1 k2 p1 p2 k3"
-
-
-class MatrixEntry(ForeignEntry):
-    """A matrix as ROS, OpenCV and PhotonVision write it."""
-
-    rows: Count
-    cols: Count
-    data: Annotated[list[Number], Field(max_length=64)]
-
-    @field_validator("data")
-    @classmethod
-    def _complete(cls, data: list[float], info: Any) -> list[float]:
-        rows, cols = info.data.get("rows"), info.data.get("cols")
-        if rows is not None and cols is not None and rows * cols != len(data):
-            raise ValueError(f"must have {rows} x {cols} numbers, got {len(data)}")
-        return data
+CameraFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]
 
 
-class CameraInfo(ForeignEntry):
-    """ROS's camera_info YAML."""
+@dataclass(frozen=True)
+class CameraFile:
+    """What a file of cameras holds.
 
-    image_width: Pixels
-    image_height: Pixels
-    camera_matrix: MatrixEntry
-    distortion_model: Text
-    distortion_coefficients: MatrixEntry
+    Attributes:
+        cameras: by the names that the file gives them, at least one.
+        left_out: the keys that say something that no camera of ours holds.
+    """
 
-
-class OpenCVCamera(ForeignEntry):
-    """OpenCV's FileStorage, under the names of its samples and those of its Python functions."""
-
-    image_width: Pixels | None = None
-    image_height: Pixels | None = None
-    image_size: Annotated[
-        ImageSize | None, Field(validation_alias=AliasChoices("image_size", "imageSize"))
-    ] = None
-    camera_matrix: Annotated[
-        MatrixEntry, Field(validation_alias=AliasChoices("camera_matrix", "cameraMatrix", "K"))
-    ]
-    distortion_coefficients: Annotated[
-        MatrixEntry,
-        Field(validation_alias=AliasChoices("distortion_coefficients", "distCoeffs", "D")),
-    ]
-    fisheye_model: Annotated[int, Field(strict=True, ge=0, le=1)] = 0
+    format: CameraFormat
+    cameras: tuple[CameraFigures, ...]
+    left_out: tuple[str, ...]
 
 
-class Resolution(ForeignEntry):
-    """PhotonVision's image size."""
+class _OneCamera(NamedTuple):
+    """How the file of a tool that writes one camera a file is read."""
 
-    width: Annotated[float, Field(strict=True, ge=1, le=65536)]
-    height: Annotated[float, Field(strict=True, ge=1, le=65536)]
+    format: CameraFormat
+    recognised: Callable[[dict[str, Any]], bool]
+    figures: Callable[[Path, dict[str, Any], str], CameraFigures]
+    left_out: Callable[[dict[str, Any]], list[str]]
 
 
-class PhotonVisionCamera(ForeignEntry):
-    """PhotonVision's JSON. Older versions wrote the lens under `cameraExtrinsics`."""
-
-    resolution: Resolution
-    cameraIntrinsics: MatrixEntry
-    distCoeffs: Annotated[
-        MatrixEntry, Field(validation_alias=AliasChoices("distCoeffs", "cameraExtrinsics"))
-    ]
-    lensmodel: Text = "LENSMODEL_OPENCV"
+_ONE_CAMERA = (
+    _OneCamera("photonvision", is_photonvision, photonvision_figures, photonvision_left_out),
+    _OneCamera("ros", is_camera_info, camera_info_figures, camera_info_left_out),
+    _OneCamera("opencv", is_opencv, opencv_figures, opencv_left_out),
+)
 
 
 def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, ImageSizePx]:
@@ -106,22 +76,40 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
     """
     path = Path(path)
     data = read_mapping(path)
+    file = camera_file(path, data)
+    if file.format in ("jaxnav", "kalibr"):
+        camera = choose_camera(path, file.cameras, name)
+    else:
+        (camera,) = file.cameras
+        if name is not None and name != data.get("camera_name"):
+            raise BadInput(path, f"holds one camera, and it is not named {name!r}")
+    return camera.camera(), camera.image_size_px
+
+
+def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
+    """All cameras of a file, whichever tool wrote it.
+
+    Those of a camchain are called `cam0`, `cam1` and so on; a camera that its file gives no name
+    is called as the file is.
+
+    Args:
+        data: what the file holds.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
     if "cameras" in data:
-        entries = {entry.name: entry for entry in validate(RigFile, data, path).cameras}
-        entry = entries[_choose(path, list(entries), name)]
-        return entry.camera(), (entry.image_size_px[0], entry.image_size_px[1])
+        rig = validate(RigFile, data, path)
+        cameras = tuple(entry.figures() for entry in rig.cameras)
+        return CameraFile("jaxnav", cameras, tuple(rig_left_out(rig)))
     if kalibr.is_camchain(data):
         chain = kalibr.camchain(path, data)
-        link = chain[_choose(path, list(chain), name)]
-        return link.camera(), (link.resolution[0], link.resolution[1])
-    if name is not None and name != data.get("camera_name"):
-        raise BadInput(path, f"holds one camera, and it is not named {name!r}")
-    if "cameraIntrinsics" in data:
-        return _photonvision(path, data)
-    if "distortion_model" in data:
-        return _camera_info(path, data)
-    if data.keys() & {"camera_matrix", "cameraMatrix", "K"}:
-        return _opencv(path, data)
+        left_out = kalibr.camchain_left_out(data, chain)
+        return CameraFile("kalibr", tuple(kalibr.camchain_figures(chain)), tuple(left_out))
+    for tool in _ONE_CAMERA:
+        if tool.recognised(data):
+            camera = tool.figures(path, data, _name(data.get("camera_name")) or path.stem)
+            return CameraFile(tool.format, (camera,), tuple(tool.left_out(data)))
     raise BadInput(
         path,
         "is no camera file that jaxnav knows: expected a rig (`cameras:`), a Kalibr camchain "
@@ -130,82 +118,33 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
     )
 
 
-def _choose(path: Path, names: list[str], name: str | None) -> str:
-    if name is None and len(names) == 1:
-        return names[0]
-    if name in names:
-        return name
+def _name(named: Any) -> str:
+    """What a tool calls a camera, which may be a serial number; empty where that is no name."""
+    name = str(named) if isinstance(named, str | int) else ""
+    return name if len(name) <= 100 and name.isprintable() else ""
+
+
+def named_by_topic(path: Path, data: dict[str, Any], file: CameraFile) -> CameraFile:
+    """The file with the cameras of a camchain called after their topics; others as they are."""
+    if file.format != "kalibr":
+        return file
+    names = kalibr.names_by_topic(kalibr.camchain(path, data))
+    cameras = [replace(camera, name=name) for camera, name in zip(file.cameras, names, strict=True)]
+    return replace(file, cameras=tuple(cameras))
+
+
+def choose_camera(
+    path: Path, cameras: tuple[CameraFigures, ...], name: str | None
+) -> CameraFigures:
+    """The camera of that name, or the only one.
+
+    Raises:
+        BadInput: there is none, or there are several and no name.
+    """
+    named = {camera.name: camera for camera in cameras}
+    if name is None and len(cameras) == 1:
+        return cameras[0]
+    if name in named:
+        return named[name]
     problem = "holds several cameras" if name is None else f"has no camera {name!r}"
-    raise BadInput(path, f"{problem}: choose one of {', '.join(names)}")
-
-
-def _camera_info(path: Path, data: dict[str, Any]) -> tuple[Camera, ImageSizePx]:
-    info = validate(CameraInfo, data, path)
-    lens = {"plumb_bob": "radtan", "rational_polynomial": "radtan", "equidistant": "equidistant"}
-    model = info.distortion_model
-    if model not in lens:
-        problem = f"must be one of {', '.join(lens)}, got {model!r}"
-        raise BadInput(at(path, "distortion_model"), problem)
-    camera = _camera(
-        (at(path, "camera_matrix.data"), info.camera_matrix.data),
-        (at(path, "distortion_coefficients.data"), info.distortion_coefficients.data),
-        lens[model],
-    )
-    return camera, (info.image_width, info.image_height)
-
-
-def _opencv(path: Path, data: dict[str, Any]) -> tuple[Camera, ImageSizePx]:
-    stored = validate(OpenCVCamera, data, path)
-    if stored.image_size is not None:
-        size = (stored.image_size[0], stored.image_size[1])
-    elif stored.image_width is not None and stored.image_height is not None:
-        size = (stored.image_width, stored.image_height)
-    else:
-        missing = "image_width" if stored.image_width is None else "image_height"
-        raise BadInput(at(path, missing), "missing: for which image size are these figures?")
-    camera = _camera(
-        (at(path, "camera_matrix.data"), stored.camera_matrix.data),
-        (at(path, "distortion_coefficients.data"), stored.distortion_coefficients.data),
-        "equidistant" if stored.fisheye_model else "radtan",
-    )
-    return camera, size
-
-
-def _photonvision(path: Path, data: dict[str, Any]) -> tuple[Camera, ImageSizePx]:
-    stored = validate(PhotonVisionCamera, data, path)
-    if "OPENCV" not in stored.lensmodel:
-        problem = f"must be an OpenCV lens, got {stored.lensmodel!r}"
-        raise BadInput(at(path, "lensmodel"), problem)
-    camera = _camera(
-        (at(path, "cameraIntrinsics.data"), stored.cameraIntrinsics.data),
-        (at(path, "distCoeffs.data"), stored.distCoeffs.data),
-        "radtan",
-    )
-    return camera, (int(stored.resolution.width), int(stored.resolution.height))
-
-
-def _camera(
-    matrix: tuple[str, Sequence[float]], distortion: tuple[str, Sequence[float]], lens: str
-) -> Camera:
-    """A camera from K (row by row) and the lens; each with its place in the file."""
-    assert lens in LENSES
-    where, K = matrix
-    if len(K) != 9:
-        raise BadInput(where, f"must be 3 x 3, got {len(K)} numbers")
-    if K[0] == 0:
-        raise BadInput(f"{where}[0]", "is 0: this camera has not been calibrated")
-    for index in (0, 4):
-        if K[index] < 1e-6:
-            raise BadInput(f"{where}[{index}]", f"the focal length must be > 0, got {K[index]:g}")
-    if any(abs(K[index]) > 1e-9 * K[0] for index in (1, 3, 6, 7)) or K[8] != 1:
-        raise BadInput(where, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
-    where, coefficients = distortion
-    most = 4 if lens == "equidistant" else 5
-    if lens == "equidistant" and len(coefficients) != 4:
-        raise BadInput(where, f"must be k1 k2 k3 k4 for a fisheye lens, got {len(coefficients)}")
-    if any(coefficients[most:]):
-        raise BadInput(
-            where, f"only {_COEFFICIENTS} are supported, and a later one is not zero: "
-            "calibrate again with five coefficients (plumb_bob, radtan)",
-        )  # fmt: skip
-    return Camera.create([K[0], K[4]], [K[2], K[5]], lens, coefficients[:most])
+    raise BadInput(path, f"{problem}: choose one of {', '.join(named)}")

@@ -1,10 +1,12 @@
 """Kalibr's camchain YAML, with imu := vehicle.
 
 `T_cam_imu` maps vehicle to camera. A camera without one is chained from the camera before it by
-`T_cn_cnm1`; OpenVINS's inverse, `T_imu_cam`, is read too.
+`T_cn_cnm1`; OpenVINS's inverse, `T_imu_cam`, is read too. A chain that Kalibr made of cameras alone
+places none of them on a vehicle.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from pydantic import Field, field_validator
 from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
+from jaxnav.files.figures import CameraFigures, Lens, unread
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import (
     ForeignEntry,
@@ -24,9 +27,16 @@ from jaxnav.files.validation import (
     at,
     validate,
 )
+from jaxnav.files.writing import yaml_text
 
-_LENS = {"radtan": "radtan", "equidistant": "equidistant", "equi": "equidistant", "none": "none"}
+_LENS: dict[str, Lens] = {
+    "radtan": "radtan",
+    "equidistant": "equidistant",
+    "equi": "equidistant",
+    "none": "none",
+}
 _CAMERA_KEY = re.compile(r"cam(0|[1-9][0-9]?)")
+_TOPIC = re.compile(r"/([^/].*)/image_raw")  # of the camera of that name
 
 
 class KalibrCamera(ForeignEntry):
@@ -40,6 +50,7 @@ class KalibrCamera(ForeignEntry):
     T_cam_imu: Matrix | None = None
     T_imu_cam: Matrix | None = None
     T_cn_cnm1: Matrix | None = None
+    rostopic: Text | None = None
     tagtopic: Text | None = None  # TagSLAM's: where the detections of this camera are published
     rig_body: Text | None = None  # TagSLAM's: the body that carries it
 
@@ -79,11 +90,17 @@ class KalibrCamera(ForeignEntry):
             raise ValueError(f"must have 4 numbers, got {len(coefficients)}")
         return coefficients
 
+    def figures(self, name: str, T_camera_vehicle: np.ndarray | None = None) -> CameraFigures:
+        """The camera under that name at that place."""
+        lens = _LENS[self.distortion_model]
+        coefficients = [] if lens == "none" else self.distortion_coeffs
+        return CameraFigures.create(
+            name, lens, self.intrinsics, coefficients, self.resolution, T_camera_vehicle
+        )
+
     def camera(self) -> Camera:
         """The intrinsic part."""
-        lens = _LENS[self.distortion_model]
-        coefficients = () if lens == "none" else self.distortion_coeffs
-        return Camera.create(self.intrinsics[:2], self.intrinsics[2:], lens, coefficients)
+        return self.figures("").camera()
 
 
 def is_camchain(data: dict[str, Any]) -> bool:
@@ -107,21 +124,100 @@ def camchain(path: Path, data: dict[str, Any] | None = None) -> dict[str, Kalibr
     return {key: validate(KalibrCamera, data[key], path, key) for key in keys}
 
 
-def Ts_camera_imu(path: Path, chain: dict[str, KalibrCamera]) -> list[np.ndarray]:
-    """(7,) wxyz_xyz for every camera: the IMU (the vehicle) in the camera.
+def camchain_figures(chain: dict[str, KalibrCamera]) -> list[CameraFigures]:
+    """The cameras under their keys, `cam0` first; those without a place have none."""
+    cameras: list[CameraFigures] = []
+    place: np.ndarray | None = None
+    for key, entry in chain.items():
+        before, place = place, None
+        if entry.T_cam_imu is not None:
+            place = np.array(entry.T_cam_imu, float)
+        elif entry.T_imu_cam is not None:
+            place = poses.inverse(poses.pose_from_matrix(entry.T_imu_cam))
+        elif entry.T_cn_cnm1 is not None and before is not None:
+            step = poses.pose_from_matrix(entry.T_cn_cnm1)
+            place = poses.compose(step, poses.pose_as_read(before))
+        cameras.append(entry.figures(key, place))
+    return cameras
+
+
+def require_places(path: Path, cameras: Sequence[CameraFigures]) -> None:
+    """Ask where the cameras of a camchain are, under their keys.
 
     Raises:
-        BadInput: a camera whose place is not given.
+        BadInput: one is not placed.
     """
-    Ts: list[np.ndarray] = []
-    for key, entry in chain.items():
-        if entry.T_cam_imu is not None:
-            Ts.append(poses.pose_from_matrix(entry.T_cam_imu))
-        elif entry.T_imu_cam is not None:
-            Ts.append(poses.inverse(poses.pose_from_matrix(entry.T_imu_cam)))
-        elif entry.T_cn_cnm1 is not None and Ts:
-            Ts.append(poses.compose(poses.pose_from_matrix(entry.T_cn_cnm1), Ts[-1]))
-        else:
+    for camera in cameras:
+        if camera.T_camera_vehicle is None:
             problem = "missing: where is this camera on the vehicle (imu := vehicle)?"
-            raise BadInput(at(path, key, "T_cam_imu"), problem)
-    return Ts
+            raise BadInput(at(path, camera.name, "T_cam_imu"), problem)
+
+
+def names_by_topic(chain: dict[str, KalibrCamera]) -> list[str]:
+    """What the cameras are called after `rostopic`, else their keys.
+
+    `/front/image_raw` is of the camera `front`; another topic is the name itself.
+    """
+    names = [
+        _name_of(entry.rostopic) if entry.rostopic and entry.rostopic.isprintable() else key
+        for key, entry in chain.items()
+    ]
+    return names if len(set(names)) == len(names) else list(chain)
+
+
+def camchain_left_out(data: dict[str, Any], chain: dict[str, KalibrCamera]) -> list[str]:
+    """The keys that are not read and say something."""
+    told = unread(data, list(chain))
+    read = set(KalibrCamera.model_fields) - {"tagtopic", "rig_body"}
+    for key, camera in zip(chain, camchain_figures(chain), strict=True):
+        unplaced = {"T_cn_cnm1"} if camera.T_camera_vehicle is None else set()
+        told += unread(data[key], sorted(read - unplaced), f"{key}.")
+    return told
+
+
+def camchain_text(cameras: Sequence[CameraFigures]) -> str:
+    """The cameras as a camchain. A camera without a place may be in it alone.
+
+    Raises:
+        BadInput: a camera with k3, which Kalibr does not know, or one of several without a place.
+    """
+    data: dict[str, Any] = {}
+    Ts: list[np.ndarray] = []
+    for index, camera in enumerate(cameras):
+        where = f"--to kalibr: {camera.name}"
+        entry: dict[str, Any] = {"cam_overlaps": [], "camera_model": "pinhole"}
+        if camera.T_camera_vehicle is not None:
+            Ts.append(poses.matrix_as_read(camera.T_camera_vehicle))
+            entry["T_cam_imu"] = Ts[-1].tolist()
+        elif len(cameras) > 1:
+            raise BadInput(where, "has no place on the vehicle: write T_cam_imu into the source")
+        if index:
+            entry["T_cn_cnm1"] = (
+                Ts[-1] @ poses.matrix(poses.inverse(poses.pose_from_matrix(Ts[-2])))
+            ).tolist()
+        coefficients = list(camera.distortion)
+        if camera.lens == "radtan" and coefficients.pop():
+            raise BadInput(
+                f"{where}.distortion",
+                "has k3, and Kalibr's radtan is k1 k2 p1 p2: calibrate again without k3",
+            )
+        data[f"cam{index}"] = entry | {
+            "distortion_coeffs": coefficients,
+            "distortion_model": camera.lens,
+            "intrinsics": [*camera.focal_px, *camera.center_px],
+            "resolution": list(camera.image_size_px),
+            "rostopic": _topic_of(where, camera.name),
+        }
+    return yaml_text(data)
+
+
+def _name_of(topic: str) -> str:
+    of_camera = _TOPIC.fullmatch(topic)
+    return of_camera[1] if of_camera else topic
+
+
+def _topic_of(where: str, name: str) -> str:
+    topic = name if name.startswith("/") else f"/{name}/image_raw"
+    if _name_of(topic) != name:
+        raise BadInput(where, "has a name that stands for a topic of another camera: rename it")
+    return topic

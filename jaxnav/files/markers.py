@@ -10,6 +10,7 @@ Instead of the corners, `T_world_marker` (4x4 or `{wxyz, xyz_m}`): x right, y up
 reader.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,14 +20,23 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from jaxnav.files import poses
+from jaxnav.files.figures import MarkerFigures
+from jaxnav.files.provenance import Calibrated
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import plain_pose, pose_array, yaml_text
+from jaxnav.files.rigs import plain_pose, with_provenance, written_pose
 from jaxnav.files.validation import Count, Entry, Point, Pose, Positive, Text, validate
-from jaxnav.files.writing import atomic_write
+from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
 
 # A corner may lie this far from the best square, as a part of the side: a tape measure's error.
 _MAX_CORNER_ERROR = 0.03
+
+
+class MarkerSigma(Entry):
+    """One standard deviation of a marker's place, as far as it was calibrated."""
+
+    position_m: Point  # along the axes of the world
+    rotation_deg: Point  # about the axes of the world
 
 
 class MarkerEntry(Entry):
@@ -37,6 +47,7 @@ class MarkerEntry(Entry):
     size_m: Positive
     corners_world_m: Annotated[list[Point], Field(min_length=4, max_length=4)] | None = None
     T_world_marker: Pose | None = None
+    sigma: MarkerSigma | None = None
 
     @field_validator("family")
     @classmethod
@@ -66,18 +77,25 @@ class MarkerEntry(Entry):
             raise ValueError("needs exactly one of corners_world_m, T_world_marker")
         return self
 
+    def figures(self) -> MarkerFigures:
+        """The marker, with the numbers of the file."""
+        if self.corners_world_m is not None:
+            T_world_marker = fit_square(np.array(self.corners_world_m), self.size_m)
+        else:
+            assert self.T_world_marker is not None  # _placed_once
+            T_world_marker = written_pose(self.T_world_marker)
+        return MarkerFigures(self.id, self.family, float(self.size_m), T_world_marker)
+
     def pose(self) -> np.ndarray:
         """(7,) wxyz_xyz of the marker in the world."""
-        if self.corners_world_m is not None:
-            return fit_square(np.array(self.corners_world_m), self.size_m)
-        assert self.T_world_marker is not None  # _placed_once
-        return pose_array(self.T_world_marker)
+        return poses.pose_as_read(self.figures().T_world_marker)
 
 
 class MarkerFile(Entry):
     """A map file."""
 
     markers: Annotated[list[MarkerEntry], Field(min_length=1, max_length=4096)]
+    calibrated: Calibrated | None = None
 
     @field_validator("markers")
     @classmethod
@@ -122,27 +140,69 @@ def marker_map(
     )
 
 
-def save_markers(path: str | Path, markers: MarkerMap) -> None:
+def save_markers(
+    path: str | Path,
+    markers: MarkerMap,
+    calibrated: Calibrated | None = None,
+    sigmas: Sequence[MarkerSigma | None] | None = None,
+) -> None:
     """Write a map; `load_markers` gives back the same numbers, bit for bit.
+
+    Args:
+        calibrated: where its figures come from.
+        sigmas: how sure they are, one entry a marker; None where a place was given.
 
     Raises:
         BadInput: the file can't be written.
     """
-    atomic_write(path, yaml_text(marker_data(markers)))
+    data = marker_data(markers)
+    for entry, sigma in zip(data["markers"], sigmas or (), strict=bool(sigmas)):
+        if sigma is not None:
+            entry["sigma"] = sigma.model_dump()
+    atomic_write(path, yaml_text(with_provenance(data, calibrated)))
 
 
 def marker_data(markers: MarkerMap) -> dict[str, Any]:
     """What a file of the map holds, in plain values, all numbers bit for bit; see `MarkerFile`."""
+    return figures_data(
+        [
+            MarkerFigures(
+                id=marker_id,
+                family=family,
+                size_m=float(markers.size_m[index]),
+                T_world_marker=np.asarray(markers.Ts_world_marker.wxyz_xyz[index], float),
+            )
+            for index, (marker_id, family) in enumerate(
+                zip(markers.ids, markers.families, strict=True)
+            )
+        ]
+    )
+
+
+def figures_data(markers: Sequence[MarkerFigures]) -> dict[str, Any]:
+    """What a file of these markers holds, in plain values."""
     entries: list[dict[str, Any]] = [
         {
-            "id": marker_id,
-            "family": family,
-            "size_m": float(markers.size_m[index]),
-            "T_world_marker": plain_pose(markers.Ts_world_marker.wxyz_xyz[index]),
+            "id": marker.id,
+            "family": marker.family,
+            "size_m": marker.size_m,
+            "T_world_marker": plain_pose(marker.T_world_marker),
         }
-        for index, (marker_id, family) in enumerate(zip(markers.ids, markers.families, strict=True))
+        for marker in markers
     ]
     return {"markers": entries}
+
+
+def markers_text(markers: Sequence[MarkerFigures]) -> str:
+    """The markers as a map file."""
+    return yaml_text(figures_data(markers))
+
+
+def markers_left_out(file: MarkerFile) -> list[str]:
+    """What a map file says beside its figures."""
+    told = ["calibrated"] if file.calibrated else []
+    sigmas = sum(entry.sigma is not None for entry in file.markers)
+    return told + ([f"sigma (of {sigmas} markers)"] if sigmas else [])
 
 
 def fit_square(corners_m: np.ndarray, size_m: float) -> np.ndarray:

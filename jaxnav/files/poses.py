@@ -1,8 +1,10 @@
 """Rigid transforms as files hold them, in NumPy's float64 whatever JAX's precision is.
 
-A pose is the (7,) array of jaxlie: quaternion w x y z, then translation in m.
+A pose is the (7,) array of jaxlie: quaternion w x y z, then translation in m. A pose as it is
+written is that or a 4x4, with the numbers of the file: not yet rounded, repaired or normalised.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -72,11 +74,37 @@ def pose_from_matrix(T: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
     return np.concatenate([row / np.linalg.norm(row), T[:3, 3]])
 
 
-def pose_from_quaternion(wxyz: Sequence[float], xyz_m: Sequence[float]) -> np.ndarray:
+def pose_from_quaternion(
+    wxyz: Sequence[float] | np.ndarray, xyz_m: Sequence[float] | np.ndarray
+) -> np.ndarray:
     """(7,); normalised only if the length is off by more than float32 rounds, exact otherwise."""
     q = np.asarray(wxyz, float)
     length = np.linalg.norm(q)
     return np.concatenate([q if abs(length - 1) < 1e-6 else q / length, np.asarray(xyz_m, float)])
+
+
+def pose_as_read(written: np.ndarray) -> np.ndarray:
+    """(7,) of a pose as it is written, (7,) or (4, 4)."""
+    if written.shape == (4, 4):
+        return pose_from_matrix(written)
+    return pose_from_quaternion(written[:4], written[4:])
+
+
+def matrix_as_read(written: np.ndarray) -> np.ndarray:
+    """4x4 of a pose as it is written, (7,) or (4, 4)."""
+    return written if written.shape == (4, 4) else matrix(written)
+
+
+def quaternion_product(p: Sequence[float], q: Sequence[float]) -> list[float]:
+    """The quaternion p q, wxyz, every number rounded once where one factor holds halves alone."""
+    pw, px, py, pz = p
+    qw, qx, qy, qz = q
+    return [
+        math.fsum((pw * qw, -px * qx, -py * qy, -pz * qz)),
+        math.fsum((pw * qx, px * qw, py * qz, -pz * qy)),
+        math.fsum((pw * qy, -px * qz, py * qw, pz * qx)),
+        math.fsum((pw * qz, px * qy, -py * qx, pz * qw)),
+    ]
 
 
 def pose_from_rotation_vector(rotation_rad: Sequence[float], xyz_m: Sequence[float]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 YAML is read with the scalars of YAML 1.2: `yes` is a word, `010` is ten and `1e-5` is a number.
 Sizes and depths are bounded, duplicate keys and aliases are refused, and OpenCV's matrices
-(`!!opencv-matrix`) are read as the mappings they are.
+(`!!opencv-matrix`, of 5 also `!!opencv-nd-matrix`) are read as the mappings they are.
 """
 
 import json
@@ -164,7 +164,8 @@ for _name, _pattern, _first, _construct in (
 ):
     _Loader.add_implicit_resolver(_TAG + _name, re.compile(_pattern), _first)
     _Loader.add_constructor(_TAG + _name, _scalar(_construct))
-_Loader.add_constructor(f"{_TAG}opencv-matrix", _matrix)
+for _name in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(_TAG + _name, _matrix)
 
 
 def _kind(value: Any) -> str:

@@ -11,24 +11,32 @@
         yaw_deg: 0.0                     # elevation_deg (up) and roll_deg (clockwise from behind)
 
 The place of a camera may also be `T_vehicle_camera` or its inverse `T_camera_vehicle`, each
-either 4x4 or `{wxyz: [...], xyz_m: [...]}`.
+either 4x4 or `{wxyz: [...], xyz_m: [...]}`. What was calibrated may say how sure it is (`sigma`,
+of a camera) and where it comes from (`calibrated`, of the file, see `jaxnav.files.provenance`).
 """
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
-import yaml
 from pydantic import Field, field_validator, model_validator
 
 from jaxnav.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
+from jaxnav.files.figures import (
+    CameraFigures,
+    Lens,
+    figures_of_rig,
+    rig_from_figures,
+)
+from jaxnav.files.provenance import Calibrated
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import (
+    NAME_PATTERN,
     Entry,
     ImageSize,
     Name,
@@ -40,10 +48,18 @@ from jaxnav.files.validation import (
     QuaternionPose,
     validate,
 )
-from jaxnav.files.writing import atomic_write
+from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.rig import CameraRig
 
-Lens = Literal["none", "radtan", "equidistant"]
+
+class CameraSigma(Entry):
+    """One standard deviation of a camera's figures, as far as they were calibrated."""
+
+    focal_px: Pair | None = None
+    center_px: Pair | None = None
+    distortion: list[Number] | None = None
+    position_m: Point | None = None  # of the camera, along the axes of the vehicle
+    rotation_deg: Point | None = None  # of the camera, about the axes of the vehicle
 
 
 class CameraEntry(Entry):
@@ -61,6 +77,7 @@ class CameraEntry(Entry):
     yaw_deg: Number | None = None
     elevation_deg: Number | None = None
     roll_deg: Number | None = None
+    sigma: CameraSigma | None = None
 
     @field_validator("distortion")
     @classmethod
@@ -89,28 +106,38 @@ class CameraEntry(Entry):
             raise ValueError("position_m needs yaw_deg (0 looks forward, 90 to the left)")
         return self
 
+    def figures(self) -> CameraFigures:
+        """The camera, with the numbers of the file."""
+        if self.T_camera_vehicle is not None:
+            T_camera_vehicle = written_pose(self.T_camera_vehicle)
+        elif self.T_vehicle_camera is not None:
+            T_vehicle_camera = poses.pose_as_read(written_pose(self.T_vehicle_camera))
+            T_camera_vehicle = poses.inverse(T_vehicle_camera)
+        else:
+            assert self.position_m is not None  # _placed_once
+            angles_deg = (self.yaw_deg or 0.0, self.elevation_deg or 0.0, self.roll_deg or 0.0)
+            T_camera_vehicle = place(self.position_m, angles_deg)
+        pinhole_px = [*self.focal_px, *self.center_px]
+        return CameraFigures.create(
+            self.name, self.lens, pinhole_px, self.distortion, self.image_size_px, T_camera_vehicle
+        )
+
     def camera(self) -> Camera:
         """The intrinsic part."""
-        return Camera.create(self.focal_px, self.center_px, self.lens, self.distortion)
+        return self.figures().camera()
 
     def T_camera_vehicle_pose(self) -> np.ndarray:
         """(7,) wxyz_xyz of the vehicle in the camera."""
-        if self.T_camera_vehicle is not None:
-            return pose_array(self.T_camera_vehicle)
-        if self.T_vehicle_camera is not None:
-            return poses.inverse(pose_array(self.T_vehicle_camera))
-        T_vehicle_camera = np.eye(4)
-        T_vehicle_camera[:3, :3] = poses.looking(
-            self.yaw_deg or 0.0, self.elevation_deg or 0.0, self.roll_deg or 0.0
-        )
-        T_vehicle_camera[:3, 3] = self.position_m
-        return poses.inverse(poses.pose_from_matrix(T_vehicle_camera))
+        written = self.figures().T_camera_vehicle
+        assert written is not None
+        return poses.pose_as_read(written)
 
 
 class RigFile(Entry):
     """A rig file."""
 
     cameras: Annotated[list[CameraEntry], Field(min_length=1, max_length=64)]
+    calibrated: Calibrated | None = None
 
     @field_validator("cameras")
     @classmethod
@@ -123,12 +150,7 @@ class RigFile(Entry):
 
     def rig(self) -> CameraRig:
         """The rig, in the process's precision."""
-        return CameraRig.create(
-            [entry.camera() for entry in self.cameras],
-            [to_se3(entry.T_camera_vehicle_pose()) for entry in self.cameras],
-            [entry.name for entry in self.cameras],
-            [(entry.image_size_px[0], entry.image_size_px[1]) for entry in self.cameras],
-        )
+        return rig_from_figures([entry.figures() for entry in self.cameras])
 
 
 def load_rig(path: str | Path) -> CameraRig:
@@ -143,66 +165,114 @@ def load_rig(path: str | Path) -> CameraRig:
         return validate(RigFile, data, path).rig()
     if kalibr.is_camchain(data):
         chain = kalibr.camchain(path, data)
-        return CameraRig.create(
-            [entry.camera() for entry in chain.values()],
-            [to_se3(pose) for pose in kalibr.Ts_camera_imu(path, chain)],
-            [entry.tagtopic or name for name, entry in chain.items()],
-            [(entry.resolution[0], entry.resolution[1]) for entry in chain.values()],
+        cameras = kalibr.camchain_figures(chain)
+        kalibr.require_places(path, cameras)
+        return rig_from_figures(
+            [
+                replace(camera, name=entry.tagtopic or camera.name)
+                for camera, entry in zip(cameras, chain.values(), strict=True)
+            ]
         )
     raise BadInput(path, "is neither a rig (`cameras:`) nor a Kalibr camchain (`cam0:`)")
 
 
-def save_rig(path: str | Path, rig: CameraRig) -> None:
+def save_rig(
+    path: str | Path,
+    rig: CameraRig,
+    calibrated: Calibrated | None = None,
+    sigmas: Sequence[CameraSigma] | None = None,
+) -> None:
     """Write a rig in jaxnav's own YAML; `load_rig` gives back the same numbers, bit for bit.
+
+    Args:
+        calibrated: where its figures come from.
+        sigmas: how sure they are, one entry a camera.
 
     Raises:
         BadInput: the file can't be written.
     """
-    atomic_write(path, yaml_text(rig_data(rig)))
+    data = rig_data(rig)
+    for entry, sigma in zip(data["cameras"], sigmas or (), strict=bool(sigmas)):
+        entry["sigma"] = sigma.model_dump(exclude_none=True)
+    atomic_write(path, yaml_text(with_provenance(data, calibrated)))
+
+
+def with_provenance(data: dict[str, Any], calibrated: Calibrated | None) -> dict[str, Any]:
+    """What a file holds, where it comes from first."""
+    return data if calibrated is None else {"calibrated": calibrated.model_dump()} | data
 
 
 def rig_data(rig: CameraRig) -> dict[str, Any]:
     """What a file of the rig holds, in plain values, all numbers bit for bit; see `RigFile`."""
+    return camera_data(figures_of_rig(rig))
+
+
+def camera_data(cameras: Sequence[CameraFigures]) -> dict[str, Any]:
+    """What a rig file of these cameras holds, in plain values; all of them must have a place."""
     entries: list[dict[str, Any]] = []
-    for index, name in enumerate(rig.names):
-        camera = rig.camera(index)
-        lens = rig.cameras.lenses[int(camera.lens_index)]
+    for camera in cameras:
+        assert camera.T_camera_vehicle is not None
         entries.append(
             {
-                "name": name,
-                "lens": lens,
-                "focal_px": plain(camera.focal_px),
-                "center_px": plain(camera.center_px),
-                "distortion": plain(camera.distortion[: LENS_COEFFICIENTS[lens]]),
-                "image_size_px": list(rig.image_sizes_px[index]),
-                "T_camera_vehicle": plain_pose(rig.Ts_camera_vehicle.wxyz_xyz[index]),
+                "name": camera.name,
+                "lens": camera.lens,
+                "focal_px": list(camera.focal_px),
+                "center_px": list(camera.center_px),
+                "distortion": list(camera.distortion),
+                "image_size_px": list(camera.image_size_px),
+                "T_camera_vehicle": plain_pose(camera.T_camera_vehicle),
             }
         )
     return {"cameras": entries}
 
 
-def pose_array(pose: QuaternionPose | Sequence[Sequence[float]]) -> np.ndarray:
-    """(7,) wxyz_xyz of a pose in either of its forms."""
+def rig_text(cameras: Sequence[CameraFigures]) -> str:
+    """The cameras as a rig file.
+
+    Raises:
+        BadInput: one has no place, or a name that a rig can't hold.
+    """
+    for camera in cameras:
+        where = f"--to jaxnav: {camera.name}"
+        if camera.T_camera_vehicle is None:
+            problem = "has no place on the vehicle: give --position-m and --yaw-deg"
+            if len(cameras) > 1:
+                problem = "has no place on the vehicle: write T_cam_imu into the source"
+            raise BadInput(where, problem)
+        if not re.match(NAME_PATTERN, camera.name):
+            raise BadInput(where, "can't be a camera's name (a letter first): give --camera-name")
+    return yaml_text(camera_data(cameras))
+
+
+def rig_left_out(file: RigFile) -> list[str]:
+    """What a rig file says beside its figures."""
+    told = ["calibrated"] if file.calibrated else []
+    return told + [f"cameras.{entry.name}.sigma" for entry in file.cameras if entry.sigma]
+
+
+def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> np.ndarray:
+    """(7,) wxyz_xyz of the vehicle in a camera at that place, which looks there.
+
+    Args:
+        position_m: of the camera in the vehicle.
+        angles_deg: yaw, elevation and roll, see `poses.looking`.
+    """
+    T_vehicle_camera = np.eye(4)
+    T_vehicle_camera[:3, :3] = poses.looking(*angles_deg)
+    T_vehicle_camera[:3, 3] = position_m
+    return poses.inverse(poses.pose_from_matrix(T_vehicle_camera))
+
+
+def written_pose(pose: QuaternionPose | Sequence[Sequence[float]]) -> np.ndarray:
+    """A pose with the numbers of the file, (7,) wxyz_xyz or (4, 4)."""
     if isinstance(pose, QuaternionPose):
-        return poses.pose_from_quaternion(pose.wxyz, pose.xyz_m)
-    return poses.pose_from_matrix(pose)
+        return np.array([*pose.wxyz, *pose.xyz_m], float)
+    return np.array(pose, float)
 
 
-def plain_pose(wxyz_xyz: Any) -> dict[str, list[float]]:
+def plain_pose(written: np.ndarray) -> dict[str, list[float]] | list[list[float]]:
     """A pose as we write it."""
-    return {"wxyz": plain(wxyz_xyz[:4]), "xyz_m": plain(wxyz_xyz[4:])}
-
-
-def plain(values: Any) -> list[float]:
-    """Numbers for YAML."""
-    return [float(value) for value in np.asarray(values)]
-
-
-def yaml_text(data: dict[str, Any]) -> str:
-    """YAML with lists of numbers on one line each."""
-    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
-
-
-def to_se3(pose: np.ndarray) -> jaxlie.SE3:
-    """A pose in the process's precision."""
-    return jaxlie.SE3(jnp.asarray(pose, float))
+    if written.shape == (4, 4):
+        rows: list[list[float]] = written.tolist()
+        return rows
+    return {"wxyz": written[:4].tolist(), "xyz_m": written[4:].tolist()}

@@ -14,14 +14,13 @@ with `bottom_left`; one made for OpenCV's, which is what jaxnav's own detectors 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
+from jaxnav.conventions import FirstCorner
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import Entry, Name, Positive, validate
-
-FirstCorner = Literal["bottom_left", "top_right"]
 
 
 class TopicsFile(Entry):

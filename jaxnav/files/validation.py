@@ -48,7 +48,8 @@ Pixels = Annotated[int, Field(strict=True, ge=1, le=65536)]
 Count = Annotated[int, Field(strict=True, ge=0, le=2**31)]
 Text = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 # Starts like a word, so that no YAML reader takes it for a number or for true.
-Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z_/][\w/.\-]{0,99}$")]
+NAME_PATTERN = r"^[A-Za-z_/][\w/.\-]{0,99}$"
+Name = Annotated[str, Field(strict=True, pattern=NAME_PATTERN)]
 
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]

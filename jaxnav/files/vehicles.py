@@ -6,18 +6,26 @@ steering_rate_limit_radps: 5.0         waypoint_radius_m: 0.15
 throttle_limit: 0.3
 speed_per_throttle_mps: 10.0
 speed_time_constant_s: 0.3
+
+A calibrated vehicle also says how its sensors are off: true speed = `speed_scale` * the speed
+read, true steering = `steering_gain` * the angle read + `steering_offset_rad`, and a camera's stamp
+is `camera_delay_s` later than the odometer's of the same instant. Left out, they are not.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from jaxnav.bicycle import Vehicle
+from jaxnav.files.provenance import Calibrated
 from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import with_provenance, yaml_text
 from jaxnav.files.validation import Entry, Number, Pair, Positive, validate
+from jaxnav.files.writing import atomic_write
 
 
 class VehicleFile(Entry):
@@ -29,10 +37,25 @@ class VehicleFile(Entry):
     speed_per_throttle_mps: Positive
     speed_time_constant_s: Positive
     steering_rate_limit_radps: Positive | None = None
+    speed_scale: Annotated[Positive, Field(ge=0.1, le=10)] = 1.0
+    steering_gain: Annotated[Positive, Field(ge=0.1, le=10)] = 1.0
+    steering_offset_rad: Annotated[Number, Field(ge=-0.5, le=0.5)] = 0.0
+    camera_delay_s: Annotated[Number, Field(ge=-0.5, le=0.5)] = 0.0
+    calibrated: Calibrated | None = None
+    sigma: dict[str, Positive] = Field(default_factory=dict)  # of the keys above, by their names
 
     def vehicle(self) -> Vehicle:
         """The vehicle, in the process's precision."""
-        return Vehicle.create(**self.model_dump(exclude_none=True))
+        return Vehicle.create(**self.model_dump(exclude={"calibrated", "sigma"}, exclude_none=True))
+
+
+_FIGURES = [name for name in VehicleFile.model_fields if name not in ("calibrated", "sigma")]
+CORRECTIONS = {
+    "speed_scale": 1.0,
+    "steering_gain": 1.0,
+    "steering_offset_rad": 0.0,
+    "camera_delay_s": 0.0,
+}  # and where they correct nothing
 
 
 class StartEntry(Entry):
@@ -72,7 +95,30 @@ def load_vehicle(path: str | Path) -> Vehicle:
 
 def vehicle_data(vehicle: Vehicle) -> dict[str, float]:
     """What a file of the vehicle holds, all numbers bit for bit; see `VehicleFile`."""
-    return {name: float(getattr(vehicle, name)) for name in VehicleFile.model_fields}
+    data = {name: float(getattr(vehicle, name)) for name in _FIGURES}
+    # Without those that correct nothing any version of the program reads it.
+    return {name: v for name, v in data.items() if CORRECTIONS.get(name) != v}
+
+
+def save_vehicle(
+    path: str | Path,
+    vehicle: Vehicle,
+    calibrated: Calibrated | None = None,
+    sigma: Mapping[str, float] | None = None,
+) -> None:
+    """Write a vehicle; `load_vehicle` gives back the same numbers, bit for bit.
+
+    Args:
+        calibrated: where its figures come from.
+        sigma: how sure they are, by the names of their keys.
+
+    Raises:
+        BadInput: the file can't be written.
+    """
+    data: dict[str, Any] = dict(vehicle_data(vehicle))
+    if sigma:
+        data["sigma"] = {name: float(value) for name, value in sigma.items()}
+    atomic_write(path, yaml_text(with_provenance(data, calibrated)))
 
 
 def load_route(path: str | Path) -> Route:

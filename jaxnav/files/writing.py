@@ -4,12 +4,13 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from jaxnav.errors import BadInput
 
@@ -47,6 +48,17 @@ def atomic_write(path: str | Path, content: str | bytes) -> None:
     raw = content.encode() if isinstance(content, str) else content
     with atomic_path(path) as beside:
         beside.write_bytes(raw)
+
+
+def atomic_write_all(contents: Mapping[Path, str]) -> None:
+    """Write several files, or none of them.
+
+    Raises:
+        BadInput: one can't be written.
+    """
+    with ExitStack() as files:
+        for path, text in contents.items():
+            files.enter_context(atomic_path(path)).write_bytes(text.encode())
 
 
 def output_folder(path: str | Path) -> Path:
@@ -94,6 +106,25 @@ def write_tum(path: str | Path, stamps_s: np.ndarray, Ts_world_vehicle: np.ndarr
         for stamp, (qw, qx, qy, qz, x, y, z) in zip(stamps_s, Ts, strict=True)
     ]
     atomic_write(path, "".join(lines))
+
+
+def yaml_text(data: dict[str, Any]) -> str:
+    """YAML with lists of numbers on one line each."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=200)
+
+
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+class Quoted(str):
+    """Text in quotes in any case, so that no reader takes it for a number."""
+
+
+_Dumper.add_representer(
+    Quoted, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"')
+)
 
 
 def plain_data(value: Any) -> Any:

@@ -18,9 +18,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from jaxnav.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL, FirstCorner
 from jaxnav.detection.types import Detections
 from jaxnav.files.images import decoded_image
-from jaxnav.files.topics import FirstCorner
 from jaxnav.runtime.interfaces import Odometry
 
 APRILTAG_ROS = "apriltag_msgs/msg/AprilTagDetectionArray"
@@ -33,12 +33,6 @@ CAMERA_TYPES = (APRILTAG_ROS, TAGSLAM, IMAGE, COMPRESSED)
 ODOMETRY_TYPES = (NAV_ODOMETRY, ACKERMANN)
 
 STANDSTILL_MPS = 0.02  # below it noise in the yaw rate makes any steering angle
-_PIXEL_EDGE_PX = 0.5  # apriltag_ros counts from the image's edge, not from a pixel's centre
-# Counter-clockwise from the first corner -> TL TR BR BL.
-_TL_TR_BR_BL: dict[FirstCorner, list[int]] = {
-    "bottom_left": [3, 2, 1, 0],
-    "top_right": [1, 0, 3, 2],
-}
 # Name in ROS -> channels, and OpenCV's conversion to grey. OpenCV names a Bayer pattern after its
 # second row and column.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
@@ -86,8 +80,8 @@ def detections(
     ids = [int(tag.id) for tag in tags]
     return Detections(
         ids=np.array(ids, int),
-        corners_px=corners_px[:, _TL_TR_BR_BL[first_corner]]
-        - (_PIXEL_EDGE_PX if kind == APRILTAG_ROS else 0.0),
+        corners_px=corners_px[:, TL_TR_BR_BL[first_corner]]
+        - (APRILTAG_PIXEL_EDGE_PX if kind == APRILTAG_ROS else 0.0),
         sigma_px=np.full((len(tags), 4), sigma_px),
         refined=np.ones(len(tags), bool),
         families=tuple(

@@ -17,6 +17,11 @@ from jaxnav.arguments import Simulate
 from jaxnav.commands import simulate
 from jaxnav.commands.locate import read_image
 from jaxnav.commands.studies import load_study, summary_of
+from jaxnav.files.cameras import camera_file, named_by_topic
+from jaxnav.files.markers import marker_map
+from jaxnav.files.poses import pose_as_read
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.wpilib import layout_figures, layout_left_out
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
 from jaxnav.runtime.drive_log import read_drive
@@ -40,6 +45,7 @@ from tests.helpers.seed_texts import (
     SIMULATED,
     STUDY,
     TAGSLAM,
+    WPILIB,
 )
 from tests.helpers.simulated import make_setup
 from tests.worlds import qcar, qcar_rig, room_markers
@@ -221,6 +227,27 @@ def _picture(extension: str) -> Callable[[Path], Path]:
     return _written(f"photo{extension}", cv2.imencode(extension, pixels)[1].tobytes())
 
 
+def _layout(path: Path) -> Any:
+    """A WPILib field layout as a map of ours."""
+    data = read_mapping(path)
+    markers = layout_figures(path, data)
+    assert all(isinstance(key, str) for key in layout_left_out(data))
+    return marker_map(
+        np.stack([pose_as_read(marker.T_world_marker) for marker in markers]),
+        [marker.size_m for marker in markers],
+        [marker.id for marker in markers],
+        [marker.family for marker in markers],
+    )
+
+
+def _cameras(path: Path) -> Any:
+    """All cameras of a file, as `jaxnav calibrate convert` takes them."""
+    data = read_mapping(path)
+    file = named_by_topic(path, data, camera_file(path, data))
+    assert all(isinstance(key, str) for key in file.left_out)
+    return [camera.camera() for camera in file.cameras]
+
+
 STRUCTURED = {
     "rig": Loader(_written("rig.yaml", (QCAR / "rig.yaml").read_bytes()), files.load_rig),
     "saved rig": Loader(_saved("rig.yaml", files.save_rig, qcar_rig), files.load_rig),
@@ -240,6 +267,8 @@ STRUCTURED = {
     "Kalibr camera": Loader(
         _written("chain.yaml", KALIBR), lambda path: files.load_camera(path, "cam1")
     ),
+    "Kalibr chain": Loader(_written("chain.yaml", KALIBR), _cameras),
+    "WPILib": Loader(_written("layout.json", WPILIB), _layout),
     "camera_info": Loader(_written("camera.yaml", CAMERA_INFO), files.load_camera),
     "OpenCV": Loader(_written("camera.yml", OPENCV), files.load_camera),
     "PhotonVision": Loader(_written("camera.json", PHOTONVISION), files.load_camera),

@@ -46,6 +46,13 @@ PHOTONVISION = """{"resolution": {"width": 640.0, "height": 480.0},
 "distCoeffs": {"rows": 1, "cols": 5, "type": 6, "data": [0.1, -0.02, 0.001, 0.002, 0.0]},
 "lensmodel": "LENSMODEL_OPENCV", "observations": []}
 """
+WPILIB = """{"tags": [
+{"ID": 1, "pose": {"translation": {"x": 15.079472, "y": 0.245872, "z": 1.355852},
+"rotation": {"quaternion": {"W": 0.5, "X": 0.0, "Y": 0.0, "Z": 0.8660254037844386}}}},
+{"ID": 7, "pose": {"translation": {"x": -0.0381, "y": 5.547868, "z": 1.451102},
+"rotation": {"quaternion": {"W": 1.0, "X": 0.0, "Y": 0.0, "Z": 0.0}}}}
+], "field": {"length": 16.541, "width": 8.211}}
+"""
 AMBIGUITY = """
 trials: 50
 seed: 3

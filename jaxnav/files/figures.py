@@ -1,0 +1,138 @@
+"""The figures of a camera and of a marker as files hold them: float64, whatever JAX's precision is.
+
+Every reader of a camera's file makes these and every writer takes them; a `Camera` or a `CameraRig`
+is made from them and in no other way. So what one format holds and another does too goes from one
+to the other bit for bit.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from jaxnav.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.files import poses
+from jaxnav.rig import CameraRig
+
+Lens = Literal["none", "radtan", "equidistant"]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFigures:
+    """One camera.
+
+    Attributes:
+        lens: see `jaxnav.camera`.
+        focal_px: fx, fy.
+        center_px: cx, cy; the centre of the top-left pixel is (0, 0).
+        distortion: as the lens counts its coefficients, all of them.
+        image_size_px: width, height.
+        T_camera_vehicle: a pose as it is written, (7,) or (4, 4), see `jaxnav.files.poses`; None
+            where the file does not place the camera.
+    """
+
+    name: str
+    lens: Lens
+    focal_px: tuple[float, float]
+    center_px: tuple[float, float]
+    distortion: tuple[float, ...]
+    image_size_px: tuple[int, int]
+    T_camera_vehicle: np.ndarray | None = None
+
+    @staticmethod
+    def create(
+        name: str,
+        lens: Lens,
+        pinhole_px: Sequence[float],
+        distortion: Sequence[float],
+        image_size_px: Sequence[int],
+        T_camera_vehicle: np.ndarray | None = None,
+    ) -> "CameraFigures":
+        """From fx fy cx cy, and from coefficients whose last ones may be missing: they are zero."""
+        fx, fy, cx, cy = (float(value) for value in pinhole_px)
+        missing = LENS_COEFFICIENTS[lens] - len(distortion)
+        return CameraFigures(
+            name=name,
+            lens=lens,
+            focal_px=(fx, fy),
+            center_px=(cx, cy),
+            distortion=(*(float(value) for value in distortion), *(0.0,) * missing),
+            image_size_px=(int(image_size_px[0]), int(image_size_px[1])),
+            T_camera_vehicle=T_camera_vehicle,
+        )
+
+    def camera(self) -> Camera:
+        """The intrinsic part, in the process's precision."""
+        return Camera.create(self.focal_px, self.center_px, self.lens, self.distortion)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerFigures:
+    """One marker of a map.
+
+    Attributes:
+        T_world_marker: a pose as it is written, (7,) or (4, 4).
+    """
+
+    id: int
+    family: str
+    size_m: float
+    T_world_marker: np.ndarray
+
+
+def rig_from_figures(cameras: Sequence[CameraFigures]) -> CameraRig:
+    """The rig, in the process's precision; every camera must have its place."""
+    Ts_camera_vehicle = []
+    for camera in cameras:
+        assert camera.T_camera_vehicle is not None
+        Ts_camera_vehicle.append(to_se3(poses.pose_as_read(camera.T_camera_vehicle)))
+    return CameraRig.create(
+        [camera.camera() for camera in cameras],
+        Ts_camera_vehicle,
+        [camera.name for camera in cameras],
+        [camera.image_size_px for camera in cameras],
+    )
+
+
+def figures_of_rig(rig: CameraRig) -> list[CameraFigures]:
+    """The figures of a rig, bit for bit."""
+    figures = []
+    for index, name in enumerate(rig.names):
+        camera = rig.camera(index)
+        lens: Any = rig.cameras.lenses[int(camera.lens_index)]
+        figures.append(
+            CameraFigures.create(
+                name,
+                lens,
+                np.concatenate([camera.focal_px, camera.center_px]).tolist(),
+                np.asarray(camera.distortion)[: LENS_COEFFICIENTS[lens]].tolist(),
+                rig.image_sizes_px[index],
+                np.asarray(rig.Ts_camera_vehicle.wxyz_xyz[index], float),
+            )
+        )
+    return figures
+
+
+def to_se3(pose: np.ndarray) -> jaxlie.SE3:
+    """A pose in the process's precision."""
+    return jaxlie.SE3(jnp.asarray(pose, float))
+
+
+def unread(data: Mapping[str, Any], known: Sequence[str], prefix: str = "") -> list[str]:
+    """The keys of a file that say something and are not among the known ones."""
+    told = []
+    for key, value in data.items():
+        if key not in known and _says_something(value):
+            count = f" ({len(value)} entries)" if isinstance(value, list) else ""
+            told.append(f"{prefix}{key if key.isprintable() else ascii(key)}{count}")
+    return told
+
+
+def _says_something(value: Any, levels: int = 8) -> bool:
+    inner = list(value.values()) if isinstance(value, Mapping) else value
+    if isinstance(inner, list) and levels:
+        return any(_says_something(item, levels - 1) for item in inner)
+    return bool(inner)

@@ -1,0 +1,87 @@
+"""A camera as OpenCV's functions take it, and most tools write it: K, row by row, and D."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator, model_validator
+
+from jaxnav.errors import BadInput
+from jaxnav.files.figures import CameraFigures, Lens
+from jaxnav.files.validation import Count, ForeignEntry, Number, shown
+
+_COEFFICIENTS = "k1 k2 p1 p2 k3"
+
+
+class MatrixEntry(ForeignEntry):
+    """A matrix as ROS, OpenCV and PhotonVision write it.
+
+    OpenCV 5 writes a vector with `sizes` alone.
+    """
+
+    rows: Count
+    cols: Count
+    data: Annotated[list[Number], Field(max_length=64)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_vector(cls, entry: Any) -> Any:
+        if isinstance(entry, dict) and "rows" not in entry and "sizes" in entry:
+            sizes = entry["sizes"]
+            if not isinstance(sizes, list) or len(sizes) != 1:
+                raise ValueError(f"sizes: must be one number, got {shown(sizes)}")
+            return {**entry, "rows": sizes[0], "cols": 1}
+        return entry
+
+    @field_validator("data")
+    @classmethod
+    def _complete(cls, data: list[float], info: Any) -> list[float]:
+        rows, cols = info.data.get("rows"), info.data.get("cols")
+        if rows is not None and cols is not None and rows * cols != len(data):
+            raise ValueError(f"must have {rows} x {cols} numbers, got {len(data)}")
+        return data
+
+
+def figures_from_matrices(
+    name: str,
+    image_size_px: Sequence[int],
+    matrix: tuple[str, Sequence[float]],
+    distortion: tuple[str, Sequence[float]],
+    lens: Lens,
+) -> CameraFigures:
+    """A camera from K and the lens's coefficients; each with its place in the file.
+
+    Raises:
+        BadInput: not calibrated, skewed, or a lens with more coefficients than ours.
+    """
+    where, K = matrix
+    if len(K) != 9:
+        raise BadInput(where, f"must be 3 x 3, got {len(K)} numbers")
+    if K[0] == 0:
+        raise BadInput(f"{where}[0]", "is 0: this camera has not been calibrated")
+    for index in (0, 4):
+        if K[index] < 1e-6:
+            raise BadInput(f"{where}[{index}]", f"the focal length must be > 0, got {K[index]:g}")
+    if any(abs(K[index]) > 1e-9 * K[0] for index in (1, 3, 6, 7)) or K[8] != 1:
+        raise BadInput(where, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
+    where, coefficients = distortion
+    most = 4 if lens == "equidistant" else 5
+    if lens == "equidistant" and len(coefficients) != 4:
+        raise BadInput(where, f"must be k1 k2 k3 k4 for a fisheye lens, got {len(coefficients)}")
+    if any(coefficients[most:]):
+        raise BadInput(
+            where, f"only {_COEFFICIENTS} are supported, and a later one is not zero: "
+            "calibrate again with five coefficients (plumb_bob, radtan)",
+        )  # fmt: skip
+    pinhole_px = [K[index] for index in (0, 4, 2, 5)]
+    return CameraFigures.create(name, lens, pinhole_px, coefficients[:most], image_size_px)
+
+
+def pinhole_matrix(camera: CameraFigures) -> list[float]:
+    """K, row by row."""
+    (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def coefficients(camera: CameraFigures) -> list[float]:
+    """D: k1 k2 p1 p2 k3, or k1 k2 k3 k4 of a fisheye lens; a camera without lens has zeros."""
+    return list(camera.distortion) if camera.lens != "none" else [0.0] * 5

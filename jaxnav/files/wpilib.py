@@ -1,0 +1,185 @@
+"""WPILib's field layout: AprilTags on a field, JSON.
+
+    {"tags": [{"ID": 7, "pose": {"translation": {"x": 0.0, "y": 5.5, "z": 1.45},
+        "rotation": {"quaternion": {"W": 1.0, "X": 0.0, "Y": 0.0, "Z": 0.0}}}}],
+     "field": {"length": 16.541, "width": 8.211}}
+
+The tags are of one family and one size, and the file says neither. The field's frame, x along its
+length and z up, is our world; how a tag is turned against our marker is told by
+`jaxnav.conventions`.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from jaxnav.conventions import APRILTAG_FAMILIES, WXYZ_TAG_MARKER
+from jaxnav.errors import BadInput
+from jaxnav.files import poses
+from jaxnav.files.figures import MarkerFigures, unread
+from jaxnav.files.validation import Count, ForeignEntry, Number, Positive, at, validate
+from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES
+
+SIZE_M = 0.1651  # the black square of FIRST's tags, 6.5 inches
+FAMILY = "tag36h11"  # FIRST's since 2024
+
+
+class Translation(ForeignEntry):
+    """m."""
+
+    x: Number
+    y: Number
+    z: Number
+
+
+class Quaternion(ForeignEntry):
+    """Of length 1."""
+
+    W: Number
+    X: Number
+    Y: Number
+    Z: Number
+
+    @model_validator(mode="after")
+    def _of_length_1(self) -> "Quaternion":
+        poses.check_quaternion([self.W, self.X, self.Y, self.Z])
+        return self
+
+
+class Rotation(ForeignEntry):
+    """Of the tag on the field."""
+
+    quaternion: Quaternion
+
+
+class TagPose(ForeignEntry):
+    """Of the tag on the field."""
+
+    translation: Translation
+    rotation: Rotation
+
+
+class Tag(ForeignEntry):
+    """One tag."""
+
+    ID: Count
+    pose: TagPose
+
+
+class FieldSize(ForeignEntry):
+    """m."""
+
+    length: Positive
+    width: Positive
+
+
+class Layout(ForeignEntry):
+    """A field layout."""
+
+    tags: Annotated[list[Tag], Field(min_length=1, max_length=4096)]
+    field: FieldSize | None = None
+
+    @field_validator("tags")
+    @classmethod
+    def _each_once(cls, tags: list[Tag]) -> list[Tag]:
+        ids = [tag.ID for tag in tags]
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"tag {next(i for i in ids if ids.count(i) > 1)} is there twice")
+        return tags
+
+
+def is_layout(data: dict[str, Any]) -> bool:
+    """Whether a mapping looks like a field layout."""
+    return "tags" in data
+
+
+def layout_figures(
+    path: Path, data: dict[str, Any], size_m: float = SIZE_M, family: str = FAMILY
+) -> list[MarkerFigures]:
+    """The markers of a field layout.
+
+    Args:
+        size_m: side of the black square of every tag.
+        family: of all tags.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    layout = validate(Layout, data, path)
+    last_id = FAMILY_SIZES[family] - 1
+    markers = []
+    for index, tag in enumerate(layout.tags):
+        marker_id = tag.ID
+        if marker_id > last_id:
+            problem = f"{family} has ids 0 to {last_id}, got {marker_id}"
+            raise BadInput(at(path, f"tags[{index}].ID"), problem)
+        place, turn = tag.pose.translation, tag.pose.rotation.quaternion
+        wxyz = poses.quaternion_product([turn.W, turn.X, turn.Y, turn.Z], WXYZ_TAG_MARKER)
+        T_world_marker = np.array([*wxyz, place.x, place.y, place.z])
+        markers.append(MarkerFigures(marker_id, family, size_m, T_world_marker))
+    return markers
+
+
+def layout_left_out(data: dict[str, Any]) -> list[str]:
+    """The keys that are not read and say something; the size of the field is one."""
+    told = unread(data, ["tags", "field"])
+    if data.get("field"):
+        size = data["field"]
+        told.append(f"field ({size['length']} x {size['width']} m, --field-size-m on the way back)")
+    for index, tag in enumerate(data["tags"]):
+        told += unread(tag, ["ID", "pose"], f"tags[{index}].")
+    return told
+
+
+def layout_text(markers: Sequence[MarkerFigures], field_size_m: tuple[float, float]) -> str:
+    """The map as a field layout.
+
+    Args:
+        field_size_m: length (along x) and width.
+
+    Raises:
+        BadInput: markers of several families or sizes, or of a family that WPILib does not know.
+    """
+    families = sorted({marker.family for marker in markers})
+    if len(families) > 1 or families[0] not in APRILTAG_FAMILIES:
+        raise BadInput(
+            "--to wpilib: family",
+            f"a layout has tags of one AprilTag family ({', '.join(APRILTAG_FAMILIES)}), these are "
+            f"{', '.join(families)}: split the map",
+        )
+    sizes = sorted({marker.size_m for marker in markers})
+    if len(sizes) > 1:
+        told = ", ".join(f"{size_m:g}" for size_m in sizes)
+        problem = f"a layout has tags of one size, these have {told} m: split the map"
+        raise BadInput("--to wpilib: size_m", problem)
+    length, width = field_size_m
+    data = {
+        "tags": [_tag(marker) for marker in markers],
+        "field": {"length": length, "width": width},
+    }
+    return json.dumps(data, indent=2) + "\n"
+
+
+def extent_m(markers: Sequence[MarkerFigures]) -> tuple[float, float]:
+    """(along x, along y) of the smallest box around the origin and all corners of all markers."""
+    corners = [np.zeros((1, 2))]
+    for marker in markers:
+        T_world_marker = poses.matrix(poses.pose_as_read(marker.T_world_marker))
+        corners_marker = marker.size_m / 2 * CORNER_SIGNS
+        corners.append((corners_marker @ T_world_marker[:3, :3].T + T_world_marker[:3, 3])[:, :2])
+    along_x, along_y = np.ptp(np.concatenate(corners), axis=0).tolist()
+    return along_x, along_y
+
+
+def _tag(marker: MarkerFigures) -> dict[str, Any]:
+    written = marker.T_world_marker
+    pose = written if written.shape == (7,) else poses.pose_as_read(written)
+    w, x, y, z = WXYZ_TAG_MARKER
+    W, X, Y, Z = poses.quaternion_product(pose[:4].tolist(), (w, -x, -y, -z))
+    place = dict(zip("xyz", pose[4:].tolist(), strict=True))
+    rotation = {"quaternion": {"W": W, "X": X, "Y": Y, "Z": Z}}
+    return {"ID": marker.id, "pose": {"translation": place, "rotation": rotation}}
