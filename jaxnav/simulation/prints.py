@@ -27,13 +27,13 @@ _AHEAD = np.float32(1e-6)  # the least cosine between a ray and the normal of wh
 
 @dataclass(frozen=True)
 class Print:
-    """A sheet of paper with a marker on it."""
+    """A sheet of paper with a marker, or any other grid of modules, on it."""
 
     T_world_marker: np.ndarray  # (4, 4)
     T_world_sheet: np.ndarray  # (4, 4): x right, y down, z into the paper, from its top left
     module_m: float
     radius_m: float  # of the paper, from the marker's centre
-    sheet: np.ndarray  # (modules, modules) grey
+    sheet: np.ndarray  # (rows, columns) grey
 
 
 def prints_of(scene: Scene) -> list[Print]:
@@ -107,7 +107,7 @@ def _print_region(
     region: tuple[slice, slice],
     instants: np.ndarray,
 ) -> None:
-    lens, modules = view.lens, len(marker.sheet)
+    lens, modules = view.lens, np.array(marker.sheet.shape[::-1])[:, None]
     rows, columns = region
     # The sheet's z axis points into the wall: a camera that sees the print has q_z < 0.
     H_middle, height = _to_modules(marker, view, rows, np.zeros(1))
@@ -197,7 +197,7 @@ def _sample_edges(
     """Print and coverage of N pixels from 64 samples each.
 
     Args:
-        sheet: (modules, modules) grey.
+        sheet: (rows, columns) grey.
         pixels: (2, N) column and row: they shift the lattice.
         centre: (3, N, K) homogeneous places on the sheet of the pixels' centres at K instants.
         along_x, along_y: (3, N) their change a pixel to the right and down.
@@ -219,7 +219,11 @@ def _sample_edges(
     inverse = 1 / np.maximum(W, _AHEAD)
     middle = centre[:, :, centre.shape[2] // 2]
     column, row = (
-        _soft_edges(place * inverse, _change_per_pixel(axis, middle, along_x, along_y))
+        _soft_edges(
+            place * inverse,
+            _change_per_pixel(axis, middle, along_x, along_y),
+            sheet.shape[1 - axis],
+        )
         for axis, place in enumerate((X, Y))
     )
     # Off the sheet there is neither light nor cover.
@@ -238,7 +242,7 @@ def _change_per_pixel(
     return np.hypot(right, down)
 
 
-def _soft_edges(modules: np.ndarray, change_per_pixel: np.ndarray) -> np.ndarray:
+def _soft_edges(modules: np.ndarray, change_per_pixel: np.ndarray, count: int) -> np.ndarray:
     """Where to interpolate linearly in the sheet, for edges as wide as a sample's share of a pixel.
 
     A sample stands for 1 / 64 of the pixel. A linear ramp with the deviation of that cell,
@@ -250,7 +254,7 @@ def _soft_edges(modules: np.ndarray, change_per_pixel: np.ndarray) -> np.ndarray
     np.clip(ramp, -0.5, 0.5, out=ramp)
     boundary += ramp
     # Texel centres of the sheet are its modules' centres; far off the sheet is off the sheet.
-    return np.clip(boundary - np.float32(0.5), -2, 64)
+    return np.clip(boundary - np.float32(0.5), -2, count + 1)
 
 
 def _may_hide(surface: Surface, marker: Print, position: np.ndarray) -> bool:

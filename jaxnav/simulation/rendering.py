@@ -7,7 +7,7 @@ rolling shutter and motion blur need no model of their own. First comes the back
 samples, then the markers are printed onto it with many where it matters.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from jaxnav.errors import BadInput
 from jaxnav.rig import CameraRig
 from jaxnav.simulation.background import render_background
-from jaxnav.simulation.prints import prints_of, render_print
+from jaxnav.simulation.prints import Print, prints_of, render_print
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor, Shutter
 from jaxnav.simulation.viewing import Lens, Motion, View
@@ -40,6 +40,7 @@ class Renderer:
         shutter: Shutter | None = None,
         sensor: Sensor | None = None,
         threads: int | None = None,
+        prints: Sequence[Print] = (),
     ):
         """Prepare the rays of every pixel.
 
@@ -49,6 +50,7 @@ class Renderer:
             shutter: exposure and row time; a still, global shutter when left out.
             sensor: noise, gain and so on.
             threads: how many cameras to render at a time; one a camera when left out.
+            prints: sheets there are beside the scene's markers.
         """
         self.scene, self.rig = scene, rig
         self.shutter = Shutter() if shutter is None else shutter
@@ -58,7 +60,7 @@ class Renderer:
         self._Ts_vehicle_camera = np.linalg.inv(
             np.asarray(rig.Ts_camera_vehicle.as_matrix(), float)
         )
-        self._prints = prints_of(scene)
+        self._prints = [*prints_of(scene), *prints]
 
     def render(
         self, T_world_vehicle_at: PoseAt, stamp_s: float, rng: np.random.Generator

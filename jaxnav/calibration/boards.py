@@ -1,0 +1,247 @@
+"""Calibration boards: what is printed where.
+
+A board lies in the plane z = 0 of its own frame: x right, y up, z towards its reader, the origin
+in the centre of its ink. Four kinds:
+
+    charuco     a chessboard with a marker in every white square (OpenCV's layout since 4.6); its
+                points are the corners between the squares
+    aprilgrid   tags in a grid with black squares between their corners (Kalibr's layout); its
+                points are the corners of the tags
+    chessboard  its points are the corners between the squares
+    marker      one navigation marker; its points are its four corners
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from jaxnav.detection import marker_cells
+from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES
+
+MIN_POINTS = 6  # of a board with saddles: fewer can't tell a wrong one among them
+
+BoardKind = Literal["charuco", "aprilgrid", "chessboard", "marker"]
+
+
+@dataclass(frozen=True)
+class Tag:
+    """One marker of a board.
+
+    Attributes:
+        id: of its family.
+        cells: (n, n), 1 white, 0 black, its black frame included, as a reader of the board sees it.
+        corners_board_m: (4, 2), TL TR BR BL of its black outline, x and y.
+        turns: quarter turns, anticlockwise, from OpenCV's picture of it to this one.
+    """
+
+    id: int
+    cells: np.ndarray
+    corners_board_m: np.ndarray
+    turns: int
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board of one of the four kinds.
+
+    Points are counted row by row from the top left; those of an aprilgrid tag by tag, row by row
+    from the bottom left, each TL TR BR BL; those of a marker TL TR BR BL.
+
+    Attributes:
+        kind: see the module.
+        columns: squares, or tags, side by side; of a marker 1.
+        rows: and one above the other.
+        size_m: the side of a square, or of a tag's black outline.
+        marker_m: of a charuco board, the side of a marker's black outline.
+        spacing: of an aprilgrid, the gap between tags in sides of a tag.
+        family: of its markers, one of `jaxnav.markers.FAMILY_SIZES`.
+        first_id: of its markers, which are numbered on from there.
+        border_cells: how wide the black frame of an aprilgrid's tags is; Kalibr prints 2.
+
+    Raises:
+        ValueError: one line on what can't be.
+    """
+
+    kind: BoardKind
+    columns: int
+    rows: int
+    size_m: float
+    marker_m: float = 0.0
+    spacing: float = 0.0
+    family: str = ""
+    first_id: int = 0
+    border_cells: int = 1
+
+    def __post_init__(self) -> None:
+        if not 1e-4 <= self.size_m <= 100:
+            raise ValueError(f"the size must be from 0.1 mm to 100 m, got {self.size_m:g} m")
+        fewest = {"charuco": 2, "chessboard": 3}.get(self.kind, 1)
+        if not (fewest <= self.columns <= 100 and fewest <= self.rows <= 100):
+            raise ValueError(
+                f"a {self.kind} has {fewest} to 100 columns and rows, "
+                f"got {self.columns} x {self.rows}"
+            )
+        if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
+            raise ValueError(
+                f"a chessboard of {self.columns} x {self.rows} squares looks the same upside down: "
+                f"take an odd and an even number, as {self.columns} x {self.rows - 1}"
+            )
+        if self.kind == "charuco" and not 0 < self.marker_m < self.size_m:
+            raise ValueError(
+                f"the markers must be smaller than the squares ({self.size_m:g} m), "
+                f"got {self.marker_m:g} m"
+            )
+        if self.kind == "aprilgrid" and not 0.05 <= self.spacing <= 1:
+            raise ValueError(
+                f"the spacing must be from 0.05 to 1 sides of a tag, got {self.spacing:g}"
+            )
+        points = self.pattern_columns * self.pattern_rows
+        if self.has_saddles and points < MIN_POINTS:
+            raise ValueError(
+                f"a {self.kind} of {self.columns} x {self.rows} has {points} points, "
+                f"at least {MIN_POINTS} are needed: take more columns or rows"
+            )
+        if self.kind != "chessboard":
+            self._check_markers()
+
+    def _check_markers(self) -> None:
+        if self.family not in FAMILY_SIZES:
+            known = ", ".join(FAMILY_SIZES)
+            raise ValueError(f"unknown family {self.family!r}: expected one of {known}")
+        if self.border_cells not in (1, 2):
+            raise ValueError(f"the frame of a tag is 1 or 2 cells wide, got {self.border_cells}")
+        last, count = self.first_id + self.tag_count - 1, FAMILY_SIZES[self.family]
+        if self.first_id < 0 or last >= count:
+            raise ValueError(
+                f"needs the ids {self.first_id} to {last}, but {self.family} has 0 to {count - 1}: "
+                "take another family or fewer tags"
+            )
+
+    @property
+    def tag_count(self) -> int:
+        """How many markers are on it."""
+        if self.kind == "charuco":
+            return self.columns * self.rows // 2
+        return 0 if self.kind == "chessboard" else self.columns * self.rows
+
+    @property
+    def pitch_m(self) -> float:
+        """From one square, or tag, to the next."""
+        return self.size_m * (1 + self.spacing)
+
+    @property
+    def width_m(self) -> float:
+        """Of its ink, an aprilgrid's corner squares included."""
+        return self.columns * self.pitch_m + self.spacing * self.size_m
+
+    @property
+    def height_m(self) -> float:
+        """Of its ink, an aprilgrid's corner squares included."""
+        return self.rows * self.pitch_m + self.spacing * self.size_m
+
+    @property
+    def has_saddles(self) -> bool:
+        """Whether black squares touch in its points; the corners of a marker stand alone."""
+        return self.kind != "marker"
+
+    @property
+    def pattern_columns(self) -> int:
+        """How many of its points are side by side."""
+        return self.columns - 1 if self.kind in ("charuco", "chessboard") else 2 * self.columns
+
+    @property
+    def pattern_rows(self) -> int:
+        """How many of its points are one above the other."""
+        return self.rows - 1 if self.kind in ("charuco", "chessboard") else 2 * self.rows
+
+    @cached_property
+    def points_board_m(self) -> np.ndarray:
+        """(P, 3), all points, m."""
+        if self.kind in ("charuco", "chessboard"):
+            x = (np.arange(1, self.columns) - self.columns / 2) * self.size_m
+            y = (self.rows / 2 - np.arange(1, self.rows)) * self.size_m
+            xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        else:
+            xy = np.concatenate([tag.corners_board_m for tag in self.tags])
+        return np.column_stack([xy, np.zeros(len(xy))])
+
+    @cached_property
+    def grid(self) -> np.ndarray:
+        """(P, 2) int, column and row of each point among the points, from the top left."""
+        _, columns = np.unique(
+            _rounded(self.points_board_m[:, 0], self.size_m), return_inverse=True
+        )
+        _, rows = np.unique(_rounded(-self.points_board_m[:, 1], self.size_m), return_inverse=True)
+        return np.column_stack([columns, rows])
+
+    @cached_property
+    def tags(self) -> tuple[Tag, ...]:
+        """Its markers, by id."""
+        if self.kind == "chessboard":
+            return ()
+        if self.kind == "charuco":
+            places = [
+                (column, self.rows - 1 - row)
+                for row in range(self.rows)
+                for column in range(self.columns)
+                if (row + column) % 2
+            ]
+        else:
+            places = [(column, row) for row in range(self.rows) for column in range(self.columns)]
+        return tuple(self._tag(self.first_id + index, *place) for index, place in enumerate(places))
+
+    def _tag(self, marker_id: int, column: int, row_from_below: int) -> Tag:
+        side_m = self.marker_m if self.kind == "charuco" else self.size_m
+        centre = np.array(
+            [
+                (column - (self.columns - 1) / 2) * self.pitch_m,
+                (row_from_below - (self.rows - 1) / 2) * self.pitch_m,
+            ]
+        )
+        # Kalibr prints AprilTags as their authors do, OpenCV upside down.
+        turns = 2 if self.kind == "aprilgrid" and self.family.startswith("tag") else 0
+        cells = np.rot90(marker_cells(self.family, marker_id), turns)
+        cells = np.pad(cells, self.border_cells - 1)
+        return Tag(marker_id, cells, centre + side_m / 2 * CORNER_SIGNS[:, :2], turns)
+
+    @cached_property
+    def dark_top_left(self) -> np.ndarray:
+        """(P,) bool, whether a saddle is black at its top left and bottom right."""
+        if self.kind in ("charuco", "chessboard"):
+            return np.asarray(self.grid.sum(axis=1) % 2 == 0)
+        # The corner squares touch a tag's TL and BR from outside, its TR and BL from beside.
+        return np.tile([True, False, True, False], self.tag_count)
+
+    @property
+    def clear_m(self) -> float:
+        """How far around a saddle, along x and y, there is nothing but its four quadrants."""
+        if self.kind == "aprilgrid":
+            frame_m = self.size_m * self.border_cells / len(self.tags[0].cells)
+            return min(frame_m, self.spacing * self.size_m)
+        return self.size_m
+
+    @property
+    def cross_m(self) -> float:
+        """Off both edges of a saddle by more than this there may be other ink."""
+        return (self.size_m - self.marker_m) / 2 if self.kind == "charuco" else self.clear_m
+
+    def __str__(self) -> str:
+        """The board in words, with its sizes in mm."""
+        ids = f"{self.family} {self.first_id}"
+        if self.tag_count > 1:
+            ids += f" to {self.first_id + self.tag_count - 1}"
+        size = f"{1e3 * self.size_m:g} mm"
+        if self.kind == "marker":
+            return f"marker {ids}, {size}"
+        grid = f"{self.kind} {self.columns} x {self.rows}"
+        if self.kind == "chessboard":
+            return f"{grid}, squares {size}"
+        if self.kind == "charuco":
+            return f"{grid}, squares {size}, markers {1e3 * self.marker_m:g} mm, {ids}"
+        return f"{grid}, tags {size}, gap {1e3 * self.spacing * self.size_m:g} mm, {ids}"
+
+
+def _rounded(values_m: np.ndarray, size_m: float) -> np.ndarray:
+    return np.rint(values_m / size_m * 1e4).astype(int)

@@ -1,0 +1,108 @@
+"""A calibration board before a camera, rendered as exactly as markers are."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxnav.camera import Camera
+from jaxnav.markers import MarkerMap
+from jaxnav.rig import CameraRig
+from jaxnav.simulation.prints import Print
+from jaxnav.simulation.rendering import PoseAt, Renderer
+from jaxnav.simulation.scene import (
+    INK_GREY,
+    PAPER_GREY,
+    Scene,
+    Surface,
+    plaster,
+    texture_atlas,
+)
+from jaxnav.simulation.sensor import Sensor, Shutter
+
+_WALL_BEHIND_M = 0.5
+
+
+class BoardRenderer:
+    """Images of one board by one camera, a wall behind it.
+
+    The board's frame is the world's: x right, y up, z towards its reader, the origin in the
+    middle of the sheet.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        image_size_px: tuple[int, int],
+        ink: np.ndarray,
+        module_m: float,
+        sensor: Sensor | None = None,
+        shutter: Shutter | None = None,
+    ):
+        """Prepare the rays of every pixel.
+
+        Args:
+            camera: its lens.
+            image_size_px: width, height.
+            ink: (rows, columns) bool, the modules of the sheet, the top row first.
+            module_m: side of a module.
+            sensor: noise, blur and so on.
+            shutter: exposure and row time; a still, global shutter when left out.
+        """
+        rig = CameraRig.create([camera], [jaxlie.SE3.identity()], ["camera"], [image_size_px])
+        nowhere = jaxlie.SE3(jnp.zeros((0, 7)))
+        T_world_wall = np.eye(4)
+        T_world_wall[2, 3] = -_WALL_BEHIND_M
+        whole_plane = (-np.inf, np.inf, -np.inf, np.inf)
+        atlas = texture_atlas(plaster(np.random.default_rng(0)))
+        wall = Surface(T_world_wall, whole_plane, 128.0, 14.0, 4e-3, atlas)
+        scene = Scene(MarkerMap(nowhere, jnp.zeros(0), (), ()), (wall,), ())
+        sheet = board_print(ink, module_m, np.eye(4))
+        self._renderer = Renderer(scene, rig, shutter, sensor, prints=(sheet,))
+
+    def render(self, T_camera_board: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """The image (H, W) uint8 of a board at rest at the pose (4, 4)."""
+        return self._renderer.render_still(_wxyz_xyz(np.linalg.inv(T_camera_board)), rng)[0]
+
+    def render_moving(self, T_board_camera_at: PoseAt, rng: np.random.Generator) -> np.ndarray:
+        """The image of a camera that moves: see `Renderer.render`, at the stamp 0."""
+        return self._renderer.render(T_board_camera_at, 0.0, rng)[0]
+
+
+def board_print(ink: np.ndarray, module_m: float, T_world_board: np.ndarray) -> Print:
+    """A sheet of modules whose middle is the board's origin, as `Renderer` takes it."""
+    rows, columns = ink.shape
+    half_width_m, half_height_m = columns * module_m / 2, rows * module_m / 2
+    T_board_sheet = np.diag([1.0, -1, -1, 1])
+    T_board_sheet[:2, 3] = -half_width_m, half_height_m
+    return Print(
+        T_world_board,
+        T_world_board @ T_board_sheet,
+        module_m,
+        float(np.hypot(half_width_m, half_height_m)),
+        np.where(ink, INK_GREY, PAPER_GREY).astype(np.float32),
+    )
+
+
+def facing_pose(
+    position_m: Sequence[float], tilt_deg: Sequence[float], roll_deg: float = 0.0
+) -> np.ndarray:
+    """T_camera_board (4, 4) of a board that is turned away from facing the camera squarely.
+
+    Args:
+        position_m: of its middle in the camera's frame.
+        tilt_deg: about its own x (its top comes nearer) and then y.
+        roll_deg: about its normal.
+    """
+    T_camera_board = np.eye(4)
+    turned = Rotation.from_euler("XYZ", [*tilt_deg, roll_deg], degrees=True).as_matrix()
+    T_camera_board[:3, :3] = np.diag([1.0, -1, -1]) @ turned
+    T_camera_board[:3, 3] = position_m
+    return T_camera_board
+
+
+def _wxyz_xyz(T: np.ndarray) -> np.ndarray:
+    quaternion = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+    return np.concatenate([quaternion, T[:3, 3]])
