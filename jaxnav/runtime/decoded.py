@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 from jaxnav.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.conventions import APRILTAG_CORNERS
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
+from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import marker_map
-from jaxnav.files.rigs import to_se3
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.recording import Recording, Rows, assemble
@@ -33,7 +34,6 @@ _REFERENCE_KEYS: dict[str, tuple[tuple[str | int, ...], str]] = {
     "rig_stamp": (("R",), "i"),
     "T_map_rig": (("R", 4, 4), "f"),
 }
-_OBJ_ORDER = [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]  # BL BR TR TL
 
 
 def read_decoded(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -> Recording:
@@ -45,11 +45,45 @@ def read_decoded(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -
     Raises:
         BadInput: one line naming file and key.
     """
+    stored = _checked(path)
+    rows, rig = _rows(path, stored, rig)
+    reference = None
+    if "rig_stamp" in stored:
+        matrices = zip(stored["rig_stamp"], stored["T_map_rig"], strict=True)
+        reference = {
+            int(stamp): _pose(path, f"T_map_rig[{index}]", T)
+            for index, (stamp, T) in enumerate(matrices)
+        }
+    return assemble(
+        path.stem if path.stem != "decoded" else path.resolve().parent.name,
+        rows,
+        rig,
+        markers or _markers(path, stored),
+        reference,
+    )
+
+
+def decoded_rows(path: Path, rig: CameraRig | None) -> tuple[Rows, CameraRig]:
+    """All detections of an .npz, and the cameras that made them.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    return _rows(path, _checked(path), rig)
+
+
+def _checked(path: Path) -> dict[str, np.ndarray]:
     stored = _load(path)
     has_reference = bool(_REFERENCE_KEYS.keys() & stored.keys())
     _check(path, stored, _KEYS | (_REFERENCE_KEYS if has_reference else {}))
-    if "obj_order" in stored and not np.array_equal(stored["obj_order"], _OBJ_ORDER):
+    if "obj_order" in stored and not np.array_equal(stored["obj_order"], APRILTAG_CORNERS):
         raise BadInput(f"{path}: obj_order", "must be (-,-) (+,-) (+,+) (-,+)")
+    return stored
+
+
+def _rows(
+    path: Path, stored: dict[str, np.ndarray], rig: CameraRig | None
+) -> tuple[Rows, CameraRig]:
     cameras = len(stored["cam_names"])
     if stored["cam"].size and not 0 <= stored["cam"].min() <= stored["cam"].max() < cameras:
         raise BadInput(f"{path}: cam", f"must be from 0 to {cameras - 1}")
@@ -63,20 +97,7 @@ def read_decoded(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -
         corners_px=stored["corners_px"].astype(float),
         frame_stamps_ns=np.unique(stamps_ns),
     )
-    reference = None
-    if has_reference:
-        matrices = zip(stored["rig_stamp"], stored["T_map_rig"], strict=True)
-        reference = {
-            int(stamp): _pose(path, f"T_map_rig[{index}]", T)
-            for index, (stamp, T) in enumerate(matrices)
-        }
-    return assemble(
-        path.stem if path.stem != "decoded" else path.resolve().parent.name,
-        rows,
-        rig or _rig(path, stored),
-        markers or _markers(path, stored),
-        reference,
-    )
+    return rows, rig or _rig(path, stored)
 
 
 def _load(path: Path) -> dict[str, np.ndarray]:

@@ -18,11 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxnav.conventions import APRILTAG_FIRST_CORNER, TL_TR_BR_BL
 from jaxnav.errors import BadInput
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
-_TL_TR_BR_BL = [3, 2, 1, 0]  # from BL BR TR TL
+TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER]
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def assemble(
 
     corners_px, visible = np.zeros((*lanes, 4, 2)), np.zeros(lanes, bool)
     at = (frame[used], rows.cameras[used], index[used])
-    corners_px[at] = rows.corners_px[used][:, _TL_TR_BR_BL]
+    corners_px[at] = rows.corners_px[used][:, TO_OURS]
     visible[at] = True
     return Recording(
         name=name,

@@ -7,7 +7,7 @@ from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime import bags
 from jaxnav.runtime.decoded import read_decoded
-from jaxnav.runtime.recording import Recording, Reference, assemble
+from jaxnav.runtime.recording import Recording, Reference, Rows, assemble
 from jaxnav.runtime.tagslam import read_tagslam
 
 __all__ = ["Recording", "Reference", "read_recording"]
@@ -39,15 +39,24 @@ def read_recording(
 
 
 def _read_single_bag(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -> Recording:
+    if rig is not None and markers is None:
+        raise BadInput("--markers-file", f"missing: {path} does not say where its markers are")
+    rows, rig = bag_rows(path, rig)
+    assert markers is not None  # the rig is asked for first
+    return assemble(path.name, rows, rig, markers)
+
+
+def bag_rows(path: Path, rig: CameraRig | None) -> tuple[Rows, CameraRig]:
+    """All detections of a single bag by the cameras of a rig, which are called like its topics.
+
+    Raises:
+        BadInput: one line naming the file, or the flag that is missing.
+    """
     if rig is None:
         raise BadInput("--rig", f"missing: {path} alone does not say what its cameras are")
-    if markers is None:
-        raise BadInput("--markers-file", f"missing: {path} does not say where its markers are")
     bag = bags.read_bag(path)
     topics = [_topic_of(path, bag, name) for name in rig.names]
-    return assemble(
-        path.name, bags.rows_of_topics([bag.detections[t] for t in topics]), rig, markers
-    )
+    return bags.rows_of_topics([bag.detections[t] for t in topics]), rig
 
 
 def _topic_of(path: Path, bag: bags.Bag, camera: str) -> str:

@@ -7,21 +7,21 @@ camera_poses.yaml  poses of the cameras on the rig, where there is no /tf
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
+from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import marker_map
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import to_se3
 from jaxnav.files.validation import Count, ForeignEntry, Number, Positive, at, validate
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime import bags
-from jaxnav.runtime.recording import Recording, assemble
+from jaxnav.runtime.recording import Recording, Rows, assemble
 
 _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 
@@ -85,6 +85,34 @@ def read_tagslam(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -
     Raises:
         BadInput: one line naming file and key.
     """
+    found = _read(path, rig)
+    markers = markers or _markers(path, found.edges)
+    reference = {
+        stamp: _canonical(pose)
+        for (_, child), stamped in found.edges.items() if child == found.body
+        for stamp, pose in stamped.items()
+    }  # fmt: skip
+    return assemble(path.name, found.rows, found.rig, markers, reference or None)
+
+
+def tagslam_rows(path: Path, rig: CameraRig | None) -> tuple[Rows, CameraRig]:
+    """All detections of a TagSLAM folder, and the cameras that made them.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    found = _read(path, rig)
+    return found.rows, found.rig
+
+
+class _Found(NamedTuple):
+    rows: Rows
+    rig: CameraRig
+    edges: "Edges"
+    body: str
+
+
+def _read(path: Path, rig: CameraRig | None) -> _Found:
     files = [file for file in sorted(path.iterdir()) if bags.is_bag(file)]
     names = {file.name for file in files}
     files = [file for file in files if file.name.removesuffix(".bz2") not in names - {file.name}]
@@ -101,13 +129,7 @@ def read_tagslam(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -
     if len(rig) != len(chain):
         problem = f"has {len(rig)} cameras, but {path / 'cameras.yaml'} has {len(chain)}"
         raise BadInput("--rig", problem)
-    markers = markers or _markers(path, edges)
-    reference = {
-        stamp: _canonical(pose)
-        for (_, child), stamped in edges.items() if child == body
-        for stamp, pose in stamped.items()
-    }  # fmt: skip
-    return assemble(path.name, rows, rig, markers, reference or None)
+    return _Found(rows, rig, edges, body)
 
 
 Edges = dict[tuple[str, str], dict[int, tuple[float, ...]]]

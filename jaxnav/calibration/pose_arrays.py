@@ -1,0 +1,21 @@
+"""Many poses at once, as the solver holds them and as matrices."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def wxyz_xyz(Ts: np.ndarray) -> jax.Array:
+    """(n, 4, 4) as (n, 7)."""
+    xyzw = Rotation.from_matrix(Ts[:, :3, :3]).as_quat()
+    return jnp.asarray(np.concatenate([xyzw[:, [3, 0, 1, 2]], Ts[:, :3, 3]], axis=1), float)
+
+
+def matrices(poses: jax.Array | np.ndarray) -> np.ndarray:
+    """(n, 7) as (n, 4, 4)."""
+    array = np.asarray(poses, float)
+    Ts = np.tile(np.eye(4), (len(array), 1, 1))
+    Ts[:, :3, :3] = Rotation.from_quat(array[:, [1, 2, 3, 0]]).as_matrix()
+    Ts[:, :3, 3] = array[:, 4:]
+    return Ts

@@ -1,0 +1,157 @@
+"""What `jaxnav calibrate rig`, `markers` and `check` look at: sightings, and what is known."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jaxnav.calibration.rig_views import RigViews
+from jaxnav.errors import BadInput
+from jaxnav.files import load_markers, load_rig
+from jaxnav.markers import FAMILY_SIZES, MarkerMap
+from jaxnav.rig import CameraRig
+from jaxnav.runtime.sightings import Sightings, read_sightings
+
+_LEAST_SIGHTINGS = 3  # of a marker that is in no map
+_APART_NS = 10**12  # between recordings
+
+MarkerKey = tuple[str, int]  # family, id
+
+
+@dataclass(frozen=True)
+class RigData:
+    """What was seen by whom.
+
+    Attributes:
+        markers: the map that was given, those that nobody saw among them; None where there is none.
+        keys: (M,) of the markers, in the order of `views`.
+        known: T_world_marker (4, 4) of those that are known, by their index.
+        parts: the recordings, and the index of the first frame of each.
+        anchored: whether a file or a recording knew a marker, or one of them was made the world.
+    """
+
+    rig: CameraRig
+    views: RigViews
+    markers: MarkerMap | None
+    keys: tuple[MarkerKey, ...]
+    known: dict[int, np.ndarray]
+    parts: tuple[tuple[Sightings, int], ...]
+    anchored: bool
+
+
+def gathered(
+    recordings: Sequence[Path],
+    rig_file: Path | None,
+    markers_file: Path | None,
+    marker_size_m: float | None,
+    family: str,
+    only_known: bool = False,
+) -> RigData:
+    """All recordings, one after the other.
+
+    Args:
+        only_known: whether markers that are in no map are left out.
+
+    Raises:
+        BadInput: names file or flag.
+    """
+    if family not in FAMILY_SIZES:
+        raise BadInput("--family", f"unknown {family!r}: expected one of {', '.join(FAMILY_SIZES)}")
+    rig = None if rig_file is None else load_rig(rig_file)
+    markers = None if markers_file is None else load_markers(markers_file)
+    parts = [read_sightings(path, rig) for path in recordings]
+    _one_rig(parts, recordings)
+    if markers is None:
+        markers = next((part.markers for part in parts if part.markers is not None), None)
+    seen = Counter(key for part in parts for key in _keys(part, family))
+    keys = tuple(sorted(key for key in seen if _wanted(key, seen[key], markers, only_known)))
+    if not keys:
+        what = "a marker of the map" if only_known else "a marker often enough"
+        raise BadInput(", ".join(map(str, recordings)), f"no camera saw {what}")
+    index_of = {key: index for index, key in enumerate(keys)}
+    known, sizes_m = _known(markers, keys, marker_size_m)
+    anchored = bool(known)
+    if not known:
+        if markers is not None:
+            ids = ", ".join(str(marker_id) for marker_id in markers.ids)
+            problem = f"none of its markers ({ids}) was seen; seen were {_listed(keys)}"
+            raise BadInput(markers_file or "--markers-file", problem)
+        known = {index_of[seen.most_common(1)[0][0]]: np.eye(4)}
+    marker = np.array([index_of.get(key, -1) for part in parts for key in _keys(part, family)], int)
+    used = marker >= 0
+    firsts = np.cumsum([0, *(len(part.stamps_ns) for part in parts)])
+    frame = np.concatenate([part.frame + n for part, n in zip(parts, firsts, strict=False)])
+    views = RigViews(
+        frame=frame[used],
+        camera=np.concatenate([part.camera for part in parts])[used],
+        marker=marker[used],
+        corners_px=np.concatenate([part.corners_px for part in parts])[used],
+        size_m=np.array(sizes_m),
+        marker_ids=tuple(marker_id for _, marker_id in keys),
+        stamps_ns=_one_after_the_other([part.stamps_ns for part in parts]),
+    )
+    return RigData(
+        parts[0].rig,
+        views,
+        markers,
+        keys,
+        known,
+        tuple((part, int(n)) for part, n in zip(parts, firsts, strict=False)),
+        anchored,
+    )
+
+
+def _one_after_the_other(stamps_ns: Sequence[np.ndarray]) -> np.ndarray:
+    """All stamps, increasing: those of the first recording as they are."""
+    together = list(stamps_ns[:1])
+    for stamps in stamps_ns[1:]:
+        before = together[-1]
+        together.append(stamps - stamps[:1] + before[-1:] + _APART_NS)
+    return np.concatenate(together)
+
+
+def _wanted(key: MarkerKey, count: int, markers: MarkerMap | None, only_known: bool) -> bool:
+    if markers is not None and markers.index(key[1], key[0]) is not None:
+        return True
+    # What is seen that rarely is another pattern, taken for a marker.
+    return count >= _LEAST_SIGHTINGS and not only_known
+
+
+def _keys(part: Sightings, family: str) -> list[MarkerKey]:
+    families = part.families or (family,) * len(part.ids)
+    return [(name, int(marker_id)) for name, marker_id in zip(families, part.ids, strict=True)]
+
+
+def _one_rig(parts: Sequence[Sightings], recordings: Sequence[Path]) -> None:
+    for part, path in zip(parts[1:], recordings[1:], strict=True):
+        if part.rig.names != parts[0].rig.names:
+            problem = f"its cameras are not those of {recordings[0]}: give one --rig for all"
+            raise BadInput(path, problem)
+
+
+def _known(
+    markers: MarkerMap | None, keys: Sequence[MarkerKey], marker_size_m: float | None
+) -> tuple[dict[int, np.ndarray], list[float]]:
+    """Places by index, and sizes of all."""
+    known, sizes_m = {}, []
+    given = [] if markers is None else sorted({float(size) for size in markers.size_m})
+    for index, (family, marker_id) in enumerate(keys):
+        place = None if markers is None else markers.index(marker_id, family)
+        if place is not None:
+            assert markers is not None
+            T = markers.Ts_world_marker.as_matrix()[place]
+            known[index] = np.array(T, float)
+            sizes_m.append(float(markers.size_m[place]))
+        elif marker_size_m is not None or len(given) == 1:
+            sizes_m.append(given[0] if marker_size_m is None else marker_size_m)
+        else:
+            problem = f"missing: how large is marker {marker_id} ({family}), which is in no map?"
+            raise BadInput("--marker-size-m", problem)
+    return known, sizes_m
+
+
+def _listed(keys: Sequence[MarkerKey], most: int = 12) -> str:
+    names = [str(marker_id) for _, marker_id in keys[:most]]
+    return ", ".join(names) + (", ..." if len(keys) > most else "")
