@@ -1,0 +1,214 @@
+"""`jaxnav calibrate intrinsics` on images of a rendered board: what it writes, and what it says."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxnav import cli
+from jaxnav.arguments.calibration import CalibrateIntrinsics
+from jaxnav.calibration import lens_comparison
+from jaxnav.calibration.board_sheets import sheet_of
+from jaxnav.calibration.boards import Board
+from jaxnav.calibration.lens_images import calibrate_images
+from jaxnav.calibration.simulated_views import simulated_views
+from jaxnav.commands import calibrate_intrinsics
+from jaxnav.commands.calibration_boards import write_board
+from jaxnav.errors import BadInput
+from jaxnav.files import calib_dir, load_rig
+from jaxnav.files.reading import read_mapping
+from jaxnav.simulation.boards import BoardRenderer
+from jaxnav.simulation.sensor import Sensor
+
+VIEWS = 7  # as few as leave the comparison of lenses out, which compiles long
+QCAR = calib_dir() / "qcar" / "rig.yaml"
+
+
+BOARD = Board("charuco", 7, 6, 0.04, marker_m=0.03, family="4x4_50")
+MARKER = Board("marker", 1, 1, 0.12, family="tag36h11", first_id=4)
+
+
+def rendered(folder, board, count, seed, **how):
+    """Images of a board by the QCar's front camera, 0.png and so on."""
+    folder.mkdir()
+    rig = load_rig(QCAR)
+    camera, size_px = rig.camera(0), rig.image_sizes_px[0]
+    sheet = sheet_of(board)
+    renderer = BoardRenderer(camera, size_px, sheet.ink, sheet.module_m, Sensor(psf_sigma_px=0.5))
+    rng = np.random.default_rng(seed)
+    how = {"distances_m": (0.2, 0.4), "reach": 0.8} | how
+    _, poses = simulated_views(camera, size_px, board.points_board_m, count, rng, **how)
+    for number, pose in enumerate(poses):
+        T_camera_board = np.eye(4)
+        T_camera_board[:3, :3] = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
+        T_camera_board[:3, 3] = pose[4:]
+        image = renderer.render(T_camera_board, rng)
+        cv2.imwrite(str(folder / f"{number}.png"), image)
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    """A folder with board.yaml and front/."""
+    folder = tmp_path_factory.mktemp("shots")
+    write_board(folder / "board.yaml", BOARD)
+    rendered(folder / "front", BOARD, VIEWS, seed=3)
+    return folder
+
+
+def arguments(shots, out, *sources, **more):
+    return CalibrateIntrinsics(sources, board=shots / "board.yaml", out=out, headless=True, **more)
+
+
+def test_rendered_images_become_a_rig_with_its_sigmas(shots, tmp_path, capsys) -> None:
+    args = arguments(shots, tmp_path, f"front={shots / 'front'}", lens="equidistant", rig=QCAR)
+    assert calibrate_intrinsics.run(args) == 0
+    rig, before = load_rig(tmp_path / "camera.yaml"), load_rig(QCAR)
+    assert rig.names == before.names
+    np.testing.assert_array_equal(rig.Ts_camera_vehicle.wxyz_xyz, before.Ts_camera_vehicle.wxyz_xyz)
+    np.testing.assert_array_equal(rig.cameras.focal_px[1:], before.cameras.focal_px[1:])
+    np.testing.assert_allclose(rig.cameras.focal_px[0], 319, rtol=1e-3)
+    np.testing.assert_allclose(rig.cameras.center_px[0], [401, 202], atol=0.3)
+
+    data = read_mapping(tmp_path / "camera.yaml")
+    assert data["calibrated"]["tool"].endswith("calibrate intrinsics")
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["data_sha256"] == data["calibrated"]["data_sha256"]
+    front = report["cameras"]["front"]
+    assert front["parameters"]["fx"]["value"] == data["cameras"][0]["focal_px"][0]
+    assert front["parameters"]["fx"]["sigma"] == data["cameras"][0]["sigma"]["focal_px"][0]
+    assert front["views"]["given"] == VIEWS
+    assert 0 < front["corner_sigma_px"] < 0.05
+    assert sum(map(sum, front["coverage"]["corners_in_cells"])) == front["corners"]
+    assert any("take more views: " in sentence for sentence in report["advice"])
+    picture = cv2.imread(str(tmp_path / "report.png"))
+    assert picture.shape[1] > 800
+    out = capsys.readouterr().out
+    assert "front: equidistant" in out
+    assert "next: take more views" in out
+
+
+def test_a_camera_that_the_rig_does_not_have_is_refused(shots, tmp_path) -> None:
+    args = arguments(shots, tmp_path, f"frnt={shots / 'front'}", rig=QCAR)
+    with pytest.raises(BadInput, match=r"rig.yaml: has no camera 'frnt': expected one of front"):
+        calibrate_intrinsics.run(args)
+
+
+def test_videos_and_folders_of_several_cameras_go_together(shots, tmp_path, capsys) -> None:
+    images = [cv2.imread(str(shots / "front" / f"{n}.png"), 0) for n in range(VIEWS)]
+    fourcc, size_px = cv2.VideoWriter_fourcc(*"MJPG"), images[0].shape[::-1]
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), fourcc, 10, size_px, isColor=False)
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no MJPG")
+    for image in images:
+        writer.write(image)
+        writer.write(image)
+    writer.release()
+    sources = f"rear={tmp_path / 'a.avi'}", f"left={shots / 'front'}"
+    args = arguments(shots, tmp_path / "out", *sources, lens="equidistant")
+    assert calibrate_intrinsics.run(args) == 0
+    rig = load_rig(tmp_path / "out" / "camera.yaml")
+    assert rig.names == ("rear", "left")
+    np.testing.assert_allclose(rig.cameras.focal_px, 319, rtol=2e-3)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    rear = report["cameras"]["rear"]["views"]
+    assert list(rear["sigma_px"]) == [f"a.avi#{2 * n}" for n in range(VIEWS)]
+    assert any(sentence.startswith("left: ") for sentence in report["advice"])
+    assert "write it into camera.yaml" in capsys.readouterr().out
+
+
+def test_a_marker_is_looked_at_again_with_the_lens_it_told(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(lens_comparison, "FEWEST_VIEWS", 100)  # which compiles long
+    rendered(tmp_path / "shots", MARKER, 12, seed=5, distances_m=(0.15, 0.4), fewest=4)
+    _, found = calibrate_images(MARKER, [tmp_path / "shots"], "equidistant")
+    np.testing.assert_allclose(found.fit.parameters[:2], 319, rtol=1e-3)
+    np.testing.assert_allclose(found.fit.parameters[2:4], [401, 202], atol=0.3)
+    assert found.fit.sigma_px < 0.03  # 0.1 and more where lines through bent edges are met
+
+
+def fewer_rows(shots, folder):
+    write_board(folder / "board.yaml", replace(BOARD, rows=5))
+    return shots / "front"
+
+
+def wider(shots, folder):
+    write_board(folder / "board.yaml", replace(BOARD, columns=8))
+    return shots / "front"
+
+
+def copies(shots, folder):
+    for number in range(12):
+        shutil.copy(shots / "front" / f"{number % 3}.png", folder / f"{number}.png")
+    return folder
+
+
+def two_sizes(shots, folder):
+    shutil.copy(shots / "front" / "0.png", folder)
+    cv2.imwrite(str(folder / "1.png"), np.zeros((240, 320), np.uint8))
+    return folder
+
+
+def parallel(shots, folder):
+    rendered(folder / "shots", BOARD, VIEWS, seed=6, most_tilt_deg=0)
+    return folder / "shots"
+
+
+def few(shots, folder):
+    return shots / "front" / "0.png", shots / "front" / "1.png", shots / "front" / "2.png"
+
+
+@pytest.mark.parametrize(
+    ("make", "line"),
+    [
+        (fewer_rows, r"front: markers 17, .* which are not on the charuco 7 x 5, .*: describe the"),
+        (wider, r"front: markers 0, .* not arranged as on the charuco 8 x 6, .* columns and rows"),
+        (
+            copies,
+            r"3 different, .* are too few: .*: 3.png \(the same picture as 0.png\), and 8 more",
+        ),
+        (two_sizes, r"1.png: is 320 x 240 pixels, but .*0.png is 820 x 410: calibrate one camera"),
+        (parallel, r"shots: the board is parallel to itself in all views, .*: tilt it by 30 to 45"),
+        (few, r"front/0.png and 2 more: 3 different, sharp views .* take at least 5"),
+    ],
+)
+def test_what_images_can_not_tell_is_one_line(make, line, shots, tmp_path, capsys) -> None:
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    (folder / "board.yaml").write_bytes((shots / "board.yaml").read_bytes())
+    sources = make(shots, folder)
+    sources = [str(source) for source in (sources if isinstance(sources, tuple) else [sources])]
+    words = ["calibrate", "intrinsics", *sources, "--board", str(folder / "board.yaml")]
+    words += ["--lens", "equidistant", "--headless", "--out", str(out)]
+    assert cli.main(words) == cli.EXIT_BAD_INPUT == 2
+    told, said = capsys.readouterr()
+    assert re.search(f"^jaxnav calibrate: .*{line}", said)
+    assert said.count("\n") == 1
+    assert told == ""
+    assert list(out.glob("*")) == []
+
+
+def test_sources_are_told_apart_by_camera(tmp_path) -> None:
+    args = arguments(tmp_path, tmp_path, "front=a", "left=b", "front=c")
+    assert {name: [str(path) for path in paths] for name, paths in args.by_camera.items()} == {
+        "front": ["a", "c"],
+        "left": ["b"],
+    }
+    assert list(arguments(tmp_path, tmp_path, "a", "b", name="rear").by_camera) == ["rear"]
+
+
+@pytest.mark.parametrize(
+    ("sources", "more", "line"),
+    [
+        ((), {}, "SOURCE: give images"),
+        (("front=a", "b"), {}, "SOURCE: give every source as NAME=PATH, or none"),
+        (("a",), {"max_views": 3}, "--max-views: must be at least 8, got 3"),
+        (("a",), {"name": "1st"}, "--name: must be a name"),
+    ],
+)
+def test_what_can_not_be_asked(tmp_path, sources, more, line) -> None:
+    with pytest.raises(BadInput, match=f"^{line}"):
+        arguments(tmp_path, tmp_path, *sources, **more)
