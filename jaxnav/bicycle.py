@@ -20,6 +20,12 @@ class Vehicle(eqx.Module):
     throttle_limit: Float[Array, ""]  # in the driver's unit (QCar: PWM duty)
     speed_per_throttle_mps: Float[Array, ""]  # steady-state speed at throttle 1
     speed_time_constant_s: Float[Array, ""]  # first-order lag from throttle to speed
+    # What its sensors tell, against the truth; the core knows the truth alone, see
+    # `jaxnav.runtime.corrections`.
+    speed_scale: float = eqx.field(static=True, default=1.0)  # true speed per speed read
+    steering_gain: float = eqx.field(static=True, default=1.0)  # true angle per angle read
+    steering_offset_rad: float = eqx.field(static=True, default=0.0)  # true angle where 0 is read
+    camera_delay_s: float = eqx.field(static=True, default=0.0)  # cameras' stamp less odometer's
 
     @staticmethod
     def create(
@@ -29,20 +35,23 @@ class Vehicle(eqx.Module):
         speed_per_throttle_mps: float,
         speed_time_constant_s: float,
         steering_rate_limit_radps: float = 5.0,  # a hobby servo: 60 degrees in 0.2 s
+        speed_scale: float = 1.0,
+        steering_gain: float = 1.0,
+        steering_offset_rad: float = 0.0,
+        camera_delay_s: float = 0.0,
     ) -> "Vehicle":
         """A vehicle from plain numbers."""
         return Vehicle(
-            *(
-                jnp.asarray(value, float)
-                for value in (
-                    wheelbase_m,
-                    steering_limit_rad,
-                    steering_rate_limit_radps,
-                    throttle_limit,
-                    speed_per_throttle_mps,
-                    speed_time_constant_s,
-                )
-            )
+            jnp.asarray(wheelbase_m, float),
+            jnp.asarray(steering_limit_rad, float),
+            jnp.asarray(steering_rate_limit_radps, float),
+            jnp.asarray(throttle_limit, float),
+            jnp.asarray(speed_per_throttle_mps, float),
+            jnp.asarray(speed_time_constant_s, float),
+            speed_scale=float(speed_scale),
+            steering_gain=float(steering_gain),
+            steering_offset_rad=float(steering_offset_rad),
+            camera_delay_s=float(camera_delay_s),
         )
 
 

@@ -21,6 +21,7 @@ from jaxnav.errors import BadInput
 from jaxnav.executables import keep_in
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.runtime import plugins
+from jaxnav.runtime.corrections import Corrections
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.guard import Guard
 from jaxnav.runtime.interfaces import HasOwnFiles, Setup
@@ -124,7 +125,8 @@ def _drive(
         gc.freeze()
         closing.callback(gc.unfreeze)
         vehicle = plugins.open_vehicle(args.vehicle, told)
-        guard = Guard(vehicle, pilot.limits, args.timeout_s)
+        corrections = Corrections.of(told.vehicle)
+        guard = Guard(vehicle, pilot.limits, args.timeout_s, corrections=corrections)
         closing.callback(guard.close)
         guard.watch_signals()
         cameras = plugins.open_cameras(args.cameras or args.vehicle, told, vehicle)

@@ -1,6 +1,7 @@
 """What a car calls of a navigator, compiled once on a machine: `Navigator.step`, and others."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import jaxlie
 
 from jaxnav import executables
+from jaxnav.bicycle import Vehicle
 from jaxnav.navigator import Navigator, Step, jitted_step
 
 
@@ -41,6 +43,7 @@ def compiled(
     Returns:
         The function of the further trees.
     """
+    navigator = _of_true_units(navigator)
     if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
         return partial(_jitted(function), navigator)
     numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
@@ -60,7 +63,24 @@ def is_compiled(
     function: Callable[..., Any], navigator: Navigator, folder: Path, *told: Any
 ) -> bool:
     """Whether `compiled(function, navigator, folder)(*told)` finds its executable in the folder."""
-    return executables.is_kept(function, (navigator, *told), folder)
+    return executables.is_kept(function, (_of_true_units(navigator), *told), folder)
+
+
+def _of_true_units(navigator: Navigator) -> Navigator:
+    """Without what its vehicle's sensors are off by: those numbers are static, no leaves."""
+
+    def bare(part: Any) -> Any:
+        if not isinstance(part, Vehicle):
+            return part
+        return replace(
+            part,
+            speed_scale=1.0,
+            steering_gain=1.0,
+            steering_offset_rad=0.0,
+            camera_delay_s=0.0,
+        )
+
+    return jax.tree.map(bare, navigator, is_leaf=lambda part: isinstance(part, Vehicle))
 
 
 @cache

@@ -22,6 +22,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any
 
+from jaxnav.runtime.corrections import Corrections
 from jaxnav.runtime.interfaces import Vehicle
 from jaxnav.runtime.limits import Limits
 
@@ -39,13 +40,16 @@ class Guard:
         limits: Limits,
         timeout_s: float = TIMEOUT_S,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        corrections: Corrections | None = None,
     ):
         """Disarmed: nothing but zero throttle gets through.
 
         Args:
+            corrections: what the servo is told for a true angle; by default the angle.
             timeout_s: from the last sign of life until the vehicle has been stopped.
         """
         self._vehicle, self._limits, self._now_ns = vehicle, limits, now_ns
+        self._corrections = corrections or Corrections()
         self._timeout_ns = int((timeout_s - 1.5 * _LOOK_S) * 1e9)
         self._lock = threading.Lock()
         self._armed = False
@@ -109,7 +113,7 @@ class Guard:
                 steering_rad, throttle if self._armed else 0.0, self._steering_rad, elapsed_s
             )
             try:
-                self._vehicle.write(steering_rad, throttle)
+                self._vehicle.write(self._corrections.servo_rad(steering_rad), throttle)
             except OSError:
                 return False
             self._steering_rad, self._written_ns = steering_rad, now_ns

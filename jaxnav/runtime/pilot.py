@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.navigator import Navigator
+from jaxnav.runtime.corrections import Corrections
 from jaxnav.runtime.estimator import Estimator, Program
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.frames import Frames, Sighted
@@ -118,6 +119,7 @@ class Pilot:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
         self.navigator = navigator
         self.limits = Limits.of(navigator.controller.vehicle)
+        self._corrections = Corrections.of(navigator.controller.vehicle)
         self._estimator = Estimator(navigator, program)
         self._gate_nis = float(getattr(navigator.motion, "gate_nis", math.inf))
         self._frames = Frames(len(navigator.rig), navigator.markers, corner_sigma_px)
@@ -143,12 +145,13 @@ class Pilot:
     def handle(self, given: Input) -> Outcome:
         """Fuse what came in, frames first. `now_ns` is never less than that of the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
-        told, stamp_ns, seen_faults = self._frames.told(given.frames, now_ns)
+        frames = [self._corrections.frame(frame) for frame in given.frames]
+        told, stamp_ns, seen_faults = self._frames.told(frames, now_ns)
         faults |= seen_faults
         if told is not None:
             outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
         if given.odometry is not None:
-            return self._odometry(given.odometry, now_ns, faults)
+            return self._odometry(self._corrections.reading(given.odometry), now_ns, faults)
         return outcome if told is not None else self._tick(now_ns, faults)
 
     def _odometry(self, reading: Odometry, now_ns: int, faults: Fault) -> Outcome:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxnav.errors import BadInput
+from jaxnav.runtime.corrections import Corrections
 from jaxnav.runtime.interfaces import Camera, Frame, Odometry, Setup, Vehicle
 from jaxnav.vehicles.options import choice, number
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
@@ -20,11 +21,15 @@ _LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are
 
 
 class SimVehicle:
-    """The car of a `World`, which stops by itself when it hears nothing."""
+    """The car of a `World`, which stops by itself when it hears nothing.
+
+    Its odometer, its servo and its stamps are off as the vehicle's description says.
+    """
 
     def __init__(self, world: World):
         """For the cameras the world is there to look at."""
         self.world = world
+        self._corrections = Corrections.of(world.vehicle)
         self._closed = False
 
     @property
@@ -37,13 +42,15 @@ class SimVehicle:
         if self._closed:
             raise OSError("the vehicle is closed")
         now_ns = time.monotonic_ns()
-        return Odometry(now_ns, *self.world.odometry(now_ns))
+        stamp_ns = now_ns + self._corrections.reading_late_ns
+        return Odometry(stamp_ns, *self._corrections.read(*self.world.odometry(now_ns)))
 
     def write(self, steering_rad: float, throttle: float) -> None:
         """See `Vehicle`."""
         if self._closed:
             raise OSError("the vehicle is closed")
-        self.world.write(steering_rad, throttle, time.monotonic_ns())
+        true_rad = self._corrections.true_rad(steering_rad)
+        self.world.write(true_rad, throttle, time.monotonic_ns())
 
     def stop(self) -> None:
         """See `Vehicle`."""
@@ -61,6 +68,7 @@ class _Shutter:
     def __init__(self, world: World, rate_hz: float, renderer: RenderingProcess | None):
         self._world, self._renderer = world, renderer
         self._period_ns = int(1e9 / rate_hz)
+        self._late_ns = Corrections.of(world.vehicle).frame_late_ns
         self._news = threading.Condition()
         self._frames: list[Frame] = []
         self._closed = False
@@ -106,10 +114,11 @@ class _Shutter:
 
     def _looked(self, stamp_ns: int) -> list[Frame]:
         if self._renderer is None:
-            return [Frame(stamp_ns, None, found) for found in self._world.detections(stamp_ns)]
+            found = self._world.detections(stamp_ns)
+            return [Frame(stamp_ns + self._late_ns, None, one) for one in found]
         times_ns = stamp_ns + (1e9 * track_times_s()).astype(int)
         poses = np.array([self._world.state(int(t))[:3] for t in times_ns])
-        return [Frame(stamp_ns, image) for image in self._renderer.render(poses)]
+        return [Frame(stamp_ns + self._late_ns, image) for image in self._renderer.render(poses)]
 
 
 class SimCamera:

@@ -1,0 +1,72 @@
+"""Pictures of odometry's calibration: the drive, what is left unexplained, and the figures."""
+
+import textwrap
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxnav.calibration.odometry import OdometryCalibration
+from jaxnav.plotting import BLACK, BLUE, ORANGE, SKY, VERMILION
+
+_GROUPS = 60  # of views, whose mean and scatter are drawn
+
+
+def odometry_report(
+    found: OdometryCalibration, corners_world_m: np.ndarray, figures: str
+) -> Figure:
+    """The drive on the map, residuals and readings over time, and the figures with advice.
+
+    Args:
+        corners_world_m: (M, 4, 3), of the markers.
+        figures: a table, in lines.
+    """
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    (drive, residuals), (told, readings) = figure.subplots(2, 2)
+    _draw_drive(drive, found, corners_world_m)
+    _draw_residuals(residuals, found)
+    _draw_readings(readings, found)
+    told.axis("off")
+    told.text(0, 1, figures, family="monospace", fontsize=9, va="top", transform=told.transAxes)
+    advice = "\n".join(textwrap.fill(sentence, 62) for sentence in found.advice)
+    told.text(0, 0.55, f"What to drive next\n{advice}", fontsize=9, va="top",
+              transform=told.transAxes)  # fmt: skip
+    return figure
+
+
+def _draw_drive(axes: Axes, found: OdometryCalibration, corners_world_m: np.ndarray) -> None:
+    axes.plot(found.poses[:, 0], found.poses[:, 1], ".", ms=1, color=BLUE, label="way of the car")
+    for index, corners_m in enumerate(corners_world_m):
+        label = "markers" if index == 0 else None
+        axes.plot(corners_m[:, 0], corners_m[:, 1], color=BLACK, lw=3, label=label)
+    title = f"{found.way_m:.1f} m in {found.duration_s:.0f} s"
+    axes.set(xlabel="x (m)", ylabel="y (m)", title=title, aspect="equal")
+    axes.legend(fontsize="small")
+
+
+def _draw_residuals(axes: Axes, found: OdometryCalibration) -> None:
+    """Each view's, and means of many, in which a wrong delay or scale would show."""
+    good, times_s = ~found.outliers, found.view_times_s
+    off_px = found.views_px.mean(axis=1)
+    for axis, name, colour in ((0, "u", BLUE), (1, "v", ORANGE)):
+        axes.plot(times_s[good], off_px[good, axis], ".", ms=2, color=colour, alpha=0.4)
+        groups = np.array_split(np.flatnonzero(good), min(_GROUPS, int(good.sum())))
+        middle = [float(times_s[group].mean()) for group in groups]
+        mean = [float(off_px[group, axis].mean()) for group in groups]
+        axes.plot(middle, mean, color=colour, label=f"{name}, mean of {len(groups[0])} views")
+    reach = 4 * float(np.std(off_px[good])) + 1e-6
+    far = np.clip(off_px[~good, 0], -reach, reach)
+    if len(far):
+        axes.plot(times_s[~good], far, "x", color=VERMILION, label="counts less")
+    title = f"corners: {found.rms_px:.2f} px RMS, chi-square {found.chi2_per_dof:.2f}"
+    axes.set(xlabel="time (s)", ylabel="seen less explained (px)", title=title)
+    axes.set_ylim(-1.2 * reach, 1.2 * reach)
+    axes.legend(fontsize="small")
+
+
+def _draw_readings(axes: Axes, found: OdometryCalibration) -> None:
+    times_s = found.node_times_s[:-1]
+    axes.plot(times_s, found.read[:, 0], color=SKY, lw=1, label="speed (m/s)")
+    axes.plot(times_s, found.read[:, 1], color=VERMILION, lw=1, label="steering (rad)")
+    axes.set(xlabel="time (s)", ylabel="as read (m/s, rad)", title="what the odometer said")
+    axes.legend(fontsize="small")
