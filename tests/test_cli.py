@@ -13,6 +13,7 @@ import pytest
 
 from jaxnav import cli
 from jaxnav.arguments import COMMANDS, Demo, Locate, Replay, TuneController, TuneFilter
+from jaxnav.arguments.calibration import CALIBRATIONS
 from jaxnav.errors import BadInput
 
 JAXNAV = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
@@ -147,15 +148,24 @@ def test_a_defect_keeps_its_traceback(command) -> None:
         cli.main(["demo"])
 
 
-POSITIONALS = ("recording", "image", "store", "config", "kind", "recordings")
-POSITIONAL = {"recordings": "RECORDING", "kind": r"\{ambiguity,drive\}"}
-
-
-# `jaxnav tune` has two commands of its own.
-HELPED = {name: ([name], fields) for name, fields in COMMANDS.items() if name != "tune"} | {
-    "tune filter": (["tune", "filter"], TuneFilter),
-    "tune controller": (["tune", "controller"], TuneController),
+POSITIONALS = tuple("recording image store config kind recordings source sources target".split())
+POSITIONAL = {
+    "recordings": "RECORDING",
+    "sources": "SOURCE",
+    "kind": r"\{ambiguity,drive\}",
+    "target": r"\{charuco,aprilgrid,chessboard,marker\}",
 }
+
+
+# `jaxnav tune` and `jaxnav calibrate` have commands of their own.
+HELPED = (
+    {name: ([name], it) for name, it in COMMANDS.items() if name not in ("tune", "calibrate")}
+    | {
+        "tune filter": (["tune", "filter"], TuneFilter),
+        "tune controller": (["tune", "controller"], TuneController),
+    }
+    | {f"calibrate {name}": (["calibrate", name], it) for name, it in CALIBRATIONS.items()}
+)
 
 
 @pytest.mark.parametrize("name", HELPED)

@@ -23,7 +23,7 @@ LAYERS = {
         "small_matrices",
         "trees",
     },
-    "models": {"bicycle", "camera", "markers", "rig"},
+    "models": {"bicycle", "camera", "conventions", "markers", "rig"},
     "estimate & control": {
         "ambiguity",
         "bicycle_kalman",
@@ -59,14 +59,18 @@ LAYERS = {
     "plug-ins": {"testing", "vehicles"},
     "shell": {
         "arguments",
+        "board_plotting",
         "cli",
         "commands",
         "drive_map_plotting",
         "drive_plotting",
         "drive_scenery",
+        "lens_plotting",
+        "odometry_plotting",
         "plotting",
         "study_plotting",
         "tuning_plotting",
+        "rig_plotting",
         "viewing",
         "viewing_outcomes",
         "viewing_scene",
@@ -77,6 +81,7 @@ LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in mod
 PURE_CORE = set(ORDER[: ORDER.index("users")])
 # The users stand side by side; these arrows alone lead from one to another.
 BETWEEN_USERS = {
+    ("calibration", "detection"),
     ("studies", "simulation"),
     ("tuning", "simulation"),
     ("detection", "executables"),
