@@ -174,7 +174,8 @@ def _one_line(box: str) -> str:
         lines for lines in sections if lines and not lines[0].startswith(("For full", "Argument"))
     )
     text = " ".join("; ".join(_listed(lines) for lines in told).split())
-    return re.sub(r"^Error parsing ([A-Z]\w*: )?", "", text) or "wrong usage"
+    # A command has its class's name; one of `tune` and `calibrate` stands in the field `what`.
+    return re.sub(r"^Error parsing ([A-Z]\w*: |what: )?", "", text) or "wrong usage"
 
 
 def _listed(lines: list[str]) -> str:

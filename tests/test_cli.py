@@ -120,6 +120,19 @@ def test_the_line_is_the_same_under_every_encoding() -> None:
     assert "Unrecognized options: --sed, 3; Perhaps you meant: --seed INT, --seeds INT" in line
 
 
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["simulate", "--seeds", "0"], "jaxnav simulate: --seeds: must be at least 1, got 0\n"),
+        (["tune", "filter", "--seeds", "0"], "jaxnav tune: --seeds: must be at least 1, got 0\n"),
+        (["calibrate", "rig"], "jaxnav calibrate: RECORDING: missing: what has the rig seen?\n"),
+    ],
+)
+def test_a_bad_flag_is_named_as_it_was_typed(words, line, capsys) -> None:
+    assert cli.main(words) == cli.EXIT_BAD_INPUT
+    assert capsys.readouterr() == ("", line)
+
+
 def test_bad_input_gets_one_line(command, capsys) -> None:
     def run() -> int:
         raise BadInput("rig.yaml: cameras[1].lens", "unknown lens 'fish'\nexpected one of ...")
