@@ -4,6 +4,7 @@ Each frame has two, and each marker some from as many sightings: a search that b
 pose ends there, and only a comparison tells.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +35,6 @@ def other_branches(
         The poses, and how many of them are others.
     """
     C, views = len(rig), linker.views
-    Ts_world_vehicle = matrices(poses.Ts_world_vehicle)
     links.Ts_group_camera[:] = matrices(poses.Ts_vehicle_camera)
     links.Ts_group_marker[:] = matrices(poses.Ts_world_marker)
     known = bundle.seen(rig, views, sigma_px)
@@ -43,39 +43,41 @@ def other_branches(
         residuals = np.asarray(bundle.reprojection_residuals_px(of, known))
         return np.bincount(groups, bundle.losses(residuals, float(known.sigma_px)), count)
 
-    F, M = len(Ts_world_vehicle), len(views.size_m)
-    changed = 0
-    best = cost(poses, views.frame, F)
-    candidates = inverted(linker.sights(links).Ts_cameras_markers)
-    for branch in (0, 1):
-        tried = candidates[:, branch]
-        other = replace(poses, Ts_world_vehicle=wxyz_xyz(tried))
-        found = cost(other, views.frame, F)
-        better = found < best - _BETTER
-        changed += int(better.sum())
-        Ts_world_vehicle[better] = tried[better]
-        best = np.minimum(best, found)
-    poses = replace(poses, Ts_world_vehicle=wxyz_xyz(Ts_world_vehicle))
+    def best_of(
+        of: bundle.Unknowns, name: str, groups: np.ndarray, tries: Iterable[np.ndarray]
+    ) -> tuple[bundle.Unknowns, int]:
+        """Each of the poses of that name where it costs its sightings least."""
+        best, changed = matrices(getattr(of, name)), 0
+        least = cost(of, groups, len(best))
+        for tried in tries:
+            found = cost(replace(of, **{name: wxyz_xyz(tried)}), groups, len(best))
+            better = found < least - _BETTER
+            changed += int(better.sum())
+            best[better] = tried[better]
+            least = np.minimum(least, found)
+        return replace(of, **{name: wxyz_xyz(best)}), changed
 
-    Ts_world_marker = matrices(poses.Ts_world_marker)
-    best = cost(poses, views.marker, M)
+    candidates = inverted(linker.sights(links).Ts_cameras_markers)
+    poses, frames = best_of(
+        poses, "Ts_world_vehicle", views.frame, (candidates[:, branch] for branch in (0, 1))
+    )
+
+    Ts_world_marker, M = matrices(poses.Ts_world_marker), len(views.size_m)
+    Ts_world_vehicle = matrices(poses.Ts_world_vehicle)
     Ts_vehicle_camera = matrices(poses.Ts_vehicle_camera)
     Ts_world_camera = Ts_world_vehicle[views.frame] @ Ts_vehicle_camera[views.camera]
     proposed = Ts_world_camera[:, None] @ linker.Ts_camera_marker
-    for row in _spread(views.marker, M):
-        for branch in (0, 1):
-            tried = np.where(
-                ((row >= 0) & free[C : C + M, 0])[:, None, None],
-                proposed[row, branch],
-                Ts_world_marker,
-            )
-            other = replace(poses, Ts_world_marker=wxyz_xyz(tried))
-            found = cost(other, views.marker, M)
-            better = found < best - _BETTER
-            changed += int(better.sum())
-            Ts_world_marker[better] = tried[better]
-            best = np.minimum(best, found)
-    return replace(poses, Ts_world_marker=wxyz_xyz(Ts_world_marker)), changed
+    tries = (
+        np.where(
+            ((row >= 0) & free[C : C + M, 0])[:, None, None],
+            proposed[row, branch],
+            Ts_world_marker,
+        )
+        for row in _spread(views.marker, M)
+        for branch in (0, 1)
+    )
+    poses, markers = best_of(poses, "Ts_world_marker", views.marker, tries)
+    return poses, frames + markers
 
 
 def _spread(marker: np.ndarray, markers: int, count: int = 10) -> np.ndarray:

@@ -16,10 +16,11 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
+from jaxnav.calibration.pose_arrays import retracted
 from jaxnav.calibration.rig_views import RigViews
 from jaxnav.calibration.schur import Blocks, Reduced, SchurLM, reduce
 from jaxnav.camera import Camera
-from jaxnav.geometry import cayley, rotation_matrix, skew
+from jaxnav.geometry import rotation_matrix, skew
 from jaxnav.rig import CameraRig
 from jaxnav.small_matrices import cho_solve, cholesky
 
@@ -137,13 +138,10 @@ def moved(poses: Unknowns, own: Float[Array, "F 6"], shared: Float[Array, " R"])
     ends = np.cumsum([*counts, poses.lenses.shape[0]])
     cameras, markers, lenses, others = jnp.split(shared.reshape(-1, 6), ends)
 
-    def one(wxyz_xyz: Array, xi: Array) -> Array:
-        return (jaxlie.SE3(wxyz_xyz) @ cayley(xi)).normalize().wxyz_xyz
-
     return Unknowns(
-        jax.vmap(one)(poses.Ts_world_vehicle, own),
-        jax.vmap(one)(poses.Ts_vehicle_camera, cameras),
-        jax.vmap(one)(poses.Ts_world_marker, markers),
+        retracted(poses.Ts_world_vehicle, own),
+        retracted(poses.Ts_vehicle_camera, cameras),
+        retracted(poses.Ts_world_marker, markers),
         poses.lenses + jnp.concatenate([lenses, others[:, :3]], axis=1),
     )
 

@@ -16,10 +16,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from jaxnav.calibration.pose_arrays import retracted
 from jaxnav.calibration.schur import Blocks, SchurLM, SchurState, reduce
 from jaxnav.calibration.views import BoardViews
 from jaxnav.camera import Camera
-from jaxnav.geometry import cayley, rotation_matrix, skew, turn_and_shift
+from jaxnav.geometry import rotation_matrix, skew, turn_and_shift
 
 # Of the shared unknowns, in their order; zero and fixed beyond what the lens has.
 NAMES = {
@@ -221,10 +222,7 @@ def normal_equations(residual_px: Array, of_lens: Array, of_pose: Array, counts:
 
 
 def _moved(y: Unknowns, own: Array, shared: Array) -> Unknowns:
-    def turned(wxyz_xyz: Array, xi: Array) -> Array:
-        return (jaxlie.SE3(wxyz_xyz) @ cayley(xi)).normalize().wxyz_xyz
-
     # A focal length that turned negative would mirror the image: at most a halving a step.
     lens = y.lens + shared
     lens = lens.at[:2].set(jnp.maximum(lens[:2], y.lens[:2] / 2))
-    return Unknowns(lens, jax.vmap(turned)(y.Ts_camera_board, own))
+    return Unknowns(lens, retracted(y.Ts_camera_board, own))

@@ -2,8 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
+
+from jaxnav.geometry import cayley
 
 
 def wxyz_xyz(Ts: np.ndarray) -> jax.Array:
@@ -19,3 +23,9 @@ def matrices(poses: jax.Array | np.ndarray) -> np.ndarray:
     Ts[:, :3, :3] = Rotation.from_quat(array[:, [1, 2, 3, 0]]).as_matrix()
     Ts[:, :3, 3] = array[:, 4:]
     return Ts
+
+
+@jax.vmap
+def retracted(wxyz_xyz: Float[Array, " 7"], xi: Float[Array, " 6"]) -> Float[Array, " 7"]:
+    """Poses (n, 7) moved by twists (n, 6): T * cay(xi)."""
+    return (jaxlie.SE3(wxyz_xyz) @ cayley(xi)).normalize().wxyz_xyz

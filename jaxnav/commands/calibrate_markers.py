@@ -5,11 +5,9 @@ import numpy as np
 from jaxnav.arguments.calibration import CalibrateMarkers as Arguments
 from jaxnav.calibration.linking import inverted
 from jaxnav.calibration.rig import calibrate_rig
-from jaxnav.commands.calibrate_rig import refuse_wrong_sizes, write_picture
+from jaxnav.commands.calibrate_rig import publish, refuse_wrong_sizes
 from jaxnav.commands.calibration_data import gathered
-from jaxnav.commands.calibration_report import provenance, summary, text, write_files
 from jaxnav.commands.process import configure_jax
-from jaxnav.files import output_folder, write_json
 
 
 def run(args: Arguments) -> int:
@@ -19,12 +17,5 @@ def run(args: Arguments) -> int:
     given = inverted(np.asarray(data.rig.Ts_camera_vehicle.as_matrix(), float))
     found = calibrate_rig(data.views, data.rig, data.known, None)
     refuse_wrong_sizes(data, found)
-    out = output_folder(args.out)
-    calibrated = provenance(data, "markers")
-    report = summary(data, found, given, calibrated)
-    write_files(out, data, found, calibrated, with_rig=False)
-    write_json(out / "report.json", report)
-    write_picture(out, data, found, given)
-    print(text(report))
-    print(f"markers and report in {out}")
+    publish(args.out, data, found, given, with_rig=False)
     return 0

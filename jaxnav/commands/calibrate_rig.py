@@ -44,19 +44,33 @@ def run(args: Arguments) -> int:
     found = calibrate_rig(data.views, data.rig, data.known, reference, args.refine_lenses)
     _refuse_nonsense(args, data, found, given)
     found = _tied(args, data, found, given, wheelbase_m)
-    out = output_folder(args.out)
-    calibrated = provenance(data, "rig")
-    report = summary(data, found, given, calibrated)
-    write_files(out, data, found, calibrated, with_rig=True)
-    write_json(out / "report.json", report)
-    write_picture(out, data, found, given)
-    print(text(report))
-    print(f"rig, markers and report in {out}")
+    publish(args.out, data, found, given, with_rig=True)
     return 0
 
 
-def write_picture(out: Path, data: RigData, found: RigCalibration, given: np.ndarray) -> None:
-    """report.png."""
+def publish(
+    folder: Path, data: RigData, found: RigCalibration, given: np.ndarray, with_rig: bool
+) -> None:
+    """Write all files, and say in a few lines what they hold.
+
+    Args:
+        given: (C, 4, 4) T_vehicle_camera before.
+        with_rig: whether cameras were looked for, or markers alone.
+
+    Raises:
+        BadInput: they can't be written.
+    """
+    out = output_folder(folder)
+    calibrated = provenance(data, "rig" if with_rig else "markers")
+    report = summary(data, found, given, calibrated)
+    write_files(out, data, found, calibrated, with_rig)
+    write_json(out / "report.json", report)
+    _write_picture(out, data, found, given)
+    print(text(report))
+    print(f"{'rig, markers' if with_rig else 'markers'} and report in {out}")
+
+
+def _write_picture(out: Path, data: RigData, found: RigCalibration, given: np.ndarray) -> None:
     markers, mapped = found_markers(data, found)
     views = found.views
     figure = rig_report(
@@ -122,7 +136,7 @@ def _refuse_nonsense(
 
 def _wheelbase_m(args: Arguments, data: RigData) -> float:
     """What a drive needs beside itself, asked for before any work is done."""
-    if len(data.parts) != 1 or not any(one.valid for one in data.parts[0][0].odometry):
+    if len(data.parts) != 1 or not any(one.valid for one in data.parts[0].odometry):
         problem = "needs one recording, of a drive with odometry (a .mcap)"
         raise BadInput("--vehicle-frame drive", problem)
     vehicle = load_vehicle(args.vehicle or calib_dir() / "qcar" / "vehicle.yaml")
@@ -141,7 +155,7 @@ def _tied(
         return found
     if args.vehicle_frame == "places":
         return moved_to_places(found, given)
-    readings = (one for one in data.parts[0][0].odometry if one.valid)
+    readings = (one for one in data.parts[0].odometry if one.valid)
     odometry = sorted(readings, key=lambda one: one.stamp_ns)
     start_ns = found.views.stamps_ns[0]
     driven = driven_frame(

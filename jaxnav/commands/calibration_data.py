@@ -28,7 +28,7 @@ class RigData:
         markers: the map that was given, those that nobody saw among them; None where there is none.
         keys: (M,) of the markers, in the order of `views`.
         known: T_world_marker (4, 4) of those that are known, by their index.
-        parts: the recordings, and the index of the first frame of each.
+        parts: the recordings.
         anchored: whether a file or a recording knew a marker, or one of them was made the world.
     """
 
@@ -37,7 +37,7 @@ class RigData:
     markers: MarkerMap | None
     keys: tuple[MarkerKey, ...]
     known: dict[int, np.ndarray]
-    parts: tuple[tuple[Sightings, int], ...]
+    parts: tuple[Sightings, ...]
     anchored: bool
 
 
@@ -98,7 +98,7 @@ def gathered(
         markers,
         keys,
         known,
-        tuple((part, int(n)) for part, n in zip(parts, firsts, strict=False)),
+        tuple(parts),
         anchored,
     )
 
