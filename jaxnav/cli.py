@@ -5,7 +5,8 @@ What a command does lies in `jaxnav.commands` and is imported when the command r
 
 Exit codes: 0 done, 1 what was to be found out is not well (a replay is not what was recorded, the
 doctor found an error, a fault came to worse than it must, the watchdog stopped the car), 2 bad
-input or usage (one line on stderr), 130 interrupted.
+input or usage (one line on stderr), 130 interrupted; `run`: 128 plus the number of the signal that
+ended it.
 """
 
 import contextlib
@@ -14,28 +15,12 @@ import io
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
-import tyro
-
-from jaxnav.arguments import (
-    COMMANDS,
-    Calibrate,
-    Command,
-    Demo,
-    Doctor,
-    Faults,
-    Locate,
-    Plot,
-    Reliability,
-    Replay,
-    Run,
-    Simulate,
-    Study,
-    Tune,
-    View,
-)
 from jaxnav.errors import BadInput
+from jaxnav.runtime.output import FreeOutput, fill_descriptors
+from jaxnav.runtime.signals import Interrupted, Signals
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -52,21 +37,6 @@ _OF_EXTRAS = {name: (name, "study") for name in ("dask", "distributed", "xarray"
     "rerun": ("rerun-sdk", "viz"),
     "optax": ("optax", "tune"),
 }
-_Command = (
-    Demo
-    | Replay
-    | Locate
-    | Simulate
-    | Reliability
-    | Study
-    | Plot
-    | View
-    | Run
-    | Faults
-    | Doctor
-    | Tune
-    | Calibrate
-)
 
 
 class UsageError(Exception):
@@ -80,16 +50,33 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the arguments after the program's name, by default those of the process.
     """
     args = list(sys.argv[1:] if argv is None else argv)
-    name = f"jaxnav {args[0]}" if args and args[0] in COMMANDS else "jaxnav"
+    if args[:1] != ["run"]:
+        return _main(args, _dispatch)
+    # A car may move: from here on no signal is lost, and no terminal holds anything up.
+    fill_descriptors()
+    signals = Signals()
     try:
-        code = _dispatch(args)
+        with FreeOutput():
+            code = _main(args, lambda args: _dispatch(args, signals))
+        return code if signals.exit_code is None else signals.exit_code
+    finally:
+        if argv is not None:  # else the process ends now, and a second Ctrl-C changes nothing
+            signals.close()
+
+
+def _main(args: list[str], dispatch: Callable[[list[str]], int]) -> int:
+    try:
+        code = dispatch(args)
         # A closed pipe shows itself on flushing: here it can still be handled.
         sys.stdout.flush()
     except (BadInput, UsageError) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(f"{_name(args)}: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
+    except Interrupted as interrupted:
+        print(f"{_name(args)}: interrupted ({interrupted})", file=sys.stderr)
+        return EXIT_INTERRUPTED
     except KeyboardInterrupt:
-        print(f"{name}: interrupted", file=sys.stderr)
+        print(f"{_name(args)}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         # The interpreter flushes again when it exits; give it something to flush into.
@@ -98,7 +85,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _dispatch(args: list[str]) -> int:
+def _name(args: list[str]) -> str:
+    """What a message begins with."""
+    from jaxnav.arguments import COMMANDS
+
+    return f"jaxnav {args[0]}" if args and args[0] in COMMANDS else "jaxnav"
+
+
+def _dispatch(args: list[str], *signals: Signals) -> int:
     if args == ["--version"]:
         from jaxnav import __version__
 
@@ -107,13 +101,13 @@ def _dispatch(args: list[str]) -> int:
     command = _parse(args)
     if command is None:
         return 0
-    if isinstance(command, Run):
+    if signals:
         # NumPy's own threads, which it asks for once: those that look for markers have matrices so
         # small that sharing one out takes longer than it does, and the cores are theirs.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         module = importlib.import_module(f"jaxnav.commands.{type(command).__name__.lower()}")
-        code: int = module.run(command)
+        code: int = module.run(command, *signals)
     except ModuleNotFoundError as missing:
         if missing.name not in _OF_EXTRAS:
             raise
@@ -122,8 +116,12 @@ def _dispatch(args: list[str]) -> int:
     return code
 
 
-def _parse(args: list[str]) -> _Command | None:
+def _parse(args: list[str]) -> Any:
     """The command, or None where help was asked for and printed."""
+    import tyro
+
+    from jaxnav.arguments import Command
+
     messages = io.StringIO()
     wide = not {"-h", "--help"} & set(args)
     try:
@@ -131,7 +129,7 @@ def _parse(args: list[str]) -> _Command | None:
             contextlib.redirect_stderr(messages),
             _unwrapped() if wide else contextlib.nullcontext(),
         ):
-            command: _Command = tyro.cli(
+            command: Any = tyro.cli(
                 Command,
                 prog="jaxnav",
                 description=DESCRIPTION,

@@ -155,12 +155,71 @@ def test_a_driver_that_hangs_is_stopped_around_it(car, guard):
     writer.join()
 
 
-def test_a_stop_that_fails_is_tried_again(car, guard):
+def test_a_write_that_hangs_and_returns_after_the_stop_is_not_the_last_word(car, guard):
+    """A driver that lets go in the end does what it was told long ago."""
     guard.arm()
     drive(guard, 0.05)
-    car.fails = 2
+    car.hangs.set()
+    writer = threading.Thread(target=guard.write, args=(0.1, 0.2), daemon=True)
+    writer.start()
+    assert guard.wait(1.0)
+    car.let_go.set()
+    writer.join(1.0)
+    throttles = [throttle for _, _, throttle in car.told]
+    assert throttles[-1] == 0
+    hung = len(throttles) - 1 - throttles[::-1].index(0.2)
+    assert 0 in throttles[:hung]  # it was stopped around, and once more after it
+
+
+def test_an_outage_of_the_bus_is_outlasted(car, guard):
+    guard.arm()
+    drive(guard, 0.05)
+    car.fails = 10**9
     guard.trip("told to")
+    assert "not now" in guard.unheard
+    time.sleep(1.0)
+    assert car.told[-1][2] != 0
+    car.fails = 0
+    end_s = time.monotonic() + 2.0
+    while car.told[-1][2] != 0 and time.monotonic() < end_s:
+        time.sleep(0.01)
     assert car.told[-1][2] == 0
+    assert guard.unheard is None
+
+
+def test_a_vehicle_that_never_hears_is_told_of_when_it_is_closed(car, guard):
+    guard.arm()
+    drive(guard, 0.05)
+    car.fails = 10**9
+    guard.close(heard_within_s=0.1)
+    assert guard.unheard == "OSError: not now"
+
+
+def test_a_dog_that_fails_stops_the_vehicle(car, guard, monkeypatch):
+    guard.arm()
+    drive(guard, 0.05)
+    monkeypatch.setattr(guard, "_beats", None)  # whatever it is that breaks it
+    assert guard.wait(1.0)
+    assert "the guard failed: AttributeError" in guard.reason
+    assert car.told[-1][2] == 0
+
+
+def test_a_dog_that_is_gone_is_missed(car, guard, monkeypatch):
+    guard.arm()
+    drive(guard, 0.05)
+    ended = threading.Thread(target=int)
+    ended.start()
+    ended.join()
+    monkeypatch.setattr(guard, "_thread", ended)
+    assert not guard.write(0.0, 0.2)
+    assert "the guard's own thread has ended" in guard.reason
+
+
+def test_a_command_after_its_own_deadline_is_not_obeyed(car, guard):
+    guard.arm()
+    assert guard.write(0.0, 0.1, time.monotonic_ns() + 10**8)
+    assert not guard.write(0.0, 0.2, time.monotonic_ns() - 1)
+    assert car.told[-1][2] == 0.1
 
 
 def test_a_write_that_fails_now_is_none_and_the_next_may_succeed(car, guard):
@@ -194,6 +253,7 @@ import math, signal, sys, threading, time
 sys.path.insert(0, {root!r})
 from jaxnav.runtime.guard import Guard
 from jaxnav.runtime.limits import Limits
+from jaxnav.runtime.signals import Signals
 
 class Car:
     timeout_s = math.inf
@@ -207,7 +267,9 @@ class Car:
         self.stop()
 
 guard = Guard(Car(), Limits(0.5, 5.0, 0.3))
-guard.watch_signals()
+{before}
+signals = Signals()
+signals.on_signal(guard.trip)
 guard.arm()
 end = time.monotonic() + 0.3
 while time.monotonic() < end:
@@ -220,17 +282,31 @@ ENDINGS = {
     "exception": "raise RuntimeError('somewhere')",
     "sys.exit": "sys.exit(3)",
     "end of the program": "",
-    # The main thread sleeps inside the C library and sees no signal for a second.
     "SIGTERM": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
     "SIGINT": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
-    "SIGTERM in a hang": "import re\nre.match('(a+)+b', 'a' * 24)\ntime.sleep(1)",
+    # The main thread is inside the C library and runs no handler of Python's for a second. What
+    # holds the interpreter as well is for the guard's process, see test_guard_process.
+    "SIGTERM in a hang": "threading.main_thread(); import ctypes; ctypes.CDLL(None).sleep(1)",
+    "SIGHUP": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
+    "SIGQUIT": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
+    "SIGTSTP": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
+    "SIGTERM with many files": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
 }
+
+
+# Descriptors of 1024 and more, which `select` can't look at.
+MANY_FILES = """
+import os, resource
+resource.setrlimit(resource.RLIMIT_NOFILE, (4096, 4096))
+kept = [os.dup(0) for _ in range(1500)]
+"""
 
 
 @pytest.mark.parametrize("name", ENDINGS)
 def test_however_a_program_ends_zero_throttle_is_the_last_word(name):
     root = str(Path(__file__).resolve().parents[1])
-    source = textwrap.dedent(PROGRAM).format(root=root, ending=ENDINGS[name])
+    before = MANY_FILES if "many files" in name else ""
+    source = textwrap.dedent(PROGRAM).format(root=root, ending=ENDINGS[name], before=before)
     process = subprocess.Popen(
         [sys.executable, "-c", source], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )

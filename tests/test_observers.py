@@ -92,9 +92,20 @@ def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monk
         assert (rig, markers, fake.how) == (setup.rig, setup.markers, {"live": True, "save": None})
         np.testing.assert_array_equal(waypoints_m, setup.route.waypoints_m)
         assert fake.closed == 0
+        found[0].handled(make_input(0), make_outcome(0))
     assert fake.closed == 1
     assert not read_drive(path).truncated
     assert open_onlookers(Run(headless=True), setup, ExitStack()) == []
+
+
+def test_a_drive_that_is_called_off_leaves_what_was_recorded_before(setup, tmp_path):
+    path = tmp_path / "drive.mcap"
+    for before in (None, b"of another day"):
+        if before is not None:
+            path.write_bytes(before)
+        with ExitStack() as closing:
+            open_onlookers(Run(record=path, headless=True), setup, closing)
+        assert [one.read_bytes() for one in tmp_path.iterdir()] == ([before] if before else [])
 
 
 def test_a_missing_rerun_gets_one_line_before_anything_is_compiled(monkeypatch, capsys):

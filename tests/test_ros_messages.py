@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from jaxnav import bicycle
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.ros_messages import STANDSTILL_MPS, TwistReader, grey_image
+from jaxnav.runtime.ros_messages import grey_image
+from jaxnav.runtime.twists import STANDSTILL_MPS, TwistReader
 from tests.helpers.ros_bags import IMAGE, Bag
 from tests.helpers.ros_drives import BEGIN_NS, problem, read, topic_map
 from tests.worlds import paper_markers, qcar

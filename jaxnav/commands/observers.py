@@ -104,8 +104,8 @@ class Recording:
             self._recorder.image(f"/camera/{name}", frame.stamp_ns, frame.image)
 
     def close(self) -> None:
-        """See `Onlooker`."""
-        self._recorder.close()
+        """See `Onlooker`. A drive that was called off leaves no file."""
+        self._recorder.close(keep_empty=False)
 
     @property
     def told(self) -> str:

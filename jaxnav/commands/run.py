@@ -1,4 +1,7 @@
-"""`jaxnav run`: the loop that drives, with all that looks on."""
+"""`jaxnav run`: the loop that drives, with all that looks on.
+
+Every step of the start asks whether a signal has come, and arming above all: see `Signals`.
+"""
 
 import gc
 import os
@@ -24,40 +27,58 @@ from jaxnav.runtime import plugins
 from jaxnav.runtime.corrections import Corrections
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.guard import Guard
-from jaxnav.runtime.interfaces import HasOwnFiles, Setup
+from jaxnav.runtime.interfaces import HasOwnFiles, Setup, SharesProcess, Vehicle
+from jaxnav.runtime.limits import Limits
 from jaxnav.runtime.loop import Loop, Observer
+from jaxnav.runtime.moved_vehicle import GuardProcess, MovedVehicle
 from jaxnav.runtime.pilot import Pilot
 from jaxnav.runtime.seeing import Eyes, Search
+from jaxnav.runtime.signals import Signals
 
 EXIT_STOPPED = 1  # by the watchdog, not by a person
-EXIT_SIGNAL = 128
 
 
-def run(args: Run) -> int:
-    """Drive, and say why it ended."""
+def run(args: Run, signals: Signals) -> int:
+    """Drive, and say why it ended.
+
+    Args:
+        signals: of the process, since its first line.
+
+    Raises:
+        Interrupted: a signal came before it drove.
+    """
     configure_jax(float64=args.float64, threads=1)
     keep_in(step_folder())
     options = _options(args.option)
     setup = _setup(args, options)
+    signals.check()
     if args.params is not None:
         params = load_params(args.params)
         setup = setup.with_params(params)
         _say(args, params.told())
-    searches = _searches(args, setup)
+    told = Setup(
+        setup.rig, setup.markers, setup.vehicle, setup.route.start_pose, args.seed, options
+    )
     with ExitStack() as closing:
+        guarding = _guarding(args)
+        if guarding is not None:
+            closing.callback(guarding.end)
+            guarding.prepare(signals.check)  # what is wrong with it is said before it compiles
+        searches = _searches(args, setup)
         onlookers = open_onlookers(args, setup, closing)
+        signals.check()
         pilot = _compiled(args, setup, searches)
-        told = Setup(
-            setup.rig, setup.markers, setup.vehicle, setup.route.start_pose, args.seed, options
-        )
-        loop, eyes, reason = _drive(args, pilot, told, searches, onlookers)
-    _summarise(loop, eyes, reason)
+        signals.check()
+        drive = _Drive(args, told, guarding, signals)
+        reason = drive.run(pilot, searches, onlookers)
+    _summarise(drive.loop, drive.eyes, reason)
+    print(f"guard: {drive.kept_by}")
     for onlooker in onlookers:
         if onlooker.told is not None:
             print(onlooker.told)
-    if loop.guard.signal is not None:
-        return EXIT_SIGNAL + loop.guard.signal
-    return EXIT_STOPPED if loop.stopped else 0
+    if drive.unheard is not None:
+        print(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {drive.unheard}")
+    return EXIT_STOPPED if drive.loop.stopped or drive.unheard is not None else 0
 
 
 def _options(given: Sequence[str]) -> dict[str, str]:
@@ -95,6 +116,14 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     )
 
 
+def _guarding(args: Run) -> GuardProcess | None:
+    """The process that will own the vehicle; None where its plug-in wants to stay in this one."""
+    factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
+    if isinstance(factory, SharesProcess) and factory.shares_process:
+        return None
+    return GuardProcess(args.vehicle)
+
+
 def _searches(args: Run, setup: DriveSetup) -> list[Search]:
     """One for each camera."""
     detectors = make_detectors(setup.markers, args.corner_backend)
@@ -115,28 +144,69 @@ def _compiled(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot
     return pilot
 
 
-def _drive(
-    args: Run, pilot: Pilot, told: Setup, searches: list[Search], onlookers: Sequence[Observer]
-) -> tuple[Loop, Eyes, str]:
-    """Open what moves, drive, stop and let go of it. Also: why it ended."""
-    duration_s = args.duration_s if args.duration_s is not None else float("inf")
-    with ExitStack() as closing:
-        # Python looks through all objects now and then: not through those of JAX, 50 ms a time.
-        gc.freeze()
-        closing.callback(gc.unfreeze)
-        vehicle = plugins.open_vehicle(args.vehicle, told)
-        corrections = Corrections.of(told.vehicle)
-        guard = Guard(vehicle, pilot.limits, args.timeout_s, corrections=corrections)
-        closing.callback(guard.close)
-        guard.watch_signals()
-        cameras = plugins.open_cameras(args.cameras or args.vehicle, told, vehicle)
-        eyes = Eyes(cameras, searches, guard, workers=max(1, os.cpu_count() or 1))
-        closing.callback(eyes.close)
-        # Before the eyes are closed, for which their threads may take a while.
-        closing.callback(guard.trip, "the drive is over")
-        loop = Loop(pilot, guard, vehicle, eyes, onlookers, args.period_s)
-        reason = loop.run(duration_s)
-    return loop, eyes, reason
+class _Drive:
+    """What moves, from opening it to letting go of it.
+
+    Attributes:
+        kept_by: who stops the vehicle whatever happens here, in words.
+        unheard: why the vehicle may not have heard the last stop; None: it has.
+    """
+
+    loop: Loop
+    eyes: Eyes
+    kept_by = ""
+    unheard: str | None = None
+
+    def __init__(self, args: Run, told: Setup, guarding: GuardProcess | None, signals: Signals):
+        """Nothing is opened yet.
+
+        Args:
+            guarding: the process for the vehicle; None: it stays in this one.
+        """
+        self._args, self._told, self._guarding, self._signals = args, told, guarding, signals
+
+    def run(self, pilot: Pilot, searches: list[Search], onlookers: Sequence[Observer]) -> str:
+        """Open, drive, stop, and let go. Returns why it ended."""
+        args, signals = self._args, self._signals
+        with ExitStack() as closing:
+            # Python looks through all objects now and then: not through those of JAX, 50 ms a time.
+            gc.freeze()
+            closing.callback(gc.unfreeze)
+            signals.hold()
+            vehicle, guard = self._guarded(pilot.limits)
+            closing.callback(self._close, vehicle, guard)
+            signals.on_signal(guard.trip)
+            signals.check()
+            cameras = plugins.open_cameras(args.cameras or args.vehicle, self._told, vehicle)
+            self.eyes = Eyes(cameras, searches, guard, workers=max(1, os.cpu_count() or 1))
+            closing.callback(self.eyes.close)
+            # Before the eyes are closed, for which their threads may take a while.
+            closing.callback(guard.trip, "the drive is over")
+            self.loop = Loop(pilot, guard, vehicle, self.eyes, onlookers, args.period_s)
+            signals.check()
+            return self.loop.run(args.duration_s if args.duration_s is not None else float("inf"))
+
+    def _guarded(self, limits: Limits) -> tuple[Vehicle, Guard]:
+        """The vehicle, in a process of its own where that can be, and the guard of this one."""
+        args, why = self._args, "it shares its process"
+        if self._guarding is not None:
+            moved = self._guarding.open(self._told, limits, args.timeout_s, self._signals.check)
+            if moved is not None:
+                guard = Guard(moved, limits, args.timeout_s)
+                moved.watch(guard.trip)
+                self.kept_by = f"a process of its own, {moved.priority}"
+                _say(args, f"guard: {self.kept_by}")
+                return moved, guard
+            why = self._guarding.stays or why
+        self.kept_by = f"a thread, {args.vehicle} can't be moved to another process: {why}"
+        _say(args, f"guard: {self.kept_by}")
+        vehicle = plugins.open_vehicle(args.vehicle, self._told)
+        corrections = Corrections.of(self._told.vehicle)
+        return vehicle, Guard(vehicle, limits, args.timeout_s, corrections=corrections)
+
+    def _close(self, vehicle: Vehicle, guard: Guard) -> None:
+        guard.close()
+        self.unheard = vehicle.unheard if isinstance(vehicle, MovedVehicle) else guard.unheard
 
 
 def _say(args: Run, text: str) -> None:

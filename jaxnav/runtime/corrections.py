@@ -5,12 +5,16 @@ recordings hold what the sensors said, and everything inside is in true units. A
 not calibrated changes nothing, not a bit.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-from jaxnav.bicycle import Vehicle
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Odometry
+if TYPE_CHECKING:  # the guard's process corrects without JAX and OpenCV
+    from jaxnav.bicycle import Vehicle
+    from jaxnav.runtime.frames import Sighted
+    from jaxnav.runtime.interfaces import Odometry
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,7 @@ class Corrections:
     steering_limit_rad: float = math.inf  # of the servo, to either side
 
     @staticmethod
-    def of(vehicle: Vehicle) -> "Corrections":
+    def of(vehicle: Vehicle) -> Corrections:
         """Those of its description."""
         return Corrections(
             vehicle.speed_scale,

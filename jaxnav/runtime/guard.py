@@ -6,21 +6,21 @@
     guard.close()
 
 A thread of its own, the monotonic clock, and nothing of JAX. It stops the vehicle when no fresh
-command came for a while, when a watched thread hangs, on a signal, on a command that is no number,
-and when it is told to. Once it has, it does not arm again: whoever wants to drive on starts anew.
+command came for a while, when a watched thread hangs, on a command that is no number, and when it
+is told to. It says stop until the vehicle has heard it, and once more after anything that might
+have undone it. Once it has stopped it does not arm again: whoever wants to drive on starts anew.
+
+A thread can't act while C code of the same process holds the interpreter, nor once the process is
+gone: vehicles that can be moved have a guard in a process of its own (see `guard_process`), and the
+one here beside it.
 """
 
 import atexit
 import math
-import os
-import select
-import signal
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from types import FrameType
-from typing import Any
 
 from jaxnav.runtime.corrections import Corrections
 from jaxnav.runtime.interfaces import Vehicle
@@ -29,6 +29,8 @@ from jaxnav.runtime.limits import Limits
 TIMEOUT_S = 0.2
 _LOOK_S = 0.02  # between two looks of the dog
 _LOCK_S = 0.02  # so long it waits for a thread that is inside the driver
+_AGAIN_S = 0.1  # between two stops of a vehicle that has heard the first one
+HEARD_WITHIN_S = 10.0  # so long `close` goes on with a vehicle that does not hear
 
 
 class Guard:
@@ -58,9 +60,9 @@ class Guard:
         self._closed = threading.Event()
         self._beats: dict[str, int] = {}  # when each watched thread was last alive
         self._steering_rad, self._written_ns = 0.0, now_ns()
-        self._signals: dict[int, Any] = {}
-        self._wakeup: tuple[int, int] | None = None
-        self.signal: int | None = None  # that ended it
+        self._deadline_ns = self._written_ns
+        self._unheard: str | None = None  # why the last stop did not reach the vehicle
+        self._stopped_s = 0.0  # when the last one did
         self._thread = threading.Thread(target=self._watch, name="jaxnav-guard", daemon=True)
         self._thread.start()
         atexit.register(self._at_exit)
@@ -75,7 +77,12 @@ class Guard:
         """Why."""
         return self._reason
 
-    def wait(self, timeout_s: float) -> bool:
+    @property
+    def unheard(self) -> str | None:
+        """Why the vehicle has not heard that it should stop; None: it has, or was not told."""
+        return self._unheard
+
+    def wait(self, timeout_s: float | None = None) -> bool:
         """Sleep, and wake when it trips: whether it has."""
         return self._tripped.wait(timeout_s)
 
@@ -84,6 +91,7 @@ class Guard:
         with self._lock:
             now_ns = self._now_ns()
             self._written_ns = now_ns
+            self._deadline_ns = now_ns + self._timeout_ns
             self._beats = dict.fromkeys(self._beats, now_ns)
             self._armed = not self.tripped
 
@@ -95,8 +103,12 @@ class Guard:
         """A thread ends as it should: it is watched no more."""
         self._beats.pop(name, None)
 
-    def write(self, steering_rad: float, throttle: float) -> bool:
+    def write(self, steering_rad: float, throttle: float, deadline_ns: int | None = None) -> bool:
         """A command, inside the limits whatever it says.
+
+        Args:
+            deadline_ns: by when the next one must have come; by default the guard's own time from
+                now. A command whose own deadline is over is not obeyed.
 
         Returns:
             Whether the vehicle took it. A driver that can't write now gets the next one.
@@ -104,10 +116,12 @@ class Guard:
         if not (math.isfinite(steering_rad) and math.isfinite(throttle)):
             self.trip(f"the command was no number: {steering_rad}, {throttle}")
             return False
+        if not self._thread.is_alive() and not self._closed.is_set():
+            self.trip("the guard's own thread has ended")
         with self._lock:
-            if self.tripped:
-                return False
             now_ns = self._now_ns()
+            if self.tripped or (deadline_ns is not None and deadline_ns <= now_ns):
+                return False
             elapsed_s = (now_ns - self._written_ns) / 1e9
             steering_rad, throttle = self._limits.applied(
                 steering_rad, throttle if self._armed else 0.0, self._steering_rad, elapsed_s
@@ -116,7 +130,11 @@ class Guard:
                 self._vehicle.write(self._corrections.servo_rad(steering_rad), throttle)
             except OSError:
                 return False
+            finally:
+                if self.tripped:  # meanwhile: what was written last must not be a throttle
+                    self._stop()
             self._steering_rad, self._written_ns = steering_rad, now_ns
+            self._deadline_ns = now_ns + self._timeout_ns if deadline_ns is None else deadline_ns
             return True
 
     def trip(self, reason: str) -> None:
@@ -133,76 +151,63 @@ class Guard:
             if held:
                 self._lock.release()
 
-    def close(self) -> None:
-        """Stop and let go of the vehicle. Any number of times."""
+    def close(self, heard_within_s: float = HEARD_WITHIN_S) -> None:
+        """Stop and let go of the vehicle. Any number of times.
+
+        Args:
+            heard_within_s: so long it goes on saying stop to a vehicle that does not hear; then
+                `unheard` says why.
+        """
         if self._closed.is_set():
             return
         self.trip("closed")
+        end_s = time.monotonic() + heard_within_s
+        while self._unheard is not None and time.monotonic() < end_s:
+            time.sleep(_LOOK_S)
+            self._stop()
         self._closed.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(1.0)
-        self._give_signals_back()
         atexit.unregister(self._at_exit)
         with suppress(Exception):
             self._vehicle.close()
-        self._stop()
-
-    def watch_signals(self, numbers: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM)) -> None:
-        """Stop the vehicle on a signal, also while the main thread is inside a library.
-
-        Only the main thread may call it; `close` gives the old handlers back.
-        """
-        read_fd, write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._wakeup = read_fd, write_fd
-        signal.set_wakeup_fd(write_fd, warn_on_full_buffer=False)
-        for number in numbers:
-            self._signals[number] = signal.signal(number, self._on_signal)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.signal = self.signal or number
+        with suppress(Exception):  # once more, for a driver that let go without a word
+            self._vehicle.stop()
 
     def _watch(self) -> None:
-        while not self._closed.is_set():
-            self._look_at_signals()
-            if self._armed and not self.tripped:
-                now_ns = self._now_ns()
-                if now_ns - self._written_ns > self._timeout_ns:
-                    self.trip(f"no fresh command for {(now_ns - self._written_ns) / 1e9:.2f} s")
-                for name, beat_ns in list(self._beats.items()):
-                    if now_ns - beat_ns > self._timeout_ns:
-                        self.trip(f"{name} hangs for {(now_ns - beat_ns) / 1e9:.2f} s")
+        while not self._closed.wait(self._until_next_look_s()):
+            try:
+                self._look()
+            except Exception as error:  # a dog that dies unseen watches nothing
+                self.trip(f"the guard failed: {type(error).__name__}: {error}")
 
-    def _look_at_signals(self) -> None:
-        """Wait a little, for a signal."""
-        if self._wakeup is None:
-            self._closed.wait(_LOOK_S)
-            return
-        ready, _, _ = select.select([self._wakeup[0]], [], [], _LOOK_S)
-        if ready:
-            with suppress(OSError):
-                for number in os.read(self._wakeup[0], 64):
-                    if number in self._signals:
-                        self.signal = self.signal or number
-                        self.trip(signal.Signals(number).name)
+    def _until_next_look_s(self) -> float:
+        if not self._armed or self.tripped:
+            return _LOOK_S
+        return min(max((self._deadline_ns - self._now_ns()) / 1e9, 0.001), _LOOK_S)
 
-    def _give_signals_back(self) -> None:
-        if self._wakeup is None:
+    def _look(self) -> None:
+        if self.tripped:
+            if self._unheard is not None or time.monotonic() - self._stopped_s > _AGAIN_S:
+                self._stop()
             return
-        for number, handler in self._signals.items():
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(-1)
-        for descriptor in self._wakeup:
-            os.close(descriptor)
-        self._wakeup = None
+        if not self._armed:
+            return
+        now_ns = self._now_ns()
+        if now_ns > self._deadline_ns:
+            self.trip(f"no fresh command for {(now_ns - self._written_ns) / 1e9:.2f} s")
+        for name, beat_ns in list(self._beats.items()):
+            if now_ns - beat_ns > self._timeout_ns:
+                self.trip(f"{name} hangs for {(now_ns - beat_ns) / 1e9:.2f} s")
 
     def _stop(self) -> None:
-        for _ in range(3):
-            try:
-                self._vehicle.stop()
-            except Exception:  # whatever it is, try again: there is nothing else to do
-                time.sleep(0.002)
-            else:
-                return
+        """Say it once; `_look` and `close` say it again until it is heard."""
+        try:
+            self._vehicle.stop()
+        except Exception as error:  # whatever it is, there is nothing else to do but try again
+            self._unheard = f"{type(error).__name__}: {error}"
+        else:
+            self._unheard, self._stopped_s = None, time.monotonic()
 
     def _at_exit(self) -> None:
         self.trip("the program ends")

@@ -7,20 +7,29 @@ A plug-in is a factory, found by an entry point of the group `jaxnav.vehicles` o
     def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]   # one for each of the rig
 
 `jaxnav.testing.check_vehicle` and `check_cameras` say whether it keeps its promises. A vehicle may
-also be `Ending`, and its factory may have `HasOwnFiles`.
+also be `Ending`, and its factory may have `HasOwnFiles` or `SharesProcess`.
+
+`jaxnav run` opens a vehicle in the process of its guard, which outlives whatever happens to the one
+that computes (see `guard_process`). There `setup.vehicle` is plain numbers, `setup.rig` and
+`setup.markers` are missing, and the vehicle that `open_cameras` gets only passes its calls on. A
+vehicle whose module imports JAX or OpenCV, that looks at rig or markers, or says `SharesProcess`,
+stays in the process that computes, watched by a thread.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-import numpy as np
+if TYPE_CHECKING:  # plug-ins import this file in the guard's process, which has none of these
+    import numpy as np
 
-from jaxnav.bicycle import Vehicle as VehicleModel
-from jaxnav.detection.types import Detections
-from jaxnav.files import Route
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+    from jaxnav.bicycle import Vehicle as VehicleModel
+    from jaxnav.detection.types import Detections
+    from jaxnav.files import Route
+    from jaxnav.markers import MarkerMap
+    from jaxnav.rig import CameraRig
 
 
 @dataclass(frozen=True)
@@ -136,6 +145,13 @@ class Camera(Protocol):
 
 OpenVehicle = Callable[[Setup], Vehicle]
 OpenCameras = Callable[[Setup, Vehicle], Sequence[Camera]]
+
+
+@runtime_checkable
+class SharesProcess(Protocol):
+    """What the factory of a vehicle may have beside: its cameras, say, need the vehicle itself."""
+
+    shares_process: bool  # True: it is opened in the process that computes
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,13 @@
 """What a command may be, whatever was computed (RELIABILITY R10)."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from jaxnav.bicycle import Vehicle
+if TYPE_CHECKING:  # the guard's process knows a vehicle's numbers without JAX
+    from jaxnav.bicycle import Vehicle
 
 
 @dataclass(frozen=True)
@@ -15,7 +19,7 @@ class Limits:
     throttle: float
 
     @staticmethod
-    def of(vehicle: Vehicle) -> "Limits":
+    def of(vehicle: Vehicle) -> Limits:
         """Those of its description."""
         return Limits(
             float(vehicle.steering_limit_rad),

@@ -48,8 +48,13 @@ def open_vehicle(name: str, setup: Setup) -> Vehicle:
         BadInput: there is none of that name, it can't be imported or opened, or what it gives is
             not a vehicle.
     """
+    return opened_vehicle(name, find("--vehicle", VEHICLES, name), setup)
+
+
+def opened_vehicle(name: str, factory: Callable[..., Any], setup: Setup) -> Vehicle:
+    """`open_vehicle` of a factory that was found before."""
     flag = "--vehicle"
-    vehicle = _opened(flag, name, find(flag, VEHICLES, name), setup)
+    vehicle: Vehicle = _opened(flag, name, factory, setup)
     if lacking := missing_members(vehicle, Vehicle):
         _close([vehicle])
         raise BadInput(flag, f"{name} gives {_what(vehicle)}, which has no {_listed(lacking)}")

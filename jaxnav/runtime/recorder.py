@@ -13,6 +13,7 @@ be read up to the last half second.
 import base64
 import errno
 import os
+import secrets
 import threading
 import time
 from collections import deque
@@ -63,7 +64,7 @@ class Recorder:
         """Open the file and write the header.
 
         Args:
-            path: a file that is there is replaced.
+            path: a file that is there is replaced once there is something to record.
             header: rig, markers, vehicle, route, settings, versions: what JSON and arrays can say.
             queue_messages: how many may wait, images among them: some seconds of a drive.
             queue_images: how many images may wait, for they are large.
@@ -83,7 +84,7 @@ class Recorder:
             self._writer.start(profile=PROFILE, library="jaxnav")
             self._writer.add_metadata(HEADER, metadata)
         except OSError as error:
-            self._file.close()
+            self._file.leave()
             raise BadInput(self.path, f"can't be written: {_reason(error)}") from None
         self._queue_messages, self._queue_images = queue_messages, queue_images
         self._queue: deque[_Item] = deque()
@@ -91,6 +92,7 @@ class Recorder:
         self._closing = threading.Event()
         self._images = self._dropped = self._written = 0
         self._failed: str | None = None
+        self._keeps_empty = True
         self._sequences: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._flushed_s = self._synced_s = time.monotonic()
@@ -130,10 +132,15 @@ class Recorder:
         """
         self._offer(topic, stamp_ns, stamp_ns, image, is_image=True)
 
-    def close(self, timeout_s: float = 5.0) -> None:
+    def close(self, timeout_s: float = 5.0, keep_empty: bool = True) -> None:
         """Write what waits and the summary. Any number of times; a disk that does not answer
-        within the time is left alone, and `failed` says so."""
+        within the time is left alone, and `failed` says so.
+
+        Args:
+            keep_empty: leave a file also where nothing was recorded, if there is none yet.
+        """
         with self._lock:
+            self._keeps_empty = keep_empty
             self._closing.set()
         self._thread.join(timeout_s)
         if self._thread.is_alive() and self._failed is None:
@@ -173,10 +180,12 @@ class Recorder:
                 self._flush_in_time()
             self._writer.finish()
             self._file.sync()
+            if self._keeps_empty:
+                self._file.take_place(only_where_free=True)
         except Exception as error:  # of a disk, or of whatever: the vehicle drives on
             self._fail(error)
         with suppress(OSError):
-            self._file.close()
+            self._file.leave()
 
     def _write(self, item: _Item) -> None:
         try:
@@ -188,6 +197,7 @@ class Recorder:
             return
         if item.topic not in self._channels:
             self._channels[item.topic] = self._new_channel(item)
+        self._file.take_place()
         channel, sequence = self._channels[item.topic], item.sequence & 0xFFFFFFFF
         self._writer.add_message(channel, log_ns, raw, stamp_ns, sequence)
         self._written += 1
@@ -217,11 +227,29 @@ class Recorder:
 
 
 class _File:
-    """What MCAP's writer needs of a file. It holds nothing back: what is written is written."""
+    """What MCAP's writer needs of a file. It holds nothing back: what is written is written.
+
+    Until `take_place` it lies beside the path under a name of its own, so that a recording of
+    another day is lost to nothing but a new one. What is no file, a pipe, is written to directly.
+    """
 
     def __init__(self, path: Path):
-        self._file = path.open("wb", buffering=0)
+        self._path, self._beside = path, path
+        if path.is_dir() or path.is_file() or not path.exists():
+            if path.is_file() and not os.access(path, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+            self._path = path.resolve()  # of a link what it leads to
+            self._beside = self._path.with_name(f".{path.name}-{secrets.token_hex(4)}.part")
+        self._file = self._beside.open("wb", buffering=0)
         self._position = 0
+
+    def take_place(self, only_where_free: bool = False) -> None:
+        """Become the file of the path, if it is not yet."""
+        if self._beside != self._path and not (only_where_free and self._path.exists()):
+            self._beside.replace(self._path)
+            self._beside = self._path
 
     def write(self, data: bytes) -> int:
         left = memoryview(data)
@@ -243,8 +271,11 @@ class _File:
             if error.errno != errno.EINVAL:  # of a pipe, which is no disk
                 raise
 
-    def close(self) -> None:
+    def leave(self) -> None:
+        """Close it, and leave nothing behind that did not become the path's."""
         self._file.close()
+        if self._beside != self._path:
+            self._beside.unlink(missing_ok=True)
 
 
 def _image_message(item: _Item) -> dict[str, Any]:

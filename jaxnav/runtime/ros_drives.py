@@ -25,6 +25,7 @@ from jaxnav.runtime.frames import Sighted
 from jaxnav.runtime.image_search import ImageSearch, size_problem
 from jaxnav.runtime.pilot import Input
 from jaxnav.runtime.ros_bags import Received, one_line, read_messages
+from jaxnav.runtime.twists import TwistReader
 
 TOGETHER_NS = 100_000_000  # frames with one stamp that come in later than this are late, not one
 
@@ -56,7 +57,7 @@ def read_ros_drive(
             problem = f"the rig has no such camera: it has {', '.join(rig.names)}"
             raise BadInput(at(topics.path, f"cameras.{name}"), problem)
     reader = _Reader(path, topics, rig, markers, corner_backend)
-    twists = ros_messages.TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
+    twists = TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
     inputs: list[Input] = []
     frames: list[tuple[int, Sighted]] = []
     with closing(read_messages(path, reader.choose)) as messages:

@@ -10,9 +10,7 @@ Corners are in the image that the detector was given. That of apriltag_ros is re
 in the rig is one without lens.
 """
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -22,6 +20,7 @@ from jaxnav.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL, FirstCorner
 from jaxnav.detection.types import Detections
 from jaxnav.files.images import decoded_image
 from jaxnav.runtime.interfaces import Odometry
+from jaxnav.runtime.twists import TwistReader
 
 APRILTAG_ROS = "apriltag_msgs/msg/AprilTagDetectionArray"
 TAGSLAM = "apriltag_msgs/msg/ApriltagArrayStamped"
@@ -32,7 +31,6 @@ ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 CAMERA_TYPES = (APRILTAG_ROS, TAGSLAM, IMAGE, COMPRESSED)
 ODOMETRY_TYPES = (NAV_ODOMETRY, ACKERMANN)
 
-STANDSTILL_MPS = 0.02  # below it noise in the yaw rate makes any steering angle
 # Name in ROS -> channels, and OpenCV's conversion to grey. OpenCV names a Bayer pattern after its
 # second row and column.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
@@ -89,41 +87,6 @@ def detections(
             for tag, i in zip(tags, ids, strict=True)
         ),
     )
-
-
-@dataclass
-class TwistReader:
-    """Speed along the course and steering of a bicycle, twist after twist.
-
-    With v the speed along the course, l the wheelbase and beta = atan(tan(steering) / 2), the
-    velocity along the vehicle's own x axis is v cos(beta), the same wherever on that axis
-    base_link is, and the yaw rate v cos(beta) tan(steering) / l. So
-
-        tan(steering) = yaw_rate l / forward,  v = forward sqrt(1 + tan^2(steering) / 4).
-
-    Source: Liu, Schofield, Shan (2023), Eqs. 4 to 6.
-
-    Attributes:
-        wheelbase_m: of the bicycle.
-        steering_limit_rad: a faster turn is noise, or slip, and not more steering.
-    """
-
-    wheelbase_m: float
-    steering_limit_rad: float
-    _held_rad: float = 0.0
-
-    def read(self, forward_mps: float, yaw_rate_radps: float) -> tuple[float, float]:
-        """(speed_mps, steering_rad), both NaN where either number is not finite.
-
-        At a standstill the steering is held.
-        """
-        if not (math.isfinite(forward_mps) and math.isfinite(yaw_rate_radps)):
-            return math.nan, math.nan
-        if abs(forward_mps) >= STANDSTILL_MPS:
-            steering_rad = math.atan(yaw_rate_radps * self.wheelbase_m / forward_mps)
-            limit_rad = self.steering_limit_rad
-            self._held_rad = min(max(steering_rad, -limit_rad), limit_rad)
-        return forward_mps * math.hypot(1.0, math.tan(self._held_rad) / 2), self._held_rad
 
 
 def odometry(kind: str, message: Any, twists: TwistReader) -> Odometry:

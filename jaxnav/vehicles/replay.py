@@ -77,6 +77,8 @@ class ReplayVehicle:
         throttle: the last one's; 0 once it was stopped.
     """
 
+    shares_process = True  # its cameras have its clock
+
     def __init__(self, setup: Setup):
         """Options: drive, the recording; images (false).
 

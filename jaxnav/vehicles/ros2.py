@@ -7,20 +7,24 @@ AckermannDriveStamped: the speed is throttle * speed_per_throttle_mps).
 ROS itself is not needed to install jaxnav; it is imported when something here is opened.
 """
 
+from __future__ import annotations
+
 import math
 import threading
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxnav.bicycle import Vehicle as VehicleModel
 from jaxnav.runtime.interfaces import Odometry, Setup, Vehicle
 from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.pilot import Outcome
-from jaxnav.runtime.ros_messages import TwistReader
+from jaxnav.runtime.twists import TwistReader
 from jaxnav.vehicles.options import choice
 from jaxnav.vehicles.ros2_node import Node
+
+if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
+    from jaxnav.bicycle import Vehicle as VehicleModel
+    from jaxnav.runtime.pilot import Outcome
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y, rotation about z among the six of a ROS covariance
 

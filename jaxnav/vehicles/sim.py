@@ -165,6 +165,9 @@ def open_vehicle(setup: Setup) -> SimVehicle:
     return SimVehicle(world)
 
 
+setattr(open_vehicle, "shares_process", True)  # noqa: B010  (mypy: a function has no such field)
+
+
 def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
     """The cameras that look at the world of the simulated car.
 

@@ -37,6 +37,9 @@ def open_vehicle(setup: Setup) -> RecordedVehicle:
     return RecordedVehicle(sim.open_vehicle(setup).world, setup.options["log"])
 
 
+setattr(open_vehicle, "shares_process", True)  # noqa: B010  (the cameras of sim look at its world)
+
+
 @dataclass(frozen=True)
 class Word:
     """What the vehicle was told."""

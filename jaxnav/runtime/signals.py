@@ -1,0 +1,183 @@
+"""Signals that end a drive: noted the moment they come, looked at before anything goes on.
+
+    with Signals() as signals:
+        signals.check()                  # between the steps of a start: raises `Interrupted`
+        signals.hold()                   # before a vehicle is opened
+        signals.on_signal(stop)          # called by a thread of ours, whatever the main thread does
+
+Python's own handler raises KeyboardInterrupt wherever the interpreter happens to be, inside a
+callback of a library as well, which swallows it. Ours raises nothing and forgets nothing.
+"""
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from types import FrameType, TracebackType
+from typing import Any
+
+# All that a person, a shell, a closed terminal or a supervisor may send, and that would end or
+# suspend a process which does not handle it. Ctrl-Z ends a drive: a car is not left half-way.
+_NAMES = "SIGINT SIGTERM SIGHUP SIGQUIT SIGTSTP SIGUSR1 SIGUSR2 SIGALRM SIGVTALRM SIGPROF SIGXCPU"
+_BY_HAND = ("SIGINT", "SIGTERM", "SIGQUIT", "SIGTSTP")  # ours, whoever else handles them
+_LEAVES_S = 1.0  # after a signal, while nothing moves and the main thread compiles or imports
+_ENDS_S = 30.0  # after a signal, while a vehicle is open: longer than all that closes it may take
+EXIT = 128  # plus the signal's number, as shells report it
+
+
+class Interrupted(BaseException):
+    """A signal came: what was begun is given up. No `except Exception` takes it for a fault."""
+
+    def __init__(self, number: int):
+        BaseException.__init__(self, signal.Signals(number).name)
+        self.number = number
+
+
+class Signals:
+    """The signals of this process from now on. Outside the main thread: none, all else works.
+
+    Attributes:
+        number: the first one that came.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._held = self._over = False
+        self._seen = threading.Event()  # by the main thread, which ends what it does
+        self._came = threading.Event()
+        self._closed = threading.Event()
+        self._told: list[Callable[[str], None]] = []
+        self._lock = threading.Lock()
+        self._before: dict[int, Any] = {}
+        self._pipe: tuple[int, int] | None = None
+        if threading.current_thread() is threading.main_thread():
+            self._take_over()
+
+    def _take_over(self) -> None:
+        for name in _NAMES.split():
+            number = getattr(signal, name, None)
+            if number is None:
+                continue
+            now = signal.getsignal(number)
+            # `nohup` has SIGHUP ignored on purpose; a plug-in may have use for others.
+            if name in _BY_HAND or now is signal.SIG_DFL:
+                self._before[number] = signal.signal(number, self._note)
+        # A program in the background may write to its terminal, which would suspend it.
+        self._before[signal.SIGTTOU] = signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+        self._pipe = os.pipe()
+        os.set_blocking(self._pipe[1], False)
+        signal.set_wakeup_fd(self._pipe[1], warn_on_full_buffer=False)
+        threading.Thread(target=self._read, name="jaxnav-signals", daemon=True).start()
+        threading.Thread(target=self._leave, name="jaxnav-leave", daemon=True).start()
+
+    @property
+    def name(self) -> str | None:
+        """Of the first one that came."""
+        return None if self.number is None else signal.Signals(self.number).name
+
+    @property
+    def exit_code(self) -> int | None:
+        """What a process that was ended by a signal returns; None: it was not."""
+        return None if self.number is None else EXIT + self.number
+
+    def check(self) -> None:
+        """Go on, or not. For the main thread, at every step.
+
+        Raises:
+            Interrupted: a signal came.
+        """
+        if self.number is not None:
+            self._seen.set()
+            raise Interrupted(self.number)
+
+    def hold(self) -> None:
+        """From now on something is open that must be closed: no signal ends the process at once.
+
+        Raises:
+            Interrupted: a signal came.
+        """
+        self._held = True
+        self.check()
+
+    def on_signal(self, tell: Callable[[str], None]) -> None:
+        """Call this with the signal's name when one comes, at once where one has come already.
+
+        Called by a thread of ours: also while the main thread is inside a library.
+        """
+        with self._lock:
+            self._told.append(tell)
+            name = self.name
+        if name is not None:
+            tell(name)
+
+    def close(self) -> None:
+        """Give the handlers back."""
+        if self._closed.is_set():
+            return
+        self._closed.set()
+        self._seen.set()
+        self._came.set()
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if self._pipe is not None:
+            signal.set_wakeup_fd(-1)
+            os.close(self._pipe[1])  # whereupon the thread reads the end, and closes the other
+
+    def __enter__(self) -> "Signals":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _note(self, number: int, frame: FrameType | None = None) -> None:
+        if self.number is None:
+            self.number = number
+
+    def _read(self) -> None:
+        """The thread that hears of signals although the main thread does not run Python now."""
+        assert self._pipe is not None
+        while True:
+            with suppress(OSError):
+                numbers = os.read(self._pipe[0], 64)
+                if not numbers:
+                    os.close(self._pipe[0])
+                    return
+                for number in numbers:
+                    if number in self._before and number != signal.SIGTTOU:
+                        self._note(number)
+                        self._tell()
+                        self._came.set()
+
+    def _tell(self) -> None:
+        with self._lock:
+            told = list(self._told)
+        for tell in told:
+            with suppress(Exception):  # one that fails must not keep the others from hearing it
+                tell(self.name or "")
+
+    def _leave(self) -> None:
+        """End a process whose main thread does not: it may compile, or hang in a driver."""
+        self._came.wait()
+        if not self._seen.wait(_LEAVES_S) and not self._held:
+            self._exit()
+        if not self._closed.wait(_ENDS_S):
+            self._exit()
+
+    def _exit(self) -> None:
+        if self._closed.is_set():
+            return
+        said = threading.Thread(target=_say_interrupted, daemon=True)
+        said.start()
+        said.join(0.2)  # a terminal that is stuck must not hold up the end
+        os._exit(self.exit_code or EXIT)
+
+
+def _say_interrupted() -> None:
+    with suppress(OSError):
+        os.write(2, b"jaxnav: interrupted\n")
