@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from jaxnav.runtime.drive_log import read_drive
 from jaxnav.runtime.flags import Health
 from jaxnav.vehicles.world import World
 from tests import worlds
-from tests.helpers import recorded_vehicle
+from tests.helpers import plain_cameras, plain_car, recorded_vehicle
 from tests.helpers.recorded_vehicle import Word, words
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,6 +59,14 @@ class Workplace:
             *("--headless", "--timeout-s", 3),
         )
 
+    def moved(self, log: Path, record: Path) -> list[str]:
+        """The same, of a car in the guard's process."""
+        return self.command(
+            *("--vehicle", plain_car.NAME, "--cameras", plain_cameras.NAME),
+            *("--option", f"log={log}", "--route", self.folder / "route.yaml"),
+            *("--record", record, "--timeout-s", 3),
+        )
+
 
 @dataclass(frozen=True)
 class Ended:
@@ -80,7 +88,21 @@ class Running:
 
     def ended(self) -> Ended:
         out, err = self.process.communicate(timeout=60)
-        return Ended(self.process.returncode, out, err, words(self.log))
+        return Ended(self.process.returncode, out, err, self.told())
+
+    def told(self) -> list[Word]:
+        """What the vehicle was told so far, by whichever process."""
+        if "plain_car" in str(self.process.args):
+            return [Word(word.stamp_ns, word.throttle) for word in plain_car.words(self.log)]
+        return words(self.log)
+
+    def stands_after_s(self, since_ns: int) -> float:
+        """How long it took until it was told nothing but zero, which must be soon."""
+        end_s = time.monotonic() + 10.0
+        while self.told()[-1].throttle != 0:
+            assert time.monotonic() < end_s, "the last word is a throttle"
+            time.sleep(0.02)
+        return (stood_ns(self.told()) - since_ns) / 1e9
 
 
 @pytest.fixture(scope="module")
@@ -91,26 +113,35 @@ def workplace(tmp_path_factory) -> Workplace:
     return Workplace(folder)
 
 
+def stood_ns(told: list[Word]) -> int:
+    """Since when it was told nothing but zero."""
+    last = max(index for index, word in enumerate(told) if word.throttle)
+    return told[last + 1].stamp_ns
+
+
 @contextmanager
-def driving(workplace: Workplace, folder: Path) -> Iterator[Running]:
+def driving(
+    workplace: Workplace, folder: Path, moved: bool = False, stderr: int = subprocess.PIPE
+) -> Iterator[Running]:
     """A drive, from when the vehicle has been told to move."""
     log, record = folder / "told", folder / "drive.mcap"
     process = subprocess.Popen(
-        workplace.driving(log, record),
+        (workplace.moved if moved else workplace.driving)(log, record),
         cwd=folder,
         env=workplace.environment(),
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stderr=stderr,
         text=True,
     )
     with process:
         try:
+            running = Running(process, log, record)
             end_s = time.monotonic() + START_S
-            while sum(word.throttle != 0 for word in words(log)) < 3:
+            while sum(word.throttle != 0 for word in running.told()) < 3:
                 if process.poll() is not None or time.monotonic() > end_s:
                     pytest.fail(f"does not drive: {process.communicate(timeout=1)}")
                 time.sleep(0.02)
-            yield Running(process, log, record)
+            yield running
         finally:
             process.kill()
 
@@ -145,15 +176,81 @@ def test_a_signal_stops_the_vehicle_at_once(workplace, tmp_path, number):
     assert (ended.code, ended.err) == (128 + number, "")
     assert ended.out.startswith(f"ended: {number.name}\n")
     assert ended.told[-1].throttle == 0
-    stood_ns = min(
-        word.stamp_ns
-        for index, word in enumerate(ended.told)
-        if all(later.throttle == 0 for later in ended.told[index:])
-    )
-    assert (stood_ns - signalled_ns) / 1e9 < STOPS_S + SLACK_S
+    assert (stood_ns(ended.told) - signalled_ns) / 1e9 < STOPS_S + SLACK_S
     log = read_drive(drive.record)
     assert not log.truncated
     assert log.outcomes.throttle.any()
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTSTP])
+def test_a_car_in_the_guards_process_stops_at_a_signal(workplace, tmp_path, number):
+    with driving(workplace, tmp_path, moved=True) as drive:
+        signalled_ns = time.monotonic_ns()
+        drive.process.send_signal(number)
+        assert drive.stands_after_s(signalled_ns) < STOPS_S + SLACK_S
+        drive.process.send_signal(signal.SIGINT)  # once more, while it ends: nothing is cut short
+        ended = drive.ended()
+    assert ended.code == 128 + number
+    assert ended.out.startswith(f"ended: {number.name}\n")
+    assert "guard: a process of its own" in ended.out
+    assert not read_drive(drive.record).truncated
+
+
+def test_a_car_in_the_guards_process_stands_when_the_drive_is_killed(workplace, tmp_path):
+    with driving(workplace, tmp_path, moved=True) as drive:
+        killed_ns = time.monotonic_ns()
+        drive.process.kill()
+        assert drive.stands_after_s(killed_ns) < STOPS_S + SLACK_S
+        assert drive.process.wait(10) == -signal.SIGKILL
+
+
+def test_the_end_of_the_guards_process_is_the_end_of_the_drive(workplace, tmp_path):
+    with driving(workplace, tmp_path, moved=True) as drive:
+        os.kill(plain_car.words(drive.log)[-1].pid, signal.SIGKILL)
+        ended = drive.ended()
+    assert ended.code == 1
+    assert ended.out.startswith("ended: the guard's process was ended by signal 9\n")
+    assert ended.told[-1].throttle == 0  # by another one that was started for it
+
+
+def test_a_terminal_that_is_stuck_holds_up_neither_the_drive_nor_its_end(workplace, tmp_path):
+    ends = os.pipe()
+    os.set_blocking(ends[1], False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(ends[1], bytes(4096))
+    os.set_blocking(ends[1], True)
+    with driving(workplace, tmp_path, moved=True, stderr=ends[1]) as drive:
+        time.sleep(0.5)
+        signalled_ns = time.monotonic_ns()
+        drive.process.send_signal(signal.SIGTERM)
+        assert drive.stands_after_s(signalled_ns) < STOPS_S + SLACK_S
+        assert drive.ended().code == 128 + signal.SIGTERM
+    for end in ends:
+        os.close(end)
+
+
+@pytest.mark.parametrize("after_s", [0.2, 1.0, 2.0])
+def test_a_start_that_is_called_off_opens_nothing(workplace, tmp_path, after_s):
+    log, record = tmp_path / "told", tmp_path / "drive.mcap"
+    record.write_bytes(b"of another day")
+    process = subprocess.Popen(
+        workplace.driving(log, record),
+        env=workplace.environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with process:
+        time.sleep(after_s)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    # A machine so fast that it drives by then has stopped, see above.
+    assert process.returncode in (-signal.SIGINT, 128 + signal.SIGINT), err
+    assert not any(word.throttle for word in words(log)[-1:])
+    if not words(log):
+        assert record.read_bytes() == b"of another day"
+        assert list(tmp_path.iterdir()) == [record]
 
 
 def test_of_a_drive_that_is_killed_the_recording_lacks_less_than_the_last_second(
