@@ -152,6 +152,29 @@ def test_a_ros_that_is_gone_is_an_oserror(bus, vehicle):
     context.running = True
 
 
+def test_a_message_that_hangs_holds_up_neither_a_stop_nor_the_end(bus, vehicle, monkeypatch):
+    hangs, let_go, publish = threading.Event(), threading.Event(), vehicle._publisher.publish
+
+    def stuck(message):
+        if message.drive.speed > 0 and not hangs.is_set():
+            hangs.set()
+            let_go.wait(5.0)
+        publish(message)
+
+    monkeypatch.setattr(vehicle._publisher, "publish", stuck)
+    writer = threading.Thread(target=vehicle.write, args=(0.0, 0.2), daemon=True)
+    writer.start()
+    assert hangs.wait(2.0)
+    begin_s = time.monotonic()
+    vehicle.stop()
+    assert time.monotonic() - begin_s < 1.0
+    assert bus.sent[-1][1].drive.speed == 0
+    let_go.set()
+    writer.join(2.0)
+    assert [message.drive.speed for _, message in bus.sent][-2:] == [2.0, 0.0]
+    vehicle.close()
+
+
 def test_an_unknown_type_of_message_is_named(bus):
     with pytest.raises(
         BadInput, match="--option odometry_type: expected odometry or ackermann, got 'pose'"

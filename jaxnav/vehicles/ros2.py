@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
     from jaxnav.bicycle import Vehicle as VehicleModel
     from jaxnav.runtime.pilot import Outcome
 
+_LOCK_PATIENCE_S = 0.03  # for a message that another thread publishes; then past it
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y, rotation about z among the six of a ROS covariance
 
 
@@ -71,6 +72,7 @@ class RosVehicle:
         self._written_ns: int | None = None
         self._closed = False
         self._writing = threading.Lock()  # so that nothing follows the zero of a `stop`
+        self._stops = 0
         self._node = Node("jaxnav_vehicle")
         self._publisher = self._node.publisher(AckermannDriveStamped, command_topic)
         if odometry_type == "ackermann":
@@ -105,17 +107,27 @@ class RosVehicle:
                 steering_rad, throttle, self._steering_rad, (now_ns - before_ns) / 1e9
             )
             self._written_ns = now_ns
-            self._command(throttle, now_ns)
+            stops = self._stops
+            try:
+                self._command(throttle, now_ns)
+            finally:
+                if self._stops != stops:  # it did not wait for this one, which hung
+                    self._command(0.0, time.monotonic_ns())
 
     def stop(self) -> None:
-        """Publish speed zero.
+        """Publish speed zero, also while ROS hangs with another message.
 
         Raises:
             OSError: it could not be published.
         """
-        with self._writing:
+        self._stops += 1
+        free = self._writing.acquire(timeout=_LOCK_PATIENCE_S)
+        try:
             if not self._closed:
                 self._command(0.0, time.monotonic_ns())
+        finally:
+            if free:
+                self._writing.release()
 
     def close(self) -> None:
         """Stop and leave ROS. Any number of times."""
@@ -124,8 +136,7 @@ class RosVehicle:
         try:
             self.stop()
         finally:
-            with self._writing:
-                self._closed = True
+            self._closed = True
             self._node.close()
 
     def _command(self, throttle: float, now_ns: int) -> None:

@@ -1,0 +1,281 @@
+"""Does the car stop? Deaths of the process that computes, signals at any moment, long driving.
+
+    python benchmarks/bench_stop.py deaths --each 50 --load 8
+    python benchmarks/bench_stop.py signals --count 500
+    python benchmarks/bench_stop.py soak --minutes 60 --load 8
+
+`--load` adds so many processes that compute. How late a process wakes that only sleeps is measured
+beside the deaths: the slack of the machine, which no program can take away.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from jaxnav.runtime.drive_log import read_drive  # noqa: E402
+from jaxnav.runtime.flags import Health  # noqa: E402
+from tests.helpers import plain_cameras, plain_car, recorded_vehicle  # noqa: E402
+from tests.helpers.dying_parent import ENDS  # noqa: E402
+
+MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+def _burn() -> None:
+    while True:
+        pass
+
+
+@contextmanager
+def load(processes: int) -> Iterator[None]:
+    """So many processes that compute."""
+    burning = [multiprocessing.Process(target=_burn, daemon=True) for _ in range(processes)]
+    for process in burning:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in burning:
+            process.kill()
+
+
+def _sleep(results: "multiprocessing.Queue[list[float]]", over: "multiprocessing.Event") -> None:  # type: ignore[valid-type]
+    late_ms = []
+    while not over.is_set():
+        begin_s = time.monotonic()
+        time.sleep(0.01)
+        late_ms.append((time.monotonic() - begin_s - 0.01) * 1e3)
+    results.put(late_ms)
+
+
+def _quantiles(values_ms: list[float]) -> str:
+    median, late, most = np.quantile(values_ms, [0.5, 0.99, 1.0])
+    return f"{median:.0f} | {late:.0f} | {most:.0f}"
+
+
+def deaths(each: int, jobs: int, processes: int) -> None:
+    """A table: how long after an end of the process that computes the vehicle was told to stop."""
+    took_ms: dict[str, list[float]] = {how: [] for how in ENDS}
+    never: Counter[str] = Counter()
+    queue: multiprocessing.Queue[list[float]] = multiprocessing.Queue()
+    over = multiprocessing.Event()
+    sleeper = multiprocessing.Process(target=_sleep, args=(queue, over), daemon=True)
+    with tempfile.TemporaryDirectory() as folder, load(processes), ThreadPoolExecutor(jobs) as pool:
+        sleeper.start()
+
+        def one(number: int, how: str) -> tuple[str, float | None]:
+            return how, _death_ms(Path(folder) / f"{how}-{number}".replace(" ", "-"), how)
+
+        todo = [(number, how) for number in range(each) for how in ENDS]
+        loads = []
+        for how, ms in tqdm(
+            pool.map(lambda args: one(*args), todo), total=len(todo), mininterval=30
+        ):
+            loads.append(os.getloadavg()[0])
+            if ms is None:
+                never[how] += 1
+            else:
+                took_ms[how].append(ms)
+        over.set()
+    late_ms = queue.get()
+    print(f"load {np.median(loads):.1f}; {os.cpu_count()} cores; of a sleep of 10 ms too long, ms:"
+          f" median | 99 % | most: {_quantiles(late_ms)}\n")  # fmt: skip
+    print("| the process that computes | stopped within 200 ms | median ms | 99 % | most |")
+    print("|---|---|---|---|---|")
+    for how, all_ms in took_ms.items():
+        within = sum(ms <= 200 for ms in all_ms)
+        print(f"| {how} | {within} of {each} | {_quantiles(all_ms)} |")
+    if never:
+        print(f"never: {dict(never)}")
+
+
+def _death_ms(log: Path, how: str) -> float | None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.helpers.dying_parent", str(log), how,
+         f"{random.uniform(0.05, 0.3)}"],
+        cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    with process:
+        assert process.stdout is not None
+        ended_ns = int(process.stdout.readline())
+        time.sleep(1.0)
+        told = plain_car.words(log)
+        process.kill()
+    if not told or told[-1].throttle != 0:
+        return None
+    last = max(index for index, word in enumerate(told) if word.throttle)
+    return (told[last + 1].stamp_ns - ended_ns) / 1e6
+
+
+def _command(kind: str, log: Path, record: Path) -> list[str]:
+    vehicle, cameras = {
+        "a thread": (recorded_vehicle.NAME, "sim"),
+        "a process": (plain_car.NAME, plain_cameras.NAME),
+    }[kind]
+    return [sys.executable, "-c", MAIN, "run", "--headless", "--timeout-s", "2", "--vehicle",
+            vehicle, "--cameras", cameras, "--option", f"log={log}", "--record", str(record)]  # fmt: skip
+
+
+def _throttles(kind: str, log: Path) -> list[tuple[int, float]]:
+    words = plain_car.words(log) if kind == "a process" else recorded_vehicle.words(log)
+    return [(word.stamp_ns, word.throttle) for word in words]
+
+
+def signals(count: int, jobs: int, seed: int) -> None:
+    """A table: signals at random moments from exec to the last waypoint."""
+    rng = random.Random(seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        lasts_s = {}
+        for kind in ("a thread", "a process"):
+            for _ in range(2):  # the first one compiles
+                begin_s = time.monotonic()
+                command = _command(kind, folder / "first", folder / "first.mcap")
+                subprocess.run(command, env=ENVIRONMENT, check=True, capture_output=True)
+                lasts_s[kind] = time.monotonic() - begin_s
+        # A good part of them in the start, where little time is spent and much can go wrong.
+        todo = [
+            (number, kind, rng.choice(SIGNALS), rng.random() ** 2 * lasts_s[kind] * jobs**0.5,
+             rng.random() < 0.5)
+            for number in range(count)
+            for kind in [rng.choice(list(lasts_s))]
+        ]  # fmt: skip
+        with ThreadPoolExecutor(jobs) as pool:
+            results = list(
+                tqdm(pool.map(lambda args: _signalled(folder, *args), todo), total=count)
+            )
+    print(f"drives last {lasts_s} s from exec; load {os.getloadavg()[0]:.1f}\n")
+    print(
+        "| guard | phase | signals | ended at zero | exit code as documented | ms to zero, most |"
+    )
+    print("|---|---|---|---|---|---|")
+    for key in sorted({(kind, phase) for kind, phase, *_ in results}):
+        mine = [rest for kind, phase, *rest in results if (kind, phase) == key]
+        stood, coded = (sum(row[index] for row in mine) for index in (0, 1))
+        most_ms = max((row[2] for row in mine), default=0.0)
+        print(f"| {key[0]} | {key[1]} | {len(mine)} | {stood} | {coded} | {most_ms:.0f} |")
+    for row in results:
+        if not (row[2] and row[3]):
+            print(row)
+
+
+def _signalled(
+    folder: Path, number: int, kind: str, what: signal.Signals, after_s: float, twice: bool
+) -> tuple[str, str, bool, bool, float, object]:
+    log, record = folder / f"{number}.log", folder / f"{number}.mcap"
+    process = subprocess.Popen(
+        _command(kind, log, record), env=ENVIRONMENT,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    time.sleep(after_s)
+    phase = "drives" if any(t for _, t in _throttles(kind, log)) else "starts"
+    over = process.poll() is not None
+    signalled_ns = time.monotonic_ns()
+    process.send_signal(what)
+    if twice:
+        time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    told = _throttles(kind, log)
+    late_ms = max([(ns - signalled_ns) / 1e6 for ns, t in told if t], default=0.0)
+    stood = not told or told[-1][1] == 0
+    # Before the first line of jaxnav the signal itself ends Python, which a shell reports alike.
+    expected = {0} if over else {128 + what, -what}
+    if not over and phase == "drives":
+        expected |= {0} if process.returncode == 0 and late_ms <= 0 else set()  # arrived meanwhile
+    for path in (log, record):
+        path.unlink(missing_ok=True)
+    phase = "was over" if over else phase
+    detail = (process.returncode, what.name, round(after_s, 3), err[-300:])
+    return kind, phase, stood, process.returncode in expected, max(late_ms, 0.0), detail
+
+
+def soak(minutes: float, processes: int) -> None:
+    """Drives of the simulated car, one after the other, for so long: no stop that is not asked for,
+    and every one that is."""
+    end_s = time.monotonic() + 60 * minutes
+    ends: Counter[str] = Counter()
+    seconds, health, loads = 0.0, Counter[str](), []
+    with tempfile.TemporaryDirectory() as name, load(processes):
+        number = 0
+        with tqdm(total=60 * minutes, unit="s") as bar:
+            while time.monotonic() < end_s:
+                number += 1
+                took_s, why, seen = _soaked(Path(name), number)
+                seconds += took_s
+                ends[why] += 1
+                health.update(seen)
+                loads.append(os.getloadavg()[0])
+                bar.update(took_s)
+    print(
+        f"{number} drives, {seconds / 60:.1f} min, load {np.median(loads):.1f}: {json.dumps(ends)}"
+    )
+    total = sum(health.values())
+    print({name: f"{count / total:.2%}" for name, count in health.most_common()})
+
+
+def _soaked(folder: Path, number: int) -> tuple[float, str, Counter[str]]:
+    """Each tenth drive is held for 1 s: it must be stopped."""
+    record, held = folder / "drive.mcap", number % 10 == 0
+    command = [sys.executable, "-c", MAIN, "run", "--vehicle", "sim", "--headless", "--seed",
+               str(number), "--record", str(record), "--duration-s", "40"]  # fmt: skip
+    begin_s = time.monotonic()
+    process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE,
+                               stderr=subprocess.STDOUT, text=True)  # fmt: skip
+    if held:
+        while not record.exists() and process.poll() is None:
+            time.sleep(0.05)
+        time.sleep(3.0)
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(1.0)
+        process.send_signal(signal.SIGCONT)
+    out, _ = process.communicate(timeout=600)
+    said = (out.splitlines() or [""])[0].removeprefix("ended: ")
+    why = f"{'held for 1 s: ' if held else ''}{process.returncode} {said.split(' for ')[0]}"
+    seen: Counter[str] = Counter()
+    if record.exists():
+        seen.update(Health(int(one)).name for one in read_drive(record).outcomes.health)
+        record.unlink()
+    return time.monotonic() - begin_s, why, seen
+
+
+def main() -> None:
+    """What is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["deaths", "signals", "soak"])
+    parser.add_argument("--each", type=int, default=50)
+    parser.add_argument("--count", type=int, default=500)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--load", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    if args.what == "deaths":
+        deaths(args.each, args.jobs, args.load)
+    elif args.what == "signals":
+        signals(args.count, args.jobs, args.seed)
+    else:
+        soak(args.minutes, args.load)
+
+
+if __name__ == "__main__":
+    main()
