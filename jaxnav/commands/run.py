@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -172,6 +172,9 @@ class _Drive:
             # Python looks through all objects now and then: not through those of JAX, 50 ms a time.
             gc.freeze()
             closing.callback(gc.unfreeze)
+            # Before what else runs here, as far as that is allowed; threads that it begins as well.
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, 0, -10)
             signals.hold()
             vehicle, guard = self._guarded(pilot.limits)
             closing.callback(self._close, vehicle, guard)

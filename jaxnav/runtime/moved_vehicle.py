@@ -77,11 +77,11 @@ class GuardProcess:
 
         Args:
             check: called while it waits; may raise.
-
-        Raises:
-            BadInput: there is no such vehicle, or it can't be imported.
         """
-        self._answer(check)
+        try:
+            self._answer(check)
+        except BadInput as bad:  # who found it here can drive it here
+            self.stays = f"there {bad}"
 
     def open(
         self,

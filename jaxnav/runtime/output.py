@@ -74,7 +74,7 @@ class _Pump:
 
 
 def fill_descriptors() -> None:
-    """Where stdin, stdout or stderr was closed: let no file that is opened later be taken for it."""
+    """Where stdin, stdout or stderr was closed: let no file opened later be taken for it."""
     if None not in (sys.stdin, sys.stdout, sys.stderr):
         return
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:

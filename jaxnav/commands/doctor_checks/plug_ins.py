@@ -13,6 +13,7 @@ from jaxnav.errors import BadInput
 from jaxnav.runtime import plugins
 from jaxnav.runtime.interfaces import Odometry, Setup, Vehicle
 from jaxnav.runtime.limits import Limits
+from jaxnav.runtime.moved_vehicle import GuardProcess
 from jaxnav.testing.calls import HANGS_S, Worker, started
 from jaxnav.testing.cameras import Parked
 
@@ -68,13 +69,39 @@ def _open_vehicle(name: str, setup: Setup, opened: list[Vehicle]) -> Iterator[Fi
         return
     opened.append(vehicle)
     yield Finding("vehicle", "ok", f"{name} opens")
+    yield _guard(name)
     if not vehicle.timeout_s < math.inf:
         yield Finding(
             "vehicle",
             "warning",
             f"{name} does not stop by itself when nothing is written any more",
-            "a program that hangs leaves it driving: have a switch at hand that cuts its power",
+            "a computer that fails as a whole leaves it driving: have a switch at hand that cuts "
+            "its power",
         )
+
+
+def _guard(name: str) -> Finding:
+    """Whether `jaxnav run` would open it in the guard's process, as far as its import tells."""
+    guarding = GuardProcess(name)
+    until_s = time.monotonic() + _OPENS_WITHIN_S
+
+    def check() -> None:
+        if time.monotonic() > until_s:
+            raise BadInput("vehicle", f"{name} is not imported within {_OPENS_WITHIN_S:g} s")
+
+    try:
+        guarding.prepare(check)
+    finally:
+        guarding.end()
+    if guarding.stays is None:
+        return Finding("guard", "ok", f"{name} can be owned by a process that outlives the rest")
+    return Finding(
+        "guard",
+        "note",
+        f"a thread alone watches {name}, which can't be moved to another process: "
+        f"{guarding.stays}",
+        "a library that holds the interpreter, or the end of the program, stops the thread too",
+    )
 
 
 def _not_opened(part: str, name: str, error: Exception) -> Finding:
