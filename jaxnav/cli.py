@@ -60,8 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _main(args, lambda args: _dispatch(args, signals))
         return code if signals.exit_code is None else signals.exit_code
     finally:
-        if argv is not None:  # else the process ends now, and a second Ctrl-C changes nothing
-            signals.close()
+        signals.ignore() if argv is None else signals.close()
 
 
 def _main(args: list[str], dispatch: Callable[[list[str]], int]) -> int:

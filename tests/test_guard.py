@@ -278,19 +278,20 @@ while time.monotonic() < end:
 {ending}
 """
 
+DRIVES_ON = "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)"
 ENDINGS = {
     "exception": "raise RuntimeError('somewhere')",
     "sys.exit": "sys.exit(3)",
     "end of the program": "",
-    "SIGTERM": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
-    "SIGINT": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
+    "SIGTERM": DRIVES_ON,
+    "SIGINT": DRIVES_ON,
     # The main thread is inside the C library and runs no handler of Python's for a second. What
     # holds the interpreter as well is for the guard's process, see test_guard_process.
     "SIGTERM in a hang": "threading.main_thread(); import ctypes; ctypes.CDLL(None).sleep(1)",
-    "SIGHUP": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
-    "SIGQUIT": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
-    "SIGTSTP": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
-    "SIGTERM with many files": "while not guard.tripped:\n    guard.write(0.0, 0.2); time.sleep(0.01)",
+    "SIGHUP": DRIVES_ON,
+    "SIGQUIT": DRIVES_ON,
+    "SIGTSTP": DRIVES_ON,
+    "SIGTERM with many files": DRIVES_ON,
 }
 
 

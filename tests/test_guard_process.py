@@ -218,9 +218,8 @@ def test_a_wait_for_it_can_be_called_off():
     def called_off():
         raise KeyboardInterrupt
 
-    with closing_of(GuardProcess(plain_car.NAME)) as guarding:
-        with pytest.raises(KeyboardInterrupt):
-            guarding.prepare(called_off)
+    with closing_of(GuardProcess(plain_car.NAME)) as guarding, pytest.raises(KeyboardInterrupt):
+        guarding.prepare(called_off)
 
 
 @pytest.mark.parametrize("module", ["qcar", "ros2"])

@@ -1,10 +1,13 @@
 """`jaxnav run` as a person runs it, in processes of its own: it arrives, or it stands."""
 
+import fcntl
 import os
+import pty
 import resource
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -121,17 +124,28 @@ def stood_ns(told: list[Word]) -> int:
 
 @contextmanager
 def driving(
-    workplace: Workplace, folder: Path, moved: bool = False, stderr: int = subprocess.PIPE
+    workplace: Workplace,
+    folder: Path,
+    moved: bool = False,
+    stderr: int = subprocess.PIPE,
+    terminal: int | None = None,
 ) -> Iterator[Running]:
-    """A drive, from when the vehicle has been told to move."""
+    """A drive, from when the vehicle has been told to move.
+
+    Args:
+        terminal: what it was started from.
+    """
     log, record = folder / "told", folder / "drive.mcap"
     process = subprocess.Popen(
         (workplace.moved if moved else workplace.driving)(log, record),
         cwd=folder,
         env=workplace.environment(),
+        stdin=terminal,
         stdout=subprocess.PIPE,
         stderr=stderr,
         text=True,
+        start_new_session=terminal is not None,
+        preexec_fn=None if terminal is None else lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )
     with process:
         try:
@@ -183,16 +197,23 @@ def test_a_signal_stops_the_vehicle_at_once(workplace, tmp_path, number):
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTSTP])
-def test_a_car_in_the_guards_process_stops_at_a_signal(workplace, tmp_path, number):
-    with driving(workplace, tmp_path, moved=True) as drive:
+def test_a_car_in_the_guards_process_stops_when_its_terminal_says_so(workplace, tmp_path, number):
+    ours, terminal = pty.openpty()
+    with driving(workplace, tmp_path, True, terminal, terminal) as drive:
+        os.close(terminal)
         signalled_ns = time.monotonic_ns()
-        drive.process.send_signal(number)
+        if number == signal.SIGHUP:
+            os.close(ours)  # the window, or the line to it, is gone
+        else:
+            os.write(ours, b"\x1a")  # Ctrl-Z
         assert drive.stands_after_s(signalled_ns) < STOPS_S + SLACK_S
         drive.process.send_signal(signal.SIGINT)  # once more, while it ends: nothing is cut short
         ended = drive.ended()
     assert ended.code == 128 + number
     assert ended.out.startswith(f"ended: {number.name}\n")
     assert "guard: a process of its own" in ended.out
+    if number != signal.SIGHUP:
+        os.close(ours)
     assert not read_drive(drive.record).truncated
 
 

@@ -22,13 +22,16 @@ class Run:
     """Drive a vehicle through its route.
 
     Everything is compiled before the vehicle is armed. The last that it hears, however this ends,
-    is zero throttle: at the last waypoint, on Ctrl-C and SIGTERM, when data are missing for too
-    long, and when anything hangs or fails. `--vehicle sim` is a simulated car in real time;
-    `--vehicle replay --option drive=FILE` is a recorded drive, with its own rig, markers, vehicle
-    and route.
+    is zero throttle: at the last waypoint, on Ctrl-C, Ctrl-Z and any other signal, when data are
+    missing for too long, and when anything hangs, fails or is killed. A vehicle that can be moved
+    is opened in a small process of its own, which stops it whatever becomes of this one; others,
+    `sim` and `replay` among them, are watched by a thread. `--vehicle sim` is a simulated car in
+    real time; `--vehicle replay --option drive=FILE` is a recorded drive, with its own rig,
+    markers, vehicle and route.
 
-    Exit codes: 0 arrived, out of time or recording, 1 stopped by the watchdog, 130 and 143 by a
-    signal.
+    Exit codes: 0 arrived, out of time or recording, 1 stopped by a guard, 2 bad input, 128 plus the
+    number of the signal that ended it: 130 Ctrl-C, 143 SIGTERM, 129 a closed terminal, 131 SIGQUIT,
+    148 Ctrl-Z.
     """
 
     vehicle: str = "sim"

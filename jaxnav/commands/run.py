@@ -121,7 +121,11 @@ def _guarding(args: Run) -> GuardProcess | None:
     factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
     if isinstance(factory, SharesProcess) and factory.shares_process:
         return None
-    return GuardProcess(args.vehicle)
+    try:
+        return GuardProcess(args.vehicle)
+    except OSError as error:
+        problem = f"the guard's process can't be started: {error.strerror or error}"
+        raise BadInput(f"--vehicle {args.vehicle}", problem) from None
 
 
 def _searches(args: Run, setup: DriveSetup) -> list[Search]:

@@ -13,7 +13,8 @@ also be `Ending`, and its factory may have `HasOwnFiles` or `SharesProcess`.
 that computes (see `guard_process`). There `setup.vehicle` is plain numbers, `setup.rig` and
 `setup.markers` are missing, and the vehicle that `open_cameras` gets only passes its calls on. A
 vehicle whose module imports JAX or OpenCV, that looks at rig or markers, or says `SharesProcess`,
-stays in the process that computes, watched by a thread.
+stays in the process that computes, watched by a thread. The guard runs at real-time priority where
+it may: a `read` that waits must sleep, not spin.
 """
 
 from __future__ import annotations

@@ -52,6 +52,9 @@ class GuardProcess:
 
         Args:
             name: of the vehicle, as `plugins.find` takes it.
+
+        Raises:
+            OSError: the machine has no room for another process.
         """
         self.name = name
         self.stays: str | None = None
@@ -77,11 +80,12 @@ class GuardProcess:
 
         Args:
             check: called while it waits; may raise.
+
+        Raises:
+            BadInput: the process has ended.
         """
-        try:
-            self._answer(check)
-        except BadInput as bad:  # who found it here can drive it here
-            self.stays = f"there {bad}"
+        if "bad" in (answer := self._answer(check)):  # who found it here can drive it here
+            self.stays = f"there {answer['bad']}"
 
     def open(
         self,
@@ -119,6 +123,8 @@ class GuardProcess:
         self._opens = True
         self.commands.tell(**told)
         answer = self._answer(check)
+        if "bad" in answer:
+            raise BadInput(*answer["bad"].split(": ", 1))
         if "opened" not in answer:
             return None
         return MovedVehicle(self, answer["opened"], answer["priority"], timeout_s)
@@ -157,8 +163,6 @@ class GuardProcess:
             raise BadInput(
                 f"--vehicle {self.name}", f"the guard's process {ending(self.process)}"
             ) from None
-        if "bad" in answer:
-            raise BadInput(*answer["bad"].split(": ", 1))
         self.stays = answer.get("stays")
         return answer
 

@@ -111,6 +111,11 @@ class Signals:
         if name is not None:
             tell(name)
 
+    def ignore(self) -> None:
+        """All is closed and the process ends: what comes now does not change how."""
+        for number in self._before:
+            signal.signal(number, signal.SIG_IGN)
+
     def close(self) -> None:
         """Give the handlers back."""
         if self._closed.is_set():

@@ -98,8 +98,7 @@ def _guard(name: str) -> Finding:
     return Finding(
         "guard",
         "note",
-        f"a thread alone watches {name}, which can't be moved to another process: "
-        f"{guarding.stays}",
+        f"a thread alone watches {name}, which can't be moved to another process: {guarding.stays}",
         "a library that holds the interpreter, or the end of the program, stops the thread too",
     )
 
