@@ -22,7 +22,7 @@ from typing import Any
 _NAMES = "SIGINT SIGTERM SIGHUP SIGQUIT SIGTSTP SIGUSR1 SIGUSR2 SIGALRM SIGVTALRM SIGPROF SIGXCPU"
 _BY_HAND = ("SIGINT", "SIGTERM", "SIGQUIT", "SIGTSTP")  # ours, whoever else handles them
 _LEAVES_S = 1.0  # after a signal, while nothing moves and the main thread compiles or imports
-_ENDS_S = 30.0  # after a signal, while a vehicle is open: longer than all that closes it may take
+_ENDS_S = 60.0  # after a signal, while a vehicle is open: longer than all that closes it may take
 EXIT = 128  # plus the signal's number, as shells report it
 
 
