@@ -47,6 +47,10 @@ def run(args: Run, signals: Signals) -> int:
     Raises:
         Interrupted: a signal came before it drove.
     """
+    # Before what else runs on the computer, as far as that is allowed. Threads have the priority of
+    # the one that began them: those of XLA begin with the first array.
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, -10)
     configure_jax(float64=args.float64, threads=1)
     keep_in(step_folder())
     options = _options(args.option)
@@ -176,9 +180,6 @@ class _Drive:
             # Python looks through all objects now and then: not through those of JAX, 50 ms a time.
             gc.freeze()
             closing.callback(gc.unfreeze)
-            # Before what else runs here, as far as that is allowed; threads that it begins as well.
-            with suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, 0, -10)
             signals.hold()
             vehicle, guard = self._guarded(pilot.limits)
             closing.callback(self._close, vehicle, guard)
