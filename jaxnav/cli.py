@@ -35,6 +35,7 @@ from jaxnav.arguments import (
     Tune,
     View,
 )
+from jaxnav.commands.outputs import check_outputs
 from jaxnav.errors import BadInput
 
 EXIT_BAD_INPUT = 2
@@ -107,6 +108,7 @@ def _dispatch(args: list[str]) -> int:
     command = _parse(args)
     if command is None:
         return 0
+    check_outputs(command)
     if isinstance(command, Run):
         # NumPy's own threads, which it asks for once: those that look for markers have matrices so
         # small that sharing one out takes longer than it does, and the cores are theirs.
