@@ -97,9 +97,12 @@ def _dispatch(args: list[str], *signals: Signals) -> int:
 
         print(f"jaxnav {__version__}")
         return 0
+    from jaxnav.commands.outputs import check_outputs
+
     command = _parse(args)
     if command is None:
         return 0
+    check_outputs(command)
     if signals:
         # NumPy's own threads, which it asks for once: those that look for markers have matrices so
         # small that sharing one out takes longer than it does, and the cores are theirs.

@@ -11,9 +11,8 @@ loading what was made of them. So the executable itself is kept.
 
 import hashlib
 import os
-import pickle
 import platform
-import tempfile
+import re
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -25,10 +24,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import serialize_executable
+
+from jaxnav.executable_bytes import NotStorableError, Run, from_bytes, to_bytes
+from jaxnav.files.private import NotPrivateError, PrivateFolder
 
 _KEPT = 64  # executables, of some MB each: the last ones used
-_CHECKSUM_BYTES = 32  # at the beginning of the file, of what follows
+_NAME = re.compile(r"[0-9a-f]{64}\.step")
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 _FOLDERS = (".", "detection", "runtime", "simulation", "vehicles")  # of all that is kept
 _PACKAGE = Path(__file__).resolve().parent
@@ -40,8 +41,9 @@ def keep_in(folder: Path | None) -> None:
     """Load and keep what is `kept` in a folder from now on; None: nowhere.
 
     Args:
-        folder: made when it is missing. Executables are run as they are found: nobody else may
-            write there.
+        folder: made when it is missing. Executables are run as they are found: where anybody else
+            may write to it, or to what leads there, nothing is loaded and nothing is kept, see
+            `PrivateFolder`.
     """
     _folders[:] = [] if folder is None else [folder]
 
@@ -66,22 +68,22 @@ class kept:
         return jax.tree.unflatten(structure, run(leaves))
 
 
-def program(
-    function: Callable[..., Any], told: tuple[Any, ...], folder: Path
-) -> tuple[Callable[[list[Any]], list[Any]], Any]:
+def program(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -> tuple[Run, Any]:
     """An executable of the leaves of what a function is told, and the structure of what it returns.
 
     Loaded if another process has kept it, else compiled and kept.
     """
     given, inputs = _asked(told)
-    file = _file(folder, _name(function, given), inputs)
-    return _loaded(file, inputs) or _compiled(function, file, given, inputs)
+    name = _file(_name(function, given), inputs)
+    return _loaded(folder, name, inputs) or _compiled(function, folder, name, given, inputs)
 
 
 def is_kept(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -> bool:
     """Whether `program` finds what it looks for."""
     given, inputs = _asked(told)
-    return _file(folder, _name(function, given), inputs).is_file()
+    with suppress(OSError, NotPrivateError), PrivateFolder(folder) as files:
+        return files.holds(_file(_name(function, given), inputs))
+    return False
 
 
 @cache
@@ -105,8 +107,8 @@ def _name(function: Callable[..., Any], given: Any) -> str:
 
 
 def _compiled(
-    function: Callable[..., Any], file: Path, given: Any, inputs: list[Any]
-) -> tuple[Any, Any]:
+    function: Callable[..., Any], folder: Path, name: str, given: Any, inputs: list[Any]
+) -> tuple[Run, Any]:
     seen: list[Any] = []
 
     def flat(leaves: list[Any]) -> list[Any]:
@@ -118,64 +120,50 @@ def _compiled(
     # stored again.
     flat.__name__ = f"step_{time.time_ns()}"
     run = jax.jit(flat).lower(inputs).compile()
-    shape = jax.tree.map(lambda leaf: 0, seen[0])  # whose tree could not be stored by itself
     # Functions of other libraries, LAPACK's say, are not there for what was loaded.
     if "custom_call_target" not in (run.as_text() or ""):
-        with suppress(ValueError, NotImplementedError):  # of a backend that can't
-            _keep(file, (serialize_executable.serialize(run), shape))
-    return run, jax.tree.structure(shape)
+        with suppress(NotStorableError):
+            _keep(folder, name, to_bytes(run, seen[0]))
+    return run, jax.tree.structure(seen[0])
 
 
-def _loaded(file: Path, inputs: list[Any]) -> tuple[Any, Any] | None:
+def _loaded(folder: Path, name: str, inputs: list[Any]) -> tuple[Run, Any] | None:
     try:
-        raw = file.read_bytes()
-        # Machine code that was damaged may do anything: it must not even be looked at.
-        if _checksum(raw[_CHECKSUM_BYTES:]) != raw[:_CHECKSUM_BYTES]:
-            return None
-        stored, shape = pickle.loads(raw[_CHECKSUM_BYTES:])
-        run = serialize_executable.deserialize_and_load(*stored)
+        with PrivateFolder(folder) as files:
+            raw = files.read(name)
+        run, structure = from_bytes(raw, inputs)
         blank = [np.zeros(like.shape, like.dtype) for like in inputs]
         jax.block_until_ready(run(blank))  # what does not run here shows now
-        file.touch()
-    except Exception:  # none yet, or none for this machine: it is made anew
+    except Exception:  # none yet, none for this machine, or somebody else's: it is made anew
         return None
-    return run, jax.tree.structure(shape)
+    return run, structure
 
 
-def _keep(file: Path, content: Any) -> None:
+def _keep(folder: Path, name: str, raw: bytes) -> None:
     """All of it or nothing, and of older ones no more than `_KEPT`."""
-    try:
-        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as part:
-            try:
-                raw = pickle.dumps(content)
-                part.write(_checksum(raw) + raw)
-                part.flush()
-                Path(part.name).replace(file)
-            except BaseException:
-                Path(part.name).unlink(missing_ok=True)
-                raise
-        by_use = sorted(file.parent.glob("*.step"), key=lambda path: path.stat().st_mtime)
-        for old in by_use[:-_KEPT]:
-            old.unlink(missing_ok=True)
-    except OSError:
-        return  # a full or a foreign disk: the program is there all the same
+    # A full, a foreign or an unsafe disk: the program is there all the same.
+    with suppress(OSError, NotPrivateError), PrivateFolder(folder, make=True) as files:
+        files.write(name, raw)
+        ours = [name for name in files.names_by_use() if _NAME.fullmatch(name)]
+        for old in ours[:-_KEPT]:
+            files.remove(old)
 
 
-def _checksum(raw: bytes) -> bytes:
-    return hashlib.sha256(raw).digest()
-
-
-def _file(folder: Path, structures: str, leaves: list[Any]) -> Path:
-    """Named by all that the executable depends on."""
+def _file(structures: str, leaves: list[Any]) -> str:
+    """A name of all that the executable depends on."""
     device = jax.devices()[0]
     depends_on = [
         structures,
         [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
-        [(name, version(name)) for name in _LIBRARIES],
+        _versions(),
         (device.platform, device.device_kind, platform.machine(), platform.node()),
         str(jnp.zeros(()).dtype),
         (os.environ.get("XLA_FLAGS"), os.environ.get("PJRT_NPROC")),
         sources_digest(_PACKAGE, _FOLDERS),
     ]
-    return folder / f"{hashlib.sha256(repr(depends_on).encode()).hexdigest()}.step"
+    return f"{hashlib.sha256(repr(depends_on).encode()).hexdigest()}.step"
+
+
+@cache
+def _versions() -> list[tuple[str, str]]:
+    return [(name, version(name)) for name in _LIBRARIES]

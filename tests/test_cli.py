@@ -14,6 +14,7 @@ import pytest
 from jaxnav import cli
 from jaxnav.arguments import COMMANDS, Demo, Locate, Replay, TuneController, TuneFilter
 from jaxnav.arguments.calibration import CALIBRATIONS
+from jaxnav.commands import process
 from jaxnav.errors import BadInput
 
 JAXNAV = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
@@ -232,8 +233,12 @@ def test_a_closed_pipe_is_no_traceback() -> None:
     assert (run.returncode, run.stderr) == (cli.EXIT_BROKEN_PIPE, "")
 
 
-def _configured(environment: dict[str, str]) -> list[str]:
-    """What configure_jax(float64=True) leaves: [cache folder or None, default float]."""
+def _configured(environment: dict[str, str], said: str = "") -> list[str]:
+    """What configure_jax(float64=True) leaves: [cache folder or None, default float].
+
+    Args:
+        said: of what stderr has one line; by default it has none.
+    """
     script = (
         "import jax, jax.numpy as jnp; from jaxnav.commands.process import configure_jax\n"
         "configure_jax(float64=True)\n"
@@ -248,7 +253,8 @@ def _configured(environment: dict[str, str]) -> list[str]:
         text=True,
         check=True,
     )
-    assert run.stderr == ""
+    assert said in run.stderr
+    assert len(run.stderr.splitlines()) == (1 if said else 0)
     return run.stdout.split()
 
 
@@ -262,13 +268,54 @@ def test_compiled_code_is_kept_for_this_machine_and_jaxlib(tmp_path) -> None:
 
 def test_an_unusable_cache_folder_is_done_without(tmp_path) -> None:
     (tmp_path / "file").write_text("in the way")
-    assert _configured({"XDG_CACHE_HOME": str(tmp_path / "file")}) == ["None", "float64"]
+    said = f"compiled code is not kept: {tmp_path}/file/jaxnav"
+    assert _configured({"XDG_CACHE_HOME": str(tmp_path / "file")}, said) == ["None", "float64"]
 
 
 def test_the_users_own_cache_folder_goes_first(tmp_path) -> None:
     own = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own"), "XDG_CACHE_HOME": str(tmp_path)}
     assert _configured(own)[0] == str(tmp_path / "own")
     assert not (tmp_path / "jaxnav").exists()
+
+
+@pytest.mark.parametrize("variable", ["JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"])
+def test_a_cache_folder_that_others_can_write_to_is_done_without(tmp_path, variable) -> None:
+    """Not a byte of it is read: its entries are machine code."""
+    folder = tmp_path / "open"
+    folder.mkdir()
+    folder.chmod(0o777)
+    said = f"compiled code is not kept: {folder} can be written to by all: chmod go-w {folder}"
+    few = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    assert _configured({variable: str(folder)} | few, said) == ["None", "float64"]
+    assert list(folder.iterdir()) == []
+
+
+def test_cache_folders_that_could_be_somebody_elses_are_refused(tmp_path, capsys) -> None:
+    """The same for JAX's cache and for kept executables, and for what lies in the folder."""
+    good = tmp_path / "good"
+    assert process._private(good) == good
+    (good / "entry-cache").write_bytes(b"")
+    good.chmod(0o755)
+    process._private.cache_clear()
+    assert process._private(good) == good
+    (good / "entry-cache").chmod(0o666)
+    (tmp_path / "link").symlink_to(good)
+    refused = [tmp_path / "link", tmp_path / "link" / "steps", good]
+    if os.geteuid() == 0:
+        (tmp_path / "theirs").mkdir()
+        os.chown(tmp_path / "theirs", 12345, -1)
+        refused += [tmp_path / "theirs", tmp_path / "theirs" / "steps"]
+    (tmp_path / "planted").mkdir()
+    (tmp_path / "planted" / "entry-cache").symlink_to(good / "entry-cache")
+    refused.append(tmp_path / "planted")
+    process._private.cache_clear()
+    for folder in refused:
+        assert process._private(folder) is None
+        assert process._private(folder) is None  # and is said once
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == len(refused)
+    assert all(line.startswith("compiled code is not kept: ") for line in lines)
+    assert process.cache_refused() in lines[-1]
 
 
 def test_the_users_own_flags_for_xla_are_kept(tmp_path) -> None:

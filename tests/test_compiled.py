@@ -1,12 +1,20 @@
 """The compiled step against the jitted one: the same numbers, and nothing compiled twice."""
 
+import hashlib
+import json
+import os
+import pathlib
+import pickle
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from jaxnav import executables
+from jaxnav import executable_bytes, executables
 from jaxnav.ambiguity import LowestReprojection
+from jaxnav.detection.edges import EdgeFit
 from jaxnav.navigator import Navigator
 from jaxnav.runtime.compiled import compiled_step, is_compiled
 from tests import worlds
@@ -61,8 +69,8 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
     for raw in damaged(file.read_bytes()):
         file.write_bytes(raw)
         with monkeypatch.context() as unopened:
-            unopened.setattr(executables.pickle, "loads", never)
-            assert executables._loaded(file, []) is None
+            unopened.setattr(executable_bytes, "_small_program", never)
+            assert executables._loaded(tmp_path, file.name, []) is None
     repaired, _ = compiled_step(nav, tmp_path)(nav.init(), obs)
     jax.tree.map(np.testing.assert_array_equal, repaired, state)
     monkeypatch.setattr(executables, "_compiled", never)
@@ -71,7 +79,7 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
 
 def test_a_file_is_for_one_structure_shape_and_source(monkeypatch, tmp_path):
     def file(nav, shape=()):
-        return executables._file(tmp_path, str(jax.tree.structure(nav)), [jnp.zeros(shape)])
+        return executables._file(str(jax.tree.structure(nav)), [jnp.zeros(shape)])
 
     nav = navigator()
     assert file(nav) == file(eqx.tree_at(lambda n: n.corner_sigma_px, nav, 2.0))
@@ -104,17 +112,97 @@ def test_without_a_folder_or_with_foreign_parts_nothing_is_kept(monkeypatch, tmp
 
 def test_old_files_go_and_a_full_disk_is_no_failure(tmp_path, monkeypatch):
     monkeypatch.setattr(executables, "_KEPT", 3)
-    for number in range(5):
-        executables._keep(tmp_path / "steps" / f"{number}.step", number)
-    assert len(list((tmp_path / "steps").iterdir())) == 3
-    assert (tmp_path / "steps" / "4.step").exists()
+    folder = tmp_path / "steps"
+    names = [f"{number:064x}.step" for number in range(6)]
+    for name in names[:2]:
+        executables._keep(folder, name, b"")
+    (folder / "bracket.step").write_text("a drawing of somebody's")
+    for name in names[2:5]:
+        executables._keep(folder, name, b"")
+    assert {path.name for path in folder.iterdir()} == {*names[2:5], "bracket.step"}
 
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(executables.pickle, "dumps", full)
-    executables._keep(tmp_path / "steps" / "5.step", 5)
-    assert len(list((tmp_path / "steps").iterdir())) == 3  # nothing half-written either
+    monkeypatch.setattr(os, "rename", full)
+    executables._keep(folder, names[5], b"5")
+    assert {path.name for path in folder.iterdir()} == {*names[2:5], "bracket.step"}
+
+
+class Writes:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return pathlib.Path.touch, (self.path,)
+
+
+def test_nothing_that_a_file_holds_is_run_as_python(tmp_path):
+    """A pickle in its place, or in place of any of its parts, whole and with a right checksum."""
+    canary = tmp_path / "canary"
+    pickled = pickle.dumps(Writes(canary))
+    run = jax.jit(lambda leaves: leaves).lower([jnp.zeros(2)]).compile()
+    good = executable_bytes.to_bytes(run, [0])
+    content = good[executable_bytes._CHECKSUM_BYTES :]
+    (length,) = executable_bytes._LENGTH.unpack_from(content)
+    head, code = content[8 : 8 + length], content[8 + length :]
+    packed = executable_bytes._LENGTH.pack
+    bad = [
+        pickled,
+        packed(len(head)) + head + pickled,
+        packed(len(pickled)) + pickled + code,
+    ]
+    named = ["os:system", "jaxnav.cli:main", "jaxnav.runtime.plugins:find", "builtins:type", "no"]
+    for name in named:
+        other = head.replace(b'"tree": ["list", 0]', f'"tree": ["{name}", {{}}]'.encode())
+        assert other != head
+        bad.append(packed(len(other)) + other + code)
+    inputs = [jax.ShapeDtypeStruct((2,), jnp.zeros(2).dtype)]
+    executables._keep(tmp_path / "steps", "one", good)
+    ready, structure = executables._loaded(tmp_path / "steps", "one", inputs)
+    np.testing.assert_array_equal(ready([np.array([1.0, 2.0])])[0], [1.0, 2.0])
+    assert structure == jax.tree.structure([0])
+    for content in bad:
+        raw = hashlib.sha256(content).digest() + content
+        executables._keep(tmp_path / "steps", "one", raw)
+        assert executables._loaded(tmp_path / "steps", "one", inputs) is None
+    assert not canary.exists()
+    pickle.loads(pickled)
+    assert canary.exists()  # it would have shown
+
+
+def test_a_tree_is_the_same_again():
+    """Modules, named tuples, dicts, None; what has no fields to tell is refused."""
+    state, out = jax.eval_shape(navigator().init), {"a": (None, [EdgeFit(*range(7))])}
+    for tree in (state, out, (), []):
+        shape = jax.tree.map(lambda leaf: 0, tree)
+        plain = json.loads(json.dumps(executable_bytes._plain(shape)))
+        again = executable_bytes._tree(plain)
+        assert jax.tree.structure(again) == jax.tree.structure(shape)
+    with pytest.raises(executable_bytes.NotStorableError):
+        executable_bytes._plain(OnesOwn())
+
+
+def test_of_a_folder_that_is_not_this_users_nothing_is_loaded(tmp_path, monkeypatch):
+    folder = tmp_path / "steps"
+    told = jnp.zeros(3), jnp.ones(3)
+
+    def both(one, other):
+        return one + other
+
+    first = executables.program(both, told, folder)[0](list(told))
+    assert executables.is_kept(both, told, folder)
+    folder.chmod(0o777)
+    assert not executables.is_kept(both, told, folder)
+    (file,) = folder.iterdir()
+    was = file.read_bytes()
+    monkeypatch.setattr(executables, "from_bytes", never)
+    again = executables.program(both, told, folder)[0](list(told))
+    np.testing.assert_array_equal(first[0], again[0])
+    assert file.read_bytes() == was
+    assert list(folder.iterdir()) == [file]
 
 
 def test_a_kept_function_is_the_jitted_one_and_is_traced_once(tmp_path):

@@ -140,18 +140,18 @@ def test_plug_ins_get_their_options(capsys, monkeypatch):
 def test_whether_the_step_is_compiled_is_looked_up(monkeypatch, tmp_path, capsys):
     asked = []
 
-    def file(folder, structures, leaves):
-        asked.append((folder, "advance_packed" in structures))
-        return tmp_path / "the.step"
+    def file(structures, leaves):
+        asked.append("advance_packed" in structures)
+        return "the.step"
 
     monkeypatch.setattr("jaxnav.commands.process.step_folder", lambda: tmp_path)
     monkeypatch.setattr("jaxnav.executables._file", file)
-    monkeypatch.setattr(f"{CHECKS}.software.compile_cache", lambda directory, compiled: [
+    monkeypatch.setattr(f"{CHECKS}.software.compile_cache", lambda directory, compiled, refused: [
         Finding("compile cache", "ok", f"compiled: {compiled}")
     ])  # fmt: skip
     assert cli.main(["doctor"]) == 0
     assert lines_with(capsys.readouterr().out, "compiled: False")
-    assert asked == [(tmp_path, True)]  # the first is missing, so nobody asks for the second
+    assert asked == [True]  # the first is missing, so nobody asks for the second
     (tmp_path / "the.step").write_bytes(b"")
     assert cli.main(["doctor"]) == 0
     assert lines_with(capsys.readouterr().out, "compiled: True")

@@ -173,5 +173,7 @@ def test_the_compile_cache(tmp_path, monkeypatch):
     assert "1 files, 1 MiB" in found.what
     assert "not compiled" in the_problem(compile_cache(tmp_path, False), "note").what
     assert "no folder" in the_problem(compile_cache(None, None), "warning").what
+    refused = "/tmp/x belongs to another user"
+    assert refused in the_problem(compile_cache(None, None, refused), "warning").what
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert "can't be written" in the_problem(compile_cache(tmp_path, True), "warning").what

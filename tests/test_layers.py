@@ -49,6 +49,7 @@ LAYERS = {
     "users": {
         "calibration",
         "detection",
+        "executable_bytes",
         "executables",
         "files",
         "runtime",
@@ -85,6 +86,8 @@ BETWEEN_USERS = {
     ("studies", "simulation"),
     ("tuning", "simulation"),
     ("detection", "executables"),
+    ("executables", "executable_bytes"),
+    ("executables", "files"),
     ("runtime", "detection"),
     ("runtime", "executables"),
     ("runtime", "files"),

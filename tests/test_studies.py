@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from jaxnav.cli import main
 from jaxnav.errors import BadInput
+from jaxnav.files.locking import sole_writer
 from jaxnav.simulation.statistics import wilson_interval
 from jaxnav.studies import store as store_module
 from jaxnav.studies.config import Config
@@ -420,6 +421,35 @@ def test_a_bad_command_is_one_line(
     assert code == 2
     assert said in printed.err
     assert printed.err.count("\n") == 1
+
+
+def test_a_second_process_at_one_store_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("jaxnav.commands.study.configure_jax", lambda float64: None)
+    monkeypatch.chdir(tmp_path)
+    Path("study.yaml").write_text("trials: 2\naxes:\n  view_angle_deg: [1]\n")
+    Path("out").mkdir()
+    with sole_writer("out/study.zarr"):
+        assert main(["study", "ambiguity", "study.yaml"]) == 2
+    assert "out/study.zarr: is being written by another process\n" in capsys.readouterr().err
+    assert not list(Path("out").iterdir())
+
+
+def test_what_a_killed_process_has_left_of_a_new_store_is_swept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as killed:
+        killed.setattr(Path, "rename", lambda path, to: None)
+        killed.setattr(store_module.shutil, "rmtree", lambda *_, **__: None)
+        with pytest.raises(BadInput):  # it is not there after all
+            open_store(tmp_path / "s[1].zarr", Fake(config()))
+    (tmp_path / ".jaxnav-s1.zarr-x").mkdir()
+    (tmp_path / ".jaxnav-else").mkdir()
+    assert len(list(tmp_path.iterdir())) == 3
+    store_module.sweep_unfinished(tmp_path / "s[1].zarr")
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {".jaxnav-s1.zarr-x", ".jaxnav-else"}
 
 
 def test_memory_does_not_grow_with_the_study(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from jaxnav.commands.tune_fit import Fitting
 from jaxnav.errors import BadInput
 from jaxnav.files import load_params
+from jaxnav.files.locking import sole_writer
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import with_parameters
 from jaxnav.tuning.descent import Noisy, Smooth
@@ -99,6 +100,13 @@ def test_the_best_is_written(tmp_path, changes):
     assert run.fitting.checkpoint.exists()
     assert run.lines == []
     with_parameters(NAVIGATOR, {name: jnp.asarray(v) for name, v in written(run).items()})
+
+
+def test_a_second_process_in_one_folder_is_told(tmp_path):
+    run = Run(tmp_path, asked())
+    with sole_writer(run.fitting.checkpoint), pytest.raises(BadInput, match="by another process"):
+        run()
+    assert not list(tmp_path.iterdir())
 
 
 def test_nothing_better_is_written_as_it_was(tmp_path):

@@ -18,7 +18,7 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import place, rig_text
 from jaxnav.files.ros_camera_info import camera_info_text
 from jaxnav.files.validation import validate
-from jaxnav.files.writing import atomic_write_all
+from jaxnav.files.writing import atomic_write_all, refuse_overwriting
 
 _MANY: dict[str, Callable[[Sequence[CameraFigures]], str]] = {
     "jaxnav": rig_text,
@@ -178,8 +178,7 @@ def _require_suffix(to: str, path: Path) -> None:
 
 
 def _write(source: Path, contents: dict[Path, str]) -> None:
-    if source.resolve() in (path.resolve() for path in contents):
-        raise BadInput("--out", f"{source} would be written over: choose another name")
+    refuse_overwriting("--out", contents, [source])
     for folder in {path.parent for path in contents}:
         output_folder(folder)
     atomic_write_all(contents)

@@ -91,14 +91,14 @@ def _cache(patient: SimpleNamespace) -> Iterable[Finding]:
     """Whether the program that a car runs with these files is compiled."""
     import jax
 
-    from jaxnav.commands.process import step_folder
+    from jaxnav.commands.process import cache_refused, step_folder
 
     folder, compiled = step_folder(), None
     if folder is not None and None not in vars(patient).values():
         compiled = _is_compiled(patient, folder)
     directory = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     found: Iterable[Finding] = _check("software", "compile_cache")(
-        Path(directory) if directory else None, compiled
+        Path(directory) if directory else None, compiled, cache_refused()
     )
     return found
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.errors import BadInput
 from jaxnav.files import (
     Params,
+    atomic_path,
     load_markers,
     load_params,
     load_rig,
@@ -175,12 +177,15 @@ def _replayed(
 ) -> Track:
     rows = []
     outcomes = replay_drive(inputs, setup, step_folder())
-    recorder = None
-    if args.record:
-        # Nobody drives, so nothing need be left out.
-        path = args.out / "replay.mcap"
-        recorder = Recorder(path, setup.header(), queue_messages=2 * len(inputs) + 1)
-    with tqdm(total=len(inputs), unit="input", disable=args.headless) as bar:
+    with ExitStack() as closing:
+        recorder = None
+        if args.record:
+            path = args.out / "replay.mcap"
+            beside = closing.enter_context(atomic_path(path))
+            # Nobody drives, so nothing need be left out.
+            recorder = Recorder(beside, setup.header(), queue_messages=2 * len(inputs) + 1)
+            closing.callback(recorder.close, timeout_s=60.0)
+        bar = closing.enter_context(tqdm(total=len(inputs), unit="input", disable=args.headless))
         bar.set_postfix_str("compiling")
         for given, outcome in zip(inputs, outcomes, strict=True):
             bar.set_postfix_str("", refresh=False)
@@ -192,10 +197,10 @@ def _replayed(
                 message = outcome_message(outcome, digest(outcome))
                 recorder.put(OUTCOME, given.now_ns, message)
             bar.update()
-    if recorder is not None:
-        recorder.close(timeout_s=60.0)
-        if recorder.failed is not None:
-            raise BadInput("--record", recorder.failed)
+        if recorder is not None:
+            recorder.close(timeout_s=60.0)
+            if recorder.failed is not None:
+                raise BadInput("--record", recorder.failed.replace(str(beside), str(path)))
     return Track(rows)
 
 

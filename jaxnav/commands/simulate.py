@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from contextlib import nullcontext
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.errors import BadInput
 from jaxnav.files import load_params, write_json
+from jaxnav.files.locking import sole_writer
 from jaxnav.files.reading import read_text
 from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.navigator import Navigator
@@ -29,6 +31,11 @@ _MAX_BYTES = 64 * 2**20
 
 def run(args: Arguments) -> int:
     """Drive every combination of selector and noise; print a table, and keep the numbers."""
+    with nullcontext() if args.json is None else sole_writer(args.json):
+        return _run(args)
+
+
+def _run(args: Arguments) -> int:
     configure_jax(float64=False)
     names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
     wanted = list(itertools.product(names, args.corner_noise_px))

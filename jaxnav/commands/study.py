@@ -13,8 +13,9 @@ from jaxnav.cli import EXIT_INTERRUPTED
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.studies import KINDS, load_study, shipped_configs
 from jaxnav.files import output_folder
+from jaxnav.files.locking import sole_writer
 from jaxnav.studies.running import local_cluster, remote_cluster, run_here, run_on_cluster
-from jaxnav.studies.store import count_done, open_store
+from jaxnav.studies.store import count_done, open_store, sweep_unfinished
 
 
 def run(args: Arguments) -> int:
@@ -24,8 +25,11 @@ def run(args: Arguments) -> int:
         return 0
     configure_jax(float64=False)
     study = load_study(args.kind, args.config)
-    path = args.out or output_folder(Path("out")) / f"{args.config.stem}.zarr"
+    path = args.out or Path("out") / f"{args.config.stem}.zarr"
+    output_folder(path.parent)
     with ExitStack() as stack:
+        stack.enter_context(sole_writer(path))
+        sweep_unfinished(path)
         client = _cluster(args, stack)
         store = open_store(path, study, args.chunk_trials)
         total, done = store.layout.trials, count_done(path)

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from jaxnav.errors import BadInput
 from jaxnav.files import write_params
+from jaxnav.files.locking import sole_writer
 from jaxnav.files.writing import atomic_write, plain_data
 from jaxnav.tuning.fit import Fit, Problem, advanced, arrays_of, fit_of
 from jaxnav.tuning.unconstrained import Space
@@ -107,9 +108,14 @@ class Fitting:
         """To the end, or on from where it was left.
 
         Raises:
-            BadInput: a checkpoint of something else, or a parameter that the loss doesn't ask.
+            BadInput: a checkpoint of something else or at which another process is at work, or a
+                parameter that the loss doesn't ask.
             KeyboardInterrupt: what was reached is kept.
         """
+        with sole_writer(self.checkpoint):
+            return self._run(headless)
+
+    def _run(self, headless: bool) -> Fit:
         fit = Fit.begin(self._space.start, self._problem)
         kept = self._kept(fit)
         if kept is not None:

@@ -1,11 +1,12 @@
 """Files out: written beside, then renamed, so that nobody ever reads half of one."""
 
+import hashlib
 import json
 import math
 import os
-import secrets
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,30 +14,55 @@ import numpy as np
 import yaml
 
 from jaxnav.errors import BadInput
+from jaxnav.files.locking import create_temporary, sweep
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A path beside `path`, with the same suffix, that becomes `path` when the block succeeds.
 
-    When the block raises, nothing is left and an older file stays as it was.
+    When the block raises, nothing is left and an older file stays as it was; when the power goes,
+    there is the older one or the new one. What was left by a process that was killed is swept
+    away. An older file's permissions and owner stay; a link stays, and what it leads to is written.
 
     Raises:
-        BadInput: the folder is missing or closed to writing, or `path` is a folder.
+        BadInput: the folder is missing or closed to writing, or `path` is a folder, a device or
+            write-protected.
     """
-    path = Path(path)
-    if path.is_dir():
-        raise BadInput(path, "can't be written: it is a folder")
-    beside = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
-    try:
+    with _naming(path):
+        target, older = _target(path)
+        word = hashlib.blake2b(os.fsencode(target.name), digest_size=4).hexdigest()
+        begin = f".jaxnav-{word}-"
+        sweep(map(str, target.parent.glob(f"{begin}*")))
+        # Nobody may read on the way what nobody else could read before.
+        name, fd = create_temporary(
+            lambda unique: f"{target.parent}/{begin}{unique}{target.suffix}",
+            0o600 if older else 0o666,
+        )
+        beside = Path(name)
         try:
             yield beside
-            os.replace(beside, path)  # noqa: PTH105  (said in the docstring by this name)
+            if older is not None:
+                _take_over(fd, older)
+            os.fsync(fd)
+            os.replace(beside, target)  # noqa: PTH105  (said in the docstring by this name)
+            _remember(target.parent)
         finally:
             beside.unlink(missing_ok=True)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise BadInput(path, f"can't be written: {reason}") from None
+            os.close(fd)
+
+
+def require_writable(path: str | Path) -> None:
+    """Find out before the work what `atomic_path` would say after it.
+
+    Raises:
+        BadInput: the file can't be written.
+    """
+    with _naming(path):
+        target, _ = _target(path)
+        name, fd = create_temporary(lambda unique: f"{target.parent}/.jaxnav-{unique}", 0o600)
+        os.unlink(name)  # noqa: PTH108
+        os.close(fd)
 
 
 def atomic_write(path: str | Path, content: str | bytes) -> None:
@@ -59,6 +85,35 @@ def atomic_write_all(contents: Mapping[Path, str]) -> None:
     with ExitStack() as files:
         for path, text in contents.items():
             files.enter_context(atomic_path(path)).write_bytes(text.encode())
+
+
+def refuse_overwriting(
+    flag: str, outputs: Iterable[Path | None], inputs: Iterable[Path | None]
+) -> None:
+    """Refuse to write over what is read.
+
+    Files are the same where the disk says so, whatever leads there: links of both kinds, another
+    spelling, letters that this disk takes for each other.
+
+    Args:
+        flag: that named the outputs.
+        outputs: files. Those that are not there yet can't be meant by an input.
+        inputs: files, and folders with the files in them.
+
+    Raises:
+        BadInput: one of the outputs is one of the inputs.
+    """
+    existing = {key: path for path in outputs if path and (key := _identity(path))}
+    if not existing:
+        return
+    for path in (path for path in inputs if path):
+        for file in (path, *(path.iterdir() if path.is_dir() else ())):
+            key = _identity(file)
+            output = existing.get(key) if key else None
+            if output is not None:
+                said = file if file == output else f"{output}, which is {file},"
+                problem = f"{said} is read and would be written over: choose another name"
+                raise BadInput(flag, problem)
 
 
 def output_folder(path: str | Path) -> Path:
@@ -106,6 +161,59 @@ def write_tum(path: str | Path, stamps_s: np.ndarray, Ts_world_vehicle: np.ndarr
         for stamp, (qw, qx, qy, qz, x, y, z) in zip(stamps_s, Ts, strict=True)
     ]
     atomic_write(path, "".join(lines))
+
+
+@contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """What the system says of a file, as a person is told."""
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise BadInput(path, f"can't be written: {reason}") from None
+
+
+def _target(path: str | Path) -> tuple[Path, os.stat_result | None]:
+    """The file that a path leads to, and what is there already."""
+    if "\0" in str(path):
+        raise BadInput(path, "can't be written: a name has no NUL")
+    target = Path(os.path.realpath(path))
+    try:
+        older = target.stat()
+    except FileNotFoundError:
+        return target, None
+    if stat.S_ISDIR(older.st_mode):
+        raise BadInput(path, "can't be written: it is a folder")
+    if not stat.S_ISREG(older.st_mode):
+        raise BadInput(path, "can't be written: it is a device or a pipe, not a file")
+    if not os.access(target, os.W_OK):
+        raise BadInput(path, "can't be written: permission denied")
+    return target, older
+
+
+def _take_over(fd: int, older: os.stat_result) -> None:
+    with suppress(PermissionError):  # only root gives files away
+        os.fchown(fd, older.st_uid, older.st_gid)
+    os.fchmod(fd, stat.S_IMODE(older.st_mode))
+
+
+def _remember(folder: Path) -> None:
+    """Let the names in a folder survive a power cut too, where its disk can do that."""
+    with suppress(OSError):
+        fd = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Device and number of what is there; None: nothing, or no name of a file at all."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino
 
 
 def yaml_text(data: dict[str, Any]) -> str:

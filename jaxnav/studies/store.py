@@ -4,6 +4,7 @@ Boxes are written whole, and only then marked as done, so a study that was kille
 was. A store belongs to one config and to one set of versions; others are refused.
 """
 
+import glob
 import json
 import math
 import secrets
@@ -108,6 +109,15 @@ def open_store(path: Path, study: Study, box_trials: int | None = None) -> Study
     return StudyStore(path, study)
 
 
+def sweep_unfinished(path: Path) -> None:
+    """Remove what was left by a process that was killed while it made this store.
+
+    Only for those who know that no other process is at it, see `sole_writer`.
+    """
+    for left in path.parent.glob(f"{glob.escape(_unfinished(path))}*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
 def read_attributes(path: Path) -> dict[str, Any]:
     """Config and versions of a store.
 
@@ -181,7 +191,7 @@ def _create(path: Path, study: Study, most: int) -> None:
     config = study.config
     axes = study.grid.outer_axes
     layout = Layout.of([*map(len, axes.values()), config.trials], most)
-    beside = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    beside = path.with_name(_unfinished(path) + secrets.token_hex(4))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -217,6 +227,11 @@ def _create(path: Path, study: Study, most: int) -> None:
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise BadInput(path, f"can't be made: {reason}") from None
+
+
+def _unfinished(path: Path) -> str:
+    """How the name of a store begins that is being made."""
+    return f".jaxnav-{path.name}-"
 
 
 def _coordinate(

@@ -125,20 +125,24 @@ def _is_jetson(model_file: Path) -> bool:
         return platform.release().endswith("-tegra")
 
 
-def compile_cache(directory: Path | None, compiled: bool | None) -> Iterator[Finding]:
+def compile_cache(
+    directory: Path | None, compiled: bool | None, refused: str | None = None
+) -> Iterator[Finding]:
     """Whether compiled code can be kept, and whether that of the step is there.
 
     Args:
         directory: JAX's cache; None where there is none.
         compiled: whether the step's program is in it; None where that is not known.
+        refused: why a folder for it is not used.
     """
     if directory is None or not os.access(_existing(directory), os.W_OK | os.X_OK):
         where = f"{directory} can't be written" if directory else "there is no folder for it"
         yield Finding(
             "compile cache",
             "warning",
-            f"{where}: every start of the car compiles its step anew",
-            "make ~/.cache writable, or set JAX_COMPILATION_CACHE_DIR",
+            f"{refused or where}: every start of the car compiles its step anew",
+            "make ~/.cache a folder that you alone can write to, or set JAX_COMPILATION_CACHE_DIR "
+            "to one",
         )
         return
     files = [path for path in directory.rglob("*") if path.is_file()]

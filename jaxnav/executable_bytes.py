@@ -1,0 +1,184 @@
+"""A compiled program as bytes, and back: XLA's own for the machine code, JSON for the rest.
+
+To read it runs no Python that the bytes name: no pickle. The machine code is run as it is found,
+so it is trusted all the same.
+"""
+
+import dataclasses
+import hashlib
+import json
+import struct
+import sys
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+_CHECKSUM_BYTES = 32  # at the beginning, of what follows
+_LENGTH = struct.Struct("<Q")  # of the JSON, then it, then the machine code
+_OURS = ("jaxnav", "jaxlie")  # whose classes a tree may consist of
+
+Run = Callable[[list[Any]], list[Any]]
+
+
+class NotStorableError(ValueError):
+    """A program, or what it returns, can't be told in bytes."""
+
+
+def to_bytes(compiled: Any, returned: Any) -> bytes:
+    """What `from_bytes` reads.
+
+    Args:
+        compiled: of JAX; takes a list of arrays and returns one.
+        returned: a tree with those arrays as leaves, or anything in their place.
+
+    Raises:
+        NotStorableError: it is more than arrays in and arrays out, its backend can't store it, or
+            the tree has classes that are not jaxnav's own.
+    """
+    held = getattr(compiled._executable, "_unloaded_executable", None)
+    if held is None or compiled._params.const_args:
+        raise NotStorableError("closes over arrays, or its backend can't store it")
+    if held.unordered_effects or held.ordered_effects or held.host_callbacks or held.mut:
+        raise NotStorableError("does more than to compute")
+    shape = jax.tree.map(lambda leaf: 0, returned)
+    tree = _plain(shape)
+    structure: Any = jax.tree.structure(shape)
+    if jax.tree.structure(_tree(tree)) != structure:
+        raise NotStorableError(f"{structure} is not all that its fields say")
+    head = json.dumps(
+        {
+            "used": sorted(held.kept_var_idx),
+            "outputs": [[a.shape, str(a.dtype), a.weak_type] for a in held.output_avals],
+            "tree": tree,
+        }
+    ).encode()
+    try:
+        machine_code = held.backend.serialize_executable(held.xla_executable)
+    except jax.errors.JaxRuntimeError as error:
+        raise NotStorableError(str(error)) from None
+    content = _LENGTH.pack(len(head)) + head + machine_code
+    return _checksum(content) + content
+
+
+def from_bytes(raw: bytes, inputs: list[Any]) -> tuple[Run, Any]:
+    """The program, ready to be called, and the structure of what it returns.
+
+    Args:
+        inputs: shapes and types of the arrays that it takes.
+
+    Raises:
+        Exception: of any kind, where the bytes are damaged, or of another JAX or machine.
+    """
+    content = raw[_CHECKSUM_BYTES:]
+    # Machine code that was damaged may do anything: it must not even be looked at.
+    if _checksum(content) != raw[:_CHECKSUM_BYTES]:
+        raise ValueError("damaged")
+    (length,) = _LENGTH.unpack_from(content)
+    begin = _LENGTH.size + length
+    head = json.loads(content[_LENGTH.size : begin])
+    like = _small_program()
+    executable = like.backend.deserialize_executable(
+        content[begin:], executable_devices=like.device_list
+    )
+    used, (scalar,) = head["used"], like.input_avals
+    input_avals = [
+        scalar.update(shape=inputs[n].shape, dtype=inputs[n].dtype, weak_type=inputs[n].weak_type)
+        for n in used
+    ]
+    output_avals = [
+        scalar.update(shape=tuple(shape), dtype=jnp.dtype(dtype), weak_type=weak_type)
+        for shape, dtype, weak_type in head["outputs"]
+    ]
+    held = dataclasses.replace(
+        like,
+        xla_executable=executable,
+        input_avals=input_avals,
+        input_shardings=list(like.input_shardings) * len(used),
+        xla_in_layouts=[None] * len(used),
+        dispatch_in_layouts=[None] * len(used),
+        output_avals=output_avals,
+        output_shardings=list(like.output_shardings) * len(output_avals),
+        xla_out_layouts=[None] * len(output_avals),
+        kept_var_idx=set(used),
+        all_args_info=None,
+    )
+    structure = jax.tree.structure([0] * len(output_avals))
+    run = jax.stages.Compiled(held.load(), [], ((inputs,), {}), structure, no_kwargs=True)
+    return run, jax.tree.structure(_tree(head["tree"]))
+
+
+@cache
+def _small_program() -> Any:
+    """As JAX holds any program: what is loaded differs from it in signature and machine code."""
+    scalar = jax.ShapeDtypeStruct((), jnp.float32)
+    compiled = jax.jit(lambda leaves: [leaf + 1 for leaf in leaves]).lower([scalar]).compile()
+    return compiled._executable._unloaded_executable  # type: ignore[attr-defined]
+
+
+def _plain(value: Any) -> Any:
+    """A tree, its fields and what stands for its leaves, as JSON can say it."""
+    kind = type(value)
+    if value is None or kind in (bool, int, float, str):
+        return value
+    if kind in (list, tuple):
+        return [kind.__name__, *map(_plain, value)]
+    if kind is dict and all(type(key) is str for key in value):
+        return ["dict", {key: _plain(inner) for key, inner in value.items()}]
+    name = f"{kind.__module__}:{kind.__qualname__}"
+    _class(name)
+    if isinstance(value, tuple):
+        return [name, *map(_plain, value)]
+    fields = (field.name for field in dataclasses.fields(value))
+    # Of a module of Equinox not all need be there.
+    return [name, {field: _plain(getattr(value, field)) for field in fields if _has(value, field)}]
+
+
+def _tree(plain: Any) -> Any:
+    """What `_plain` was told. No class is asked to make itself: its fields are put in place."""
+    if not isinstance(plain, list):
+        return plain
+    name, *content = plain
+    if name == "list":
+        return [_tree(inner) for inner in content]
+    if name == "tuple":
+        return tuple(_tree(inner) for inner in content)
+    if name == "dict":
+        return {key: _tree(inner) for key, inner in content[0].items()}
+    kind = _class(name)
+    if issubclass(kind, tuple):
+        return tuple.__new__(kind, [_tree(inner) for inner in content])
+    made = object.__new__(kind)
+    known = {field.name for field in dataclasses.fields(kind)}
+    for field, inner in content[0].items():
+        if field not in known:
+            raise ValueError(f"{name} has no {field}")
+        object.__setattr__(made, field, _tree(inner))
+    return made
+
+
+def _class(name: str) -> Any:
+    """A class that this process knows already, by `module:name`."""
+    module, _, qualified = name.partition(":")
+    found: Any = sys.modules.get(module)
+    if module.partition(".")[0] in _OURS:
+        for part in qualified.split("."):
+            found = getattr(found, part, None)
+        is_named = isinstance(found, type) and hasattr(found, "_fields")
+        if isinstance(found, type) and (dataclasses.is_dataclass(found) or is_named):
+            return found
+    raise NotStorableError(f"{name} is no class of jaxnav's that consists of fields")
+
+
+def _has(value: Any, field: str) -> bool:
+    try:
+        getattr(value, field)
+    except AttributeError:
+        return False
+    return True
+
+
+def _checksum(content: bytes) -> bytes:
+    return hashlib.sha256(content).digest()

@@ -1,0 +1,201 @@
+"""Folders whose content is run as it is found: what others could have put there is never read."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from jaxnav.files import private
+from jaxnav.files.private import NotPrivateError, PrivateFolder
+
+SOMEBODY = 12345
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """With a file in it."""
+    path = tmp_path / "outer" / "inner"
+    with PrivateFolder(path, make=True) as made:
+        made.write("one", b"content")
+    return path
+
+
+def read(path: Path) -> bytes:
+    with PrivateFolder(path) as found:
+        found.require_own_entries()
+        return found.read("one")
+
+
+def test_what_is_written_is_read_and_is_this_users_alone(folder):
+    assert read(folder) == b"content"
+    for path in (folder.parent, folder):
+        assert path.stat().st_mode & 0o777 == 0o700
+    assert (folder / "one").stat().st_mode & 0o777 == 0o600
+    with PrivateFolder(folder) as found:
+        found.write("one", b"newer")
+        assert found.holds("one")
+        assert not found.holds("two")
+    assert read(folder) == b"newer"
+    assert [path.name for path in folder.iterdir()] == ["one"]
+
+
+@pytest.mark.parametrize("part", ["outer", "outer/inner", "outer/inner/one"])
+@pytest.mark.parametrize("mode", [0o770, 0o707])
+def test_a_part_that_others_can_write_to(folder, tmp_path, part, mode):
+    folder.chmod(0o755)  # or nobody could get at the file, whatever its mode
+    (tmp_path / part).chmod(mode)
+    with pytest.raises(NotPrivateError, match=f"{part} can be written to by (all|its group)"):
+        read(folder)
+    (tmp_path / part).chmod(0o755)
+    assert read(folder) == b"content"
+
+
+def test_all_may_write_to_a_part_where_names_are_their_owners_alone(folder):
+    folder.parent.chmod(0o1777)  # as /tmp is
+    assert read(folder) == b"content"
+    folder.chmod(0o1777)
+    with pytest.raises(NotPrivateError, match="inner can be written to by all"):
+        read(folder)
+
+
+@needs_root
+@pytest.mark.parametrize("part", ["outer", "outer/inner", "outer/inner/one"])
+def test_a_part_that_is_somebody_elses(folder, tmp_path, part):
+    os.chown(tmp_path / part, SOMEBODY, -1)
+    with pytest.raises(NotPrivateError, match=f"{part} belongs to another user, number {SOMEBODY}"):
+        read(folder)
+
+
+@needs_root
+def test_a_user_does_not_trust_another_ones_folder_and_trusts_roots(folder, monkeypatch):
+    monkeypatch.setattr(os, "geteuid", lambda: SOMEBODY)
+    assert read(folder) == b"content"  # root's
+    os.chown(folder, SOMEBODY, -1)
+    assert read(folder) == b"content"  # one's own
+    monkeypatch.setattr(os, "geteuid", lambda: SOMEBODY + 1)
+    with pytest.raises(NotPrivateError, match="belongs to another user"):
+        read(folder)
+
+
+@pytest.mark.parametrize("part", ["outer", "outer/inner", "outer/inner/one"])
+def test_a_link_is_not_followed(folder, tmp_path, part):
+    path = tmp_path / part
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(NotPrivateError, match=f"{part} is a link"):
+        read(folder)
+    if part.endswith("one"):
+        with PrivateFolder(folder) as found, pytest.raises(OSError, match="symbolic links"):
+            found.read("one")
+
+
+def test_a_link_in_the_root_folder_is_followed(monkeypatch, folder):
+    linked = Path("/", folder.parts[1])
+    monkeypatch.setattr(Path, "is_symlink", lambda path: path == Path("/short"))
+    monkeypatch.setattr(Path, "readlink", lambda path: linked.relative_to("/"))
+    with PrivateFolder(Path("/short", *folder.parts[2:])) as found:
+        assert found.path == folder
+
+
+def test_what_was_judged_is_what_is_read(folder, tmp_path):
+    """Another folder that takes the name of an open one changes nothing."""
+    with PrivateFolder(folder) as found:
+        folder.rename(tmp_path / "aside")
+        folder.mkdir()
+        (folder / "one").write_bytes(b"another")
+        assert found.read("one") == b"content"
+
+
+def test_no_file_and_no_folder(folder, tmp_path):
+    (folder / "pipe").unlink(missing_ok=True)
+    os.mkfifo(folder / "pipe", 0o600)
+    (folder / "deep").mkdir(mode=0o700)
+    with PrivateFolder(folder) as found:
+        for name in ("pipe", "deep", "missing"):
+            assert not found.holds(name)
+            with pytest.raises(OSError):  # noqa: PT011
+                found.read(name)
+    for path in (folder / "one", folder / "one" / "more", tmp_path / "missing"):
+        with pytest.raises(OSError):  # noqa: PT011
+            PrivateFolder(path)
+
+
+def test_a_large_file_is_not_read(folder, monkeypatch):
+    monkeypatch.setattr(private, "_MAX_BYTES", 3)
+    with pytest.raises(OSError, match="no file of at most 3 bytes"):
+        read(folder)
+
+
+# Processes that write to a folder, each by one argument: killed or halted before the file has its
+# name, or as often as a byte is to be seen.
+WRITERS = """
+import os, signal, sys
+from pathlib import Path
+from jaxnav.files.private import PrivateFolder
+
+def write(role):
+    with PrivateFolder(Path(sys.argv[1]), make=True) as folder:
+        if role.startswith("SIG"):
+            os.rename = lambda *_, **__: os.kill(os.getpid(), getattr(signal, role))
+            folder.write("one", b"half")
+        for _ in range(200):
+            folder.write("one", role.encode() * 10_000)
+
+children = {}
+for role in sys.argv[2:]:
+    child = os.fork()
+    if child == 0:
+        os.close(1)  # nobody waits for what is halted
+        write(role)
+        os._exit(0)
+    _, status = os.waitpid(child, os.WUNTRACED) if role.startswith("SIG") else (0, 0)
+    children[role] = child
+    if role == "SIGSTOP":
+        print(child)
+for role, child in children.items():
+    if not role.startswith("SIG"):
+        assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+def write_from_processes(path: Path, *roles: str) -> str:
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", WRITERS, str(path), *roles],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return run.stdout
+
+
+def test_what_a_killed_process_has_left_is_swept_and_a_living_one_keeps_its_own(folder):
+    write_from_processes(folder, "SIGKILL")
+    (left,) = folder.glob(".part-*")
+    halted = int(write_from_processes(folder, "SIGSTOP"))
+    try:
+        assert not left.exists()
+        (left,) = folder.glob(".part-*")
+        with PrivateFolder(folder) as found:
+            found.write("two", b"2")
+        assert left.read_bytes() == b"half"
+        assert read(folder) == b"content"
+    finally:
+        os.kill(halted, signal.SIGKILL)
+    while Path(f"/proc/{halted}/fd/0").exists():  # it holds its lock until it is quite gone
+        time.sleep(0.01)
+    with PrivateFolder(folder) as found:
+        found.write("two", b"2")
+    assert {path.name for path in folder.iterdir()} == {"one", "two"}
+
+
+def test_two_at_once_leave_one_whole_file(tmp_path):
+    path = tmp_path / "new" / "folder"
+    write_from_processes(path, "a", "b")
+    assert read(path) in (b"a" * 10_000, b"b" * 10_000)
+    assert [file.name for file in path.iterdir()] == ["one"]
