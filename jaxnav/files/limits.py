@@ -1,0 +1,16 @@
+"""How much a file may hold: every cap on what is unpacked or declared, and where each comes from.
+
+A file of 50 MB, whoever made it, must not take more than 2 GiB or 10 s to be read or refused. So
+every reader asks these before it allocates what a file declares, and counts what it unpacks. What
+honest recordings need is a tenth of a cap or less; docs/files.md says which were tried.
+"""
+
+MIB = 2**20
+
+# Text. A map has 4096 markers at most, 25 values and 200 bytes each; a value of YAML costs 15 us.
+YAML_BYTES = 2 * MIB
+YAML_VALUES = 300_000
+DEPTH = 24  # our deepest file has 7 levels
+# PhotonVision keeps its snapshots inside, as base64; what else it says is some thousand values.
+JSON_BYTES = 64 * MIB
+JSON_VALUES = 2_000_000  # 100 bytes and 1 us each
