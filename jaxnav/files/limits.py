@@ -14,3 +14,11 @@ DEPTH = 24  # our deepest file has 7 levels
 # PhotonVision keeps its snapshots inside, as base64; what else it says is some thousand values.
 JSON_BYTES = 64 * MIB
 JSON_VALUES = 2_000_000  # 100 bytes and 1 us each
+
+# Pictures. The search for markers takes up to 43 bytes a pixel, of noise: 1.5 GiB. Cameras that
+# drive have 0.3 to 8 million, one for photographs 12 to 30.
+IMAGE_PIXELS = 2**25
+IMAGE_BYTES = 256 * MIB  # of such a one, not compressed, 16 bits in 4 channels
+
+# Arrays once they are unpacked, all of a file: 3 million detections, two days of a rig of four.
+NPZ_BYTES = 256 * MIB
