@@ -22,3 +22,19 @@ IMAGE_BYTES = 256 * MIB  # of such a one, not compressed, 16 bits in 4 channels
 
 # Arrays once they are unpacked, all of a file: 3 million detections, two days of a rig of four.
 NPZ_BYTES = 256 * MIB
+
+# Recordings. Compressed, they are a third to a tenth of what they were (TagSLAM's bags in bz2: 1.04
+# to 9.5; ours in zstd: 9); a file may unpack to so many times its size, and to so much in any case.
+UNPACKED_BYTES = 64 * MIB
+UNPACKED_TIMES = 32
+CHUNK_BYTES = 64 * MIB  # one of a bag or an MCAP file: 0.8 to 4 MiB, or a single large image
+MESSAGE_BYTES = 4 * MIB  # of a message that is no picture: that of 4096 markers in view is 1 MiB
+CONNECTIONS = 4096  # of a bag: one a topic and publisher
+INDEX_ENTRIES = 2_000_000  # of a bag, 200 bytes each: half an hour of 1 kHz
+DEFINITION_BYTES = 64 * 2**10  # of a type of message; PX4's longest have 10
+LIST_LENGTH = (
+    1000  # of a list of messages that a definition declares; covariances are plain numbers
+)
+SQLITE_STEPS = 400_000_000  # to open a .db3: 30 each message, 30 ns each step
+# Of our own recordings, with their outcomes: an hour at 130 inputs a second. 1.7 kB of memory each.
+MCAP_MESSAGES = 1_000_000

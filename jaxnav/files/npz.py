@@ -25,7 +25,10 @@ def read_npz(path: Path, keys: Collection[str] | None = None) -> Mapping[str, np
     """
     found: dict[str, np.ndarray] = {}
     left = limits.NPZ_BYTES
-    with path.open("rb") as file, zipfile.ZipFile(cast(IO[bytes], _Bounded(file))) as archive:
+    with path.open("rb") as file:
+        if file.read(6) == np.lib.format.MAGIC_PREFIX:
+            raise ValueError("it holds a single array")
+        archive = zipfile.ZipFile(cast(IO[bytes], _Bounded(file)))
         for info in archive.infolist():
             key = info.filename.removesuffix(".npy")
             if keys is not None and key not in keys:
@@ -50,15 +53,15 @@ def _array(key: str, stream: IO[bytes], most_bytes: int) -> np.ndarray:
         raise ValueError(f"{key}: neither numbers nor text")
     if count * dtype.itemsize > most_bytes:
         raise ValueError(f"{key}: {shape} of {dtype} is too large")
-    array = np.empty(count, dtype)
-    into = memoryview(array).cast("B") if array.dtype.kind != "U" else memoryview(array.view("u1"))
+    raw = bytearray(count * dtype.itemsize)
     at = 0
-    while at < len(into):
-        piece = stream.read(min(_PIECE, len(into) - at))
+    while at < len(raw):
+        piece = stream.read(min(_PIECE, len(raw) - at))
         if not piece:
             raise ValueError(f"{key}: ends too early")
-        into[at : at + len(piece)] = piece
+        raw[at : at + len(piece)] = piece
         at += len(piece)
+    array = np.frombuffer(raw, dtype)
     return array.reshape(shape[::-1]).T if is_fortran else array.reshape(shape)
 
 

@@ -67,7 +67,7 @@ def _parse_yaml(path: Path, text: str) -> Any:
     if text.startswith("%YAML:"):
         text = "#" + text
     try:
-        return yaml.load(text, Loader=_Loader)
+        return _Loader(text).get_single_data()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         # libyaml sees the end of a file on the line after its last one.
@@ -102,7 +102,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 try:
-    from yaml.cyaml import CParser as _Parser  # libyaml: a tenth of the time
+    # libyaml: a tenth of the time
+    from yaml.cyaml import CParser as _Parser  # type: ignore[attr-defined]
 except ImportError:  # a PyYAML that was built without it
 
     class _Parser(Reader, Scanner, Parser):  # type: ignore[no-redef]
@@ -192,9 +193,9 @@ for _name, _pattern, _first, _construct in (
     ("float", f"{_FLOAT}|{_SPECIAL_FLOAT}", list("-+.0123456789"), _to_float),
 ):
     _Loader.add_implicit_resolver(_TAG + _name, re.compile(_pattern), _first)
-    _Loader.add_constructor(_TAG + _name, _scalar(_construct))
+    _Loader.yaml_constructors[_TAG + _name] = _scalar(_construct)
 for _name in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(_TAG + _name, _matrix)
+    _Loader.yaml_constructors[_TAG + _name] = _matrix
 
 
 def _kind(value: Any) -> str:
