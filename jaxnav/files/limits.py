@@ -38,3 +38,6 @@ LIST_LENGTH = (
 SQLITE_STEPS = 400_000_000  # to open a .db3: 30 each message, 30 ns each step
 # Of our own recordings, with their outcomes: an hour at 130 inputs a second. 1.7 kB of memory each.
 MCAP_MESSAGES = 1_000_000
+# Of a recording that is read as a whole: two hours of a rig that has 8 markers in view at 30 Hz.
+DETECTIONS = 2_000_000
+IN_VIEW = 4096  # markers in one frame of a camera: all of the largest map

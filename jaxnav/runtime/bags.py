@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import BadInput
+from jaxnav.files import limits
 from jaxnav.files.unpacking import Budget, copy_bz2
 from jaxnav.runtime.bag_readers import Ros1Reader, checked_message, typestore
 from jaxnav.runtime.recording import Rows
@@ -102,13 +103,17 @@ def _read(path: Path) -> Bag:
 
 def _add_detections(detections: Detections, message: Any) -> None:
     stamp_ns = _nanoseconds(message.header)
+    if len(message.apriltags) > limits.IN_VIEW:
+        raise ValueError(f"a frame of more than {limits.IN_VIEW} detections")
+    if len(detections.ids) > limits.DETECTIONS:
+        raise ValueError(f"more than {limits.DETECTIONS} detections")
     detections.message_stamps_ns.append(stamp_ns)
     for tag in message.apriltags:
         if len(tag.corners) != 4:
             raise ValueError(f"a detection of marker {tag.id} has {len(tag.corners)} corners")
         detections.stamps_ns.append(stamp_ns)
         detections.ids.append(int(tag.id))
-        detections.corners_px.append([(corner.x, corner.y) for corner in tag.corners])
+        detections.corners_px.append(np.array([(corner.x, corner.y) for corner in tag.corners]))
 
 
 def _add_transforms(

@@ -169,7 +169,9 @@ def _opened(chunk: Chunk, budget: Budget) -> Iterator[McapRecord]:
     """The records of a chunk, one after the other: a million of them need no memory."""
     if chunk.compression not in ("", "zstd"):
         raise ValueError(f"compressed by {chunk.compression[:20]!r}, only zstd is read")
-    data = unpacked(chunk.compression, chunk.data, budget)
+    if chunk.uncompressed_size > limits.CHUNK_BYTES:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
+    data = unpacked(chunk.compression, chunk.data, budget, most=chunk.uncompressed_size)
     if len(data) != chunk.uncompressed_size:
         raise ValueError("a chunk that is not as large as it says")
     if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
@@ -181,9 +183,9 @@ def _opened(chunk: Chunk, budget: Budget) -> Iterator[McapRecord]:
         if at + length > len(data):
             raise ValueError("a record that is longer than its chunk")
         if opcode == Opcode.MESSAGE:
-            yield Message(
-                *_MESSAGE.unpack_from(data, at), data=data[at + _MESSAGE.size : at + length]
-            )
+            channel, sequence, log_ns, stamp_ns = _MESSAGE.unpack_from(data, at)
+            body = data[at + _MESSAGE.size : at + length]
+            yield Message(channel, log_ns, body, stamp_ns, sequence)
         elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
             kind = Channel if opcode == Opcode.CHANNEL else Schema
             yield kind.read(ReadDataStream(BytesIO(data[at : at + length])))
