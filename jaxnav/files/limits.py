@@ -41,3 +41,4 @@ MCAP_MESSAGES = 1_000_000
 # Of a recording that is read as a whole: two hours of a rig that has 8 markers in view at 30 Hz.
 DETECTIONS = 2_000_000
 IN_VIEW = 4096  # markers in one frame of a camera: all of the largest map
+TRACKED_POSES = 4_000_000  # of markers each for itself, frames x markers, 90 bytes each
