@@ -42,3 +42,6 @@ MCAP_MESSAGES = 1_000_000
 DETECTIONS = 2_000_000
 IN_VIEW = 4096  # markers in one frame of a camera: all of the largest map
 TRACKED_POSES = 4_000_000  # of markers each for itself, frames x markers, 90 bytes each
+
+# Of a study, read at once: a box has 2 million trials at most, in 8 bytes.
+STORE_BYTES = 128 * MIB

@@ -33,7 +33,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     """
     is_json = path.suffix.lower() == ".json"
     text = read_text(path, limits.JSON_BYTES if is_json else limits.YAML_BYTES)
-    data = _parse_json(path, text) if is_json else _parse_yaml(path, text)
+    data = parse_json(path, text) if is_json else parse_yaml(path, text)
     if data is None:
         raise BadInput(path, "the file is empty")
     if not isinstance(data, dict):
@@ -62,7 +62,12 @@ def read_text(path: Path, max_bytes: int) -> str:
         raise BadInput(path, f"is not UTF-8 text (byte {error.start})") from None
 
 
-def _parse_yaml(path: Path, text: str) -> Any:
+def parse_yaml(path: Path, text: str) -> Any:
+    """What a text of YAML holds.
+
+    Raises:
+        BadInput: it is not YAML, or holds too much.
+    """
     # OpenCV 3 and 4 head their files with "%YAML:1.0", which is not a YAML directive.
     if text.startswith("%YAML:"):
         text = "#" + text
@@ -83,7 +88,12 @@ def _parse_yaml(path: Path, text: str) -> Any:
         raise BadInput(path, f"is not valid YAML: {error}") from None
 
 
-def _parse_json(path: Path, text: str) -> Any:
+def parse_json(path: Path, text: str) -> Any:
+    """What a text of JSON holds.
+
+    Raises:
+        BadInput: it is not JSON, or holds too much.
+    """
     # Every value stands behind one of these, and few are in texts.
     if sum(map(text.count, "[{,")) > limits.JSON_VALUES:
         raise BadInput(path, f"holds more than {limits.JSON_VALUES} values")
