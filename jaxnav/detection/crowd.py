@@ -21,7 +21,7 @@ _KEPT_SHARE = 4  # of the picture, a quarter: what is larger holds most of the c
 # As OpenCV's decoder: its windows, how much darker than their mean, how straight an edge must be.
 _WINDOWS_PX, _DARKER, _STRAIGHT = (3, 13, 23), 7, 0.03
 _SAME_PLACE_PX = 3.0
-_MARGIN_SIDES, _MARGIN_PX = 0.4, 4
+_MARGIN_SIDES, _MARGIN_PX = 0.25, 4
 
 
 def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.ndarray:

@@ -95,11 +95,13 @@ def json_brackets(path: Path) -> Path:
 
 
 def _npz(path: Path, name: str, header: bytes, zeros: int) -> Path:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-            member.write(header)
-            for _ in range(zeros // 2**20):
-                member.write(bytes(2**20))
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open(f"{name}.npy", "w", force_zip64=True) as member,
+    ):
+        member.write(header)
+        for _ in range(zeros // 2**20):
+            member.write(bytes(2**20))
     return path
 
 
