@@ -6,14 +6,16 @@ is missing there, or of another form, is left out of the picture.
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from jaxnav.errors import BadInput
 from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import MarkerFile, marker_map
+from jaxnav.files.reading import parse_yaml
 from jaxnav.files.rigs import RigFile
 from jaxnav.files.validation import Pair
 from jaxnav.markers import MarkerMap
@@ -69,8 +71,9 @@ class _RouteEntry(BaseModel):
 
 def _read(model: type[_Model], value: Any) -> _Model | None:
     try:
-        return model.model_validate(yaml.safe_load(value) if isinstance(value, str) else value)
-    except (ValidationError, yaml.YAMLError):
+        data = parse_yaml(Path("header"), value) if isinstance(value, str) else value
+        return model.model_validate(data)
+    except (ValidationError, BadInput):
         return None
 
 

@@ -16,6 +16,8 @@ from jaxnav.calibration.boards import Board
 from jaxnav.calibration.views import BoardView, BoardViews
 from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
+from jaxnav.files import limits
+from jaxnav.files.images import read_image
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
@@ -157,20 +159,9 @@ class _Collector:
         self._examples: list[np.ndarray] = []
 
     def add_image(self, file: Path, name: str) -> None:
-        try:
-            raw = np.fromfile(file, np.uint8)
-        except OSError as error:
-            problem = f"can't be read: {(error.strerror or str(error)).lower()}"
-            raise BadInput(file, problem) from None
-        try:
-            # As the sensor gave it: what a viewer turns upright is of another camera.
-            flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imdecode(raw, flags) if len(raw) else None
-        except cv2.error:
-            image = None
-        if image is None:
-            raise BadInput(file, "is not an image that OpenCV can read")
-        image = np.asarray(image, np.uint8)
+        # As the sensor gave it: what a viewer turns upright is of another camera.
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        image = read_image(file, flags)
         self._same_size(str(file), image)
         if not self._is_repeated(name, image):
             look = self._look(name, image)
@@ -253,6 +244,9 @@ def _frames(file: Path) -> Iterator[tuple[int, np.ndarray]]:
         if not capture.isOpened():
             raise BadInput(file, "is not a video that OpenCV can read")
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as of images
+        width, height = map(capture.get, (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if width * height > limits.IMAGE_PIXELS:
+            raise BadInput(file, f"has frames of {width:.0f} x {height:.0f} pixels, too many")
         count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         stride = max(1, -(-count // _MOST_FRAMES))
         number = 0

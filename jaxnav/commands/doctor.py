@@ -133,7 +133,7 @@ def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
 
 def _pictures(args: Doctor, patient: SimpleNamespace) -> Iterable[Finding]:
     from jaxnav.commands.doctor_checks.photographs import examine_pictures
-    from jaxnav.commands.locate import read_image
+    from jaxnav.files.images import read_image
 
     if patient.rig is None or patient.markers is None:
         return [Finding("picture", "note", "not looked at: rig and markers are needed")]

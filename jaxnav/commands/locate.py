@@ -1,7 +1,6 @@
 """`jaxnav locate`: the markers of a photograph, both poses of each."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,7 +18,7 @@ from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.detection import Detections, make_detector
 from jaxnav.errors import BadInput
 from jaxnav.files import load_camera
-from jaxnav.files.images import decoded_image
+from jaxnav.files.images import read_image
 from jaxnav.markers import MarkerMap
 from jaxnav.observation import Observation, Snapshot
 from jaxnav.plotting import View, photo_with_poses
@@ -57,22 +56,6 @@ def run(args: Locate) -> int:
         save_figure(photo_with_poses(view), args.out)
     print(json.dumps(report, indent=2) if args.json else table(report))
     return 0
-
-
-def read_image(path: Path) -> np.ndarray:
-    """A picture as (H, W, 3) BGR.
-
-    Raises:
-        BadInput: missing, unreadable, or not an image.
-    """
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise BadInput(path, f"can't be read: {(error.strerror or str(error)).lower()}") from None
-    image = decoded_image(raw)
-    if image is None:
-        raise BadInput(path, "is not an image that OpenCV can read")
-    return image
 
 
 @jax.jit

@@ -86,7 +86,7 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
         "params": args.params,
         "frames": len(recording),
         "frames_located": int(result.seen.any(axis=1).sum()),
-        "detections": int(recording.visible.sum()),
+        "detections": len(recording.seen_px),
         "detections_not_in_map": recording.unmapped_detections,
         "detections_dropped": recording.dropped_detections,
         "poses": int(result.seen.sum()),

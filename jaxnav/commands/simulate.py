@@ -1,7 +1,6 @@
 """`jaxnav simulate`: many closed-loop drives at corner level, counted."""
 
 import itertools
-import json
 import math
 from contextlib import nullcontext
 from typing import Annotated, Any
@@ -16,17 +15,15 @@ from jaxnav.arguments import Simulate as Arguments
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.errors import BadInput
-from jaxnav.files import load_params, write_json
+from jaxnav.files import limits, load_params, write_json
 from jaxnav.files.locking import sole_writer
-from jaxnav.files.reading import read_text
+from jaxnav.files.reading import parse_json, read_text
 from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.navigator import Navigator
 from jaxnav.selectors import SELECTORS, make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
-
-_MAX_BYTES = 64 * 2**20
 
 
 def run(args: Arguments) -> int:
@@ -111,11 +108,11 @@ def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[
 def _resumed(args: Arguments) -> list[dict[str, Any]]:
     if not args.resume or args.json is None or not args.json.exists():
         return []
-    text = read_text(args.json, _MAX_BYTES)
+    text = read_text(args.json, limits.JSON_BYTES)
     try:
-        kept = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise BadInput(args.json, f"is not valid JSON: {error}; can't resume") from None
+        kept = parse_json(args.json, text)
+    except BadInput as bad:
+        raise BadInput(args.json, f"can't resume: {bad}") from None
     if not isinstance(kept, dict) or not kept.keys() & {"run", "runs"}:
         problem = "is not a result of jaxnav simulate, which has `run` or `runs`; can't resume"
         raise BadInput(args.json, problem)

@@ -20,6 +20,7 @@ from tqdm import tqdm
 from jaxnav.errors import BadInput
 from jaxnav.files import write_params
 from jaxnav.files.locking import sole_writer
+from jaxnav.files.npz import read_npz
 from jaxnav.files.writing import atomic_write, plain_data
 from jaxnav.tuning.fit import Fit, Problem, advanced, arrays_of, fit_of
 from jaxnav.tuning.unconstrained import Space
@@ -183,9 +184,7 @@ class Fitting:
         if not self.checkpoint.exists():
             return None
         try:
-            raw = io.BytesIO(self.checkpoint.read_bytes())
-            with np.load(raw, allow_pickle=False) as arrays:
-                found = dict(arrays)
+            found = dict(read_npz(self.checkpoint))
             key = dict(json.loads(str(found.pop("run"))))
         except _DAMAGED as error:
             raise self._damaged(error) from None

@@ -64,7 +64,7 @@ def tracks(
         BadInput: there are fewer than `LEAST_SEQUENCES`.
     """
     begin, end = bounds(len(recording), part)
-    seen = np.any(recording.visible, axis=1)  # (F, M)
+    seen = recording.seen
     markers, pieces = [], []
     for marker in range(seen.shape[1] if one_at_a_time else 1):
         frames = np.arange(begin, end)
@@ -96,11 +96,18 @@ def _recorded(
     frames, used = side_by_side(pieces)
     if markers is None:
         lanes = np.tile(np.arange(len(recording.markers.ids)), (len(pieces), 1))
-        corners_px, visible = recording.corners_px[frames], recording.visible[frames]
+        corners_px, visible = (
+            lanes_of.reshape(*frames.shape, *lanes_of.shape[1:])
+            for lanes_of in recording.lanes(frames.ravel())
+        )
     else:
         lanes = markers[:, None]
-        corners_px = recording.corners_px[frames, :, markers[:, None]][:, :, :, None]
-        visible = recording.visible[frames, :, markers[:, None]][..., None]
+        # Piece by piece: of a large map all but one marker is dropped at once.
+        alone = [
+            [lanes_of[:, :, [marker]] for lanes_of in recording.lanes(piece)]
+            for piece, marker in zip(frames, markers, strict=True)
+        ]
+        corners_px, visible = (np.stack(rows) for rows in zip(*alone, strict=True))
     visible = visible & used[:, :, None, None]
     corners_px = np.where(visible[..., None, None], corners_px, 0.0)
     stamps_ns = recording.stamps_ns[frames]

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from jaxnav.camera import Camera
+from jaxnav.detection.crowd import thinned
 from jaxnav.detection.families import dictionary
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.read import frames_first, read_marker
@@ -12,10 +13,12 @@ from jaxnav.detection.types import Detections, grey, refined_detections
 
 # The closer look: quadrilaterals of these sides.
 _CLOSER_LOOK_PX = (8.0, 150.0)
+_LOOKS_IN_A_CROWD = 3  # closer ones, of 10 ms
 _ENLARGE_UP_TO_PX = 40.0
 _ENLARGE = 3
 _PERIMETER_RATE = 0.03  # OpenCV's, of the longer side of the image
 _SMALLEST = 0.6  # part of the predicted perimeter
+_SAME_PLACE_PX = 0.5  # quadrilaterals whose centres are nearer to each other are one
 # A prediction may be off by this part of its side, and by some pixels.
 _SEARCH_SIDES, _SEARCH_PX = 0.5, 8
 
@@ -110,12 +113,17 @@ class ArucoDetector:
         self, image: np.ndarray, perimeter_rate: float = 0.0
     ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
         """What OpenCV read, (id, corners) each, and the quadrilaterals that it could not read."""
-        quads, ids, unread = self._decoder(perimeter_rate).detectMarkers(image)
+        least_px = max(perimeter_rate, _PERIMETER_RATE) * max(image.shape)
+        left = thinned(image, self.family, least_px)
+        quads, ids, unread = self._decoder(perimeter_rate).detectMarkers(left)
         found_ids = [] if ids is None else [int(i) for i in ids.ravel()]
         found = [
             (i, quad.reshape(4, 2).astype(float)) for i, quad in zip(found_ids, quads, strict=True)
         ]
-        return found, [quad.reshape(4, 2).astype(float) for quad in unread]
+        others = [quad.reshape(4, 2).astype(float) for quad in unread]
+        if left is not image:
+            others = frames_first(image, _worth_a_look(others))[:_LOOKS_IN_A_CROWD]
+        return found, others
 
     def _decode_around(
         self, image: np.ndarray, quad: np.ndarray
@@ -150,12 +158,27 @@ class ArucoDetector:
 
 def _worth_a_look(quads: list[np.ndarray]) -> list[np.ndarray]:
     """Of the quadrilaterals those neither too small nor too large, each place once."""
+    if not quads:
+        return []
+    corners = np.stack(quads)
+    sides_px = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
+    centers = corners.mean(axis=1)
+    smallest, largest = _CLOSER_LOOK_PX
     kept: list[np.ndarray] = []
-    for quad in quads:
-        low, high = _CLOSER_LOOK_PX
-        known = any(np.max(np.abs(quad.mean(axis=0) - q.mean(axis=0))) < 0.5 for q in kept)
-        if low <= mean_side_px(quad) <= high and not known:
-            kept.append(quad)
+    # By squares of `_SAME_PLACE_PX`: what is nearer than that is in the same or the next one.
+    places: dict[tuple[int, int], list[np.ndarray]] = {}
+    for index in np.flatnonzero((sides_px >= smallest) & (sides_px <= largest)):
+        center = centers[index]
+        column, row = (int(value) for value in np.floor(center / _SAME_PLACE_PX))
+        near = (
+            other
+            for x in (column - 1, column, column + 1)
+            for y in (row - 1, row, row + 1)
+            for other in places.get((x, y), ())
+        )
+        if not any(np.max(np.abs(center - other)) < _SAME_PLACE_PX for other in near):
+            kept.append(quads[index])
+            places.setdefault((column, row), []).append(center)
     return kept
 
 

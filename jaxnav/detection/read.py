@@ -63,7 +63,7 @@ def read_marker(
 
 
 @cache
-def _codes(family: str) -> np.ndarray:
+def codes_of(family: str) -> np.ndarray:
     """Ink inside the frame, (4 * ids, cells): each marker as it looks after 0..3 turns."""
     inner = 1 - all_cells(family)[:, 1:-1, 1:-1]
     # Turned k times clockwise, the marker's own top-left corner is corner k of the picture.
@@ -75,7 +75,7 @@ def _most_likely(
     image: np.ndarray, fitted: Fitted, family: str, lens: Lens
 ) -> tuple[int, int] | None:
     """(id, turns) of the code that explains the pixels best, None where others come near."""
-    codes = _codes(family)
+    codes = codes_of(family)
     n = all_cells(family).shape[1]
     ink = _cells_in_image(fitted, n, lens)
     inside = np.pad(np.ones((n - 2, n - 2), bool), 1).ravel()

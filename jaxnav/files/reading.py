@@ -1,23 +1,28 @@
 """Text, YAML and JSON from disk, with everything surprising refused.
 
 YAML is read with the scalars of YAML 1.2: `yes` is a word, `010` is ten and `1e-5` is a number.
-Sizes and depths are bounded, duplicate keys and aliases are refused, and OpenCV's matrices
-(`!!opencv-matrix`, of 5 also `!!opencv-nd-matrix`) are read as the mappings they are.
+Sizes, depths and numbers of values are bounded, duplicate keys and aliases are refused, and
+OpenCV's matrices (`!!opencv-matrix`, of 5 also `!!opencv-nd-matrix`) are read as the mappings they
+are.
 """
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import yaml
+from yaml.composer import Composer
+from yaml.constructor import SafeConstructor
+from yaml.parser import Parser
+from yaml.reader import Reader
+from yaml.resolver import Resolver
+from yaml.scanner import Scanner
 
 from jaxnav.errors import BadInput
-
-_MAX_YAML_BYTES = 2 * 2**20  # several thousand markers
-_MAX_JSON_BYTES = 64 * 2**20  # PhotonVision keeps its snapshots inside
-_MAX_DEPTH = 24
+from jaxnav.files import limits
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -27,8 +32,8 @@ def read_mapping(path: Path) -> dict[str, Any]:
         BadInput: unreadable, too large, not text, not YAML or JSON, or not a mapping.
     """
     is_json = path.suffix.lower() == ".json"
-    text = read_text(path, _MAX_JSON_BYTES if is_json else _MAX_YAML_BYTES)
-    data = _parse_json(path, text) if is_json else _parse_yaml(path, text)
+    text = read_text(path, limits.JSON_BYTES if is_json else limits.YAML_BYTES)
+    data = parse_json(path, text) if is_json else parse_yaml(path, text)
     if data is None:
         raise BadInput(path, "the file is empty")
     if not isinstance(data, dict):
@@ -57,15 +62,22 @@ def read_text(path: Path, max_bytes: int) -> str:
         raise BadInput(path, f"is not UTF-8 text (byte {error.start})") from None
 
 
-def _parse_yaml(path: Path, text: str) -> Any:
+def parse_yaml(path: Path, text: str) -> Any:
+    """What a text of YAML holds.
+
+    Raises:
+        BadInput: it is not YAML, or holds too much.
+    """
     # OpenCV 3 and 4 head their files with "%YAML:1.0", which is not a YAML directive.
     if text.startswith("%YAML:"):
         text = "#" + text
     try:
-        return yaml.load(text, Loader=_Loader)
+        return _Loader(text).get_single_data()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        line = f"line {mark.line + 1}: " if mark else ""
+        # libyaml sees the end of a file on the line after its last one.
+        last = max(len(text.splitlines()), 1)
+        line = f"line {min(mark.line + 1, last)}: " if mark else ""
         raise BadInput(path, f"is not valid YAML: {line}{error.problem or error.context}") from None
     except yaml.YAMLError as error:  # a character that YAML does not allow
         raise BadInput(path, f"is not valid YAML: {str(error).splitlines()[0]}") from None
@@ -76,7 +88,15 @@ def _parse_yaml(path: Path, text: str) -> Any:
         raise BadInput(path, f"is not valid YAML: {error}") from None
 
 
-def _parse_json(path: Path, text: str) -> Any:
+def parse_json(path: Path, text: str) -> Any:
+    """What a text of JSON holds.
+
+    Raises:
+        BadInput: it is not JSON, or holds too much.
+    """
+    # Every value stands behind one of these, and few are in texts.
+    if sum(map(text.count, "[{,")) > limits.JSON_VALUES:
+        raise BadInput(path, f"holds more than {limits.JSON_VALUES} values")
     try:
         return json.loads(text, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
@@ -86,33 +106,53 @@ def _parse_json(path: Path, text: str) -> Any:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     mapping = dict(pairs)
     if len(mapping) < len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f"duplicate key {next(key for key in keys if keys.count(key) > 1)!r}")
+        times = Counter(key for key, _ in pairs)
+        raise ValueError(f"duplicate key {next(key for key in times if times[key] > 1)!r}")
     return mapping
 
 
-class _Loader(yaml.SafeLoader):
+try:
+    # libyaml: a tenth of the time
+    from yaml.cyaml import CParser as _Parser  # type: ignore[attr-defined]
+except ImportError:  # a PyYAML that was built without it
+
+    class _Parser(Reader, Scanner, Parser):  # type: ignore[no-redef]
+        """PyYAML's own."""
+
+        def __init__(self, stream: str):
+            Reader.__init__(self, stream)
+            Scanner.__init__(self)
+            Parser.__init__(self)
+
+
+class _Loader(Composer, _Parser, SafeConstructor, Resolver):
     """PyYAML's safe loader, stricter."""
 
     # PyYAML's own names, filled below.
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
     yaml_constructors: ClassVar[dict[Any, Any]] = {
         tag: construct
-        for tag, construct in yaml.SafeLoader.yaml_constructors.items()
+        for tag, construct in SafeConstructor.yaml_constructors.items()
         if tag is None or tag.rpartition(":")[2] in ("map", "seq", "str")
     }
 
     def __init__(self, stream: str):
-        yaml.SafeLoader.__init__(self, stream)
-        self._depth = 0
+        _Parser.__init__(self, stream)
+        Composer.__init__(self)
+        SafeConstructor.__init__(self)
+        Resolver.__init__(self)
+        self._depth = self._nodes = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             self._refuse("aliases (*name) are not supported", self.peek_event())
-        if self._depth == _MAX_DEPTH:
-            self._refuse(f"nested deeper than {_MAX_DEPTH} levels", self.peek_event())
+        if self._depth == limits.DEPTH:
+            self._refuse(f"nested deeper than {limits.DEPTH} levels", self.peek_event())
+        if self._nodes == limits.YAML_VALUES:
+            self._refuse(f"more than {limits.YAML_VALUES} values", self.peek_event())
+        self._nodes += 1
         self._depth += 1
-        node = yaml.SafeLoader.compose_node(self, parent, index)
+        node = Composer.compose_node(self, parent, index)
         self._depth -= 1
         return node
 
@@ -163,9 +203,9 @@ for _name, _pattern, _first, _construct in (
     ("float", f"{_FLOAT}|{_SPECIAL_FLOAT}", list("-+.0123456789"), _to_float),
 ):
     _Loader.add_implicit_resolver(_TAG + _name, re.compile(_pattern), _first)
-    _Loader.add_constructor(_TAG + _name, _scalar(_construct))
+    _Loader.yaml_constructors[_TAG + _name] = _scalar(_construct)
 for _name in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(_TAG + _name, _matrix)
+    _Loader.yaml_constructors[_TAG + _name] = _matrix
 
 
 def _kind(value: Any) -> str:

@@ -4,8 +4,6 @@ Message definitions come from the bag itself. Of all its messages two kinds matt
 detections (`apriltag_msgs/ApriltagArrayStamped`, TagSLAM's) and transforms (`/tf`).
 """
 
-import bz2
-import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,15 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag1 import Reader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from jaxnav.errors import BadInput
+from jaxnav.files import limits
+from jaxnav.files.unpacking import Budget, copy_bz2
+from jaxnav.runtime.bag_readers import Ros1Reader, checked_message, typestore
 from jaxnav.runtime.recording import Rows
 
 DETECTIONS_TYPE = "apriltag_msgs/msg/ApriltagArrayStamped"
 _TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
-_COPY_BYTES = 2**20
 
 
 @dataclass
@@ -79,8 +77,8 @@ def decompressed(path: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="jaxnav-") as folder:
         plain = Path(folder) / path.stem
         try:
-            with bz2.open(path) as source, plain.open("wb") as target:
-                shutil.copyfileobj(source, target, _COPY_BYTES)
+            with plain.open("wb") as target:
+                copy_bz2(path, target, Budget.of_file(path))
         except (OSError, EOFError, ValueError) as error:
             raise BadInput(path, f"can't be decompressed: {str(error).lower()}") from None
         yield plain
@@ -88,16 +86,14 @@ def decompressed(path: Path) -> Iterator[Path]:
 
 def _read(path: Path) -> Bag:
     bag = Bag()
-    with Reader(path) as reader:
-        types = get_typestore(Stores.EMPTY)
-        wanted = []
-        for connection in reader.connections:
-            bag.topics[connection.topic] = connection.msgtype
-            if connection.msgtype in (DETECTIONS_TYPE, *_TF_TYPES):
-                types.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
-                wanted.append(connection)
-        for connection, _, raw in reader.messages(connections=wanted):
-            message = types.deserialize_ros1(raw, connection.msgtype)
+    with Ros1Reader(path) as reader:
+        bag.topics = {connection.topic: connection.msgtype for connection in reader.connections}
+        kinds = (DETECTIONS_TYPE, *_TF_TYPES)
+        wanted = [c for c in reader.connections if c.msgtype in kinds]
+        types = typestore(wanted, {})
+        for connection, _, raw in reader.messages(connections=wanted) if wanted else ():
+            kind = connection.msgtype
+            message = types.deserialize_ros1(checked_message(kind, raw), kind)
             if connection.msgtype == DETECTIONS_TYPE:
                 _add_detections(bag.detections.setdefault(connection.topic, Detections()), message)
             else:
@@ -107,13 +103,17 @@ def _read(path: Path) -> Bag:
 
 def _add_detections(detections: Detections, message: Any) -> None:
     stamp_ns = _nanoseconds(message.header)
+    if len(message.apriltags) > limits.IN_VIEW:
+        raise ValueError(f"a frame of more than {limits.IN_VIEW} detections")
+    if len(detections.ids) > limits.DETECTIONS:
+        raise ValueError(f"more than {limits.DETECTIONS} detections")
     detections.message_stamps_ns.append(stamp_ns)
     for tag in message.apriltags:
         if len(tag.corners) != 4:
             raise ValueError(f"a detection of marker {tag.id} has {len(tag.corners)} corners")
         detections.stamps_ns.append(stamp_ns)
         detections.ids.append(int(tag.id))
-        detections.corners_px.append([(corner.x, corner.y) for corner in tag.corners])
+        detections.corners_px.append(np.array([(corner.x, corner.y) for corner in tag.corners]))
 
 
 def _add_transforms(

@@ -11,6 +11,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import marker_map
+from jaxnav.files.npz import read_npz
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.recording import Recording, Rows, assemble
@@ -102,12 +103,7 @@ def _rows(
 
 def _load(path: Path) -> dict[str, np.ndarray]:
     try:
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it holds a single array")
-            known = _KEYS.keys() | _REFERENCE_KEYS.keys() | {"obj_order"}
-            return {key: archive[key] for key in archive.files if key in known}
+        return dict(read_npz(path, _KEYS.keys() | _REFERENCE_KEYS.keys() | {"obj_order"}))
     except Exception as error:
         # NumPy, zipfile and zlib meet whatever bytes a file holds.
         problem = f"is not a readable .npz file ({type(error).__name__}: {error})"

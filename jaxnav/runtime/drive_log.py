@@ -9,6 +9,7 @@ import numpy as np
 from mcap.records import Metadata
 
 from jaxnav.errors import BadInput
+from jaxnav.files import limits
 from jaxnav.files.validation import Model, validate
 from jaxnav.runtime.drive_format import HEADER, decode, header_of
 from jaxnav.runtime.mcap_messages import McapMessages, Recorded
@@ -118,7 +119,9 @@ def read_drive(path: str | Path) -> DriveLog:
     path = Path(path)
     header: dict[str, Any] | None = None
     inputs: list[Input] = []
-    outcomes: list[OutcomeMessage] = []
+    # Not as messages: one takes four times the memory of what it says.
+    told: dict[str, list[Any]] = {name: [] for name in OutcomeMessage.model_fields}
+    detections = 0
     gaps = _Gaps()
     records = McapMessages(path)
     for record in records:
@@ -128,15 +131,22 @@ def read_drive(path: str | Path) -> DriveLog:
             continue
         gaps.count(record)
         if record.topic in MESSAGES:
-            message = _message(record, path, len(outcomes if record.topic == OUTCOME else inputs))
+            index = len(told["now_ns"] if record.topic == OUTCOME else inputs)
+            message = _message(record, path, index)
             if isinstance(message, OutcomeMessage):
-                outcomes.append(message)
-            else:
-                inputs.append(input_of(message))
+                for name, values in told.items():
+                    values.append(getattr(message, name))
+                continue
+            inputs.append(input_of(message))
+            found = (frame.detections for frame in inputs[-1].frames)
+            detections += sum(len(one) for one in found if one is not None)
+            if detections > limits.DETECTIONS:
+                problem = f"holds more than {limits.DETECTIONS} detections"
+                raise BadInput(f"{path}: {record.topic}", problem)
     if header is None:
         problem = "is cut off before its header" if records.truncated else "is no recorded drive"
         raise BadInput(path, problem)
-    table = _table(outcomes, path)
+    table = _table(told, path)
     return DriveLog(path, header, tuple(inputs), table, gaps.missing, records.truncated)
 
 
@@ -159,6 +169,8 @@ def _message(record: Recorded, path: Path, index: int) -> AnyMessage:
     if (record.schema, record.encoding) != (name, "json"):
         problem = f"expected {name} in json, got {record.schema!r} in {record.encoding!r}"
         raise BadInput(f"{path}: {record.topic}", problem)
+    if len(record.data) > limits.MESSAGE_BYTES:
+        raise BadInput(f"{path}: {record.topic}[{index}]", f"has {len(record.data)} bytes")
     return _checked(model, record, path, f"{record.topic}[{index}]")
 
 
@@ -170,22 +182,19 @@ def _checked(model: type[Model], record: Recorded, path: Path, key: str) -> Mode
     return validate(model, data, path, key)
 
 
-def _table(outcomes: list[OutcomeMessage], path: Path) -> Outcomes:
+def _table(told: dict[str, list[Any]], path: Path) -> Outcomes:
     def column(name: str, dtype: type, missing: Any = None) -> np.ndarray:
-        values = [getattr(outcome, name) for outcome in outcomes]
-        return np.array([missing if value is None else value for value in values], dtype)
+        return np.array([missing if value is None else value for value in told[name]], dtype)
 
     def rows(name: str, shape: tuple[int, ...]) -> np.ndarray:
-        values = [getattr(outcome, name) for outcome in outcomes]
         missing = np.full(shape, np.nan)
-        filled = [missing if value is None else value for value in values]
+        filled = [missing if value is None else value for value in told[name]]
         return np.array(filled, float).reshape(len(filled), *shape)
 
     def ragged(name: str, *row: int) -> tuple[np.ndarray, ...]:
-        values = [getattr(outcome, name) for outcome in outcomes]
-        return tuple(np.zeros((0, *row)) if value is None else value for value in values)
+        return tuple(np.zeros((0, *row)) if value is None else value for value in told[name])
 
-    sides = {len(outcome.covariance) for outcome in outcomes if outcome.covariance is not None}
+    sides = {len(covariance) for covariance in told["covariance"] if covariance is not None}
     if len(sides) > 1:
         raise BadInput(f"{path}: {OUTCOME}.covariance", f"differ in size: {sorted(sides)}")
     side = sides.pop() if sides else 0
@@ -212,6 +221,6 @@ def _table(outcomes: list[OutcomeMessage], path: Path) -> Outcomes:
         Ts_vehicle_world=ragged("Ts_vehicle_world", 7),
         costs=ragged("costs"),
         selected=column("selected", int, -1),
-        reasons=tuple(outcome.reason for outcome in outcomes),
-        digests=tuple(outcome.digest for outcome in outcomes),
+        reasons=tuple(told["reason"]),
+        digests=tuple(told["digest"]),
     )

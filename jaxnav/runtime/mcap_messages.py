@@ -4,13 +4,17 @@ A file that is cut off, as a program that was killed leaves it, is read up to th
 bounded, and checksums are compared where there are any.
 """
 
+import struct
+import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import IO, cast
 
-import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import InvalidMagic
+from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
     Chunk,
@@ -21,14 +25,15 @@ from mcap.records import (
     Metadata,
     Schema,
 )
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader
 
 from jaxnav.errors import BadInput
-
-MAX_BYTES = 64 * 2**20  # of a message, and of a chunk once it is decompressed
-
+from jaxnav.files import limits
+from jaxnav.files.unpacking import Budget, unpacked
 
 _MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log and publish time
 
 
 def profile_of(path: Path) -> str | None:
@@ -71,6 +76,7 @@ class McapMessages:
         self.truncated = True
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
+        self._messages = 0
 
     def __iter__(self) -> Iterator[Metadata | Recorded]:
         try:
@@ -94,14 +100,14 @@ class McapMessages:
     def _read(self, file: IO[bytes]) -> Iterator[Metadata | Recorded]:
         bounded = cast(IO[bytes], _Bounded(file))
         reader = StreamReader(
-            bounded, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_BYTES
+            bounded, emit_chunks=True, validate_crcs=True, record_size_limit=limits.CHUNK_BYTES
         )
-        is_over = False
+        is_over, budget = False, Budget.of_file(self.path)
         for record in reader.records:
             is_over |= isinstance(record, DataEnd | Footer)  # what follows only repeats
             if is_over:
                 continue
-            for inner in _opened(record) if isinstance(record, Chunk) else [record]:
+            for inner in _opened(record, budget) if isinstance(record, Chunk) else [record]:
                 if (found := self._found(inner)) is not None:
                     yield found
         self.truncated = False
@@ -117,6 +123,9 @@ class McapMessages:
                     raise ValueError(f"{record.topic} has an unknown schema")
                 self._channels[record.id] = record
             case Message():
+                self._messages += 1
+                if self._messages > limits.MCAP_MESSAGES:
+                    raise ValueError(f"more than {limits.MCAP_MESSAGES} messages")
                 channel = self._channels.get(record.channel_id)
                 if channel is None:
                     raise ValueError(f"a message of the unknown channel {record.channel_id}")
@@ -147,7 +156,7 @@ class _Bounded:
         self._file, self._begun = file, False
 
     def read(self, size: int) -> bytes:
-        if size > MAX_BYTES:
+        if size > limits.CHUNK_BYTES:
             raise ValueError(f"{size} bytes in one piece")
         data = self._file.read(size)
         if len(data) < size:
@@ -156,17 +165,28 @@ class _Bounded:
         return data
 
 
-def _opened(chunk: Chunk) -> list[McapRecord]:
-    if chunk.uncompressed_size > MAX_BYTES:
-        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-    data = chunk.data
-    if chunk.compression == "zstd":
-        # The frame's own word is what decides how much memory is taken.
-        if zstandard.frame_content_size(data) > MAX_BYTES:
-            raise ValueError("a chunk that is larger than it says")
-        data = zstandard.ZstdDecompressor().decompress(data, chunk.uncompressed_size)
-    elif chunk.compression:
+def _opened(chunk: Chunk, budget: Budget) -> Iterator[McapRecord]:
+    """The records of a chunk, one after the other: a million of them need no memory."""
+    if chunk.compression not in ("", "zstd"):
         raise ValueError(f"compressed by {chunk.compression[:20]!r}, only zstd is read")
+    if chunk.uncompressed_size > limits.CHUNK_BYTES:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
+    data = unpacked(chunk.compression, chunk.data, budget, most=chunk.uncompressed_size)
     if len(data) != chunk.uncompressed_size:
         raise ValueError("a chunk that is not as large as it says")
-    return breakup_chunk(replace(chunk, compression="", data=data), validate_crc=True)
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("a chunk whose checksum differs")
+    at = 0
+    while at < len(data):
+        opcode, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if at + length > len(data):
+            raise ValueError("a record that is longer than its chunk")
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_ns, stamp_ns = _MESSAGE.unpack_from(data, at)
+            body = data[at + _MESSAGE.size : at + length]
+            yield Message(channel, log_ns, body, stamp_ns, sequence)
+        elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+            kind = Channel if opcode == Opcode.CHANNEL else Schema
+            yield kind.read(ReadDataStream(BytesIO(data[at : at + length])))
+        at += length

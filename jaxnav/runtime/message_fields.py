@@ -13,6 +13,8 @@ from pydantic_core import core_schema
 
 from jaxnav.runtime.flags import Fault
 
+_MOST_SIDES = 32  # of a covariance: a state has 6 to 9 numbers
+
 
 @dataclass(frozen=True)
 class Array:
@@ -90,7 +92,7 @@ def square(array: np.ndarray) -> np.ndarray:
         ValueError: their number is no square.
     """
     side = math.isqrt(array.size)
-    if side**2 != array.size:
+    if side**2 != array.size or side > _MOST_SIDES:
         raise ValueError(f"must be a square matrix, got {array.size} values")
     return array.reshape(side, side)
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
+from jaxnav.files import limits
 from jaxnav.files.validation import Count, Entry
 from jaxnav.runtime.drive_format import NOT_FINITE
 from jaxnav.runtime.flags import Health, Reject
@@ -55,6 +56,8 @@ class SightedMessage(Entry):
         fields = (self.ids, self.families, self.corners_px, self.sigma_px, self.refined)
         if len({len(field) for field in fields}) > 1:
             raise ValueError("ids, families, corners_px, sigma_px and refined must agree in number")
+        if len(self.ids) > limits.IN_VIEW:
+            raise ValueError(f"has more than {limits.IN_VIEW} detections")
         if not self.usable and len(self.ids):
             raise ValueError("a frame that was not usable has no detections")
         return self

@@ -37,12 +37,16 @@ class Reference:
 
 @dataclass(frozen=True)
 class Recording:
-    """What C cameras saw of M markers in F frames. Hidden lanes hold zeros."""
+    """What C cameras saw of M markers in F frames, N sightings.
+
+    Ten minutes of a map of a thousand markers are 70 million lanes, of which as good as all are
+    hidden: `lanes` gives those of some frames.
+    """
 
     name: str
     stamps_ns: Int[np.ndarray, " F"]  # increasing
-    corners_px: Float[np.ndarray, "F C M 4 2"]
-    visible: Bool[np.ndarray, "F C M"]
+    seen_at: Int[np.ndarray, "3 N"]  # frame, camera, marker of each sighting, in this order
+    seen_px: Float[np.ndarray, "N 4 2"]  # TL TR BR BL
     rig: CameraRig
     markers: MarkerMap
     reference: Reference | None
@@ -52,8 +56,41 @@ class Recording:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    @property
+    def corners_px(self) -> Float[np.ndarray, "F C M 4 2"]:
+        """Of all frames, zeros where hidden: for short recordings and small maps."""
+        return self.lanes(np.arange(len(self)))[0]
+
+    @property
+    def visible(self) -> Bool[np.ndarray, "F C M"]:
+        """Of all frames."""
+        return self.lanes(np.arange(len(self)))[1]
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "F M"]:
+        """Whether any camera saw a marker."""
+        seen = np.zeros((len(self), len(self.markers.ids)), bool)
+        seen[self.seen_at[0], self.seen_at[2]] = True
+        return seen
+
+    def lanes(
+        self, frames: Int[np.ndarray, " K"]
+    ) -> tuple[Float[np.ndarray, "K C M 4 2"], Bool[np.ndarray, "K C M"]]:
+        """Corners, zeros where hidden, and what is visible, of some frames in any order."""
+        shape = (len(frames), len(self.rig), len(self.markers.ids))
+        corners_px, visible = np.zeros((*shape, 4, 2)), np.zeros(shape, bool)
+        begin = np.searchsorted(self.seen_at[0], frames)
+        count = np.searchsorted(self.seen_at[0], frames, side="right") - begin
+        row = np.repeat(np.arange(len(frames)), count)
+        sighting = np.arange(len(row)) + np.repeat(begin - np.cumsum(count) + count, count)
+        _, camera, marker = self.seen_at[:, sighting]
+        corners_px[row, camera, marker] = self.seen_px[sighting]
+        visible[row, camera, marker] = True
+        return corners_px, visible
+
     def first(self, frames: int) -> "Recording":
         """The first frames alone."""
+        kept = np.searchsorted(self.seen_at[0], frames)
         reference = self.reference
         if reference is not None:
             reference = Reference(
@@ -64,8 +101,8 @@ class Recording:
         return replace(
             self,
             stamps_ns=self.stamps_ns[:frames],
-            corners_px=self.corners_px[:frames],
-            visible=self.visible[:frames],
+            seen_at=self.seen_at[:, :kept],
+            seen_px=self.seen_px[:kept],
             reference=reference,
         )
 
@@ -105,26 +142,24 @@ def assemble(
     finite = np.isfinite(rows.corners_px).all(axis=(1, 2))
     frame = np.searchsorted(stamps, rows.stamps_ns)
 
-    lanes = (len(stamps), len(rig), len(markers.ids))
-    reports = np.zeros(lanes, int)
-    np.add.at(reports, (frame[mapped], rows.cameras[mapped], index[mapped]), 1)
-    used = mapped & finite
-    used[used] = reports[frame[used], rows.cameras[used], index[used]] == 1
-
-    corners_px, visible = np.zeros((*lanes, 4, 2)), np.zeros(lanes, bool)
-    at = (frame[used], rows.cameras[used], index[used])
-    corners_px[at] = rows.corners_px[used][:, TO_OURS]
-    visible[at] = True
+    used = np.flatnonzero(mapped & finite)
+    shape = (len(stamps), len(rig), len(markers.ids))
+    at = np.ravel_multi_index((frame[mapped], rows.cameras[mapped], index[mapped]), shape)
+    once = np.ones(len(rows.ids), bool)
+    _, which, reports = np.unique(at, return_inverse=True, return_counts=True)
+    once[mapped] = reports[which] == 1
+    used = used[once[used]]
+    used = used[np.lexsort((index[used], rows.cameras[used], frame[used]))]
     return Recording(
         name=name,
         stamps_ns=stamps,
-        corners_px=corners_px,
-        visible=visible,
+        seen_at=np.stack([frame[used], rows.cameras[used], index[used]]),
+        seen_px=rows.corners_px[used][:, TO_OURS],
         rig=rig,
         markers=markers,
         reference=None if poses is None else _align(stamps, poses),
         unmapped_detections=int(np.sum(~mapped)),
-        dropped_detections=int(np.sum(mapped & ~used)),
+        dropped_detections=int(np.sum(mapped)) - len(used),
     )
 
 

@@ -18,8 +18,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.ambiguity import Selector
 from jaxnav.candidates import find_candidates
 from jaxnav.constant_velocity import ConstantVelocity
+from jaxnav.errors import BadInput
 from jaxnav.evaluation import Branch, judge_branch
-from jaxnav.files import Params, apply_params
+from jaxnav.files import Params, apply_params, limits
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator, State
 from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
@@ -90,16 +91,20 @@ def replay(
     navigator = apply_params(navigator, params)
     corner_sigma_px = float(navigator.corner_sigma_px)
     tracks = len(recording.markers.ids) if one_at_a_time else 1
+    if tracks * len(recording) > limits.TRACKED_POSES:
+        problem = (
+            f"{len(recording)} frames of {tracks} markers are more than {limits.TRACKED_POSES}"
+        )
+        raise BadInput("--markers one-at-a-time", f"{problem} poses: take fewer frames (--limit)")
     state = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)), navigator.init()
     )
-    frames = _frames(recording)
     total = len(recording)
-    run_chunk = _run_chunk.lower(navigator, state, _chunk(frames, 0), one_at_a_time).compile()
+    run_chunk = _run_chunk.lower(navigator, state, _frames(recording, 0), one_at_a_time).compile()
     started = time.perf_counter()
     chunks = []
     for begin in range(0, total, CHUNK_FRAMES):
-        state, outputs = run_chunk(navigator, state, _chunk(frames, begin))
+        state, outputs = run_chunk(navigator, state, _frames(recording, begin))
         chunks.append(jax.device_get(outputs))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
@@ -118,11 +123,11 @@ def estimate_corner_sigma_px(recording: Recording) -> float:
     with 2 degrees of freedom, whatever the map and the extrinsics are worth. The median over the
     recording is not moved by a few bad detections. What calibration adds is `MODEL_SIGMA_PX`.
     """
-    frames, cameras, marker_indices = np.nonzero(recording.visible)
-    if not len(frames):
+    sightings = len(recording.seen_px)
+    if not sightings:
         return 1.0
-    picks = np.linspace(0, len(frames) - 1, min(len(frames), SIGMA_SAMPLES)).astype(int)
-    corners_px = recording.corners_px[frames[picks], cameras[picks], marker_indices[picks]]
+    picks = np.linspace(0, sightings - 1, min(sightings, SIGMA_SAMPLES)).astype(int)
+    _, cameras, marker_indices = recording.seen_at[:, picks]
     padding = SIGMA_SAMPLES - len(picks)
 
     def padded(rows: np.ndarray) -> Array:
@@ -131,9 +136,9 @@ def estimate_corner_sigma_px(recording: Recording) -> float:
     e1_px2 = _best_e1_px2(
         recording.rig,
         recording.markers,
-        padded(corners_px),
-        padded(cameras[picks]),
-        padded(marker_indices[picks]),
+        padded(recording.seen_px[picks]),
+        padded(cameras),
+        padded(marker_indices),
     )
     sigma_px = np.sqrt(np.median(np.asarray(e1_px2)[: len(picks)]) / (2 * np.log(2)))
     return float(np.hypot(sigma_px, MODEL_SIGMA_PX))
@@ -191,33 +196,27 @@ def _single(markers: MarkerMap, index: Array) -> MarkerMap:
     return MarkerMap(T_world_marker, markers.size_m[index][None], ids=(0,), families=("",))
 
 
-def _frames(recording: Recording) -> _Frames:
-    """All frames, padded to whole chunks with frames that show nothing."""
-    count = len(recording)
-    dt_s = np.diff(recording.stamps_ns, prepend=recording.stamps_ns[:1]) / 1e9
-    identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, 1))
+def _frames(recording: Recording, begin: int) -> _Frames:
+    """A chunk of frames; those beyond the last one show nothing."""
+    frames = np.arange(begin, min(begin + CHUNK_FRAMES, len(recording)))
+    padding = CHUNK_FRAMES - len(frames)
+    dt_s = (
+        np.diff(recording.stamps_ns[frames], prepend=recording.stamps_ns[max(begin - 1, 0)]) / 1e9
+    )
     reference = recording.reference
-    truth = identity if reference is None else reference.T_world_vehicle
-    padding = -count % CHUNK_FRAMES
+    identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(frames), 1))
+    truth = identity if reference is None else reference.T_world_vehicle[frames]
+    corners_px, visible = recording.lanes(frames)
 
     def pad(rows: np.ndarray) -> Array:
         return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)]))
 
-    visible = np.concatenate(
-        [recording.visible, np.zeros((padding, *recording.visible.shape[1:]), bool)]
-    )
+    hidden = np.zeros((padding, *visible.shape[1:]), bool)
     return _Frames(
-        corners_px=pad(recording.corners_px),
-        visible=jnp.asarray(visible),
+        corners_px=pad(corners_px),
+        visible=jnp.asarray(np.concatenate([visible, hidden])),
         dt_s=pad(np.clip(dt_s, 0, MAX_DT_S)),
         T_world_vehicle_true=pad(truth),
-    )
-
-
-@jax.jit
-def _chunk(frames: _Frames, begin: int | Array) -> _Frames:
-    return jax.tree.map(
-        lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, begin, CHUNK_FRAMES), frames
     )
 
 

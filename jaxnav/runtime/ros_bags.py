@@ -12,13 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Connection, MessageDefinitionFormat
-from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag2 import Reader as Ros2Reader
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-
 from jaxnav.errors import BadInput
 from jaxnav.runtime import bags
+from jaxnav.runtime.bag_readers import Ros1Reader, Ros2Reader, checked_message, typestore
 
 _ROS2_FILES = (".db3", ".mcap")
 _LONGEST = 200  # characters of what a library says about broken bytes; it may quote all of them
@@ -104,35 +100,15 @@ def _read(
         with reader_class(plain) as reader:
             chosen = choose({c.topic: c.msgtype for c in reader.connections})
             connections = [c for c in reader.connections if c.topic in chosen]
-            types = _typestore(connections)
+            types = typestore(connections, _DEFINITIONS)
             is_ros1 = reader_class is Ros1Reader
             deserialize = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
             for connection, received_ns, raw in reader.messages(connections=connections):
                 kind = connection.msgtype
-                yield Received(connection.topic, kind, received_ns, deserialize(raw, kind))
+                message = deserialize(checked_message(kind, raw), kind)
+                yield Received(connection.topic, kind, received_ns, message)
     except BadInput:
         raise
     except Exception as error:
         # The reader meets whatever bytes a file holds, and raises whatever they lead to.
         raise BadInput(path, f"is not a readable ROS bag ({one_line(error)})") from None
-
-
-def _typestore(connections: Collection[Connection]) -> Any:
-    """The types of some connections."""
-    undefined = {c.msgtype for c in connections if c.msgdef.format is MessageDefinitionFormat.NONE}
-    types = get_typestore(Stores.ROS2_HUMBLE if undefined else Stores.EMPTY)
-    for kind in undefined - types.fielddefs.keys():
-        if kind not in _DEFINITIONS:
-            raise ValueError(f"the bag holds no definition of {kind}")
-        types.register(get_types_from_msg(_DEFINITIONS[kind], kind))
-    for connection in connections:
-        definition = connection.msgdef
-        if definition.format is MessageDefinitionFormat.MSG:
-            types.register(get_types_from_msg(definition.data, connection.msgtype))
-        elif definition.format is MessageDefinitionFormat.IDL:
-            for part in definition.data.split(_RULE):
-                # Each part is headed by `IDL: package/msg/Type`, unless there is only one.
-                text = part.partition("\n")[2] if part.startswith("IDL: ") else part
-                if text.strip():
-                    types.register(get_types_from_idl(text))
-    return types

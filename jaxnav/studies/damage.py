@@ -1,5 +1,6 @@
 """Is a store still what was written: damaged bytes, and parts that do not fit together, named."""
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from jaxnav.errors import BadInput
+from jaxnav.files import limits
 from jaxnav.studies.layout import Layout
 from jaxnav.studies.study import Grid
 
@@ -31,6 +33,22 @@ def reading(path: Path) -> Iterator[None]:
         said = f"{type(error).__name__}: {error}"
         shown = said if len(said) <= _LONGEST else f"{said[:_LONGEST]}..."
         raise BadInput(path, f"is damaged ({shown})") from None
+
+
+def check_sizes(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Whether what is read of a store at once, as its arrays declare it, is not too much.
+
+    That is a chunk of any, and of an axis and of which boxes are done all.
+
+    Raises:
+        BadInput: it is.
+    """
+    for name, array in arrays.items():
+        is_whole = name == "done" or tuple(array.metadata.dimension_names or ()) == (name,)
+        count = math.prod(array.shape if is_whole else array.chunks)
+        count = max(count, math.prod(array.chunks))
+        if array.shards is not None or count * array.dtype.itemsize > limits.STORE_BYTES:
+            raise BadInput(f"{path}: {name}", f"is too large: {array.shape} by {array.chunks}")
 
 
 def layout_of(path: Path, attributes: Mapping[str, Any], counts: tuple[int, ...]) -> Layout:

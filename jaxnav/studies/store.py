@@ -22,7 +22,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from jaxnav.errors import BadInput
 from jaxnav.studies.config import difference
-from jaxnav.studies.damage import check_layout, layout_of, reading
+from jaxnav.studies.damage import check_layout, check_sizes, layout_of, reading
 from jaxnav.studies.layout import Layout
 from jaxnav.studies.study import Study, Variable
 
@@ -178,6 +178,9 @@ def _open_group(path: Path, mode: Any) -> zarr.Group:
     try:
         group = zarr.open_group(path, mode=mode)
         is_ours = _DONE in group
+        check_sizes(path, dict(group.arrays()))
+    except BadInput:
+        raise
     except Exception as error:  # of whatever bytes it holds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadInput(path, f"is not a store of jaxnav study ({reason})") from None

@@ -15,9 +15,9 @@ import numpy as np
 from jaxnav import files
 from jaxnav.arguments import Simulate
 from jaxnav.commands import simulate
-from jaxnav.commands.locate import read_image
 from jaxnav.commands.studies import load_study, summary_of
 from jaxnav.files.cameras import camera_file, named_by_topic
+from jaxnav.files.images import read_image
 from jaxnav.files.markers import marker_map
 from jaxnav.files.poses import pose_as_read
 from jaxnav.files.reading import read_mapping

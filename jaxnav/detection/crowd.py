@@ -1,0 +1,110 @@
+"""A picture full of squares, thinned out to those that may be markers.
+
+A decoder takes a millisecond for every quadrilateral and compares them all with each other: a
+grille, a tiled wall or a poster made for it holds a camera up for seconds. In a picture that has
+more of them than any room, each is first held against the codes of the family by its cells alone,
+all at once, and only what surrounds the best is left in the picture.
+"""
+
+import cv2
+import numpy as np
+
+from jaxnav.detection.families import all_cells
+from jaxnav.detection.read import codes_of
+
+# A room with markers has a dozen quadrilaterals in 820 x 410 pixels; so many cost 50 to 100 ms.
+_CROWD = 40
+_CROWD_PIXELS = 820 * 410
+_MOST_LOOKED_AT = 4096
+_KEPT = 16
+_KEPT_SHARE = 4  # of the picture, a quarter: what is larger holds most of the crowd
+# As OpenCV's decoder: its windows, how much darker than their mean, how straight an edge must be.
+_WINDOWS_PX, _DARKER, _STRAIGHT = (3, 13, 23), 7, 0.03
+_SAME_PLACE_PX = 3.0
+_MARGIN_SIDES, _MARGIN_PX = 0.25, 4
+
+
+def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.ndarray:
+    """The image, or one with nothing but the likeliest markers in it where it is a crowd.
+
+    Args:
+        image: (H, W) grey levels.
+        family: one of `jaxnav.markers.FAMILY_SIZES`.
+        least_perimeter_px: of the quadrilaterals that a decoder would look at.
+    """
+    crowd = max(_CROWD, min(1000, _CROWD * image.size // _CROWD_PIXELS))
+    if _spots(image, least_perimeter_px / 4) <= crowd:
+        return image
+    quads = _quads(image, least_perimeter_px)
+    if len(quads) <= crowd:
+        return image
+    likely = quads[np.argsort(_unlikeness(image, quads, family), kind="stable")[:_KEPT]]
+    left, room_px2 = np.full_like(image, int(image.mean())), image.size / _KEPT_SHARE
+    for quad in likely:
+        low, high = quad.min(axis=0), quad.max(axis=0)
+        margin_px = _MARGIN_SIDES * (high - low).max() + _MARGIN_PX
+        x0, y0 = np.maximum(low - margin_px, 0).astype(int)
+        x1, y1 = np.ceil(high + margin_px).astype(int)
+        if (x1 - x0) * (y1 - y0) > room_px2:
+            continue
+        room_px2 -= (x1 - x0) * (y1 - y0)
+        left[y0:y1, x0:x1] = image[y0:y1, x0:x1]
+    return left
+
+
+def _spots(image: np.ndarray, least_side_px: float) -> int:
+    """How many dark or light spots, not too small, at half the size: more than quadrilaterals."""
+    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    dark = _dark(small, 11)
+    count = 0
+    for spots in (dark, 255 - dark):
+        size_px = cv2.connectedComponentsWithStats(spots, connectivity=4)[2][1:, 2:4]
+        count += int(np.count_nonzero(size_px.min(axis=1) >= max(least_side_px / 4, 2)))
+    return count
+
+
+def _dark(image: np.ndarray, window_px: int) -> np.ndarray:
+    mean, inverse = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV
+    return np.asarray(cv2.adaptiveThreshold(image, 255, mean, inverse, window_px, _DARKER))
+
+
+def _quads(image: np.ndarray, least_perimeter_px: float) -> np.ndarray:
+    """Quadrilaterals (Q, 4, 2), clockwise, the largest first."""
+    outlines: list[np.ndarray] = []
+    for window_px in _WINDOWS_PX:
+        dark = _dark(image, window_px)
+        found_there, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        outlines += [np.asarray(o) for o in found_there if len(o) >= least_perimeter_px]
+    quads = []
+    for outline in sorted(outlines, key=len)[::-1]:
+        corners = cv2.approxPolyDP(outline, _STRAIGHT * len(outline), True)
+        if len(corners) == 4 and cv2.isContourConvex(corners):
+            quads.append(corners.reshape(4, 2))
+            if len(quads) == _MOST_LOOKED_AT:
+                break
+    found = np.array(quads, float).reshape(-1, 4, 2)
+    # One place shows in each of the windows.
+    places = np.round(found.mean(axis=1) / _SAME_PLACE_PX)
+    found = found[np.sort(np.unique(places, axis=0, return_index=True)[1])]
+    edges = np.roll(found, -1, axis=1) - found
+    is_clockwise = edges[:, 0, 0] * edges[:, 1, 1] > edges[:, 0, 1] * edges[:, 1, 0]
+    return np.where(is_clockwise[:, None, None], found, found[:, ::-1])
+
+
+def _unlikeness(image: np.ndarray, quads: np.ndarray, family: str) -> np.ndarray:
+    """(Q,) how many cells differ from the nearest code of the family, frame and inside."""
+    n = all_cells(family).shape[1]
+    at = (np.arange(n) + 0.5) / n
+    u, v = (side.ravel()[:, None] for side in np.meshgrid(at, at))
+    weights = np.hstack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v])  # of TL TR BR BL
+    points = (weights @ quads).astype(np.float32)
+    x, y = np.moveaxis(points, -1, 0).copy()
+    levels = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    levels = levels.astype(np.float32)
+    middle = (levels.min(axis=1) + levels.max(axis=1)) / 2
+    ink = (levels < middle[:, None]).astype(np.float32)
+    is_inside = np.pad(np.ones((n - 2, n - 2), bool), 1).ravel()
+    inside, codes = ink[:, is_inside], codes_of(family).astype(np.float32)
+    differ = inside.sum(axis=1)[:, None] + codes.sum(axis=1) - 2 * inside @ codes.T
+    frame = np.count_nonzero(~is_inside) - ink[:, ~is_inside].sum(axis=1)
+    return np.asarray(differ.min(axis=1) + frame)

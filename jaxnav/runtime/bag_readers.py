@@ -1,0 +1,231 @@
+"""rosbags' readers with an eye on what a bag declares and unpacks, whatever bytes it holds.
+
+A bag is refused, by an exception as its reader raises them, before more is taken for it than
+`jaxnav.files.limits` allows: for a chunk, for all of them together, for an index, for a definition.
+"""
+
+import struct
+import threading
+from collections.abc import Callable, Collection, Generator, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import IO, Any
+
+import apsw
+from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
+from rosbags.rosbag1 import Reader as _Ros1Reader
+from rosbags.rosbag1.reader import Chunk, ChunkInfo, IndexData
+from rosbags.rosbag2 import Reader as _Ros2Reader
+from rosbags.rosbag2 import reader as _rosbag2
+from rosbags.rosbag2 import storage_mcap as _mcap
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+from jaxnav.files import limits
+from jaxnav.files.unpacking import Budget, unpacked, zstd_pieces
+
+_RULE = "=" * 80 + "\n"  # between the definitions of a message's parts
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_SIZES = {"8": 1, "bool": 1, "byte": 1, "char": 1, "16": 2, "32": 4, "64": 8, "128": 16}
+
+
+class Ros1Reader(_Ros1Reader):
+    """Of .bag files."""
+
+    def __init__(self, path: Path):
+        _Ros1Reader.__init__(self, path)
+        self._budget = Budget.of_file(path)
+        self._connections = self._entries = 0
+
+    def read_connection(self) -> Connection:
+        """See rosbags."""
+        self._connections += 1
+        if self._connections > limits.CONNECTIONS:
+            raise ValueError(f"more than {limits.CONNECTIONS} connections")
+        return _Ros1Reader.read_connection(self)
+
+    def read_chunk_info(self) -> ChunkInfo:
+        """See rosbags."""
+        self._count_entries(1)
+        return _Ros1Reader.read_chunk_info(self)
+
+    def read_chunk(self) -> Chunk:
+        """See rosbags."""
+        chunk = _Ros1Reader.read_chunk(self)
+        kind = next(k for k, unpack in _ros1_decompressors.items() if unpack is chunk.decompressor)
+        return chunk._replace(decompressor=partial(self._unpacked, kind))
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
+        """See rosbags. Two chunks may name one index: what counts is how often it is read."""
+        assert self.bio is not None
+        begin = self.bio.tell()
+        _, (size,) = self.bio.seek(begin + 51), struct.unpack("<L", self.bio.read(4))
+        self.bio.seek(begin)
+        self._count_entries(1 + size // 12)
+        _Ros1Reader.read_index_data(self, pos, indexes)
+
+    def _count_entries(self, count: int) -> None:
+        self._entries += count
+        if self._entries > limits.INDEX_ENTRIES:
+            raise ValueError(f"an index of more than {limits.INDEX_ENTRIES} entries")
+
+    def _unpacked(self, kind: str, data: bytes) -> bytes:
+        return unpacked(kind, data, self._budget)
+
+
+class Ros2Reader(_Ros2Reader):
+    """Of folders, .db3 and .mcap files."""
+
+    def __init__(self, path: Path):
+        _Ros2Reader.__init__(self, path)
+        self._budget = Budget(0)
+        for file in path.iterdir() if path.is_dir() else [path]:
+            self._budget.left += Budget.of_file(file).left
+        metadata = path / "metadata.yaml"
+        if path.is_dir() and metadata.stat().st_size > limits.YAML_BYTES:
+            raise ValueError(
+                f"{metadata.name} is larger than {limits.YAML_BYTES // limits.MIB} MiB"
+            )
+
+    def open(self) -> None:
+        """See rosbags."""
+        with _spending(self._budget):
+            _Ros2Reader.open(self)
+
+    def messages(
+        self, connections: Collection[Connection] = (), start: Any = None, stop: Any = None
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """See rosbags."""
+        found = _Ros2Reader.messages(self, connections, start, stop)
+        while True:
+            with _spending(self._budget):
+                one = next(found, None)
+            if one is None:
+                return
+            yield one
+
+
+def checked_message(kind: str, raw: bytes) -> bytes:
+    """A message's bytes, if it is not too long to be taken apart."""
+    if kind not in _IMAGES and len(raw) > limits.MESSAGE_BYTES:
+        raise ValueError(f"a message of {len(raw)} bytes")
+    return raw
+
+
+def typestore(connections: Collection[Connection], known: dict[str, str]) -> Any:
+    """The types of some connections.
+
+    Args:
+        known: definitions of types that a bag may use without one.
+
+    Raises:
+        Exception: of rosbags, or that a definition is too long or declares too much.
+    """
+    undefined = {c.msgtype for c in connections if c.msgdef.format is MessageDefinitionFormat.NONE}
+    types = get_typestore(Stores.ROS2_HUMBLE if undefined else Stores.EMPTY)
+    for kind in undefined - types.fielddefs.keys():
+        if kind not in known:
+            raise ValueError(f"the bag holds no definition of {kind}")
+        types.register(get_types_from_msg(known[kind], kind))
+    for connection in connections:
+        definition = connection.msgdef
+        if len(definition.data) > limits.DEFINITION_BYTES:
+            raise ValueError(f"the definition of {connection.msgtype} is too long")
+        if definition.format is MessageDefinitionFormat.MSG:
+            _register(types, get_types_from_msg(definition.data, connection.msgtype))
+        elif definition.format is MessageDefinitionFormat.IDL:
+            for part in definition.data.split(_RULE):
+                # Each part is headed by `IDL: package/msg/Type`, unless there is only one.
+                text = part.partition("\n")[2] if part.startswith("IDL: ") else part
+                if text.strip():
+                    _register(types, get_types_from_idl(text))
+    return types
+
+
+def _register(types: Any, found: Any) -> None:
+    """Add types of which no message can be larger in memory than its bytes account for."""
+    least: dict[str, int] = {}
+
+    def least_bytes(name: str, above: tuple[str, ...]) -> int:
+        if name in above or len(above) > limits.DEPTH:
+            raise ValueError(f"{name} holds itself")
+        if name not in least:
+            definition = found.get(name) or types.fielddefs.get(name)
+            fields = definition[1] if definition else ()
+            least[name] = sum(of_field(field[1], (*above, name)) for field in fields)
+        return least[name]
+
+    def of_field(field: Any, above: tuple[str, ...]) -> int:
+        if field[0] == Nodetype.NAME:
+            return least_bytes(field[1], above)
+        if field[0] == Nodetype.BASE:
+            name = field[1][0]
+            return 4 if name == "string" else next(n for w, n in _SIZES.items() if name.endswith(w))
+        inner, length = field[1]
+        size = of_field(inner, above)
+        if not size:
+            raise ValueError("a list of messages without content")
+        if field[0] == Nodetype.SEQUENCE:
+            return 4
+        is_plain = inner[0] == Nodetype.BASE and inner[1][0] != "string"
+        if length > (limits.MESSAGE_BYTES if is_plain else limits.LIST_LENGTH):
+            raise ValueError(f"a list of {length} entries in every message")
+        return int(length) * size
+
+    for name in found:
+        if least_bytes(name, ()) > limits.MESSAGE_BYTES:
+            raise ValueError(f"{name} is larger than any message")
+    types.register(found)
+
+
+# rosbags' own tables and names, by which it unpacks: they know of no budget.
+_ros1_decompressors = _Ros1Reader.read_chunk.__globals__["decompressors"]
+_now = threading.local()
+
+
+@contextmanager
+def _spending(budget: Budget) -> Iterator[None]:
+    """What rosbags unpacks in this block, and this thread, is taken from a budget."""
+    before, _now.budget = getattr(_now, "budget", None), budget
+    try:
+        yield
+    finally:
+        _now.budget = before
+
+
+def _bounded(kind: str) -> Callable[..., bytes]:
+    return lambda data, *_: unpacked(kind, data, getattr(_now, "budget", None) or Budget(0))
+
+
+class _Zstd:
+    """In place of the module, for folders whose files or messages are packed."""
+
+    decompress = staticmethod(_bounded("zstd"))
+
+    @staticmethod
+    @contextmanager
+    def open(file: IO[bytes], mode: str) -> Iterator[Any]:
+        """What can be read of a file, as `shutil.copyfileobj` reads it."""
+        pieces, budget = zstd_pieces(file), getattr(_now, "budget", None) or Budget(0)
+
+        def read(size: int) -> bytes:
+            piece = next(pieces, b"")
+            budget.take(len(piece))
+            return piece
+
+        yield SimpleNamespace(read=read)
+
+
+_mcap.DECOMPRESSORS.update({kind: _bounded(kind) for kind in ("", "lz4", "zstd")})
+_rosbag2.zstd = _Zstd  # type: ignore[assignment]
+
+
+def _limit(connection: apsw.Connection) -> None:
+    """A table may make its values up: neither long ones nor for long."""
+    connection.limit(apsw.SQLITE_LIMIT_LENGTH, limits.CHUNK_BYTES)
+    steps = iter(range(limits.SQLITE_STEPS // 1_000_000))
+    connection.set_progress_handler(lambda: next(steps, None) is None, 1_000_000)
+
+
+apsw.connection_hooks.append(_limit)

@@ -1,0 +1,274 @@
+"""Small files that declare or unpack to gigabytes: refused in one line, in seconds and 2 GiB."""
+
+import resource
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import zarr
+
+from jaxnav.detection import make_detector
+from jaxnav.detection.aruco import _CLOSER_LOOK_PX, _worth_a_look
+from jaxnav.detection.crowd import thinned
+from jaxnav.detection.families import all_cells
+from jaxnav.detection.refine import mean_side_px
+from jaxnav.errors import BadInput
+from jaxnav.files import limits
+from jaxnav.files.image_headers import image_size_px
+from jaxnav.files.images import decoded_image, image_problem, read_image
+from jaxnav.files.npz import read_npz
+from jaxnav.files.reading import read_mapping
+from jaxnav.runtime import bag_readers
+from jaxnav.runtime.bags import decompressed, read_bag
+from jaxnav.runtime.drive_log import read_drive
+from jaxnav.runtime.recordings import read_recording
+from jaxnav.studies.damage import check_sizes
+from tests.helpers import bombs
+
+SECONDS = 10.0  # of a processor that others use too
+
+
+@pytest.fixture(autouse=True)
+def two_gib() -> Iterator[None]:
+    """No more than 2 GiB beside what this process has already, and 10 s."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 2 * bombs.GIB, hard))
+    began_s = time.process_time()
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    assert time.process_time() - began_s < SECONDS
+
+
+def problem(load, path: Path) -> str:
+    """The one line that a person gets: of a cap, not of memory that was asked for in vain."""
+    with pytest.raises(BadInput) as caught:
+        load(path)
+    line = str(caught.value)
+    assert str(path) in line
+    assert "MemoryError" not in line
+    assert "allocate" not in line
+    return line
+
+
+@pytest.mark.parametrize("name", bombs.PICTURES)
+def test_a_picture_is_as_large_as_its_header_says(name, tmp_path):
+    path = bombs.PICTURES[name](tmp_path / name)
+    assert image_problem(path.read_bytes()) is not None
+    assert decoded_image(path.read_bytes()) is None
+    problem(read_image, path)
+
+
+def test_the_size_of_a_picture_is_read_as_opencv_reads_it():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (24, 37, 3), np.uint8)
+    ways = [
+        (".png", []), (".jpg", []), (".jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]), (".bmp", []),
+        (".tiff", []), (".tiff", [cv2.IMWRITE_TIFF_COMPRESSION, 1]), (".ppm", []),
+        (".ppm", [cv2.IMWRITE_PXM_BINARY, 0]), (".webp", []),
+        (".webp", [cv2.IMWRITE_WEBP_QUALITY, 50]),
+    ]  # fmt: skip
+    for extension, options in ways:
+        raw = cv2.imencode(extension, image, options)[1].tobytes()
+        assert image_size_px(raw) == (37, 24), extension
+        decoded = decoded_image(raw)
+        assert decoded is not None
+        assert decoded.shape == image.shape
+    deep = cv2.imencode(".png", image.astype(np.uint16))[1].tobytes()
+    assert image_size_px(deep) == (37, 24)
+
+
+def test_text_with_too_many_values_is_refused(tmp_path):
+    assert "more than 300000 values" in problem(
+        read_mapping, bombs.yaml_brackets(tmp_path / "rig.yaml")
+    )
+    assert "more than 2000000 values" in problem(
+        read_mapping, bombs.json_brackets(tmp_path / "layout.json")
+    )
+
+
+def test_a_map_of_the_largest_size_is_read(tmp_path):
+    row = "  - {id: %d, family: tag36h11, size_m: 0.172, corners_world_m: %s}\n"
+    corners = "[[-0.086, 1.471234, 0.312], [0.086, 1.47, 0.312], [0.086, 1.47, 0.14], [0, 1, 0]]"
+    path = tmp_path / "markers.yaml"
+    path.write_text("markers:\n" + "".join(row % (index, corners) for index in range(4096)))
+    assert len(read_mapping(path)["markers"]) == 4096
+
+
+@pytest.mark.parametrize("name", bombs.ARRAYS)
+def test_arrays_are_as_large_as_their_headers_say(name, tmp_path):
+    assert "npz file (" in problem(read_recording, bombs.ARRAYS[name](tmp_path / name))
+
+
+def test_arrays_come_back_as_numpy_wrote_them(tmp_path):
+    arrays = {
+        "whole": np.arange(5),
+        "columns": np.asfortranarray(np.arange(12.0).reshape(3, 4)),
+        "text": np.array(["a", "bbb"]),
+        "none": np.zeros((0, 4)),
+        "one": np.array(3.5),
+    }
+    for save in (np.savez, np.savez_compressed):
+        save(tmp_path / "a.npz", **arrays)
+        found = read_npz(tmp_path / "a.npz")
+        assert found.keys() == arrays.keys()
+        for name, array in arrays.items():
+            assert found[name].dtype == array.dtype
+            np.testing.assert_array_equal(found[name], array)
+
+
+def test_a_compressed_bag_does_not_fill_the_disk(tmp_path, monkeypatch):
+    path = bombs.bz2_zeros(tmp_path / "drive.bag.bz2")
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+
+    def load(path: Path) -> None:
+        with decompressed(path):
+            pass
+
+    assert "far more than any recording" in problem(load, path)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["bz2", "lz4"])
+def test_a_chunk_of_a_bag_is_unpacked_no_further_than_it_may_be(kind, tmp_path):
+    line = problem(read_bag, bombs.bag_chunk(tmp_path / "drive.bag", kind))
+    assert "a chunk that is larger" in line or "far more than any recording" in line
+
+
+@pytest.mark.parametrize(
+    ("definition", "expected"),
+    [
+        ("std_msgs/Empty[] corners\n", "a list of messages without content"),
+        ("std_msgs/Empty[4000000000] corners\n", "a list of messages without content"),
+        ("std_msgs/Tick[4000000000] corners\n", "a list of 4000000000 entries"),
+        ("float64[4000000000] corners\n", "a list of 4000000000 entries"),
+        ("string[4000000000] corners\n", "a list of 4000000000 entries"),
+        ("float64[1000000] a\n" * 1, "is larger than any message"),
+        ("# " + "x" * 70_000 + "\nuint8 a\n", "is too long"),
+    ],
+)
+def test_a_definition_can_not_ask_for_more_than_a_message_holds(definition, expected):
+    parts = (
+        f"{definition}{'=' * 80}\nMSG: std_msgs/Empty\n{'=' * 80}\nMSG: std_msgs/Tick\nuint8 a\n"
+    )
+    connection = SimpleNamespace(
+        msgtype="std_msgs/msg/Whole",
+        msgdef=SimpleNamespace(format=bag_readers.MessageDefinitionFormat.MSG, data=parts),
+    )
+    with pytest.raises(ValueError, match=expected):
+        bag_readers.typestore([connection], {})
+
+
+@pytest.mark.parametrize("name", bombs.DRIVES)
+def test_a_drive_unpacks_to_no_more_than_a_drive(name, tmp_path, monkeypatch):
+    # A million messages take 30 s: that there is a cap is seen by a lower one.
+    monkeypatch.setattr(limits, "MCAP_MESSAGES", 5000)
+    expected = {
+        "zeros.mcap": "far more than any recording",
+        "ticks.mcap": "more than 5000 messages",
+        "detections.mcap": "bytes",
+        "covariance.mcap": "must be a square matrix",
+    }
+    assert expected[name] in problem(read_drive, bombs.DRIVES[name](tmp_path / name))
+
+
+def test_a_store_can_not_declare_more_than_is_read_at_once(tmp_path):
+    group = zarr.create_group(tmp_path / "s.zarr")
+    done = {"shape": (10**6, 10**6), "chunks": (1, 1), "dtype": "int8", "fill_value": 0}
+    group.create_array("done", **done)
+    with pytest.raises(BadInput, match="done: is too large"):
+        check_sizes(tmp_path, dict(group.arrays()))
+    del group["done"]
+    wide = {"shape": (10**9,), "chunks": (10**9,), "dtype": "float64", "fill_value": 0}
+    group.create_array("error", **wide)
+    with pytest.raises(BadInput, match="error: is too large"):
+        check_sizes(tmp_path, dict(group.arrays()))
+
+
+def test_ten_minutes_in_a_map_of_a_thousand_markers(tmp_path):
+    path = bombs.honest_arrays(tmp_path / "d.npz", 18_000, cameras=4, markers=1000, in_view=4)
+    recording = read_recording(path)
+    assert (len(recording), len(recording.markers.ids)) == (18_000, 1000)
+    frames = np.array([17_999, 3])
+    corners_px, visible = recording.lanes(frames)
+    assert visible.shape == (2, 4, 1000)
+    for row, frame in enumerate(frames):
+        seen = recording.seen_at[0] == frame
+        assert visible[row].sum() == seen.sum() > 0
+        _, cameras, markers = recording.seen_at[:, seen]
+        np.testing.assert_array_equal(corners_px[row, cameras, markers], recording.seen_px[seen])
+
+
+# --- pictures that are too much to look at ---
+
+
+def grille(period_px: int, side_px: int, shape: tuple[int, int] = (410, 820)) -> np.ndarray:
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    dark = (x % period_px < side_px) & (y % period_px < side_px)
+    return np.where(dark, 30, 220).astype(np.uint8)
+
+
+def chessboard(side_px: int) -> np.ndarray:
+    y, x = np.mgrid[:410, :820]
+    return ((x // side_px + y // side_px) % 2 * 255).astype(np.uint8)
+
+
+CROWDS = {
+    "grille": grille(16, 10),
+    "mesh": 250 - grille(20, 12),
+    "chessboard": chessboard(10),
+    "wide chessboard": chessboard(30),
+}
+
+
+@pytest.mark.parametrize("name", CROWDS)
+def test_a_picture_full_of_squares_is_thinned_out(name):
+    """Half a thousand quadrilaterals and more become some dozen, at most."""
+    image = CROWDS[name]
+    detector = make_detector("aruco")
+    whole = detector._decoder(0.0)
+    left = thinned(image, "tag36h11", 25.0)
+    assert left is not image
+    assert len(whole.detectMarkers(left)[2]) < 120
+
+
+def test_a_marker_in_a_crowd_is_found():
+    image = grille(16, 10)
+    cells = np.pad(all_cells("tag36h11")[7], 1, constant_values=1)
+    marker = np.kron(cells * 190 + 30, np.ones((8, 8))).astype(np.uint8)
+    height, width = marker.shape
+    image[150 : 150 + height, 300 : 300 + width] = marker
+    found = make_detector("aruco").detect(image)
+    assert found.ids.tolist() == [7]
+
+
+def test_an_ordinary_picture_is_left_as_it_is():
+    rng = np.random.default_rng(0)
+    for image in (rng.integers(0, 256, (410, 820), np.uint8), grille(160, 100)):
+        assert thinned(image, "tag36h11", 25.0) is image
+
+
+def test_what_is_worth_a_look_is_what_it_was():
+    """Against each with all that were kept before it, as it is defined."""
+    rng = np.random.default_rng(0)
+    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    centers = rng.uniform(0, 12, (400, 1, 2))
+    quads = list(
+        centers + square * rng.uniform(5, 200, (400, 1, 1)) * rng.choice([1, 1, 0.05], (400, 1, 1))
+    )
+    kept: list[np.ndarray] = []
+    for quad in quads:
+        known = any(np.max(np.abs(quad.mean(axis=0) - q.mean(axis=0))) < 0.5 for q in kept)
+        if _CLOSER_LOOK_PX[0] <= mean_side_px(quad) <= _CLOSER_LOOK_PX[1] and not known:
+            kept.append(quad)
+    assert 20 < len(kept) < 390
+    found = _worth_a_look(quads)
+    assert len(found) == len(kept)
+    assert all(one is other for one, other in zip(found, kept, strict=True))
