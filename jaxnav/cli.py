@@ -35,7 +35,8 @@ from jaxnav.arguments import (
     Tune,
     View,
 )
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
+from jaxnav.terminal import nothing_hidden
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -86,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # A closed pipe shows itself on flushing: here it can still be handled.
         sys.stdout.flush()
     except (BadInput, UsageError) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(f"{name}: {visible(error)}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
@@ -113,7 +114,8 @@ def _dispatch(args: list[str]) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         module = importlib.import_module(f"jaxnav.commands.{type(command).__name__.lower()}")
-        code: int = module.run(command)
+        with nothing_hidden():
+            code: int = module.run(command)
     except ModuleNotFoundError as missing:
         if missing.name not in _OF_EXTRAS:
             raise

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import MarkerFile, marker_map
 from jaxnav.files.rigs import RigFile
-from jaxnav.files.validation import Pair
+from jaxnav.files.validation import FloorPlace
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
@@ -63,7 +63,7 @@ class _RouteEntry(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    waypoints_m: list[Pair] = Field(default_factory=list)
+    waypoints_m: list[FloorPlace] = Field(default_factory=list)
     waypoint_radius_m: float = Field(default=math.nan, strict=True)
 
 

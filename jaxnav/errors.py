@@ -1,6 +1,20 @@
-"""What a person gets for bad input: one line, exit code 2."""
+"""What a person gets for bad input: one line, exit code 2, in which nothing is hidden."""
 
 _LONGEST = 1000  # characters of a line: what a file holds may be quoted in it
+
+
+def visible(text: object) -> str:
+    """Text that came from a file, a name or a plug-in, as a terminal and a picture may show it.
+
+    What a terminal obeys and what hides is written out: line feeds and escapes, characters that
+    turn the direction of writing or have no width, and bytes that are no character.
+
+        visible("a\\x1b[31m\\nb") == r"a\\x1b[31m\\nb"
+    """
+    raw = str(text)
+    if raw.isprintable():
+        return raw
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in raw)
 
 
 class BadInput(ValueError):
@@ -12,7 +26,7 @@ class BadInput(ValueError):
     """
 
     def __init__(self, where: object, problem: str):
-        one_line = " ".join(f"{where}: {problem}".split())
+        one_line = visible(f"{visible(where)}: {' '.join(problem.split())}")
         if len(one_line) > _LONGEST:
             one_line = f"{one_line[:_LONGEST]}..."
         ValueError.__init__(self, one_line)

@@ -71,6 +71,7 @@ LAYERS = {
         "study_plotting",
         "tuning_plotting",
         "rig_plotting",
+        "terminal",
         "viewing",
         "viewing_outcomes",
         "viewing_scene",

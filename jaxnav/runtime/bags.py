@@ -18,6 +18,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from jaxnav.errors import BadInput
+from jaxnav.files.ranges import is_within
 from jaxnav.runtime.recording import Rows
 
 DETECTIONS_TYPE = "apriltag_msgs/msg/ApriltagArrayStamped"
@@ -125,6 +126,8 @@ def _add_transforms(
         pose = (q.w, q.x, q.y, q.z, p.x, p.y, p.z)
         if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[:4]) - 1) > 1e-3:
             raise ValueError(f"the transform from {edge[1]} to {edge[0]} is not rigid")
+        if not is_within("position_m", pose[4:]).all():
+            raise ValueError(f"the transform from {edge[1]} to {edge[0]} leads out of the world")
         transforms.setdefault(edge, {})[_nanoseconds(stamped.header)] = pose
 
 

@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from jaxnav.errors import BadInput
+from jaxnav.files.ranges import problem_of
 from jaxnav.runtime import bags
 
 _ROS2_FILES = (".db3", ".mcap")
@@ -109,6 +110,10 @@ def _read(
             deserialize = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
             for connection, received_ns, raw in reader.messages(connections=connections):
                 kind = connection.msgtype
+                if not isinstance(received_ns, int):
+                    raise ValueError(f"a message of {connection.topic} has no time")
+                if problem := problem_of("stamp_ns", received_ns):
+                    raise ValueError(f"the time of a message of {connection.topic} {problem}")
                 yield Received(connection.topic, kind, received_ns, deserialize(raw, kind))
     except BadInput:
         raise
