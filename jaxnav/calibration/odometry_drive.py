@@ -33,6 +33,7 @@ class Drive:
         marker: (V,) int, index in the map.
         corners_px: (V, 4, 2).
         sigma_px: (V, 4), standard deviation of each corner along one axis.
+        left_out: readings and views with numbers that no sensor of a car can mean.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Drive:
     marker: np.ndarray
     corners_px: np.ndarray
     sigma_px: np.ndarray
+    left_out: int = 0
 
 
 Column = Any  # an array of NumPy's on the host, of JAX's inside jit

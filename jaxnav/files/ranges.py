@@ -115,7 +115,8 @@ def outside(allowed: Range, value: float) -> str:
 
 def is_within(name: str, values: Any) -> np.ndarray:
     """Which of an array's numbers are in the range; NaN and infinities are not."""
-    return np.asarray(RANGES[name].holds(np.asarray(values)))
+    inside: np.ndarray = np.asarray(RANGES[name].holds(np.asarray(values)))
+    return inside
 
 
 def within(name: str) -> AfterValidator:
