@@ -184,9 +184,10 @@ def _run(told: argparse.Namespace, workers: list[Worker], tally: Tally) -> None:
                     tally.add(worker.case, trouble)
                 worker.kill()
                 worker.start(told.seed, told.workers, told.only, not told.cold)
-        if time.monotonic() - shown_s > 1.0 and sys.stdout.isatty():
+        if time.monotonic() - shown_s > (1.0 if sys.stdout.isatty() else 60.0):
             shown_s = time.monotonic()
-            print(f"\r{tally.line()}", end="", flush=True)
+            begin, end = ("\r", "") if sys.stdout.isatty() else ("", "\n")
+            print(f"{begin}{tally.line()}", end=end, flush=True)
 
 
 def _hear(worker: Worker, said: dict[str, Any], step: int, tally: Tally) -> None:
@@ -196,6 +197,7 @@ def _hear(worker: Worker, said: dict[str, Any], step: int, tally: Tally) -> None
     if said["number"] < 0:
         tally.add(said, said["problem"])
     elif said.get("done"):
+        said |= {"place": worker.case["place"]} if worker.case else {}
         worker.case = None
         problem = said["problem"]
         if problem is None and said["peak"] > MAX_BYTES:

@@ -13,8 +13,9 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
-import jax
+from jax._src import compiler
 
 from jaxnav import cli
 from jaxnav.errors import BadInput, visible
@@ -121,17 +122,23 @@ def _digests(folder: Path) -> dict[str, str]:
     }
 
 
-def refuse_large_programs(least_bytes: int) -> None:
-    """From now on, what would compile for seconds raises `Skipped`: so many runs share the
-    programs that were compiled before."""
-    from jax._src import compiler
+@contextlib.contextmanager
+def small_programs(most_bytes: int = 150_000) -> Iterator[None]:
+    """Meanwhile what would compile for seconds raises `Skipped`: so many runs share the programs
+    that were compiled before.
 
+    Args:
+        most_bytes: of a program's text; by default some 0.5 s to compile.
+    """
     compile_now = compiler.backend_compile_and_load
 
-    def guarded(backend, module, *args, **kwargs):
-        if len(str(module)) > least_bytes:
+    def guarded(backend: Any, module: Any, *args: Any, **kwargs: Any) -> Any:
+        if len(str(module)) > most_bytes:
             raise Skipped
         return compile_now(backend, module, *args, **kwargs)
 
     compiler.backend_compile_and_load = guarded
-    jax.config.update("jax_log_compiles", False)
+    try:
+        yield
+    finally:
+        compiler.backend_compile_and_load = compile_now

@@ -42,7 +42,9 @@ def replayed(place: Path, scratch: Path) -> str | None:
         scratch: an empty folder.
     """
     story = json.loads((place / "case.json").read_text())
-    case = undamaged(story["target"], _seeds(scratch.parent), scratch)
+    is_command = "{" in story["target"]
+    seeds_folder = _seeds(scratch.parent) if is_command else scratch
+    case = undamaged(story["target"], seeds_folder, scratch)
     file = case.file
     if story["renamed"] is not None:
         file = file.rename(file.with_name(story["renamed"]))

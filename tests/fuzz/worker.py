@@ -4,6 +4,7 @@ Before a case it says its number, afterwards what was wrong with it: whoever sta
 one it was when it is silent for too long.
 """
 
+import contextlib
 import json
 import os
 import resource
@@ -19,7 +20,6 @@ from tests.fuzz.cases import LOADERS, drawn, undamaged
 from tests.fuzz.targets import COMMANDS
 
 _DPI = 20  # of pictures: that they are drawn is all that counts
-_LARGE_PROGRAM_BYTES = 150_000  # of its text: some 0.5 s to compile
 
 
 def main() -> None:
@@ -34,8 +34,9 @@ def main() -> None:
     (scratch / "temporary").mkdir(parents=True, exist_ok=True)
     tempfile.tempdir = str(scratch / "temporary")
     configure_jax(float64=False)
+    only_small = contextlib.ExitStack()
     if not warm:
-        judge.refuse_large_programs(_LARGE_PROGRAM_BYTES)
+        only_small.enter_context(judge.small_programs())
     made = scratch / "seeds"
     if not made.exists():
         made.mkdir()
@@ -46,8 +47,7 @@ def main() -> None:
             problem = undamaged(target, made, scratch).problem()
             if problem is not None:
                 _say(said, number=-1, target=target, problem=f"undamaged: {problem}")
-    if warm:
-        judge.refuse_large_programs(_LARGE_PROGRAM_BYTES)
+    only_small.enter_context(judge.small_programs())
     number = first
     while True:
         case = drawn(seed, number, made, scratch, wanted)
