@@ -239,6 +239,8 @@ def _chosen(columns: _Columns, rows: np.ndarray) -> _Columns:
 
 def _spikes(values: np.ndarray, least_sigma: float) -> np.ndarray:
     """Readings that neither of their neighbours knows anything of."""
+    if not len(values):
+        return np.zeros(0, bool)
     padded = np.concatenate([values[:1], values, values[-1:]])
     off = np.abs(values - np.median(np.stack([padded[:-2], values, padded[2:]]), axis=0))
     sigma = max(1.4826 * float(np.median(off)), least_sigma)
