@@ -1,5 +1,10 @@
 """What a person gets for bad input: one line, exit code 2, in which nothing is hidden."""
 
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+
 _LONGEST = 1000  # characters of a line: what a file holds may be quoted in it
 
 
@@ -30,3 +35,23 @@ class BadInput(ValueError):
         if len(one_line) > _LONGEST:
             one_line = f"{one_line[:_LONGEST]}..."
         ValueError.__init__(self, one_line)
+
+
+@contextlib.contextmanager
+def libraries_silenced() -> Iterator[None]:
+    """While the block runs, nothing reaches the standard error: libraries in C comment on broken
+    files there, and a person is to get one line. For programs with one thread at work."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # it is closed, and nothing reaches it anyway
+        yield
+        return
+    try:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
+        with open(os.devnull, "wb") as nowhere:  # noqa: PTH123  (a device, not a file of anybody's)
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

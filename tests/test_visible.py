@@ -2,6 +2,8 @@
 
 import sys
 
+import cv2
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -12,6 +14,7 @@ from jaxnav.errors import BadInput, visible
 from jaxnav.files.images import decoded_image
 from jaxnav.terminal import nothing_hidden
 from jaxnav.vehicles.opencv_cameras import _device
+from tests.helpers.seed_texts import OPENCV
 
 NASTY = ["\x1b[31mred", "a\nb", "a\rb", "\u202eevil", "\u200b", "\x9b1m", "\udcff", "\x00"]
 
@@ -89,3 +92,17 @@ def test_digits_of_other_scripts_are_no_numbers(tmp_path):
     assert _device("²") is None
     assert _device("9" * 5000) is None
     assert _device("2") == 2
+
+
+def test_a_library_adds_no_line_to_ours(tmp_path, capfd):
+    whole = cv2.imencode(".png", np.random.default_rng(0).integers(0, 256, (60, 60), np.uint8))[1]
+    path = tmp_path / "a.png"
+    for cut in (bytes(whole)[:200], bytes(whole)[:100] + bytes(50) + bytes(whole)[150:]):
+        path.write_bytes(cut)
+        camera = tmp_path / "camera.yml"
+        camera.write_text(OPENCV)
+        given = [str(path), "--camera", str(camera), "--marker-size-m", "0.2"]
+        main(["locate", *given])
+        assert capfd.readouterr().err.count("\n") <= 1
+        assert main(["calibrate", "intrinsics", str(path), "--board", str(path)]) == 2
+        assert capfd.readouterr().err.count("\n") == 1

@@ -15,7 +15,7 @@ from jaxnav.calibration.board_mismatch import what_is_seen
 from jaxnav.calibration.boards import Board
 from jaxnav.calibration.views import BoardView, BoardViews
 from jaxnav.camera import Camera
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, libraries_silenced
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
@@ -165,7 +165,8 @@ class _Collector:
         try:
             # As the sensor gave it: what a viewer turns upright is of another camera.
             flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imdecode(raw, flags) if len(raw) else None
+            with libraries_silenced():
+                image = cv2.imdecode(raw, flags) if len(raw) else None
         except cv2.error:
             image = None
         if image is None:

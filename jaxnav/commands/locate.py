@@ -17,7 +17,7 @@ from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.detection import Detections, make_detector
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, libraries_silenced
 from jaxnav.files import load_camera
 from jaxnav.files.images import decoded_image
 from jaxnav.markers import MarkerMap
@@ -69,7 +69,8 @@ def read_image(path: Path) -> np.ndarray:
         raw = path.read_bytes()
     except OSError as error:
         raise BadInput(path, f"can't be read: {(error.strerror or str(error)).lower()}") from None
-    image = decoded_image(raw)
+    with libraries_silenced():
+        image = decoded_image(raw)
     if image is None:
         raise BadInput(path, "is not an image that OpenCV can read")
     return image

@@ -141,7 +141,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--only", default="", help="targets whose names hold this")
-    parser.add_argument("--cold", action="store_true", help="compile nothing large")
+    parser.add_argument("--cold", action="store_true", help="compile nothing beforehand")
     parser.add_argument("--replay", action="store_true", help="the kept cases alone")
     told = parser.parse_args()
     if told.replay:

@@ -32,7 +32,11 @@ def damage(rng: Random, path: Path) -> None:
     if by_value and path.suffix in (".yaml", ".yml", ".json"):
         path.write_text(_restructured(rng, path))
     elif by_value and path.suffix == ".mcap":
-        write_drive(path, _changed_drive(rng, _parts_of(path.read_bytes())))
+        parts = _parts_of(path.read_bytes())
+        if parts:
+            write_drive(path, _changed_drive(rng, parts))
+        else:  # a ROS bag
+            path.write_bytes(edited_by(rng, path.read_bytes()))
     elif by_value and path.suffix == ".npz":
         path.write_bytes(_changed_arrays(rng, path))
     else:

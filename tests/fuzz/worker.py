@@ -42,7 +42,7 @@ def main() -> None:
         made.mkdir()
         seeds.make(made)
     for target in [*(one.line for one in COMMANDS), *LOADERS]:
-        if wanted in target:
+        if wanted in target and warm:
             _say(said, warming=target)
             problem = undamaged(target, made, scratch).problem()
             if problem is not None:
