@@ -127,9 +127,6 @@ class OutcomeMessage(Entry):
         reported = [getattr(self, name) is not None for name in REPORTED]
         if any(reported) and not all(reported):
             raise ValueError(f"must have all of {', '.join(REPORTED)}, or none")
-        for one, other in (("hypotheses", "log_weight"), ("Ts_vehicle_world", "costs")):
-            if all(reported) and len(getattr(self, one)) != len(getattr(self, other)):
-                raise ValueError(f"{one} and {other} must agree in number")
         return self
 
 

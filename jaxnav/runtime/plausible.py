@@ -25,8 +25,10 @@ def plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
     odd = (outcomes.located & ~posed) | ~(np.abs(commanded) <= _MOST).all(axis=1)
     spread = _all(np.abs(outcomes.covariance).reshape(len(posed), -1) <= _MOST**2)
     odd |= outcomes.located & ~spread
-    banks = [_all(is_within("pose", bank)) for bank in outcomes.hypotheses]
-    places = [_are_poses(Ts) for Ts in outcomes.Ts_vehicle_world]
+    hypotheses, log_weight = _paired(outcomes.hypotheses, outcomes.log_weight)
+    Ts_vehicle_world, costs = _paired(outcomes.Ts_vehicle_world, outcomes.costs)
+    banks = [_all(is_within("pose", bank)) for bank in hypotheses]
+    places = [_are_poses(Ts) for Ts in Ts_vehicle_world]
     odd |= np.array([not (a.all() and b.all()) for a, b in zip(banks, places, strict=True)], bool)
     shown = replace(
         outcomes,
@@ -36,10 +38,10 @@ def plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
         steering_rad=_tame(outcomes.steering_rad),
         throttle=_tame(outcomes.throttle),
         nis=_tame(outcomes.nis),
-        hypotheses=_kept(outcomes.hypotheses, banks),
-        log_weight=_kept(outcomes.log_weight, banks),
-        Ts_vehicle_world=_kept(outcomes.Ts_vehicle_world, places),
-        costs=_kept(outcomes.costs, places),
+        hypotheses=_kept(hypotheses, banks),
+        log_weight=_kept(log_weight, banks),
+        Ts_vehicle_world=_kept(Ts_vehicle_world, places),
+        costs=_kept(costs, places),
         selected=np.array(
             [_moved(*pair) for pair in zip(outcomes.selected, places, strict=True)], int
         ),
@@ -68,7 +70,19 @@ def _are_poses(Ts: np.ndarray) -> np.ndarray:
     return near
 
 
-def _kept(rows: tuple[np.ndarray, ...], which: list[np.ndarray]) -> tuple[np.ndarray, ...]:
+_Rows = tuple[np.ndarray, ...]
+
+
+def _paired(rows: _Rows, others: _Rows) -> tuple[_Rows, _Rows]:
+    """Rows that belong together, without those that have no counterpart."""
+    counts = [min(len(a), len(b)) for a, b in zip(rows, others, strict=True)]
+    return (
+        tuple(row[:count] for row, count in zip(rows, counts, strict=True)),
+        tuple(row[:count] for row, count in zip(others, counts, strict=True)),
+    )
+
+
+def _kept(rows: _Rows, which: list[np.ndarray]) -> _Rows:
     return tuple(row[kept] for row, kept in zip(rows, which, strict=True))
 
 

@@ -105,12 +105,18 @@ def _captured() -> Iterator[Callable[[], tuple[bytes, bytes]]]:
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         os.dup2(out.fileno(), 1)
         os.dup2(err.fileno(), 2)
+        streams = sys.stdout, sys.stderr  # a test runner's, perhaps
+        sys.stdout, sys.stderr = (
+            os.fdopen(os.dup(number), "w", encoding="utf-8", errors="backslashreplace")
+            for number in (1, 2)
+        )
         read: list[bytes] = []
         try:
             yield lambda: (read[0], read[1])
         finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
+            for stream in (sys.stdout, sys.stderr):
+                stream.close()
+            sys.stdout, sys.stderr = streams
             for number, descriptor in enumerate(kept, 1):
                 os.dup2(descriptor, number)
                 os.close(descriptor)

@@ -4,12 +4,12 @@ import hashlib
 import json
 import re
 import shutil
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from tests.fuzz import seeds
 from tests.fuzz.cases import Case, undamaged
+from tests.fuzz.targets import COMMANDS
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "fuzz"
 
@@ -42,20 +42,16 @@ def replayed(place: Path, scratch: Path) -> str | None:
         scratch: an empty folder.
     """
     story = json.loads((place / "case.json").read_text())
-    is_command = "{" in story["target"]
-    seeds_folder = _seeds(scratch.parent) if is_command else scratch
-    case = undamaged(story["target"], seeds_folder, scratch)
+    sound = scratch / "seeds"
+    sound.mkdir()
+    command = next((one for one in COMMANDS if one.line == story["target"]), None)
+    if command is not None:
+        seeds.make(sound, set(command.seeds) - {command.damaged})
+        (sound / command.damaged).parent.mkdir(exist_ok=True)
+        shutil.copyfile(place / "file", sound / command.damaged)
+    case = undamaged(story["target"], sound, scratch)
     file = case.file
     if story["renamed"] is not None:
         file = file.rename(file.with_name(story["renamed"]))
     shutil.copyfile(place / "file", file)
     return Case(case.target, case.folder, file, story["renamed"]).problem()
-
-
-@cache
-def _seeds(beside: Path) -> Path:
-    folder = beside / "fuzz-seeds"
-    if not folder.exists():
-        folder.mkdir()
-        seeds.make(folder)
-    return folder

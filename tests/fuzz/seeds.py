@@ -3,6 +3,7 @@
 import json
 import shutil
 import zlib
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -52,43 +53,50 @@ family: 4x4_50
 Parts = list[tuple[str, dict[str, Any]]]
 
 
-def make(folder: Path) -> None:
-    """Write all of them."""
-    qcar = files.calib_dir() / "qcar"
-    for name in ("rig", "vehicle", "route"):
-        shutil.copy(qcar / f"{name}.yaml", folder)
-    files.save_markers(folder / "markers.yaml", room_markers())
-    texts = {
-        "chain.yaml": KALIBR,
-        "info.yaml": CAMERA_INFO,
-        "opencv.yml": OPENCV,
-        "photon.json": PHOTONVISION,
-        "layout.json": WPILIB,
-        "params.yaml": PARAMS,
-        "topics.yaml": TOPICS,
-        "ambiguity.yaml": AMBIGUITY,
-        "drive.yaml": DRIVE,
-        "board.yaml": BOARD,
-        "kept.json": json.dumps(SIMULATED),
-    }
-    for name, text in texts.items():
-        (folder / name).write_text(text)
-    shutil.copy(_DRIVES / "plain.mcap", folder / "drive.mcap")
-    write_drive(folder / "eights.mcap", _eights())
-    for loader, name in (("arrays", "decoded.npz"), ("bag", "seen.bag")):
-        made = loaders.BINARY[loader].make(folder)
-        made.rename(folder / name)
-    ros_drive("bag").write(folder).rename(folder / "ros.bag")
-    (folder / "tagslam").mkdir()
-    loaders.STRUCTURED["TagSLAM tagslam.yaml"].make(folder / "tagslam")
-    (folder / "study").mkdir()
-    loaders.BINARY["store zarr.json"].make(folder / "study")
+def make(folder: Path, wanted: Collection[str] | None = None) -> None:
+    """Write some of them.
+
+    Args:
+        wanted: their names; by default all.
+    """
+    for name, write in _MAKERS.items():
+        if wanted is None or name in wanted:
+            write(folder / name)
+
+
+def _text(text: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(text)
+
+
+def _copied(source: Path) -> Callable[[Path], object]:
+    return lambda path: shutil.copy(source, path)
+
+
+def _loaded(name: str) -> Callable[[Path], object]:
+    """What a loader reads, alone in its folder."""
+    return lambda path: loaders.BINARY[name].make(path.parent).rename(path)
+
+
+def _photo(path: Path) -> None:
     photo = np.full((410, 820), 200, np.uint8)
     cells = (255 * marker_cells("tag36h11", 0)).astype(np.uint8)
     photo[150:250, 300:400] = cv2.resize(cells, (100, 100), interpolation=cv2.INTER_NEAREST)
-    cv2.imwrite(str(folder / "photo.png"), photo)
-    (folder / "images").mkdir()
-    cv2.imwrite(str(folder / "images" / "1.png"), photo[:200, :300])
+    cv2.imwrite(str(path), photo)
+
+
+def _images(path: Path) -> None:
+    path.mkdir()
+    _photo(path / "1.png")
+
+
+def _tagslam(path: Path) -> None:
+    path.mkdir()
+    loaders.STRUCTURED["TagSLAM tagslam.yaml"].make(path)
+
+
+def _study(path: Path) -> None:
+    path.mkdir()
+    loaders.BINARY["store zarr.json"].make(path)
 
 
 def _eights() -> Parts:
@@ -148,3 +156,30 @@ def write_drive(path: Path, parts: Parts) -> None:
             counts[topic] = counts.get(topic, -1) + 1
             writer.add_message(channels[topic], 1, text.encode(), 1, counts[topic])
         writer.finish()
+
+
+_QCAR = files.calib_dir() / "qcar"
+_MAKERS: dict[str, Callable[[Path], object]] = {
+    **{name: _copied(_QCAR / name) for name in ("rig.yaml", "vehicle.yaml", "route.yaml")},
+    "markers.yaml": lambda path: files.save_markers(path, room_markers()),
+    "chain.yaml": _text(KALIBR),
+    "info.yaml": _text(CAMERA_INFO),
+    "opencv.yml": _text(OPENCV),
+    "photon.json": _text(PHOTONVISION),
+    "layout.json": _text(WPILIB),
+    "params.yaml": _text(PARAMS),
+    "topics.yaml": _text(TOPICS),
+    "ambiguity.yaml": _text(AMBIGUITY),
+    "drive.yaml": _text(DRIVE),
+    "board.yaml": _text(BOARD),
+    "kept.json": _text(json.dumps(SIMULATED)),
+    "drive.mcap": _copied(_DRIVES / "plain.mcap"),
+    "eights.mcap": lambda path: write_drive(path, _eights()),
+    "decoded.npz": _loaded("arrays"),
+    "seen.bag": _loaded("bag"),
+    "ros.bag": lambda path: ros_drive("bag").write(path.parent).rename(path),
+    "tagslam": _tagslam,
+    "study": _study,
+    "photo.png": _photo,
+    "images": _images,
+}
