@@ -3,12 +3,14 @@
 
 PYTHON ?= python3
 WORKERS ?= 2
+MINUTES ?= 60
+SEED ?= $(shell date +%s)
 VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format benchmark clean
+.PHONY: help demo test lint format benchmark fuzz clean
 
 help:
 	@echo "make demo       the main job: a simulated drive, its report in demo/"
@@ -16,6 +18,7 @@ help:
 	@echo "make lint       ruff and mypy alone"
 	@echo "make format     let ruff rewrite what it can"
 	@echo "make benchmark  timings against OpenCV and NumPy"
+	@echo "make fuzz       damaged files against every loader and command, an hour: MINUTES=5 SEED=1"
 	@echo "make clean      remove .venv and everything that was generated"
 
 demo: $(VENV)/.installed
@@ -35,6 +38,10 @@ format: $(VENV)/.installed-dev
 
 benchmark: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest benchmarks --benchmark-enable --benchmark-only
+
+# The same SEED makes the same cases; each kind of failure is kept in tests/data/fuzz.
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.fuzz --minutes $(MINUTES) --seed $(SEED) --workers $(WORKERS)
 
 clean:
 	rm -rf $(VENV) build dist demo out .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks

@@ -18,9 +18,10 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.runtime.output import FreeOutput, fill_descriptors
 from jaxnav.runtime.signals import Interrupted, Signals
+from jaxnav.terminal import nothing_hidden
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
@@ -69,7 +70,7 @@ def _main(args: list[str], dispatch: Callable[[list[str]], int]) -> int:
         # A closed pipe shows itself on flushing: here it can still be handled.
         sys.stdout.flush()
     except (BadInput, UsageError) as error:
-        print(f"{_name(args)}: {error}", file=sys.stderr)
+        print(f"{_name(args)}: {visible(error)}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except Interrupted as interrupted:
         print(f"{_name(args)}: interrupted ({interrupted})", file=sys.stderr)
@@ -109,7 +110,8 @@ def _dispatch(args: list[str], *signals: Signals) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         module = importlib.import_module(f"jaxnav.commands.{type(command).__name__.lower()}")
-        code: int = module.run(command, *signals)
+        with nothing_hidden():
+            code: int = module.run(command, *signals)
     except ModuleNotFoundError as missing:
         if missing.name not in _OF_EXTRAS:
             raise

@@ -17,7 +17,7 @@ from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import MarkerFile, marker_map
 from jaxnav.files.reading import parse_yaml
 from jaxnav.files.rigs import RigFile
-from jaxnav.files.validation import Pair
+from jaxnav.files.validation import FloorPlace
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
@@ -65,7 +65,7 @@ class _RouteEntry(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    waypoints_m: list[Pair] = Field(default_factory=list)
+    waypoints_m: list[FloorPlace] = Field(default_factory=list)
     waypoint_radius_m: float = Field(default=math.nan, strict=True)
 
 

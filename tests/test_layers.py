@@ -72,6 +72,7 @@ LAYERS = {
         "study_plotting",
         "tuning_plotting",
         "rig_plotting",
+        "terminal",
         "viewing",
         "viewing_outcomes",
         "viewing_scene",

@@ -122,8 +122,9 @@ def _sighted(seed: int) -> Sighted:
     return Sighted(count, seed - 1000, found if rng.random() < 0.8 else None, faults)
 
 
-NOW_NS = st.integers(0, 2**63 - 1)
-READINGS = st.builds(Odometry, st.integers(), FLOATS, FLOATS, st.booleans())
+MOST_NS = 2**62 - 1
+NOW_NS = st.integers(0, MOST_NS)
+READINGS = st.builds(Odometry, st.integers(-MOST_NS, MOST_NS), FLOATS, FLOATS, st.booleans())
 FRAMES = st.lists(st.integers(0, 2**32).map(_sighted), min_size=1, max_size=3).map(tuple)
 INPUTS = st.builds(Input, NOW_NS, st.none() | READINGS, st.just(()), FAULTS) | st.builds(
     Input, NOW_NS, st.none(), FRAMES, FAULTS

@@ -139,7 +139,7 @@ def _known() -> str:
 def _by_number(path: Path) -> list[tuple[int, str]]:
     """A key that sorts 2.png before 10.png."""
     return [
-        (int(part), "") if part.isdigit() else (-1, part)
+        (int(part), "") if re.fullmatch("[0-9]{1,300}", part) else (-1, part)
         for part in re.split(r"([0-9]+)", path.name)
     ]
 

@@ -127,6 +127,26 @@ def calibrate_odometry(
             odometry and cameras contradict each other.
     """
     where = ", ".join(drive.name for drive in drives)
+    try:
+        return _calibrated(where, drives, rig, markers, before, fixed, wheelbase_sigma_m, progress)
+    except np.linalg.LinAlgError:
+        problem = (
+            "odometry, cameras and map have no course of a car in common that can be computed: "
+            "check --markers-file, --rig and --vehicle"
+        )
+        raise BadInput(where, problem) from None
+
+
+def _calibrated(
+    where: str,
+    drives: Sequence[Drive],
+    rig: CameraRig,
+    markers: MarkerMap,
+    before: Mapping[str, float],
+    fixed: Sequence[str],
+    wheelbase_sigma_m: float | None,
+    progress: Callable[[], object],
+) -> OdometryCalibration:
     theta = np.array([before[name] for name in NAMES])
     course = lay_out(drives)
     sigma = reading_sigma(course.intervals)

@@ -33,6 +33,7 @@ class Drive:
         marker: (V,) int, index in the map.
         corners_px: (V, 4, 2).
         sigma_px: (V, 4), standard deviation of each corner along one axis.
+        left_out: readings and views with numbers that no sensor of a car can mean.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Drive:
     marker: np.ndarray
     corners_px: np.ndarray
     sigma_px: np.ndarray
+    left_out: int = 0
 
 
 Column = Any  # an array of NumPy's on the host, of JAX's inside jit
@@ -237,6 +239,8 @@ def _chosen(columns: _Columns, rows: np.ndarray) -> _Columns:
 
 def _spikes(values: np.ndarray, least_sigma: float) -> np.ndarray:
     """Readings that neither of their neighbours knows anything of."""
+    if not len(values):
+        return np.zeros(0, bool)
     padded = np.concatenate([values[:1], values, values[-1:]])
     off = np.abs(values - np.median(np.stack([padded[:-2], values, padded[2:]]), axis=0))
     sigma = max(1.4826 * float(np.median(off)), least_sigma)

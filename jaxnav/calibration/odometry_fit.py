@@ -70,6 +70,9 @@ def fit(
     Args:
         free: (5,) bool, parameters to be found; the others stay.
         progress: called at every evaluation.
+
+    Raises:
+        LinAlgError: the equations at the end can't be solved.
     """
 
     def evaluated(nodes: np.ndarray, theta: np.ndarray) -> tuple[float, Blocks]:
@@ -162,7 +165,11 @@ class _System:
         )
 
     def reduced(self, damping: float = 0.0) -> np.ndarray:
-        """(p, p): the parameters' information when the nodes are eliminated."""
+        """(p, p): the parameters' information when the nodes are eliminated.
+
+        Raises:
+            LinAlgError: as `solved`.
+        """
         return self._eliminated(damping)[0]
 
     def solved(self, damping: float) -> _Step:
@@ -184,6 +191,8 @@ class _System:
     def _eliminated(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
         """The Schur complement, and the band's inverse times border and gradient."""
         band, corner = self.band.copy(), self.corner.copy()
+        if not all(np.isfinite(part).all() for part in (band, self.border, corner)):
+            raise LinAlgError("the equations are not finite")
         band[0] *= 1 + damping
         corner[range(len(corner)), range(len(corner))] *= 1 + damping
         factor = cholesky_banded(band, lower=True, check_finite=False)

@@ -13,7 +13,7 @@ from jaxnav.commands.calibration_data import RigData, gathered
 from jaxnav.commands.calibration_report import provenance, summary, write_files
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.rig_plotting import map_check
 
@@ -57,7 +57,7 @@ def run(args: Arguments) -> int:
     )
     save_figure(figure, out / "report.png")
     print(_text(data, check))
-    print(f"the map as it was found, and the report, in {out}")
+    print(f"the map as it was found, and the report, in {visible(out)}")
     return 0 if all(verdict.right for verdict in check.verdicts.values()) else EXIT_WRONG
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jaxnav.arguments.calibration import CalibrateConvert
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, wpilib
 from jaxnav.files.cameras import camera_file, choose_camera, named_by_topic
 from jaxnav.files.figures import CameraFigures, MarkerFigures
@@ -54,7 +54,7 @@ def run(args: CalibrateConvert) -> int:
     else:
         told, left_out = _write_cameras(args, source)
     for path, what in told.items():
-        print(f"{path}: {what}")
+        print(f"{visible(path)}: {what}")
     if left_out:
         print(f"not carried over: {', '.join(left_out)}")
     return 0

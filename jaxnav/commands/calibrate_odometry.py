@@ -16,6 +16,7 @@ from jaxnav.calibration.odometry_model import NAMES
 from jaxnav.commands.odometry_recordings import Recorded, read_recordings
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.errors import visible
 from jaxnav.files import output_folder, save_vehicle, write_json
 from jaxnav.files.provenance import Calibrated, calibrated_now
 from jaxnav.odometry_plotting import odometry_report
@@ -45,9 +46,11 @@ def run(args: Arguments) -> int:
     corners_world_m = np.asarray(recorded.markers.corners_world_m)
     save_figure(odometry_report(found, corners_world_m, table(found)), out / "report.png")
     print(f"{head(found)}\n{table(found)}")
+    if left_out := sum(drive.left_out for drive in recorded.drives):
+        print(f"left out: {left_out} readings and views that are not finite, or of no car")
     for sentence in found.advice:
         print(f"next: {sentence}")
-    print(f"vehicle.yaml, report.json and report.png in {out}")
+    print(f"vehicle.yaml, report.json and report.png in {visible(out)}")
     return 0
 
 

@@ -20,7 +20,7 @@ from jaxnav.commands.calibration_report import (
 )
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_vehicle, output_folder, write_json
 from jaxnav.rig_plotting import rig_report
 
@@ -67,7 +67,7 @@ def publish(
     write_json(out / "report.json", report)
     _write_picture(out, data, found, given)
     print(text(report))
-    print(f"{'rig, markers' if with_rig else 'markers'} and report in {out}")
+    print(f"{'rig, markers' if with_rig else 'markers'} and report in {visible(out)}")
 
 
 def _write_picture(out: Path, data: RigData, found: RigCalibration, given: np.ndarray) -> None:

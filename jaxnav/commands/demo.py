@@ -16,6 +16,7 @@ from jaxnav.arguments import Demo
 from jaxnav.commands.pictures import save_figure, views_of
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.commands.rendered_world import Cameras, World
+from jaxnav.errors import visible
 from jaxnav.files import (
     output_folder,
     write_json,
@@ -65,7 +66,7 @@ def run(args: Demo) -> int:
         overall = _overall(summaries)
         write_json(out / "summary.json", overall)
         print(f"reached in {overall['reached']} of {overall['runs']} drives")
-    print(f"report in {out}")
+    print(f"report in {visible(out)}")
     return 0
 
 

@@ -1,5 +1,6 @@
 """`jaxnav plot DRIVE.mcap`: a recorded drive as a picture and in a few lines."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,12 @@ import numpy as np
 from jaxnav.arguments import Plot as Arguments
 from jaxnav.commands.pictures import save_figure
 from jaxnav.drive_plotting import drive_log_report
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder
+from jaxnav.files.ranges import is_within
 from jaxnav.runtime.drive_log import DriveLog, read_drive
 from jaxnav.runtime.flags import Fault, Health, Reject
+from jaxnav.runtime.plausible import left_out, plausible
 
 _LONGEST_STEP_S = 1.0  # between readings, for the distance: beyond it nobody knows
 
@@ -35,11 +38,15 @@ def read_outcomes(path: Path) -> DriveLog:
 def draw_drive(args: Arguments) -> int:
     """Write drive.png, and print what happened."""
     log = read_outcomes(args.store)
+    outcomes, odd = plausible(log.outcomes)
+    log = replace(log, outcomes=outcomes)
     out = output_folder(args.out)
-    save_figure(drive_log_report(log, args.store.name), out / "drive.png")
+    save_figure(drive_log_report(log, visible(args.store.name)), out / "drive.png")
     for line in summary_lines(log):
-        print(line)
-    print(f"picture in {out / 'drive.png'}")
+        print(visible(line))
+    if odd:
+        print(left_out(odd))
+    print(f"picture in {visible(out / 'drive.png')}")
     return 0
 
 
@@ -84,7 +91,7 @@ def distance_m(log: DriveLog) -> float:
     ]
     stamps_s = np.array([reading.stamp_ns for reading in readings], float) / 1e9
     speeds_mps = np.abs([reading.speed_mps for reading in readings])
-    usable = np.isfinite(speeds_mps)
+    usable = is_within("speed_mps", speeds_mps)
     steps_s = np.clip(np.diff(stamps_s[usable]), 0, _LONGEST_STEP_S)
     return float(steps_s @ speeds_mps[usable][1:])
 

@@ -14,10 +14,12 @@ from jaxnav.detection import Detections
 from jaxnav.detection.observe import observe
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig, load_topics, load_vehicle
+from jaxnav.files.ranges import is_within
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.drive_log import read_drive
 from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.runtime.interfaces import Odometry
 from jaxnav.runtime.pilot import Input
 from jaxnav.runtime.ros_drives import read_ros_drive
 
@@ -105,13 +107,17 @@ def drive_of(
     Args:
         corner_sigma_px: of every corner along one axis; by default as each detection says.
     """
+    left_out = 0
     readings: list[tuple[int, float, float]] = []
     views: list[tuple[int, int, int, np.ndarray, np.ndarray]] = []
     looked: set[tuple[int, int]] = set()
     for given in inputs:
         if given.odometry is not None and given.odometry.valid:
             read = given.odometry
-            readings.append((read.stamp_ns, read.speed_mps, read.steering_rad))
+            if _is_sound(read):
+                readings.append((read.stamp_ns, read.speed_mps, read.steering_rad))
+            else:
+                left_out += 1
         for frame in given.frames:
             key = frame.camera, frame.stamp_ns
             if not frame.detections or key in looked or not 0 <= frame.camera < len(rig):
@@ -125,7 +131,11 @@ def drive_of(
                 if corner_sigma_px is not None:
                     sigma_px = np.full(4, corner_sigma_px)
                 corners_px = seen.corners_px[frame.camera, marker]
-                views.append((frame.stamp_ns, frame.camera, int(marker), corners_px, sigma_px))
+                known = is_within("corner_px", corners_px).all() and frame.stamp_ns > 0
+                if known and is_within("seen_sigma_px", sigma_px).all():
+                    views.append((frame.stamp_ns, frame.camera, int(marker), corners_px, sigma_px))
+                else:
+                    left_out += 1
     read_columns = _columns(readings, 3)
     columns = _columns(views, 5)
     return Drive(
@@ -138,7 +148,13 @@ def drive_of(
         np.array(columns[2], int),
         np.array(columns[3], float).reshape(-1, 4, 2),
         np.array(columns[4], float).reshape(-1, 4),
+        left_out,
     )
+
+
+def _is_sound(read: Odometry) -> bool:
+    sound = is_within("speed_mps", read.speed_mps) and is_within("steering_rad", read.steering_rad)
+    return bool(sound) and read.stamp_ns > 0
 
 
 def _columns(rows: Sequence[tuple[Any, ...]], count: int) -> list[tuple[Any, ...]]:

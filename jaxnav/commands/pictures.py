@@ -1,14 +1,20 @@
 """What the commands draw: candidate poses in camera frames, and figures into files."""
 
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axis import Axis, Tick
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from jaxnav.camera import Camera
+from jaxnav.errors import visible
 from jaxnav.files import atomic_path
 from jaxnav.navigator import Output
 from jaxnav.plotting import View
@@ -20,8 +26,24 @@ _NORMAL_SIDES = 0.8  # length of a drawn normal, in sides of the marker
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a PNG, whole or not at all."""
-    with atomic_path(path) as beside:
+    for text in _words(figure):
+        # Names of files and markers are no formulas, and hold what they hold.
+        text.set_parse_math(False)
+        text.set_text("\n".join(visible(line) for line in text.get_text().split("\n")))
+    with atomic_path(path) as beside, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from")  # a box stands for it
         figure.savefig(beside, dpi=PNG_DPI, format="png")
+
+
+def _words(artist: Artist) -> Iterator[Text]:
+    """All texts of a figure but those at its ticks, which are numbers and formulas of powers."""
+    for child in artist.get_children():
+        if isinstance(child, Text):
+            yield child
+        elif isinstance(child, Axis):
+            yield child.label
+        elif not isinstance(child, Tick):
+            yield from _words(child)
 
 
 def normals_px(

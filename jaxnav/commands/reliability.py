@@ -8,7 +8,7 @@ from tqdm import tqdm
 from jaxnav.arguments import Reliability as Arguments
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.plotting import reliability_diagram
 from jaxnav.runtime.recordings import read_recording
@@ -47,7 +47,7 @@ def run(args: Arguments) -> int:
     save_figure(figure, out / "reliability.png")
     write_json(out / "summary.json", summary)
     print(text)
-    print(f"diagram in {out}")
+    print(f"diagram in {visible(out)}")
     return 0
 
 

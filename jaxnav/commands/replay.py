@@ -12,7 +12,7 @@ from jaxnav.arguments import Selector
 from jaxnav.commands import replay_drive
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     apply_params,
     load_markers,
@@ -73,7 +73,7 @@ def run(args: Arguments) -> int:
     save_figure(_report(args, recording, result, summary), out / "report.png")
     write_json(out / "summary.json", summary)
     print(_text(summary))
-    print(f"report in {out}")
+    print(f"report in {visible(out)}")
     return 0
 
 
@@ -166,7 +166,7 @@ def _report(
 
 def _text(summary: dict[str, Any]) -> str:
     head = (
-        f"{summary['recording']}, {summary['selector']}, markers {summary['markers']}: "
+        f"{visible(summary['recording'])}, {summary['selector']}, markers {summary['markers']}: "
         f"{summary['poses']} poses in {summary['frames']} frames, "
         f"{summary['frames_per_second']:.0f} frames/s"
     )

@@ -14,7 +14,7 @@ from jaxnav.arguments import Replay as Arguments
 from jaxnav.commands.drive_track import Row, Track
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax, step_folder
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     Params,
     atomic_path,
@@ -30,7 +30,7 @@ from jaxnav.files import (
 )
 from jaxnav.plotting import localisation_report
 from jaxnav.runtime.drive_format import PROFILE
-from jaxnav.runtime.drive_log import DriveLog, read_drive
+from jaxnav.runtime.drive_log import DriveLog, Outcomes, read_drive
 from jaxnav.runtime.drive_replay import (
     Comparison,
     check_inputs,
@@ -42,6 +42,7 @@ from jaxnav.runtime.mcap_messages import profile_of
 from jaxnav.runtime.message_schemas import OUTCOME
 from jaxnav.runtime.messages import digest, input_message, outcome_message
 from jaxnav.runtime.pilot import Input
+from jaxnav.runtime.plausible import plausible
 from jaxnav.runtime.recorder import Recorder
 from jaxnav.runtime.ros_drives import read_ros_drive
 
@@ -95,9 +96,11 @@ def run(args: Arguments) -> int:
         "parameters": setup.parameters,
     }
     summary |= track.summary()
+    recorded = None
     if log is not None:
         summary |= {"changed": changed, "missing": log.missing, "truncated": log.truncated}
-        summary |= track.against(log.outcomes)
+        recorded = plausible(log.outcomes)[0]
+        summary |= track.against(recorded)
     if comparison is not None:
         summary |= {
             "compared": comparison.compared,
@@ -105,12 +108,12 @@ def run(args: Arguments) -> int:
             "first_difference": comparison.first and dataclasses.asdict(comparison.first),
         }
     else:
-        save_figure(_picture(setup, track, log, _text(summary)), out / "report.png")
+        save_figure(_picture(setup, track, recorded, _text(summary)), out / "report.png")
     write_json(out / "summary.json", summary)
     located = track.located
     write_tum(out / "trajectory.tum", track.now_ns[located] / 1e9, track.Ts_world_vehicle[located])
     print(_text(summary))
-    print(f"summary in {out}")
+    print(f"summary in {visible(out)}")
     return EXIT_DIFFERS if comparison is not None and comparison.first else 0
 
 
@@ -204,16 +207,15 @@ def _replayed(
     return Track(rows)
 
 
-def _picture(setup: DriveSetup, track: Track, log: DriveLog | None, title: str) -> Figure:
+def _picture(setup: DriveSetup, track: Track, recorded: Outcomes | None, title: str) -> Figure:
     recorded_m, drawn = None, {}
-    if log is not None:
-        shift_m, turn_rad = track.off(log.outcomes)
+    if recorded is not None:
+        shift_m, turn_rad = track.off(recorded)
         # On a logarithmic axis nothing is the least that is drawn.
         drawn = {
             "position off (m)": np.maximum(shift_m, 1e-9),
             "heading off (deg)": np.maximum(np.rad2deg(turn_rad), 1e-9),
         }
-        recorded = log.outcomes
         recorded_m = np.where(recorded.located[:, None], recorded.pose, np.nan)
         recorded_m[:, 2] = 0.0
     return localisation_report(
@@ -230,7 +232,7 @@ def _text(summary: dict[str, Any]) -> str:
     shares = summary["health_shares"]
     health = ", ".join(f"{name} {share:.0%}" for name, share in shares.items() if share)
     head = (
-        f"{summary['recording']}, {summary['selector']}: {summary['states']} states in "
+        f"{visible(summary['recording'])}, {summary['selector']}: {summary['states']} states in "
         f"{summary['duration_s']:.1f} s, {health}, {summary['restarts']} restarts"
     )
     lost = sum(summary.get("missing", {}).values())

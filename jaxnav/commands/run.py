@@ -20,7 +20,7 @@ from jaxnav.arguments import Run
 from jaxnav.commands.observers import open_onlookers
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.detection import make_detectors
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.executables import keep_in
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.runtime import plugins
@@ -219,7 +219,7 @@ class _Drive:
 
 def _say(args: Run, text: str) -> None:
     if not args.headless:
-        sys.stderr.write(f"{text}\n")
+        sys.stderr.write(f"{visible(text)}\n")
 
 
 def _summarise(loop: Loop, eyes: Eyes, reason: str) -> None:

@@ -12,6 +12,7 @@ from jaxnav.arguments import Study as Arguments
 from jaxnav.cli import EXIT_INTERRUPTED
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.studies import KINDS, load_study, shipped_configs
+from jaxnav.errors import visible
 from jaxnav.files import output_folder
 from jaxnav.files.locking import sole_writer
 from jaxnav.studies.running import local_cluster, remote_cluster, run_here, run_on_cluster
@@ -34,7 +35,7 @@ def run(args: Arguments) -> int:
         store = open_store(path, study, args.chunk_trials)
         total, done = store.layout.trials, count_done(path)
         if 0 < done < total:
-            print(f"{path} holds {done} of {total} trials: going on", flush=True)
+            print(f"{visible(path)} holds {done} of {total} trials: going on", flush=True)
         bar = stack.enter_context(
             tqdm(total=total, initial=done, unit="trial", unit_scale=True, disable=args.headless)
         )
@@ -51,7 +52,7 @@ def run(args: Arguments) -> int:
                 "the same command goes on"
             )
             return EXIT_INTERRUPTED
-    print(f"{total} trials in {path}; `jaxnav plot {path}` draws them")
+    print(f"{total} trials in {visible(path)}; `jaxnav plot {visible(path)}` draws them")
     return 0
 
 

@@ -10,7 +10,7 @@ from tqdm import tqdm
 from jaxnav.arguments import Plot as Arguments
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.studies import summary_of
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.study_plotting import numeric_axes, study_curves, study_map, study_reliability
 
@@ -74,9 +74,9 @@ def draw_study(args: Arguments) -> int:
         drawn.append("reliability.png")
     write_json(out / "summary.json", _plain(summary))
     if done < total:
-        print(f"{args.store} holds {done} of {total} trials so far")
+        print(f"{visible(args.store)} holds {done} of {total} trials so far")
     invalid = int(summary["outcome_count"].sel(outcome="invalid").sum())
-    print(f"{done} trials, {invalid} outcomes not finite; {len(drawn)} pictures in {out}")
+    print(f"{done} trials, {invalid} outcomes not finite; {len(drawn)} pictures in {visible(out)}")
     return 0
 
 

@@ -17,7 +17,7 @@ from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.commands.tune_fit import Fitting, measure, plain_key, summary_of
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import Params, load_params, output_folder, write_json
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
@@ -63,7 +63,7 @@ def run(args: Arguments) -> int:
         fit = fitting.run(args.headless)
         found = gains.tested(fit)
     except KeyboardInterrupt:
-        print(f"interrupted: the best so far is in {out}; the same command goes on")
+        print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
         return EXIT_INTERRUPTED
     known = parameters_of(navigator)
     summary = summary_of(
@@ -76,7 +76,7 @@ def run(args: Arguments) -> int:
     write_json(out / "summary.json", summary)
     save_figure(controller_report(fit, space, found), out / "report.png")
     print(_text(summary))
-    print(f"parameters and report in {out}")
+    print(f"parameters and report in {visible(out)}")
     return 0
 
 

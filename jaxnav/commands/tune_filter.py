@@ -16,7 +16,7 @@ from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.tune_data import AT_A_TIME, Data, read_data
 from jaxnav.commands.tune_fit import Fitting, measure, plain_key, summary_of
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, visible
 from jaxnav.files import Params, apply_params, load_params, output_folder, write_json
 from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
@@ -50,7 +50,7 @@ def run(args: Arguments) -> int:
     try:
         fit = fitting.run(args.headless)
     except KeyboardInterrupt:
-        print(f"interrupted: the best so far is in {out}; the same command goes on")
+        print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
         return EXIT_INTERRUPTED
     found = _tested(args, data, params, space, fit)
     summary = summary_of(
@@ -63,7 +63,7 @@ def run(args: Arguments) -> int:
     write_json(out / "summary.json", summary)
     save_figure(tuning_report(fit, space, found), out / "report.png")
     print(_text(summary))
-    print(f"parameters and report in {out}")
+    print(f"parameters and report in {visible(out)}")
     return 0
 
 

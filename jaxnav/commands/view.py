@@ -7,8 +7,10 @@ from tqdm import tqdm
 from jaxnav.arguments import View as Arguments
 from jaxnav.commands.drive_pictures import read_outcomes
 from jaxnav.drive_scenery import Scenery
+from jaxnav.errors import visible
 from jaxnav.files import atomic_path, output_folder
 from jaxnav.runtime.drive_log import DriveLog
+from jaxnav.runtime.plausible import left_out, plausible
 from jaxnav.viewing import RerunView, import_rerun
 from jaxnav.viewing_outcomes import Shown
 
@@ -33,7 +35,7 @@ def run(args: Arguments) -> int:
         stack.callback(view.close)
         show_drive(view, log, scenery, args.headless)
     if args.out is not None:
-        print(f"written to {args.out}: rerun {args.out} opens it")
+        print(f"written to {visible(args.out)}: rerun {visible(args.out)} opens it")
     if view.dropped:
         print(f"{view.dropped} outcomes or images could not be shown")
     return 0
@@ -41,7 +43,9 @@ def run(args: Arguments) -> int:
 
 def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool) -> None:
     """All outcomes, all frames, all images."""
-    outcomes = log.outcomes
+    outcomes, odd = plausible(log.outcomes)
+    if odd:
+        print(left_out(odd))
     names = () if scenery.rig is None else scenery.rig.names
     for index in tqdm(range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False):
         view.show(Shown.of_row(outcomes, index))

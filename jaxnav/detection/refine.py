@@ -12,6 +12,7 @@ from jaxnav.detection.paper import SQUARE, generators, homography, on_paper, ray
 
 # Markers up to this side are fitted whole; of larger ones only the outline, which is plenty.
 _WHOLE_UP_TO_PX = 30.0
+_NOWHERE_PX = 1e6  # as of `ranges`: beyond, no corner is
 _OUTLINE_PX = 3.0
 _POINTS_PER_EDGE = 16
 _MIN_PIXELS = 60
@@ -129,6 +130,8 @@ def _pixels_around(
     ends = zip(SQUARE, np.roll(SQUARE, -1, 0), strict=True)
     outline = np.concatenate([(1 - t) * a + t * b for a, b in ends])
     outline_px = lens.pixels(rays_of(M, outline))
+    if not (np.abs(outline_px) < _NOWHERE_PX).all():  # a quadrilateral that is no marker's
+        return np.zeros((0, 2), int)
     # Not past the white zone around the marker, one cell wide.
     reach = round(min(_OUTLINE_PX, max(1.0, cell_px)))
     low = np.maximum(np.floor(outline_px.min(0)).astype(int) - reach - 1, 0)

@@ -19,10 +19,12 @@ import yaml
 from pydantic import Field
 
 from jaxnav.errors import BadInput
+from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import Count, Entry, ForeignEntry, Positive, Text, at, validate
+from jaxnav.files.validation import Count, Entry, ForeignEntry, Positive, Size, Text, at, validate
 from jaxnav.files.writing import atomic_write
 
+Spacing = Annotated[Positive, within("spacing")]
 Squares = Annotated[int, Field(strict=True, ge=1, le=100)]
 
 
@@ -32,8 +34,8 @@ class Charuco(Entry):
     board: Literal["charuco"]
     columns: Squares
     rows: Squares
-    square_m: Positive
-    marker_m: Positive
+    square_m: Size
+    marker_m: Size
     family: Text
     first_id: Count = 0
 
@@ -48,8 +50,8 @@ class Aprilgrid(Entry):
     board: Literal["aprilgrid"]
     columns: Squares
     rows: Squares
-    tag_m: Positive
-    spacing: Positive
+    tag_m: Size
+    spacing: Spacing
     family: Text = "tag36h11"
     first_id: Count = 0
     border_cells: Annotated[int, Field(strict=True, ge=1, le=2)] = 2
@@ -64,7 +66,7 @@ class Chessboard(Entry):
     board: Literal["chessboard"]
     columns: Squares
     rows: Squares
-    square_m: Positive
+    square_m: Size
 
     def figures(self) -> dict[str, Any]:
         return _figures(self, size_m=self.square_m)
@@ -74,7 +76,7 @@ class SingleMarker(Entry):
     """One navigation marker."""
 
     board: Literal["marker"]
-    size_m: Positive
+    size_m: Size
     family: Text
     first_id: Count
 
@@ -87,8 +89,8 @@ class KalibrAprilgrid(ForeignEntry):
 
     tagCols: Squares
     tagRows: Squares
-    tagSize: Positive
-    tagSpacing: Positive
+    tagSize: Size
+    tagSpacing: Spacing
 
     def figures(self) -> dict[str, Any]:
         return {
@@ -107,8 +109,8 @@ class KalibrCheckerboard(ForeignEntry):
 
     targetCols: Squares
     targetRows: Squares
-    rowSpacingMeters: Positive
-    colSpacingMeters: Positive
+    rowSpacingMeters: Size
+    colSpacingMeters: Size
 
     def figures(self) -> dict[str, Any]:
         return {

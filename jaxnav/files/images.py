@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, libraries_silenced
 from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
 
@@ -42,7 +42,8 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
             raw = file.read(limits.IMAGE_BYTES + 1)
     except OSError as error:
         raise BadInput(path, f"can't be read: {(error.strerror or str(error)).lower()}") from None
-    image = decoded_image(raw, flags)
+    with libraries_silenced():
+        image = decoded_image(raw, flags)
     if image is None:
         raise BadInput(path, image_problem(raw) or "is not an image that OpenCV can read")
     return image

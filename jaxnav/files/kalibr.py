@@ -8,20 +8,23 @@ places none of them on a vehicle.
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import CameraFigures, Lens, unread
+from jaxnav.files.ranges import pinhole_problem, placed_within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import (
+    Coefficient,
     ForeignEntry,
     ImageSize,
     Matrix,
+    MountMatrix,
     Number,
     Text,
     at,
@@ -45,11 +48,11 @@ class KalibrCamera(ForeignEntry):
     camera_model: Text
     intrinsics: list[Number]
     distortion_model: Text = "none"
-    distortion_coeffs: list[Number] = Field(default_factory=list)
+    distortion_coeffs: list[Coefficient] = Field(default_factory=list)
     resolution: ImageSize
-    T_cam_imu: Matrix | None = None
-    T_imu_cam: Matrix | None = None
-    T_cn_cnm1: Matrix | None = None
+    T_cam_imu: MountMatrix | None = None
+    T_imu_cam: MountMatrix | None = None
+    T_cn_cnm1: Annotated[Matrix, placed_within("baseline_m")] | None = None
     rostopic: Text | None = None
     tagtopic: Text | None = None  # TagSLAM's: where the detections of this camera are published
     rig_body: Text | None = None  # TagSLAM's: the body that carries it
@@ -68,7 +71,7 @@ class KalibrCamera(ForeignEntry):
     def _fu_fv_pu_pv(cls, intrinsics: list[float]) -> list[float]:
         if len(intrinsics) != 4:
             raise ValueError(f"must be fu fv pu pv, got {len(intrinsics)} numbers")
-        if min(intrinsics[:2]) < 1e-6:
+        if min(intrinsics[:2]) <= 0:
             raise ValueError(f"the focal lengths must be > 0, got {intrinsics[:2]}")
         return intrinsics
 
@@ -89,6 +92,12 @@ class KalibrCamera(ForeignEntry):
         if model != "none" and len(coefficients) != 4:
             raise ValueError(f"must have 4 numbers, got {len(coefficients)}")
         return coefficients
+
+    @model_validator(mode="after")
+    def _fits_the_images(self) -> "KalibrCamera":
+        if problem := pinhole_problem(self.intrinsics, self.resolution):
+            raise ValueError(f"intrinsics, resolution: {problem}")
+        return self
 
     def figures(self, name: str, T_camera_vehicle: np.ndarray | None = None) -> CameraFigures:
         """The camera under that name at that place."""

@@ -24,7 +24,7 @@ from jaxnav.files.figures import MarkerFigures
 from jaxnav.files.provenance import Calibrated
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import plain_pose, with_provenance, written_pose
-from jaxnav.files.validation import Count, Entry, Point, Pose, Positive, Text, validate
+from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, validate
 from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
 
@@ -44,8 +44,8 @@ class MarkerEntry(Entry):
 
     family: Text
     id: Count
-    size_m: Positive
-    corners_world_m: Annotated[list[Point], Field(min_length=4, max_length=4)] | None = None
+    size_m: Size
+    corners_world_m: Annotated[list[Place], Field(min_length=4, max_length=4)] | None = None
     T_world_marker: Pose | None = None
     sigma: MarkerSigma | None = None
 

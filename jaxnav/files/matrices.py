@@ -7,6 +7,7 @@ from pydantic import Field, field_validator, model_validator
 
 from jaxnav.errors import BadInput
 from jaxnav.files.figures import CameraFigures, Lens
+from jaxnav.files.ranges import pinhole_problem, problem_of
 from jaxnav.files.validation import Count, ForeignEntry, Number, shown
 
 _COEFFICIENTS = "k1 k2 p1 p2 k3"
@@ -59,10 +60,13 @@ def figures_from_matrices(
     if K[0] == 0:
         raise BadInput(f"{where}[0]", "is 0: this camera has not been calibrated")
     for index in (0, 4):
-        if K[index] < 1e-6:
+        if K[index] <= 0:
             raise BadInput(f"{where}[{index}]", f"the focal length must be > 0, got {K[index]:g}")
     if any(abs(K[index]) > 1e-9 * K[0] for index in (1, 3, 6, 7)) or K[8] != 1:
         raise BadInput(where, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
+    pinhole_px = [K[index] for index in (0, 4, 2, 5)]
+    if problem := pinhole_problem(pinhole_px, image_size_px):
+        raise BadInput(where, problem)
     where, coefficients = distortion
     most = 4 if lens == "equidistant" else 5
     if lens == "equidistant" and len(coefficients) != 4:
@@ -72,7 +76,9 @@ def figures_from_matrices(
             where, f"only {_COEFFICIENTS} are supported, and a later one is not zero: "
             "calibrate again with five coefficients (plumb_bob, radtan)",
         )  # fmt: skip
-    pinhole_px = [K[index] for index in (0, 4, 2, 5)]
+    for index, value in enumerate(coefficients[:most]):
+        if problem := problem_of("distortion", value):
+            raise BadInput(f"{where}[{index}]", problem)
     return CameraFigures.create(name, lens, pinhole_px, coefficients[:most], image_size_px)
 
 

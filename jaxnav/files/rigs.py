@@ -34,16 +34,20 @@ from jaxnav.files.figures import (
     rig_from_figures,
 )
 from jaxnav.files.provenance import Calibrated
+from jaxnav.files.ranges import pinhole_problem
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import (
     NAME_PATTERN,
+    AngleDeg,
+    Coefficient,
     Entry,
     ImageSize,
+    Mount,
+    MountPose,
     Name,
     Number,
     Pair,
     Point,
-    Pose,
     PositivePair,
     QuaternionPose,
     validate,
@@ -69,14 +73,14 @@ class CameraEntry(Entry):
     lens: Lens
     focal_px: PositivePair
     center_px: Pair
-    distortion: list[Number] = Field(default_factory=list)
+    distortion: list[Coefficient] = Field(default_factory=list)
     image_size_px: ImageSize
-    T_vehicle_camera: Pose | None = None
-    T_camera_vehicle: Pose | None = None
-    position_m: Point | None = None
-    yaw_deg: Number | None = None
-    elevation_deg: Number | None = None
-    roll_deg: Number | None = None
+    T_vehicle_camera: MountPose | None = None
+    T_camera_vehicle: MountPose | None = None
+    position_m: Mount | None = None
+    yaw_deg: AngleDeg | None = None
+    elevation_deg: AngleDeg | None = None
+    roll_deg: AngleDeg | None = None
     sigma: CameraSigma | None = None
 
     @field_validator("distortion")
@@ -104,6 +108,13 @@ class CameraEntry(Entry):
             raise ValueError(f"{angles[0]} goes with position_m, not with {given[0]}")
         if given == ["position_m"] and self.yaw_deg is None:
             raise ValueError("position_m needs yaw_deg (0 looks forward, 90 to the left)")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_the_images(self) -> "CameraEntry":
+        problem = pinhole_problem([*self.focal_px, *self.center_px], self.image_size_px)
+        if problem:
+            raise ValueError(f"focal_px, center_px, image_size_px: {problem}")
         return self
 
     def figures(self) -> CameraFigures:

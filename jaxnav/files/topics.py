@@ -20,7 +20,7 @@ from pydantic import Field, field_validator
 
 from jaxnav.conventions import FirstCorner
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import Entry, Name, Positive, validate
+from jaxnav.files.validation import CornerSigma, Entry, Name, validate
 
 
 class TopicsFile(Entry):
@@ -28,7 +28,7 @@ class TopicsFile(Entry):
 
     cameras: Annotated[dict[str, Name], Field(min_length=1, max_length=64)]
     odometry: Name | None = None
-    corner_sigma_px: Positive = 0.3
+    corner_sigma_px: CornerSigma = 0.3
     first_corner: FirstCorner = "bottom_left"
 
     @field_validator("cameras")

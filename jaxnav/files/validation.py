@@ -19,6 +19,7 @@ from pydantic import (
 
 from jaxnav.errors import BadInput
 from jaxnav.files.poses import check_matrix, check_quaternion
+from jaxnav.files.ranges import RANGES, placed_within, within
 
 
 class Entry(BaseModel):
@@ -33,18 +34,18 @@ class ForeignEntry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-def _not_tiny(value: float) -> float:
-    if value < 1e-6:
-        raise ValueError(f"must be at least 1e-06, got {value:g}")
-    return value
-
-
-# A number is a number: not text, not true/false, finite, and within what float32 can hold.
+# A number is a number: not text, not true/false, finite, and within what float32 can hold. What it
+# may be beside that, `ranges` says.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
-Positive = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e9), AfterValidator(_not_tiny)
-]
-Pixels = Annotated[int, Field(strict=True, ge=1, le=65536)]
+Positive = Annotated[Number, Field(gt=0)]
+Size = Annotated[Positive, within("size_m")]
+Radius = Annotated[Positive, within("radius_m")]
+CornerSigma = Annotated[Positive, within("corner_sigma_px")]
+Position = Annotated[Number, within("position_m")]
+AngleDeg = Annotated[Number, within("angle_deg")]
+Coefficient = Annotated[Number, within("distortion")]
+_IMAGE = RANGES["image_px"]
+Pixels = Annotated[int, Field(strict=True, ge=int(_IMAGE.least), le=int(_IMAGE.most))]
 Count = Annotated[int, Field(strict=True, ge=0, le=2**31)]
 Text = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 # Starts like a word, so that no YAML reader takes it for a number or for true.
@@ -53,6 +54,11 @@ Name = Annotated[str, Field(strict=True, pattern=NAME_PATTERN)]
 
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
+# In the world: a point, and one on its floor.
+Place = Annotated[list[Position], Field(min_length=3, max_length=3)]
+FloorPlace = Annotated[list[Position], Field(min_length=2, max_length=2)]
+# On a vehicle.
+Mount = Annotated[list[Number], Field(min_length=3, max_length=3), placed_within("mount_m")]
 PositivePair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 ImageSize = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
 
@@ -71,10 +77,13 @@ class QuaternionPose(Entry):
     xyz_m: Point
 
 
-Pose = Annotated[
+_Pose = Annotated[
     Annotated[QuaternionPose, Tag("<wxyz>")] | Annotated[Matrix, Tag("<4x4>")],
     Discriminator(lambda value: "<wxyz>" if isinstance(value, dict | QuaternionPose) else "<4x4>"),
 ]
+Pose = Annotated[_Pose, placed_within("position_m")]  # in the world
+MountMatrix = Annotated[Matrix, placed_within("mount_m")]
+MountPose = Annotated[_Pose, placed_within("mount_m")]  # on a vehicle
 
 Model = TypeVar("Model", bound=BaseModel)
 

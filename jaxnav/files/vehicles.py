@@ -22,25 +22,35 @@ from pydantic import Field
 
 from jaxnav.bicycle import Vehicle
 from jaxnav.files.provenance import Calibrated
+from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import with_provenance, yaml_text
-from jaxnav.files.validation import Entry, Number, Pair, Positive, validate
+from jaxnav.files.validation import (
+    AngleDeg,
+    Entry,
+    FloorPlace,
+    Number,
+    Position,
+    Positive,
+    Radius,
+    validate,
+)
 from jaxnav.files.writing import atomic_write
 
 
 class VehicleFile(Entry):
     """A vehicle file: the arguments of `Vehicle.create`."""
 
-    wheelbase_m: Positive
-    steering_limit_rad: Annotated[Positive, Field(lt=math.pi / 2)]
-    throttle_limit: Positive
-    speed_per_throttle_mps: Positive
-    speed_time_constant_s: Positive
-    steering_rate_limit_radps: Positive | None = None
-    speed_scale: Annotated[Positive, Field(ge=0.1, le=10)] = 1.0
-    steering_gain: Annotated[Positive, Field(ge=0.1, le=10)] = 1.0
-    steering_offset_rad: Annotated[Number, Field(ge=-0.5, le=0.5)] = 0.0
-    camera_delay_s: Annotated[Number, Field(ge=-0.5, le=0.5)] = 0.0
+    wheelbase_m: Annotated[Positive, within("wheelbase_m")]
+    steering_limit_rad: Annotated[Positive, Field(lt=math.pi / 2), within("steering_limit_rad")]
+    throttle_limit: Annotated[Positive, within("throttle")]
+    speed_per_throttle_mps: Annotated[Positive, within("speed_per_throttle_mps")]
+    speed_time_constant_s: Annotated[Positive, within("time_constant_s")]
+    steering_rate_limit_radps: Annotated[Positive, within("steering_rate_radps")] | None = None
+    speed_scale: Annotated[Positive, within("gain")] = 1.0
+    steering_gain: Annotated[Positive, within("gain")] = 1.0
+    steering_offset_rad: Annotated[Number, within("offset_rad")] = 0.0
+    camera_delay_s: Annotated[Number, within("delay_s")] = 0.0
     calibrated: Calibrated | None = None
     sigma: dict[str, Positive] = Field(default_factory=dict)  # of the keys above, by their names
 
@@ -61,16 +71,16 @@ CORRECTIONS = {
 class StartEntry(Entry):
     """Where a drive starts."""
 
-    x_m: Number
-    y_m: Number
-    psi_deg: Number
+    x_m: Position
+    y_m: Position
+    psi_deg: AngleDeg
 
 
 class RouteFile(Entry):
     """A route file."""
 
-    waypoints_m: Annotated[list[Pair], Field(min_length=1, max_length=4096)]
-    waypoint_radius_m: Positive
+    waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
+    waypoint_radius_m: Radius
     start: StartEntry
 
 

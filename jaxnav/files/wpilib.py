@@ -21,7 +21,16 @@ from jaxnav.conventions import APRILTAG_FAMILIES, WXYZ_TAG_MARKER
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import MarkerFigures, unread
-from jaxnav.files.validation import Count, ForeignEntry, Number, Positive, at, validate
+from jaxnav.files.ranges import within
+from jaxnav.files.validation import (
+    Count,
+    ForeignEntry,
+    Number,
+    Position,
+    Positive,
+    at,
+    validate,
+)
 from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES
 
 SIZE_M = 0.1651  # the black square of FIRST's tags, 6.5 inches
@@ -31,9 +40,9 @@ FAMILY = "tag36h11"  # FIRST's since 2024
 class Translation(ForeignEntry):
     """m."""
 
-    x: Number
-    y: Number
-    z: Number
+    x: Position
+    y: Position
+    z: Position
 
 
 class Quaternion(ForeignEntry):
@@ -73,8 +82,8 @@ class Tag(ForeignEntry):
 class FieldSize(ForeignEntry):
     """m."""
 
-    length: Positive
-    width: Positive
+    length: Annotated[Positive, within("position_m")]
+    width: Annotated[Positive, within("position_m")]
 
 
 class Layout(ForeignEntry):

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
+from jaxnav.files.ranges import is_within
 from jaxnav.files.unpacking import Budget, copy_bz2
 from jaxnav.runtime.bag_readers import Ros1Reader, checked_message, typestore
 from jaxnav.runtime.recording import Rows
@@ -125,6 +126,8 @@ def _add_transforms(
         pose = (q.w, q.x, q.y, q.z, p.x, p.y, p.z)
         if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[:4]) - 1) > 1e-3:
             raise ValueError(f"the transform from {edge[1]} to {edge[0]} is not rigid")
+        if not is_within("position_m", pose[4:]).all():
+            raise ValueError(f"the transform from {edge[1]} to {edge[0]} leads out of the world")
         transforms.setdefault(edge, {})[_nanoseconds(stamped.header)] = pose
 
 

@@ -12,6 +12,7 @@ from jaxnav.files import poses
 from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import marker_map
 from jaxnav.files.npz import read_npz
+from jaxnav.files.ranges import is_within, pinhole_problem, problem_of
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.recording import Recording, Rows, assemble
@@ -79,7 +80,34 @@ def _checked(path: Path) -> dict[str, np.ndarray]:
     _check(path, stored, _KEYS | (_REFERENCE_KEYS if has_reference else {}))
     if "obj_order" in stored and not np.array_equal(stored["obj_order"], APRILTAG_CORNERS):
         raise BadInput(f"{path}: obj_order", "must be (-,-) (+,-) (+,+) (-,+)")
+    _check_ranges(path, stored)
     return stored
+
+
+# key -> the quantity that its numbers are; the translations of poses apart.
+_QUANTITIES = {
+    "stamp_ns": "stamp_ns",
+    "rig_stamp": "stamp_ns",
+    "tag_id": "id",
+    "map_ids": "id",
+    "dist": "distortion",
+}
+_PLACES = {"T_rig_cam": "position_m", "T_map_tag": "position_m", "T_map_rig": "position_m"}
+
+
+def _check_ranges(path: Path, stored: dict[str, np.ndarray]) -> None:
+    places = {key: stored[key][:, :3, 3] for key in _PLACES.keys() & stored.keys()}
+    plain = {key: stored[key] for key in _QUANTITIES.keys() & stored.keys()}
+    for key, values in (plain | places).items():
+        name = (_QUANTITIES | _PLACES)[key]
+        inside = is_within(name, values)
+        if not inside.all():
+            place = tuple(int(i) for i in np.argwhere(~inside)[0])
+            at = "".join(f"[{i}]" for i in place)
+            raise BadInput(f"{path}: {key}{at}", str(problem_of(name, values[place].item())))
+    for index, name in enumerate(stored["cam_names"]):
+        if not (0 < len(name) <= 100 and str(name).isprintable()):
+            raise BadInput(f"{path}: cam_names[{index}]", f"must be a name, got {str(name)!r:.40}")
 
 
 def _rows(
@@ -164,9 +192,16 @@ def _rig(path: Path, stored: dict[str, np.ndarray]) -> CameraRig:
             Camera.create(K[:2].tolist(), K[2:].tolist(), lens, distortion[:count].tolist())
         )
         corners = stored["corners_px"][stored["cam"] == index].reshape(-1, 2)
-        furthest = np.max(corners, axis=0, initial=0, where=np.isfinite(corners))
-        width, height = np.ceil(np.maximum(2 * K[2:], furthest) + 1).astype(int)
-        sizes_px.append((int(width), int(height)))
+        inside = is_within("image_px", corners)
+        furthest = np.max(corners, axis=0, initial=0, where=inside)
+        size_px = np.ceil(np.maximum(2 * K[2:], furthest) + 1)
+        if not is_within("image_px", size_px).all():
+            problem = f"the principal point {K[2:]} is of no image that there is"
+            raise BadInput(f"{path}: K[{index}]", problem)
+        wrong = pinhole_problem(K.tolist(), size_px.tolist())
+        if wrong is not None:
+            raise BadInput(f"{path}: K[{index}]", wrong)
+        sizes_px.append((int(size_px[0]), int(size_px[1])))
     Ts_camera_vehicle = [
         to_se3(poses.inverse(_pose(path, f"T_rig_cam[{index}]", T)))
         for index, T in enumerate(stored["T_rig_cam"])
@@ -178,6 +213,9 @@ def _rig(path: Path, stored: dict[str, np.ndarray]) -> CameraRig:
 def _markers(path: Path, stored: dict[str, np.ndarray]) -> MarkerMap:
     if stored["map_size"].min() <= 0:
         raise BadInput(f"{path}: map_size", "must be > 0")
+    for index, size_m in enumerate(stored["map_size"].tolist()):
+        if problem := problem_of("size_m", size_m):
+            raise BadInput(f"{path}: map_size[{index}]", problem)
     ids = stored["map_ids"].tolist()
     if len(set(ids)) < len(ids):
         raise BadInput(f"{path}: map_ids", "must differ")

@@ -26,8 +26,18 @@ from jaxnav.errors import BadInput
 from jaxnav.executables import sources_digest
 from jaxnav.files import Params, Route, apply_params
 from jaxnav.files.markers import MarkerFile, marker_data
+from jaxnav.files.ranges import problem_of
 from jaxnav.files.rigs import RigFile, rig_data
-from jaxnav.files.validation import Entry, Number, Pair, Positive, Text, at, validate
+from jaxnav.files.validation import (
+    CornerSigma,
+    Entry,
+    FloorPlace,
+    Position,
+    Radius,
+    Text,
+    at,
+    validate,
+)
 from jaxnav.files.vehicles import VehicleFile, vehicle_data
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
@@ -50,9 +60,16 @@ _Limit = Annotated[float, Field(strict=True, ge=0)]  # also inf: never
 class RouteEntry(Entry):
     """See `Route`."""
 
-    waypoints_m: Annotated[list[Pair], Field(min_length=1, max_length=4096)]
-    waypoint_radius_m: Positive
-    start_pose: Annotated[list[Number], Field(min_length=3, max_length=3)]
+    waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
+    waypoint_radius_m: Radius
+    start_pose: Annotated[list[Position], Field(min_length=3, max_length=3)]
+
+    @field_validator("start_pose")
+    @classmethod
+    def _turned_little(cls, start_pose: list[float]) -> list[float]:
+        if problem := problem_of("angle_rad", start_pose[2]):
+            raise ValueError(f"psi {problem}")
+        return start_pose
 
     def route(self) -> Route:
         """The route."""
@@ -74,7 +91,7 @@ class SetupEntry(Entry):
     vehicle: VehicleFile
     route: RouteEntry
     selector: Text
-    corner_sigma_px: Positive | None
+    corner_sigma_px: CornerSigma | None
     parameters: dict[str, Any] = Field(default_factory=dict)  # older drives have none
     timeouts: TimeoutsEntry
     float64: Flag

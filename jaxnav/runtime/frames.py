@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxnav.detection.observe import observe
 from jaxnav.detection.types import Detections
+from jaxnav.files.ranges import RANGES
 from jaxnav.markers import MarkerMap
 from jaxnav.runtime.flags import Fault
 from jaxnav.runtime.history import Told
@@ -14,6 +15,7 @@ from jaxnav.runtime.stamps import Stamps
 
 _FROZEN_AFTER = 3  # frames with the very same corners
 _NO_FAULT = Fault(0)
+_MOST_PX = RANGES["corner_px"].most  # beyond, a corner is as good as infinite
 _NONE = Detections.concatenate([])
 
 
@@ -78,7 +80,7 @@ class Frames:
         seen = observe(found, self._markers)
         faults |= Fault.UNKNOWN_MARKER if seen.unknown else _NO_FAULT
         faults |= Fault.DUPLICATE_MARKER if seen.duplicates else _NO_FAULT
-        finite = np.isfinite(seen.corners_px).all(axis=(2, 3))
+        finite = (np.abs(seen.corners_px) <= _MOST_PX).all(axis=(2, 3))  # NaN is not
         finite &= (np.isfinite(seen.sigma_px) & (seen.sigma_px > 0)).all(axis=2)
         faults |= Fault.CORNERS_NOT_FINITE if np.any(seen.visible & ~finite) else _NO_FAULT
         visible = seen.visible & finite

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, WithJsonSchema
 from pydantic_core import core_schema
 
+from jaxnav.files.ranges import RANGES
 from jaxnav.runtime.flags import Fault
 
 _MOST_SIDES = 32  # of a covariance: a state has 6 to 9 numbers
@@ -97,10 +98,11 @@ def square(array: np.ndarray) -> np.ndarray:
     return array.reshape(side, side)
 
 
-Now = Annotated[int, Field(strict=True, ge=0, lt=2**63)]  # ns, the loop's own clock
-Index = Annotated[int, Field(strict=True, ge=-1, le=2**31)]  # -1: none
-# ns, whatever a driver says, if a float can hold it.
-Stamp = Annotated[int, Field(strict=True, ge=-(2**1000), le=2**1000)]
+_STAMP, _INDEX = RANGES["stamp_ns"], RANGES["index"]
+Now = Annotated[int, Field(strict=True, ge=0, lt=int(_STAMP.most) + 1)]  # ns, the loop's own clock
+Index = Annotated[int, Field(strict=True, ge=int(_INDEX.least), le=int(_INDEX.most))]  # -1: none
+# ns, whatever a driver says.
+Stamp = Annotated[int, Field(strict=True, ge=int(_STAMP.least), le=int(_STAMP.most))]
 Real = Annotated[float, Field(strict=True)]  # also NaN and infinite
 Flag = Annotated[bool, Field(strict=True)]
 Word = Annotated[str, Field(strict=True)]

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 
 from jaxnav.detection.types import Detections
+from jaxnav.files.ranges import RANGES
 from jaxnav.motion import Belief
 from jaxnav.runtime.frames import Sighted
 from jaxnav.runtime.interfaces import Odometry
@@ -27,6 +28,8 @@ from jaxnav.runtime.message_schemas import (
 from jaxnav.runtime.pilot import Input, Outcome
 from jaxnav.timeline import Report
 
+# Beyond, a stamp is none, see `Stamps`; what is recorded of it is not one either.
+_LEAST_NS, _MOST_NS = int(RANGES["stamp_ns"].least), int(RANGES["stamp_ns"].most)
 _NONE = Detections.concatenate([])
 
 
@@ -40,7 +43,7 @@ def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
         return topic, given.now_ns if stamp_ns is None else stamp_ns, message
     reading = given.odometry
     message |= {
-        "stamp_ns": reading.stamp_ns,
+        "stamp_ns": _recordable(reading.stamp_ns),
         "speed_mps": float(reading.speed_mps),
         "steering_rad": float(reading.steering_rad),
         "valid": bool(reading.valid),
@@ -121,7 +124,7 @@ def _sighted_message(frame: Sighted) -> dict[str, Any]:
     found = _NONE if frame.detections is None else frame.detections
     return {
         "camera": frame.camera,
-        "stamp_ns": frame.stamp_ns,
+        "stamp_ns": _recordable(frame.stamp_ns),
         "usable": frame.detections is not None,
         "ids": found.ids,
         "families": found.families,
@@ -130,6 +133,10 @@ def _sighted_message(frame: Sighted) -> dict[str, Any]:
         "refined": found.refined,
         "faults": frame.faults,
     }
+
+
+def _recordable(stamp_ns: int) -> int:
+    return min(max(stamp_ns, _LEAST_NS), _MOST_NS)
 
 
 def _sighted(message: SightedMessage) -> Sighted:

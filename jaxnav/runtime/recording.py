@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxnav.conventions import APRILTAG_FIRST_CORNER, TL_TR_BR_BL
 from jaxnav.errors import BadInput
+from jaxnav.files.ranges import is_within
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 
@@ -51,7 +52,7 @@ class Recording:
     markers: MarkerMap
     reference: Reference | None
     unmapped_detections: int  # of markers that are not in the map
-    dropped_detections: int  # reported twice, or with a corner that is not finite
+    dropped_detections: int  # reported twice, or with a corner that is nowhere
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -139,7 +140,7 @@ def assemble(
     index_of_id = {marker_id: index for index, marker_id in enumerate(markers.ids)}
     index = np.array([index_of_id.get(int(marker_id), -1) for marker_id in rows.ids], int)
     mapped = index >= 0
-    finite = np.isfinite(rows.corners_px).all(axis=(1, 2))
+    finite = is_within("corner_px", rows.corners_px).all(axis=(1, 2))
     frame = np.searchsorted(stamps, rows.stamps_ns)
 
     used = np.flatnonzero(mapped & finite)

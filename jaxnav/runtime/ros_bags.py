@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.errors import BadInput
+from jaxnav.files.ranges import problem_of
 from jaxnav.runtime import bags
 from jaxnav.runtime.bag_readers import Ros1Reader, Ros2Reader, checked_message, typestore
 
@@ -105,6 +106,10 @@ def _read(
             deserialize = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
             for connection, received_ns, raw in reader.messages(connections=connections):
                 kind = connection.msgtype
+                if not isinstance(received_ns, int):
+                    raise ValueError(f"a message of {connection.topic} has no time")
+                if problem := problem_of("stamp_ns", received_ns):
+                    raise ValueError(f"the time of a message of {connection.topic} {problem}")
                 message = deserialize(checked_message(kind, raw), kind)
                 yield Received(connection.topic, kind, received_ns, message)
     except BadInput:

@@ -69,11 +69,12 @@ class Search:
         """Look at a picture of a marker, so that the first frame takes no longer than others."""
         width, height = self._size_px
         image = np.full((height, width), 200, np.uint8)
+        side = max(min(16 * (min(width, height) // 32), 64), 1)
         for detector in self._detectors:
             printed = (255 * marker_cells(detector.family, 0)).astype(np.uint8)
-            side = min(16 * (min(width, height) // 32), 64)
+            # In a picture that is too small for a marker there is nothing but its beginning.
             picture = cv2.resize(printed, (side, side), interpolation=cv2.INTER_NEAREST)
-            image[8 : 8 + side, 8 : 8 + side] = picture
+            image[8 : 8 + side, 8 : 8 + side] = picture[: height - 8, : width - 8]
         corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
         region = Region((8 + side * corner)[None], np.array([4.0]))
         self._near(image, region)

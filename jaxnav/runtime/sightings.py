@@ -7,11 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnav.errors import BadInput
+from jaxnav.files.ranges import is_within
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime import bags
 from jaxnav.runtime.decoded import decoded_rows
 from jaxnav.runtime.drive_log import read_drive
+from jaxnav.runtime.drive_replay import check_inputs
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.runtime.recording import TO_OURS, Rows
@@ -81,6 +83,7 @@ def _of_rows(rows: Rows, rig: CameraRig) -> Sightings:
 def _of_drive(path: Path, rig: CameraRig | None) -> Sightings:
     log = read_drive(path)
     setup = DriveSetup.of_header(log.header, path)
+    check_inputs(log.inputs, setup, path)
     if rig is not None and len(rig) != len(setup.rig):
         raise BadInput("--rig", f"has {len(rig)} cameras, but {path} has {len(setup.rig)}")
     stamps_ns: list[int] = []
@@ -121,7 +124,7 @@ def _ordered(
     named = np.array(families if families is not None else [""] * len(ids), str)
     keys = np.rec.fromarrays([frame, camera, ids, named])
     _, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
-    once = (count[inverse] == 1) & np.isfinite(corners_px).all(axis=(1, 2))
+    once = (count[inverse] == 1) & is_within("corner_px", corners_px).all(axis=(1, 2))
     kept = np.flatnonzero(once)
     kept = kept[np.lexsort([ids[kept], camera[kept], frame[kept]])]
     return Sightings(

@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass, field
 
+from jaxnav.files.ranges import RANGES
+
 FUTURE_NS = 20_000_000  # a stamp may be ahead by this much: drifting clocks, middle of an exposure
 OLD_NS = 800_000_000  # older data are of another time altogether
 AGREE_NS = 50_000_000  # refused stamps that tell of the same jump
+MOST_NS = int(RANGES["stamp_ns"].most)  # what a recording keeps; nothing is that far in the future
 JUMP_AFTER = 10  # such stamps in a row: the source counts from elsewhere now
 
 
@@ -27,7 +30,7 @@ class Stamps:
 
         Out of order is not wrong: late data have their place in the past.
         """
-        if stamp_ns <= 0 or stamp_ns in self._seen:
+        if not 0 < stamp_ns < MOST_NS or stamp_ns in self._seen:
             return None
         shifted_ns = stamp_ns + self.shift_ns
         delay_ns = now_ns - shifted_ns

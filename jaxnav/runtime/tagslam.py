@@ -6,6 +6,7 @@ tagslam.yaml       sizes of the markers, and poses of the known ones
 camera_poses.yaml  poses of the cameras on the rig, where there is no /tf
 """
 
+import re
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -17,7 +18,7 @@ from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import to_se3
 from jaxnav.files.markers import marker_map
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import Count, ForeignEntry, Number, Positive, at, validate
+from jaxnav.files.validation import Count, ForeignEntry, Position, Size, at, validate
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime import bags
@@ -29,9 +30,9 @@ _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 class Vector(ForeignEntry):
     """x y z: m, or a rotation vector in rad."""
 
-    x: Number
-    y: Number
-    z: Number
+    x: Position
+    y: Position
+    z: Position
 
     def xyz(self) -> list[float]:
         """As a list."""
@@ -53,7 +54,7 @@ class TagEntry(ForeignEntry):
     """A marker on a body."""
 
     id: Count
-    size: Positive | None = None
+    size: Size | None = None
     pose: PoseEntry | None = None
 
 
@@ -61,7 +62,7 @@ class BodyEntry(ForeignEntry):
     """A body that carries markers."""
 
     is_static: bool = True
-    default_tag_size: Positive | None = None
+    default_tag_size: Size | None = None
     pose: PoseEntry | None = None
     tags: list[TagEntry] = Field(default_factory=list)
 
@@ -179,7 +180,7 @@ def _markers(path: Path, edges: Edges) -> MarkerMap:
     parents = {child: (parent, stamped) for (parent, child), stamped in edges.items()}
     for parent, child in edges:
         number = child.removeprefix("tag_")
-        if number != child and number.isdecimal():
+        if number != child and re.fullmatch("[0-9]{1,9}", number):
             Ts_world_marker[int(number)] = (parent, _to_root(child, parents))
     if not Ts_world_marker:
         for (name, tag_id), tag in entry_of.items():

@@ -150,7 +150,7 @@ class _Capture:
 
 def _device(source: str) -> int | None:
     """The number of a V4L2 device; OpenCV opens them by that alone."""
-    if source.isdecimal():
+    if re.fullmatch("[0-9]{1,6}", source):
         return int(source)
     if not source.startswith("/dev/"):
         return None

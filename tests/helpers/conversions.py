@@ -62,9 +62,11 @@ HELD = [
     ("photonvision", "radtan"),
 ]
 
-NUMBERS = st.floats(-1e6, 1e6).filter(lambda value: value == 0 or abs(value) > 1e-300)
 COEFFICIENTS = st.floats(-10, 10)
-FOCAL = st.floats(1e-3, 1e6)
+
+
+def numbers(least: float, most: float) -> st.SearchStrategy[float]:
+    return st.floats(least, most).filter(lambda value: value == 0 or abs(value) > 1e-300)
 
 
 @st.composite
@@ -74,13 +76,15 @@ def a_camera(draw, lens: str, name: str = "front", k3: bool = True) -> CameraFig
         coefficients[4] = 0.0
     q = np.array([draw(st.floats(-1, 1)) for _ in range(4)])
     q = q / np.linalg.norm(q) if np.linalg.norm(q) > 0.1 else np.array([1.0, 0, 0, 0])
-    T = np.array([*q, *(draw(NUMBERS) for _ in range(3))])
+    T = np.array([*q, *(draw(numbers(-500, 500)) for _ in range(3))])
+    width, height = draw(st.integers(1, 65536)), draw(st.integers(1, 65536))
+    focal = st.floats(*(bound * max(width, height) for bound in (1e-3, 1e3)))
     return CameraFigures.create(
         name,
         lens,
-        [draw(FOCAL), draw(FOCAL), draw(NUMBERS), draw(NUMBERS)],
+        [draw(focal), draw(focal), *(draw(numbers(-n, 2 * n)) for n in (width, height))],
         coefficients,
-        (draw(st.integers(1, 65536)), draw(st.integers(1, 65536))),
+        (width, height),
         T if draw(st.booleans()) else poses.matrix(T),
     )
 

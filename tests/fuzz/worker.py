@@ -1,0 +1,68 @@
+"""A process that runs cases one after the other, and may die of one.
+
+Before a case it says its number, afterwards what was wrong with it: whoever started it knows which
+one it was when it is silent for too long.
+"""
+
+import contextlib
+import json
+import os
+import resource
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from jaxnav.commands import pictures
+from jaxnav.commands.process import configure_jax
+from tests.fuzz import judge, seeds
+from tests.fuzz.cases import LOADERS, drawn, undamaged
+from tests.fuzz.targets import COMMANDS
+
+_DPI = 20  # of pictures: that they are drawn is all that counts
+
+
+def main() -> None:
+    """Arguments: seed, first number, step from number to number, scratch folder, part of the
+    targets' names, whether programs are compiled beforehand."""
+    seed, first, step = map(int, sys.argv[1:4])
+    scratch, wanted, warm = Path(sys.argv[4]), sys.argv[5], sys.argv[6] == "1"
+    said = os.fdopen(os.dup(1), "w", buffering=1)
+    os.environ.setdefault("JAXNAV_FUZZ_CACHE", str(scratch.parent / "cache"))
+    os.environ["XDG_CACHE_HOME"] = os.environ["JAXNAV_FUZZ_CACHE"]
+    pictures.PNG_DPI = _DPI
+    (scratch / "temporary").mkdir(parents=True, exist_ok=True)
+    tempfile.tempdir = str(scratch / "temporary")
+    configure_jax(float64=False)
+    only_small = contextlib.ExitStack()
+    if not warm:
+        only_small.enter_context(judge.small_programs())
+    made = scratch / "seeds"
+    if not made.exists():
+        made.mkdir()
+        seeds.make(made)
+    for target in [*(one.line for one in COMMANDS), *LOADERS]:
+        if wanted in target and warm:
+            _say(said, warming=target)
+            problem = undamaged(target, made, scratch).problem()
+            if problem is not None:
+                _say(said, number=-1, target=target, problem=f"undamaged: {problem}")
+    only_small.enter_context(judge.small_programs())
+    number = first
+    while True:
+        case = drawn(seed, number, made, scratch, wanted)
+        if case is not None:
+            place = [str(case.folder), str(case.file), case.renamed]
+            _say(said, number=number, target=case.target, place=place)
+            problem = case.problem()
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+            _say(said, number=number, target=case.target, problem=problem, done=True, peak=peak)
+        number += step
+
+
+def _say(said: Any, **what: Any) -> None:
+    said.write(json.dumps(what) + "\n")
+
+
+if __name__ == "__main__":
+    main()

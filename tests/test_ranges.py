@@ -1,0 +1,213 @@
+"""Numbers that no vehicle can have are refused by file and key, in every format."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from jaxnav.errors import BadInput
+from jaxnav.files.ranges import RANGES, is_within, pinhole_problem, problem_of, table
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.validation import validate
+from jaxnav.runtime.drive_format import decode, encode
+from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.runtime.flags import Fault
+from jaxnav.runtime.frames import Frames, Sighted
+from jaxnav.runtime.interfaces import Odometry
+from jaxnav.runtime.message_schemas import MESSAGES
+from jaxnav.runtime.messages import input_message, input_of
+from jaxnav.runtime.pilot import Input
+from jaxnav.runtime.stamps import MOST_NS, Stamps
+from tests.helpers.drives import make_detections
+from tests.helpers.loader_seeds import BINARY, STRUCTURED
+from tests.helpers.simulated import make_setup
+from tests.helpers.yaml_numbers import dumped
+from tests.worlds import room_markers
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "ranges.md"
+ODD = [1e9, 1e-6, 1e300]
+# Loader of `loader_seeds`, the way to a number, and odd numbers for it.
+FIELDS: list[tuple[str, tuple[Any, ...], list[float]]] = [
+    ("rig", ("cameras", 0, "focal_px", 0), ODD),
+    ("rig", ("cameras", 0, "center_px", 1), [1e9, -1e9, 1e300]),
+    ("rig", ("cameras", 0, "distortion", 0), [1e9, -1e300]),
+    ("rig", ("cameras", 0, "position_m", 2), [1e9, -1e5]),
+    ("rig", ("cameras", 0, "yaw_deg"), [1e9]),
+    ("saved rig", ("cameras", 0, "T_camera_vehicle", "xyz_m", 0), [1e9, 1e5]),
+    ("saved markers", ("markers", 0, "size_m"), ODD),
+    ("saved markers", ("markers", 0, "T_world_marker", "xyz_m", 1), [1e9, -1e300]),
+    *(("vehicle", (name,), [1e9, 1e-9]) for name in (
+        "wheelbase_m", "steering_limit_rad", "throttle_limit", "speed_per_throttle_mps",
+        "speed_time_constant_s")),
+    ("route", ("waypoints_m", 0, 0), [1e9]),
+    ("route", ("waypoint_radius_m",), ODD),
+    ("route", ("start", "psi_deg"), [1e9]),
+    ("topics", ("corner_sigma_px",), ODD),
+    ("Kalibr rig", ("cam0", "intrinsics", 0), ODD),
+    ("Kalibr rig", ("cam0", "intrinsics", 2), [1e9, 1e300]),
+    ("Kalibr rig", ("cam0", "distortion_coeffs", 0), [1e9]),
+    ("Kalibr rig", ("cam0", "T_cam_imu", 0, 3), [1e9, 1e5]),
+    ("camera_info", ("camera_matrix", "data", 0), ODD),
+    ("camera_info", ("camera_matrix", "data", 2), [1e9]),
+    ("camera_info", ("distortion_coefficients", "data", 0), [1e8]),
+    ("OpenCV", ("camera_matrix", "data", 4), ODD),
+    ("PhotonVision", ("cameraIntrinsics", "data", 5), [1e9]),
+    ("WPILib", ("tags", 0, "pose", "translation", "x"), [1e9]),
+    ("TagSLAM cameras.yaml", ("cam0", "intrinsics", 0), ODD),
+    ("TagSLAM tagslam.yaml", ("bodies", 0, "wall", "default_tag_size"), ODD),
+    ("TagSLAM camera_poses.yaml", ("cam0", "pose", "position", "x"), [1e9]),
+]  # fmt: skip
+
+
+def put(data: Any, keys: tuple[Any, ...], value: Any) -> None:
+    for key in keys[:-1]:
+        data = data[key]
+    assert data[keys[-1]] != value
+    data[keys[-1]] = value
+
+
+@pytest.mark.parametrize(("name", "keys", "odd"), FIELDS, ids=lambda part: str(part)[:60])
+def test_an_odd_number_is_refused_by_file_and_key(name, keys, odd, tmp_path):
+    loader = STRUCTURED[name]
+    path = loader.make(tmp_path)
+    loader.load(path)
+    for value in odd:
+        data = read_mapping(path)
+        put(data, keys, value)
+        sound = path.read_bytes()
+        path.write_text(json.dumps(data) if path.suffix == ".json" else dumped(data))
+        with pytest.raises(BadInput) as caught:
+            loader.load(path)
+        path.write_bytes(sound)
+        line = str(caught.value)
+        assert path.name in line
+        named = [key for key in keys if isinstance(key, str)]
+        assert any(key in line for key in named[-2:]), line
+
+
+@pytest.mark.parametrize(
+    ("keys", "odd"),
+    [
+        (("rig", "cameras", 0, "focal_px", 0), ODD),
+        (("rig", "cameras", 0, "center_px", 0), [1e300]),
+        (("markers", "markers", 0, "size_m"), ODD),
+        (("vehicle", "wheelbase_m"), ODD),
+        (("route", "start_pose", 0), [1e9]),
+        (("route", "start_pose", 2), [1e6]),
+        (("route", "waypoint_radius_m"), ODD),
+        (("corner_sigma_px",), ODD),
+    ],
+)
+def test_so_it_is_in_the_header_of_a_drive(keys, odd):
+    for value in odd:
+        header = decode(encode(make_setup().header()))
+        put(header, keys, value)
+        named = keys[-1] if len(keys) < 3 and isinstance(keys[-1], str) else keys[0]
+        with pytest.raises(BadInput, match=rf"drive.mcap: header.*{named}"):
+            DriveSetup.of_header(header, Path("drive.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("K", 1e9, r"K\[0\]: the principal point"),
+        ("K", 1e300, r"K\[0\]: the principal point"),
+        ("K", 1e-6, r"K\[0\]: .* must be from"),
+        ("map_size", 1e9, r"map_size\[0\]: must be from 0.001 to 100 m, got 1e\+09"),
+        ("T_map_tag", 1e300, r"T_map_tag\[0\]\[.\]: must be from"),
+        ("dist", 1e9, r"dist\[0\]\[0\]: must be from"),
+        ("stamp_ns", 2**62, r"stamp_ns\[0\]: must be from"),
+        ("cam_names", "\x1b[31m", r"cam_names\[0\]: must be a name, got '\\x1b\[31m'"),
+    ],
+)
+def test_so_it_is_in_arrays(key, value, expected, tmp_path):
+    loader = BINARY["arrays"]
+    path = loader.make(tmp_path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    if key.startswith("T_"):
+        arrays[key][..., :3, 3] = value
+    elif key == "cam_names":
+        arrays[key] = np.array([value] * 2)
+    else:
+        arrays[key][...] = value
+    np.savez(path, **arrays)
+    with pytest.raises(BadInput, match=expected):
+        loader.load(path)
+
+
+def test_corners_that_are_nowhere_are_dropped_and_counted(tmp_path):
+    loader = BINARY["arrays"]
+    path = loader.make(tmp_path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    arrays["corners_px"][0, 1, 0] = 1e300
+    np.savez(path, **arrays)
+    recording = loader.load(path)
+    assert recording.dropped_detections == 1
+    assert all(1 <= side <= 65536 for size in recording.rig.image_sizes_px for side in size)
+
+
+def test_the_page_for_users_shows_the_table():
+    assert table() in PAGE.read_text()
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_bounds_are_in_and_what_is_beyond_is_not(name):
+    allowed = RANGES[name]
+    step = 1 if isinstance(allowed.least, int) else 1e-5 * max(abs(allowed.most), 1e-3)
+    for value in (allowed.least, allowed.most):
+        assert problem_of(name, value) is None
+    for value in (allowed.least - step, allowed.most + step, np.nan):
+        if np.isfinite(allowed.most):
+            assert problem_of(name, value) is not None
+            assert not is_within(name, np.array([float(value)])) or isinstance(step, int)
+
+
+def test_focal_length_and_principal_point_are_held_against_the_image():
+    assert pinhole_problem([319, 319, 401, 202], [820, 410]) is None
+    assert pinhole_problem([3.6, 3.6, 401, 202], [820, 410]) is None  # mm: the doctor tells
+    assert "fx" in str(pinhole_problem([0.1, 319, 401, 202], [820, 410]))
+    assert "cy" in str(pinhole_problem([319, 319, 401, 2000], [820, 410]))
+
+
+def test_a_stamp_that_no_clock_can_say_is_recorded_as_one_that_nobody_believes():
+    for stamp_ns in (2**70, 2**62, -(2**70), MOST_NS):
+        given = Input(5, Odometry(stamp_ns, 0.0, 0.0))
+        topic, _, message = input_message(given)
+        model: type[BaseModel] = MESSAGES[topic][1]
+        back = input_of(validate(model, decode(encode(message)), Path("a.mcap")))
+        assert abs(back.odometry.stamp_ns) == MOST_NS
+        live, again = Stamps(), Stamps()
+        for now_ns in range(10**9, 2 * 10**9, 10**7):
+            told = live.take(stamp_ns + now_ns * (stamp_ns > 0), now_ns)
+            assert told is again.take(back.odometry.stamp_ns, now_ns) is None
+        assert live == again
+
+
+def test_a_recorded_stamp_beyond_the_table_is_refused():
+    _, _, message = input_message(Input(5, Odometry(7, 0.0, 0.0)))
+    for key in ("stamp_ns", "now_ns"):
+        data = decode(encode(message)) | {key: 2**62}
+        with pytest.raises(BadInput, match=rf"a\.mcap: {key}: must be <"):
+            validate(MESSAGES["/odometry"][1], data, Path("a.mcap"))
+
+
+def test_a_corner_that_is_nowhere_is_as_good_as_infinite():
+    markers = room_markers()
+    found = make_detections(np.random.default_rng(0), 1)
+    corners_px = found.corners_px.copy()
+    corners_px[0, 0, 0] = 1e300
+    seen = type(found)(
+        ids=np.array(markers.ids[:1]),
+        corners_px=corners_px,
+        sigma_px=found.sigma_px,
+        refined=found.refined,
+        families=markers.families[:1],
+    )
+    told, _, faults = Frames(1, markers).told([Sighted(0, 10**9, seen)], 10**9)
+    assert told is None
+    assert Fault.CORNERS_NOT_FINITE in faults
