@@ -9,6 +9,7 @@ beside the deaths: the slack of the machine, which no program can take away.
 """
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import os
@@ -131,8 +132,9 @@ def _command(kind: str, log: Path, record: Path) -> list[str]:
         "a thread": (recorded_vehicle.NAME, "sim"),
         "a process": (plain_car.NAME, plain_cameras.NAME),
     }[kind]
-    return [sys.executable, "-c", MAIN, "run", "--headless", "--timeout-s", "2", "--vehicle",
-            vehicle, "--cameras", cameras, "--option", f"log={log}", "--record", str(record)]  # fmt: skip
+    command = [sys.executable, "-c", MAIN, "run", "--headless", "--timeout-s", "2"]
+    told = {"--vehicle": vehicle, "--cameras": cameras, "--option": f"log={log}"}
+    return [*command, *itertools.chain(*told.items()), "--record", str(record)]
 
 
 def _throttles(kind: str, log: Path) -> list[tuple[int, float]]:
