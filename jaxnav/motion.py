@@ -38,7 +38,6 @@ from jaxnav.small_matrices import (
 )
 from jaxnav.trees import where
 
-
 # A pause without any pose contradicts nothing: of it no more than this counts (RELIABILITY R4's
 # flag for a marker that is missing).
 _PAUSE_S = 1.0
@@ -168,18 +167,14 @@ def unstarted(
     )
 
 
-def forgotten(
-    belief: Belief, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float
-) -> Belief:
+def forgotten(belief: Belief, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Belief:
     """The prediction without the hypotheses that are lost: their next pose starts them anew.
 
     Args:
         dt_s: since the last observation, of whatever kind: for the others time goes on.
     """
     waited_s = jnp.minimum(belief.rejections.waited_s + dt_s, _PAUSE_S)
-    rejections = dataclasses.replace(
-        belief.rejections, waited_s=waited_s.astype(belief.mean.dtype)
-    )
+    rejections = dataclasses.replace(belief.rejections, waited_s=waited_s.astype(belief.mean.dtype))
     return eqx.tree_at(
         lambda b: (b.initialised, b.rejections),
         belief,

@@ -78,6 +78,10 @@ class Estimator:
         self._moment = self._first
         self._moment_ns = 0
 
+    def forget_speed(self) -> None:
+        """Command as if it had never been known: the last that was told was not true."""
+        self._odometry = (np.nan, self._odometry[1])
+
     def warm_up(self) -> None:
         """Compile, once for events with corners and once for those without."""
         for seeing in (False, True):
@@ -126,10 +130,10 @@ class Estimator:
             return moment, then, report.fetched().unpacked()
         # One less: its place is what `new` means where the new event is of another part.
         size, control = EVENTS - 1, self._control
-        for begin in range(0, len(rows), size):
-            part, holds = rows[begin : begin + size], begin <= new < begin + size
+        for first in range(0, len(rows), size):
+            part, holds = rows[first : first + size], first <= new < first + size
             self._control = control  # there is one command
-            index = new - begin if holds else size
+            index = new - first if holds else size
             moment, after, report = self._call(moment, part, base_ns, index, now_ns, elapsed_ns)
             base_ns = part[-1][0]
             if holds:
@@ -174,7 +178,9 @@ class Estimator:
 
 def _finding(report: Report, other: Report) -> Report:
     """A report with what another one has found in the corners."""
-    found = {name: getattr(other.output, name) for name in ("candidates", "costs", "selected", "nis")}
+    found = {
+        name: getattr(other.output, name) for name in ("candidates", "costs", "selected", "nis")
+    }
     return replace(report, output=replace(report.output, **found))
 
 

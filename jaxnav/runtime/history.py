@@ -81,7 +81,7 @@ class History:
         self._forget()
 
     def _thin(self) -> None:
-        """Leave out the reading before the newest where it follows too soon on the one before it."""
+        """Leave out the reading before the newest where it follows another one too soon."""
         last = self._entries[-3:]
         if len(last) == 3 and all(entry.told and entry.told.corners_px is None for entry in last):
             before, middle, _ = last
