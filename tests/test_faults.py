@@ -1,6 +1,7 @@
 """The fault matrix: every fault comes to what it must (RELIABILITY)."""
 
 import dataclasses
+from collections.abc import Iterator
 from functools import partial
 
 import jax
@@ -32,9 +33,11 @@ class Compiled:
         return self.executables[kind](*told)
 
 
-@pytest.fixture(scope="module")
-def trial() -> Trial:
-    return Trial(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), program=Compiled())
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def trial(request) -> Iterator[Trial]:
+    """Compiled once in each precision, in which all rows are then driven."""
+    with jax.enable_x64(request.param == "float64"):
+        yield Trial(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), program=Compiled())
 
 
 @pytest.mark.parametrize("row", matrix(), ids=lambda row: row.name)

@@ -104,7 +104,7 @@ class Frames:
             if frozen is None or not shown.any():
                 taken_ns = stamp_ns
                 continue
-            sigma = float(seen.sigma_px[camera][shown].mean())
+            sigma = float(seen.sigma_px[camera][shown].max())
             if frozen(camera, stamp_ns, now_ns, seen.corners_px[camera], shown, sigma):
                 faults |= Fault.FRAME_FROZEN
                 visible[camera] = False

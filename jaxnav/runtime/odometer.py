@@ -34,7 +34,7 @@ class Odometer:
     _repeated: int = 0
     _same_speed: int = 0
     _pulled_mps: float = 0.0  # after what the motor was told
-    _pulled_then_mps: float = 0.0  # when the speed was read that has not changed since
+    _pulled_range_mps: tuple[float, float] = (0.0, 0.0)  # since the speed that is read changed
     _refused_mps: float = 0.0
     _refusals: int = 0
     _path: deque[tuple[int, float, float]] = field(default_factory=deque)  # see _agrees
@@ -142,9 +142,9 @@ class Odometer:
         self._raw, self._raw_ns = (speed_mps, steering_rad), stamp_ns
         self._repeated = self._repeated + 1 if same else 0
         self._same_speed = self._same_speed + 1 if same_speed else 0
-        if not same_speed:
-            self._pulled_then_mps = self._pulled_mps
-        pulled_elsewhere = abs(self._pulled_mps - self._pulled_then_mps) > _PULLED_MPS
+        least, most = self._pulled_range_mps if same_speed else (math.inf, -math.inf)
+        least, most = min(least, self._pulled_mps), max(most, self._pulled_mps)
+        self._pulled_range_mps = least, most
         return self._repeated >= _STUCK_AFTER or (
-            self._same_speed >= _STUCK_AFTER and pulled_elsewhere
+            self._same_speed >= _STUCK_AFTER and most - least > _PULLED_MPS
         )

@@ -182,7 +182,7 @@ class Pilot:
             self._speed(),
             self._seeing(now_ns),
             self._command[1],
-            self._standstill.read(stamp_ns, reading.speed_mps),
+            self._standstill.read(stamp_ns, now_ns, reading.speed_mps),
         )
         faults |= faults_seen
         if Fault.ODOMETRY_STUCK in faults_seen:

@@ -10,8 +10,9 @@ odometer's way makes due, and s those that are seen,
     share = <s, d> / <d, d>,      sigma of it = sqrt(2) sigma_px / |d|.
 
 A marker far ahead on the axis of motion has no due, and so raises no alarm; neither does a vehicle
-that stands. In the third case nothing tells where it goes, and the throttle is not to be tried
-again: it stays so until something moves.
+that stands. In the third case nothing tells where it goes: it may be blind, or held fast, or without
+power. Whether it can go again is not tried, for it might go blind: it stays so until something
+moves, a vehicle that is pushed say. Senses that tell nothing are stale, and others' concern.
 """
 
 import math
@@ -44,7 +45,7 @@ _PAUSE_NS = 1_000_000_000  # between two moves of one motion
 # Without a marker and without odometry it stops after 1 s (RELIABILITY R4): nothing tells where it
 # goes then either. A motor takes less to start, and what is meant to go less far stands.
 _PULLS_NS, _PULLS_M = 1_000_000_000, 0.2
-_MAX_GAP_NS = 200_000_000  # between two commands: after a longer one the watchdog has stopped it
+_MAX_GAP_NS = 200_000_000  # without a command the watchdog stops it then, and cameras are stale
 _GOES_MPS, _GOES_SHARE = 0.05, 0.25  # five sigmas of the odometer; of the speed that is pulled for
 
 
@@ -83,9 +84,11 @@ class Standstill:
     _pulled_m: float = 0.0  # since something moved
     _moved_ns: int | None = None  # when that was
     _commanded_ns: int | None = None
+    _claimed_ns: int | None = None  # when a sense last told anything
 
-    def read(self, stamp_ns: int, speed_mps: float) -> bool:
+    def read(self, stamp_ns: int, now_ns: int, speed_mps: float) -> bool:
         """A reading, whatever is thought of it: whether corners move while it says it stands."""
+        self._claimed_ns = now_ns
         self._told_ns = max(stamp_ns, self._told_ns)
         if abs(speed_mps) >= _RESTS_MPS:
             self._quiet_ns = self._contradicted_ns = None
@@ -112,7 +115,8 @@ class Standstill:
         done = 1 - math.exp(-gap_s / self.time_constant_s)
         self._pulled_mps += done * (target_mps - self._pulled_mps)
         self._pulled_m += abs(self._pulled_mps) * gap_s
-        if self._moved_ns is None or throttle == 0:
+        claims = self._claimed_ns is not None and now_ns - self._claimed_ns < _MAX_GAP_NS
+        if self._moved_ns is None or throttle == 0 or not claims:
             self._moved_ns, self._pulled_m = now_ns, 0.0
         if self._pulled_m >= _PULLS_M and now_ns - self._moved_ns >= _PULLS_NS:
             self.nothing_moves = True
@@ -131,7 +135,7 @@ class Standstill:
 
         Args:
             corners_px: (M, 4, 2), finite where a marker is visible, (M,).
-            sigma_px: of them.
+            sigma_px: of the least certain.
             due: asked where corners rest while the odometer goes.
         """
         rest = self._rests.get(camera)
@@ -140,7 +144,8 @@ class Standstill:
             self._rests[camera] = self._rest(corners_px, visible, stamp_ns)
             return False
         sigma_px = max(sigma_px, _MIN_SIGMA_PX)
-        seen_px = corners_px[both] - rest.corners_px[both]
+        with np.errstate(over="ignore"):  # whatever a camera says
+            seen_px = corners_px[both] - rest.corners_px[both]
         moved_px, noise_px = np.abs(seen_px).max(), max(_MOVED_PX, _MOVED_SIGMAS * sigma_px)
         if moved_px > noise_px:
             moved = self._moved(rest, self._rest(corners_px, visible, stamp_ns))
@@ -149,6 +154,7 @@ class Standstill:
             if moved.moves > 1 or moved_px > 3 * noise_px or not self.nothing_moves:
                 self._moves(now_ns)
             return False
+        self._claimed_ns = now_ns
         if rest.frozen:
             return True
         place = self.way.at(stamp_ns)
@@ -187,8 +193,9 @@ class Standstill:
 
 def _withheld(due_px: np.ndarray, seen_px: np.ndarray, sigma_px: float) -> bool:
     """Whether surely less than half is seen of the shifts that are due."""
-    squared_px2 = float(np.sum(due_px**2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared_px2, along_px2 = float(np.sum(due_px**2)), float(np.sum(seen_px * due_px))
     if not 0 < squared_px2 < math.inf:
         return False
-    share = float(np.sum(seen_px * due_px)) / squared_px2
+    share = along_px2 / squared_px2
     return share + _SHARE_SIGMAS * math.sqrt(2 / squared_px2) * sigma_px < _SHARE
