@@ -107,15 +107,15 @@ class Estimator:
         if placed is None:
             base_ns = self._moment_ns if self._history is not None else now_ns
             moment, _, report = self._call(self._moment, [], base_ns, 0, now_ns, elapsed_ns)
-            report, moment = report.fetched().unpacked(), moment.fetched().unpacked()
-            return Fused(report, moment, told is not None, 0)
+            told_of = moment.fetched().unpacked()
+            return Fused(report.fetched().unpacked(), told_of, told is not None, 0)
         base, entries = placed
         assert self._history is not None
         new = next(index for index, entry in enumerate(entries) if entry.told is told)
-        moment, then, report = self._fused(base, entries, new, now_ns, elapsed_ns)
+        moment, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
         self._moment, self._moment_ns = moment, entries[-1].stamp_ns
         self._history.fused(moment, entries[new], then)
-        return Fused(report, moment.fetched().unpacked(), False, len(entries))
+        return Fused(known, moment.fetched().unpacked(), False, len(entries))
 
     def _fused(
         self, base: Entry, entries: list[Entry], new: int, now_ns: int, elapsed_ns: int

@@ -10,7 +10,7 @@ odometer's way makes due, and s those that are seen,
     share = <s, d> / <d, d>,      sigma of it = sqrt(2) sigma_px / |d|.
 
 A marker far ahead on the axis of motion has no due, and so raises no alarm; neither does a vehicle
-that stands. In the third case nothing tells where it goes: it may be blind, or held fast, or without
+that stands. In the third case nothing tells where it goes: it may be blind, held fast, or without
 power. Whether it can go again is not tried, for it might go blind: it stays so until something
 moves, a vehicle that is pushed say. Senses that tell nothing are stale, and others' concern.
 """
