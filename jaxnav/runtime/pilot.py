@@ -11,14 +11,15 @@ R11). Every event is one call of one compiled program.
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxnav.navigator import Navigator
 from jaxnav.runtime.corrections import Corrections
+from jaxnav.runtime.due import due_px
 from jaxnav.runtime.estimator import Estimator, Program
-from jaxnav.runtime.expect import expected
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.frames import Frames, Sighted
 from jaxnav.runtime.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
@@ -28,7 +29,7 @@ from jaxnav.runtime.limits import Limits
 from jaxnav.runtime.odometer import Odometer
 from jaxnav.runtime.stamps import Stamps
 from jaxnav.runtime.standstill import Standstill
-from jaxnav.runtime.way import Place, Way
+from jaxnav.runtime.way import Way
 from jaxnav.timeline import Moment, Report
 
 SLEPT_NS = 1_000_000_000  # a loop that was away for so long believes what is of another time
@@ -151,7 +152,7 @@ class Pilot:
     def warm_up(self) -> None:
         """Compile, and leave no trace of it."""
         self._estimator.warm_up()
-        self._quads_px((0.0, 0.0, 0.0))
+        due_px(self.navigator, np.zeros(3), (0.0, 0.0, 0.0))
 
     def handle(self, given: Input) -> Outcome:
         """Fuse what came in, frames first. `now_ns` is never less than that of the input before."""
@@ -298,40 +299,11 @@ class Pilot:
             self._restarts_ns.popleft()
         return len(self._restarts_ns)
 
-    def _is_frozen(
-        self,
-        camera: int,
-        stamp_ns: int,
-        now_ns: int,
-        corners_px: np.ndarray,
-        visible: np.ndarray,
-        sigma_px: float,
-    ) -> bool:
-        """See `Standstill.frozen`."""
-        return self._standstill.frozen(
-            camera, stamp_ns, now_ns, corners_px, visible, sigma_px, self._due_px
-        )
-
-    def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
-        """Corners before and after a motion that ends where the vehicle is believed to be."""
-        if self._known is None or not self._known.located:
-            return None
-        x_m, y_m, psi_rad = map(float, self._known.pose)
-        before_rad = psi_rad - motion[2]
-        c, s = math.cos(before_rad), math.sin(before_rad)
-        gone_m = c * motion[0] - s * motion[1], s * motion[0] + c * motion[1]
-        before = x_m - gone_m[0], y_m - gone_m[1], before_rad
-        return self._quads_px(before), self._quads_px((x_m, y_m, psi_rad))
-
-    def _quads_px(self, pose: Place) -> np.ndarray:
-        """Corners (C, M, 4, 2) as they are seen from (x_m, y_m, psi_rad)."""
-        navigator, (x_m, y_m, psi_rad) = self.navigator, pose
-        dtype = np.asarray(navigator.corner_sigma_px).dtype
-        half_rad = psi_rad / 2
-        wxyz_xyz = np.array([math.cos(half_rad), 0, 0, math.sin(half_rad), x_m, y_m, 0], dtype)
-        none = np.zeros((3, 3), dtype)
-        found = expected(navigator.rig, navigator.markers, wxyz_xyz, none)
-        return np.asarray(found.quads_px)
+    def _is_frozen(self, *shown: Any) -> bool:
+        """See `Frozen` and `Standstill.frozen`."""
+        known = self._known
+        pose = known.pose if known is not None and known.located else None
+        return self._standstill.frozen(*shown, partial(due_px, self.navigator, pose))
 
     def _slept(self, now_ns: int) -> Fault:
         """Whether the loop was away so long that what it believes is of another time."""

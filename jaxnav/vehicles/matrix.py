@@ -1,7 +1,6 @@
 """The rows of the fault matrix (RELIABILITY), and what each must come to."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,15 +11,13 @@ from jaxnav.detection.types import Detections
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.vehicles import injections as inject
-from jaxnav.vehicles.faults import BEGIN_S, END_S, Happens, Row
+from jaxnav.vehicles.faults import ALL_CAMERAS, BEGIN_S, Happens, Row, lasting
 from jaxnav.vehicles.lockstep import BEGIN_NS, Change, Rates
+from jaxnav.vehicles.matrix_standstill import rates, standstill
 from jaxnav.vehicles.world import World
 
 _LATEST = np.inf  # to the end of the drive
 _SLOW = Health.DEGRADED
-_ALL = range(4)  # cameras
-# By which a look near where a marker is expected and one at the whole picture differ.
-_JITTER_PX = 0.01
 _BLIND_S = (0.2, 1.0, 5.0, 20.0)
 
 
@@ -36,20 +33,16 @@ def matrix() -> list[Row]:
         *_calibration(),
         *_world(),
         *_loop(),
-        *_standstill(),
-        *_rates(),
+        *standstill(),
+        *rates(),
     ]
-
-
-def _for(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
-    return lambda: inject.between(BEGIN_S, end_s, change())
 
 
 def _cameras() -> list[Row]:
     rows = [
         Row(
             f"camera {camera} out",
-            _for(partial(_frames_of, camera)),
+            lasting(partial(_frames_of, camera)),
             faults=Fault.CAMERA_STALE,
             at_most=_SLOW,
             error_m=0.10,
@@ -66,7 +59,7 @@ def _cameras() -> list[Row]:
             rows.append(
                 Row(
                     f"{name}, {duration_s:g} s",
-                    _for(partial(inject.frames, edit), BEGIN_S + duration_s),
+                    lasting(partial(inject.frames, edit), BEGIN_S + duration_s),
                     faults=stale,
                     at_least=costs,
                     at_most=max(costs, _SLOW if "all" in name else Health.DEAD_RECKONING),
@@ -94,28 +87,28 @@ def _frames() -> list[Row]:
     return [
         Row(
             "None or wrong-size frames",
-            _for(lambda: inject.frames(inject.unusable)),
+            lasting(lambda: inject.frames(inject.unusable)),
             faults=Fault.FRAME_UNUSABLE,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "frozen images, new stamps",
-            _for(lambda: inject.frames(inject.frozen(_ALL, 0.0))),
+            lasting(lambda: inject.frames(inject.frozen(ALL_CAMERAS, 0.0))),
             faults=Fault.FRAME_FROZEN,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "NaN in corners",
-            _for(lambda: inject.frames(inject.corners(lambda c: c * np.nan))),
+            lasting(lambda: inject.frames(inject.corners(lambda c: c * np.nan))),
             faults=Fault.CORNERS_NOT_FINITE,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "inf in corners",
-            _for(lambda: inject.frames(inject.corners(lambda c: c + np.inf))),
+            lasting(lambda: inject.frames(inject.corners(lambda c: c + np.inf))),
             faults=Fault.CORNERS_NOT_FINITE,
             at_most=_SLOW,
             error_m=0.15,
@@ -141,32 +134,32 @@ def _markers() -> list[Row]:
     return [
         Row(
             "unknown id",
-            _for(lambda: inject.frames(inject.detections(renamed))),
+            lasting(lambda: inject.frames(inject.detections(renamed))),
             faults=Fault.UNKNOWN_MARKER,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "two markers of one id",
-            _for(lambda: inject.frames(inject.detections(doubled(60.0)))),
+            lasting(lambda: inject.frames(inject.detections(doubled(60.0)))),
             faults=Fault.DUPLICATE_MARKER,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "duplicate detection",
-            _for(lambda: inject.frames(inject.detections(doubled(0.0)))),
+            lasting(lambda: inject.frames(inject.detections(doubled(0.0)))),
         ),
         Row(
             "mirrored corners, 5 frames",
-            _for(lambda: inject.frames(inject.corners(mirrored)), BEGIN_S + 0.17),
+            lasting(lambda: inject.frames(inject.corners(mirrored)), BEGIN_S + 0.17),
             at_most=_SLOW,
             error_m=0.10,
             ends_s=BEGIN_S + 0.17,
         ),
         Row(
             "corners turned by 90 deg, 5 frames",
-            _for(
+            lasting(
                 lambda: inject.frames(inject.corners(lambda c: np.roll(c, 1, axis=1))),
                 BEGIN_S + 0.17,
             ),
@@ -197,13 +190,13 @@ def _stamps() -> list[Row]:
 
     refused: dict[str, Any] = {"faults": Fault.STAMP_INVALID, "at_most": _SLOW, "error_m": 0.15}
     return [
-        Row("stamps jump by +1 s", _for(shifted(1.0)), **refused),
-        Row("stamps jump by -1 s", _for(shifted(-1.0)), **refused),
-        Row("frames 50 ms late, each other", _for(lambda: inject.late(0.05, 2))),
-        Row("frames 500 ms late, each third", _for(lambda: inject.late(0.5, 3)), at_most=_SLOW),
-        Row("equal stamps", _for(constant(BEGIN_NS + 1)), **refused),
-        Row("zero stamps", _for(constant(0)), **refused),
-        Row("negative stamps", _for(constant(-5)), **refused),
+        Row("stamps jump by +1 s", lasting(shifted(1.0)), **refused),
+        Row("stamps jump by -1 s", lasting(shifted(-1.0)), **refused),
+        Row("frames 50 ms late, each other", lasting(lambda: inject.late(0.05, 2))),
+        Row("frames 500 ms late, each third", lasting(lambda: inject.late(0.5, 3)), at_most=_SLOW),
+        Row("equal stamps", lasting(constant(BEGIN_NS + 1)), **refused),
+        Row("zero stamps", lasting(constant(0)), **refused),
+        Row("negative stamps", lasting(constant(-5)), **refused),
         Row("clocks that drift by 100 ppm", lambda: both, begins_s=2.0, ends_s=_LATEST),
         Row(
             "cameras skewed by 30 ms",
@@ -239,25 +232,25 @@ def _odometry() -> list[Row]:
         return dataclasses.replace(reading, valid=False)
 
     return [
-        Row("odometry x10, each fifth", _for(spikes), rejects=Reject.ODOMETRY),
+        Row("odometry x10, each fifth", lasting(spikes), rejects=Reject.ODOMETRY),
         Row(
             "odometry of the other sign",
-            _for(scaled(-1.0)),
+            lasting(scaled(-1.0)),
             rejects=Reject.ODOMETRY,
             at_most=_SLOW,
             error_m=0.08,
         ),
-        Row("odometry 30 % off", _for(scaled(1.3)), at_most=_SLOW, error_m=0.08),
+        Row("odometry 30 % off", lasting(scaled(1.3)), at_most=_SLOW, error_m=0.08),
         Row(
             "odometry stuck",
-            _for(lambda: inject.odometry(inject.repeated())),
+            lasting(lambda: inject.odometry(inject.repeated())),
             faults=Fault.ODOMETRY_STUCK,
             at_most=_SLOW,
             error_m=0.08,
         ),
         Row(
             "odometry invalid",
-            _for(lambda: inject.odometry(invalid)),
+            lasting(lambda: inject.odometry(invalid)),
             faults=Fault.ODOMETRY_INVALID,
             at_least=_SLOW,
             at_most=_SLOW,
@@ -265,7 +258,7 @@ def _odometry() -> list[Row]:
         ),
         Row(
             "odometry out",
-            _for(lambda: inject.odometry(inject.gone)),
+            lasting(lambda: inject.odometry(inject.gone)),
             faults=Fault.ODOMETRY_STALE,
             at_least=_SLOW,
             at_most=_SLOW,
@@ -273,20 +266,20 @@ def _odometry() -> list[Row]:
         ),
         Row(
             "odometry wraps around",
-            _for(lambda: inject.odometry(wrapped), BEGIN_S + 0.03),
+            lasting(lambda: inject.odometry(wrapped), BEGIN_S + 0.03),
             rejects=Reject.ODOMETRY,
             ends_s=BEGIN_S + 0.03,
         ),
         Row(
             "NaN and inf in odometry",
-            _for(lambda: inject.odometry(inject.with_values(inject.NOT_FINITE))),
+            lasting(lambda: inject.odometry(inject.with_values(inject.NOT_FINITE))),
             faults=Fault.ODOMETRY_INVALID,
             at_most=_SLOW,
             error_m=0.08,
         ),
         Row(
             "blind and without odometry",
-            _for(lambda: lambda given: [dataclasses.replace(given, odometry=None, frames=())]),
+            lasting(lambda: lambda given: [dataclasses.replace(given, odometry=None, frames=())]),
             faults=Fault.CAMERAS_STALE,
             at_least=Health.STOP,
             at_most=Health.STOP,
@@ -357,130 +350,3 @@ def _loop() -> list[Row]:
             )
         )
     return rows
-
-
-def _standstill() -> list[Row]:
-    """What stands still while others move."""
-
-    def still(cameras: range) -> Callable[[], Change]:
-        return lambda: inject.frames(inject.frozen(cameras, _JITTER_PX))
-
-    def stopped(reading: Odometry) -> Odometry:
-        return dataclasses.replace(reading, speed_mps=0.0)
-
-    def all_of_it() -> Change:
-        return inject.both(still(_ALL)(), inject.odometry(inject.repeated()))
-
-    def held() -> Happens:
-        def happens(now_ns: int, world: World) -> None:
-            world.hold(now_ns >= BEGIN_NS + int(BEGIN_S * 1e9))
-
-        return happens
-
-    return [
-        Row(
-            "frozen images, found anew",
-            _for(still(_ALL)),
-            faults=Fault.FRAME_FROZEN,
-            at_most=_SLOW,
-            error_m=0.15,
-        ),
-        Row(
-            "one camera frozen, found anew",
-            _for(still(range(1))),
-            faults=Fault.FRAME_FROZEN,
-            at_most=_SLOW,
-            error_m=0.15,
-        ),
-        Row(
-            "frozen images for 9 s",
-            _for(still(_ALL), BEGIN_S + 9.0),
-            faults=Fault.FRAME_FROZEN,
-            at_least=Health.STOP,
-            at_most=Health.STOP,
-            error_m=0.35,
-            ends_s=BEGIN_S + 9.0,
-            drive_s=BEGIN_S + 12.0,
-        ),
-        Row(
-            "odometry stuck at 0",
-            _for(lambda: inject.odometry(stopped)),
-            faults=Fault.ODOMETRY_STUCK,
-            at_least=_SLOW,
-            at_most=_SLOW,
-            error_m=0.10,
-        ),
-        Row(
-            "odometry at 0 from the start",
-            lambda: inject.between(0.0, END_S, inject.odometry(stopped)),
-            faults=Fault.ODOMETRY_STUCK,
-            at_least=_SLOW,
-            at_most=_SLOW,
-            error_m=0.20,
-            begins_s=0.0,
-        ),
-        Row(
-            "odometry stuck, steering not",
-            _for(lambda: inject.odometry(inject.speed(inject.constant())), BEGIN_S + 4.0),
-            faults=Fault.ODOMETRY_STUCK,
-            at_most=_SLOW,
-            error_m=0.10,
-            ends_s=BEGIN_S + 4.0,
-            drive_s=BEGIN_S + 7.0,
-        ),
-        Row(
-            "cameras and odometry frozen",
-            _for(all_of_it, BEGIN_S + 4.0),
-            faults=Fault.NOTHING_MOVES | Fault.ODOMETRY_STALE,
-            at_least=Health.STOP,
-            at_most=Health.STOP,
-            error_m=0.8,
-            ends_s=BEGIN_S + 4.0,
-            drive_s=BEGIN_S + 7.0,
-        ),
-        Row(
-            "the car is held fast",
-            happens=held,
-            faults=Fault.NOTHING_MOVES,
-            at_least=Health.STOP,
-            at_most=Health.STOP,
-            error_m=0.15,
-            ends_s=_LATEST,
-        ),
-    ]
-
-
-def _rates() -> list[Row]:
-    """What depends on how often things come."""
-
-    def to_and_fro() -> Happens:
-        turn_ns = iter(itertools.count(BEGIN_NS + int(BEGIN_S * 1e9), 700_000_000))
-        due_ns, side = next(turn_ns), itertools.cycle((1.0, -1.0))
-
-        def happens(now_ns: int, world: World) -> None:
-            nonlocal due_ns
-            if due_ns <= now_ns < BEGIN_NS + int((BEGIN_S + 7.0) * 1e9):
-                due_ns = next(turn_ns)
-                world.move_markers((next(side), 0.0, 0.0))
-
-        return happens
-
-    return [
-        Row(
-            "frames 150 ms late, odometry at 500 Hz",
-            rates=Rates(odometry_period_s=0.002, frame_delay_s=0.15),
-            begins_s=2.0,
-            ends_s=_LATEST,
-            drive_s=4.0,
-        ),
-        Row(
-            "a marker to and fro for 7 s",
-            happens=to_and_fro,
-            faults=Fault.RESTARTED_OFTEN,
-            at_least=Health.STOP,
-            at_most=Health.STOP,
-            error_m=1.5,
-            ends_s=_LATEST,
-            drive_s=BEGIN_S + 7.0,
-        ),
-    ]
