@@ -1,9 +1,10 @@
 """The filter as the loop calls it: one compiled call an event, and the history of what was told."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -178,10 +179,13 @@ class Estimator:
 
 def _finding(report: Report, other: Report) -> Report:
     """A report with what another one has found in the corners."""
-    found = {
-        name: getattr(other.output, name) for name in ("candidates", "costs", "selected", "nis")
-    }
-    return replace(report, output=replace(report.output, **found))
+
+    def found(of: Report) -> tuple[Any, ...]:
+        output = of.output
+        return output.candidates, output.costs, output.selected, output.nis
+
+    merged: Report = eqx.tree_at(found, report, found(other))
+    return merged
 
 
 def _layout(navigator: Navigator, seeing: bool) -> Layout:
