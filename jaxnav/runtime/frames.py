@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxnav.detection.observe import observe
+from jaxnav.detection.observe import Observed, observe
 from jaxnav.detection.types import Detections
 from jaxnav.markers import MarkerMap
 from jaxnav.runtime.flags import Fault
@@ -72,7 +72,6 @@ class Frames:
             return None, now_ns, _NO_FAULT
         faults = _NO_FAULT
         found = [_NONE] * len(self.newest_ns)
-        taken_ns: int | None = None
         stamps_ns: dict[int, int] = {}
         for frame in frames:
             faults |= frame.faults
@@ -99,18 +98,8 @@ class Frames:
         finite &= (np.isfinite(seen.sigma_px) & (seen.sigma_px > 0)).all(axis=2)
         faults |= Fault.CORNERS_NOT_FINITE if np.any(seen.visible & ~finite) else _NO_FAULT
         visible = seen.visible & finite
-        for camera, stamp_ns in stamps_ns.items():
-            shown = visible[camera]
-            if frozen is None or not shown.any():
-                taken_ns = stamp_ns
-                continue
-            sigma = float(seen.sigma_px[camera][shown].max())
-            if frozen(camera, stamp_ns, now_ns, seen.corners_px[camera], shown, sigma):
-                faults |= Fault.FRAME_FROZEN
-                visible[camera] = False
-                self.newest_ns[camera] = self._newest_before_ns[camera]
-            else:
-                taken_ns = stamp_ns
+        taken_ns, frozen_seen = self._leave_out_frozen(seen, visible, stamps_ns, now_ns, frozen)
+        faults |= frozen_seen
         sigma_px: np.ndarray | float = seen.sigma_px
         if self._corner_sigma_px is not None:
             sigma_px = self._corner_sigma_px
@@ -122,6 +111,27 @@ class Frames:
             sigma_px=np.where(visible[..., None], sigma_px, np.ones_like(seen.sigma_px)),
         )
         return told, taken_ns, faults
+
+    def _leave_out_frozen(
+        self,
+        seen: Observed,
+        visible: np.ndarray,
+        stamps_ns: dict[int, int],
+        now_ns: int,
+        frozen: Frozen | None,
+    ) -> tuple[int | None, Fault]:
+        """When what is left was true, and whether a camera was left out of `visible`."""
+        taken_ns, faults = None, _NO_FAULT
+        for camera, stamp_ns in stamps_ns.items():
+            shown, corners_px = visible[camera], seen.corners_px[camera]
+            if frozen is not None and shown.any():
+                sigma_px = float(seen.sigma_px[camera][shown].max())
+                if frozen(camera, stamp_ns, now_ns, corners_px, shown.copy(), sigma_px):
+                    faults, visible[camera] = Fault.FRAME_FROZEN, False
+                    self.newest_ns[camera] = self._newest_before_ns[camera]
+                    continue
+            taken_ns = stamp_ns
+        return taken_ns, faults
 
     def _frozen(self, camera: int, detections: Detections) -> bool:
         """Whether a camera shows the very same corners once too often."""
