@@ -1,7 +1,7 @@
 """Events in the order of their stamps, however they come, against a list that is sorted."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxnav.runtime.history import KEPT, THIN_NS, History, Told
@@ -109,6 +109,7 @@ def test_what_is_older_than_all_that_is_kept_is_refused():
     np.testing.assert_array_equal(moment, [*range(200), 777])
 
 
+@settings(deadline=None)
 @given(st.sampled_from([50, 100, 200, 500, 1000, 5000]), st.integers(0, 790), st.integers(1, 4))
 def test_all_that_stamps_let_in_has_its_place_whatever_the_rates(rate_hz, late_ms, cameras):
     """Cameras at 30 Hz whose frames are late by so much, among odometry at some rate."""

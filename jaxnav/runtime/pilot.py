@@ -12,7 +12,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from jaxnav.runtime.limits import Limits
 from jaxnav.runtime.odometer import Odometer
 from jaxnav.runtime.stamps import Stamps
 from jaxnav.runtime.standstill import Standstill
-from jaxnav.runtime.way import Way
+from jaxnav.runtime.way import Place, Way
 from jaxnav.timeline import Moment, Report
 
 SLEPT_NS = 1_000_000_000  # a loop that was away for so long believes what is of another time
@@ -136,6 +136,7 @@ class Pilot:
             self._odometer.speed_per_throttle_mps,
             self._odometer.time_constant_s,
         )
+        self._frozen = partial(self._standstill.frozen, due=self._due_px)
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
         self._distance_m = 0.0
@@ -158,7 +159,7 @@ class Pilot:
         """Fuse what came in, frames first. `now_ns` is never less than that of the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
         frames = [self._corrections.frame(frame) for frame in given.frames]
-        told, stamp_ns, seen_faults = self._frames.told(frames, now_ns, self._is_frozen)
+        told, stamp_ns, seen_faults = self._frames.told(frames, now_ns, self._frozen)
         faults |= seen_faults
         if told is not None:
             outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
@@ -299,11 +300,10 @@ class Pilot:
             self._restarts_ns.popleft()
         return len(self._restarts_ns)
 
-    def _is_frozen(self, *shown: Any) -> bool:
-        """See `Frozen` and `Standstill.frozen`."""
+    def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
+        """See `due_px`."""
         known = self._known
-        pose = known.pose if known is not None and known.located else None
-        return self._standstill.frozen(*shown, partial(due_px, self.navigator, pose))
+        return due_px(self.navigator, known.pose if known and known.located else None, motion)
 
     def _slept(self, now_ns: int) -> Fault:
         """Whether the loop was away so long that what it believes is of another time."""
