@@ -68,7 +68,7 @@ class BicycleKalman(Motion):
             belief.mean, belief.covariance
         )
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
-        return forgotten(predicted, self.lost(belief))
+        return forgotten(predicted, self.lost(belief), obs.dt_s)
 
     def lost(self, belief: Belief) -> Bool[Array, " K"]:
         """Whether the gate has contradicted a hypothesis too often or too long."""

@@ -64,7 +64,8 @@ class ConstantVelocity(Motion):
         variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
         wrong = self.lost(belief)
-        return forgotten(predicted, wrong | ~(variance_m2 < self.lost_sigma_m**2))
+        lost = wrong | ~(variance_m2 < self.lost_sigma_m**2)
+        return forgotten(predicted, lost, dt_s)
 
     def lost(self, belief: Belief) -> Bool[Array, " K"]:
         """Whether the gate has contradicted a hypothesis too often or too long."""

@@ -38,6 +38,10 @@ from jaxnav.small_matrices import (
 )
 from jaxnav.trees import where
 
+# A pause without any pose contradicts nothing: of it no more than this counts (RELIABILITY R4's
+# flag for a marker that is missing).
+_PAUSE_S = 1.0
+
 
 class Rejections(eqx.Module):
     """Measured poses in a row that contradict the prediction (RELIABILITY R1 to R3)."""
@@ -45,6 +49,7 @@ class Rejections(eqx.Module):
     count: Int[Array, "*K"]  # of the last ones, which agree with each other
     last: Float[Array, "*K m"]  # whitened innovation of the last one
     duration_s: Float[Array, "*K"]  # of all of them, those that were taken nevertheless included
+    waited_s: Float[Array, "*K"]  # since a pose was last offered, however often it was predicted
 
 
 class Belief(eqx.Module):
@@ -121,7 +126,7 @@ class Motion(eqx.Module):
 
         def one(before: Belief, measured: Any) -> tuple[Belief, Array, Array]:
             offered = offer(before, measured, obs)
-            after, nis = gated(before, offered, measured.taken, obs.dt_s)
+            after, nis = gated(before, offered, measured.taken)
             compared = measured.taken & before.initialised
             return after, nis, jnp.where(compared, offered.log_likelihood, 0)
 
@@ -157,16 +162,23 @@ def unstarted(
             jnp.zeros(hypotheses, int),
             jnp.zeros((hypotheses, pose_states), mean.dtype),
             jnp.zeros(hypotheses, mean.dtype),
+            jnp.zeros(hypotheses, mean.dtype),
         ),
     )
 
 
-def forgotten(belief: Belief, lost: Bool[Array, " K"]) -> Belief:
-    """The prediction without the hypotheses that are lost: their next pose starts them anew."""
+def forgotten(belief: Belief, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Belief:
+    """The prediction without the hypotheses that are lost: their next pose starts them anew.
+
+    Args:
+        dt_s: since the last observation, of whatever kind: for the others time goes on.
+    """
+    waited_s = jnp.minimum(belief.rejections.waited_s + dt_s, _PAUSE_S)
+    rejections = dataclasses.replace(belief.rejections, waited_s=waited_s.astype(belief.mean.dtype))
     return eqx.tree_at(
         lambda b: (b.initialised, b.rejections),
         belief,
-        (belief.initialised & ~lost, _cleared(belief.rejections, lost)),
+        (belief.initialised & ~lost, _cleared(rejections, lost)),
     )
 
 
@@ -182,7 +194,6 @@ def gated(
     belief: Belief,
     offer: Offer,
     taken: Bool[Array, ""],
-    dt_s: Float[Array, ""] | float,
 ) -> tuple[Belief, Float[Array, ""]]:
     """One hypothesis that was offered a pose, and its NIS, 0 where there was none to compare.
 
@@ -191,7 +202,6 @@ def gated(
 
     Args:
         taken: whether there is a pose at all.
-        dt_s: since the last observation.
     """
     nis = jnp.sum(offer.innovation**2)
     offered = taken & belief.initialised
@@ -204,13 +214,13 @@ def gated(
         covariance,
         belief.log_weight,
         belief.initialised | taken,
-        _cleared(_and_another(belief.rejections, offered, offer.innovation, dt_s), agrees | starts),
+        _cleared(_and_another(belief.rejections, offered, offer.innovation), agrees | starts),
         belief.number,
     ), jnp.where(offered, nis, 0)
 
 
 def _and_another(
-    rejections: Rejections, rejected: Bool[Array, ""], innovation: Array, dt_s: Array | float
+    rejections: Rejections, rejected: Bool[Array, ""], innovation: Array
 ) -> Rejections:
     """One more, which agrees with the last one if it lies within 60 degrees of its direction."""
     both = jnp.sum(innovation**2) * jnp.sum(rejections.last**2)
@@ -219,7 +229,8 @@ def _and_another(
     return Rejections(
         jnp.where(rejected, jnp.where(agrees, rejections.count, 0) + 1, rejections.count),
         jnp.where(rejected, innovation, rejections.last),
-        rejections.duration_s + jnp.where(rejected, dt_s, 0).astype(innovation.dtype),
+        rejections.duration_s + jnp.where(rejected, rejections.waited_s, 0),
+        jnp.where(rejected, 0, rejections.waited_s),
     )
 
 

@@ -1,6 +1,7 @@
 """The fault matrix: every fault comes to what it must (RELIABILITY)."""
 
 import dataclasses
+from collections.abc import Iterator
 from functools import partial
 
 import jax
@@ -8,10 +9,23 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
+from jaxnav.detection import make_detector
+from jaxnav.navigator import Navigator, Output
 from jaxnav.runtime.estimator import advance_packed
+from jaxnav.runtime.expect import expected
 from jaxnav.runtime.flags import Fault, Health
-from jaxnav.vehicles.faults import Row, Trial, line, run_trial
+from jaxnav.runtime.frames import Sighted
+from jaxnav.runtime.interfaces import Frame
+from jaxnav.runtime.pilot import Pilot
+from jaxnav.runtime.seeing import Region, Search
+from jaxnav.simulation.rendering import Renderer
+from jaxnav.simulation.scene import Scene
+from jaxnav.simulation.sensor import Sensor
+from jaxnav.vehicles import injections as inject
+from jaxnav.vehicles.faults import WAYPOINTS_M, Row, Trial, line, run_trial
+from jaxnav.vehicles.lockstep import BEGIN_NS, drive
 from jaxnav.vehicles.matrix import matrix
+from jaxnav.vehicles.world import World
 from tests import worlds
 
 
@@ -32,15 +46,71 @@ class Compiled:
         return self.executables[kind](*told)
 
 
-@pytest.fixture(scope="module")
-def trial() -> Trial:
-    return Trial(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), program=Compiled())
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def trial(request) -> Iterator[Trial]:
+    """Compiled once in each precision, in which all rows are then driven."""
+    with jax.enable_x64(request.param == "float64"):
+        yield Trial(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), program=Compiled())
 
 
 @pytest.mark.parametrize("row", matrix(), ids=lambda row: row.name)
 def test_every_fault_comes_to_what_it_must(trial, row):
     result = run_trial(row, trial)
     assert result.broken == (), line(result)
+
+
+class FrozenPicture:
+    """From an instant on the front camera shows one picture, with a clock in its corner."""
+
+    def __init__(self, trial: Trial, world: World, navigator: Navigator, begin_s: float):
+        self.world, self.navigator, self.begin_ns = world, navigator, BEGIN_NS + int(begin_s * 1e9)
+        scene = Scene.create(trial.markers, seed=0)
+        self.renderer = Renderer(scene, trial.rig, sensor=Sensor(), threads=1)
+        detectors = [make_detector("aruco", "tag36h11")]
+        self.search = Search(0, trial.rig.image_sizes_px[0], trial.rig.camera(0), detectors)
+        self.picture: np.ndarray | None = None
+        self.output: Output | None = None
+
+    def edit(self, frame: Sighted) -> Sighted:
+        """As whoever looks at pictures: near where the marker is expected, or everywhere."""
+        if frame.camera != 0 or frame.stamp_ns < self.begin_ns:
+            return frame
+        if self.picture is None:
+            rng, pose = np.random.default_rng(0), self.world.pose(frame.stamp_ns)
+            self.picture = self.renderer.render_still(pose, rng)[0]
+        image = self.picture.copy()
+        image[:8, :8] = np.frombuffer(frame.stamp_ns.to_bytes(8), np.uint8)
+        rig, markers = self.navigator.rig, self.navigator.markers
+        wxyz_xyz = np.asarray(self.output.T_world_vehicle.wxyz_xyz)
+        found = expected(rig, markers, wxyz_xyz, np.asarray(self.output.covariance[:3, :3]))
+        quads_px, visible, radius_px = (np.asarray(part)[0] for part in found)
+        region = Region(quads_px[visible], radius_px[visible])
+        return self.search.look(Frame(frame.stamp_ns, image), region)
+
+
+def test_a_picture_that_freezes_does_not_lead_the_car_astray(trial):
+    """Looked at as on the car, near and whole in turn, for four seconds."""
+    begin_s = 2.5
+    navigator = Navigator(
+        trial.rig, trial.markers, trial.vehicle, WAYPOINTS_M, waypoint_radius_m=0.15
+    )
+    pilot = Pilot(navigator, program=trial.program(navigator))
+    world = World(trial.rig, trial.markers, trial.vehicle, trial.start_pose, BEGIN_NS)
+    frozen = FrozenPicture(trial, world, navigator, begin_s)
+    steps = []
+    for step in drive(pilot, world, begin_s + 4.0, inject.frames(frozen.edit)):
+        frozen.output = step.outcome.report.output
+        steps.append(step)
+    faults = [(step.input.now_ns - BEGIN_NS, step.outcome.faults) for step in steps]
+    seen_s = [ns / 1e9 - begin_s for ns, fault in faults if Fault.FRAME_FROZEN in fault]
+    assert 0 < seen_s[0] < 1.3
+    truths = np.array([step.truth[:2] for step in steps])
+    poses = np.array([step.outcome.report.output.pose[:2] for step in steps])
+    lasts = np.array([ns > begin_s * 1e9 for ns, _ in faults])
+    assert np.hypot(*np.diff(truths[lasts], axis=0).T).sum() > 0.5  # it has driven
+    assert np.hypot(*(poses - truths)[lasts].T).max() < 0.2
+    assert Fault.CAMERA_STALE in steps[-1].outcome.faults
+    assert steps[-1].outcome.health > Health.OK
 
 
 def test_what_is_asked_of_a_fault_can_be_missed(trial):

@@ -8,7 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.runtime.flags import Fault, Health, Reject, names
-from jaxnav.runtime.health import LOOKS, SPEED_FACTOR, Monitor, Senses, Timeouts
+from jaxnav.runtime.health import (
+    LOOKS,
+    MOST_RESTARTS,
+    SPEED_FACTOR,
+    Monitor,
+    Senses,
+    Timeouts,
+)
 
 WELL = Senses(
     located=True,
@@ -57,6 +64,14 @@ def seen(**changes) -> tuple[Health, Fault]:
         ({"faults": Fault.NOT_FINITE, "located": False}, Health.STOP, Fault.NOT_FINITE),
         ({"faults": Fault.ODOMETRY_STUCK}, Health.DEGRADED, Fault.ODOMETRY_STUCK),
         ({"faults": Fault.RECORDER_FAILED}, Health.OK, Fault.RECORDER_FAILED),
+        ({"faults": Fault.NOTHING_MOVES}, Health.STOP, Fault.NOTHING_MOVES),
+        ({"restarts": MOST_RESTARTS}, Health.OK, Fault(0)),
+        ({"restarts": MOST_RESTARTS + 1}, Health.STOP, Fault.RESTARTED_OFTEN),
+        (
+            {"restarts": MOST_RESTARTS + 1, "located": False},
+            Health.STOP,
+            Fault.RESTARTED_OFTEN,
+        ),
         ({"cameras_age_s": ()}, Health.OK, Fault(0)),
     ],
 )

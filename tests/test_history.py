@@ -1,16 +1,19 @@
 """Events in the order of their stamps, however they come, against a list that is sorted."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.runtime.history import EVENTS, History, Told
+from jaxnav.runtime.history import KEPT, THIN_NS, History, Told
+from jaxnav.runtime.stamps import OLD_NS
 
-BEGIN_NS = 1000
+BEGIN_NS = 10**12
+MS = 1_000_000
 
 
 def told(number: int) -> Told:
-    return Told(odometry=(float(number), 0.0))
+    """Of a camera too: such events are never left out."""
+    return Told(odometry=(float(number), 0.0), corners_px=np.zeros(1))
 
 
 def number_of(of: Told | None) -> int:
@@ -19,15 +22,15 @@ def number_of(of: Told | None) -> int:
     return int(of.odometry[0])
 
 
-def fuse(history: History, stamp_ns: int, number: int) -> tuple | None:
+def fuse(history: History, stamp_ns: int, number: int, made=told) -> tuple | None:
     """As the estimator does; what is believed is the tuple of all events fused so far."""
-    placed = history.place(stamp_ns, told(number))
+    placed = history.place(stamp_ns, made(number))
     if placed is None:
         return None
     base, entries = placed
     stamps_ns = [entry.stamp_ns for entry in entries]
     assert [base.stamp_ns, *stamps_ns] == sorted([base.stamp_ns, *stamps_ns])
-    assert len(entries) <= EVENTS
+    assert len(entries) <= KEPT + 1
     numbers = [number_of(entry.told) for entry in entries]
     new = numbers.index(number)
     moment = (*base.moment, *numbers)
@@ -41,7 +44,7 @@ def test_what_is_believed_is_that_of_the_sorted_events(late_ns):
     history = History((), BEGIN_NS)
     accepted = []
     for number, lateness_ns in enumerate(late_ns):
-        stamp_ns = BEGIN_NS + 10 * number - lateness_ns
+        stamp_ns = BEGIN_NS + (10 * number - lateness_ns) * MS
         moment = fuse(history, stamp_ns, number)
         if moment is None:
             continue
@@ -52,33 +55,33 @@ def test_what_is_believed_is_that_of_the_sorted_events(late_ns):
 
 def test_events_in_order_are_fused_once():
     history = History((), BEGIN_NS)
-    for number in range(3 * EVENTS):
-        placed = history.place(BEGIN_NS + number, told(number))
+    for number in range(200):
+        placed = history.place(BEGIN_NS + 10 * MS * number, told(number))
         assert placed is not None
         base, entries = placed
         assert [number_of(entry.told) for entry in entries] == [number]
         history.fused((*base.moment, number), entries[0], (*base.moment, number))
-        assert history.newest_ns == BEGIN_NS + number
+        assert history.newest_ns == BEGIN_NS + 10 * MS * number
 
 
 def test_a_late_event_undoes_those_after_it_alone():
     history = History((), BEGIN_NS)
     for number in range(10):
-        fuse(history, BEGIN_NS + 10 * number, number)
-    placed = history.place(BEGIN_NS + 65, told(99))
+        fuse(history, BEGIN_NS + 10 * MS * number, number)
+    placed = history.place(BEGIN_NS + 65 * MS, told(99))
     assert placed is not None
     base, entries = placed
-    assert base.stamp_ns == BEGIN_NS + 60
+    assert base.stamp_ns == BEGIN_NS + 60 * MS
     assert [number_of(entry.told) for entry in entries] == [99, 7, 8, 9]
 
 
 def test_cameras_that_are_always_late_cost_little():
     """30 Hz, each frame 100 ms old, among odometry at 50 Hz: nothing is ever refused."""
-    history, longest = History((), 0), 0
+    history, longest = History((), -1), 0
     events = [(20 * k, 20 * k) for k in range(500)]
     events += [(100 + 33 * k, 33 * k) for k in range(290)]
     for number, (_, stamp_ns) in enumerate(sorted(events)):
-        placed = history.place(stamp_ns, told(number))
+        placed = history.place(stamp_ns * MS, told(number))
         assert placed is not None
         _, entries = placed
         longest = max(longest, len(entries))
@@ -96,11 +99,53 @@ def test_equal_stamps_keep_their_order():
 
 def test_what_is_older_than_all_that_is_kept_is_refused():
     history = History((), BEGIN_NS)
-    for number in range(2 * EVENTS):
-        fuse(history, BEGIN_NS + 10 * number, number)
-    newest_ns = BEGIN_NS + 10 * (2 * EVENTS - 1)
-    assert history.place(newest_ns - 10 * EVENTS, told(999)) is None
+    for number in range(200):
+        fuse(history, BEGIN_NS + 10 * MS * number, number)
+    newest_ns = BEGIN_NS + 1990 * MS
+    assert history.place(newest_ns - OLD_NS - 20 * MS, told(999)) is None
     assert history.place(BEGIN_NS - 1, told(999)) is None
-    moment = fuse(history, newest_ns + 10, 777)
+    moment = fuse(history, newest_ns + 10 * MS, 777)
     assert moment is not None
-    np.testing.assert_array_equal(moment, [*range(2 * EVENTS), 777])
+    np.testing.assert_array_equal(moment, [*range(200), 777])
+
+
+@settings(deadline=None)
+@given(st.sampled_from([50, 100, 200, 500, 1000, 5000]), st.integers(0, 790), st.integers(1, 4))
+def test_all_that_stamps_let_in_has_its_place_whatever_the_rates(rate_hz, late_ms, cameras):
+    """Cameras at 30 Hz whose frames are late by so much, among odometry at some rate."""
+    history, most = History((), -1), 0
+    events = [(k * 1000 / rate_hz, k * 1000 / rate_hz, None) for k in range(2 * rate_hz)]
+    events += [
+        (late_ms + 33 * k + 8 * c, 33 * k + 8 * c, np.zeros(1))
+        for k in range(30)
+        for c in range(cameras)
+    ]
+    for _, stamp_ms, corners_px in sorted(events, key=lambda event: event[:2]):
+        of = Told(odometry=(0.0, 0.0), corners_px=corners_px)
+        placed = history.place(int(stamp_ms * MS), of)
+        assert placed is not None
+        _, entries = placed
+        new = next(entry for entry in entries if entry.told is of)
+        history.fused((), new, ())
+        most = max(most, len(entries))
+    # Of the odometer no more than one each THIN_NS, and two beside each frame.
+    fastest_hz = min(rate_hz, 1e9 / THIN_NS)
+    assert most <= (late_ms + 33) / 1000 * (fastest_hz + 90 * cameras) + 5
+
+
+def test_of_a_fast_odometer_no_more_than_needed_is_fused_once_more():
+    history = History((), BEGIN_NS)
+    for number in range(1000):  # 500 Hz
+        fuse(history, BEGIN_NS + 2 * MS * number, number, lambda n: Told(odometry=(float(n), 0.0)))
+    placed = history.place(BEGIN_NS + 1800 * MS, told(5000))
+    assert placed is not None
+    assert len(placed[1]) <= 200 * MS / THIN_NS + 2
+
+
+def test_there_is_an_end_to_what_is_kept():
+    history = History((), BEGIN_NS)
+    for number in range(2 * KEPT):
+        placed = history.place(BEGIN_NS + number, Told(corners_px=np.zeros(1)))
+        history.fused((), placed[1][0], ())
+    assert history.place(BEGIN_NS + KEPT - 2, told(0)) is None
+    assert history.place(BEGIN_NS + KEPT + 2, told(0)) is not None

@@ -265,6 +265,17 @@ def test_a_frozen_image_is_noticed_at_the_third(camera, image, corners_px, drive
     assert drive.handle(search.look(Frame(9, thawed), region)) == (Fault(0), True)
 
 
+def test_a_picture_that_was_there_before_is_not_looked_at(camera, image, corners_px):
+    """Whatever look it is, and whichever memory it is in."""
+    search, region = new_search(camera), around(corners_px)
+    buffer = image.copy()
+    seen = [search.look(Frame(n, buffer), region if n % 2 else None) for n in range(4)]
+    assert [one.faults for one in seen] == [Fault(0)] * 2 + [Fault.FRAME_FROZEN] * 2
+    assert [one.detections is None for one in seen] == [False, False, True, True]
+    buffer[0, 0] ^= 1  # the camera writes its next picture there
+    assert_found(search.look(Frame(9, buffer), region).detections, corners_px, 0.1)
+
+
 def test_an_unusable_image_reaches_the_pilot_as_that(camera, drive):
     assert drive.handle(looked(camera, None)) == (Fault.FRAME_UNUSABLE, False)
 

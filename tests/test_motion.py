@@ -62,6 +62,12 @@ def drive_step(motion, belief, pose, covariance, taken, obs):
     return prior, posterior, nis
 
 
+@jax.jit
+def coasted(motion, belief, dt_s):
+    """A prediction alone, at rest."""
+    return motion.predict(belief, reading(dt_s=dt_s))
+
+
 def started(motion, pose, covariance, speed_mps=0.3, steering_rad=0.1) -> Belief:
     obs = reading(speed_mps, steering_rad)
     return drive_step(motion, motion.init(), jnp.asarray(pose), covariance, True, obs)[1]
@@ -324,6 +330,36 @@ def test_rejections_that_contradict_each_other_start_nothing(kind):
     prior, belief, _ = step(belief, 5.0)
     assert not prior.initialised[0]
     assert (belief.rejections.count[0], belief.rejections.duration_s[0]) == (0, 0)
+
+
+@pytest.mark.parametrize("coasts", [1, 4])
+def test_rejections_last_as_long_as_the_clock_says(coasts):
+    """Whatever comes between two poses, odometry say, and however often: its time counts too."""
+    motion, step = outlier_steps("car", max_rejected_s=0.5)
+    belief, forgotten_s = motion.init(), None
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    for count in range(40):
+        for _ in range(coasts):
+            belief = coasted(motion, belief, 0.02)
+        prior, belief, _ = step(belief, 5.0 if count % 2 else -5.0)
+        if not prior.initialised[0]:
+            forgotten_s = 0.02 * (1 + coasts) * count
+            break
+    assert forgotten_s == pytest.approx(0.5, abs=0.02 * (1 + coasts))
+
+
+def test_a_pause_without_poses_contradicts_for_a_second_at_most():
+    motion, step = outlier_steps("car")
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    for seconds in (1.0, 2.0):
+        for _ in range(20):
+            belief = coasted(motion, belief, 0.5)
+        assert belief.initialised[0]
+        _, belief, _ = step(belief, 5000.0 * (-1) ** seconds)
+        assert belief.rejections.duration_s[0] == pytest.approx(seconds)
 
 
 @pytest.mark.parametrize("kind", ["car", "free"])

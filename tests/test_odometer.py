@@ -67,6 +67,25 @@ def test_the_same_numbers_again_and_again_are_a_stuck_sensor():
     assert drive.tell(1.0, throttle=0.1, steering_rad=0.11)[0]
 
 
+def test_a_speed_that_the_motor_was_told_to_change_and_that_stays_is_stuck():
+    """Also where the steering is never the same, since it is what was commanded."""
+    steady, changing = Drive(), Drive()
+    for drive in (steady, changing):
+        drive.accelerate(0.04, 100)
+        assert all(drive.tell(0.4, throttle=0.04)[0] for _ in range(100))  # a rough encoder
+    assert all(steady.tell(0.4, throttle=0.04) == (True, Fault(0)) for _ in range(50))
+    told = [changing.tell(0.4, throttle=0.02) for _ in range(50)]
+    assert told[-1] == (False, Fault.ODOMETRY_STUCK)
+    assert 0 < [taken for taken, _ in told].index(False) < 25
+    assert changing.tell(0.39, throttle=0.02) == (True, Fault(0))
+
+
+def test_a_sensor_that_stands_while_corners_move_is_stuck():
+    odometer = Odometer(MAX_MPS, PER_THROTTLE, LAG_S)
+    told = [odometer.judge(0.0, 0.0, BEGIN_NS + n, None, True, 0.0, n == 1) for n in (0, 1, 2)]
+    assert told == [(True, Fault(0)), (False, Fault.ODOMETRY_STUCK), (True, Fault(0))]
+
+
 def test_a_vehicle_that_stands_is_not_stuck():
     drive = Drive()
     assert all(drive.tell(0.0, steering_rad=0.0) == (True, Fault(0)) for _ in range(100))

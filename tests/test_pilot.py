@@ -115,6 +115,39 @@ def test_late_frames_tell_the_same_as_frames_in_time(setup, inputs, delay_ns):
     np.testing.assert_allclose(one[-1].report.output.pose, other[-1].report.output.pose, atol=1e-9)
 
 
+def test_what_takes_several_calls_tells_the_same_as_one(setup, inputs, monkeypatch):
+    """Every third frame comes so late that it is fused in parts of three events."""
+    late = [
+        dataclasses.replace(given, now_ns=given.now_ns + 300 * MS)
+        if given.frames and index % 3 == 0 and index > 40
+        else given
+        for index, given in enumerate(inputs[:130])
+    ]
+    late.sort(key=lambda given: given.now_ns)
+    _, one = handled(setup, late)
+    pilot = setup.pilot(None)
+    monkeypatch.setattr("jaxnav.runtime.estimator.EVENTS", 4)
+    other = [pilot.handle(given) for given in late]
+    assert {outcome.rejects for outcome in other} <= {Reject(0), Reject.INNOVATION_LARGE}
+    for a, b in zip(one, other, strict=True):
+        for name in ("nis", "selected", "costs", "pose"):
+            first, second = getattr(a.report.output, name), getattr(b.report.output, name)
+            np.testing.assert_allclose(first, second, atol=1e-9, rtol=1e-9)
+        assert (a.steering_rad, a.throttle) == pytest.approx((b.steering_rad, b.throttle), abs=1e-9)
+    assert_same_belief(one[-1], other[-1], atol=1e-9)
+
+
+def test_a_camera_whose_frames_are_too_late_for_the_filter_is_stale(setup, inputs):
+    pilot = setup.pilot(None)
+    pilot.handle(inputs[0])
+    given = next(given for given in inputs if given.frames)
+    early_ns = inputs[0].now_ns - MS  # before all that was told
+    told = [dataclasses.replace(frame, stamp_ns=early_ns) for frame in given.frames]
+    outcome = pilot.handle(Input(inputs[0].now_ns + 250 * MS, frames=tuple(told)))
+    assert Reject.TOO_LATE in outcome.rejects
+    assert Fault.CAMERAS_STALE in outcome.faults
+
+
 def test_a_tick_changes_nothing_of_what_is_believed(setup, steps, inputs):
     with_ticks, steps = [], steps[60:110]
     for given in inputs[60:110]:

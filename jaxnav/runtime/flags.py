@@ -9,7 +9,8 @@ class Fault(enum.IntFlag):
     CAMERA_STALE = enum.auto()  # one or several gave no frame in time
     CAMERAS_STALE = enum.auto()  # all of them
     FRAME_UNUSABLE = enum.auto()  # no image, of a wrong size, or without any contrast
-    FRAME_FROZEN = enum.auto()  # the same picture again and again, under new stamps
+    # The same picture again and again, under new stamps, or one that stays while the odometer goes.
+    FRAME_FROZEN = enum.auto()
     UNKNOWN_MARKER = enum.auto()
     DUPLICATE_MARKER = enum.auto()  # one id at several places in an image
     CORNERS_NOT_FINITE = enum.auto()
@@ -17,7 +18,7 @@ class Fault(enum.IntFlag):
     CLOCK_JUMPED = enum.auto()  # a source counts from elsewhere now, or the loop itself slept
     ODOMETRY_STALE = enum.auto()
     ODOMETRY_INVALID = enum.auto()  # the driver says so, or no number
-    ODOMETRY_STUCK = enum.auto()  # the same numbers again and again while it moves
+    ODOMETRY_STUCK = enum.auto()  # the same numbers again and again while it moves, or corners do
     NO_MARKER = enum.auto()  # for a second
     UNSURE = enum.auto()  # position sigma beyond its limit
     FAR_FROM_FIX = enum.auto()  # distance driven without a marker beyond its limit
@@ -28,6 +29,8 @@ class Fault(enum.IntFlag):
     DEADLINE_MISSED = enum.auto()  # a cycle took longer than its period
     RECORDER_BEHIND = enum.auto()  # messages were left out
     RECORDER_FAILED = enum.auto()  # disk full, or the file is gone
+    NOTHING_MOVES = enum.auto()  # the throttle pulls, and neither wheels nor any corner move
+    RESTARTED_OFTEN = enum.auto()  # given up again and again in a short time
 
 
 class Reject(enum.IntFlag):

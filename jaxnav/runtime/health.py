@@ -8,6 +8,10 @@ from jaxnav.runtime.flags import Fault, Health
 # every contradiction and down with every agreement, and is bad at ten (ArduPilot's EKF check).
 LOOKS = 10
 _OFTEN = 10
+# A vehicle that is carried off restarts once, or twice where it takes the mirror pose first. Who
+# restarts more often than that believes something new every other second, and stands, until it is
+# so long ago. It is no trip of the watchdog: the drive goes on by itself.
+MOST_RESTARTS, RESTARTS_S = 3, 10.0
 
 SPEED_FACTOR = {
     Health.INIT: 0.0,
@@ -45,6 +49,7 @@ class Senses:
     position_sigma_m: float
     distance_m: float  # driven since corners were last believed
     faults: Fault  # that are seen elsewhere
+    restarts: int = 0  # in the last RESTARTS_S
 
 
 @dataclass
@@ -82,6 +87,8 @@ class Monitor:
             found |= Fault.CAMERAS_STALE
         if senses.odometry_age_s > limits.odometry_stale_s:
             found |= Fault.ODOMETRY_STALE
+        if senses.restarts > MOST_RESTARTS:
+            found |= Fault.RESTARTED_OFTEN
         if senses.located:
             if senses.fix_age_s > limits.flag_s:
                 found |= Fault.NO_MARKER
@@ -93,7 +100,8 @@ class Monitor:
 
     def _wanted(self, senses: Senses, faults: Fault) -> Health:
         limits = self.timeouts
-        if faults & (Fault.NOT_FINITE | Fault.VEHICLE_FAILED):
+        broken = Fault.NOT_FINITE | Fault.VEHICLE_FAILED
+        if faults & (broken | Fault.NOTHING_MOVES | Fault.RESTARTED_OFTEN):
             return Health.STOP
         if not senses.located:
             return Health.INIT

@@ -16,6 +16,7 @@ _DISTRUSTED = 5  # refusals in a row: then a speed that fits does not suffice, t
 _PATH_NS = 1_000_000_000
 _PATH_M, _PATH_SHARE = 0.02, 0.1  # how well
 _STUCK_AFTER = 25  # readings, none different from the one before, of a vehicle that moves
+_PULLED_MPS = 0.1  # a change that any encoder shows
 _MAX_GAP_NS = 1_000_000_000
 
 
@@ -29,7 +30,11 @@ class Odometer:
     last: tuple[float, float] | None = None  # speed_mps, steering_rad, believed
     _last_ns: int = 0
     _raw: tuple[float, float] | None = None
+    _raw_ns: int = 0
     _repeated: int = 0
+    _same_speed: int = 0
+    _pulled_mps: float = 0.0  # after what the motor was told
+    _pulled_range_mps: tuple[float, float] = (0.0, 0.0)  # since the speed that is read changed
     _refused_mps: float = 0.0
     _refusals: int = 0
     _path: deque[tuple[int, float, float]] = field(default_factory=deque)  # see _agrees
@@ -52,6 +57,7 @@ class Odometer:
         believed: tuple[float, float] | None,
         seeing: bool,
         throttle: float,
+        contradicted: bool = False,
     ) -> tuple[bool, Fault]:
         """Whether to fuse a reading, and what is wrong with the sensor.
 
@@ -59,8 +65,9 @@ class Odometer:
             believed: the estimate's speed and its sigma, m/s, where there is one.
             seeing: cameras tell the speed too, so that odometry which insists is not believed.
             throttle: last commanded.
+            contradicted: corners move, and have done so for a while, where it says it stands.
         """
-        if self._stuck(speed_mps, steering_rad):
+        if self._stuck(speed_mps, steering_rad, stamp_ns, throttle) or contradicted:
             return False, Fault.ODOMETRY_STUCK
         if self._possible(speed_mps, stamp_ns, believed, throttle):
             if (
@@ -124,8 +131,20 @@ class Odometer:
         long_enough = stamp_ns - stamps[0] > _PATH_NS / 2
         return long_enough and abs(off_m) < _PATH_M + _PATH_SHARE * way_m
 
-    def _stuck(self, speed_mps: float, steering_rad: float) -> bool:
-        same = self._raw == (speed_mps, steering_rad)
-        self._raw = speed_mps, steering_rad
-        self._repeated = self._repeated + 1 if same and speed_mps != 0 else 0
-        return self._repeated >= _STUCK_AFTER
+    def _stuck(self, speed_mps: float, steering_rad: float, stamp_ns: int, throttle: float) -> bool:
+        """Whether a sensor tells the same too often: all of it, or a speed that the motor was told
+        to change meanwhile (who has no sensor for the steering gives what was commanded)."""
+        gap_s = min(max(stamp_ns - self._raw_ns, 0), _MAX_GAP_NS) / 1e9
+        done = 1 - math.exp(-gap_s / self.time_constant_s)
+        self._pulled_mps += done * (throttle * self.speed_per_throttle_mps - self._pulled_mps)
+        same_speed = speed_mps != 0 and self._raw is not None and self._raw[0] == speed_mps
+        same = same_speed and self._raw == (speed_mps, steering_rad)
+        self._raw, self._raw_ns = (speed_mps, steering_rad), stamp_ns
+        self._repeated = self._repeated + 1 if same else 0
+        self._same_speed = self._same_speed + 1 if same_speed else 0
+        least, most = self._pulled_range_mps if same_speed else (math.inf, -math.inf)
+        least, most = min(least, self._pulled_mps), max(most, self._pulled_mps)
+        self._pulled_range_mps = least, most
+        return self._repeated >= _STUCK_AFTER or (
+            self._same_speed >= _STUCK_AFTER and most - least > _PULLED_MPS
+        )

@@ -9,22 +9,27 @@ R11). Every event is one call of one compiled program.
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxnav.navigator import Navigator
 from jaxnav.runtime.corrections import Corrections
+from jaxnav.runtime.due import due_px
 from jaxnav.runtime.estimator import Estimator, Program
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.frames import Frames, Sighted
-from jaxnav.runtime.health import SPEED_FACTOR, Monitor, Senses, Timeouts
+from jaxnav.runtime.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
 from jaxnav.runtime.history import Told
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.runtime.limits import Limits
 from jaxnav.runtime.odometer import Odometer
 from jaxnav.runtime.stamps import Stamps
+from jaxnav.runtime.standstill import Standstill
+from jaxnav.runtime.way import Place, Way
 from jaxnav.timeline import Moment, Report
 
 SLEPT_NS = 1_000_000_000  # a loop that was away for so long believes what is of another time
@@ -126,6 +131,12 @@ class Pilot:
         self._monitor = Monitor(timeouts or Timeouts())
         self._odometry_stamps = Stamps()
         self._odometer = Odometer.of(navigator.controller.vehicle)
+        self._standstill = Standstill(
+            Way(float(navigator.controller.vehicle.wheelbase_m)),
+            self._odometer.speed_per_throttle_mps,
+            self._odometer.time_constant_s,
+        )
+        self._frozen = partial(self._standstill.frozen, due=self._due_px)
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
         self._distance_m = 0.0
@@ -134,6 +145,7 @@ class Pilot:
         self._known: _Known | None = None
         self._restarts = self._restarts_before = 0
         self._restart_reason = ""
+        self._restarts_ns: deque[int] = deque()  # the last ones
         self._left: _Known | None = None  # what was believed before a restart
         self._command = (0.0, 0.0)
         self._commanded_ns: int | None = None
@@ -141,12 +153,13 @@ class Pilot:
     def warm_up(self) -> None:
         """Compile, and leave no trace of it."""
         self._estimator.warm_up()
+        due_px(self.navigator, np.zeros(3), (0.0, 0.0, 0.0))
 
     def handle(self, given: Input) -> Outcome:
         """Fuse what came in, frames first. `now_ns` is never less than that of the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
         frames = [self._corrections.frame(frame) for frame in given.frames]
-        told, stamp_ns, seen_faults = self._frames.told(frames, now_ns)
+        told, stamp_ns, seen_faults = self._frames.told(frames, now_ns, self._frozen)
         faults |= seen_faults
         if told is not None:
             outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
@@ -171,8 +184,11 @@ class Pilot:
             self._speed(),
             self._seeing(now_ns),
             self._command[1],
+            self._standstill.read(stamp_ns, now_ns, reading.speed_mps),
         )
         faults |= faults_seen
+        if Fault.ODOMETRY_STUCK in faults_seen:
+            self._estimator.forget_speed()
         if not believable:
             return self._tick(now_ns, faults, Reject.ODOMETRY)
         if self._odometer_ns is not None:
@@ -180,6 +196,7 @@ class Pilot:
                 abs(reading.speed_mps) * min(max(stamp_ns - self._odometer_ns, 0), SLEPT_NS) / 1e9
             )
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
+        self._standstill.went(stamp_ns, now_ns, reading.speed_mps, reading.steering_rad)
         told = Told(odometry=(reading.speed_mps, reading.steering_rad))
         return self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
 
@@ -197,15 +214,20 @@ class Pilot:
             faults |= Fault.NOT_FINITE
             self._begin_anew("the estimate was no number")
         rejects |= Reject.TOO_LATE if fused.refused else _NO_REJECT
-        if told is not None and told.corners_px is not None and not fused.refused:
-            rejects |= self._judge(known, stamp_ns)
+        if told is not None and told.corners_px is not None:
+            if fused.refused:
+                self._frames.refused()
+            else:
+                rejects |= self._judge(known, stamp_ns)
         restarts = self._restarts_before + int(fused.moment.restarts)
         if finite and restarts > self._restarts:
             self._restarts, self._restart_reason = restarts, "contradicted by the corners"
             faults |= Fault.RESTARTED
             self._left = self._known
+            self._restarts_ns.append(now_ns)
         self._arrived_elsewhere(known)
         self._known, self._now_ns = known, now_ns
+        faults |= Fault.NOTHING_MOVES if self._standstill.nothing_moves else _NO_FAULT
         health, faults = self._monitor.look(self._senses(known, now_ns, faults))
         steering_rad, throttle = self._limited(known, health, now_ns, elapsed_ns)
         return Outcome(
@@ -252,6 +274,7 @@ class Pilot:
             elapsed_ns / 1e9,
         )
         self._commanded_ns = now_ns
+        self._standstill.commanded(self._command[1], now_ns)
         return self._command
 
     def _senses(self, known: _Known, now_ns: int, faults: Fault) -> Senses:
@@ -269,7 +292,18 @@ class Pilot:
             position_sigma_m=known.sigma(0, 1),
             distance_m=self._distance_m,
             faults=faults,
+            restarts=self._restarts_lately(now_ns),
         )
+
+    def _restarts_lately(self, now_ns: int) -> int:
+        while self._restarts_ns and now_ns - self._restarts_ns[0] > RESTARTS_S * 1e9:
+            self._restarts_ns.popleft()
+        return len(self._restarts_ns)
+
+    def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
+        """See `due_px`."""
+        known = self._known
+        return due_px(self.navigator, known.pose if known and known.located else None, motion)
 
     def _slept(self, now_ns: int) -> Fault:
         """Whether the loop was away so long that what it believes is of another time."""
@@ -283,6 +317,8 @@ class Pilot:
     def _begin_anew(self, reason: str) -> None:
         self._estimator.reset()
         self._restarts += 1
+        if self._now_ns is not None:
+            self._restarts_ns.append(self._now_ns)
         self._restarts_before, self._restart_reason = self._restarts, reason
         self._fix_ns, self._distance_m = None, 0.0
         self._left = self._known

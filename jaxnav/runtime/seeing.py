@@ -16,7 +16,7 @@ from jaxnav.camera import Camera as CameraModel
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.types import Detections, Detector, RegionDetector
 from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.frames import Sighted
+from jaxnav.runtime.frames import FROZEN_AFTER, Sighted
 from jaxnav.runtime.guard import Guard
 from jaxnav.runtime.interfaces import Camera, Frame
 
@@ -64,6 +64,7 @@ class Search:
         self._camera, self._size_px, self._model = camera, size_px, model
         self._detectors = list(detectors)
         self._since_whole = camera  # so that cameras take turns
+        self._picture, self._pictures = b"", 0  # the last, and how often the same
 
     def warm_up(self) -> None:
         """Look at a picture of a marker, so that the first frame takes no longer than others."""
@@ -91,6 +92,8 @@ class Search:
         fault = image_fault(frame.image, self._size_px)
         if fault or frame.image is None:
             return Sighted(self._camera, frame.stamp_ns, None, fault)
+        if self._repeats(frame.image):
+            return Sighted(self._camera, frame.stamp_ns, None, Fault.FRAME_FROZEN)
         self._since_whole += 1
         found = _NONE
         if region is not None and self._since_whole < WHOLE_EVERY:
@@ -101,6 +104,14 @@ class Search:
             self._since_whole = 0
             found = self._everywhere(frame.image, region)
         return Sighted(self._camera, frame.stamp_ns, found)
+
+    def _repeats(self, image: np.ndarray) -> bool:
+        """Whether a picture is the same once too often. No sensor is without noise; bytes are
+        compared, since 20 us of that see more than any digest of the same time."""
+        picture = image.tobytes()
+        self._pictures = self._pictures + 1 if picture == self._picture else 1
+        self._picture = picture
+        return self._pictures >= FROZEN_AFTER
 
     def _near(self, image: np.ndarray, region: Region) -> Detections:
         parts = [

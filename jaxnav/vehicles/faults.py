@@ -24,10 +24,12 @@ from jaxnav.rig import CameraRig
 from jaxnav.runtime.estimator import Program
 from jaxnav.runtime.flags import Fault, Health, Reject, names
 from jaxnav.runtime.pilot import Pilot
+from jaxnav.vehicles.injections import between
 from jaxnav.vehicles.lockstep import BEGIN_NS, Change, Rates, Step, drive
 from jaxnav.vehicles.world import World
 
 BEGIN_S, END_S = 2.5, 4.0  # of most faults
+ALL_CAMERAS = range(4)  # of the rig that is driven with
 SETTLE_S = 2.0  # after a fault: then the position must be right again (R3)
 WAYPOINTS_M = (
     (1.3, 0.0), (0.3, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5),
@@ -35,6 +37,11 @@ WAYPOINTS_M = (
 )  # fmt: skip
 
 Happens = Callable[[int, World], None]
+
+
+def lasting(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
+    """A change while most faults last."""
+    return lambda: between(BEGIN_S, end_s, change())
 
 
 def _unchanged() -> Change:

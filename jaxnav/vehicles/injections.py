@@ -114,6 +114,50 @@ def stalled(begin_s: float, stall_s: float) -> Change:
     return change
 
 
+def frozen(cameras: Iterable[int], jitter_px: float, seed: int = 0) -> EditFrame:
+    """Cameras whose pictures stay the same under new stamps.
+
+    Args:
+        jitter_px: the largest error of a corner that is found anew in the same picture.
+    """
+    kept: dict[int, Detections] = {}
+    of, rng = set(cameras), np.random.default_rng(seed)
+
+    def edit(frame: Sighted) -> Sighted:
+        if frame.camera not in of:
+            return frame
+        if frame.detections is not None:
+            kept.setdefault(frame.camera, frame.detections)
+        found = kept.get(frame.camera)
+        if found is not None:
+            noise_px = jitter_px * rng.uniform(-1, 1, found.corners_px.shape)
+            found = dataclasses.replace(found, corners_px=found.corners_px + noise_px)
+        return dataclasses.replace(frame, detections=found)
+
+    return edit
+
+
+def speed(edit: Callable[[float], float]) -> EditOdometry:
+    """What the wheels say, edited; the steering goes on."""
+    return lambda reading: dataclasses.replace(reading, speed_mps=edit(reading.speed_mps))
+
+
+def constant() -> Callable[[float], float]:
+    """The first value for ever."""
+    first: list[float] = []
+
+    def edit(value: float) -> float:
+        first.append(value)
+        return first[0]
+
+    return edit
+
+
+def both(change: Change, other: Change) -> Change:
+    """Two changes one after the other."""
+    return lambda given: [done for one in change(given) for done in other(one)]
+
+
 def repeated() -> EditOdometry:
     """A driver that gives its old values again, under new stamps."""
     last: list[Odometry] = []

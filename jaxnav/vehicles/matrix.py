@@ -11,8 +11,9 @@ from jaxnav.detection.types import Detections
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.vehicles import injections as inject
-from jaxnav.vehicles.faults import BEGIN_S, END_S, Happens, Row
+from jaxnav.vehicles.faults import ALL_CAMERAS, BEGIN_S, Happens, Row, lasting
 from jaxnav.vehicles.lockstep import BEGIN_NS, Change, Rates
+from jaxnav.vehicles.matrix_standstill import rates, standstill
 from jaxnav.vehicles.world import World
 
 _LATEST = np.inf  # to the end of the drive
@@ -32,18 +33,16 @@ def matrix() -> list[Row]:
         *_calibration(),
         *_world(),
         *_loop(),
+        *standstill(),
+        *rates(),
     ]
-
-
-def _for(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
-    return lambda: inject.between(BEGIN_S, end_s, change())
 
 
 def _cameras() -> list[Row]:
     rows = [
         Row(
             f"camera {camera} out",
-            _for(partial(_frames_of, camera)),
+            lasting(partial(_frames_of, camera)),
             faults=Fault.CAMERA_STALE,
             at_most=_SLOW,
             error_m=0.10,
@@ -60,7 +59,7 @@ def _cameras() -> list[Row]:
             rows.append(
                 Row(
                     f"{name}, {duration_s:g} s",
-                    _for(partial(inject.frames, edit), BEGIN_S + duration_s),
+                    lasting(partial(inject.frames, edit), BEGIN_S + duration_s),
                     faults=stale,
                     at_least=costs,
                     at_most=max(costs, _SLOW if "all" in name else Health.DEAD_RECKONING),
@@ -85,41 +84,31 @@ def _cost(blind_s: float) -> Health:
 
 
 def _frames() -> list[Row]:
-    def frozen() -> Change:
-        kept: dict[int, Detections] = {}
-
-        def edit(frame: inject.Sighted) -> inject.Sighted:
-            if frame.detections is not None:
-                kept.setdefault(frame.camera, frame.detections)
-            return dataclasses.replace(frame, detections=kept[frame.camera])
-
-        return inject.frames(edit)
-
     return [
         Row(
             "None or wrong-size frames",
-            _for(lambda: inject.frames(inject.unusable)),
+            lasting(lambda: inject.frames(inject.unusable)),
             faults=Fault.FRAME_UNUSABLE,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "frozen images, new stamps",
-            _for(frozen),
+            lasting(lambda: inject.frames(inject.frozen(ALL_CAMERAS, 0.0))),
             faults=Fault.FRAME_FROZEN,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "NaN in corners",
-            _for(lambda: inject.frames(inject.corners(lambda c: c * np.nan))),
+            lasting(lambda: inject.frames(inject.corners(lambda c: c * np.nan))),
             faults=Fault.CORNERS_NOT_FINITE,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "inf in corners",
-            _for(lambda: inject.frames(inject.corners(lambda c: c + np.inf))),
+            lasting(lambda: inject.frames(inject.corners(lambda c: c + np.inf))),
             faults=Fault.CORNERS_NOT_FINITE,
             at_most=_SLOW,
             error_m=0.15,
@@ -145,32 +134,32 @@ def _markers() -> list[Row]:
     return [
         Row(
             "unknown id",
-            _for(lambda: inject.frames(inject.detections(renamed))),
+            lasting(lambda: inject.frames(inject.detections(renamed))),
             faults=Fault.UNKNOWN_MARKER,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "two markers of one id",
-            _for(lambda: inject.frames(inject.detections(doubled(60.0)))),
+            lasting(lambda: inject.frames(inject.detections(doubled(60.0)))),
             faults=Fault.DUPLICATE_MARKER,
             at_most=_SLOW,
             error_m=0.15,
         ),
         Row(
             "duplicate detection",
-            _for(lambda: inject.frames(inject.detections(doubled(0.0)))),
+            lasting(lambda: inject.frames(inject.detections(doubled(0.0)))),
         ),
         Row(
             "mirrored corners, 5 frames",
-            _for(lambda: inject.frames(inject.corners(mirrored)), BEGIN_S + 0.17),
+            lasting(lambda: inject.frames(inject.corners(mirrored)), BEGIN_S + 0.17),
             at_most=_SLOW,
             error_m=0.10,
             ends_s=BEGIN_S + 0.17,
         ),
         Row(
             "corners turned by 90 deg, 5 frames",
-            _for(
+            lasting(
                 lambda: inject.frames(inject.corners(lambda c: np.roll(c, 1, axis=1))),
                 BEGIN_S + 0.17,
             ),
@@ -201,13 +190,13 @@ def _stamps() -> list[Row]:
 
     refused: dict[str, Any] = {"faults": Fault.STAMP_INVALID, "at_most": _SLOW, "error_m": 0.15}
     return [
-        Row("stamps jump by +1 s", _for(shifted(1.0)), **refused),
-        Row("stamps jump by -1 s", _for(shifted(-1.0)), **refused),
-        Row("frames 50 ms late, each other", _for(lambda: inject.late(0.05, 2))),
-        Row("frames 500 ms late, each third", _for(lambda: inject.late(0.5, 3)), at_most=_SLOW),
-        Row("equal stamps", _for(constant(BEGIN_NS + 1)), **refused),
-        Row("zero stamps", _for(constant(0)), **refused),
-        Row("negative stamps", _for(constant(-5)), **refused),
+        Row("stamps jump by +1 s", lasting(shifted(1.0)), **refused),
+        Row("stamps jump by -1 s", lasting(shifted(-1.0)), **refused),
+        Row("frames 50 ms late, each other", lasting(lambda: inject.late(0.05, 2))),
+        Row("frames 500 ms late, each third", lasting(lambda: inject.late(0.5, 3)), at_most=_SLOW),
+        Row("equal stamps", lasting(constant(BEGIN_NS + 1)), **refused),
+        Row("zero stamps", lasting(constant(0)), **refused),
+        Row("negative stamps", lasting(constant(-5)), **refused),
         Row("clocks that drift by 100 ppm", lambda: both, begins_s=2.0, ends_s=_LATEST),
         Row(
             "cameras skewed by 30 ms",
@@ -243,25 +232,25 @@ def _odometry() -> list[Row]:
         return dataclasses.replace(reading, valid=False)
 
     return [
-        Row("odometry x10, each fifth", _for(spikes), rejects=Reject.ODOMETRY),
+        Row("odometry x10, each fifth", lasting(spikes), rejects=Reject.ODOMETRY),
         Row(
             "odometry of the other sign",
-            _for(scaled(-1.0)),
+            lasting(scaled(-1.0)),
             rejects=Reject.ODOMETRY,
             at_most=_SLOW,
             error_m=0.08,
         ),
-        Row("odometry 30 % off", _for(scaled(1.3)), at_most=_SLOW, error_m=0.08),
+        Row("odometry 30 % off", lasting(scaled(1.3)), at_most=_SLOW, error_m=0.08),
         Row(
             "odometry stuck",
-            _for(lambda: inject.odometry(inject.repeated())),
+            lasting(lambda: inject.odometry(inject.repeated())),
             faults=Fault.ODOMETRY_STUCK,
             at_most=_SLOW,
             error_m=0.08,
         ),
         Row(
             "odometry invalid",
-            _for(lambda: inject.odometry(invalid)),
+            lasting(lambda: inject.odometry(invalid)),
             faults=Fault.ODOMETRY_INVALID,
             at_least=_SLOW,
             at_most=_SLOW,
@@ -269,7 +258,7 @@ def _odometry() -> list[Row]:
         ),
         Row(
             "odometry out",
-            _for(lambda: inject.odometry(inject.gone)),
+            lasting(lambda: inject.odometry(inject.gone)),
             faults=Fault.ODOMETRY_STALE,
             at_least=_SLOW,
             at_most=_SLOW,
@@ -277,20 +266,20 @@ def _odometry() -> list[Row]:
         ),
         Row(
             "odometry wraps around",
-            _for(lambda: inject.odometry(wrapped), BEGIN_S + 0.03),
+            lasting(lambda: inject.odometry(wrapped), BEGIN_S + 0.03),
             rejects=Reject.ODOMETRY,
             ends_s=BEGIN_S + 0.03,
         ),
         Row(
             "NaN and inf in odometry",
-            _for(lambda: inject.odometry(inject.with_values(inject.NOT_FINITE))),
+            lasting(lambda: inject.odometry(inject.with_values(inject.NOT_FINITE))),
             faults=Fault.ODOMETRY_INVALID,
             at_most=_SLOW,
             error_m=0.08,
         ),
         Row(
             "blind and without odometry",
-            _for(lambda: lambda given: [dataclasses.replace(given, odometry=None, frames=())]),
+            lasting(lambda: lambda given: [dataclasses.replace(given, odometry=None, frames=())]),
             faults=Fault.CAMERAS_STALE,
             at_least=Health.STOP,
             at_most=Health.STOP,

@@ -71,6 +71,7 @@ class World:
         # What was commanded, and when it acts: the last one that is due is obeyed.
         self._commands: deque[tuple[int, float, float]] = deque([(begin_ns, 0.0, 0.0)])
         self._written_ns = begin_ns
+        self._held = False
 
     def write(self, steering_rad: float, throttle: float, now_ns: int) -> None:
         """A command that acts soon."""
@@ -84,6 +85,11 @@ class World:
         """Somebody takes the car elsewhere: m, m, rad in the world."""
         with self._lock:
             self._row = self._row + np.array([*by, 0.0, 0.0], self._dtype)
+
+    def hold(self, held: bool) -> None:
+        """Somebody holds the car fast, wheels and all, or lets it go."""
+        with self._lock:
+            self._held = held
 
     def move_markers(self, by_m: tuple[float, float, float]) -> None:
         """Somebody takes the markers elsewhere, by so much in the world."""
@@ -148,7 +154,11 @@ class World:
             steering_rad, throttle = self._obeyed(self._time_ns)
             command = np.array([steering_rad, throttle], self._dtype)
             dt_s = np.asarray(step_ns / 1e9, self._dtype)
-            self._row = np.asarray(_moved(self.vehicle, self._row, command, dt_s))
+            moved = np.asarray(_moved(self.vehicle, self._row, command, dt_s))
+            # Held, it stands where it stands; its wheels are steered nevertheless.
+            self._row = (
+                np.array([*self._row[:3], 0, moved[4]], self._dtype) if self._held else moved
+            )
             self._time_ns += step_ns
             self._track.append((self._time_ns, self._row))
 
