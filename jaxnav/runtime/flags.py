@@ -28,6 +28,10 @@ class Fault(enum.IntFlag):
     DEADLINE_MISSED = enum.auto()  # a cycle took longer than its period
     RECORDER_BEHIND = enum.auto()  # messages were left out
     RECORDER_FAILED = enum.auto()  # disk full, or the file is gone
+    RELOCATED = enum.auto()  # the corners put it where no slip of its wheels can have brought it
+    WAYS_DISPUTED = enum.auto()  # corners and odometer tell of different ways
+    ODOMETRY_DOUBTFUL = enum.auto()  # no marker, and the odometer contradicts the throttle
+    MARKER_OUTVOTED = enum.auto()  # its corners contradict what the others agree on
 
 
 class Reject(enum.IntFlag):
