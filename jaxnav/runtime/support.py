@@ -18,9 +18,11 @@ from jaxnav.runtime.propulsion import Propulsion
 from jaxnav.runtime.ways import Fix, Ways
 
 CONFIRMED = 3  # frames in a row, with the first: one can be anything, two a repetition of it
-# Driven slowly after a relocation: five seconds at half of a walking robot's speed, for a person to
-# look at the car (R4 gives no more to a car that sees nothing).
+# Driven slowly after a relocation, for a person to look at the car: some five seconds at the half of
+# what it drives in a room, and R4 gives no more to a car that sees nothing.
 SLOW_M = 1.0
+# Every further restart on that way asks for twice as many frames, up to three seconds' of a camera.
+_MOST_CONFIRMED = 96
 
 
 class Doubt(NamedTuple):
@@ -47,14 +49,14 @@ class Support:
         self._relocate = relocate
         self._ways = Ways(float(vehicle.wheelbase_m))
         self._propulsion = Propulsion.of(vehicle)
-        self._confirmations = 0
+        self._confirmations, self._needed = 0, CONFIRMED
         self._restarted = False
         self._slow_until_m = 0.0
 
     @property
     def confirmed(self) -> bool:
         """Whether so many frames in a row have fitted the pose."""
-        return self._confirmations >= CONFIRMED
+        return self._confirmations >= self._needed
 
     @property
     def relocated(self) -> bool:
@@ -86,11 +88,13 @@ class Support:
 
     def restarted(self) -> None:
         """All that was believed was given up; what was confirmed tells where it can be now."""
+        self._needed = min(2 * self._needed, _MOST_CONFIRMED) if self.relocated else CONFIRMED
         self._confirmations, self._restarted = 0, True
 
     def begin_anew(self) -> None:
         """The same, and anything may have happened meanwhile."""
-        self._confirmations, self._restarted, self.refused = 0, False, False
+        self._confirmations, self._needed = 0, CONFIRMED
+        self._restarted = self.refused = False
         self._ways.forget()
 
     def corners(
@@ -107,6 +111,7 @@ class Support:
             fix: that pose; None: several are possible.
             possible: these.
         """
+        self._ways.glimpse(now_ns)
         if not believed:
             if not self.confirmed:
                 self._confirmations = 0
@@ -125,8 +130,6 @@ class Support:
                 return False
             self.relocations += 1
             self._slow_until_m = self._ways.way_m + SLOW_M
-            self._ways.forget()
-        elif self._restarted:
             self._ways.forget()
         self._restarted = self.refused = False
         self._propulsion.confirmed()

@@ -1,8 +1,9 @@
 """The way that corners tell of, held against the way that the wheels have gone.
 
-    ways.drove(speed_mps, steering_rad, heading_rad, gap_s)       # with every odometry
-    ways.look(now_ns, fix)                                      # with every pose to be trusted
-    ways.out_of_reach(fix)                                        # after a restart
+    ways.drove(speed_mps, steering_rad, heading_rad, gap_s)    # with every odometry
+    ways.glimpse(now_ns)                                       # with every frame that shows markers
+    ways.look(now_ns, fix)                                     # with every pose to be trusted
+    ways.out_of_reach(fix)                                     # before that
 
 A marker that is carried along, or a copy of it elsewhere, fits its own corners as well as the true
 one does. What it can't imitate is the odometer: the car has not gone where the corners say. Two
@@ -29,7 +30,8 @@ DRIFT_SHARE = 0.1
 REACH_RAD = math.radians(20.0)  # from there on `MultiHypothesis` calls it another branch
 _WINDOW_NS = 8_000_000_000  # 0.1 m in it is 1.25 cm/s, of a car that stands
 _EVERY_NS = 200_000_000
-# They agree again when, over a second, they part by no more (see `Odometer._agrees`).
+# They agree again when, over a second, they part by no more than this (see `Odometer._agrees`) and
+# half of DRIFT_SHARE.
 _AGREES_NS = 1_000_000_000
 _AGREES_M = 0.02
 _GAP_NS = 500_000_000  # unseen for longer, dead reckoning has errors of its own
@@ -71,6 +73,7 @@ class Ways:
     _turned_rad: float = 0.0  # whichever way
     _x_m: float = 0.0  # by odometry, along the heading that was believed
     _y_m: float = 0.0
+    _seen_ns: int = 0
     _last: _Anchor | None = None
     _window: deque[_Anchor] = field(default_factory=deque)
 
@@ -92,15 +95,20 @@ class Ways:
         self.way_m += abs(step_m)
         self._turned_rad += abs(step_m * math.sin(beta_rad)) * 2 / self.wheelbase_m
 
+    def glimpse(self, now_ns: int) -> None:
+        """Corners were seen, believed or not."""
+        if not 0 <= now_ns - self._seen_ns <= _GAP_NS:
+            self._window.clear()
+        self._seen_ns = now_ns
+
     def look(self, now_ns: int, fix: Fix) -> None:
         """Compare where the corners say that the car is with the way that it went."""
-        last = self._last
         here = _Anchor(
             now_ns, fix, fix.x_m - self._x_m, fix.y_m - self._y_m, self.way_m, self._turned_rad
         )
         self._last = here
         window = self._window
-        if last is None or not 0 <= now_ns - last.now_ns <= _GAP_NS:
+        if not window:
             self._agree(here)
             return
         if now_ns - window[-1].now_ns < _EVERY_NS:
@@ -108,14 +116,12 @@ class Ways:
         window.append(here)
         while window[0].now_ns < now_ns - _WINDOW_NS:
             window.popleft()
-        if any(_part_m(here, then) > _bound_m(here, then, DRIFT_M) for then in window):
+        if any(_parts(here, then) for then in window):
             self.disputed = True
         if self.disputed:
             recent = [then for then in window if then.now_ns >= now_ns - _AGREES_NS]
             lasting = now_ns - recent[0].now_ns >= _AGREES_NS - _EVERY_NS
-            if lasting and all(
-                _part_m(here, then) <= _bound_m(here, then, _AGREES_M) for then in recent
-            ):
+            if lasting and all(_agrees(here, then) for then in recent):
                 self._agree(here)
 
     def out_of_reach(self, fix: Fix, slack_m: float = 0.0) -> bool:
@@ -163,5 +169,10 @@ def _part_m(one: _Anchor, other: _Anchor) -> float:
     return math.hypot(one.x_m - other.x_m, one.y_m - other.y_m)
 
 
-def _bound_m(here: _Anchor, then: _Anchor, beside_m: float) -> float:
-    return beside_m + DRIFT_SHARE * (here.way_m - then.way_m) + _SIGMAS * then.fix.sigma_m
+def _parts(here: _Anchor, then: _Anchor) -> bool:
+    bound_m = DRIFT_M + DRIFT_SHARE * (here.way_m - then.way_m) + _SIGMAS * then.fix.sigma_m
+    return _part_m(here, then) > bound_m
+
+
+def _agrees(here: _Anchor, then: _Anchor) -> bool:
+    return _part_m(here, then) <= _AGREES_M + DRIFT_SHARE / 2 * (here.way_m - then.way_m)
