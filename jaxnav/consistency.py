@@ -17,17 +17,18 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.candidates import Candidates, own_errors_px
 from jaxnav.observation import Sightings, Snapshot
+from jaxnav.trees import where
 
 # Corners are those of a square in space where they miss the best projection of one by less than so
 # many of their sigmas, or than such a share of the marker's side: 2 px of blur on a marker of 17 px
 # is 12 %. Of quads drawn at random over an image 2 % come as near.
 _MISFIT_SIGMAS = 10.0
 _MISFIT_SHARE = 0.12
-# A joint misfit beyond three sigmas of its chi-square, times this, is a contradiction: cameras off by
-# 1 deg or 1 cm, or a map off by a centimetre, stay below in a room.
+# A joint misfit beyond three sigmas of its chi-square, times this, is a contradiction: corners off by
+# four times their sigma, more than cameras off by 1 deg or a map off by 1 cm come to in a room.
 _CONTRADICTION = 16.0
 _GAIN = 4.0  # by which it must fall without one marker, and without no other as far
-_LEAST_MARKERS = 3  # two can't outvote each other
+LEAST_MARKERS = 3  # two can't outvote each other
 
 
 class Consistent(NamedTuple):
@@ -48,7 +49,7 @@ def consistent(snapshot: Snapshot, find: Callable[[Snapshot], Candidates]) -> Co
     snapshot = _among(snapshot, _can_be_markers(snapshot))
     candidates = find(snapshot)
     nobody = jnp.zeros(len(snapshot.markers.ids), bool)
-    if nobody.shape[0] < _LEAST_MARKERS or snapshot.seen.visible.shape[0] < _LEAST_MARKERS:
+    if nobody.shape[0] < LEAST_MARKERS or snapshot.seen.visible.shape[0] < LEAST_MARKERS:
         return Consistent(snapshot, candidates, nobody)
     seen = snapshot.seen
     in_view = jnp.sum(_in_view(seen, nobody.shape[0]))
@@ -70,11 +71,11 @@ def consistent(snapshot: Snapshot, find: Callable[[Snapshot], Candidates]) -> Co
             excess[best] * _GAIN <= jnp.minimum(second, all_of_them)
         )
         kept = is_other | ~clear
-        chosen = jax.tree.map(lambda leaf, own: jnp.where(clear, leaf[best], own), found, candidates)
-        return kept, chosen
+        rest = jax.tree.map(lambda leaf: leaf[best], found)
+        return kept, where(clear, rest, candidates)
 
     kept, candidates = jax.lax.cond(
-        (in_view >= _LEAST_MARKERS) & (all_of_them > _CONTRADICTION),
+        (in_view >= LEAST_MARKERS) & (all_of_them > _CONTRADICTION),
         outvote,
         lambda: (jnp.ones_like(seen.visible), candidates),
     )

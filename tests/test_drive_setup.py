@@ -46,7 +46,7 @@ def bits(setup: DriveSetup) -> list:
     names = ("route", "selector", "corner_sigma_px", "timeouts", "parameters")
     plain = [getattr(setup, name) for name in names]
     told = [(leaf.dtype.name, leaf.shape, np.asarray(leaf).tobytes()) for leaf in leaves]
-    return [str(structure), told, plain, setup.float64]
+    return [str(structure), told, plain, setup.float64, setup.relocate]
 
 
 small = st.floats(-10, 10)
@@ -98,8 +98,9 @@ def test_a_setup_comes_back_bit_for_bit(double):
         vehicles,
         st.tuples(routes, st.sampled_from(PILOT_SELECTORS), st.none() | positive, timeouts),
         parameters,
+        st.booleans(),
     )
-    def check(rig, markers, vehicle, others, parameters) -> None:
+    def check(rig, markers, vehicle, others, parameters, relocate) -> None:
         lenses, placed, images = zip(*rig, strict=True)
         setup = DriveSetup(
             CameraRig.create(
@@ -116,6 +117,7 @@ def test_a_setup_comes_back_bit_for_bit(double):
             *others,
             double,
             parameters,
+            relocate,
         )
         back = DriveSetup.of_header(decode(encode(setup.header())), WHERE)
         assert bits(back) == bits(setup)

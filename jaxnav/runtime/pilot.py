@@ -10,7 +10,7 @@ R11). Every event is one call of one compiled program.
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from jaxnav.runtime.history import Told
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.runtime.limits import Limits
 from jaxnav.runtime.odometer import Odometer
+from jaxnav.runtime.outvoted import Outvoted
 from jaxnav.runtime.stamps import Stamps
 from jaxnav.runtime.support import Support
 from jaxnav.runtime.ways import Fix
@@ -66,6 +67,7 @@ class Outcome:
     stamp_ns: int
     restarts: int  # so far, and why the last one
     restart_reason: str
+    outvoted: tuple[int, ...] = ()  # ids of markers that were left out, since others contradict
 
 
 class _Known(NamedTuple):
@@ -132,6 +134,8 @@ class Pilot:
         self._odometry_stamps = Stamps()
         self._odometer = Odometer.of(navigator.controller.vehicle)
         self._support = Support(navigator.controller.vehicle, relocate)
+        self._outvoted = Outvoted(navigator.markers.ids)
+        self._hidden: tuple[int, ...] = ()  # of the last frames
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
         self._distance_m = 0.0
@@ -154,6 +158,9 @@ class Pilot:
         frames = [self._corrections.frame(frame) for frame in given.frames]
         told, stamp_ns, seen_faults = self._frames.told(frames, now_ns)
         faults |= seen_faults
+        if told is not None:
+            told, self._hidden = self._outvoted.without(told)
+            faults |= Fault.MARKER_OUTVOTED if self._hidden else _NO_FAULT
         if told is not None:
             outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
         if given.odometry is not None:
@@ -216,7 +223,10 @@ class Pilot:
             faults |= Fault.RESTARTED
             self._left = self._known
             self._support.restarted()
+        outvoted: tuple[int, ...] = ()
         if told is not None and told.corners_px is not None and not fused.refused:
+            outvoted = self._outvoted.count(told, np.asarray(fused.report.outvoted))
+            faults |= Fault.MARKER_OUTVOTED if outvoted else _NO_FAULT
             rejects |= self._judge(known, fused.moment.belief, stamp_ns, now_ns)
         faults |= self._contradictions()
         report, known = self._honest(fused.report, known)
@@ -238,6 +248,7 @@ class Pilot:
             stamp_ns,
             self._restarts,
             self._restart_reason,
+            outvoted or (self._hidden if Fault.MARKER_OUTVOTED in faults else ()),
         )
 
     def _arrived_elsewhere(self, known: _Known) -> None:
@@ -256,16 +267,25 @@ class Pilot:
         self._monitor.corners(believed)
         fix = _fix(known.pose, known.covariance) if known.decided else None
         alive = zip(belief.mean, belief.covariance, belief.initialised, strict=True)
-        if self._support.corners(
+        support = self._support
+        before = support.relocations, support.refused
+        if support.corners(
             believed,
             now_ns,
             fix,
             lambda: [_fix(mean, covariance) for mean, covariance, lives in alive if lives],
         ):
             self._fix_ns, self._distance_m = max(stamp_ns, self._fix_ns or 0), 0.0
+        if support.relocations > before[0] or support.refused > before[1]:
+            self._explain("refused" if support.refused else "relocated")
         if believed:
             return Reject.INNOVATION_LARGE if nis > gate / 2 else _NO_REJECT
         return Reject.INNOVATION
+
+    def _explain(self, what: str) -> None:
+        """Add to the reason of the last restart."""
+        parts = [self._restart_reason, f"{what}: no slip explains the way there"]
+        self._restart_reason = "; ".join(part for part in parts if part)
 
     def _contradictions(self) -> Fault:
         """What speaks against where the estimate says that the vehicle is."""
@@ -285,8 +305,9 @@ class Pilot:
             return report, known
         covariance = known.covariance.copy()
         covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
-        output = replace(report.output, decided=np.asarray(False), covariance=covariance)
-        return replace(report, output=output), known._replace(covariance=covariance)
+        told: dict[str, Any] = {"decided": np.asarray(False), "covariance": covariance}
+        honest = replace(report, output=replace(report.output, **told))
+        return honest, known._replace(covariance=covariance)
 
     def _limited(
         self, known: _Known, health: Health, now_ns: int, elapsed_ns: int

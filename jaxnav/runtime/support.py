@@ -18,8 +18,8 @@ from jaxnav.runtime.propulsion import Propulsion
 from jaxnav.runtime.ways import Fix, Ways
 
 CONFIRMED = 3  # frames in a row, with the first: one can be anything, two a repetition of it
-# Driven slowly after a relocation, for a person to look at the car: some five seconds at the half of
-# what it drives in a room, and R4 gives no more to a car that sees nothing.
+# Driven slowly after a relocation, for a person to look at the car: about five seconds at half of
+# its speed in a room, and R4 gives no more to a car that sees nothing.
 SLOW_M = 1.0
 # Every further restart on that way asks for twice as many frames, up to three seconds' of a camera.
 _MOST_CONFIRMED = 96

@@ -22,8 +22,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-# What corners get wrong themselves while the car goes round a marker, with cameras 1 deg or 2 % off:
-# half of it is in the fault matrix. It is also how near R3 wants a kidnapped car to come.
+# What corners get wrong themselves while the car goes round a marker, with cameras off by 1 deg or
+# 2 %. It is also how near R3 wants a kidnapped car to come.
 DRIFT_M = 0.1
 # What wheels and their calibration get wrong, as where `Odometer` believes a sensor again.
 DRIFT_SHARE = 0.1
@@ -138,15 +138,12 @@ class Ways:
         way_m, turned_rad = self.way_m - self._last.way_m, self._turned_rad - self._last.turned_rad
         off_m = math.hypot(fix.x_m - before.x_m, fix.y_m - before.y_m)
         off_rad = abs(math.remainder(fix.psi_rad - before.psi_rad, math.tau))
-        # Wheels that slide turn it as well: no more than their way at full lock of any car would.
+        # Sliding about one axle, a car turns by the way over the wheelbase.
         sliding_rad = (way_m + slack_m) / self.wheelbase_m
-        return (
-            off_m > DRIFT_M + way_m + slack_m + _SIGMAS * (before.sigma_m + fix.sigma_m)
-            or off_rad
-            > REACH_RAD
-            + turned_rad
-            + sliding_rad
-            + _SIGMAS * (before.sigma_rad + fix.sigma_rad)
+        return off_m > DRIFT_M + way_m + slack_m + _SIGMAS * (
+            before.sigma_m + fix.sigma_m
+        ) or off_rad > REACH_RAD + turned_rad + sliding_rad + _SIGMAS * (
+            before.sigma_rad + fix.sigma_rad
         )
 
     @property
