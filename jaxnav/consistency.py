@@ -24,8 +24,8 @@ from jaxnav.trees import where
 # is 12 %. Of quads drawn at random over an image 2 % come as near.
 _MISFIT_SIGMAS = 10.0
 _MISFIT_SHARE = 0.12
-# A joint misfit beyond three sigmas of its chi-square, times this, is a contradiction: corners off by
-# four times their sigma, more than cameras off by 1 deg or a map off by 1 cm come to in a room.
+# A joint misfit beyond three sigmas of its chi-square, times this, is a contradiction: corners off
+# by four times their sigma, more than cameras off by 1 deg or a map off by 1 cm come to in a room.
 _CONTRADICTION = 16.0
 _GAIN = 4.0  # by which it must fall without one marker, and without no other as far
 LEAST_MARKERS = 3  # two can't outvote each other

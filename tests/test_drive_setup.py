@@ -257,3 +257,13 @@ def test_any_change_of_a_byte_gives_a_setup_or_bad_input(where, new, out):
         assert isinstance(DriveSetup.of_header(header, WHERE), DriveSetup)
     except BadInput as error:
         assert str(error).startswith("drive.mcap: header.")  # noqa: PT017
+
+
+def test_only_a_drive_that_must_not_relocate_says_so():
+    """So that older programs read what they can replay, and older drives are read."""
+    assert "relocate" not in qcar_setup().header()
+    header = qcar_setup(relocate=False).header()
+    assert header["relocate"] is False
+    assert not DriveSetup.of_header(header, WHERE).relocate
+    with pytest.raises(BadInput, match=r"drive.mcap: header.relocate"):
+        DriveSetup.of_header(header | {"relocate": "no"}, WHERE)

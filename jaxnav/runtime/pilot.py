@@ -9,9 +9,10 @@ R11). Every event is one call of one compiled program.
 """
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 
 from jaxnav.motion import Belief
@@ -305,8 +306,11 @@ class Pilot:
             return report, known
         covariance = known.covariance.copy()
         covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
-        told: dict[str, Any] = {"decided": np.asarray(False), "covariance": covariance}
-        honest = replace(report, output=replace(report.output, **told))
+        honest: Report = eqx.tree_at(
+            lambda r: (r.output.decided, r.output.covariance),
+            report,
+            (np.asarray(False), covariance),
+        )
         return honest, known._replace(covariance=covariance)
 
     def _limited(
