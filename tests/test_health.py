@@ -140,7 +140,8 @@ def test_it_never_gets_better_in_a_hurry_nor_worse_with_delay(looks):
 def test_whoever_is_lost_or_blind_stands_still(sensed):
     health, _ = Monitor().look(sensed)
     blind = min(sensed.odometry_age_s, sensed.fix_age_s) > 1 or sensed.fix_age_s > 5
-    if not sensed.located or blind or sensed.refused or sensed.faults & (Fault.NOT_FINITE | Fault.VEHICLE_FAILED):
+    failed = sensed.faults & (Fault.NOT_FINITE | Fault.VEHICLE_FAILED)
+    if not sensed.located or blind or sensed.refused or failed:
         assert SPEED_FACTOR[health] == 0
 
 
