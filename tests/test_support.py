@@ -77,10 +77,10 @@ def test_every_further_relocation_asks_for_twice_as_many_frames():
     seeing = Seeing()
     seeing.frames(10)
     needed, at = [], [AWAY, HERE]
-    for lap in range(8):
+    for lap in range(9):
         seeing.support.restarted()
         needed.append(seeing.frames(200, at[lap % 2]).index(True) + 1)
-    assert needed == [3, 6, 12, 24, 48, 96, 96, 96]
+    assert needed == [2, 4, 8, 16, 32, 64, 96, 96, 96]
     seeing.drives(1.1 * SLOW_M)
     seeing.support.restarted()
     assert seeing.frames(10).index(True) + 1 == CONFIRMED

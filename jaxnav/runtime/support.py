@@ -17,7 +17,7 @@ from jaxnav.bicycle import Vehicle
 from jaxnav.runtime.propulsion import Propulsion
 from jaxnav.runtime.ways import Fix, Ways
 
-CONFIRMED = 3  # frames in a row, with the first: one can be anything, two a repetition of it
+CONFIRMED = 2  # frames in a row, with the first: R2's never on a single one
 # Driven slowly after a relocation, for a person to look at the car: about five seconds at half of
 # its speed in a room, and R4 gives no more to a car that sees nothing.
 SLOW_M = 1.0
