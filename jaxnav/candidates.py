@@ -12,7 +12,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.camera import Camera
-from jaxnav.geometry import on_ground, rotation_matrix, safe_norm, transform_points
+from jaxnav.geometry import on_ground, rotation_matrix, safe_norm, safe_sqrt, transform_points
 from jaxnav.ippe import ippe_from_rays
 from jaxnav.markers import MarkerMap
 from jaxnav.observation import Sightings, Snapshot, cameras_of
@@ -115,6 +115,33 @@ def find_candidates(
         converged=refined.converged,
         steps=refined.steps,
     )
+
+
+def own_errors_px(snapshot: Snapshot) -> Float[Array, " D"]:
+    """How far the corners of each sighting are from those of the better of its own two poses, RMS.
+
+    Large where they are not the image of a square at all.
+    """
+    rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
+    Ts_vehicle_world, _ = _both_poses(rig, markers, seen)
+
+    def one(
+        camera: Camera, T_camera_vehicle: jaxlie.SE3, Ts: jaxlie.SE3, corners: Array, px: Array
+    ) -> Array:
+        def error(T_vehicle_world: jaxlie.SE3) -> Array:
+            corners_camera = transform_points(T_camera_vehicle @ T_vehicle_world, corners)
+            return jnp.mean(jnp.sum((camera.project(corners_camera) - px) ** 2, axis=1))
+
+        return jnp.min(jax.vmap(error)(Ts))
+
+    squared = jax.vmap(one)(
+        cameras_of(rig, seen),
+        jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index]),
+        jaxlie.SE3(Ts_vehicle_world.wxyz_xyz.reshape(-1, 2, 7)),
+        markers.corners_world_m[seen.marker_index],
+        seen.corners_px,
+    )
+    return safe_sqrt(squared)
 
 
 def _both_poses(

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.candidates import Candidates
+from jaxnav.consistency import consistent
 from jaxnav.control import ControlState
 from jaxnav.motion import Belief
 from jaxnav.navigator import Estimate, Navigator, Output
@@ -85,6 +86,7 @@ class Report(eqx.Module):
 
     output: Output
     mean: Float[Array, " n"]  # of the motion model's state, at present
+    outvoted: Bool[Array, " M"]  # markers that the others in view of the new event contradict
 
 
 class _Found(eqx.Module):
@@ -94,6 +96,7 @@ class _Found(eqx.Module):
     costs: Float[Array, " N"]
     selected: Int[Array, ""]
     nis: Float[Array, ""]
+    outvoted: Bool[Array, " M"]
 
 
 def begin(navigator: Navigator) -> Moment:
@@ -165,16 +168,22 @@ def _after(
         blind: no event of the call shows corners.
     """
 
-    def looked() -> tuple[Moment, _Found]:
-        snapshot = navigator.snapshot(obs)
-        candidates = navigator.find_candidates(snapshot)
-        estimate = navigator.estimate(before.belief, snapshot, candidates)
+    snapshot = navigator.snapshot(obs)
+
+    def looked() -> tuple[Array, Candidates, Array]:
+        found = consistent(snapshot, navigator.find_candidates)
+        return found.snapshot.seen.visible, found.candidates, found.outvoted
+
+    def estimated() -> tuple[Moment, _Found]:
+        seen = eqx.tree_at(lambda s: s.seen.visible, snapshot, visible)
+        estimate = navigator.estimate(before.belief, seen, candidates)
+        found = _Found(candidates, estimate.costs, estimate.selected, estimate.nis, outvoted)
         return Moment(
             estimate.belief,
             estimate.decided,
             estimate.flip_probability.astype(before.flip_probability.dtype),
             before.restarts + estimate.restarted,
-        ), _Found(candidates, estimate.costs, estimate.selected, estimate.nis)
+        ), found
 
     def coasted() -> tuple[Moment, _Found]:
         belief = navigator.coast(before.belief, obs)
@@ -189,7 +198,12 @@ def _after(
 
     if blind:
         return coasted()
-    after: tuple[Moment, _Found] = jax.lax.cond(jnp.any(obs.visible), looked, coasted)
+    visible, candidates, outvoted = jax.lax.cond(
+        jnp.any(obs.visible),
+        looked,
+        lambda: (snapshot.seen.visible, nothing.candidates, nothing.outvoted),
+    )
+    after: tuple[Moment, _Found] = jax.lax.cond(jnp.any(visible), estimated, coasted)
     return after
 
 
@@ -197,7 +211,9 @@ def _nothing(navigator: Navigator, moment: Moment) -> _Found:
     """What an event without corners tells."""
     candidates = navigator.no_candidates()
     costs = jnp.full_like(candidates.cost, jnp.inf)
-    return _Found(candidates, costs, jnp.asarray(-1), jnp.zeros((), moment.belief.mean.dtype))
+    nobody = jnp.zeros(len(navigator.markers.ids), bool)
+    nis = jnp.zeros((), moment.belief.mean.dtype)
+    return _Found(candidates, costs, jnp.asarray(-1), nis, nobody)
 
 
 def _reported(
@@ -230,7 +246,7 @@ def _reported(
         log_likelihood=jnp.zeros((), belief.mean.dtype),
     )
     control, output = navigator.act(control, obs, found.candidates, present)
-    return control, Report(output, best.mean)
+    return control, Report(output, best.mean, found.outvoted)
 
 
 def _lanes(navigator: Navigator) -> tuple[int, int]:

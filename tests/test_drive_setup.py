@@ -46,7 +46,7 @@ def bits(setup: DriveSetup) -> list:
     names = ("route", "selector", "corner_sigma_px", "timeouts", "parameters")
     plain = [getattr(setup, name) for name in names]
     told = [(leaf.dtype.name, leaf.shape, np.asarray(leaf).tobytes()) for leaf in leaves]
-    return [str(structure), told, plain, setup.float64]
+    return [str(structure), told, plain, setup.float64, setup.relocate]
 
 
 small = st.floats(-10, 10)
@@ -98,8 +98,9 @@ def test_a_setup_comes_back_bit_for_bit(double):
         vehicles,
         st.tuples(routes, st.sampled_from(PILOT_SELECTORS), st.none() | positive, timeouts),
         parameters,
+        st.booleans(),
     )
-    def check(rig, markers, vehicle, others, parameters) -> None:
+    def check(rig, markers, vehicle, others, parameters, relocate) -> None:
         lenses, placed, images = zip(*rig, strict=True)
         setup = DriveSetup(
             CameraRig.create(
@@ -116,6 +117,7 @@ def test_a_setup_comes_back_bit_for_bit(double):
             *others,
             double,
             parameters,
+            relocate,
         )
         back = DriveSetup.of_header(decode(encode(setup.header())), WHERE)
         assert bits(back) == bits(setup)
@@ -255,3 +257,13 @@ def test_any_change_of_a_byte_gives_a_setup_or_bad_input(where, new, out):
         assert isinstance(DriveSetup.of_header(header, WHERE), DriveSetup)
     except BadInput as error:
         assert str(error).startswith("drive.mcap: header.")  # noqa: PT017
+
+
+def test_only_a_drive_that_must_not_relocate_says_so():
+    """So that older programs read what they can replay, and older drives are read."""
+    assert "relocate" not in qcar_setup().header()
+    header = qcar_setup(relocate=False).header()
+    assert header["relocate"] is False
+    assert not DriveSetup.of_header(header, WHERE).relocate
+    with pytest.raises(BadInput, match=r"drive.mcap: header.relocate"):
+        DriveSetup.of_header(header | {"relocate": "no"}, WHERE)

@@ -73,6 +73,19 @@ def seen(**changes) -> tuple[Health, Fault]:
             Fault.RESTARTED_OFTEN,
         ),
         ({"cameras_age_s": ()}, Health.OK, Fault(0)),
+        ({"confirmed": False}, Health.INIT, Fault(0)),
+        ({"confirmed": False, "decided": False}, Health.ALIGNED, Fault(0)),
+        ({"refused": True}, Health.STOP, Fault(0)),
+        ({"refused": True, "confirmed": False}, Health.STOP, Fault(0)),
+        ({"faults": Fault.RELOCATED}, Health.DEGRADED, Fault.RELOCATED),
+        ({"faults": Fault.WAYS_DISPUTED}, Health.DEGRADED, Fault.WAYS_DISPUTED),
+        ({"faults": Fault.MARKER_OUTVOTED}, Health.OK, Fault.MARKER_OUTVOTED),
+        ({"faults": Fault.ODOMETRY_DOUBTFUL}, Health.DEGRADED, Fault.ODOMETRY_DOUBTFUL),
+        (
+            {"faults": Fault.ODOMETRY_DOUBTFUL, "fix_age_s": 1.01},
+            Health.STOP,
+            Fault.ODOMETRY_DOUBTFUL | Fault.NO_MARKER,
+        ),
     ],
 )
 def test_what_is_missing_costs(changes, health, faults):
@@ -116,6 +129,8 @@ senses = st.builds(
     position_sigma_m=st.floats(),
     distance_m=ages,
     faults=st.sampled_from([Fault(0), *Fault]),
+    confirmed=st.booleans(),
+    refused=st.booleans(),
 )
 
 
@@ -140,7 +155,8 @@ def test_it_never_gets_better_in_a_hurry_nor_worse_with_delay(looks):
 def test_whoever_is_lost_or_blind_stands_still(sensed):
     health, _ = Monitor().look(sensed)
     blind = min(sensed.odometry_age_s, sensed.fix_age_s) > 1 or sensed.fix_age_s > 5
-    if not sensed.located or blind or sensed.faults & (Fault.NOT_FINITE | Fault.VEHICLE_FAILED):
+    failed = sensed.faults & (Fault.NOT_FINITE | Fault.VEHICLE_FAILED)
+    if not sensed.located or blind or sensed.refused or failed:
         assert SPEED_FACTOR[health] == 0
 
 

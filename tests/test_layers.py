@@ -28,6 +28,7 @@ LAYERS = {
         "ambiguity",
         "bicycle_kalman",
         "candidates",
+        "consistency",
         "constant_velocity",
         "control",
         "evaluation",

@@ -20,6 +20,7 @@ from jaxnav.runtime.history import Told
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.runtime.messages import digest
 from jaxnav.runtime.pilot import Input, Outcome, Pilot
+from jaxnav.vehicles import injections as inject
 from jaxnav.vehicles.lockstep import BEGIN_NS, Rates, Step
 from tests import worlds
 from tests.helpers.simulated import make_setup, simulated
@@ -395,3 +396,28 @@ def test_cameras_that_look_in_turn_are_fused_each_at_its_time(setup):
     assert {len(step.input.frames) for step in steps} == {0, 1}
     assert steps[-1].outcome.health == Health.OK
     assert np.hypot(*(steps[-1].outcome.report.output.pose - steps[-1].truth[:3])[:2]) < 0.02
+
+
+def test_what_nothing_confirms_is_not_decided_and_its_sigma_says_so(setup):
+    """No marker, the throttle in, and an odometer that stands: blocked wheels, or a dead sensor."""
+
+    def blind(given: Input) -> list[Input]:
+        still = dataclasses.replace(given, frames=())
+        if given.odometry is not None:
+            still = dataclasses.replace(
+                still, odometry=dataclasses.replace(given.odometry, speed_mps=0.0)
+            )
+        return [still]
+
+    steps = simulated(setup, 4.0, change=inject.between(1.5, np.inf, blind))
+    last = steps[-1]
+    output = last.outcome.report.output
+    assert bool(last.outcome.moment.decided)
+    assert not output.decided
+    error_m = np.hypot(*(output.pose - last.truth[:3])[:2])
+    assert error_m > 0.1
+    assert np.sqrt(np.trace(output.covariance[:2, :2])) > error_m / 4
+    assert Fault.ODOMETRY_DOUBTFUL in last.outcome.faults
+    assert (last.outcome.health, last.outcome.throttle) == (Health.STOP, 0.0)
+    wrong = [step for step in steps if step.outcome.report.output.decided]
+    assert max(np.hypot(*(s.outcome.report.output.pose - s.truth[:3])[:2]) for s in wrong) < 0.1

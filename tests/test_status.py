@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.commands.status import WIDTH, status_line
-from jaxnav.runtime.flags import Health
+from jaxnav.commands.status import WIDTH, notice, status_line
+from jaxnav.runtime.flags import Fault, Health
 from tests.helpers.drives import make_outcome
 
 FLOATS = st.floats() | st.floats(-500, 500) | st.sampled_from([-0.0, 1e308, -1e308, 5e-324])
@@ -62,3 +62,20 @@ def test_every_line_has_the_same_width(rate_hz, latency_ms, marker_seen, **drive
     assert line.isprintable()
     for unit in (" Hz ", " ms ", "% x", " m", " deg thr ", " str "):
         assert line.index(unit) == USUAL.index(unit)
+
+
+def test_what_begins_is_told_once():
+    outcome = dataclasses.replace(
+        outcome_of([1.0, 2.0, 3.0], 0.5, True),
+        faults=Fault.RELOCATED | Fault.MARKER_OUTVOTED | Fault.NO_MARKER,
+        restart_reason="contradicted by the corners; relocated",
+        outvoted=(3, 7),
+    )
+    told = notice(outcome, Fault.NO_MARKER)
+    assert "contradicted by the corners; relocated" in told
+    assert "marker 3, 7" in told
+    assert notice(outcome, outcome.faults) is None
+    assert "marker" not in notice(outcome, Fault.MARKER_OUTVOTED)
+    for fault in (Fault.WAYS_DISPUTED, Fault.ODOMETRY_DOUBTFUL):
+        assert notice(dataclasses.replace(outcome, faults=fault), Fault(0))
+    assert notice(dataclasses.replace(outcome, faults=Fault.CAMERA_STALE), Fault(0)) is None

@@ -62,6 +62,9 @@ class Run:
     """Which of the two poses of a marker is believed."""
     corner_backend: CornerBackend = "aruco"
     """Marker detector. apriltag needs the extra of that name."""
+    relocate: bool = True
+    """Drive on, slowly at first, where the corners say that the car is where its wheels can't have
+    brought it: somebody carried it there, or shows it a copy of the marker. Without: stop."""
     record: Annotated[
         Path | None, tyro.conf.arg(metavar="MCAP", help_behavior_hint="(optional)")
     ] = None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from jaxnav.arguments import Run
-from jaxnav.commands.status import status_line
+from jaxnav.commands.status import notice, status_line
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.flags import Fault
 from jaxnav.runtime.frames import Sighted
@@ -158,12 +158,17 @@ class StatusLine:
 
     def __init__(self) -> None:
         self._last_ns, self._count, self._marker_ns = 0, 0, 0
+        self._faults = Fault(0)
 
     def handled(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
         self._count += 1
         if outcome.told is not None and outcome.told.corners_px is not None:
             self._marker_ns = given.now_ns
+        if outcome.faults != self._faults:
+            text, self._faults = notice(outcome, self._faults), outcome.faults
+            if text is not None:
+                sys.stderr.write(f"\r{text:<100}\n")
         elapsed_ns = given.now_ns - self._last_ns
         if elapsed_ns < _STATUS_NS:
             return

@@ -117,6 +117,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
         route=chosen("route", args.route, load_route),
         selector=args.selector,
         float64=args.float64,
+        relocate=args.relocate,
     )
 
 

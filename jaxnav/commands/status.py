@@ -2,6 +2,7 @@
 
 import math
 
+from jaxnav.runtime.flags import Fault
 from jaxnav.runtime.pilot import Outcome
 
 WIDTH = 100  # characters, at most
@@ -46,3 +47,23 @@ def _fixed(value: float, width: int, decimals: int) -> str:
         return f"{'?':>{width}}"
     shown = f"{value:{width}.{decimals}f}"
     return shown if len(shown) <= width else "#" * width
+
+
+def notice(outcome: Outcome, before: Fault) -> str | None:
+    """What a person should hear of when it begins; None: nothing did.
+
+    Args:
+        before: the faults of the outcome before.
+    """
+    new = outcome.faults & ~before
+    told = []
+    if Fault.RELOCATED in new:
+        told.append(f"not where its wheels can have brought it: {outcome.restart_reason}")
+    if Fault.WAYS_DISPUTED in new:
+        told.append("corners and odometer tell of different ways: a marker moves, or wheels slip")
+    if Fault.ODOMETRY_DOUBTFUL in new:
+        told.append("no marker in view, and the odometer contradicts the throttle")
+    if Fault.MARKER_OUTVOTED in new and outcome.outvoted:
+        ids = ", ".join(map(str, outcome.outvoted))
+        told.append(f"marker {ids} is not where the others say: left out")
+    return "; ".join(told) or None

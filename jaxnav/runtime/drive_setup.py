@@ -95,6 +95,7 @@ class SetupEntry(Entry):
     parameters: dict[str, Any] = Field(default_factory=dict)  # older drives have none
     timeouts: TimeoutsEntry
     float64: Flag
+    relocate: Flag = True  # older drives don't say
     made_by: dict[str, str]
 
     @field_validator("selector")
@@ -116,6 +117,7 @@ class DriveSetup:
         float64: precision of the process, in which rig, markers and vehicle are made too.
         parameters: name -> number or nested lists, in place of the navigator's own; see
             `with_params`.
+        relocate: whether the car drives on from a pose that no slip explains; see `Pilot`.
     """
 
     rig: CameraRig
@@ -127,6 +129,7 @@ class DriveSetup:
     timeouts: Timeouts = field(default_factory=Timeouts)
     float64: bool = False
     parameters: dict[str, Any] = field(default_factory=dict)
+    relocate: bool = True
 
     def with_params(self, params: Params) -> "DriveSetup":
         """The setup with these parameters, and none of those that it had.
@@ -157,7 +160,7 @@ class DriveSetup:
         """
         navigator = self.navigator()
         program = compiled(advance_packed, navigator, folder)
-        return Pilot(navigator, self.timeouts, program, self.corner_sigma_px)
+        return Pilot(navigator, self.timeouts, program, self.corner_sigma_px, self.relocate)
 
     def header(self) -> dict[str, Any]:
         """All of it, every number bit for bit, and what this process is."""
@@ -174,7 +177,9 @@ class DriveSetup:
             "made_by": this_process(),
         }
         # Without them any version of the program reads it.
-        return header | ({"parameters": dict(self.parameters)} if self.parameters else {})
+        if self.parameters:
+            header["parameters"] = dict(self.parameters)
+        return header if self.relocate else header | {"relocate": False}
 
     @staticmethod
     def of_header(header: dict[str, Any], where: Path) -> "DriveSetup":
@@ -196,6 +201,7 @@ class DriveSetup:
             corner_sigma_px=entry.corner_sigma_px,
             timeouts=Timeouts(**entry.timeouts.model_dump()),
             float64=entry.float64,
+            relocate=entry.relocate,
         )
         if not entry.parameters:
             return setup

@@ -31,6 +31,10 @@ class Fault(enum.IntFlag):
     RECORDER_FAILED = enum.auto()  # disk full, or the file is gone
     NOTHING_MOVES = enum.auto()  # the throttle pulls, and neither wheels nor any corner move
     RESTARTED_OFTEN = enum.auto()  # given up again and again in a short time
+    RELOCATED = enum.auto()  # the corners put it where no slip of its wheels can have brought it
+    WAYS_DISPUTED = enum.auto()  # corners and odometer tell of different ways
+    ODOMETRY_DOUBTFUL = enum.auto()  # no marker, and the odometer contradicts the throttle
+    MARKER_OUTVOTED = enum.auto()  # its corners contradict what the others agree on
 
 
 class Reject(enum.IntFlag):

@@ -23,6 +23,16 @@ SPEED_FACTOR = {
 }
 
 
+_SLOW = (
+    Fault.CAMERAS_STALE
+    | Fault.ODOMETRY_STALE
+    | Fault.ODOMETRY_STUCK
+    | Fault.RELOCATED
+    | Fault.WAYS_DISPUTED
+    | Fault.ODOMETRY_DOUBTFUL
+)
+
+
 @dataclass(frozen=True)
 class Timeouts:
     """When missing data count, and when they count as too much."""
@@ -50,6 +60,8 @@ class Senses:
     distance_m: float  # driven since corners were last believed
     faults: Fault  # that are seen elsewhere
     restarts: int = 0  # in the last RESTARTS_S
+    confirmed: bool = True  # by corners, more than once (R2)
+    refused: bool = False  # what is located is not where it may be
 
 
 @dataclass
@@ -72,6 +84,11 @@ class Monitor:
             if self._better >= LOOKS:
                 self.health, self._better = wanted, 0
         return self.health, faults
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether corners contradict what is believed more often than not."""
+        return self._doubts >= _OFTEN
 
     def corners(self, believed: bool) -> None:
         """Count a frame's corners that were believed, or not."""
@@ -103,17 +120,21 @@ class Monitor:
         broken = Fault.NOT_FINITE | Fault.VEHICLE_FAILED
         if faults & (broken | Fault.NOTHING_MOVES | Fault.RESTARTED_OFTEN):
             return Health.STOP
-        if not senses.located:
+        if senses.refused:
+            return Health.STOP
+        if not senses.located or (senses.decided and not senses.confirmed):
             return Health.INIT
-        blind = senses.odometry_age_s > limits.blind_s and senses.fix_age_s > limits.blind_s
+        without_odometry = (
+            senses.odometry_age_s > limits.blind_s or Fault.ODOMETRY_DOUBTFUL in faults
+        )
+        blind = without_odometry and senses.fix_age_s > limits.blind_s
         if (
             senses.fix_age_s > limits.stop_s
             or blind
             or faults & (Fault.UNSURE | Fault.FAR_FROM_FIX)
         ):
             return Health.STOP
-        slow = Fault.CAMERAS_STALE | Fault.ODOMETRY_STALE | Fault.ODOMETRY_STUCK
-        if senses.fix_age_s > limits.slow_s or faults & slow or self._doubts >= _OFTEN:
+        if senses.fix_age_s > limits.slow_s or faults & _SLOW or self.contradicted:
             return Health.DEGRADED
         if Fault.NO_MARKER in faults:
             return Health.DEAD_RECKONING

@@ -99,6 +99,7 @@ class OutcomeMessage(Entry):
         Ts_vehicle_world: (N, 7), wxyz_xyz of the candidates that are valid.
         selected: index into these, -1: none.
         digest: of the pilot's state, for who replays; "" where none was taken.
+        outvoted: ids of markers that were left out; older drives have none.
     """
 
     now_ns: Now
@@ -124,6 +125,7 @@ class OutcomeMessage(Entry):
     Ts_vehicle_world: Annotated[np.ndarray, Array("number", (-1, 7))] | None = None
     costs: Annotated[np.ndarray, Array("number")] | None = None
     selected: Index | None = None
+    outvoted: list[Count] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _is_whole(self) -> "OutcomeMessage":

@@ -85,6 +85,8 @@ def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
         "digest": digest,
         "stamp_ns": outcome.stamp_ns,
     }
+    if outcome.outvoted:
+        message["outvoted"] = list(outcome.outvoted)
     return message | _reported(outcome.report, outcome.moment.belief)
 
 

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 
+from jaxnav.motion import Belief
 from jaxnav.navigator import Navigator
 from jaxnav.runtime.corrections import Corrections
 from jaxnav.runtime.due import due_px
@@ -27,9 +29,12 @@ from jaxnav.runtime.history import Told
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.runtime.limits import Limits
 from jaxnav.runtime.odometer import Odometer
+from jaxnav.runtime.outvoted import Outvoted
 from jaxnav.runtime.stamps import Stamps
 from jaxnav.runtime.standstill import Standstill
+from jaxnav.runtime.support import Support
 from jaxnav.runtime.way import Place, Way
+from jaxnav.runtime.ways import Fix
 from jaxnav.timeline import Moment, Report
 
 SLEPT_NS = 1_000_000_000  # a loop that was away for so long believes what is of another time
@@ -68,6 +73,7 @@ class Outcome:
     stamp_ns: int
     restarts: int  # so far, and why the last one
     restart_reason: str
+    outvoted: tuple[int, ...] = ()  # ids of markers that were left out, since others contradict
 
 
 class _Known(NamedTuple):
@@ -113,12 +119,14 @@ class Pilot:
         timeouts: Timeouts | None = None,
         program: Program | None = None,
         corner_sigma_px: float | None = None,
+        relocate: bool = True,
     ):
         """Args:
         navigator: with a vehicle and waypoints.
         timeouts: see there.
         program: `advance_packed` of the navigator, compiled; by default by `jax.jit`.
         corner_sigma_px: of every corner along one axis; by default as each detection says.
+        relocate: whether to drive on from a pose that no slip explains, slowly at first; else stop.
         """
         if navigator.controller is None:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
@@ -137,6 +145,9 @@ class Pilot:
             self._odometer.time_constant_s,
         )
         self._frozen = partial(self._standstill.frozen, due=self._due_px)
+        self._support = Support(navigator.controller.vehicle, relocate)
+        self._outvoted = Outvoted(navigator.markers.ids)
+        self._hidden: tuple[int, ...] = ()  # of the last frames
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
         self._distance_m = 0.0
@@ -161,6 +172,9 @@ class Pilot:
         frames = [self._corrections.frame(frame) for frame in given.frames]
         told, stamp_ns, seen_faults = self._frames.told(frames, now_ns, self._frozen)
         faults |= seen_faults
+        if told is not None:
+            told, self._hidden = self._outvoted.without(told)
+            faults |= Fault.MARKER_OUTVOTED if self._hidden else _NO_FAULT
         if told is not None:
             outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
         if given.odometry is not None:
@@ -192,8 +206,15 @@ class Pilot:
         if not believable:
             return self._tick(now_ns, faults, Reject.ODOMETRY)
         if self._odometer_ns is not None:
-            self._distance_m += (
-                abs(reading.speed_mps) * min(max(stamp_ns - self._odometer_ns, 0), SLEPT_NS) / 1e9
+            gap_s = min(max(stamp_ns - self._odometer_ns, 0), SLEPT_NS) / 1e9
+            self._distance_m += abs(reading.speed_mps) * gap_s
+            self._support.drove(
+                reading.speed_mps,
+                reading.steering_rad,
+                0.0 if self._known is None else float(self._known.pose[2]),
+                gap_s,
+                self._command[1],
+                self._seeing(now_ns),
             )
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
         self._standstill.went(stamp_ns, now_ns, reading.speed_mps, reading.steering_rad)
@@ -214,18 +235,24 @@ class Pilot:
             faults |= Fault.NOT_FINITE
             self._begin_anew("the estimate was no number")
         rejects |= Reject.TOO_LATE if fused.refused else _NO_REJECT
-        if told is not None and told.corners_px is not None:
-            if fused.refused:
-                self._frames.refused()
-            else:
-                rejects |= self._judge(known, stamp_ns)
+        if told is not None and told.corners_px is not None and fused.refused:
+            self._frames.refused()
         restarts = self._restarts_before + int(fused.moment.restarts)
         if finite and restarts > self._restarts:
             self._restarts, self._restart_reason = restarts, "contradicted by the corners"
             faults |= Fault.RESTARTED
             self._left = self._known
             self._restarts_ns.append(now_ns)
-        self._arrived_elsewhere(known)
+            self._support.restarted()
+        outvoted: tuple[int, ...] = ()
+        if told is not None and told.corners_px is not None and not fused.refused:
+            outvoted = self._outvoted.count(told, np.asarray(fused.report.outvoted))
+            faults |= Fault.MARKER_OUTVOTED if outvoted else _NO_FAULT
+            rejects |= self._judge(known, fused.moment.belief, stamp_ns, now_ns)
+        faults |= self._contradictions()
+        report, known = self._honest(fused.report, known)
+        if report.output.decided:
+            self._arrived_elsewhere(known)
         self._known, self._now_ns = known, now_ns
         faults |= Fault.NOTHING_MOVES if self._standstill.nothing_moves else _NO_FAULT
         health, faults = self._monitor.look(self._senses(known, now_ns, faults))
@@ -237,32 +264,75 @@ class Pilot:
             rejects,
             steering_rad,
             throttle,
-            fused.report,
+            report,
             fused.moment,
             told,
             stamp_ns,
             self._restarts,
             self._restart_reason,
+            outvoted or (self._hidden if Fault.MARKER_OUTVOTED in faults else ()),
         )
 
     def _arrived_elsewhere(self, known: _Known) -> None:
         """After a restart, once the pose is known again: how far it is from what was believed."""
-        if self._left is None or not known.decided:
+        if self._left is None:
             return
         x_m, y_m, psi_rad = known.pose - self._left.pose
         psi_deg = math.degrees(math.remainder(float(psi_rad), math.tau))
         self._restart_reason += f"; {math.hypot(x_m, y_m):.2f} m and {psi_deg:.0f} deg away"
         self._left = None
 
-    def _judge(self, known: _Known, stamp_ns: int) -> Reject:
+    def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
         """Whether the corners were believed."""
         gate, nis = self._gate_nis, known.nis
         believed = known.selected >= 0 and nis <= gate
         self._monitor.corners(believed)
-        if believed:
+        fix = _fix(known.pose, known.covariance) if known.decided else None
+        alive = zip(belief.mean, belief.covariance, belief.initialised, strict=True)
+        support = self._support
+        before = support.relocations, support.refused
+        if support.corners(
+            believed,
+            now_ns,
+            fix,
+            lambda: [_fix(mean, covariance) for mean, covariance, lives in alive if lives],
+        ):
             self._fix_ns, self._distance_m = max(stamp_ns, self._fix_ns or 0), 0.0
+        if support.relocations > before[0] or support.refused > before[1]:
+            self._explain("refused" if support.refused else "relocated")
+        if believed:
             return Reject.INNOVATION_LARGE if nis > gate / 2 else _NO_REJECT
         return Reject.INNOVATION
+
+    def _explain(self, what: str) -> None:
+        """Add to the reason of the last restart."""
+        parts = [self._restart_reason, f"{what}: no slip explains the way there"]
+        self._restart_reason = "; ".join(part for part in parts if part)
+
+    def _contradictions(self) -> Fault:
+        """What speaks against where the estimate says that the vehicle is."""
+        support, found = self._support, _NO_FAULT
+        if support.relocated:
+            found |= Fault.RELOCATED
+        if support.disputed:
+            found |= Fault.WAYS_DISPUTED
+        if support.odometry_doubtful:
+            found |= Fault.ODOMETRY_DOUBTFUL
+        return found
+
+    def _honest(self, report: Report, known: _Known) -> tuple[Report, _Known]:
+        """What is told of an estimate that nothing confirms: not decided, and how far off."""
+        doubt = self._support.doubt(self._monitor.contradicted)
+        if not (doubt.is_doubted and known.decided):
+            return report, known
+        covariance = known.covariance.copy()
+        covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
+        honest: Report = eqx.tree_at(
+            lambda r: (r.output.decided, r.output.covariance),
+            report,
+            (np.asarray(False), covariance),
+        )
+        return honest, known._replace(covariance=covariance)
 
     def _limited(
         self, known: _Known, health: Health, now_ns: int, elapsed_ns: int
@@ -293,6 +363,8 @@ class Pilot:
             distance_m=self._distance_m,
             faults=faults,
             restarts=self._restarts_lately(now_ns),
+            confirmed=self._support.confirmed,
+            refused=self._support.refused,
         )
 
     def _restarts_lately(self, now_ns: int) -> int:
@@ -316,6 +388,7 @@ class Pilot:
 
     def _begin_anew(self, reason: str) -> None:
         self._estimator.reset()
+        self._support.begin_anew()
         self._restarts += 1
         if self._now_ns is not None:
             self._restarts_ns.append(self._now_ns)
@@ -336,3 +409,10 @@ class Pilot:
         forward = math.cos(heading) * velocity[0] + math.sin(heading) * velocity[1]
         speed = math.copysign(math.hypot(*velocity), forward)
         return speed, known.sigma(3, 4)
+
+
+def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
+    """Of a state that begins with x_m, y_m, psi_rad."""
+    x_m, y_m, psi_rad = map(float, pose[:3])
+    sigma_m = math.sqrt(max(float(covariance[0, 0] + covariance[1, 1]), 0.0))
+    return Fix(x_m, y_m, psi_rad, sigma_m, math.sqrt(max(float(covariance[2, 2]), 0.0)))

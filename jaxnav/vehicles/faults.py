@@ -67,6 +67,9 @@ class Row:
         begins_s, ends_s: of the fault; inf: it lasts.
         drive_s: of the whole drive.
         telling: how the navigator's rig and markers differ from the true ones.
+        markers: where there are others than the trial's: made of these.
+        relocate: see `Pilot`.
+        well: the health at which the car has recovered.
     """
 
     name: str
@@ -83,6 +86,9 @@ class Row:
     drive_s: float = 7.0
     rates: Rates = field(default_factory=Rates)
     telling: str = ""
+    markers: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
+    relocate: bool = True
+    well: Health = Health.OK
 
 
 @dataclass(frozen=True)
@@ -95,7 +101,7 @@ class Result:
     worst: Health
     error_m: float
     error_after_m: float
-    recovered_s: float  # after the end until health was OK for good; inf: never, or it lasts
+    recovered_s: float  # after the end until it was well for good; inf: never, or it lasts
     restarts: int
     broken: tuple[str, ...]  # promises that were not kept
 
@@ -114,17 +120,17 @@ class Trial:
 
 def run_trial(row: Row, trial: Trial) -> Result:
     """A drive with the fault in it."""
+    markers = row.markers(trial.markers)
     navigator = Navigator(
         rig=told_rig(trial.rig, row.telling),
-        markers=trial.markers,
+        markers=markers,
         vehicle=trial.vehicle,
         waypoints_m=WAYPOINTS_M,
         waypoint_radius_m=0.15,
     )
-    pilot = Pilot(navigator, program=trial.program and trial.program(navigator))
-    world = World(
-        trial.rig, trial.markers, trial.vehicle, trial.start_pose, BEGIN_NS, seed=trial.seed
-    )
+    program = trial.program and trial.program(navigator)
+    pilot = Pilot(navigator, program=program, relocate=row.relocate)
+    world = World(trial.rig, markers, trial.vehicle, trial.start_pose, BEGIN_NS, seed=trial.seed)
     steps = list(drive(pilot, world, row.drive_s, row.change(), row.rates, row.happens()))
     return judge(row, steps, pilot)
 
@@ -159,8 +165,9 @@ def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
         faults |= outcomes[index].faults
         rejects |= outcomes[index].rejects
     after = times_s >= row.ends_s
-    well = np.flatnonzero(after & (healths == Health.OK))
-    ill = np.flatnonzero(after & (healths != Health.OK))
+    is_well = (healths >= Health.OK) & (healths <= row.well)
+    well = np.flatnonzero(after & is_well)
+    ill = np.flatnonzero(after & ~is_well)
     recovered_s = math.inf
     if len(well) and (not len(ill) or ill[-1] < well[-1]):
         first = well[0] if not len(ill) else well[well > ill[-1]][0]

@@ -5,9 +5,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import jax.numpy as jnp
+import jaxlie
 import numpy as np
 
 from jaxnav.detection.types import Detections
+from jaxnav.markers import MarkerMap
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.vehicles import injections as inject
@@ -35,6 +38,9 @@ def matrix() -> list[Row]:
         *_loop(),
         *standstill(),
         *rates(),
+        *_nonsense(),
+        *_spoofed(),
+        *_outvoted(),
     ]
 
 
@@ -299,25 +305,26 @@ def _calibration() -> list[Row]:
     ]  # fmt: skip
 
 
+def _once(act: Callable[[World], None]) -> Callable[[], Happens]:
+    def made() -> Happens:
+        done = False
+
+        def happens(now_ns: int, world: World) -> None:
+            nonlocal done
+            if not done and now_ns >= BEGIN_NS + int(BEGIN_S * 1e9):
+                done = True
+                act(world)
+
+        return happens
+
+    return made
+
+
 def _world() -> list[Row]:
-    def once(act: Callable[[World], None]) -> Callable[[], Happens]:
-        def made() -> Happens:
-            done = False
-
-            def happens(now_ns: int, world: World) -> None:
-                nonlocal done
-                if not done and now_ns >= BEGIN_NS + int(BEGIN_S * 1e9):
-                    done = True
-                    act(world)
-
-            return happens
-
-        return made
-
     return [
         Row(
             "marker moved by 5 cm",
-            happens=once(lambda world: world.move_markers((0.05, 0.0, 0.0))),
+            happens=_once(lambda world: world.move_markers((0.05, 0.0, 0.0))),
             error_m=0.15,
             error_after_m=0.10,
             at_most=_SLOW,
@@ -325,13 +332,14 @@ def _world() -> list[Row]:
         ),
         Row(
             "kidnapped: 1 m, 90 deg",
-            happens=once(lambda world: world.carry_off((-0.7, -0.7, np.pi / 2))),
+            happens=_once(lambda world: world.carry_off((-0.7, -0.7, np.pi / 2))),
             faults=Fault.RESTARTED,
             rejects=Reject.INNOVATION,
             error_m=1.2,
             error_after_m=0.10,
             at_most=Health.STOP,
             ends_s=BEGIN_S + 0.1,
+            well=_SLOW,  # for a metre
         ),
     ]
 
@@ -350,3 +358,117 @@ def _loop() -> list[Row]:
             )
         )
     return rows
+
+
+def _nonsense() -> list[Row]:
+    def anywhere() -> Change:
+        rng = np.random.default_rng(0)
+        return inject.frames(inject.corners(lambda c: rng.uniform([0, 0], [820, 410], c.shape)))
+
+    def blind(by: float) -> Callable[[], Change]:
+        """Without a marker, the odometer telling so much of the speed."""
+
+        def edit(reading: Odometry) -> Odometry:
+            return dataclasses.replace(reading, speed_mps=by * reading.speed_mps)
+
+        dark, scaled = inject.frames(inject.nothing_seen), inject.odometry(edit)
+        return lambda: lambda given: [one for seen in dark(given) for one in scaled(seen)]
+
+    doubted: dict[str, Any] = {
+        "faults": Fault.ODOMETRY_DOUBTFUL,
+        "at_least": Health.STOP,
+        "at_most": Health.STOP,
+        "error_m": 0.10,
+    }
+    return [
+        Row(
+            "corners at random places",
+            lasting(anywhere),
+            rejects=Reject.INNOVATION,
+            at_least=_SLOW,
+            at_most=_SLOW,
+        ),
+        Row(
+            "corners at random places from the start",
+            anywhere,
+            rejects=Reject.INNOVATION,
+            at_most=Health.STOP,
+            begins_s=0.0,
+            ends_s=_LATEST,
+        ),
+        Row("odometry 0 without a marker", lasting(blind(0.0)), **doubted),
+        Row("odometry x3 without a marker", lasting(blind(3.0)), **doubted),
+    ]
+
+
+def _spoofed() -> list[Row]:
+    def dragged(by_mps: float) -> Callable[[], Happens]:
+        def made() -> Happens:
+            last_ns = BEGIN_NS + int(BEGIN_S * 1e9)
+
+            def happens(now_ns: int, world: World) -> None:
+                nonlocal last_ns
+                if now_ns > last_ns:
+                    world.move_markers((by_mps * (now_ns - last_ns) / 1e9, 0.0, 0.0))
+                    last_ns = now_ns
+
+            return happens
+
+        return made
+
+    moved = _once(lambda world: world.move_markers((1.0, 0.0, 0.0)))
+    larger = _once(lambda world: world.move_markers((0.0, 0.0, 0.0), scale=1.5))
+    lasting: dict[str, Any] = {"ends_s": _LATEST, "drive_s": 8.0, "at_most": Health.STOP}
+    relocated = lasting | {"faults": Fault.RELOCATED, "at_least": _SLOW}
+    return [
+        # What one marker tells can't be told from the truth: that it is slow, and said, is asked.
+        Row("a copy 1 m away instead", happens=moved, error_m=1.1, **relocated),
+        Row("a larger copy instead", happens=larger, error_m=1.1, **relocated),
+        Row(
+            "a copy 1 m away instead, not to relocate",
+            happens=moved,
+            relocate=False,
+            error_m=0.10,
+            **(relocated | {"at_least": Health.STOP}),
+        ),
+        Row(
+            "a copy dragged at 0.1 m/s",
+            happens=dragged(0.1),
+            faults=Fault.WAYS_DISPUTED,
+            at_least=_SLOW,
+            error_m=0.6,
+            **lasting,
+        ),
+        # Restart follows restart, and none of them is confirmed: it stands.
+        Row(
+            "a copy dragged at 0.5 m/s",
+            happens=dragged(0.5),
+            faults=Fault.RESTARTED,
+            error_m=0.3,
+            **lasting,
+        ),
+    ]
+
+
+def _outvoted() -> list[Row]:
+    def three(markers: MarkerMap) -> MarkerMap:
+        """The marker, and one on either side."""
+        Ts = np.repeat(np.asarray(markers.Ts_world_marker.wxyz_xyz)[:1], 3, axis=0)
+        Ts[:, 4] += np.array([0.0, -0.5, 0.5], Ts.dtype)
+        return MarkerMap(
+            jaxlie.SE3(jnp.asarray(Ts)),
+            jnp.repeat(markers.size_m[:1], 3),
+            tuple(range(3)),
+            markers.families[:1] * 3,
+        )
+
+    return [
+        Row(
+            "one of three markers moved",
+            happens=_once(lambda world: world.move_markers((0.3, 0.0, 0.0), slice(2, 3))),
+            markers=three,
+            faults=Fault.MARKER_OUTVOTED,
+            at_most=_SLOW,
+            ends_s=_LATEST,
+        ),
+    ]

@@ -91,11 +91,15 @@ class World:
         with self._lock:
             self._held = held
 
-    def move_markers(self, by_m: tuple[float, float, float]) -> None:
-        """Somebody takes the markers elsewhere, by so much in the world."""
+    def move_markers(
+        self, by_m: tuple[float, float, float], which: slice = slice(None), scale: float = 1.0
+    ) -> None:
+        """Somebody takes markers elsewhere, by so much in the world, or puts larger ones there."""
         with self._lock:
             Ts = self.markers.Ts_world_marker
-            moved = Ts.wxyz_xyz.at[:, 4:].add(jnp.asarray(by_m, Ts.wxyz_xyz.dtype)[None])
+            moved = Ts.wxyz_xyz.at[which, 4:].add(jnp.asarray(by_m, Ts.wxyz_xyz.dtype)[None])
+            size_m = self.markers.size_m.at[which].multiply(scale)
+            self.markers = eqx.tree_at(lambda m: m.size_m, self.markers, size_m)
             self.markers = eqx.tree_at(lambda m: m.Ts_world_marker.wxyz_xyz, self.markers, moved)
 
     def state(self, at_ns: int) -> np.ndarray:

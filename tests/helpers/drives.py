@@ -81,7 +81,7 @@ def make_report(rng: np.random.Generator, dtype: type = float) -> Report:
         nis=random(),
         control_log=None,
     )
-    return _as_numpy(Report(output=output, mean=random(8)))
+    return _as_numpy(Report(output=output, mean=random(8), outvoted=jnp.zeros(1, bool)))
 
 
 def make_moment(rng: np.random.Generator, dtype: type = float) -> Moment:

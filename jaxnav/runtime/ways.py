@@ -1,0 +1,175 @@
+"""The way that corners tell of, held against the way that the wheels have gone.
+
+    ways.drove(speed_mps, steering_rad, heading_rad, gap_s)    # with every odometry
+    ways.glimpse(now_ns)                                       # with every frame that shows markers
+    ways.look(now_ns, fix)                                     # with every pose to be trusted
+    ways.out_of_reach(fix)                                     # before that
+
+A marker that is carried along, or a copy of it elsewhere, fits its own corners as well as the true
+one does. What it can't imitate is the odometer: the car has not gone where the corners say. Two
+measures, since a slow drag hides in what wheels slip and a leap does not:
+
+    disputed       over some seconds the two ways part by more than DRIFT_M + DRIFT_SHARE of the way
+    out of reach   a pose farther from the last one than the wheels have turned, or turned farther
+                   than they can have turned it
+
+What neither can see: a copy carried slower than DRIFT_SHARE of the car's own speed, or by less than
+the two margins; and one that was there from the beginning.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+# What corners get wrong themselves while the car goes round a marker, with cameras off by 1 deg or
+# 2 %. It is also how near R3 wants a kidnapped car to come.
+DRIFT_M = 0.1
+# What wheels and their calibration get wrong, as where `Odometer` believes a sensor again.
+DRIFT_SHARE = 0.1
+REACH_RAD = math.radians(20.0)  # from there on `MultiHypothesis` calls it another branch
+_WINDOW_NS = 8_000_000_000  # 0.1 m in it is 1.25 cm/s, of a car that stands
+_EVERY_NS = 200_000_000
+# They agree again when, over a second, they part by no more than this (see `Odometer._agrees`) and
+# half of DRIFT_SHARE.
+_AGREES_NS = 1_000_000_000
+_AGREES_M = 0.02
+_GAP_NS = 500_000_000  # unseen for longer, dead reckoning has errors of its own
+_SIGMAS = 3.0
+
+
+class Fix(NamedTuple):
+    """A pose in the world that the corners tell, and its sigmas."""
+
+    x_m: float
+    y_m: float
+    psi_rad: float
+    sigma_m: float
+    sigma_rad: float
+
+
+class _Anchor(NamedTuple):
+    now_ns: int
+    fix: Fix
+    x_m: float  # of the fix beside the way by odometry
+    y_m: float
+    way_m: float
+    turned_rad: float
+
+
+@dataclass
+class Ways:
+    """Both ways of one drive.
+
+    Attributes:
+        wheelbase_m: of the vehicle.
+        disputed: the two part.
+        way_m: by odometry, forwards or backwards, since the drive began.
+    """
+
+    wheelbase_m: float
+    disputed: bool = False
+    way_m: float = 0.0
+    _turned_rad: float = 0.0  # whichever way
+    _x_m: float = 0.0  # by odometry, along the heading that was believed
+    _y_m: float = 0.0
+    _seen_ns: int = 0
+    _last: _Anchor | None = None
+    _window: deque[_Anchor] = field(default_factory=deque)
+
+    def drove(
+        self, speed_mps: float, steering_rad: float, heading_rad: float, gap_s: float
+    ) -> None:
+        """What the odometer tells of the last moment.
+
+        Args:
+            heading_rad: as it is believed, so that a steering sensor's offset does not add up.
+            gap_s: since the reading before.
+        """
+        step_m = speed_mps * gap_s
+        # Eqs. 4 to 7 of the paper, see `bicycle.velocity_world`.
+        beta_rad = math.atan(math.tan(steering_rad) / 2)
+        course_rad = heading_rad + beta_rad
+        self._x_m += step_m * math.cos(course_rad)
+        self._y_m += step_m * math.sin(course_rad)
+        self.way_m += abs(step_m)
+        self._turned_rad += abs(step_m * math.sin(beta_rad)) * 2 / self.wheelbase_m
+
+    def glimpse(self, now_ns: int) -> None:
+        """Corners were seen, believed or not."""
+        if not 0 <= now_ns - self._seen_ns <= _GAP_NS:
+            self._window.clear()
+        self._seen_ns = now_ns
+
+    def look(self, now_ns: int, fix: Fix) -> None:
+        """Compare where the corners say that the car is with the way that it went."""
+        here = _Anchor(
+            now_ns, fix, fix.x_m - self._x_m, fix.y_m - self._y_m, self.way_m, self._turned_rad
+        )
+        self._last = here
+        window = self._window
+        if not window:
+            self._agree(here)
+            return
+        if now_ns - window[-1].now_ns < _EVERY_NS:
+            return
+        window.append(here)
+        while window[0].now_ns < now_ns - _WINDOW_NS:
+            window.popleft()
+        if any(_parts(here, then) for then in window):
+            self.disputed = True
+        if self.disputed:
+            recent = [then for then in window if then.now_ns >= now_ns - _AGREES_NS]
+            lasting = now_ns - recent[0].now_ns >= _AGREES_NS - _EVERY_NS
+            if lasting and all(_agrees(here, then) for then in recent):
+                self._agree(here)
+
+    def out_of_reach(self, fix: Fix, slack_m: float = 0.0) -> bool:
+        """Whether no slip explains how the car came from the last pose to this one.
+
+        Wheels that spin or slide leave it anywhere within the way that they have turned.
+
+        Args:
+            slack_m: by which the way may be longer than the odometer says.
+        """
+        if self._last is None:
+            return False
+        before = self._last.fix
+        way_m, turned_rad = self.way_m - self._last.way_m, self._turned_rad - self._last.turned_rad
+        off_m = math.hypot(fix.x_m - before.x_m, fix.y_m - before.y_m)
+        off_rad = abs(math.remainder(fix.psi_rad - before.psi_rad, math.tau))
+        # Sliding about one axle, a car turns by the way over the wheelbase.
+        sliding_rad = (way_m + slack_m) / self.wheelbase_m
+        return off_m > DRIFT_M + way_m + slack_m + _SIGMAS * (
+            before.sigma_m + fix.sigma_m
+        ) or off_rad > REACH_RAD + turned_rad + sliding_rad + _SIGMAS * (
+            before.sigma_rad + fix.sigma_rad
+        )
+
+    @property
+    def since_fix_m(self) -> float:
+        """Way by odometry since the last pose."""
+        return 0.0 if self._last is None else self.way_m - self._last.way_m
+
+    def forget(self) -> None:
+        """The last pose tells nothing of the next one."""
+        self._last, self.disputed = None, False
+        self._window.clear()
+
+    def _agree(self, here: _Anchor) -> None:
+        self.disputed = False
+        self._window.clear()
+        self._window.append(here)
+
+
+def _part_m(one: _Anchor, other: _Anchor) -> float:
+    return math.hypot(one.x_m - other.x_m, one.y_m - other.y_m)
+
+
+def _parts(here: _Anchor, then: _Anchor) -> bool:
+    bound_m = DRIFT_M + DRIFT_SHARE * (here.way_m - then.way_m) + _SIGMAS * then.fix.sigma_m
+    return _part_m(here, then) > bound_m
+
+
+def _agrees(here: _Anchor, then: _Anchor) -> bool:
+    return _part_m(here, then) <= _AGREES_M + DRIFT_SHARE / 2 * (here.way_m - then.way_m)

@@ -1,0 +1,118 @@
+"""Where corners and wheels part, and what no slip explains."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxnav.runtime.ways import Fix, Ways
+
+MS = 1_000_000
+WHEELBASE_M = 0.256
+
+
+class Drive:
+    """Straight ahead at 50 Hz, a fix with every reading; what the corners add can be chosen."""
+
+    def __init__(self, speed_mps: float, scale: float = 1.0):
+        self.ways = Ways(WHEELBASE_M)
+        self.speed_mps, self.scale = speed_mps, scale
+        self.now_ns, self.x_m, self.off_m = 10**9, 0.0, 0.0
+
+    def step(self, drag_mps: float = 0.0, looks: bool = True) -> bool:
+        """20 ms; whether the ways are disputed then."""
+        self.now_ns += 20 * MS
+        self.x_m += 0.02 * self.speed_mps
+        self.off_m += 0.02 * drag_mps
+        self.ways.drove(self.scale * self.speed_mps, 0.0, 0.0, 0.02)
+        if looks:
+            self.ways.glimpse(self.now_ns)
+            self.ways.look(self.now_ns, self.fix())
+        return self.ways.disputed
+
+    def fix(self, by_m: float = 0.0, turn_rad: float = 0.0) -> Fix:
+        return Fix(self.x_m, self.off_m + by_m, turn_rad, 0.005, 0.005)
+
+    def seconds(self, seconds: float, **how) -> list[bool]:
+        return [self.step(**how) for _ in range(round(seconds * 50))]
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 0.3, 1.5])
+@pytest.mark.parametrize("scale", [0.93, 1.0, 1.07])
+def test_wheels_within_their_calibration_dispute_nothing(speed_mps, scale):
+    assert not any(Drive(speed_mps, scale).seconds(30))
+
+
+@pytest.mark.parametrize(
+    ("drag_mps", "speed_mps", "within_s"),
+    [(0.5, 0.3, 0.5), (0.1, 0.3, 2.5), (0.05, 0.0, 4.0), (0.05, 0.2, 5.0), (-0.5, 1.5, 0.7)],
+)
+def test_a_marker_that_is_carried_along_is_disputed_for_as_long_as_it_is(
+    drag_mps, speed_mps, within_s
+):
+    drive = Drive(speed_mps)
+    drive.seconds(3)
+    disputed = drive.seconds(20, drag_mps=drag_mps)
+    assert 0 <= disputed.index(True) / 50 < within_s
+    assert all(disputed[disputed.index(True) :])
+    settled = drive.seconds(2)
+    assert settled[0]
+    assert not settled[-1]
+
+
+def test_slip_is_disputed_and_over_soon():
+    drive = Drive(0.4)
+    drive.seconds(3)
+    drive.scale = 1.3
+    assert drive.seconds(3)[-1]
+    drive.scale = 1.0
+    assert not drive.seconds(1.5)[-1]
+
+
+def test_what_was_driven_blind_is_not_held_against_the_corners():
+    drive = Drive(0.4, scale=1.3)
+    drive.step()
+    drive.seconds(4, looks=False)
+    assert not drive.step()
+
+
+@given(st.floats(-1, 1), st.floats(0, 0.5))
+def test_a_pose_within_the_way_is_in_reach_whatever_has_slipped(share, seconds):
+    drive = Drive(1.0)
+    drive.seconds(1)
+    drive.seconds(seconds, looks=False)
+    way_m = drive.ways.since_fix_m
+    assert way_m == pytest.approx(round(seconds * 50) * 0.02)
+    anywhere = Fix(drive.x_m - way_m + share * way_m, 0.0, share * way_m, 0.0, 0.0)
+    assert not drive.ways.out_of_reach(anywhere)
+
+
+@pytest.mark.parametrize(
+    ("by_m", "turn_rad", "out"),
+    [(0.0, 0.0, False), (0.2, 0.0, False), (0.4, 0.0, True), (0.0, 2.0, True), (0.0, 0.7, False)],
+)
+def test_a_pose_beyond_the_way_is_out_of_reach(by_m, turn_rad, out):
+    drive = Drive(0.4)
+    drive.seconds(1)
+    drive.seconds(0.34, looks=False)  # R3's ten frames
+    assert drive.ways.out_of_reach(drive.fix(by_m, turn_rad)) == out
+    assert not drive.ways.out_of_reach(drive.fix(by_m, turn_rad), slack_m=1.0)
+
+
+def test_before_the_first_pose_and_after_forgetting_everything_is_in_reach():
+    drive = Drive(0.4)
+    assert not drive.ways.out_of_reach(drive.fix(9.0))
+    drive.seconds(1)
+    assert drive.ways.out_of_reach(drive.fix(9.0))
+    drive.ways.forget()
+    assert not drive.ways.out_of_reach(drive.fix(9.0))
+
+
+def test_a_turn_is_the_bicycles():
+    ways = Ways(WHEELBASE_M)
+    ways.look(0, Fix(0.0, 0.0, 0.0, 0.0, 0.0))
+    for _ in range(50):
+        ways.drove(-0.5, 0.4, 0.0, 0.02)
+    curvature_per_m = math.cos(math.atan(math.tan(0.4) / 2)) * math.tan(0.4) / WHEELBASE_M
+    assert ways._turned_rad == pytest.approx(0.5 * curvature_per_m)
