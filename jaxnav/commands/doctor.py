@@ -72,6 +72,8 @@ def _files(report: Report, args: Doctor) -> SimpleNamespace:
     }
     for name, path in paths.items():
         setattr(patient, name, report.read(name, partial(getattr(files, f"load_{name}"), path)))
+    if patient.markers is not None and patient.route is not None:
+        patient.route = patient.route.relative_to(patient.markers.origin_m)
     rig, markers, vehicle, route = vars(patient).values()
     if rig is not None:
         report.examine("rig", lambda: _check("rig_file", "rig_file")(paths["rig"], rig))

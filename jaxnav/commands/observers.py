@@ -62,7 +62,7 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     if args.view:
         from jaxnav.viewing import RerunView  # with all that draws
 
-        waypoints_m = np.asarray(setup.route.waypoints_m, float)
+        waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
         add(View(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
     if not args.headless:
         add(StatusLine())

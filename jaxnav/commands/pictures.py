@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 
 from jaxnav.camera import Camera
 from jaxnav.files import atomic_path
+from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Output
+from jaxnav.origin import points_in_world
 from jaxnav.plotting import View
 from jaxnav.rig import CameraRig
 
@@ -22,6 +24,11 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Write a PNG, whole or not at all."""
     with atomic_path(path) as beside:
         figure.savefig(beside, dpi=PNG_DPI, format="png")
+
+
+def corners_in_world(markers: MarkerMap) -> np.ndarray:
+    """(M, 4, 3) corners of a map as files count, m, float64."""
+    return np.asarray(points_in_world(markers.corners_world_m, markers.origin_m), float)
 
 
 def normals_px(

@@ -47,9 +47,8 @@ def run(args: Run) -> int:
     with ExitStack() as closing:
         onlookers = open_onlookers(args, setup, closing)
         pilot = _compiled(args, setup, searches)
-        told = Setup(
-            setup.rig, setup.markers, setup.vehicle, setup.route.start_pose, args.seed, options
-        )
+        start_pose = setup.route_on_map.start_pose
+        told = Setup(setup.rig, setup.markers, setup.vehicle, start_pose, args.seed, options)
         loop, eyes, reason = _drive(args, pilot, told, searches, onlookers)
     _summarise(loop, eyes, reason)
     for onlooker in onlookers:

@@ -23,6 +23,7 @@ from jaxnav.files import Params, apply_params
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator, State
 from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
+from jaxnav.origin import opposite, poses_in_world
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.recording import Recording
 
@@ -106,8 +107,15 @@ def replay(
     wxyz_xyz, seen, located, flip_probability, branch = jax.tree.map(
         lambda *leaves: np.concatenate(leaves)[:total], *chunks
     )
+    Ts_world_vehicle = np.asarray(poses_in_world(wxyz_xyz, recording.markers.origin_m))
     return Replay(
-        wxyz_xyz, seen, located, flip_probability, branch, total / elapsed_s, corner_sigma_px
+        Ts_world_vehicle,
+        seen,
+        located,
+        flip_probability,
+        branch,
+        total / elapsed_s,
+        corner_sigma_px,
     )
 
 
@@ -197,7 +205,9 @@ def _frames(recording: Recording) -> _Frames:
     dt_s = np.diff(recording.stamps_ns, prepend=recording.stamps_ns[:1]) / 1e9
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, 1))
     reference = recording.reference
-    truth = identity if reference is None else reference.T_world_vehicle
+    truth = identity
+    if reference is not None:
+        truth = poses_in_world(reference.T_world_vehicle, opposite(recording.markers.origin_m))
     padding = -count % CHUNK_FRAMES
 
     def pad(rows: np.ndarray) -> Array:
