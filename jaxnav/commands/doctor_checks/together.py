@@ -71,7 +71,8 @@ def _place(whole: Fit, route: Route, origin_m: Origin) -> Finding:
         "picture",
         "ok",
         f"the car stands at x {origin_m[0] + x_m:.2f} m, y {origin_m[1] + y_m:.2f} m, "
-        f"psi {round(math.degrees(psi_rad))} deg: {apart_m:.2f} m and {round(turn_deg):+d} deg from the route's start",
+        f"psi {round(math.degrees(psi_rad))} deg: "
+        f"{apart_m:.2f} m and {round(turn_deg):+d} deg from the route's start",
     )
 
 
