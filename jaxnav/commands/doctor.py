@@ -27,6 +27,8 @@ def run(args: Doctor) -> int:
         report.examine("picture", lambda: _pictures(args, patient))
     if args.vehicle is not None or args.cameras is not None:
         report.examine("plug-ins", lambda: _plug_ins(report, args, patient))
+    if args.drive is not None:
+        report.examine("stamps", lambda: _check("stamps", "stamps")(args.drive))
     print(report.summary())
     if args.json is not None:
         from jaxnav.files import write_json

@@ -28,6 +28,7 @@ class Fault(enum.IntFlag):
     DEADLINE_MISSED = enum.auto()  # a cycle took longer than its period
     RECORDER_BEHIND = enum.auto()  # messages were left out
     RECORDER_FAILED = enum.auto()  # disk full, or the file is gone
+    CAMERA_LATE = enum.auto()  # images are older, or newer, than their stamps say; costs no health
 
 
 class Reject(enum.IntFlag):

@@ -24,6 +24,7 @@ from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
 from jaxnav.origin import ZERO, Origin, planar_in_world, points_in_world
 from jaxnav.rig import CameraRig
+from jaxnav.runtime.camera_delays import CameraDelays
 from jaxnav.runtime.compiled import bare
 from jaxnav.runtime.estimator import Program
 from jaxnav.runtime.flags import Fault, Health, Reject, names
@@ -124,7 +125,10 @@ def run_trial(row: Row, trial: Trial) -> Result:
     )
     pilot = Pilot(navigator, program=trial.program and trial.program(bare(navigator)))
     world = World(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
-    steps = list(drive(pilot, world, row.drive_s, row.change(), row.rates, row.happens()))
+    delays = None
+    if Fault.CAMERA_LATE in row.faults:
+        delays = CameraDelays(navigator.rig, markers, trial.vehicle)
+    steps = list(drive(pilot, world, row.drive_s, row.change(), row.rates, row.happens(), delays))
     return judge(row, steps, pilot)
 
 

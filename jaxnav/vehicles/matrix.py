@@ -33,6 +33,7 @@ def matrix() -> list[Row]:
         *_world(),
         *_loop(),
         *_far_origins(),
+        *_late_stamps(),
     ]
 
 
@@ -369,4 +370,22 @@ def _far_origins() -> list[Row]:
     return [
         Row("map 10 000 km from the origin", shift_m=(1e7, -1e7, 0.0)),
         Row("map at UTM coordinates", shift_m=(448_251.37, 5_411_932.81, 0.0)),
+    ]
+
+
+def _late_stamps() -> list[Row]:
+    """Frames that were taken earlier than they say, and no clock shows it."""
+    late_s = 0.05
+    return [
+        Row(
+            "frames 50 ms late, unsaid, all",
+            lambda: inject.frames(inject.stamps(lambda ns: ns + int(late_s * 1e9))),
+            faults=Fault.CAMERA_LATE,
+            at_most=_SLOW,
+            error_m=0.20,
+            begins_s=0.0,
+            ends_s=_LATEST,
+            drive_s=10.0,
+            rates=Rates(frame_delay_s=0.03 + late_s),
+        ),
     ]
