@@ -17,7 +17,8 @@ from jaxnav.runtime.frames import Frames, Sighted
 from jaxnav.runtime.interfaces import Frame
 from jaxnav.runtime.pilot import Input, Outcome
 
-_CLOSE_S = 2.0  # for the thread to end
+# The compiler can not be cut short, and the vehicle stands already.
+_CLOSE_S = 20.0
 
 
 class DelayWatch:
@@ -78,15 +79,16 @@ class DelayWatch:
 
 def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
     """A line for each camera whose stamps are surely wrong, or one for all of them."""
-    late = [
-        (name, one) for name, one in zip(setup.rig.names, delays.found, strict=True) if one.late
-    ]
-    together, known = delays.together, [one for one in delays.found if one.known]
-    if together.late and all(_agree(one, together) for one in known):
+    found, together = delays.found, delays.together
+    known = [one for one in found if one.known]
+    if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
         delay_s = setup.vehicle.camera_delay_s + together.delay_s
-        yield f"the cameras are {told(together)}: set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
+        do = f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
+        yield f"the cameras are {told(together)}: {do}"
         return
-    for name, one in late:
+    for name, one in zip(setup.rig.names, found, strict=True):
+        if not one.late:
+            continue
         delay_s = setup.vehicle.camera_delay_s + one.delay_s
         yield (
             f"camera {name!r} is {told(one)}: raise its latency_ms by {one.delay_s * 1e3:.0f}, or "
