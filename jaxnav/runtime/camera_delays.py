@@ -56,7 +56,7 @@ _LEAST_SIGMA_S = 0.001
 # A view counts in full up to the 99.9th percentile of chi-square with 8 degrees of freedom.
 _FULL_WEIGHT = 26.1
 _STEPS = 15
-_DONE = 1e-3  # of a prior sigma: a step that changes nothing
+_DONE = 5e-3  # of a prior sigma: after such a step the next one would change nothing
 # Of x, y (m), psi (rad) at the start, the camera's turn about its axes (rad), the odometer's speed
 # and steering gain (shares), the steering's zero (rad), and the delay (s).
 _PRIOR = np.array([1.0, 1.0, 0.5, 0.03, 0.03, 0.03, 0.15, 0.15, 0.03, 0.3])
@@ -230,9 +230,8 @@ class CameraDelays:
                 break
         else:
             return 0.0, 0.0
-        A, _, chi2 = self._equations(stretch, p)
         numbers = 8 * int(stretch.used.sum()) - len(p)
-        variance = np.linalg.inv(A + np.diag(1 / _PRIOR**2))[_DELAY, _DELAY]
+        variance = np.linalg.inv(A)[_DELAY, _DELAY]
         if not variance > 0 or abs(p[_DELAY]) >= _LIMIT_S:
             return 0.0, 0.0
         # What the stretch alone tells, without the prior: stretches are added up.
