@@ -2,7 +2,7 @@
 
     delays = CameraDelays(rig, markers, vehicle)
     delays.take(outcome)                 # every one of a pilot: some microseconds
-    while delays.due:                    # where nobody waits: some milliseconds
+    while delays.due:                    # where nobody waits: tens of milliseconds
         delays.solve()
     delays.found                         # one `Delay` a camera
 
