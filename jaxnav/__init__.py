@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from jaxnav.markers import MarkerMap as MarkerMap
     from jaxnav.navigator import Navigator as Navigator
     from jaxnav.navigator import Observation as Observation
+    from jaxnav.origin import planar_in_world as planar_in_world
+    from jaxnav.origin import poses_in_world as poses_in_world
     from jaxnav.refine import refine_pose as refine_pose
     from jaxnav.refine import solve_marker as solve_marker
     from jaxnav.refine import solve_markers as solve_markers
@@ -76,6 +78,8 @@ _MODULE_OF = {
     "load_rig": "files",
     "load_route": "files",
     "load_vehicle": "files",
+    "planar_in_world": "origin",
+    "poses_in_world": "origin",
     "refine_pose": "refine",
     "solve_marker": "refine",
     "solve_markers": "refine",

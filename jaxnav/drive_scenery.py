@@ -19,6 +19,7 @@ from jaxnav.files.reading import parse_yaml
 from jaxnav.files.rigs import RigFile
 from jaxnav.files.validation import FloorPlace
 from jaxnav.markers import MarkerMap
+from jaxnav.origin import ZERO, Origin, opposite, points_in_world
 from jaxnav.rig import CameraRig
 
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -44,7 +45,17 @@ class Scenery:
         """(M, 4, 3) corners in the world."""
         if self.markers is None:
             return np.zeros((0, 4, 3))
-        return np.asarray(self.markers.corners_world_m, float)
+        corners_m = points_in_world(self.markers.corners_world_m, self.origin_m)
+        return np.asarray(corners_m, float)
+
+    @property
+    def origin_m(self) -> Origin:
+        """What the markers count from, see `MarkerMap`."""
+        return ZERO if self.markers is None else self.markers.origin_m
+
+    def on_map_m(self, places_m: np.ndarray) -> np.ndarray:
+        """Places (N, 2) in the world, as the markers count."""
+        return np.asarray(points_in_world(places_m, opposite(self.origin_m)))
 
     @staticmethod
     def of(header: dict[str, Any]) -> "Scenery":

@@ -4,6 +4,8 @@ Corners are counted top-left, top-right, bottom-right, bottom-left, as a reader 
 sees them. The marker frame is x right, y up, z out of the paper towards the reader.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnav.geometry import rotation_matrix
+from jaxnav.origin import ZERO, Origin
 
 # How many markers each family has. AprilTag's keep AprilTag's names; ArUco's are OpenCV's, in lower
 # case without DICT_.
@@ -41,12 +44,17 @@ def opencv_dictionary_name(family: str) -> str:
 
 
 class MarkerMap(eqx.Module):
-    """M markers: identity, size and pose. The order of the map is the order of every M axis."""
+    """M markers: identity, size and pose. The order of the map is the order of every M axis.
+
+    What is called the world here and in all that computes with the map counts from `origin_m`, a
+    place of the files' world near the markers; see `jaxnav.origin`.
+    """
 
     Ts_world_marker: jaxlie.SE3  # batch axis (M,)
     size_m: Float[Array, " M"]
     ids: tuple[int, ...] = eqx.field(static=True)
     families: tuple[str, ...] = eqx.field(static=True)
+    origin_m: Origin = eqx.field(static=True, default=ZERO)
 
     @property
     def corners_world_m(self) -> Float[Array, "M 4 3"]:
@@ -55,6 +63,10 @@ class MarkerMap(eqx.Module):
         R = jax.vmap(rotation_matrix)(self.Ts_world_marker.rotation())
         turned = jnp.sum(R[:, None] * corners[:, :, None], axis=3)
         return turned + self.Ts_world_marker.translation()[:, None]
+
+    def without_origin(self) -> "MarkerMap":
+        """The same numbers, whatever they count from: one compiled program serves all origins."""
+        return self if self.origin_m == ZERO else dataclasses.replace(self, origin_m=ZERO)
 
     def index(self, marker_id: int, family: str) -> int | None:
         """Where a marker stands in the map, None where it is not in it."""

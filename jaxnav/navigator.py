@@ -94,6 +94,9 @@ class Navigator(eqx.Module):
 
     With a vehicle and waypoints it drives; without, it only localises (give it the motion model
     of the body then, `ConstantVelocity()` by default).
+
+    Waypoints, states and outputs count from `markers.origin_m`, zero unless the map is far from it:
+    `Route.relative_to` leads there, `planar_in_world` and `poses_in_world` lead back.
     """
 
     rig: CameraRig

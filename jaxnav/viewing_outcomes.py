@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxnav.origin import ZERO, Origin, inverses_in_world, opposite, planar_in_world
 from jaxnav.runtime.drive_log import Outcomes
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.pilot import Outcome
@@ -11,7 +12,8 @@ from jaxnav.runtime.pilot import Outcome
 
 @dataclass(frozen=True)
 class Shown:
-    """Of an outcome, what is shown; see `Outcomes`. Poses and candidates are NumPy's."""
+    """Of an outcome, what is shown; see `Outcomes`. Poses and candidates are NumPy's, and count
+    from the origin of the map."""
 
     now_ns: int
     health: Health
@@ -54,8 +56,13 @@ class Shown:
         )
 
     @staticmethod
-    def of_row(outcomes: Outcomes, index: int) -> "Shown":
-        """One outcome of a recorded drive."""
+    def of_row(outcomes: Outcomes, index: int, origin_m: Origin = ZERO) -> "Shown":
+        """One outcome of a recorded drive.
+
+        Args:
+            origin_m: of the map that it is shown with.
+        """
+        away_m = opposite(origin_m)
         return Shown(
             now_ns=int(outcomes.now_ns[index]),
             health=Health(int(outcomes.health[index])),
@@ -63,13 +70,13 @@ class Shown:
             rejects=Reject(int(outcomes.rejects[index])),
             steering_rad=float(outcomes.steering_rad[index]),
             throttle=float(outcomes.throttle[index]),
-            pose=outcomes.pose[index],
+            pose=planar_in_world(outcomes.pose[index], away_m),
             covariance=outcomes.covariance[index],
             located=bool(outcomes.located[index]),
             flip_probability=float(outcomes.flip_probability[index]),
             nis=float(outcomes.nis[index]),
-            hypotheses=outcomes.hypotheses[index],
+            hypotheses=planar_in_world(outcomes.hypotheses[index], away_m),
             log_weight=outcomes.log_weight[index],
-            Ts_vehicle_world=outcomes.Ts_vehicle_world[index],
+            Ts_vehicle_world=inverses_in_world(outcomes.Ts_vehicle_world[index], away_m),
             selected=int(outcomes.selected[index]),
         )

@@ -5,6 +5,9 @@
     plots/...                 numbers over time
     health                    a line where health, faults or rejects change
 
+Rerun holds places in float32: they count from the origin of the map, which `health` tells where it
+is not the world's zero.
+
 The images of a wide lens are shown as if it were none: they bend where Rerun draws straight lines.
 """
 
@@ -16,6 +19,7 @@ import numpy as np
 
 from jaxnav.files import poses
 from jaxnav.markers import MarkerMap
+from jaxnav.origin import ZERO
 from jaxnav.plotting import BLUE, GREEN, ORANGE, SKY, VERMILION
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.flags import Health, names
@@ -64,6 +68,9 @@ class Scene:
                 "world/waypoints",
                 rerun.Points3D(places_m, colors=_rgb(GREEN), labels=labels, radii=0.03),
             )
+        if markers is not None and markers.origin_m != ZERO:
+            from_m = ", ".join(f"{value:.0f}" for value in markers.origin_m)
+            self._still("health", rerun.TextLog(f"places are relative to ({from_m}) m"))
         stream.send_blueprint(self._blueprint())
 
     def show(self, shown: Shown) -> None:

@@ -23,7 +23,7 @@ LAYERS = {
         "small_matrices",
         "trees",
     },
-    "models": {"bicycle", "camera", "conventions", "markers", "rig"},
+    "models": {"bicycle", "camera", "conventions", "markers", "origin", "rig"},
     "estimate & control": {
         "ambiguity",
         "bicycle_kalman",

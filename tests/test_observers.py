@@ -9,6 +9,7 @@ import pytest
 
 from jaxnav import cli
 from jaxnav.arguments import Run
+from jaxnav.commands.delay_watch import DelayWatch
 from jaxnav.commands.observers import Recording, StatusLine, View, open_onlookers
 from jaxnav.commands.status import WIDTH
 from jaxnav.detection.types import Detections
@@ -86,7 +87,7 @@ def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monk
     path = tmp_path / "drive.mcap"
     with ExitStack() as closing:
         found = open_onlookers(Run(record=path, view=True), setup, closing)
-        assert [type(one) for one in found] == [Recording, View, StatusLine]
+        assert [type(one) for one in found] == [Recording, View, DelayWatch, StatusLine]
         fake = found[1]._view
         rig, markers, waypoints_m = fake.where
         assert (rig, markers, fake.how) == (setup.rig, setup.markers, {"live": True, "save": None})
@@ -95,7 +96,9 @@ def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monk
         found[0].handled(make_input(0), make_outcome(0))
     assert fake.closed == 1
     assert not read_drive(path).truncated
-    assert open_onlookers(Run(headless=True), setup, ExitStack()) == []
+    with ExitStack() as closing:
+        alone = open_onlookers(Run(headless=True), setup, closing)
+        assert [type(one) for one in alone] == [DelayWatch]
 
 
 def test_a_drive_that_is_called_off_leaves_what_was_recorded_before(setup, tmp_path):

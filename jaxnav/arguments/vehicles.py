@@ -145,6 +145,10 @@ class Doctor:
         tyro.conf.arg(metavar="CAMERA=IMAGE", help_behavior_hint="(repeatable)"),
     ] = ()
     """A picture by one of the rig's cameras, the car standing anywhere with a marker in view."""
+    drive: Annotated[
+        Path | None, tyro.conf.arg(metavar="FILE.mcap", help_behavior_hint="(optional)")
+    ] = None
+    """A recorded drive with eights, or stops and starts: are the cameras later than they say?"""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
         None
     )

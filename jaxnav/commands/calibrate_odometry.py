@@ -14,12 +14,13 @@ from jaxnav.bicycle import Vehicle
 from jaxnav.calibration.odometry import OdometryCalibration, calibrate_odometry
 from jaxnav.calibration.odometry_model import NAMES
 from jaxnav.commands.odometry_recordings import Recorded, read_recordings
-from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import visible
 from jaxnav.files import output_folder, save_vehicle, write_json
 from jaxnav.files.provenance import Calibrated, calibrated_now
 from jaxnav.odometry_plotting import odometry_report
+from jaxnav.origin import planar_in_world
 
 
 def run(args: Arguments) -> int:
@@ -43,8 +44,10 @@ def run(args: Arguments) -> int:
         out / "vehicle.yaml", calibrated_vehicle(recorded.vehicle, found), calibrated, found.sigma
     )
     write_json(out / "report.json", report(args, recorded, found, calibrated))
-    corners_world_m = np.asarray(recorded.markers.corners_world_m)
-    save_figure(odometry_report(found, corners_world_m, table(found)), out / "report.png")
+    origin_m = recorded.markers.origin_m
+    drawn = dataclasses.replace(found, poses=planar_in_world(found.poses, origin_m))
+    figure = odometry_report(drawn, corners_in_world(recorded.markers), table(found))
+    save_figure(figure, out / "report.png")
     print(f"{head(found)}\n{table(found)}")
     if left_out := sum(drive.left_out for drive in recorded.drives):
         print(f"left out: {left_out} readings and views that are not finite, or of no car")

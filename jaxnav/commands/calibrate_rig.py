@@ -18,7 +18,7 @@ from jaxnav.commands.calibration_report import (
     text,
     write_files,
 )
-from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_vehicle, output_folder, write_json
@@ -80,7 +80,7 @@ def _write_picture(out: Path, data: RigData, found: RigCalibration, given: np.nd
         centers_px=views.corners_px.mean(axis=1),
         residuals_px=found.residuals_px.mean(axis=1),
         weight=found.weight,
-        corners_world_m=np.asarray(markers.corners_world_m),
+        corners_world_m=corners_in_world(markers),
         marker_ids=[data.keys[index][1] for index in mapped],
         path_m=found.Ts_world_vehicle[:, :3, 3],
         Ts_vehicle_camera=found.Ts_vehicle_camera,

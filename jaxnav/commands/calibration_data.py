@@ -143,6 +143,7 @@ def _known(
             assert markers is not None
             T = markers.Ts_world_marker.as_matrix()[place]
             known[index] = np.array(T, float)
+            known[index][:3, 3] += markers.origin_m
             sizes_m.append(float(markers.size_m[place]))
         elif marker_size_m is not None or len(given) == 1:
             sizes_m.append(given[0] if marker_size_m is None else marker_size_m)

@@ -19,6 +19,7 @@ from jaxnav.files.poses import pose_from_matrix
 from jaxnav.files.provenance import Calibrated, calibrated_now
 from jaxnav.files.rigs import CameraSigma
 from jaxnav.markers import MarkerMap
+from jaxnav.origin import poses_in_world
 from jaxnav.rig import CameraRig
 
 # Good enough for driving: half a degree moves the car 3 cm sideways at 3 m from a marker.
@@ -66,7 +67,10 @@ def with_unseen(data: RigData, found: MarkerMap) -> tuple[MarkerMap, int]:
     given = data.markers
     keys = zip(given.families, given.ids, strict=True)
     unseen = [index for index, key in enumerate(keys) if key not in data.keys]
-    poses = [np.asarray(of.Ts_world_marker.wxyz_xyz) for of in (found, given)]
+    poses = [
+        np.asarray(poses_in_world(of.Ts_world_marker.wxyz_xyz, of.origin_m))
+        for of in (found, given)
+    ]
     sizes_m = [np.asarray(of.size_m) for of in (found, given)]
     return marker_map(
         np.concatenate([poses[0], poses[1][unseen]]),

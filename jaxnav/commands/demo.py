@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from jaxnav.ambiguity import LowestReprojection
 from jaxnav.arguments import Demo
-from jaxnav.commands.pictures import save_figure, views_of
+from jaxnav.commands.pictures import corners_in_world, save_figure, views_of
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.commands.rendered_world import Cameras, World
 from jaxnav.errors import visible
@@ -23,6 +23,7 @@ from jaxnav.files import (
     write_tum,
 )
 from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.origin import planar_in_world, points_in_world, poses_in_world
 from jaxnav.plotting import Track, camera_mosaic, drive_report
 from jaxnav.runtime.compiled import compiled_step
 from jaxnav.selectors import make_selector
@@ -112,7 +113,8 @@ def _drive(args: Demo, world: World, methods: Methods, seed: int) -> Record:
                 kept[len(frames)] = cameras.images
             frames.append(frame)
             bar.update(settings.frame_period_s)
-            x_m, y_m, psi_rad = frame.outputs[OURS].pose
+            pose = planar_in_world(frame.outputs[OURS].pose, world.markers.origin_m)
+            x_m, y_m, psi_rad = pose
             bar.set_postfix_str(f"at ({x_m:.2f}, {y_m:.2f}) m, {np.rad2deg(psi_rad):.0f} deg")
     return Record(frames, kept)
 
@@ -172,18 +174,21 @@ def _overall(summaries: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _write(folder: Path, world: World, record: Record, summary: dict[str, Any]) -> None:
     times_s = np.array([frame.stamp_s for frame in record.frames])
+    origin_m = world.markers.origin_m
     poses = {"truth": record.true_poses} | {name: record.poses(name) for name in (OURS, METHOD_A)}
     for name, rows in poses.items():
         known = np.isfinite(rows[:, 0])
-        Ts_world_vehicle = T_world_vehicle_from_planar(jnp.asarray(rows[known]))
-        write_tum(folder / f"{name}.tum", times_s[known], np.asarray(Ts_world_vehicle.wxyz_xyz))
+        wxyz_xyz = T_world_vehicle_from_planar(jnp.asarray(rows[known])).wxyz_xyz
+        Ts_world_vehicle = np.asarray(poses_in_world(wxyz_xyz, origin_m))
+        write_tum(folder / f"{name}.tum", times_s[known], Ts_world_vehicle)
+    poses = {name: planar_in_world(rows, origin_m) for name, rows in poses.items()}
     report = drive_report(
         times_s,
         Track("truth", poses["truth"]),
         [Track(LABELS[name], poses[name]) for name in (OURS, METHOD_A)],
-        np.asarray(world.route.waypoints_m),
+        np.asarray(points_in_world(world.route.waypoints_m, origin_m)),
         world.route.waypoint_radius_m,
-        np.asarray(world.markers.corners_world_m),
+        corners_in_world(world.markers),
         title=_one_line(summary),
     )
     save_figure(report, folder / "report.png")

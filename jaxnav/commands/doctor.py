@@ -27,6 +27,8 @@ def run(args: Doctor) -> int:
         report.examine("picture", lambda: _pictures(args, patient))
     if args.vehicle is not None or args.cameras is not None:
         report.examine("plug-ins", lambda: _plug_ins(report, args, patient))
+    if args.drive is not None:
+        report.examine("stamps", lambda: _check("stamps", "stamps")(args.drive))
     print(report.summary())
     if args.json is not None:
         from jaxnav.files import write_json
@@ -72,6 +74,8 @@ def _files(report: Report, args: Doctor) -> SimpleNamespace:
     }
     for name, path in paths.items():
         setattr(patient, name, report.read(name, partial(getattr(files, f"load_{name}"), path)))
+    if patient.markers is not None and patient.route is not None:
+        patient.route = patient.route.relative_to(patient.markers.origin_m)
     rig, markers, vehicle, route = vars(patient).values()
     if rig is not None:
         report.examine("rig", lambda: _check("rig_file", "rig_file")(paths["rig"], rig))

@@ -32,8 +32,8 @@ class Row(NamedTuple):
         output = outcome.report.output
         return Row(
             outcome.now_ns,
-            np.asarray(output.pose, float),
-            np.asarray(output.T_world_vehicle.wxyz_xyz, float),
+            np.asarray(outcome.pose, float),
+            np.asarray(outcome.T_world_vehicle, float),
             bool(output.located),
             bool(output.decided),
             outcome.health,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from jaxnav.arguments import Run
+from jaxnav.commands.delay_watch import DelayWatch
 from jaxnav.commands.status import notice, status_line
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.flags import Fault
@@ -62,8 +63,9 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     if args.view:
         from jaxnav.viewing import RerunView  # with all that draws
 
-        waypoints_m = np.asarray(setup.route.waypoints_m, float)
+        waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
         add(View(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
+    add(DelayWatch(setup, warns=not args.headless))
     if not args.headless:
         add(StatusLine())
     return found

@@ -16,7 +16,9 @@ from matplotlib.text import Text
 from jaxnav.camera import Camera
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path
+from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Output
+from jaxnav.origin import points_in_world
 from jaxnav.plotting import View
 from jaxnav.rig import CameraRig
 
@@ -44,6 +46,11 @@ def _words(artist: Artist) -> Iterator[Text]:
             yield child.label
         elif not isinstance(child, Tick):
             yield from _words(child)
+
+
+def corners_in_world(markers: MarkerMap) -> np.ndarray:
+    """(M, 4, 3) corners of a map as files count, m, float64."""
+    return np.asarray(points_in_world(markers.corners_world_m, markers.origin_m), float)
 
 
 def normals_px(

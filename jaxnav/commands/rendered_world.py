@@ -44,7 +44,7 @@ class World:
     rig: CameraRig
     markers: MarkerMap
     vehicle: Vehicle
-    route: Route
+    route: Route  # in the coordinates of the markers
     params: Params | None
     renderer: Renderer
     detectors: list[Detector]
@@ -70,7 +70,7 @@ class World:
             rig=rig,
             markers=markers,
             vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
-            route=load_route(args.route or qcar / "route.yaml"),
+            route=load_route(args.route or qcar / "route.yaml").relative_to(markers.origin_m),
             params=None if args.params is None else load_params(args.params),
             renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, SENSOR),
             detectors=make_detectors(markers, args.corner_backend),
@@ -93,7 +93,7 @@ class World:
         return navigator if self.params is None else apply_params(navigator, self.params)
 
     def floor_m(self) -> tuple[float, float, float, float]:
-        """The part of the world the car may use: x_min, x_max, y_min, y_max."""
+        """The part of the map the car may use: x_min, x_max, y_min, y_max."""
         points = np.vstack(
             [
                 self.route.waypoints_m,

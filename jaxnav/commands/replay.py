@@ -10,7 +10,7 @@ from tqdm import tqdm
 from jaxnav.arguments import Replay as Arguments
 from jaxnav.arguments import Selector
 from jaxnav.commands import replay_drive
-from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
@@ -158,7 +158,7 @@ def _report(
         positions_m.transpose(1, 0, 2).reshape(-1, 3),
         reference_m,
         drawn,
-        np.asarray(recording.markers.corners_world_m),
+        corners_in_world(recording.markers),
         title=_text(summary),
         connected=tracks == 1,
     )

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from jaxnav.arguments import Replay as Arguments
 from jaxnav.commands.drive_track import Row, Track
-from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
@@ -223,7 +223,7 @@ def _picture(setup: DriveSetup, track: Track, recorded: Outcomes | None, title: 
         track.positions_m,
         recorded_m,
         drawn,
-        np.asarray(setup.markers.corners_world_m),
+        corners_in_world(setup.markers),
         title=title,
     )
 

@@ -61,7 +61,7 @@ def run(args: Run, signals: Signals) -> int:
         setup = setup.with_params(params)
         _say(args, params.told())
     told = Setup(
-        setup.rig, setup.markers, setup.vehicle, setup.route.start_pose, args.seed, options
+        setup.rig, setup.markers, setup.vehicle, setup.route_on_map.start_pose, args.seed, options
     )
     with ExitStack() as closing:
         guarding = _guarding(args)

@@ -2,15 +2,19 @@
 
 import math
 
+from jaxnav.origin import ZERO
 from jaxnav.runtime.flags import Fault
 from jaxnav.runtime.pilot import Outcome
 
 WIDTH = 100  # characters, at most
 _WIDEST_NAME = 14  # of a health
+_FAR = 12  # of a coordinate to the cm, 10 000 km from zero
 
 
 def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen: bool) -> str:
     """Rate, latency, health, marker, flip probability, position, command: at most 100 characters.
+
+    Far from the world's zero a position takes up more of them, and the units are left out.
 
         30 Hz   4.2 ms OK             marker flip  0.1% x  1.83 y -0.79 m 124 deg thr  0.037 ...
 
@@ -22,11 +26,25 @@ def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen
         latency_ms: from an exposure to its command.
         marker_seen: of late.
     """
-    output = outcome.report.output
-    x_m, y_m, psi_rad = (float(value) for value in output.pose)
-    places = [_fixed(x_m, 6, 2), _fixed(y_m, 6, 2), _fixed(math.degrees(psi_rad), 4, 0)]
+    output, far = outcome.report.output, outcome.origin_m != ZERO
+    x_m, y_m, psi_rad = (float(value) for value in outcome.pose)
+    width = _FAR if far else 6
+    places = [_fixed(x_m, width, 2), _fixed(y_m, width, 2), _fixed(math.degrees(psi_rad), 4, 0)]
     x, y, psi = places if bool(output.located) else [f"{'-':>{len(place)}}" for place in places]
     flip = _fixed(100 * float(output.flip_probability), 5, 1)
+    if far:
+        return " ".join(
+            (
+                f"{_fixed(rate_hz, 4, 0)}Hz",
+                f"{_fixed(latency_ms, 5, 1)}ms",
+                f"{outcome.health.name:<{_WIDEST_NAME}}",
+                "marker" if marker_seen else "  --  ",
+                f"flip{flip}%",
+                f"x{x} y{y}{psi}",
+                f"thr {_fixed(outcome.throttle, 6, 3)}",
+                f"str {_fixed(math.degrees(outcome.steering_rad), 5, 1)}",
+            )
+        )
     return " ".join(
         (
             f"{_fixed(rate_hz, 4, 0)} Hz",

@@ -10,6 +10,7 @@ from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.errors import BadInput
 from jaxnav.navigator import Navigator
 from jaxnav.observation import Observation
+from jaxnav.origin import opposite, poses_in_world
 from jaxnav.runtime.recording import Recording
 from jaxnav.runtime.replay import estimate_corner_sigma_px
 from jaxnav.selectors import make_selector
@@ -117,7 +118,8 @@ def _recorded(
     if reference is not None:
         judged = used & reference.valid[frames] & visible.any(axis=(2, 3))
         known = reference.valid[frames][..., None]
-        truth = np.where(known, reference.T_world_vehicle[frames], truth)
+        Ts = poses_in_world(reference.T_world_vehicle[frames], opposite(recording.markers.origin_m))
+        truth = np.where(known, Ts, truth)
     return Recorded(
         markers=maps(recording.markers, lanes),
         obs=_observations(

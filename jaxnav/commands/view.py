@@ -27,7 +27,7 @@ def run(args: Arguments) -> int:
         view = RerunView(
             scenery.rig,
             scenery.markers,
-            scenery.waypoints_m,
+            scenery.on_map_m(scenery.waypoints_m),
             live=save is None,
             save=save,
             waits=True,
@@ -48,7 +48,7 @@ def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool)
         print(left_out(odd))
     names = () if scenery.rig is None else scenery.rig.names
     for index in tqdm(range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False):
-        view.show(Shown.of_row(outcomes, index))
+        view.show(Shown.of_row(outcomes, index, scenery.origin_m))
     for frame in (frame for given in log.inputs for frame in given.frames):
         name = names[frame.camera] if frame.camera < len(names) else f"camera_{frame.camera}"
         if frame.detections is not None:

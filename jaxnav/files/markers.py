@@ -7,7 +7,7 @@
         corners_world_m: [[...], [...], [...], [...]]   # TL TR BR BL, as its reader sees them
 
 Instead of the corners, `T_world_marker` (4x4 or `{wxyz, xyz_m}`): x right, y up, z towards the
-reader.
+reader. Wherever in the world a map is, its places are exact: see `jaxnav.origin`.
 """
 
 from collections.abc import Sequence
@@ -27,6 +27,7 @@ from jaxnav.files.rigs import plain_pose, with_provenance, written_pose
 from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, validate
 from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
+from jaxnav.origin import Origin, opposite, origin_near, poses_in_world
 
 # A corner may lie this far from the best square, as a part of the side: a tape measure's error.
 _MAX_CORNER_ERROR = 0.03
@@ -108,13 +109,14 @@ class MarkerFile(Entry):
             seen.add(key)
         return markers
 
-    def map(self) -> MarkerMap:
-        """The map, in the process's precision."""
+    def map(self, origin_m: Origin | None = None) -> MarkerMap:
+        """The map, in the process's precision; see `marker_map`."""
         return marker_map(
             np.stack([entry.pose() for entry in self.markers]),
             [entry.size_m for entry in self.markers],
             [entry.id for entry in self.markers],
             [entry.family for entry in self.markers],
+            origin_m,
         )
 
 
@@ -129,14 +131,26 @@ def load_markers(path: str | Path) -> MarkerMap:
 
 
 def marker_map(
-    Ts_world_marker: np.ndarray, size_m: list[float], ids: list[int], families: list[str]
+    Ts_world_marker: np.ndarray,
+    size_m: list[float],
+    ids: list[int],
+    families: list[str],
+    origin_m: Origin | None = None,
 ) -> MarkerMap:
-    """A map from plain values: (M, 7) wxyz_xyz and M of each of the others."""
+    """A map from plain values: (M, 7) wxyz_xyz and M of each of the others.
+
+    Args:
+        origin_m: that the map counts from; by default one that is near.
+    """
+    if origin_m is None:
+        origin_m = origin_near(Ts_world_marker[:, 4:])
+    Ts_map_marker = poses_in_world(Ts_world_marker, opposite(origin_m))
     return MarkerMap(
-        Ts_world_marker=jaxlie.SE3(jnp.asarray(Ts_world_marker, float)),
+        Ts_world_marker=jaxlie.SE3(jnp.asarray(Ts_map_marker, float)),
         size_m=jnp.asarray(size_m, float),
         ids=tuple(int(marker_id) for marker_id in ids),
         families=tuple(families),
+        origin_m=origin_m,
     )
 
 
@@ -163,14 +177,18 @@ def save_markers(
 
 
 def marker_data(markers: MarkerMap) -> dict[str, Any]:
-    """What a file of the map holds, in plain values, all numbers bit for bit; see `MarkerFile`."""
+    """What a file of the map holds, in plain values, all numbers bit for bit; see `MarkerFile`.
+
+    Far from zero places keep the digits that float64 has there: a nanometre at 10 000 km.
+    """
+    Ts_world_marker = poses_in_world(markers.Ts_world_marker.wxyz_xyz, markers.origin_m)
     return figures_data(
         [
             MarkerFigures(
                 id=marker_id,
                 family=family,
                 size_m=float(markers.size_m[index]),
-                T_world_marker=np.asarray(markers.Ts_world_marker.wxyz_xyz[index], float),
+                T_world_marker=np.asarray(Ts_world_marker[index], float),
             )
             for index, (marker_id, family) in enumerate(
                 zip(markers.ids, markers.families, strict=True)

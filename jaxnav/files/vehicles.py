@@ -36,6 +36,7 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import atomic_write
+from jaxnav.origin import Origin, opposite, planar_in_world, points_in_world
 
 
 class VehicleFile(Entry):
@@ -91,6 +92,17 @@ class Route:
     waypoints_m: tuple[tuple[float, float], ...]  # (N, 2) x y
     waypoint_radius_m: float  # a waypoint is reached within this
     start_pose: tuple[float, float, float]  # (x m, y m, psi rad) where a simulated drive starts
+
+    def relative_to(self, origin_m: Origin) -> "Route":
+        """The route in the coordinates of a map that counts from there, see `MarkerMap`."""
+        away_m = opposite(origin_m)
+        waypoints_m = points_in_world(self.waypoints_m, away_m)
+        x_m, y_m, psi_rad = planar_in_world(self.start_pose, away_m)
+        return Route(
+            tuple((float(x), float(y)) for x, y in waypoints_m),
+            self.waypoint_radius_m,
+            (float(x_m), float(y_m), float(psi_rad)),
+        )
 
 
 def load_vehicle(path: str | Path) -> Vehicle:

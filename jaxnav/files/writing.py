@@ -157,7 +157,7 @@ def write_tum(path: str | Path, stamps_s: np.ndarray, Ts_world_vehicle: np.ndarr
     if Ts.shape != (*stamps_s.shape, 7) or stamps_s.ndim != 1:
         raise ValueError(f"(F,) and (F, 7) expected, got {stamps_s.shape} and {Ts.shape}")
     lines = [
-        f"{stamp:.9f} {x:.9g} {y:.9g} {z:.9g} {qx:.9g} {qy:.9g} {qz:.9g} {qw:.9g}\n"
+        f"{stamp:.9f} {_metres(x)} {_metres(y)} {_metres(z)} {qx:.9g} {qy:.9g} {qz:.9g} {qw:.9g}\n"
         for stamp, (qw, qx, qy, qz, x, y, z) in zip(stamps_s, Ts, strict=True)
     ]
     atomic_write(path, "".join(lines))
@@ -214,6 +214,11 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except (OSError, ValueError):
         return None
     return found.st_dev, found.st_ino
+
+
+def _metres(value: float) -> str:
+    """To 9 digits, and to the um where these would be fewer."""
+    return f"{value:.9g}" if abs(value) < 1e3 else f"{value:.6f}"
 
 
 def yaml_text(data: dict[str, Any]) -> str:

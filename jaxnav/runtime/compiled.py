@@ -13,6 +13,7 @@ import jaxlie
 
 from jaxnav import executables
 from jaxnav.bicycle import Vehicle
+from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator, Step, jitted_step
 
 
@@ -43,7 +44,7 @@ def compiled(
     Returns:
         The function of the further trees.
     """
-    navigator = _of_true_units(navigator)
+    navigator = bare(navigator)
     if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
         return partial(_jitted(function), navigator)
     numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
@@ -63,13 +64,16 @@ def is_compiled(
     function: Callable[..., Any], navigator: Navigator, folder: Path, *told: Any
 ) -> bool:
     """Whether `compiled(function, navigator, folder)(*told)` finds its executable in the folder."""
-    return executables.is_kept(function, (_of_true_units(navigator), *told), folder)
+    return executables.is_kept(function, (bare(navigator), *told), folder)
 
 
-def _of_true_units(navigator: Navigator) -> Navigator:
-    """Without what its vehicle's sensors are off by: those numbers are static, no leaves."""
+def bare(navigator: Navigator) -> Navigator:
+    """Without what its vehicle's sensors are off by and what its map counts from: those numbers
+    are static, no leaves, and nothing is computed with them."""
 
-    def bare(part: Any) -> Any:
+    def without(part: Any) -> Any:
+        if isinstance(part, MarkerMap):
+            return part.without_origin()
         if not isinstance(part, Vehicle):
             return part
         return replace(
@@ -80,7 +84,9 @@ def _of_true_units(navigator: Navigator) -> Navigator:
             camera_delay_s=0.0,
         )
 
-    return jax.tree.map(bare, navigator, is_leaf=lambda part: isinstance(part, Vehicle))
+    return jax.tree.map(
+        without, navigator, is_leaf=lambda part: isinstance(part, Vehicle | MarkerMap)
+    )
 
 
 @cache

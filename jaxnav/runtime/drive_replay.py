@@ -19,6 +19,7 @@ import numpy as np
 from jaxnav.detection import Detections
 from jaxnav.errors import BadInput
 from jaxnav.files.images import decoded_image
+from jaxnav.origin import opposite, planar_in_world
 from jaxnav.runtime.drive_log import DriveLog, Outcomes
 from jaxnav.runtime.drive_setup import DriveSetup, made_here
 from jaxnav.runtime.flags import Fault, Health, Reject, names
@@ -124,7 +125,7 @@ def first_difference(log: DriveLog, outcomes: Iterable[Outcome]) -> Difference |
 
 
 def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: float) -> str | None:
-    output = outcome.report.output
+    output, away_m = outcome.report.output, opposite(outcome.origin_m)
     for name, kind in (("health", Health), ("faults", Fault), ("rejects", Reject)):
         before, now = kind(int(getattr(recorded, name)[index])), getattr(outcome, name)
         if before != now:
@@ -138,15 +139,20 @@ def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: flo
         if (before := getattr(recorded, name)[index]) != now:
             return f"{name}: {now}, recorded {before}"
     for name, value in (
-        ("pose", output.pose),
+        ("pose", outcome.pose),
         ("covariance", output.covariance),
         ("steering_rad", outcome.steering_rad),
         ("throttle", outcome.throttle),
         ("flip_probability", output.flip_probability),
         ("nis", output.nis),
     ):
-        bound = _MAGNIFIED * tolerance if name == "nis" else tolerance
-        off = _off(np.asarray(value, float), np.asarray(getattr(recorded, name)[index], float))
+        before, bound = getattr(recorded, name)[index], tolerance
+        if name == "nis":
+            bound *= _MAGNIFIED
+        if name == "pose":  # by the numbers that were computed with, less what was rounded since
+            value, before = (planar_in_world(pose, away_m) for pose in (value, before))
+            bound += float(np.spacing(max(map(abs, away_m)))) if tolerance else 0.0
+        off = _off(np.asarray(value, float), np.asarray(before, float))
         if not off <= bound:
             return f"{name}: off by {off:.3g}"
     return None

@@ -32,6 +32,7 @@ from jaxnav.files.validation import (
     CornerSigma,
     Entry,
     FloorPlace,
+    Point,
     Position,
     Radius,
     Text,
@@ -41,6 +42,7 @@ from jaxnav.files.validation import (
 from jaxnav.files.vehicles import VehicleFile, vehicle_data
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
+from jaxnav.origin import ZERO, Origin
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.compiled import compiled
 from jaxnav.runtime.estimator import advance_packed
@@ -88,6 +90,7 @@ class SetupEntry(Entry):
     setup_version: Annotated[int, Field(strict=True)]
     rig: RigFile
     markers: MarkerFile
+    origin_m: Point | None = None  # that the map counts from; maps near zero have none
     vehicle: VehicleFile
     route: RouteEntry
     selector: Text
@@ -97,6 +100,13 @@ class SetupEntry(Entry):
     float64: Flag
     relocate: Flag = True  # older drives don't say
     made_by: dict[str, str]
+
+    def origin(self) -> Origin:
+        """What the map counted from when it was recorded."""
+        if self.origin_m is None:
+            return ZERO
+        x_m, y_m, z_m = self.origin_m
+        return x_m, y_m, z_m
 
     @field_validator("selector")
     @classmethod
@@ -112,6 +122,7 @@ class DriveSetup:
     """What a drive is driven with.
 
     Attributes:
+        markers: what is driven with counts from their `origin_m`, the route from zero.
         selector: one of `PILOT_SELECTORS`.
         corner_sigma_px: of every corner along one axis; None: as whoever detects it says.
         float64: precision of the process, in which rig, markers and vehicle are made too.
@@ -140,13 +151,18 @@ class DriveSetup:
         apply_params(replace(self, parameters={}).navigator(), params)
         return replace(self, parameters=params.plain())
 
+    @property
+    def route_on_map(self) -> Route:
+        """The route in the coordinates of the markers."""
+        return self.route.relative_to(self.markers.origin_m)
+
     def navigator(self) -> Navigator:
         """What the pilot runs."""
         navigator = Navigator(
             rig=self.rig,
             markers=self.markers,
             vehicle=self.vehicle,
-            waypoints_m=self.route.waypoints_m,
+            waypoints_m=self.route_on_map.waypoints_m,
             waypoint_radius_m=self.route.waypoint_radius_m,
             selector=make_selector(self.selector),
         )
@@ -179,6 +195,8 @@ class DriveSetup:
         # Without them any version of the program reads it.
         if self.parameters:
             header["parameters"] = dict(self.parameters)
+        if self.markers.origin_m != ZERO:
+            header["origin_m"] = list(self.markers.origin_m)
         return header if self.relocate else header | {"relocate": False}
 
     @staticmethod
@@ -194,7 +212,7 @@ class DriveSetup:
         entry = _checked(header, where)
         setup = DriveSetup(
             rig=entry.rig.rig(),
-            markers=entry.markers.map(),
+            markers=entry.markers.map(entry.origin()),
             vehicle=entry.vehicle.vehicle(),
             route=entry.route.route(),
             selector=entry.selector,

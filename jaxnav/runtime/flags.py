@@ -35,6 +35,7 @@ class Fault(enum.IntFlag):
     WAYS_DISPUTED = enum.auto()  # corners and odometer tell of different ways
     ODOMETRY_DOUBTFUL = enum.auto()  # no marker, and the odometer contradicts the throttle
     MARKER_OUTVOTED = enum.auto()  # its corners contradict what the others agree on
+    CAMERA_LATE = enum.auto()  # images are older, or newer, than their stamps say; costs no health
 
 
 class Reject(enum.IntFlag):

@@ -40,7 +40,7 @@ class Setup:
     rig: CameraRig
     markers: MarkerMap
     vehicle: VehicleModel
-    start_pose: tuple[float, float, float]  # x_m, y_m, psi_rad of the route; for simulations
+    start_pose: tuple[float, float, float]  # x_m, y_m, psi_rad on the map; for simulations
     seed: int = 0  # for simulations
     options: Mapping[str, str] = field(default_factory=dict)  # --option KEY=VALUE
 

@@ -91,7 +91,8 @@ class TickMessage(Entry):
 
 
 class OutcomeMessage(Entry):
-    """See `Outcome` and its report, without which all from `pose` on is missing.
+    """See `Outcome` and its report, without which all from `pose` on is missing. All poses are in
+    the world.
 
     Attributes:
         covariance: (d, d).

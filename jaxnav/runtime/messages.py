@@ -6,7 +6,9 @@ written. So they must not be changed afterwards.
 
 import hashlib
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,6 +16,7 @@ import jax
 from jaxnav.detection.types import Detections
 from jaxnav.files.ranges import RANGES
 from jaxnav.motion import Belief
+from jaxnav.origin import Origin, inverses_in_world, planar_in_world
 from jaxnav.runtime.frames import Sighted
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.runtime.message_schemas import (
@@ -87,7 +90,7 @@ def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
     }
     if outcome.outvoted:
         message["outvoted"] = list(outcome.outvoted)
-    return message | _reported(outcome.report, outcome.moment.belief)
+    return message | _reported(outcome.report, outcome.moment.belief, outcome.origin_m)
 
 
 @dataclass(frozen=True)
@@ -96,17 +99,23 @@ class _Rows:
 
     array: Any
     which: Any = ...
+    in_world: Callable[[Any], Any] | None = None  # to the world's coordinates
 
     def tolist(self) -> list[Any]:
-        values: list[Any] = self.array[self.which].ravel().tolist()
+        rows = self.array[self.which]
+        if self.in_world is not None:
+            rows = self.in_world(rows)
+        values: list[Any] = rows.ravel().tolist()
         return values
 
 
-def _reported(report: Report, belief: Belief) -> dict[str, Any]:
+def _reported(report: Report, belief: Belief, origin_m: Origin) -> dict[str, Any]:
     output, alive, valid = report.output, belief.initialised, report.output.candidates.valid
     selected = int(output.selected)
+    planar = partial(planar_in_world, origin_m=origin_m)
+    inverses = partial(inverses_in_world, origin_m=origin_m)
     return {
-        "pose": output.pose,
+        "pose": _Rows(output.pose, in_world=planar),
         "covariance": _Rows(output.covariance),
         "located": output.located,
         "decided": output.decided,
@@ -114,9 +123,9 @@ def _reported(report: Report, belief: Belief) -> dict[str, Any]:
         "flip_probability": output.flip_probability,
         "nis": output.nis,
         "hypothesis": output.hypothesis,
-        "hypotheses": _Rows(belief.mean[:, :3], alive),
+        "hypotheses": _Rows(belief.mean[:, :3], alive, planar),
         "log_weight": _Rows(belief.log_weight, alive),
-        "Ts_vehicle_world": _Rows(output.candidates.T_vehicle_world.wxyz_xyz, valid),
+        "Ts_vehicle_world": _Rows(output.candidates.T_vehicle_world.wxyz_xyz, valid, inverses),
         "costs": _Rows(output.costs, valid),
         "selected": sum(valid[:selected].tolist()) if selected >= 0 else -1,
     }

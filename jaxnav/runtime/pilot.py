@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxnav.motion import Belief
 from jaxnav.navigator import Navigator
+from jaxnav.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.runtime.corrections import Corrections
 from jaxnav.runtime.due import due_px
 from jaxnav.runtime.estimator import Estimator, Program
@@ -59,7 +60,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the pilot makes of an event."""
+    """What the pilot makes of an event. Its report and moment count from `origin_m`."""
 
     now_ns: int
     health: Health
@@ -74,6 +75,18 @@ class Outcome:
     restarts: int  # so far, and why the last one
     restart_reason: str
     outvoted: tuple[int, ...] = ()  # ids of markers that were left out, since others contradict
+    origin_m: Origin = ZERO  # see `MarkerMap`
+
+    @property
+    def pose(self) -> np.ndarray:
+        """x_m, y_m, psi_rad in the world."""
+        return np.asarray(planar_in_world(self.report.output.pose, self.origin_m))
+
+    @property
+    def T_world_vehicle(self) -> np.ndarray:
+        """(7,) wxyz_xyz."""
+        wxyz_xyz = self.report.output.T_world_vehicle.wxyz_xyz
+        return np.asarray(poses_in_world(wxyz_xyz, self.origin_m))
 
 
 class _Known(NamedTuple):
@@ -131,6 +144,7 @@ class Pilot:
         if navigator.controller is None:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
         self.navigator = navigator
+        self._origin_m = navigator.markers.origin_m
         self.limits = Limits.of(navigator.controller.vehicle)
         self._corrections = Corrections.of(navigator.controller.vehicle)
         self._estimator = Estimator(navigator, program)
@@ -271,6 +285,7 @@ class Pilot:
             self._restarts,
             self._restart_reason,
             outvoted or (self._hidden if Fault.MARKER_OUTVOTED in faults else ()),
+            self._origin_m,
         )
 
     def _arrived_elsewhere(self, known: _Known) -> None:

@@ -24,6 +24,7 @@ from jaxnav.files import Params, apply_params, limits
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator, State
 from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot
+from jaxnav.origin import opposite, poses_in_world
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.recording import Recording
 
@@ -111,8 +112,15 @@ def replay(
     wxyz_xyz, seen, located, flip_probability, branch = jax.tree.map(
         lambda *leaves: np.concatenate(leaves)[:total], *chunks
     )
+    Ts_world_vehicle = np.asarray(poses_in_world(wxyz_xyz, recording.markers.origin_m))
     return Replay(
-        wxyz_xyz, seen, located, flip_probability, branch, total / elapsed_s, corner_sigma_px
+        Ts_world_vehicle,
+        seen,
+        located,
+        flip_probability,
+        branch,
+        total / elapsed_s,
+        corner_sigma_px,
     )
 
 
@@ -205,7 +213,10 @@ def _frames(recording: Recording, begin: int) -> _Frames:
     )
     reference = recording.reference
     identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(frames), 1))
-    truth = identity if reference is None else reference.T_world_vehicle[frames]
+    truth = identity
+    if reference is not None:
+        there = opposite(recording.markers.origin_m)
+        truth = poses_in_world(reference.T_world_vehicle[frames], there)
     corners_px, visible = recording.lanes(frames)
 
     def pad(rows: np.ndarray) -> Array:

@@ -18,9 +18,14 @@ import jaxlie
 import numpy as np
 
 from jaxnav.bicycle import Vehicle
+from jaxnav.files.markers import MarkerFile, marker_data
+from jaxnav.files.vehicles import Route
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Navigator
+from jaxnav.origin import ZERO, Origin, planar_in_world, points_in_world
 from jaxnav.rig import CameraRig
+from jaxnav.runtime.camera_delays import CameraDelays
+from jaxnav.runtime.compiled import bare
 from jaxnav.runtime.estimator import Program
 from jaxnav.runtime.flags import Fault, Health, Reject, names
 from jaxnav.runtime.pilot import Pilot
@@ -35,6 +40,7 @@ WAYPOINTS_M = (
     (1.3, 0.0), (0.3, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5),
     (0.5, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5), (0.5, 0.2),
 )  # fmt: skip
+_RADIUS_M = 0.15
 
 Happens = Callable[[int, World], None]
 
@@ -70,6 +76,7 @@ class Row:
         markers: where there are others than the trial's: made of these.
         relocate: see `Pilot`.
         well: the health at which the car has recovered.
+        shift_m: so far from the trial's world the map and the route are written down.
     """
 
     name: str
@@ -89,6 +96,7 @@ class Row:
     markers: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
     relocate: bool = True
     well: Health = Health.OK
+    shift_m: Origin = ZERO
 
 
 @dataclass(frozen=True)
@@ -120,19 +128,38 @@ class Trial:
 
 def run_trial(row: Row, trial: Trial) -> Result:
     """A drive with the fault in it."""
-    markers = row.markers(trial.markers)
+    trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
+    markers, route = written_down(trial, row.shift_m)
     navigator = Navigator(
         rig=told_rig(trial.rig, row.telling),
         markers=markers,
         vehicle=trial.vehicle,
-        waypoints_m=WAYPOINTS_M,
-        waypoint_radius_m=0.15,
+        waypoints_m=route.waypoints_m,
+        waypoint_radius_m=route.waypoint_radius_m,
     )
-    program = trial.program and trial.program(navigator)
+    program = trial.program and trial.program(bare(navigator))
     pilot = Pilot(navigator, program=program, relocate=row.relocate)
-    world = World(trial.rig, markers, trial.vehicle, trial.start_pose, BEGIN_NS, seed=trial.seed)
-    steps = list(drive(pilot, world, row.drive_s, row.change(), row.rates, row.happens()))
+    world = World(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
+    delays = None
+    if Fault.CAMERA_LATE in row.faults:
+        delays = CameraDelays(navigator.rig, markers, trial.vehicle)
+    steps = list(drive(pilot, world, row.drive_s, row.change(), row.rates, row.happens(), delays))
     return judge(row, steps, pilot)
+
+
+def written_down(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
+    """Map and route as a drive has them when their files count from elsewhere.
+
+    What the trial counts from is that of its map.
+    """
+    if shift_m == ZERO:
+        return trial.markers, Route(WAYPOINTS_M, _RADIUS_M, trial.start_pose)
+    x_m, y_m, z_m = np.add(trial.markers.origin_m, shift_m).tolist()
+    data = marker_data(dataclasses.replace(trial.markers, origin_m=(x_m, y_m, z_m)))
+    markers = MarkerFile.model_validate(data).map()
+    waypoints_m = points_in_world(WAYPOINTS_M, (x_m, y_m, z_m))
+    start_pose = planar_in_world(trial.start_pose, (x_m, y_m, z_m))
+    return markers, Route(waypoints_m, _RADIUS_M, start_pose).relative_to(markers.origin_m)
 
 
 def told_rig(rig: CameraRig, telling: str) -> CameraRig:
@@ -188,10 +215,11 @@ def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
 
 def _error_m(step: Step) -> float:
     """Of a position that is acted upon; NaN where there is none."""
-    output = step.outcome.report.output
-    if not output.decided or step.outcome.throttle == 0:
+    outcome = step.outcome
+    if not outcome.report.output.decided or outcome.throttle == 0:
         return math.nan
-    return float(np.hypot(*(output.pose[:2] - step.truth[:2])))
+    truth = planar_in_world(step.truth[:3], outcome.origin_m)
+    return float(np.hypot(*(outcome.pose[:2] - truth[:2])))
 
 
 def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:

@@ -3,12 +3,15 @@
 What reaches the pilot may be changed on its way: that is how faults are tried.
 """
 
+import dataclasses
 import heapq
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from jaxnav.runtime.camera_delays import CameraDelays
+from jaxnav.runtime.flags import Fault
 from jaxnav.runtime.frames import Sighted
 from jaxnav.runtime.interfaces import Odometry
 from jaxnav.runtime.pilot import Input, Outcome, Pilot
@@ -47,11 +50,13 @@ def drive(
     change: Change = lambda given: [given],
     rates: Rates | None = None,
     happens: Callable[[int, World], None] = lambda now_ns, world: None,
+    delays: CameraDelays | None = None,
 ) -> Iterator[Step]:
     """Drive, an event at a time, until the time is over.
 
     Args:
         change: what happens to an input on its way.
+        delays: who watches the cameras' stamps, if anybody does.
         happens: to the world, called with the time before each input is made.
     """
     rates = rates or Rates()
@@ -68,7 +73,13 @@ def drive(
             upcoming = next(sources, None)
             continue
         given = heapq.heappop(waiting)[2]
+        if delays is not None and delays.late:
+            given = dataclasses.replace(given, faults=given.faults | Fault.CAMERA_LATE)
         outcome = pilot.handle(given)
+        if delays is not None:
+            delays.take(outcome)
+            while delays.due:
+                delays.solve()
         world.write(outcome.steering_rad, outcome.throttle, given.now_ns)
         yield Step(given, outcome, world.state(given.now_ns))
 

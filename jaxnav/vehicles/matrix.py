@@ -41,6 +41,8 @@ def matrix() -> list[Row]:
         *_nonsense(),
         *_spoofed(),
         *_outvoted(),
+        *_far_origins(),
+        *_late_stamps(),
     ]
 
 
@@ -470,5 +472,32 @@ def _outvoted() -> list[Row]:
             faults=Fault.MARKER_OUTVOTED,
             at_most=_SLOW,
             ends_s=_LATEST,
+        ),
+    ]
+
+
+def _far_origins() -> list[Row]:
+    """Nothing is wrong, but that float32 ends at half a metre or a metre where the map is."""
+    return [
+        Row("map 10 000 km from the origin", shift_m=(1e7, -1e7, 0.0)),
+        Row("map at UTM coordinates", shift_m=(448_251.37, 5_411_932.81, 0.0)),
+    ]
+
+
+def _late_stamps() -> list[Row]:
+    """Frames that were taken earlier than they say, and no clock shows it: it is told, and what it
+    does to the estimate meanwhile is not promised."""
+    late_s = 0.05
+    return [
+        Row(
+            "frames 50 ms late, unsaid, all",
+            lambda: inject.frames(inject.stamps(lambda ns: ns + int(late_s * 1e9))),
+            faults=Fault.CAMERA_LATE,
+            at_most=_SLOW,
+            error_m=np.inf,
+            begins_s=0.0,
+            ends_s=_LATEST,
+            drive_s=10.0,
+            rates=Rates(frame_delay_s=0.03 + late_s),
         ),
     ]

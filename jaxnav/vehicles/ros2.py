@@ -194,7 +194,7 @@ class RosPublisher:
         self._node.publish_drive(self._command, outcome.steering_rad, speed_mps, outcome.now_ns)
         if not outcome.report.output.located:
             return
-        pose = np.asarray(outcome.report.output.pose, float)
+        pose = np.asarray(outcome.pose, float)
         velocity = np.asarray(outcome.report.mean, float)[3:6]
         covariance = np.asarray(outcome.report.output.covariance, float)
         if all(np.isfinite(part).all() for part in (pose, velocity, covariance)):

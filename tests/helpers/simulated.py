@@ -24,7 +24,7 @@ def make_setup() -> DriveSetup:
 
 def simulated(setup: DriveSetup, duration_s: float, **how) -> list[Step]:
     """A drive in lockstep; see there."""
-    start = setup.route.start_pose
+    start = setup.route_on_map.start_pose
     world = World(setup.rig, setup.markers, setup.vehicle, start, BEGIN_NS)
     return list(drive(setup.pilot(None), world, duration_s, **how))
 

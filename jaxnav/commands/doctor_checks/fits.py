@@ -62,6 +62,7 @@ class Sighted:
             markers.size_m[kept],
             tuple(markers.ids[i] for i in kept),
             tuple(markers.families[i] for i in kept),
+            markers.origin_m,
         )
         sigma_px = np.hypot(seen.sigma_px[:, kept], MODEL_SIGMA_PX)
         return Sighted(rig, chosen, seen.corners_px[:, kept], seen.visible[:, kept], sigma_px)

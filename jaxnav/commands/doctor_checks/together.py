@@ -11,6 +11,7 @@ from jaxnav.commands.doctor_checks.findings import Finding
 from jaxnav.commands.doctor_checks.fits import Fit, Sighted, Unknowns, fit
 from jaxnav.files import Route
 from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.origin import Origin
 
 _FITS = 2.0  # chi-square for each number, up to which all is well
 _SMALL_PX = 0.3  # nor is this much an error of a file
@@ -28,7 +29,7 @@ def together(seen: Sighted, poses: Sequence[Fit], route: Route | None) -> Iterat
     starts = [_on_ground(pose) for pose in poses]
     whole = fit(seen, starts, Unknowns.of_pose(seen, level=True))
     if route is not None:
-        yield _place(whole, route)
+        yield _place(whole, route, seen.markers.origin_m)
     if len(seen.markers.ids) == 1:
         yield _size_alone(seen, starts)
         return
@@ -61,7 +62,7 @@ def _on_ground(pose: Fit) -> np.ndarray:
     return np.asarray(T_world_vehicle_from_planar(jnp.asarray(pose.planar, float)).wxyz_xyz)
 
 
-def _place(whole: Fit, route: Route) -> Finding:
+def _place(whole: Fit, route: Route, origin_m: Origin) -> Finding:
     x_m, y_m, psi_rad = whole.planar
     start = route.start_pose
     apart_m = math.hypot(x_m - start[0], y_m - start[1])
@@ -69,7 +70,8 @@ def _place(whole: Fit, route: Route) -> Finding:
     return Finding(
         "picture",
         "ok",
-        f"the car stands at x {x_m:.2f} m, y {y_m:.2f} m, psi {round(math.degrees(psi_rad))} deg: "
+        f"the car stands at x {origin_m[0] + x_m:.2f} m, y {origin_m[1] + y_m:.2f} m, "
+        f"psi {round(math.degrees(psi_rad))} deg: "
         f"{apart_m:.2f} m and {round(turn_deg):+d} deg from the route's start",
     )
 

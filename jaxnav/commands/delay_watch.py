@@ -1,0 +1,135 @@
+"""Whether the cameras' stamps tell the truth: while a car drives, and of a recorded drive."""
+
+import math
+import sys
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxnav.origin import opposite, planar_in_world
+from jaxnav.runtime.camera_delays import CameraDelays, Delay
+from jaxnav.runtime.corrections import Corrections
+from jaxnav.runtime.drive_log import DriveLog
+from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.runtime.flags import Fault
+from jaxnav.runtime.frames import Frames, Sighted
+from jaxnav.runtime.interfaces import Frame
+from jaxnav.runtime.pilot import Input, Outcome
+
+# The compiler can not be cut short, and the vehicle stands already.
+_CLOSE_S = 20.0
+
+
+class DelayWatch:
+    """Warns once when a camera is later than its stamps say; see `Onlooker`.
+
+    What takes milliseconds is done by a thread of its own, beside whoever drives.
+    """
+
+    def __init__(self, setup: DriveSetup, warns: bool):
+        """Args:
+        warns: on the terminal, when it is found.
+        """
+        self._setup, self._warns = setup, warns
+        self._delays = CameraDelays(setup.rig, setup.markers, setup.vehicle)
+        self._faults = Fault(0)
+        self._wake, self._closing = threading.Event(), False
+        self._thread = threading.Thread(target=self._run, name="jaxnav-delays", daemon=True)
+        self._thread.start()
+
+    @property
+    def faults(self) -> Fault:
+        """See `Observer`."""
+        return self._faults
+
+    def handled(self, given: Input, outcome: Outcome) -> None:
+        """See `Observer`."""
+        self._delays.take(outcome)
+        if self._delays.due:
+            self._wake.set()
+
+    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+        """See `Observer`."""
+
+    def close(self) -> None:
+        """See `Onlooker`."""
+        self._closing = True
+        self._wake.set()
+        self._thread.join(_CLOSE_S)
+
+    @property
+    def told(self) -> str | None:
+        """See `Onlooker`."""
+        return "\n".join(warnings(self._delays, self._setup)) or None if self._faults else None
+
+    def _run(self) -> None:
+        self._delays.warm_up()
+        while not self._closing:
+            self._wake.wait()
+            self._wake.clear()
+            while self._delays.due and not self._closing:
+                self._delays.solve()
+            if self._delays.late and not self._faults:
+                self._faults = Fault.CAMERA_LATE
+                if self._warns:
+                    text = "\n".join(warnings(self._delays, self._setup))
+                    sys.stderr.write(f"\n{text}\n")
+
+
+def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
+    """A line for each camera whose stamps are surely wrong, or one for all of them."""
+    found, together = delays.found, delays.together
+    known = [one for one in found if one.known]
+    if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
+        delay_s = setup.vehicle.camera_delay_s + together.delay_s
+        do = f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
+        yield f"the cameras are {told(together)}: {do}"
+        return
+    for name, one in zip(setup.rig.names, found, strict=True):
+        if not one.late:
+            continue
+        delay_s = setup.vehicle.camera_delay_s + one.delay_s
+        yield (
+            f"camera {name!r} is {told(one)}: raise its latency_ms by {one.delay_s * 1e3:.0f}, or "
+            f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml where all cameras are like it"
+        )
+
+
+def told(delay: Delay) -> str:
+    """`48 +- 6 ms later than its stamps say`."""
+    way = "later" if delay.delay_s > 0 else "earlier"
+    off_ms, sigma_ms = abs(delay.delay_s) * 1e3, max(delay.sigma_s * 1e3, 1.0)
+    return f"{off_ms:.0f} +- {sigma_ms:.0f} ms {way} than stamps say"
+
+
+def _agree(one: Delay, together: Delay) -> bool:
+    apart_s = abs(one.delay_s - together.delay_s)
+    return apart_s < 3 * math.hypot(one.sigma_s, together.sigma_s)
+
+
+def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
+    """What a recorded drive tells of its cameras' stamps."""
+    delays = CameraDelays(setup.rig, setup.markers, setup.vehicle)
+    corrections = Corrections.of(setup.vehicle)
+    frames = Frames(len(setup.rig), setup.markers, setup.corner_sigma_px)
+    outcomes = log.outcomes
+    poses = planar_in_world(outcomes.pose, opposite(setup.markers.origin_m))
+    known = outcomes.decided & np.isfinite(poses).all(axis=1)
+    at = 0
+    for given in log.inputs:
+        read = given.odometry
+        if read is not None and read.valid:
+            right = corrections.reading(read)
+            if math.isfinite(right.speed_mps) and math.isfinite(right.steering_rad):
+                delays.read(right.stamp_ns, right.speed_mps, right.steering_rad)
+        seen, stamp_ns, _ = frames.told([corrections.frame(f) for f in given.frames], given.now_ns)
+        if seen is not None:
+            delays.seen(stamp_ns, seen)
+        while at < len(known) and outcomes.now_ns[at] <= given.now_ns:
+            if known[at]:
+                delays.at(int(outcomes.now_ns[at]), np.asarray(poses[at], float))
+            at += 1
+        while delays.due:
+            delays.solve()
+    return delays

@@ -1,0 +1,81 @@
+"""Coordinates near zero for maps that are far from it, so that float32 holds them.
+
+float32 has 7 digits: 1 km from zero they end at 0.06 mm, 100 km away at 8 mm, at 5 000 km (UTM)
+at half a metre. So a `MarkerMap` counts from its `origin_m`, a round place near its markers, and
+with it all that computes: waypoints, beliefs, outputs, simulated cars. Files and people count from
+the world's zero in float64, and what goes from one to the other passes through here:
+
+    route = route.relative_to(markers.origin_m)                  # on the way in
+    x_m, y_m, psi_rad = planar_in_world(out.pose, markers.origin_m)   # on the way out
+
+The axes are the same, and so are angles, velocities and covariances. At the zero origin, that of
+every map within `NEAR_M`, nothing changes, not a bit.
+"""
+
+from typing import Any
+
+import numpy as np
+
+Origin = tuple[float, float, float]  # x_m, y_m, z_m in the world
+
+ZERO: Origin = (0.0, 0.0, 0.0)
+# float32's spacing there, 0.06 mm, is a thirtieth of what the best drives are off by.
+NEAR_M = 1000.0
+# Round for a person who reads it, and near: what is left is below 50 m and a map's own size.
+GRID_M = 100.0
+
+
+def origin_near(positions_m: np.ndarray) -> Origin:
+    """The origin for places (N, 3): on each axis zero within `NEAR_M`, else a multiple of `GRID_M`.
+
+    What lies on the ground of a car (z = 0 of its coordinates) is thus at the origin's z.
+    """
+    middle_m = np.mean(np.asarray(positions_m, float), axis=0)
+    rounded_m = GRID_M * np.round(middle_m / GRID_M)
+    x_m, y_m, z_m = np.where(np.abs(middle_m) > NEAR_M, rounded_m, 0.0).tolist()
+    return x_m, y_m, z_m
+
+
+def points_in_world(points_m: Any, origin_m: Origin) -> Any:
+    """Points (..., 2) or (..., 3) of a map's coordinates in the world's, float64."""
+    if origin_m == ZERO:
+        return points_m
+    points = np.asarray(points_m, float)
+    return points + np.array(origin_m)[: points.shape[-1]]
+
+
+def planar_in_world(poses: Any, origin_m: Origin) -> Any:
+    """Planar poses (..., 3), x_m y_m psi_rad, of a map's coordinates in the world's, float64."""
+    return _shifted(poses, (*origin_m[:2], 0.0))
+
+
+def poses_in_world(Ts_map_body: Any, origin_m: Origin) -> Any:
+    """Poses (..., 7), wxyz_xyz, of a map's coordinates in the world's, float64."""
+    return _shifted(Ts_map_body, (0.0, 0.0, 0.0, 0.0, *origin_m))
+
+
+def inverses_in_world(Ts_body_map: Any, origin_m: Origin) -> Any:
+    """What maps a map's coordinates to a body's, (..., 7), for the world's coordinates, float64.
+
+    The quaternions are normalised to float64's last digit: their lever is as long as the origin
+    is far.
+    """
+    if origin_m == ZERO:
+        return Ts_body_map
+    Ts = np.array(Ts_body_map, float)
+    Ts[..., :4] /= np.linalg.norm(Ts[..., :4], axis=-1, keepdims=True)
+    # Body from map, times minus the origin: what is rotated is p + 2 q x (q x p + w p).
+    w, q = Ts[..., :1], Ts[..., 1:4]
+    origin = np.broadcast_to(np.array(origin_m), q.shape)
+    Ts[..., 4:] -= origin + 2 * np.cross(q, np.cross(q, origin) + w * origin)
+    return Ts
+
+
+def opposite(origin_m: Origin) -> Origin:
+    """The origin that leads back: from the world's coordinates to the map's."""
+    x_m, y_m, z_m = origin_m
+    return (-x_m, -y_m, -z_m) if origin_m != ZERO else ZERO
+
+
+def _shifted(values: Any, shift: tuple[float, ...]) -> Any:
+    return values if not any(shift) else np.asarray(values, float) + np.array(shift)
