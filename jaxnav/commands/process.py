@@ -62,7 +62,11 @@ def _choose_cache() -> None:
     JAX's own entries are XLA's bytes and no pickle, but it opens them by their path and looks at
     nothing: the path is judged before, and what lies at its end.
     """
-    asked = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    asked = None
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        asked = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+        if not asked:  # set after JAX had been imported, which goes without then
+            return
     folder = None
     if asked is not None and "://" in asked:
         _refuse(f"{asked} is not on this machine")
