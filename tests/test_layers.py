@@ -85,6 +85,8 @@ PURE_CORE = set(ORDER[: ORDER.index("users")])
 # The users stand side by side; these arrows alone lead from one to another.
 BETWEEN_USERS = {
     ("calibration", "detection"),
+    ("calibration", "files"),
+    ("studies", "files"),
     ("studies", "simulation"),
     ("tuning", "simulation"),
     ("detection", "executables"),

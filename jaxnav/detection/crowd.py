@@ -16,7 +16,7 @@ from jaxnav.detection.read import codes_of
 _CROWD = 40
 _CROWD_PIXELS = 820 * 410
 _MOST_LOOKED_AT = 4096
-_KEPT = 16
+_KEPT = 12
 _KEPT_SHARE = 4  # of the picture, a quarter: what is larger holds most of the crowd
 # As OpenCV's decoder: its windows, how much darker than their mean, how straight an edge must be.
 _WINDOWS_PX, _DARKER, _STRAIGHT = (3, 13, 23), 7, 0.03
