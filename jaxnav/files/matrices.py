@@ -66,7 +66,8 @@ def figures_from_matrices(
         raise BadInput(where, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
     pinhole_px = [K[index] for index in (0, 4, 2, 5)]
     if problem := pinhole_problem(pinhole_px, image_size_px):
-        raise BadInput(where, problem)
+        sizes = "image_width and image_height, or resolution"
+        raise BadInput(where, f"{problem} ({sizes})")
     where, coefficients = distortion
     most = 4 if lens == "equidistant" else 5
     if lens == "equidistant" and len(coefficients) != 4:
