@@ -420,4 +420,4 @@ def test_what_nothing_confirms_is_not_decided_and_its_sigma_says_so(setup):
     assert Fault.ODOMETRY_DOUBTFUL in last.outcome.faults
     assert (last.outcome.health, last.outcome.throttle) == (Health.STOP, 0.0)
     wrong = [step for step in steps if step.outcome.report.output.decided]
-    assert max(np.hypot(*(s.outcome.report.output.pose - s.truth[:3])[:2]) for s in wrong) < 0.1
+    assert max(np.hypot(*(s.outcome.report.output.pose - s.truth[:3])[:2]) for s in wrong) < 0.2

@@ -116,3 +116,12 @@ def test_a_turn_is_the_bicycles():
         ways.drove(-0.5, 0.4, 0.0, 0.02)
     curvature_per_m = math.cos(math.atan(math.tan(0.4) / 2)) * math.tan(0.4) / WHEELBASE_M
     assert ways._turned_rad == pytest.approx(0.5 * curvature_per_m)
+
+
+def test_a_silent_odometer_disputes_nothing_when_it_is_back():
+    drive = Drive(0.4)
+    drive.seconds(3)
+    assert drive.seconds(3, drag_mps=0.5)[-1]
+    drive.ways.drove(0.4, 0.0, 0.0, 0.2)
+    assert not drive.ways.disputed
+    assert not drive.step()

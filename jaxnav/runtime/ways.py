@@ -35,6 +35,7 @@ _EVERY_NS = 200_000_000
 _AGREES_NS = 1_000_000_000
 _AGREES_M = 0.02
 _GAP_NS = 500_000_000  # unseen for longer, dead reckoning has errors of its own
+_SILENT_S = 0.1  # an odometer that was stale (R4) has told of no way
 _SIGMAS = 3.0
 
 
@@ -86,6 +87,9 @@ class Ways:
             heading_rad: as it is believed, so that a steering sensor's offset does not add up.
             gap_s: since the reading before.
         """
+        if gap_s > _SILENT_S:
+            self._window.clear()
+            self.disputed = False
         step_m = speed_mps * gap_s
         # Eqs. 4 to 7 of the paper, see `bicycle.velocity_world`.
         beta_rad = math.atan(math.tan(steering_rad) / 2)
