@@ -33,7 +33,7 @@ def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.nda
         least_perimeter_px: of the quadrilaterals that a decoder would look at.
     """
     crowd = max(_CROWD, min(1000, _CROWD * image.size // _CROWD_PIXELS))
-    if _spots(image, least_perimeter_px / 4) <= crowd:
+    if not _has_spots(image, least_perimeter_px / 4, crowd):
         return image
     quads = _quads(image, least_perimeter_px)
     if len(quads) <= crowd:
@@ -52,15 +52,19 @@ def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.nda
     return left
 
 
-def _spots(image: np.ndarray, least_side_px: float) -> int:
-    """How many dark or light spots, not too small, at half the size: more than quadrilaterals."""
+def _has_spots(image: np.ndarray, least_side_px: float, more_than: int) -> bool:
+    """Whether there are more dark and light spots, not too small, at half the size: there are no
+    more quadrilaterals than these. To count them all takes a fifth of measuring them."""
     small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     dark = _dark(small, 11)
+    both = dark, 255 - dark
+    if sum(cv2.connectedComponents(one, connectivity=4)[0] - 1 for one in both) <= more_than:
+        return False
     count = 0
-    for spots in (dark, 255 - dark):
+    for spots in both:
         size_px = cv2.connectedComponentsWithStats(spots, connectivity=4)[2][1:, 2:4]
         count += int(np.count_nonzero(size_px.min(axis=1) >= max(least_side_px / 4, 2)))
-    return count
+    return count > more_than
 
 
 def _dark(image: np.ndarray, window_px: int) -> np.ndarray:
