@@ -22,7 +22,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -161,10 +161,12 @@ def signals(count: int, jobs: int, seed: int) -> None:
             for number in range(count)
             for kind in [rng.choice(list(lasts_s))]
         ]  # fmt: skip
-        with ThreadPoolExecutor(jobs) as pool:
-            results = list(
-                tqdm(pool.map(lambda args: _signalled(folder, *args), todo), total=count)
-            )
+        results = []
+        pool = ThreadPoolExecutor(jobs)
+        with suppress(KeyboardInterrupt):  # what has come by then is told
+            for row in tqdm(pool.map(lambda args: _signalled(folder, *args), todo), total=count):
+                results.append(row)
+        pool.shutdown(cancel_futures=True)
     print(f"drives last {lasts_s} s from exec; load {os.getloadavg()[0]:.1f}\n")
     print(
         "| guard | phase | signals | ended at zero | exit code as documented | ms to zero, most |"

@@ -95,7 +95,7 @@ def make_moment(rng: np.random.Generator, dtype: type = float) -> Moment:
         covariance=random(4, 6, 6),
         log_weight=random(4),
         initialised=jnp.asarray([False, True, True, False]),
-        rejections=Rejections(jnp.zeros(4, int), random(4, 3), random(4)),
+        rejections=Rejections(jnp.zeros(4, int), random(4, 3), random(4), jnp.zeros(4, dtype)),
         number=jnp.arange(4),
     )
     decided, restarts = jnp.asarray(True), jnp.asarray(1, jnp.int32)
