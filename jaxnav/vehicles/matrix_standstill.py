@@ -96,6 +96,8 @@ def standstill() -> list[Row]:
             at_most=Health.STOP,
             error_m=0.8,
             ends_s=BEGIN_S + 4.0,
+            # It has gone on unseen, farther than the frozen odometer explains: RELOCATED, and slow.
+            well=Health.DEGRADED,
             drive_s=BEGIN_S + 7.0,
         ),
         Row(
