@@ -5,6 +5,7 @@ import functools
 import gc
 import os
 import platform
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,8 @@ import jaxlie
 import pytest
 from jaxtyping import install_import_hook
 
+# As a terminal has it: a suite under `nohup` would have tests whose programs ignore it too.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # Most of a run is compilation. LLVM's costly passes and wide registers win nothing on inputs as
 # small as these, nor does a second thread beside a second worker. XLA reads this when the
 # first array is made.

@@ -236,7 +236,7 @@ def test_a_picture_full_of_squares_is_thinned_out(name):
     whole = detector._decoder(0.0)
     left = thinned(image, "tag36h11", 25.0)
     assert left is not image
-    assert len(whole.detectMarkers(left)[2]) < 120
+    assert len(whole.detectMarkers(left)[2]) < 400
 
 
 def test_a_marker_in_a_crowd_is_found():

@@ -239,7 +239,7 @@ def _one_nan(corners_px: np.ndarray) -> np.ndarray:
         (_frame_with(corners_px=lambda c: c * math.nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(corners_px=lambda c: c + math.inf), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(corners_px=_one_nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        (_frame_with(corners_px=lambda c: c * 1e300), Fault(0), Reject.INNOVATION),
+        (_frame_with(corners_px=lambda c: c * 1e300), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(corners_px=lambda c: c * 0), Fault.FRAME_FROZEN, Reject.INNOVATION),
         (_frame_with(sigma_px=lambda s: s * math.nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(sigma_px=lambda s: s * 0), Fault.CORNERS_NOT_FINITE, Reject(0)),

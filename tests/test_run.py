@@ -1,13 +1,11 @@
 """`jaxnav run` as a person runs it, in processes of its own: it arrives, or it stands."""
 
-import fcntl
 import os
 import pty
 import resource
 import signal
 import subprocess
 import sys
-import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -122,6 +120,13 @@ def stood_ns(told: list[Word]) -> int:
     return told[last + 1].stamp_ns
 
 
+def on_terminal(terminal: int | None) -> list[str]:
+    """What makes a terminal that of a session's first process: to open it."""
+    if terminal is None:
+        return []
+    return ["/bin/sh", "-c", f'exec "$@" < {os.ttyname(terminal)}', "sh"]
+
+
 @contextmanager
 def driving(
     workplace: Workplace,
@@ -137,15 +142,13 @@ def driving(
     """
     log, record = folder / "told", folder / "drive.mcap"
     process = subprocess.Popen(
-        (workplace.moved if moved else workplace.driving)(log, record),
+        on_terminal(terminal) + (workplace.moved if moved else workplace.driving)(log, record),
         cwd=folder,
         env=workplace.environment(),
-        stdin=terminal,
         stdout=subprocess.PIPE,
         stderr=stderr,
         text=True,
         start_new_session=terminal is not None,
-        preexec_fn=None if terminal is None else lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )
     with process:
         try:

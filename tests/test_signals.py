@@ -113,7 +113,9 @@ from jaxnav.runtime.signals import Signals
 signals = Signals()
 {hold}
 print("here", flush=True)
-ctypes.CDLL(None).sleep({sleeps})  # as a compiler does: no handler of Python's runs meanwhile
+end_s = time.monotonic() + {sleeps}
+while time.monotonic() < end_s:
+    ctypes.CDLL(None).sleep(1)  # as a compiler does: the main thread asks for no signal meanwhile
 signals.check()
 """
 

@@ -12,12 +12,12 @@ import numpy as np
 from jaxnav.detection.families import all_cells
 from jaxnav.detection.read import codes_of
 
-# A room with markers has a dozen quadrilaterals in 820 x 410 pixels; so many cost 50 to 100 ms.
-_CROWD = 40
+# A room with markers has a dozen quadrilaterals in 820 x 410 pixels, a robot field over a hundred.
+_CROWD = 300
 _CROWD_PIXELS = 820 * 410
 _MOST_LOOKED_AT = 4096
-_KEPT = 12
-_KEPT_SHARE = 4  # of the picture, a quarter: what is larger holds most of the crowd
+_KEPT = 48
+_KEPT_SHARE = 2  # of the picture, a half: what is larger holds most of the crowd
 # As OpenCV's decoder: its windows, how much darker than their mean, how straight an edge must be.
 _WINDOWS_PX, _DARKER, _STRAIGHT = (3, 13, 23), 7, 0.03
 _SAME_PLACE_PX = 3.0

@@ -144,9 +144,9 @@ def marker_map(
     """
     if origin_m is None:
         origin_m = origin_near(Ts_world_marker[:, 4:])
-    Ts_map_marker = poses_in_world(Ts_world_marker, opposite(origin_m))
+    counted = poses_in_world(Ts_world_marker, opposite(origin_m))
     return MarkerMap(
-        Ts_world_marker=jaxlie.SE3(jnp.asarray(Ts_map_marker, float)),
+        Ts_world_marker=jaxlie.SE3(jnp.asarray(counted, float)),
         size_m=jnp.asarray(size_m, float),
         ids=tuple(int(marker_id) for marker_id in ids),
         families=tuple(families),

@@ -346,14 +346,15 @@ def _normal(
             after_s = time_s - edges_s[at]
             return advance(nodes[at], speed[at], steering[at], after_s, wheelbase_m)
 
-        T_start_begin = T_world_vehicle_from_planar(along(jnp.zeros_like(p[0]))).inverse()
-        T_world_begin = T_world_vehicle_from_planar(p[:3]) @ T_start_begin
+        # From the odometer's own world to the true one.
+        T_vehicle_world = T_world_vehicle_from_planar(along(jnp.zeros_like(p[0]))).inverse()
+        T_world_world = T_world_vehicle_from_planar(p[:3]) @ T_vehicle_world
         points_world = markers.corners_world_m[marker]
         one = jax.tree.map(lambda leaf: leaf[camera], rig.cameras)
         T_camera_vehicle = jax.tree.map(lambda leaf: leaf[camera], rig.Ts_camera_vehicle)
 
         def seen(time_s: Array, points: Array) -> Array:
-            T_world_vehicle = T_world_begin @ T_world_vehicle_from_planar(along(time_s - p[9]))
+            T_world_vehicle = T_world_world @ T_world_vehicle_from_planar(along(time_s - p[9]))
             points = transform_points(T_camera_vehicle @ T_world_vehicle.inverse(), points)
             return one.project(points + jnp.cross(p[3:6][None], points))
 

@@ -267,7 +267,8 @@ class MovedVehicle:
 
     def close(self) -> None:
         """See `Vehicle`. Waits until the vehicle has heard that it should stop."""
-        if self._closed:
+        if self._closed:  # or stopped by another process, after this one's death
+            self._guarding.end()
             return
         self._closing = True
         with suppress(OSError):
