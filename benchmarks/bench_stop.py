@@ -145,13 +145,14 @@ def _throttles(kind: str, log: Path) -> list[tuple[int, float]]:
 def signals(count: int, jobs: int, seed: int) -> None:
     """A table: signals at random moments from exec to the last waypoint."""
     rng = random.Random(seed)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
         lasts_s = {}
         for kind in ("a thread", "a process"):
-            for _ in range(2):  # the first one compiles
+            for first in ("compiles", "is timed"):
                 begin_s = time.monotonic()
-                command = _command(kind, folder / "first", folder / "first.mcap")
+                name = f"{kind} {first}".replace(" ", "-")  # a car reads its own log alone
+                command = _command(kind, folder / f"{name}.log", folder / f"{name}.mcap")
                 subprocess.run(command, env=ENVIRONMENT, check=True, capture_output=True)
                 lasts_s[kind] = time.monotonic() - begin_s
         # A good part of them in the start, where little time is spent and much can go wrong.
