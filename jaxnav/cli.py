@@ -59,9 +59,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with FreeOutput():
             code = _main(args, lambda args: _dispatch(args, signals))
-        return code if signals.exit_code is None else signals.exit_code
+        code = code if signals.exit_code is None else signals.exit_code
     finally:
         signals.ignore() if argv is None else signals.close()
+    if argv is None:
+        # All is closed and written. Threads of drivers and of OpenCV may still be in C code, whose
+        # end while Python takes itself down is a crash with an exit code of its own.
+        os._exit(code)
+    return code
 
 
 def _main(args: list[str], dispatch: Callable[[list[str]], int]) -> int:
