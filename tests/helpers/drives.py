@@ -57,7 +57,7 @@ def make_report(rng: np.random.Generator, dtype: type = float) -> Report:
         return jnp.asarray(rng.normal(size=shape).astype(dtype))
 
     candidates = Candidates(
-        T_vehicle_world=jaxlie.SE3(random(3, 7)),
+        T_vehicle_world=jaxlie.SE3(random(3, 7)).normalize(),
         e1_px2=random(3),
         cost=random(3),
         covariance=random(3, 6, 6),
