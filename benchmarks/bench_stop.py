@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,30 @@ def _sleep(results: "multiprocessing.Queue[list[float]]", over: "multiprocessing
         time.sleep(0.01)
         late_ms.append((time.monotonic() - begin_s - 0.01) * 1e3)
     results.put(late_ms)
+
+
+def _watch_stalls(path: Path, ahead: bool) -> None:
+    """Write when a process that only sleeps woke more than 50 ms late: begin in ns, how late in ms.
+
+    Args:
+        ahead: at real-time priority, if it may: then it is the machine that stood still.
+    """
+    if ahead:
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    with path.open("w", buffering=1) as file:
+        while True:
+            begin_ns = time.monotonic_ns()
+            time.sleep(0.01)
+            late_ms = (time.monotonic_ns() - begin_ns) / 1e6 - 10
+            if late_ms > 50:
+                file.write(f"{begin_ns} {late_ms:.0f}\n")
+
+
+def _stalled_ms(path: Path, around_ns: int) -> int:
+    """How late that process was at most in the second around an instant."""
+    rows = [tuple(map(int, line.split())) for line in path.read_text().splitlines()]
+    return max((ms for ns, ms in rows if abs(ns - around_ns) < 1_000_000_000), default=0)
 
 
 def _quantiles(values_ms: list[float]) -> str:
@@ -216,21 +241,33 @@ def _signalled(
 
 def soak(minutes: float, processes: int) -> None:
     """Drives of the simulated car, one after the other, for so long: no stop that is not asked for,
-    and every one that is."""
+    and every one that is. Beside each stop: how late others woke then that only sleep."""
     end_s = time.monotonic() + 60 * minutes
     ends: Counter[str] = Counter()
     seconds, health, loads = 0.0, Counter[str](), []
     with tempfile.TemporaryDirectory() as name, load(processes):
+        stalls = {name: Path(made) / f"{name}.txt" for made in [name] for name in _SLEEPERS}
+        sleepers = [
+            multiprocessing.Process(target=_watch_stalls, args=(path, name == "ahead"), daemon=True)
+            for name, path in stalls.items()
+        ]
+        for sleeper in sleepers:
+            sleeper.start()
         number = 0
-        with tqdm(total=60 * minutes, unit="s") as bar:
+        with tqdm(total=60 * minutes, unit="s") as bar, suppress(KeyboardInterrupt):
             while time.monotonic() < end_s:
                 number += 1
-                took_s, why, seen = _soaked(Path(name), number)
-                seconds += took_s
-                ends[why] += 1
-                health.update(seen)
+                drive = _soaked(Path(name), number)
+                seconds += drive.took_s
+                ends[drive.end] += 1
+                health.update(drive.health)
                 loads.append(os.getloadavg()[0])
-                bar.update(took_s)
+                bar.update(drive.took_s)
+                if not drive.end.startswith(("0 arrived", "held")):
+                    late = {name: _stalled_ms(path, drive.last_ns) for name, path in stalls.items()}
+                    bar.write(f"{number}: {drive.said}; asleep too long, ms: {late}")
+        for sleeper in sleepers:
+            sleeper.kill()
     print(
         f"{number} drives, {seconds / 60:.1f} min, load {np.median(loads):.1f}: {json.dumps(ends)}"
     )
@@ -238,7 +275,21 @@ def soak(minutes: float, processes: int) -> None:
     print({name: f"{count / total:.2%}" for name, count in health.most_common()})
 
 
-def _soaked(folder: Path, number: int) -> tuple[float, str, Counter[str]]:
+_SLEEPERS = ("like others", "ahead")
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """How one drive of the soak ended; `last_ns`: its last command, on the monotonic clock."""
+
+    took_s: float
+    end: str
+    said: str
+    health: Counter[str]
+    last_ns: int
+
+
+def _soaked(folder: Path, number: int) -> _Drive:
     """Each tenth drive is held for 1 s: it must be stopped."""
     record, held = folder / "drive.mcap", number % 10 == 0
     command = [sys.executable, "-c", MAIN, "run", "--vehicle", "sim", "--headless", "--seed",
@@ -255,12 +306,15 @@ def _soaked(folder: Path, number: int) -> tuple[float, str, Counter[str]]:
         process.send_signal(signal.SIGCONT)
     out, _ = process.communicate(timeout=600)
     said = (out.splitlines() or [""])[0].removeprefix("ended: ")
-    why = f"{'held for 1 s: ' if held else ''}{process.returncode} {said.split(' for ')[0]}"
+    end = f"{'held for 1 s: ' if held else ''}{process.returncode} {said.split(' for ')[0]}"
     seen: Counter[str] = Counter()
+    last_ns = 0
     if record.exists():
-        seen.update(Health(int(one)).name for one in read_drive(record).outcomes.health)
+        outcomes = read_drive(record).outcomes
+        seen.update(Health(int(one)).name for one in outcomes.health)
+        last_ns = int(outcomes.now_ns[-1]) if len(outcomes.now_ns) else 0
         record.unlink()
-    return time.monotonic() - begin_s, why, seen
+    return _Drive(time.monotonic() - begin_s, end, said, seen, last_ns)
 
 
 def main() -> None:

@@ -21,6 +21,8 @@ _KEPT_SHARE = 2  # of the picture, a half: what is larger holds most of the crow
 # As OpenCV's decoder: its windows, how much darker than their mean, how straight an edge must be.
 _WINDOWS_PX, _DARKER, _STRAIGHT = (3, 13, 23), 7, 0.03
 _SAME_PLACE_PX = 3.0
+# At half the size: what noise makes dark is gone, and the least outline is that of 3 x 3 pixels.
+_HALF_WINDOW_PX, _SPECK, _OUTLINE_PX = 11, np.ones((2, 2), np.uint8), 8
 _MARGIN_SIDES, _MARGIN_PX = 0.25, 4
 
 
@@ -33,7 +35,7 @@ def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.nda
         least_perimeter_px: of the quadrilaterals that a decoder would look at.
     """
     crowd = max(_CROWD, min(1000, _CROWD * image.size // _CROWD_PIXELS))
-    if not _has_spots(image, least_perimeter_px / 4, crowd):
+    if not _has_outlines(image, crowd * 2 // 3):
         return image
     quads = _quads(image, least_perimeter_px)
     if len(quads) <= crowd:
@@ -52,19 +54,13 @@ def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.nda
     return left
 
 
-def _has_spots(image: np.ndarray, least_side_px: float, more_than: int) -> bool:
-    """Whether there are more dark and light spots, not too small, at half the size: there are no
-    more quadrilaterals than these. To count them all takes a fifth of measuring them."""
+def _has_outlines(image: np.ndarray, more_than: int) -> bool:
+    """Whether there are more outlines, of dark and of light spots, at half the size. It takes a
+    twentieth of a look; to find the quadrilaterals takes as long as a look."""
     small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    dark = _dark(small, 11)
-    both = dark, 255 - dark
-    if sum(cv2.connectedComponents(one, connectivity=4)[0] - 1 for one in both) <= more_than:
-        return False
-    count = 0
-    for spots in both:
-        size_px = cv2.connectedComponentsWithStats(spots, connectivity=4)[2][1:, 2:4]
-        count += int(np.count_nonzero(size_px.min(axis=1) >= max(least_side_px / 4, 2)))
-    return count > more_than
+    dark = cv2.morphologyEx(_dark(small, _HALF_WINDOW_PX), cv2.MORPH_OPEN, _SPECK)
+    outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return sum(len(outline) >= _OUTLINE_PX for outline in outlines) > more_than
 
 
 def _dark(image: np.ndarray, window_px: int) -> np.ndarray:

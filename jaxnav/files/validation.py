@@ -162,6 +162,7 @@ def _problem(error: Any, model: type[BaseModel]) -> str:
 
 _EXPECTED = {
     "float_type": "must be a number",
+    "bool_type": "must be true or false",
     "int_type": "must be a whole number",
     "int_from_float": "must be a whole number",
     "finite_number": "must be finite",

@@ -14,6 +14,8 @@ import zlib
 from pathlib import Path
 from typing import Any, NoReturn
 
+from pydantic_core import from_json
+
 from jaxnav.errors import BadInput
 from jaxnav.runtime.flags import names
 
@@ -21,6 +23,7 @@ FORMAT_VERSION = 1
 PROFILE = "jaxnav"  # of the MCAP file
 HEADER = "jaxnav.drive"  # the name of the metadata record, the first of the file
 NOT_FINITE = "not_finite"
+_PARTS = {dict, list}
 _WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
@@ -45,10 +48,11 @@ def decode(raw: bytes) -> dict[str, Any]:
         ValueError: not such JSON.
     """
     try:
-        text = raw.decode(json.detect_encoding(raw), "surrogatepass")
-        message = (_MERGING if NOT_FINITE in text else _PLAIN).decode(text)
-    except RecursionError:
-        raise ValueError("it is nested too deep") from None
+        message = from_json(raw, allow_inf_nan=False, cache_strings="keys")
+        if NOT_FINITE.encode() in raw:
+            message = _merged_below(message)
+    except ValueError:
+        message = _decode_slowly(raw)
     if not isinstance(message, dict):
         raise ValueError("it is not an object")
     return message
@@ -123,6 +127,23 @@ def _merged(mapping: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(words, dict) or words.keys() & mapping.keys():
         raise ValueError(f"{NOT_FINITE} must be an object of other keys")
     return mapping | {key: _in_numbers(value) for key, value in words.items()}
+
+
+def _merged_below(value: Any) -> Any:
+    if isinstance(value, list) and not _PARTS.isdisjoint(map(type, value)):
+        return [_merged_below(one) for one in value]
+    if isinstance(value, dict):
+        return _merged({key: _merged_below(inner) for key, inner in value.items()})
+    return value
+
+
+def _decode_slowly(raw: bytes) -> Any:
+    """By Python's own reader: takes other encodings as well, and says what is wrong where."""
+    try:
+        text = raw.decode(json.detect_encoding(raw), "surrogatepass")
+        return (_MERGING if NOT_FINITE in text else _PLAIN).decode(text)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
 
 
 def _in_numbers(value: Any) -> Any:

@@ -134,8 +134,8 @@ def read_drive(path: str | Path) -> DriveLog:
             index = len(told["now_ns"] if record.topic == OUTCOME else inputs)
             message = _message(record, path, index)
             if isinstance(message, OutcomeMessage):
-                for name, values in told.items():
-                    values.append(getattr(message, name))
+                for name, value in vars(message).items():
+                    told[name].append(value)
                 continue
             inputs.append(input_of(message))
             found = (frame.detections for frame in inputs[-1].frames)

@@ -76,7 +76,8 @@ class Frames:
         found = [_NONE] * len(self.newest_ns)
         stamps_ns: dict[int, int] = {}
         for frame in frames:
-            faults |= frame.faults
+            if frame.faults:
+                faults |= frame.faults
             stamps = self._stamps[frame.camera]
             jumps = stamps.jumps
             stamp_ns = stamps.take(frame.stamp_ns, now_ns)
@@ -94,11 +95,14 @@ class Frames:
             if len(frame.detections):
                 found[frame.camera], stamps_ns[frame.camera] = frame.detections, stamp_ns
         seen = observe(found, self._markers)
-        faults |= Fault.UNKNOWN_MARKER if seen.unknown else _NO_FAULT
-        faults |= Fault.DUPLICATE_MARKER if seen.duplicates else _NO_FAULT
+        if seen.unknown:
+            faults |= Fault.UNKNOWN_MARKER
+        if seen.duplicates:
+            faults |= Fault.DUPLICATE_MARKER
         finite = (np.abs(seen.corners_px) <= _MOST_PX).all(axis=(2, 3))  # NaN is not
         finite &= (np.isfinite(seen.sigma_px) & (seen.sigma_px > 0)).all(axis=2)
-        faults |= Fault.CORNERS_NOT_FINITE if np.any(seen.visible & ~finite) else _NO_FAULT
+        if np.any(seen.visible & ~finite):
+            faults |= Fault.CORNERS_NOT_FINITE
         visible = seen.visible & finite
         taken_ns, frozen_seen = self._leave_out_frozen(seen, visible, stamps_ns, now_ns, frozen)
         faults |= frozen_seen

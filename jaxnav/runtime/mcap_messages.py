@@ -7,10 +7,9 @@ bounded, and checksums are compared where there are any.
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, NamedTuple, cast
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import InvalidMagic
@@ -50,8 +49,7 @@ def profile_of(path: Path) -> str | None:
     return head[21 : 21 + size].decode(errors="replace")
 
 
-@dataclass(frozen=True)
-class Recorded:
+class Recorded(NamedTuple):
     """One message as the file has it."""
 
     topic: str
@@ -113,31 +111,25 @@ class McapMessages:
         self.truncated = False
 
     def _found(self, record: McapRecord) -> Metadata | Recorded | None:
-        match record:
-            case Metadata():
-                return record
-            case Schema():
-                self._schemas[record.id] = record
-            case Channel():
-                if record.schema_id and record.schema_id not in self._schemas:
-                    raise ValueError(f"{record.topic} has an unknown schema")
-                self._channels[record.id] = record
-            case Message():
-                self._messages += 1
-                if self._messages > limits.MCAP_MESSAGES:
-                    raise ValueError(f"more than {limits.MCAP_MESSAGES} messages")
-                channel = self._channels.get(record.channel_id)
-                if channel is None:
-                    raise ValueError(f"a message of the unknown channel {record.channel_id}")
-                schema = self._schemas[channel.schema_id].name if channel.schema_id else ""
-                return Recorded(
-                    channel.topic,
-                    schema,
-                    channel.message_encoding,
-                    record.sequence,
-                    record.publish_time,
-                    record.data,
-                )
+        if isinstance(record, Message):
+            self._messages += 1
+            if self._messages > limits.MCAP_MESSAGES:
+                raise ValueError(f"more than {limits.MCAP_MESSAGES} messages")
+            channel = self._channels.get(record.channel_id)
+            if channel is None:
+                raise ValueError(f"a message of the unknown channel {record.channel_id}")
+            schema = self._schemas[channel.schema_id].name if channel.schema_id else ""
+            encoding, data = channel.message_encoding, record.data
+            stamp_ns = record.publish_time
+            return Recorded(channel.topic, schema, encoding, record.sequence, stamp_ns, data)
+        if isinstance(record, Metadata):
+            return record
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            if record.schema_id and record.schema_id not in self._schemas:
+                raise ValueError(f"{record.topic} has an unknown schema")
+            self._channels[record.id] = record
         return None
 
 

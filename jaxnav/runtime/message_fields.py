@@ -4,6 +4,7 @@ import base64
 import binascii
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -14,6 +15,13 @@ from pydantic_core import core_schema
 from jaxnav.files.ranges import RANGES
 from jaxnav.runtime.flags import Fault
 
+# What JSON schema calls a value -> what checks it, and its dtype.
+_ITEMS: dict[str, tuple[core_schema.CoreSchema, type]] = {
+    "number": (core_schema.float_schema(strict=True), float),
+    "integer": (core_schema.int_schema(strict=True, ge=-(2**63), lt=2**63), int),
+    "boolean": (core_schema.bool_schema(strict=True), bool),
+}
+_MOST_KNOWN = 1000  # lists of words that are not read again
 _MOST_SIDES = 32  # of a covariance: a state has 6 to 9 numbers
 
 
@@ -30,24 +38,24 @@ class Array:
     shape: tuple[int, ...] = (-1,)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return core_schema.no_info_plain_validator_function(self._read)
+        # The values are checked by compiled code: a drive has a million lists.
+        values = core_schema.list_schema(_ITEMS[self.items][0], strict=True)
+        return core_schema.no_info_after_validator_function(self._shaper(), values)
+
+    def _shaper(self) -> Callable[[list[Any]], np.ndarray]:
+        dtype, shape = _ITEMS[self.items][1], self.shape
+        row, is_fixed = math.prod(size for size in shape if size > 0), -1 not in shape
+        of_none = (0, *shape[1:])
+
+        def shaped(values: list[Any]) -> np.ndarray:
+            if len(values) % row or (is_fixed and len(values) != row):
+                raise ValueError(f"must hold {row} values{'' if is_fixed else ' a row'}")
+            return np.array(values, dtype).reshape(shape if values else of_none)
+
+        return shaped
 
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
         return {"type": "array", "items": {"type": self.items}}
-
-    def _read(self, value: Any) -> np.ndarray:
-        if not isinstance(value, list):
-            raise ValueError("must be a list")
-        kinds, dtype = {"number": ("fi", float), "integer": ("i", int), "boolean": ("b", bool)}[
-            self.items
-        ]
-        array = np.array(value)  # ValueError: lists inside, of several lengths
-        if array.ndim != 1 or (array.size and array.dtype.kind not in kinds):
-            raise ValueError(f"must be a list of values that are each of the type {self.items}")
-        row = math.prod(size for size in self.shape if size > 0)
-        if array.size % row or (-1 not in self.shape and array.size != row):
-            raise ValueError(f"must hold {row} values{' a row' if -1 in self.shape else ''}")
-        return array.astype(dtype).reshape(self.shape if array.size else (0, *self.shape[1:]))
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,19 @@ class Words:
     kind: type[enum.Enum]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return core_schema.no_info_plain_validator_function(self._read)
+        known: dict[tuple[Any, ...], Any] = {}
+
+        def read(value: Any) -> Any:
+            words = tuple(value) if isinstance(value, list) else (value, "")
+            try:
+                return known[words]
+            except (KeyError, TypeError):  # TypeError: holds what is no text
+                result = self._read(value)
+            if len(known) < _MOST_KNOWN:
+                known[words] = result
+            return result
+
+        return core_schema.no_info_plain_validator_function(read)
 
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
         word = {"type": "string", "enum": list(self.kind.__members__)}

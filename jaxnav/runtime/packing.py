@@ -63,7 +63,7 @@ class Layout:
         leaves = [
             floats[begin:end].reshape(shape)
             if is_float
-            else integers[begin:end].reshape(shape).astype(dtype)
+            else integers[begin:end].reshape(shape).astype(dtype, copy=False)
             for begin, end, shape, dtype, is_float in self._slices
         ]
         return jax.tree.unflatten(self._structure, leaves)

@@ -188,7 +188,8 @@ class Pilot:
         faults |= seen_faults
         if told is not None:
             told, self._hidden = self._outvoted.without(told)
-            faults |= Fault.MARKER_OUTVOTED if self._hidden else _NO_FAULT
+            if self._hidden:
+                faults |= Fault.MARKER_OUTVOTED
         if told is not None:
             outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
         if given.odometry is not None:
@@ -204,7 +205,8 @@ class Pilot:
             return self._tick(now_ns, faults | Fault.ODOMETRY_INVALID)
         if stamp_ns is None:
             return self._tick(now_ns, faults | Fault.STAMP_INVALID)
-        faults |= Fault.CLOCK_JUMPED if self._odometry_stamps.jumps > jumps else _NO_FAULT
+        if self._odometry_stamps.jumps > jumps:
+            faults |= Fault.CLOCK_JUMPED
         believable, faults_seen = self._odometer.judge(
             reading.speed_mps,
             reading.steering_rad,
@@ -248,7 +250,8 @@ class Pilot:
         if not finite:
             faults |= Fault.NOT_FINITE
             self._begin_anew("the estimate was no number")
-        rejects |= Reject.TOO_LATE if fused.refused else _NO_REJECT
+        if fused.refused:
+            rejects |= Reject.TOO_LATE
         if told is not None and told.corners_px is not None and fused.refused:
             self._frames.refused()
         restarts = self._restarts_before + int(fused.moment.restarts)
@@ -261,14 +264,16 @@ class Pilot:
         outvoted: tuple[int, ...] = ()
         if told is not None and told.corners_px is not None and not fused.refused:
             outvoted = self._outvoted.count(told, np.asarray(fused.report.outvoted))
-            faults |= Fault.MARKER_OUTVOTED if outvoted else _NO_FAULT
+            if outvoted:
+                faults |= Fault.MARKER_OUTVOTED
             rejects |= self._judge(known, fused.moment.belief, stamp_ns, now_ns)
         faults |= self._contradictions()
         report, known = self._honest(fused.report, known)
         if report.output.decided:
             self._arrived_elsewhere(known)
         self._known, self._now_ns = known, now_ns
-        faults |= Fault.NOTHING_MOVES if self._standstill.nothing_moves else _NO_FAULT
+        if self._standstill.nothing_moves:
+            faults |= Fault.NOTHING_MOVES
         health, faults = self._monitor.look(self._senses(known, now_ns, faults))
         steering_rad, throttle = self._limited(known, health, now_ns, elapsed_ns)
         return Outcome(
