@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +32,14 @@ from jaxnav.runtime.limits import Limits
 from jaxnav.runtime.loop import Loop, Observer
 from jaxnav.runtime.moved_vehicle import GuardProcess, MovedVehicle
 from jaxnav.runtime.pilot import Pilot
+from jaxnav.runtime.priority import before_others
 from jaxnav.runtime.seeing import Eyes, Search
 from jaxnav.runtime.signals import Signals
 
 EXIT_STOPPED = 1  # by the watchdog, not by a person
 
 
+@before_others()
 def run(args: Run, signals: Signals) -> int:
     """Drive, and say why it ended.
 
@@ -47,10 +49,6 @@ def run(args: Run, signals: Signals) -> int:
     Raises:
         Interrupted: a signal came before it drove.
     """
-    # Before what else runs on the computer, as far as that is allowed. Threads have the priority of
-    # the one that began them: those of XLA begin with the first array.
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, -10)
     configure_jax(float64=args.float64, threads=1)
     keep_in(step_folder())
     options = _options(args.option)

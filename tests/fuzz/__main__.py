@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tests.fuzz.cases import COMMAND_EVERY
 from tests.fuzz.kept import keep, kept_cases, replayed
 
 CPU_S = 10.0  # of one case
@@ -44,9 +45,12 @@ class Worker:
     begun_cpu_s: float = 0.0
     buffer: bytes = b""
 
-    def start(self, seed: int, step: int, only: str, warm: bool) -> None:
+    def start(self, told: argparse.Namespace) -> None:
         """From its next number on."""
-        arguments = [seed, self.next_number, step, self.scratch, only, int(warm)]
+        arguments = [
+            told.seed, self.next_number, told.workers, self.scratch, told.only,
+            int(not told.cold), told.command_every,
+        ]  # fmt: skip
         self.process = subprocess.Popen(
             [sys.executable, "-W", "default", "-m", "tests.fuzz.worker", *map(str, arguments)],
             stdout=subprocess.PIPE,
@@ -141,6 +145,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--only", default="", help="targets whose names hold this")
+    parser.add_argument("--command-every", type=int, default=COMMAND_EVERY, metavar="CASES")
     parser.add_argument("--cold", action="store_true", help="compile nothing beforehand")
     parser.add_argument("--replay", action="store_true", help="the kept cases alone")
     told = parser.parse_args()
@@ -148,7 +153,8 @@ def main() -> int:
         return _replay()
     print(f"seed {told.seed}, {told.minutes:g} minutes, {told.workers} workers", flush=True)
     tally = Tally()
-    with tempfile.TemporaryDirectory(prefix="jaxnav-fuzz-") as name:
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    with tempfile.TemporaryDirectory(prefix="jaxnav-fuzz-", dir=memory) as name:
         workers = [
             Worker(index, Path(name) / str(index), None, told.first + index)
             for index in range(told.workers)
@@ -170,7 +176,7 @@ def main() -> int:
 def _run(told: argparse.Namespace, workers: list[Worker], tally: Tally) -> None:
     for worker in workers:
         worker.scratch.mkdir()
-        worker.start(told.seed, told.workers, told.only, not told.cold)
+        worker.start(told)
     end_s = time.monotonic() + 60 * told.minutes
     shown_s = 0.0
     while time.monotonic() < end_s:
@@ -183,7 +189,7 @@ def _run(told: argparse.Namespace, workers: list[Worker], tally: Tally) -> None:
                 if worker.case is not None:
                     tally.add(worker.case, trouble)
                 worker.kill()
-                worker.start(told.seed, told.workers, told.only, not told.cold)
+                worker.start(told)
         if time.monotonic() - shown_s > (1.0 if sys.stdout.isatty() else 60.0):
             shown_s = time.monotonic()
             begin, end = ("\r", "") if sys.stdout.isatty() else ("", "\n")

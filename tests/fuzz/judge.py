@@ -60,7 +60,7 @@ def of_command(argv: list[str], inputs: Path, elsewhere: Path) -> str | None:
     ):
         return f"code 2 with {err.count(chr(10))} lines: {visible(err[:300])}"
     for name, text in (("stdout", out), ("stderr", err)):
-        if "Traceback" in text:
+        if "Traceback" in text and f"{Skipped.__name__}\n" not in text:
             return f"traceback on {name}: {visible(text[-300:])}"
         if found := _OBEYED.search(text):
             return f"{name} has {found[0]!r}: {visible(text[:200])}"

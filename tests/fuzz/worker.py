@@ -24,9 +24,11 @@ _DPI = 20  # of pictures: that they are drawn is all that counts
 
 def main() -> None:
     """Arguments: seed, first number, step from number to number, scratch folder, part of the
-    targets' names, whether programs are compiled beforehand."""
+    targets' names, whether programs are compiled beforehand, how many cases to one of a command.
+    """
     seed, first, step = map(int, sys.argv[1:4])
     scratch, wanted, warm = Path(sys.argv[4]), sys.argv[5], sys.argv[6] == "1"
+    command_every = int(sys.argv[7])
     said = os.fdopen(os.dup(1), "w", buffering=1)
     os.environ.setdefault("JAXNAV_FUZZ_CACHE", str(scratch.parent / "cache"))
     os.environ["XDG_CACHE_HOME"] = os.environ["JAXNAV_FUZZ_CACHE"]
@@ -50,7 +52,7 @@ def main() -> None:
     only_small.enter_context(judge.small_programs())
     number = first
     while True:
-        case = drawn(seed, number, made, scratch, wanted)
+        case = drawn(seed, number, made, scratch, wanted, command_every)
         if case is not None:
             place = [str(case.folder), str(case.file), case.renamed]
             _say(said, number=number, target=case.target, place=place)
