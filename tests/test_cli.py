@@ -211,16 +211,20 @@ def test_help_and_version_name_themselves(capsys) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no os.wait4 on Windows")
-def test_help_takes_no_longer_than_300_ms() -> None:
-    # Processor time, which other processes on the machine don't lengthen; the best of five.
-    seconds = []
-    for _ in range(5):
-        process = subprocess.Popen([*JAXNAV, "--help"], stdout=subprocess.DEVNULL)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        assert process.returncode == 0
-        seconds.append(usage.ru_utime + usage.ru_stime)
-    assert min(seconds) <= 0.3
+def test_help_takes_little_more_than_what_reads_the_command_line() -> None:
+    """0.3 s where importing tyro takes 0.13, see bench_loop; processor time, the best of five."""
+
+    def least_s(argv: list[str]) -> float:
+        seconds = []
+        for _ in range(5):
+            process = subprocess.Popen(argv, stdout=subprocess.DEVNULL)
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            assert process.returncode == 0
+            seconds.append(usage.ru_utime + usage.ru_stime)
+        return min(seconds)
+
+    assert least_s([*JAXNAV, "--help"]) <= 4 * least_s([sys.executable, "-c", "import tyro"])
 
 
 def test_a_closed_pipe_is_no_traceback() -> None:

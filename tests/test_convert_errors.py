@@ -94,7 +94,7 @@ def test_a_flag_that_does_not_fit_is_one_line(tmp_path, source, to, out, flags, 
     ("flags", "expected"),
     [
         ({"yaw_deg": 3.0}, "--yaw-deg: needs --position-m"),
-        ({"roll_deg": float("nan")}, "--roll-deg: must not be negative and finite"),
+        ({"roll_deg": float("nan")}, "--roll-deg: must be from -3600 to 3600 deg, got"),
         ({"field_size_m": (1.0, 0.0)}, "--field-size-m: must be positive and finite, got 0.0"),
         ({"marker_size_m": -1.0}, "--marker-size-m: must be positive and finite, got -1.0"),
     ],

@@ -51,3 +51,17 @@ def require_finite(flag: str, value: float, zero_allowed: bool = False) -> None:
     large_enough = value >= 0 if zero_allowed else value > 0
     bound = "not be negative" if zero_allowed else "be positive"
     require(math.isfinite(value) and large_enough, flag, f"must {bound} and finite, got {value}")
+
+
+def require_within(flag: str, value: float, name: str) -> None:
+    """Raise BadInput where a number is not what a file may hold of the same quantity.
+
+    Args:
+        name: of the quantity, in `jaxnav.files.ranges`.
+    """
+    from jaxnav.files.ranges import RANGES, problem_of  # NumPy: not for --help
+
+    if RANGES[name].least > 0:
+        require_finite(flag, value)
+    problem = problem_of(name, value)
+    require(problem is None, flag, problem or "")

@@ -12,7 +12,7 @@ from jaxnav.arguments.kinds import (
     Selector,
     Switch,
     require,
-    require_finite,
+    require_within,
 )
 
 
@@ -77,7 +77,7 @@ class Replay:
         if self.limit is not None:
             require(self.limit >= 1, "--limit", f"must be at least 1, got {self.limit}")
         if self.corner_sigma_px is not None:
-            require_finite("--corner-sigma-px", self.corner_sigma_px)
+            require_within("--corner-sigma-px", self.corner_sigma_px, "corner_sigma_px")
 
 
 @dataclass(frozen=True)
@@ -128,4 +128,4 @@ class Locate:
     """Draw the markers and both poses into this file."""
 
     def __post_init__(self) -> None:
-        require_finite("--marker-size-m", self.marker_size_m)
+        require_within("--marker-size-m", self.marker_size_m, "size_m")

@@ -16,6 +16,7 @@ from jaxnav.arguments.kinds import (
     Switch,
     require,
     require_finite,
+    require_within,
 )
 
 
@@ -117,9 +118,9 @@ class Simulate:
         require(bool(self.selector), "--selector", "names no selector")
         require(bool(self.corner_noise_px), "--corner-noise-px", "holds no number")
         for value in self.corner_noise_px:
-            require_finite("--corner-noise-px", value)
+            require_within("--corner-noise-px", value, "corner_sigma_px")
         if self.told_noise_px is not None:
-            require_finite("--told-noise-px", self.told_noise_px)
+            require_within("--told-noise-px", self.told_noise_px, "corner_sigma_px")
         require(not self.resume or self.json is not None, "--resume", "needs --json")
 
 

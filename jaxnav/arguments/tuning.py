@@ -14,6 +14,7 @@ from jaxnav.arguments.kinds import (
     Switch,
     require,
     require_finite,
+    require_within,
 )
 
 _Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
@@ -93,7 +94,7 @@ class TuneFilter:
         require(0 <= self.seed < 10**6, "--seed", f"must be from 0 to 999999, got {self.seed}")
         most = 10**6 - self.seed - self.seeds
         require(self.held_out_seeds <= most, "--seeds", "test drives count from a million on")
-        require_finite("--corner-noise-px", self.corner_noise_px)
+        require_within("--corner-noise-px", self.corner_noise_px, "corner_sigma_px")
         begin, end = self.part
         bounds = f"must be two parts of 1, the first below the second, got {begin:g} {end:g}"
         require(0 <= begin < end <= 1, "--part", bounds)
@@ -176,7 +177,7 @@ class TuneController:
             require_finite(flag, value, zero_allowed=True)
         total = self.time + self.cross_track + self.effort + self.smoothness
         require(total > 0, "--time", "is 0 as all other weights are: there is nothing to lower")
-        require_finite("--corner-noise-px", self.corner_noise_px)
+        require_within("--corner-noise-px", self.corner_noise_px, "corner_sigma_px")
         require_finite("--learning-rate", self.learning_rate)
 
 

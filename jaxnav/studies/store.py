@@ -9,6 +9,7 @@ import json
 import math
 import secrets
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 import xarray as xr
 import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.errors import ZarrUserWarning
 
 from jaxnav.errors import BadInput
 from jaxnav.studies.config import difference
@@ -176,9 +178,10 @@ def _open_group(path: Path, mode: Any) -> zarr.Group:
     if not path.exists():
         raise BadInput(path, "doesn't exist")
     try:
-        group = zarr.open_group(path, mode=mode)
-        is_ours = _DONE in group
-        check_sizes(path, dict(group.arrays()))
+        with warnings.catch_warnings(action="ignore", category=ZarrUserWarning):
+            group = zarr.open_group(path, mode=mode)
+            is_ours = _DONE in group
+            check_sizes(path, dict(group.arrays()))
     except BadInput:
         raise
     except Exception as error:  # of whatever bytes it holds

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jaxnav.arguments.kinds import require, require_finite
+from jaxnav.arguments.kinds import require, require_finite, require_within
 
 CalibrationFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision", "wpilib"]
 WPILibFamily = Literal["tag16h5", "tag25h9", "tag36h11"]
@@ -70,12 +70,12 @@ class CalibrateConvert:
             ("--elevation-deg", self.elevation_deg),
             ("--roll-deg", self.roll_deg),
         ):
-            require_finite(flag, abs(angle_deg), zero_allowed=True)
+            require_within(flag, angle_deg, "angle_deg")
             require(self.position_m is not None or angle_deg == 0, flag, "needs --position-m")
         for coordinate in self.position_m or ():
-            require_finite("--position-m", abs(coordinate), zero_allowed=True)
+            require_within("--position-m", coordinate, "position_m")
         for size_m in self.field_size_m or ():
             require_finite("--field-size-m", size_m)
         require(self.camera_name != "", "--camera-name", "must not be empty")
         if self.marker_size_m is not None:
-            require_finite("--marker-size-m", self.marker_size_m)
+            require_within("--marker-size-m", self.marker_size_m, "size_m")

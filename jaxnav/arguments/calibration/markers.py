@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from jaxnav.arguments.calibration.rig import MarkerSize, Recordings, require_recordings
-from jaxnav.arguments.kinds import OptionalFile, require_finite
+from jaxnav.arguments.kinds import OptionalFile, require_within
 
 
 @dataclass(frozen=True)
@@ -36,4 +36,4 @@ class CalibrateMarkers:
     def __post_init__(self) -> None:
         require_recordings(self.recordings)
         if self.marker_size_m is not None:
-            require_finite("--marker-size-m", self.marker_size_m)
+            require_within("--marker-size-m", self.marker_size_m, "size_m")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jaxnav.arguments.kinds import CornerBackend, Switch, require, require_finite
+from jaxnav.arguments.kinds import CornerBackend, Switch, require, require_within
 
 OdometryParameter = Literal[
     "speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "camera_delay_s"
@@ -57,6 +57,6 @@ class CalibrateOdometry:
     def __post_init__(self) -> None:
         require(bool(self.recordings), "RECORDING", "names no recording")
         if self.wheelbase_sigma_m is not None:
-            require_finite("--wheelbase-sigma-m", self.wheelbase_sigma_m)
+            require_within("--wheelbase-sigma-m", self.wheelbase_sigma_m, "size_m")
             told = "goes with a wheelbase that is looked for: leave it out of --fix"
             require("wheelbase_m" not in self.fix, "--wheelbase-sigma-m", told)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxnav.arguments.kinds import OptionalFile, QCarFile, Switch, require, require_finite
+from jaxnav.arguments.kinds import OptionalFile, QCarFile, Switch, require, require_within
 
 Recordings = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RECORDING")]
 MarkerSize = Annotated[
@@ -54,7 +54,7 @@ class CalibrateRig:
     def __post_init__(self) -> None:
         require_recordings(self.recordings)
         if self.marker_size_m is not None:
-            require_finite("--marker-size-m", self.marker_size_m)
+            require_within("--marker-size-m", self.marker_size_m, "size_m")
 
 
 def require_recordings(recordings: tuple[Path, ...]) -> None:
