@@ -87,6 +87,12 @@ def _main(args: list[str], dispatch: Callable[[list[str]], int]) -> int:
         # The interpreter flushes again when it exits; give it something to flush into.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE
+    except OSError as error:
+        if error.filename is None:
+            raise
+        problem = (error.strerror or type(error).__name__).lower()  # a name that is too long, say
+        print(f"{_name(args)}: {visible(f'{error.filename}: {problem}')}", file=sys.stderr)
+        return EXIT_BAD_INPUT
     return code
 
 

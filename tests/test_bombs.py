@@ -206,6 +206,17 @@ def test_ten_minutes_in_a_map_of_a_thousand_markers(tmp_path):
         np.testing.assert_array_equal(corners_px[row, cameras, markers], recording.seen_px[seen])
 
 
+def test_a_chunk_of_a_png_that_is_larger_than_its_file_is_not_decoded():
+    """A decoder takes memory for it before it reads it: 2 kB took 3.4 GB."""
+    raw = bytearray(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes())
+    at = raw.index(b"IDAT") - 4
+    assert image_problem(bytes(raw)) is None
+    raw[at : at + 4] = (3_345_162_068).to_bytes(4, "big")
+    assert image_problem(bytes(raw)) is not None
+    empty = b"\0\0\0\0tEXt\0\0\0\0"
+    assert image_problem(bytes(raw[:at]) + 2**17 * empty) is not None
+
+
 # --- pictures that are too much to look at ---
 
 

@@ -227,6 +227,17 @@ def test_help_takes_little_more_than_what_reads_the_command_line() -> None:
     assert least_s([*JAXNAV, "--help"]) <= 4 * least_s([sys.executable, "-c", "import tyro"])
 
 
+@pytest.mark.parametrize(
+    "command", ["replay", "plot", "calibrate rig", "study ambiguity", "tune filter", "demo --out"]
+)
+def test_a_name_that_is_too_long_is_one_line(command: str, capsys, monkeypatch, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*command.split(), "x" * 300]) == cli.EXIT_BAD_INPUT
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.endswith("file name too long")
+    assert f"jaxnav {command.split()[0]}: xxx" in last
+
+
 def test_a_closed_pipe_is_no_traceback() -> None:
     reader, writer = os.pipe()
     os.close(reader)

@@ -107,9 +107,16 @@ def _calibration(data: Mapping[str, Any], path: Path, kind: str) -> dict[str, Pa
             raise BadInput(f"{path}: {name}", f"must be a file, or qcar, got {given!r}")
         shipped = calib_dir() / "qcar" / f"{name}.yaml"
         found[name] = shipped if given == "qcar" else path.parent / given
-        if not found[name].is_file():
+        if not _is_file(found[name]):
             raise BadInput(f"{path}: {name}", f"there is no file {found[name]}")
     return found
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
 
 
 def _digest(path: Path) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 # Passes of a JPEG over its picture: encoders make 10 at most, some bytes make a thousand.
 _JPEG_SCANS = 32
+_PNG_CHUNKS = 2**17  # one of 256 bytes each in the largest picture, where encoders write 8 KiB
 _TIFF_TAGS = 4096
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
 _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
@@ -35,7 +36,16 @@ def _png(raw: bytes) -> SizePx:
     length, kind, width, height = struct.unpack_from(">L4sLL", raw, 8)
     if (length, kind) != (13, b"IHDR"):
         raise ValueError("no IHDR")
-    return width, height
+    # A decoder takes memory for a chunk before it reads it.
+    at = 8
+    for _ in range(_PNG_CHUNKS):
+        if at + 8 > len(raw):
+            return width, height
+        (length,) = struct.unpack_from(">L", raw, at)
+        if length > len(raw):
+            raise ValueError("a chunk that is larger than the file")
+        at += 12 + length
+    raise ValueError("too many chunks")
 
 
 def _jpeg(raw: bytes) -> SizePx:

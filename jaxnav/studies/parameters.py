@@ -118,7 +118,7 @@ def _spaced(given: Mapping[str, Any], where: str) -> list[float]:
             raise BadInput(f"{where}.{key}", f"must be a number, got {value!r}")
         if not _is_finite(value):
             raise BadInput(f"{where}.{key}", f"must be finite, got {str(value)[:40]}")
-        ends.append(value)
+        ends.append(float(value))  # NumPy takes no whole number above 2^64
     begin, end, count = ends
     if not 1 <= count <= _MAX_VALUES or count != int(count):
         raise BadInput(
