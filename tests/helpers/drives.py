@@ -57,7 +57,7 @@ def make_report(rng: np.random.Generator, dtype: type = float) -> Report:
         return jnp.asarray(rng.normal(size=shape).astype(dtype))
 
     candidates = Candidates(
-        T_vehicle_world=jaxlie.SE3(random(3, 7)).normalize(),
+        T_vehicle_world=jaxlie.SE3(jnp.asarray(_poses(rng, 3).astype(dtype))),
         e1_px2=random(3),
         cost=random(3),
         covariance=random(3, 6, 6),
@@ -82,6 +82,13 @@ def make_report(rng: np.random.Generator, dtype: type = float) -> Report:
         control_log=None,
     )
     return _as_numpy(Report(output=output, mean=random(8), outvoted=jnp.zeros(1, bool)))
+
+
+def _poses(rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, 7) wxyz_xyz."""
+    poses = rng.normal(size=(count, 7))
+    poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
+    return poses
 
 
 def make_moment(rng: np.random.Generator, dtype: type = float) -> Moment:
