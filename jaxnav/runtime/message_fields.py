@@ -65,10 +65,10 @@ class Words:
     kind: type[enum.Enum]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        known: dict[tuple[Any, ...], Any] = {}
+        known: dict[Any, Any] = {}
 
         def read(value: Any) -> Any:
-            words = tuple(value) if isinstance(value, list) else (value, "")
+            words = tuple(value) if isinstance(value, list) else value
             try:
                 return known[words]
             except (KeyError, TypeError):  # TypeError: holds what is no text
