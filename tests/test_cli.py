@@ -227,13 +227,13 @@ def test_help_takes_little_more_than_what_reads_the_command_line() -> None:
     assert least_s([*JAXNAV, "--help"]) <= 4 * least_s([sys.executable, "-c", "import tyro"])
 
 
-@pytest.mark.parametrize(
-    "command", ["replay", "plot", "calibrate rig", "study ambiguity", "tune filter", "demo --out"]
-)
-def test_a_name_that_is_too_long_is_one_line(command: str, capsys, monkeypatch, tmp_path) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert cli.main([*command.split(), "x" * 300]) == cli.EXIT_BAD_INPUT
-    last = capsys.readouterr().err.splitlines()[-1]
+@pytest.mark.parametrize("command", ["replay", "calibrate rig", "demo --out"])
+def test_a_name_that_is_too_long_is_one_line(command: str, tmp_path: Path) -> None:
+    run = subprocess.run(
+        [*JAXNAV, *command.split(), "x" * 300], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert run.returncode == cli.EXIT_BAD_INPUT
+    last = run.stderr.splitlines()[-1]
     assert last.endswith("file name too long")
     assert f"jaxnav {command.split()[0]}: xxx" in last
 
