@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the guard's process corrects without JAX and OpenCV
@@ -39,17 +40,17 @@ class Corrections:
         )
 
     # Whoever is late is moved back, never the other ahead: no stamp lies in the future.
-    @property
+    @cached_property
     def frame_late_ns(self) -> int:
         """What is taken from the stamps of frames."""
         return round(max(self.camera_delay_s, 0.0) * 1e9)
 
-    @property
+    @cached_property
     def reading_late_ns(self) -> int:
         """What is taken from the stamps of readings."""
         return round(max(-self.camera_delay_s, 0.0) * 1e9)
 
-    @property
+    @cached_property
     def _is_neutral(self) -> bool:
         return (self.speed_scale, self.steering_gain, self.steering_offset_rad) == (1, 1, 0)
 

@@ -164,17 +164,20 @@ class Estimator:
             self._fill(events, rows, base_ns)
         return packed
 
-    def _fill(self, into: Any, rows: Sequence[tuple[int, Told]], base_ns: int) -> None:
-        into.speed_mps[:], into.steering_rad[:] = self._odometry
+    def _fill(self, events: Events, rows: Sequence[tuple[int, Told]], base_ns: int) -> None:
+        into = vars(events)  # an attribute of an equinox module takes a us
+        speed_mps, steering_rad = into["speed_mps"], into["steering_rad"]
+        speed_mps[:], steering_rad[:] = self._odometry
         for index, (stamp_ns, told) in enumerate(rows):
-            into.stamps_us[index] = _int32(_us_between(base_ns, stamp_ns))
+            into["stamps_us"][index] = _int32(_us_between(base_ns, stamp_ns))
             if told.odometry is not None:
-                into.speed_mps[index], into.steering_rad[index] = told.odometry
-                into.has_odometry[index] = True
+                speed_mps[index], steering_rad[index] = told.odometry
+                into["has_odometry"][index] = True
             if told.corners_px is not None:
-                into.corners.corners_px[index] = told.corners_px
-                into.corners.visible[index] = told.visible
-                into.corners.corner_sigma_px[index] = told.sigma_px
+                corners = vars(into["corners"])
+                corners["corners_px"][index] = told.corners_px
+                corners["visible"][index] = told.visible
+                corners["corner_sigma_px"][index] = told.sigma_px
 
 
 def _finding(report: Report, other: Report) -> Report:

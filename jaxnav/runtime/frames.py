@@ -99,51 +99,53 @@ class Frames:
             faults |= Fault.UNKNOWN_MARKER
         if seen.duplicates:
             faults |= Fault.DUPLICATE_MARKER
-        finite = (np.abs(seen.corners_px) <= _MOST_PX).all(axis=(2, 3))  # NaN is not
-        finite &= (np.isfinite(seen.sigma_px) & (seen.sigma_px > 0)).all(axis=2)
-        if np.any(seen.visible & ~finite):
+        if not _are_finite(seen.corners_px, seen.sigma_px):
             faults |= Fault.CORNERS_NOT_FINITE
-        visible = seen.visible & finite
-        taken_ns, frozen_seen = self._leave_out_frozen(seen, visible, stamps_ns, now_ns, frozen)
-        faults |= frozen_seen
-        sigma_px: np.ndarray | float = seen.sigma_px
-        if self._corner_sigma_px is not None:
-            sigma_px = self._corner_sigma_px
-        if taken_ns is None or not visible.any():
+            for lane in zip(*np.nonzero(seen.visible), strict=True):
+                if not _are_finite(seen.corners_px[lane], seen.sigma_px[lane]):
+                    _hide(seen, lane)
+        taken_ns, frozen_seen = self._leave_out_frozen(seen, stamps_ns, now_ns, frozen)
+        if frozen_seen:
+            faults |= Fault.FRAME_FROZEN
+        if taken_ns is None or not seen.visible.any():
             return None, now_ns, faults
-        told = Told(
-            corners_px=np.where(visible[..., None, None], seen.corners_px, 0),
-            visible=visible,
-            sigma_px=np.where(visible[..., None], sigma_px, np.ones_like(seen.sigma_px)),
-        )
-        return told, taken_ns, faults
+        if self._corner_sigma_px is not None:
+            seen.sigma_px[seen.visible] = self._corner_sigma_px
+        return Told(None, seen.corners_px, seen.visible, seen.sigma_px), taken_ns, faults
 
     def _leave_out_frozen(
-        self,
-        seen: Observed,
-        visible: np.ndarray,
-        stamps_ns: dict[int, int],
-        now_ns: int,
-        frozen: Frozen | None,
-    ) -> tuple[int | None, Fault]:
-        """When what is left was true, and whether a camera was left out of `visible`."""
-        taken_ns, faults = None, _NO_FAULT
+        self, seen: Observed, stamps_ns: dict[int, int], now_ns: int, frozen: Frozen | None
+    ) -> tuple[int | None, bool]:
+        """When what is left was true, and whether a camera was left out."""
+        taken_ns, left_out = None, False
         for camera, stamp_ns in stamps_ns.items():
-            shown, corners_px = visible[camera], seen.corners_px[camera]
+            shown, corners_px = seen.visible[camera], seen.corners_px[camera]
             if frozen is not None and shown.any():
                 sigma_px = float(seen.sigma_px[camera][shown].max())
                 if frozen(camera, stamp_ns, now_ns, corners_px, shown.copy(), sigma_px):
-                    faults, visible[camera] = Fault.FRAME_FROZEN, False
+                    left_out = True
+                    _hide(seen, (camera,))
                     self.newest_ns[camera] = self._newest_before_ns[camera]
                     continue
             taken_ns = stamp_ns
-        return taken_ns, faults
+        return taken_ns, left_out
 
     def _frozen(self, camera: int, detections: Detections) -> bool:
         """Whether a camera shows the very same corners once too often."""
-        is_comparable = len(detections) and np.isfinite(detections.corners_px).all()
-        shown = detections.corners_px.tobytes() if is_comparable else b""
+        shown = detections.corners_px.tobytes() if len(detections) else b""
         last, times = self._corners[camera]
-        times = times + 1 if shown and shown == last else 1
+        repeats = shown and shown == last and np.isfinite(detections.corners_px).all()
+        times = times + 1 if repeats else 1
         self._corners[camera] = shown, times
         return times >= FROZEN_AFTER
+
+
+def _are_finite(corners_px: np.ndarray, sigma_px: np.ndarray) -> bool:
+    """Whether all are numbers that a vehicle can have; those of NaN compare as none."""
+    near = np.abs(corners_px).max() <= _MOST_PX
+    return bool(near and sigma_px.min() > 0 and sigma_px.max() < np.inf)
+
+
+def _hide(seen: Observed, lane: tuple[int, ...]) -> None:
+    """Make it one that shows nothing."""
+    seen.visible[lane], seen.corners_px[lane], seen.sigma_px[lane] = False, 0, 1

@@ -23,6 +23,9 @@ SPEED_FACTOR = {
 }
 
 
+_NO_FAULT = Fault(0)
+_BROKEN = Fault.NOT_FINITE | Fault.VEHICLE_FAILED | Fault.NOTHING_MOVES | Fault.RESTARTED_OFTEN
+_LOST = Fault.UNSURE | Fault.FAR_FROM_FIX
 _SLOW = (
     Fault.CAMERAS_STALE
     | Fault.ODOMETRY_STALE
@@ -75,7 +78,8 @@ class Monitor:
 
     def look(self, senses: Senses) -> tuple[Health, Fault]:
         """The health now, and what is wrong. Call it at a steady rate."""
-        faults = senses.faults | self._missing(senses)
+        missing = self._missing(senses)
+        faults = senses.faults | missing if missing else senses.faults
         wanted = self._wanted(senses, faults)
         if wanted >= self.health or self.health <= Health.OK:
             self.health, self._better = wanted, 0
@@ -97,7 +101,7 @@ class Monitor:
     def _missing(self, senses: Senses) -> Fault:
         limits = self.timeouts
         stale = [age_s > limits.camera_stale_s for age_s in senses.cameras_age_s]
-        found = Fault(0)
+        found = _NO_FAULT
         if any(stale):
             found |= Fault.CAMERA_STALE
         if stale and all(stale):
@@ -117,10 +121,7 @@ class Monitor:
 
     def _wanted(self, senses: Senses, faults: Fault) -> Health:
         limits = self.timeouts
-        broken = Fault.NOT_FINITE | Fault.VEHICLE_FAILED
-        if faults & (broken | Fault.NOTHING_MOVES | Fault.RESTARTED_OFTEN):
-            return Health.STOP
-        if senses.refused:
+        if faults & _BROKEN or senses.refused:
             return Health.STOP
         if not senses.located or (senses.decided and not senses.confirmed):
             return Health.INIT
@@ -128,11 +129,7 @@ class Monitor:
             senses.odometry_age_s > limits.blind_s or Fault.ODOMETRY_DOUBTFUL in faults
         )
         blind = without_odometry and senses.fix_age_s > limits.blind_s
-        if (
-            senses.fix_age_s > limits.stop_s
-            or blind
-            or faults & (Fault.UNSURE | Fault.FAR_FROM_FIX)
-        ):
+        if senses.fix_age_s > limits.stop_s or blind or faults & _LOST:
             return Health.STOP
         if senses.fix_age_s > limits.slow_s or faults & _SLOW or self.contradicted:
             return Health.DEGRADED

@@ -60,30 +60,49 @@ class Layout:
 
     def unpack(self, floats: Any, integers: Any) -> Any:
         """The tree."""
-        leaves = [
-            floats[begin:end].reshape(shape)
-            if is_float
-            else integers[begin:end].reshape(shape).astype(dtype, copy=False)
-            for begin, end, shape, dtype, is_float in self._slices
-        ]
+        leaves = self._views(floats, integers)
+        for index, dtype in self._casts:
+            leaves[index] = leaves[index].astype(dtype)
         return jax.tree.unflatten(self._structure, leaves)
 
     def room(self) -> tuple["Packed", Any]:
         """Zeros of NumPy's, and a tree of views to write to; truth values are integers there."""
-        ends = [0, 0]
-        for _, end, _, _, is_float in self._slices:
-            ends[is_float] = max(ends[is_float], end)
-        numbers = np.zeros(ends[0], np.int32), np.zeros(ends[1], self.precision)
-        views = [
-            numbers[is_float][begin:end].reshape(shape)
-            for begin, end, shape, _, is_float in self._slices
+        integers, floats = self._sizes
+        packed = Packed(np.zeros(floats, self.precision), np.zeros(integers, np.int32), self)
+        views = self._views(packed.floats, packed.integers)
+        return packed, jax.tree.unflatten(self._structure, views)
+
+    def _views(self, floats: Any, integers: Any) -> list[Any]:
+        parts = integers, floats
+        return [
+            parts[is_float][where] if shape is None else parts[is_float][where].reshape(shape)
+            for where, shape, is_float in self._slices
         ]
-        return Packed(numbers[1], numbers[0], self), jax.tree.unflatten(self._structure, views)
 
     @cached_property
-    def _slices(self) -> list[tuple[int, int, tuple[int, ...], np.dtype, bool]]:
-        places: list[Place] = jax.tree.leaves(self.places)
-        return [(at.begin, at.end, at.shape, np.dtype(at.dtype), at.is_float) for at in places]
+    def _slices(self) -> list[tuple[slice, tuple[int, ...] | None, bool]]:
+        """Where each leaf is, and its shape, None of a vector's: each array made takes a us."""
+        return [
+            (slice(at.begin, at.end), None if len(at.shape) == 1 else at.shape, at.is_float)
+            for at in jax.tree.leaves(self.places)
+        ]
+
+    @cached_property
+    def _casts(self) -> list[tuple[int, np.dtype]]:
+        """Which leaves are no int32, and what they are."""
+        places = list(enumerate(jax.tree.leaves(self.places)))
+        others = [(index, at) for index, at in places if not at.is_float and at.dtype != "int32"]
+        return [(index, np.dtype(at.dtype)) for index, at in others]
+
+    @cached_property
+    def _sizes(self) -> tuple[int, int]:
+        """How many integers and floats there are."""
+        places = jax.tree.leaves(self.places)
+        integers, floats = (
+            max((at.end for at in places if at.is_float is kind), default=0)
+            for kind in (False, True)
+        )
+        return integers, floats
 
     @cached_property
     def _structure(self) -> Any:

@@ -90,7 +90,7 @@ class Outcome:
 
 
 class _Known(NamedTuple):
-    """What the pilot looks at in a report: an attribute of an equinox module takes a us."""
+    """What the pilot looks at in a report."""
 
     pose: np.ndarray  # x_m, y_m, psi_rad
     covariance: np.ndarray
@@ -104,19 +104,25 @@ class _Known(NamedTuple):
 
     @staticmethod
     def of(report: Report) -> "_Known":
-        output = report.output
-        assert output.command is not None
+        told = vars(report)  # an attribute of an equinox module takes a us
+        output = vars(told["output"])
+        command = vars(output["command"])
         return _Known(
-            np.asarray(output.pose),
-            np.asarray(output.covariance),
-            bool(output.located),
-            bool(output.decided),
-            int(output.selected),
-            float(output.nis),
-            float(output.command.steering_rad),
-            float(output.command.throttle),
-            np.asarray(report.mean),
+            output["pose"],
+            output["covariance"],
+            bool(output["located"]),
+            bool(output["decided"]),
+            int(output["selected"]),
+            float(output["nis"]),
+            float(command["steering_rad"]),
+            float(command["throttle"]),
+            told["mean"],
         )
+
+    @property
+    def is_finite(self) -> bool:
+        numbers = (*self.pose.tolist(), *self.covariance.ravel().tolist())
+        return all(map(math.isfinite, numbers))
 
     def sigma(self, *states: int) -> float:
         """Of several states together."""
@@ -246,7 +252,7 @@ class Pilot:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
         fused = self._estimator.fuse(told, stamp_ns, now_ns, elapsed_ns)
         known = _Known.of(fused.report)
-        finite = all(np.isfinite(part).all() for part in (known.pose, known.covariance))
+        finite = known.is_finite
         if not finite:
             faults |= Fault.NOT_FINITE
             self._begin_anew("the estimate was no number")
@@ -269,8 +275,9 @@ class Pilot:
             rejects |= self._judge(known, fused.moment.belief, stamp_ns, now_ns)
         faults |= self._contradictions()
         report, known = self._honest(fused.report, known)
-        if report.output.decided:
-            self._arrived_elsewhere(known)
+        if self._left is not None and report.output.decided:
+            self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
+            self._left = None
         self._known, self._now_ns = known, now_ns
         if self._standstill.nothing_moves:
             faults |= Fault.NOTHING_MOVES
@@ -292,15 +299,6 @@ class Pilot:
             outvoted or (self._hidden if Fault.MARKER_OUTVOTED in faults else ()),
             self._origin_m,
         )
-
-    def _arrived_elsewhere(self, known: _Known) -> None:
-        """After a restart, once the pose is known again: how far it is from what was believed."""
-        if self._left is None:
-            return
-        x_m, y_m, psi_rad = known.pose - self._left.pose
-        psi_deg = math.degrees(math.remainder(float(psi_rad), math.tau))
-        self._restart_reason += f"; {math.hypot(x_m, y_m):.2f} m and {psi_deg:.0f} deg away"
-        self._left = None
 
     def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
         """Whether the corners were believed."""
@@ -436,3 +434,10 @@ def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
     x_m, y_m, psi_rad = map(float, pose[:3])
     sigma_m = math.sqrt(max(float(covariance[0, 0] + covariance[1, 1]), 0.0))
     return Fix(x_m, y_m, psi_rad, sigma_m, math.sqrt(max(float(covariance[2, 2]), 0.0)))
+
+
+def _apart(pose: np.ndarray, other: np.ndarray) -> str:
+    """How far the other one is, in words."""
+    x_m, y_m, psi_rad = other - pose
+    psi_deg = math.degrees(math.remainder(float(psi_rad), math.tau))
+    return f"{math.hypot(x_m, y_m):.2f} m and {psi_deg:.0f} deg"
