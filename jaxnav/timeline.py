@@ -168,23 +168,6 @@ def _after(
         blind: no event of the call shows corners.
     """
 
-    snapshot = navigator.snapshot(obs)
-
-    def looked() -> tuple[Array, Candidates, Array]:
-        found = consistent(snapshot, navigator.find_candidates)
-        return found.snapshot.seen.visible, found.candidates, found.outvoted
-
-    def estimated() -> tuple[Moment, _Found]:
-        seen = eqx.tree_at(lambda s: s.seen.visible, snapshot, visible)
-        estimate = navigator.estimate(before.belief, seen, candidates)
-        found = _Found(candidates, estimate.costs, estimate.selected, estimate.nis, outvoted)
-        return Moment(
-            estimate.belief,
-            estimate.decided,
-            estimate.flip_probability.astype(before.flip_probability.dtype),
-            before.restarts + estimate.restarted,
-        ), found
-
     def coasted() -> tuple[Moment, _Found]:
         belief = navigator.coast(before.belief, obs)
         located = jnp.any(belief.initialised)
@@ -196,14 +179,28 @@ def _after(
             before.restarts + given_up,
         ), nothing
 
+    def looked() -> tuple[Moment, _Found]:
+        found = consistent(navigator.snapshot(obs), navigator.find_candidates)
+
+        def estimated() -> tuple[Moment, _Found]:
+            estimate = navigator.estimate(before.belief, found.snapshot, found.candidates)
+            return Moment(
+                estimate.belief,
+                estimate.decided,
+                estimate.flip_probability.astype(before.flip_probability.dtype),
+                before.restarts + estimate.restarted,
+            ), _Found(
+                found.candidates, estimate.costs, estimate.selected, estimate.nis, found.outvoted
+            )
+
+        after: tuple[Moment, _Found] = jax.lax.cond(
+            jnp.any(found.snapshot.seen.visible), estimated, coasted
+        )
+        return after
+
     if blind:
         return coasted()
-    visible, candidates, outvoted = jax.lax.cond(
-        jnp.any(obs.visible),
-        looked,
-        lambda: (snapshot.seen.visible, nothing.candidates, nothing.outvoted),
-    )
-    after: tuple[Moment, _Found] = jax.lax.cond(jnp.any(visible), estimated, coasted)
+    after: tuple[Moment, _Found] = jax.lax.cond(jnp.any(obs.visible), looked, coasted)
     return after
 
 
