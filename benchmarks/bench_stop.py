@@ -60,12 +60,20 @@ def load(processes: int) -> Iterator[None]:
             process.kill()
 
 
+def _sleeps() -> Iterator[tuple[int, float]]:
+    """Sleep 10 ms at a time: when each began, in ns, and how late it ended, in ms."""
+    while True:
+        begin_ns = time.monotonic_ns()
+        time.sleep(0.01)
+        yield begin_ns, (time.monotonic_ns() - begin_ns) / 1e6 - 10
+
+
 def _sleep(results: "multiprocessing.Queue[list[float]]", over: "multiprocessing.Event") -> None:  # type: ignore[valid-type]
     late_ms = []
-    while not over.is_set():
-        begin_s = time.monotonic()
-        time.sleep(0.01)
-        late_ms.append((time.monotonic() - begin_s - 0.01) * 1e3)
+    for _, ms in _sleeps():
+        late_ms.append(ms)
+        if over.is_set():
+            break
     results.put(late_ms)
 
 
@@ -79,10 +87,7 @@ def _watch_stalls(path: Path, ahead: bool) -> None:
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     with path.open("w", buffering=1) as file:
-        while True:
-            begin_ns = time.monotonic_ns()
-            time.sleep(0.01)
-            late_ms = (time.monotonic_ns() - begin_ns) / 1e6 - 10
+        for begin_ns, late_ms in _sleeps():
             if late_ms > 50:
                 file.write(f"{begin_ns} {late_ms:.0f}\n")
 
@@ -253,11 +258,11 @@ def soak(minutes: float, processes: int) -> None:
     end_s = time.monotonic() + 60 * minutes
     ends: Counter[str] = Counter()
     seconds, health, loads = 0.0, Counter[str](), []
-    with tempfile.TemporaryDirectory() as name, load(processes):
-        stalls = {name: Path(made) / f"{name}.txt" for made in [name] for name in _SLEEPERS}
+    with tempfile.TemporaryDirectory() as folder, load(processes):
+        stalls = {who: Path(folder) / f"{who}.txt" for who in ("like others", "ahead")}
         sleepers = [
-            multiprocessing.Process(target=_watch_stalls, args=(path, name == "ahead"), daemon=True)
-            for name, path in stalls.items()
+            multiprocessing.Process(target=_watch_stalls, args=(path, who == "ahead"), daemon=True)
+            for who, path in stalls.items()
         ]
         for sleeper in sleepers:
             sleeper.start()
@@ -265,14 +270,14 @@ def soak(minutes: float, processes: int) -> None:
         with tqdm(total=60 * minutes, unit="s") as bar, suppress(KeyboardInterrupt):
             while time.monotonic() < end_s:
                 number += 1
-                drive = _soaked(Path(name), number)
+                drive = _soaked(Path(folder), number)
                 seconds += drive.took_s
                 ends[drive.end] += 1
                 health.update(drive.health)
                 loads.append(os.getloadavg()[0])
                 bar.update(drive.took_s)
                 if not drive.end.startswith(("0 arrived", "held")):
-                    late = {name: _stalled_ms(path, drive.last_ns) for name, path in stalls.items()}
+                    late = {who: _stalled_ms(path, drive.last_ns) for who, path in stalls.items()}
                     bar.write(f"{number}: {drive.said}; asleep too long, ms: {late}")
         for sleeper in sleepers:
             sleeper.kill()
@@ -281,9 +286,6 @@ def soak(minutes: float, processes: int) -> None:
     )
     total = sum(health.values())
     print({name: f"{count / total:.2%}" for name, count in health.most_common()})
-
-
-_SLEEPERS = ("like others", "ahead")
 
 
 @dataclass(frozen=True)

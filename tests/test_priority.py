@@ -1,6 +1,7 @@
 """A process that comes before others, and a terminal that is afterwards as it was."""
 
 import os
+import sys
 
 import pytest
 
@@ -51,4 +52,23 @@ def test_without_groups_or_without_the_right_to_it_goes_on(group, monkeypatch):
     monkeypatch.setattr(priority, "_group_nice", lambda: 0)
     monkeypatch.setattr(priority, "_GROUP", group / "nowhere")
     with priority.before_others():
+        pass
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="nice values of threads are Linux's")
+def test_a_thread_comes_before_its_siblings_and_goes_back(monkeypatch):
+    given = [-10]
+    monkeypatch.setattr(os, "getpriority", lambda *_: given[-1])
+    monkeypatch.setattr(os, "setpriority", lambda kind, who, nice: given.append(nice))
+    with priority.before_siblings():
+        assert given[-1] == priority.FIRST_NICE
+    assert given == [-10, priority.FIRST_NICE, -10]
+
+
+def test_a_thread_that_may_not_come_first_goes_on(monkeypatch):
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(os, "setpriority", refuse)
+    with priority.before_siblings():
         pass

@@ -140,8 +140,7 @@ def _merged_below(value: Any) -> Any:
 def _decode_slowly(raw: bytes) -> Any:
     """By Python's own reader: takes other encodings as well, and says what is wrong where."""
     try:
-        text = raw.decode(json.detect_encoding(raw), "surrogatepass")
-        return (_MERGING if NOT_FINITE in text else _PLAIN).decode(text)
+        return _merged_below(_PYTHON.decode(raw.decode(json.detect_encoding(raw), "surrogatepass")))
     except RecursionError:
         raise ValueError("it is nested too deep") from None
 
@@ -156,6 +155,4 @@ def _refuse(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no JSON")
 
 
-# A hook costs half the time of a message, and most have nothing to merge.
-_PLAIN = json.JSONDecoder(parse_constant=_refuse)
-_MERGING = json.JSONDecoder(object_hook=_merged, parse_constant=_refuse)
+_PYTHON = json.JSONDecoder(parse_constant=_refuse)

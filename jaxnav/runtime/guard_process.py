@@ -35,6 +35,7 @@ from jaxnav.runtime.guard import Guard
 from jaxnav.runtime.interfaces import Ending, Setup, SharesProcess, Vehicle
 from jaxnav.runtime.limits import Limits
 from jaxnav.runtime.output import FreeOutput
+from jaxnav.runtime.priority import NICE, lower_nice
 
 COMMAND = struct.Struct("<cQqdd")  # kind, sequence, deadline_ns, steering_rad, throttle
 READING = struct.Struct("<cqdd?")  # kind, stamp_ns, speed_mps, steering_rad, valid
@@ -251,10 +252,7 @@ def _preferred() -> str:
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
         return "real-time priority"
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, -10)
-        return "raised priority"
-    return "no priority: it may not be raised here"
+    return "raised priority" if lower_nice(NICE) else "no priority: it may not be raised here"
 
 
 if __name__ == "__main__":

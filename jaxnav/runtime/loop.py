@@ -21,6 +21,7 @@ from jaxnav.runtime.frames import Sighted
 from jaxnav.runtime.guard import Guard
 from jaxnav.runtime.interfaces import Ending, Frame, Vehicle
 from jaxnav.runtime.pilot import Input, Outcome, Pilot
+from jaxnav.runtime.priority import before_siblings
 from jaxnav.runtime.seeing import Eyes, Region, groups
 
 _THREAD = "the loop"
@@ -114,9 +115,13 @@ class Loop:
         Returns:
             Why it ended: "arrived", "time is over", what an `Ending` vehicle or the guard says.
         """
-        ending = self._vehicle if isinstance(self._vehicle, Ending) else None
         self._eyes.expected = self._region
         self._eyes.start()
+        with before_siblings():  # a late image is one image less, a late command ends the drive
+            return self._driven(duration_s)
+
+    def _driven(self, duration_s: float) -> str:
+        ending = self._vehicle if isinstance(self._vehicle, Ending) else None
         begin_ns = self._now_ns()
         due_ns = begin_ns
         arrived_ns: int | None = None

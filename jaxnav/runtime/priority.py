@@ -1,16 +1,17 @@
-"""A process that runs before what else the computer has to do.
+"""A process that runs before what else the computer has to do, and a thread before its siblings.
 
 A nice value counts among the processes of one terminal only, where the kernel groups them by
-session (sched(7), autogroups; so do most distributions): what another terminal runs gets as much
-time as all of this one. So the group's value is lowered as well.
+session (sched(7), autogroups; on by default in most of Linux): what another terminal runs gets as
+much time as all of this one. So the group's value is lowered as well.
 """
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-NICE = -10
+NICE, FIRST_NICE = -10, -20
 _GROUP = Path("/proc/self/autogroup")  # "/autogroup-42 nice 0"
 
 
@@ -21,8 +22,7 @@ def before_others() -> Iterator[None]:
 
     Threads have the priority of the one that began them: those of XLA begin with the first array.
     """
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, NICE)
+    lower_nice(NICE)
     before = _group_nice()
     if before is None or before <= NICE:
         yield
@@ -34,6 +34,28 @@ def before_others() -> Iterator[None]:
         _set_group_nice(before)
 
 
+@contextmanager
+def before_siblings() -> Iterator[None]:
+    """Meanwhile the calling thread comes before the others of its process that run already."""
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    # Elsewhere than on Linux a nice value is the process's, and its siblings have it as well.
+    if sys.platform != "linux" or before <= FIRST_NICE or not lower_nice(FIRST_NICE):
+        yield
+        return
+    try:
+        yield
+    finally:
+        os.setpriority(os.PRIO_PROCESS, 0, before)
+
+
+def lower_nice(nice: int) -> bool:
+    """Give the calling thread a nice value, if that may be."""
+    with suppress(OSError):  # PermissionError: it may not be raised here
+        os.setpriority(os.PRIO_PROCESS, 0, nice)
+        return True
+    return False
+
+
 def _group_nice() -> int | None:
     """None where the kernel has no such groups."""
     try:
@@ -43,5 +65,5 @@ def _group_nice() -> int | None:
 
 
 def _set_group_nice(nice: int) -> None:
-    with suppress(OSError):  # PermissionError: it may not be raised here
+    with suppress(OSError):
         _GROUP.write_text(str(nice))

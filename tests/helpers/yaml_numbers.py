@@ -5,8 +5,10 @@ from typing import Any
 
 import yaml
 
+_Fastest: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # where PyYAML came with libyaml
 
-class _Dumper(yaml.SafeDumper):
+
+class _Dumper(_Fastest):  # type: ignore[misc]
     """Without aliases, which are refused, and with numbers as YAML 1.2 reads them."""
 
     def ignore_aliases(self, data: Any) -> bool:
