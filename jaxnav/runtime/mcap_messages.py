@@ -97,7 +97,7 @@ class McapMessages:
 
     def _read(self, file: IO[bytes]) -> Iterator[Metadata | Recorded]:
         bounded = cast(IO[bytes], _Bounded(file))
-        reader = StreamReader(
+        reader = _Reader(
             bounded, emit_chunks=True, validate_crcs=True, record_size_limit=limits.CHUNK_BYTES
         )
         is_over, budget = False, Budget.of_file(self.path)
@@ -131,6 +131,13 @@ class McapMessages:
                 raise ValueError(f"{record.topic} has an unknown schema")
             self._channels[record.id] = record
         return None
+
+
+class _Reader(StreamReader):
+    """MCAP's, without the index of a chunk's messages: two numbers for each, to leap to a time."""
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
 
 
 class _CutOff(Exception):
