@@ -18,11 +18,11 @@ from matplotlib.patches import Ellipse
 
 from jaxnav import cli
 from jaxnav.commands.drive_pictures import distance_m, summary_lines
-from jaxnav.drive_map_plotting import HEALTH_COLORS
-from jaxnav.drive_plotting import drive_log_report
-from jaxnav.drive_scenery import Scenery
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.plots.drive import drive_log_report
+from jaxnav.plots.drive_map import HEALTH_COLORS
+from jaxnav.plots.scenery import Scenery
 from jaxnav.runtime.drive_log import DriveLog, read_drive
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.interfaces import Odometry

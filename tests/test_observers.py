@@ -83,7 +83,7 @@ def test_a_view_that_is_gone_is_no_fault_and_is_told_in_the_end():
 
 
 def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxnav.viewing.RerunView", FakeView)
+    monkeypatch.setattr("jaxnav.viewer.rerun_view.RerunView", FakeView)
     path = tmp_path / "drive.mcap"
     with ExitStack() as closing:
         found = open_onlookers(Run(record=path, view=True), setup, closing)

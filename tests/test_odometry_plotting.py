@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxnav.calibration.odometry import OdometryCalibration
 from jaxnav.calibration.odometry_drive import ReadingSigma
-from jaxnav.odometry_plotting import odometry_report
+from jaxnav.plots.odometry import odometry_report
 from tests import worlds
 
 

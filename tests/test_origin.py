@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from jaxnav.cli import main
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.status import WIDTH, status_line
-from jaxnav.drive_scenery import Scenery
 from jaxnav.files import Route, calib_dir, load_markers, load_route, poses, save_markers, write_tum
 from jaxnav.files.markers import MarkerFile, marker_data, marker_map
 from jaxnav.files.vehicles import RouteFile
@@ -29,12 +28,13 @@ from jaxnav.origin import (
     planar_in_world,
     poses_in_world,
 )
+from jaxnav.plots.scenery import Scenery
 from jaxnav.runtime.drive_log import read_drive
 from jaxnav.runtime.drive_replay import Comparison, replay_drive
 from jaxnav.runtime.drive_setup import DriveSetup
 from jaxnav.runtime.flags import Health
 from jaxnav.vehicles.faults import WAYPOINTS_M
-from jaxnav.viewing_outcomes import Shown
+from jaxnav.viewer.outcomes import Shown
 from tests import worlds
 from tests.helpers.simulated import record, simulated
 

@@ -5,7 +5,7 @@ import io
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxnav.plotting import (
+from jaxnav.plots.localisation import (
     Track,
     View,
     camera_mosaic,

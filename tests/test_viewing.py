@@ -17,16 +17,17 @@ import numpy as np
 import pytest
 import yaml
 
-from jaxnav import cli, viewing
-from jaxnav.drive_scenery import Scenery
+from jaxnav import cli
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
+from jaxnav.plots.scenery import Scenery
 from jaxnav.runtime.drive_log import read_drive
 from jaxnav.runtime.flags import Health
 from jaxnav.runtime.history import Told
 from jaxnav.runtime.recorder import Recorder
-from jaxnav.viewing import RerunView
-from jaxnav.viewing_outcomes import Shown
+from jaxnav.viewer import rerun_view as viewing
+from jaxnav.viewer.outcomes import Shown
+from jaxnav.viewer.rerun_view import RerunView
 from tests.helpers.drives import PERIOD_NS, make_outcome, make_picture, record_drive
 
 QCAR = calib_dir() / "qcar"

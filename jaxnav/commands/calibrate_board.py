@@ -7,7 +7,6 @@ from matplotlib.figure import Figure
 
 from jaxnav import __version__
 from jaxnav.arguments.calibration import CalibrateBoard
-from jaxnav.board_plotting import board_page
 from jaxnav.calibration.board_pages import PAPERS_MM, check_fit, largest
 from jaxnav.calibration.board_sheets import sheet_of
 from jaxnav.calibration.boards import Board
@@ -17,6 +16,7 @@ from jaxnav.detection import marker_cells
 from jaxnav.errors import BadInput
 from jaxnav.files import atomic_path, output_folder, write_json
 from jaxnav.markers import FAMILY_SIZES
+from jaxnav.plots.board import board_page
 
 # Longer and shorter side, in squares or tags.
 _GRIDS = {"charuco": (9, 6), "aprilgrid": (6, 4), "chessboard": (10, 7), "marker": (1, 1)}

@@ -15,7 +15,7 @@ from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
-from jaxnav.rig_plotting import map_check
+from jaxnav.plots.rig import map_check
 
 EXIT_WRONG = 1
 

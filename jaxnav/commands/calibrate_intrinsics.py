@@ -30,7 +30,7 @@ from jaxnav.files.rigs import (
     save_rig,
 )
 from jaxnav.files.validation import validate
-from jaxnav.lens_plotting import lens_report
+from jaxnav.plots.lens import lens_report
 
 # Where a camera of such a name looks, until somebody says where it is.
 _YAWS_DEG = {"front": 0.0, "left": 90.0, "rear": 180.0, "back": 180.0, "right": -90.0}

@@ -19,8 +19,8 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.errors import visible
 from jaxnav.files import output_folder, save_vehicle, write_json
 from jaxnav.files.provenance import Calibrated, calibrated_now
-from jaxnav.odometry_plotting import odometry_report
 from jaxnav.origin import planar_in_world
+from jaxnav.plots.odometry import odometry_report
 
 
 def run(args: Arguments) -> int:

@@ -22,7 +22,7 @@ from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_vehicle, output_folder, write_json
-from jaxnav.rig_plotting import rig_report
+from jaxnav.plots.rig import rig_report
 
 _WRONG_SCALE = 3.0  # between how far apart cameras are and were said to be
 _WRONG_SIZE = 1.5  # between how large a marker looks and was said to be

@@ -24,7 +24,7 @@ from jaxnav.files import (
 )
 from jaxnav.geometry import T_world_vehicle_from_planar
 from jaxnav.origin import planar_in_world, points_in_world, poses_in_world
-from jaxnav.plotting import Track, camera_mosaic, drive_report
+from jaxnav.plots.localisation import Track, camera_mosaic, drive_report
 from jaxnav.runtime.compiled import compiled_step
 from jaxnav.selectors import make_selector
 from jaxnav.simulation.drive import (

@@ -7,10 +7,10 @@ import numpy as np
 
 from jaxnav.arguments import Plot as Arguments
 from jaxnav.commands.pictures import save_figure
-from jaxnav.drive_plotting import drive_log_report
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder
 from jaxnav.files.ranges import is_within
+from jaxnav.plots.drive import drive_log_report
 from jaxnav.runtime.drive_log import DriveLog, read_drive
 from jaxnav.runtime.flags import Fault, Health, Reject
 from jaxnav.runtime.plausible import left_out, plausible

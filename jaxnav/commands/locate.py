@@ -21,7 +21,7 @@ from jaxnav.files import load_camera
 from jaxnav.files.images import read_image
 from jaxnav.markers import MarkerMap
 from jaxnav.observation import Observation, Snapshot
-from jaxnav.plotting import View, photo_with_poses
+from jaxnav.plots.localisation import View, photo_with_poses
 from jaxnav.rig import CameraRig
 
 

@@ -24,7 +24,7 @@ from jaxnav.runtime.pilot import Input, Outcome
 from jaxnav.runtime.recorder import Recorder
 
 if TYPE_CHECKING:
-    from jaxnav.viewing import RerunView
+    from jaxnav.viewer.rerun_view import RerunView
 
 _STATUS_NS = 200_000_000
 _MARKER_NS = 200_000_000  # for so long after a marker it counts as seen
@@ -61,7 +61,7 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     if args.record is not None:
         add(Recording(args.record, setup, args.record_images))
     if args.view:
-        from jaxnav.viewing import RerunView  # with all that draws
+        from jaxnav.viewer.rerun_view import RerunView  # with all that draws
 
         waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
         add(View(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))

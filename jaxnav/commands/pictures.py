@@ -19,7 +19,7 @@ from jaxnav.files import atomic_path
 from jaxnav.markers import MarkerMap
 from jaxnav.navigator import Output
 from jaxnav.origin import points_in_world
-from jaxnav.plotting import View
+from jaxnav.plots.localisation import View
 from jaxnav.rig import CameraRig
 
 PNG_DPI = 110

@@ -10,7 +10,7 @@ from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
-from jaxnav.plotting import reliability_diagram
+from jaxnav.plots.localisation import reliability_diagram
 from jaxnav.runtime.recordings import read_recording
 from jaxnav.runtime.replay import replay
 from jaxnav.selectors import make_selector

@@ -23,7 +23,7 @@ from jaxnav.files import (
     write_tum,
 )
 from jaxnav.navigator import Navigator
-from jaxnav.plotting import localisation_report
+from jaxnav.plots.localisation import localisation_report
 from jaxnav.runtime.recordings import Recording, read_recording
 from jaxnav.runtime.replay import Replay, errors, frames_in_view, replay
 from jaxnav.selectors import make_selector

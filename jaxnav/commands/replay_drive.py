@@ -28,7 +28,7 @@ from jaxnav.files import (
     write_json,
     write_tum,
 )
-from jaxnav.plotting import localisation_report
+from jaxnav.plots.localisation import localisation_report
 from jaxnav.runtime.drive_format import PROFILE
 from jaxnav.runtime.drive_log import DriveLog, Outcomes, read_drive
 from jaxnav.runtime.drive_replay import (

@@ -12,7 +12,7 @@ from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.studies import summary_of
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
-from jaxnav.study_plotting import numeric_axes, study_curves, study_map, study_reliability
+from jaxnav.plots.study import numeric_axes, study_curves, study_map, study_reliability
 
 MAPS = {
     "ambiguity": ("flip_rate", "success_rate", "rotation_error_deg_median"),

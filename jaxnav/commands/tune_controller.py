@@ -21,6 +21,7 @@ from jaxnav.errors import BadInput, visible
 from jaxnav.files import Params, load_params, output_folder, write_json
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
+from jaxnav.plots.tuning import controller_report
 from jaxnav.selectors import make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
@@ -33,7 +34,6 @@ from jaxnav.tuning.driving import ClosedLoop
 from jaxnav.tuning.fit import Fit, Problem
 from jaxnav.tuning.objective import Batch, NotFinite
 from jaxnav.tuning.unconstrained import Space
-from jaxnav.tuning_plotting import controller_report
 
 GAINS = (
     "controller.proportional_per_m",

@@ -21,6 +21,7 @@ from jaxnav.files import Params, apply_params, load_params, output_folder, write
 from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of, with_parameters
+from jaxnav.plots.tuning import tuning_report
 from jaxnav.simulation.statistics import anees_band, resampled
 from jaxnav.tuning.branches import estimated
 from jaxnav.tuning.descent import Smooth
@@ -29,7 +30,6 @@ from jaxnav.tuning.fit import Fit, Problem
 from jaxnav.tuning.objective import Batch, Objective, where_not_finite
 from jaxnav.tuning.recorded import Recorded
 from jaxnav.tuning.unconstrained import Space
-from jaxnav.tuning_plotting import tuning_report
 
 _STAGES = 4
 

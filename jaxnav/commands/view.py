@@ -6,13 +6,13 @@ from tqdm import tqdm
 
 from jaxnav.arguments import View as Arguments
 from jaxnav.commands.drive_pictures import read_outcomes
-from jaxnav.drive_scenery import Scenery
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path, output_folder
+from jaxnav.plots.scenery import Scenery
 from jaxnav.runtime.drive_log import DriveLog
 from jaxnav.runtime.plausible import left_out, plausible
-from jaxnav.viewing import RerunView, import_rerun
-from jaxnav.viewing_outcomes import Shown
+from jaxnav.viewer.outcomes import Shown
+from jaxnav.viewer.rerun_view import RerunView, import_rerun
 
 
 def run(args: Arguments) -> int:

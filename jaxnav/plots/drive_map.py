@@ -8,9 +8,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
-from jaxnav.drive_scenery import Scenery
 from jaxnav.files import poses
-from jaxnav.plotting import (
+from jaxnav.plots.localisation import (
     BLACK,
     BLUE,
     GREEN,
@@ -20,6 +19,7 @@ from jaxnav.plotting import (
     draw_markers,
     draw_waypoints,
 )
+from jaxnav.plots.scenery import Scenery
 from jaxnav.runtime.drive_log import Outcomes
 from jaxnav.runtime.flags import Health
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnav.markers import CORNER_SIGNS
-from jaxnav.plotting import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.plots.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)
 _ARROWS = 400  # residuals drawn for each camera

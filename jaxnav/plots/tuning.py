@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnav.plotting import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.plots.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 from jaxnav.tuning.fit import Fit
 from jaxnav.tuning.unconstrained import Space
 

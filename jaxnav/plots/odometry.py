@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnav.calibration.odometry import OdometryCalibration
-from jaxnav.plotting import BLACK, BLUE, ORANGE, SKY, VERMILION
+from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
 
 _GROUPS = 60  # of views, whose mean and scatter are drawn
 

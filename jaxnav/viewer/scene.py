@@ -20,10 +20,10 @@ import numpy as np
 from jaxnav.files import poses
 from jaxnav.markers import MarkerMap
 from jaxnav.origin import ZERO
-from jaxnav.plotting import BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.plots.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.flags import Health, names
-from jaxnav.viewing_outcomes import Shown
+from jaxnav.viewer.outcomes import Shown
 
 TIMELINE = "drive"  # seconds since the first event
 _CHI2_2DOF_95 = 5.991

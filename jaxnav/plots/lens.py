@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, SubFigure
 from jaxnav.calibration.intrinsics import LensCalibration
 from jaxnav.calibration.lens_bundle import gathered
 from jaxnav.calibration.lens_checks import Cells, cells
-from jaxnav.plotting import BLACK, BLUE, ORANGE, SKY, VERMILION
+from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
 
 _ARROW = 0.5  # of a cell, the longest one
 _MOST_NAMES = 30  # of views that can be read below their bars

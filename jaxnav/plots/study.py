@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from jaxnav.plotting import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.plots.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 
 _COLORS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK, "#CC79A7", "#8C8C8C")
 _STYLES = ("-", "--", "-.", ":")

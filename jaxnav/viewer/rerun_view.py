@@ -29,8 +29,8 @@ from jaxnav.errors import BadInput
 from jaxnav.markers import MarkerMap
 from jaxnav.rig import CameraRig
 from jaxnav.runtime.pilot import Outcome
-from jaxnav.viewing_outcomes import Shown
-from jaxnav.viewing_scene import Scene
+from jaxnav.viewer.outcomes import Shown
+from jaxnav.viewer.scene import Scene
 
 APPLICATION = "jaxnav"
 _IDLE_S = 0.02  # between looks at an empty queue

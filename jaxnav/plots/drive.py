@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.drive_map_plotting import HEALTH_COLORS, PURPLE, draw_drive_map
-from jaxnav.drive_scenery import Scenery
-from jaxnav.plotting import BLACK, BLUE, GREEN, VERMILION
+from jaxnav.plots.drive_map import HEALTH_COLORS, PURPLE, draw_drive_map
+from jaxnav.plots.localisation import BLACK, BLUE, GREEN, VERMILION
+from jaxnav.plots.scenery import Scenery
 from jaxnav.runtime.drive_log import DriveLog, Outcomes
 from jaxnav.runtime.flags import Fault, Health, Reject
 

@@ -1,0 +1,1 @@
+"""Pictures: of drives, studies, calibrations and tuning, as matplotlib draws them."""
