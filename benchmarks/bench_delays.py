@@ -19,11 +19,11 @@ import jaxlie
 import numpy as np
 
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.runtime.camera_delays import CameraDelays
-from jaxnav.runtime.history import Told
+from jaxnav.loop.camera_delays import CameraDelays
+from jaxnav.loop.history import Told
+from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.simulation.corners import see
-from jaxnav.vehicles.faults import WAYPOINTS_M
+from jaxnav.testing.faults import WAYPOINTS_M
 
 STEP_S, FRAME_S, READING_S = 0.005, 1 / 30, 0.02
 START_SPREAD = np.array([0.1, 0.1, math.radians(10.0)])

@@ -22,8 +22,8 @@ from jaxnav.calibration.lens_fit import LensFit, fit_lens
 from jaxnav.calibration.lens_start import board_poses, opencv_calibration
 from jaxnav.calibration.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.calibration.views import BoardViews
-from jaxnav.camera import Camera
 from jaxnav.commands.process import configure_jax
+from jaxnav.models.camera import Camera
 
 TRIALS, ROUNDS, VIEWS, SIGMA_PX = 100, 15, 40, 0.1
 IMAGE_SIZE_PX = (820, 410)

@@ -31,17 +31,17 @@ import pytest  # noqa: E402
 from jaxnav.commands.rendered_world import SENSOR  # noqa: E402
 from jaxnav.detection import make_detector  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
-from jaxnav.runtime.drive_log import read_drive  # noqa: E402
-from jaxnav.runtime.drive_setup import DriveSetup  # noqa: E402
-from jaxnav.runtime.expect import expected  # noqa: E402
-from jaxnav.runtime.flags import Health  # noqa: E402
-from jaxnav.runtime.interfaces import Frame  # noqa: E402
-from jaxnav.runtime.pilot import Input  # noqa: E402
-from jaxnav.runtime.seeing import Region, Search  # noqa: E402
+from jaxnav.loop.expect import expected  # noqa: E402
+from jaxnav.loop.flags import Health  # noqa: E402
+from jaxnav.loop.interfaces import Frame  # noqa: E402
+from jaxnav.loop.pilot import Input  # noqa: E402
+from jaxnav.loop.seeing import Region, Search  # noqa: E402
+from jaxnav.recording.drive_log import read_drive  # noqa: E402
+from jaxnav.recording.drive_setup import DriveSetup  # noqa: E402
 from jaxnav.simulation.rendering import Renderer  # noqa: E402
 from jaxnav.simulation.scene import Scene  # noqa: E402
-from jaxnav.vehicles.faults import WAYPOINTS_M  # noqa: E402
-from jaxnav.vehicles.lockstep import BEGIN_NS, Rates, drive  # noqa: E402
+from jaxnav.testing.faults import WAYPOINTS_M  # noqa: E402
+from jaxnav.testing.lockstep import BEGIN_NS, Rates, drive  # noqa: E402
 from jaxnav.vehicles.world import World  # noqa: E402
 
 DISTANCES_M = (1.0, 2.0, 3.0)  # from the front camera's lens

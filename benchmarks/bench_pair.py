@@ -27,11 +27,11 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from jaxnav import refine
 from jaxnav.commands.process import configure_jax
-from jaxnav.ippe import PosePair, ippe_square
-from jaxnav.markers import CORNER_SIGNS
-from jaxnav.pair_lanes import ippe_squares, solve_pairs
+from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.pose import refine
+from jaxnav.pose.ippe import PosePair, ippe_square
+from jaxnav.pose.pair_lanes import ippe_squares, solve_pairs
 
 SIZE_M, FOCAL_PX, ROUNDS, STEPS = 0.172, 319.0, 15, 12
 BATCH, OPENCV_LANES, GENERAL_LANES, QUALITY_LANES = 100_000, 200, 2_000, 10_000

@@ -8,9 +8,9 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.camera import Camera
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor, Shutter

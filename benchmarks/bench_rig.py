@@ -227,7 +227,7 @@ def tagslam() -> None:
     from jaxnav.calibration.rig import calibrate_rig
     from jaxnav.calibration.rig_views import RigViews
     from jaxnav.calibration.vehicle_frame import moved_to_places
-    from jaxnav.runtime.recordings import read_recording
+    from jaxnav.datasets.recordings import read_recording
 
     data = Path(os.environ.get("JAXNAV_DATA", ROOT.parent / "shared" / "data")) / "tagslam"
     recording = read_recording(data / "test_5")
@@ -287,9 +287,9 @@ def _localise(data: Path, Ts_vehicle_camera: np.ndarray, theirs: np.ndarray) -> 
 
     from jaxnav.calibration.linking import inverted
     from jaxnav.calibration.pose_arrays import wxyz_xyz
+    from jaxnav.datasets.recordings import read_recording
     from jaxnav.files import save_rig
-    from jaxnav.rig import CameraRig
-    from jaxnav.runtime.recordings import read_recording
+    from jaxnav.models.rig import CameraRig
 
     recording = read_recording(data / "test_7")
     for name, Ts in (("TagSLAM's", theirs), ("ours", Ts_vehicle_camera)):

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.process import configure_jax
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.navigator import Navigator
-from jaxnav.selectors import make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Fault, Health, names
-from jaxnav.vehicles.faults import WAYPOINTS_M
-from jaxnav.vehicles.lockstep import BEGIN_NS, Step, drive
+from jaxnav.loop.flags import Fault, Health, names
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.testing.faults import WAYPOINTS_M
+from jaxnav.testing.lockstep import BEGIN_NS, Step, drive
 from jaxnav.vehicles.world import World
 
 BEGIN_S, DRIVE_S = 4.0, 14.0

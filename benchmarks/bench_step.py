@@ -32,15 +32,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import step_numpy as peer  # noqa: E402
 
-from jaxnav.ambiguity import PaperCost, Selector  # noqa: E402
+from jaxnav.belief.ambiguity import PaperCost, Selector  # noqa: E402
+from jaxnav.belief.hypotheses import MultiHypothesis  # noqa: E402
+from jaxnav.compiling.step import compiled_step  # noqa: E402
 from jaxnav.control import Command  # noqa: E402
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
-from jaxnav.geometry import T_world_vehicle_from_planar  # noqa: E402
-from jaxnav.hypotheses import MultiHypothesis  # noqa: E402
-from jaxnav.levenberg_marquardt import KEEP_FOUND  # noqa: E402
+from jaxnav.models.geometry import T_world_vehicle_from_planar  # noqa: E402
 from jaxnav.navigator import Navigator, State  # noqa: E402
-from jaxnav.observation import Observation  # noqa: E402
-from jaxnav.runtime.compiled import compiled_step  # noqa: E402
+from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND  # noqa: E402
+from jaxnav.pose.observation import Observation  # noqa: E402
 from jaxnav.simulation.corners import see  # noqa: E402
 from jaxnav.simulation.plant import CarState, move_through  # noqa: E402
 

@@ -32,8 +32,8 @@ from tqdm import tqdm
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from jaxnav.runtime.drive_log import read_drive  # noqa: E402
-from jaxnav.runtime.flags import Health  # noqa: E402
+from jaxnav.loop.flags import Health  # noqa: E402
+from jaxnav.recording.drive_log import read_drive  # noqa: E402
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle  # noqa: E402
 from tests.helpers.dying_parent import ENDS  # noqa: E402
 

@@ -20,12 +20,12 @@ from tqdm import tqdm
 
 from jaxnav.commands.process import configure_jax
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
+from jaxnav.loop.estimator import advance_packed
+from jaxnav.loop.flags import Fault, Health
+from jaxnav.loop.pilot import Input, Pilot
 from jaxnav.navigator import Navigator
-from jaxnav.runtime.estimator import advance_packed
-from jaxnav.runtime.flags import Fault, Health
-from jaxnav.runtime.pilot import Input, Pilot
-from jaxnav.vehicles.faults import WAYPOINTS_M
-from jaxnav.vehicles.lockstep import BEGIN_NS, drive
+from jaxnav.testing.faults import WAYPOINTS_M
+from jaxnav.testing.lockstep import BEGIN_NS, drive
 from jaxnav.vehicles.world import World
 
 RECORDED_S = 20.0

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.markers import CORNER_SIGNS
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.navigator import Navigator, State
 
 Array = NDArray[np.float64]

@@ -14,17 +14,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxnav.ambiguity import LowestReprojection as LowestReprojection
-    from jaxnav.ambiguity import Mahalanobis as Mahalanobis
-    from jaxnav.ambiguity import ObjectSpace as ObjectSpace
-    from jaxnav.ambiguity import Oracle as Oracle
-    from jaxnav.ambiguity import OrientationGiven as OrientationGiven
-    from jaxnav.ambiguity import PaperCost as PaperCost
-    from jaxnav.ambiguity import RatioTest as RatioTest
-    from jaxnav.bicycle import Vehicle as Vehicle
-    from jaxnav.bicycle_kalman import BicycleKalman as BicycleKalman
-    from jaxnav.camera import Camera as Camera
-    from jaxnav.constant_velocity import ConstantVelocity as ConstantVelocity
+    from jaxnav.belief.ambiguity import LowestReprojection as LowestReprojection
+    from jaxnav.belief.ambiguity import Mahalanobis as Mahalanobis
+    from jaxnav.belief.ambiguity import ObjectSpace as ObjectSpace
+    from jaxnav.belief.ambiguity import Oracle as Oracle
+    from jaxnav.belief.ambiguity import OrientationGiven as OrientationGiven
+    from jaxnav.belief.ambiguity import PaperCost as PaperCost
+    from jaxnav.belief.ambiguity import RatioTest as RatioTest
+    from jaxnav.belief.bicycle_kalman import BicycleKalman as BicycleKalman
+    from jaxnav.belief.constant_velocity import ConstantVelocity as ConstantVelocity
+    from jaxnav.belief.hypotheses import MultiHypothesis as MultiHypothesis
     from jaxnav.errors import BadInput as BadInput
     from jaxnav.files import load_camera as load_camera
     from jaxnav.files import load_markers as load_markers
@@ -32,57 +31,58 @@ if TYPE_CHECKING:
     from jaxnav.files import load_rig as load_rig
     from jaxnav.files import load_route as load_route
     from jaxnav.files import load_vehicle as load_vehicle
-    from jaxnav.hypotheses import MultiHypothesis as MultiHypothesis
-    from jaxnav.ippe import PosePair as PosePair
-    from jaxnav.ippe import ippe_square as ippe_square
-    from jaxnav.markers import MarkerMap as MarkerMap
+    from jaxnav.models.bicycle import Vehicle as Vehicle
+    from jaxnav.models.camera import Camera as Camera
+    from jaxnav.models.markers import MarkerMap as MarkerMap
+    from jaxnav.models.origin import planar_in_world as planar_in_world
+    from jaxnav.models.origin import poses_in_world as poses_in_world
+    from jaxnav.models.rig import CameraRig as CameraRig
     from jaxnav.navigator import Navigator as Navigator
     from jaxnav.navigator import Observation as Observation
-    from jaxnav.origin import planar_in_world as planar_in_world
-    from jaxnav.origin import poses_in_world as poses_in_world
-    from jaxnav.refine import refine_pose as refine_pose
-    from jaxnav.refine import solve_marker as solve_marker
-    from jaxnav.refine import solve_markers as solve_markers
-    from jaxnav.residuals import e1 as e1
-    from jaxnav.residuals import e2 as e2
-    from jaxnav.rig import CameraRig as CameraRig
+    from jaxnav.pose.ippe import PosePair as PosePair
+    from jaxnav.pose.ippe import ippe_square as ippe_square
+    from jaxnav.pose.refine import refine_pose as refine_pose
+    from jaxnav.pose.refine import solve_marker as solve_marker
+    from jaxnav.pose.refine import solve_markers as solve_markers
+    from jaxnav.pose.residuals import e1 as e1
+    from jaxnav.pose.residuals import e2 as e2
 
     __version__: str
 
 # The imports above tell the same to type checkers; a test holds the two together.
 _MODULE_OF = {
     "BadInput": "errors",
-    "BicycleKalman": "bicycle_kalman",
-    "Camera": "camera",
-    "CameraRig": "rig",
-    "ConstantVelocity": "constant_velocity",
-    "LowestReprojection": "ambiguity",
-    "Mahalanobis": "ambiguity",
-    "MarkerMap": "markers",
-    "MultiHypothesis": "hypotheses",
+    "BicycleKalman": "belief.bicycle_kalman",
+    "Camera": "models.camera",
+    "CameraRig": "models.rig",
+    "ConstantVelocity": "belief.constant_velocity",
+    "LowestReprojection": "belief.ambiguity",
+    "Mahalanobis": "belief.ambiguity",
+    "MarkerMap": "models.markers",
+    "MultiHypothesis": "belief.hypotheses",
     "Navigator": "navigator",
-    "ObjectSpace": "ambiguity",
+    "ObjectSpace": "belief.ambiguity",
     "Observation": "navigator",
-    "Oracle": "ambiguity",
-    "OrientationGiven": "ambiguity",
-    "PaperCost": "ambiguity",
-    "PosePair": "ippe",
-    "RatioTest": "ambiguity",
-    "Vehicle": "bicycle",
-    "e1": "residuals",
-    "e2": "residuals",
-    "ippe_square": "ippe",
+    "Oracle": "belief.ambiguity",
+    "OrientationGiven": "belief.ambiguity",
+    "PaperCost": "belief.ambiguity",
+    "PosePair": "pose.ippe",
+    "RatioTest": "belief.ambiguity",
+    "Vehicle": "models.bicycle",
+    "e1": "pose.residuals",
+    "e2": "pose.residuals",
+    "ippe_square": "pose.ippe",
     "load_camera": "files",
     "load_markers": "files",
     "load_params": "files",
     "load_rig": "files",
     "load_route": "files",
     "load_vehicle": "files",
-    "planar_in_world": "origin",
-    "poses_in_world": "origin",
-    "refine_pose": "refine",
-    "solve_marker": "refine",
-    "solve_markers": "refine",
+    "planar_in_world": "models.origin",
+    "poses_in_world": "models.origin",
+    "refine_pose": "pose.refine",
+    "solve_marker": "pose.refine",
+    "solve_markers": "pose.refine",
 }
 
 __all__ = sorted(_MODULE_OF)

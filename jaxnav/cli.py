@@ -18,13 +18,13 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from jaxnav.commands.terminal import nothing_hidden
+from jaxnav.errors import EXIT_BAD_INPUT as EXIT_BAD_INPUT
+from jaxnav.errors import EXIT_INTERRUPTED as EXIT_INTERRUPTED
 from jaxnav.errors import BadInput, visible
-from jaxnav.runtime.output import FreeOutput, fill_descriptors
-from jaxnav.runtime.signals import Interrupted, Signals
-from jaxnav.terminal import nothing_hidden
+from jaxnav.loop.output import FreeOutput, fill_descriptors
+from jaxnav.loop.signals import Interrupted, Signals
 
-EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
 
 DESCRIPTION = (

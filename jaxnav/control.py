@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.bicycle import Vehicle, curvature_per_m, sideslip_rad
-from jaxnav.geometry import safe_atan2, safe_norm, wrap_angle
+from jaxnav.models.bicycle import Vehicle, curvature_per_m, sideslip_rad
+from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
 
 
 class Command(eqx.Module):

@@ -5,6 +5,8 @@ import os
 import sys
 from collections.abc import Iterator
 
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 _LONGEST = 1000  # characters of a line: what a file holds may be quoted in it
 
 

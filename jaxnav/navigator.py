@@ -11,16 +11,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.ambiguity import Selector
-from jaxnav.bicycle import Vehicle
-from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.candidates import Candidates, find_candidates
-from jaxnav.constant_velocity import ConstantVelocity
-from jaxnav.control import Command, Controller, ControlLog, ControlState
-from jaxnav.geometry import planar_from_T_world_vehicle, transform_points
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.markers import MarkerMap
-from jaxnav.motion import (
+from jaxnav.belief.ambiguity import Selector
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.motion import (
     Belief,
     Motion,
     followed_by,
@@ -30,8 +25,13 @@ from jaxnav.motion import (
     restarted_where_broken,
     survivors_first,
 )
-from jaxnav.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
-from jaxnav.rig import CameraRig
+from jaxnav.control import Command, Controller, ControlLog, ControlState
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.geometry import planar_from_T_world_vehicle, transform_points
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.candidates import Candidates, find_candidates
+from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
 
 # Slots of the banks that `step_by_regime` keeps compiled beside the whole one: nine frames of ten
 # need a single one, and of the others two of three no more than these.
@@ -185,7 +185,7 @@ class Navigator(eqx.Module):
         """`step` without the slots that are empty: the same up to rounding.
 
         Branches for one sighting or several, and for one hypothesis, a few or the whole bank: worth
-        it where many lanes run side by side, each in its own branch (see `lanes.py`).
+        it where many lanes run side by side, each in its own branch (see `lanes`).
         """
         obs = obs.usable()
         snapshot = self.snapshot(obs)

@@ -10,13 +10,13 @@ and wheelbase are measured, limits are the vehicle's.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.navigator import Navigator
+Whole = TypeVar("Whole", bound=eqx.Module)  # a `Navigator`
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,12 @@ TUNABLES: dict[str, Tunable] = {
 }
 
 
-def parameters_of(navigator: Navigator) -> dict[str, Float[Array, "*shape"]]:
+def parameters_of(navigator: eqx.Module) -> dict[str, Float[Array, "*shape"]]:
     """What can be tuned of a navigator, in the order of `TUNABLES`."""
     return {name: jnp.asarray(_get(navigator, name), float) for name in _names(navigator)}
 
 
-def with_parameters(
-    navigator: Navigator, values: Mapping[str, Float[Array, "*shape"]]
-) -> Navigator:
+def with_parameters(navigator: Whole, values: Mapping[str, Float[Array, "*shape"]]) -> Whole:
     """The navigator with other numbers.
 
     Raises:
@@ -103,7 +101,7 @@ def with_parameters(
     if not values:
         return navigator
     names = list(values)
-    changed: Navigator = eqx.tree_at(
+    changed: Whole = eqx.tree_at(
         lambda n: [_get(n, name) for name in names],
         navigator,
         [jnp.asarray(values[name], known[name].dtype) for name in names],
@@ -118,7 +116,7 @@ def allowed_shapes(name: str, shape: tuple[int, ...]) -> list[tuple[int, ...]]:
     return [shape[:1], (*shape[:1], *shape[:1])]
 
 
-def _names(navigator: Navigator) -> Iterator[str]:
+def _names(navigator: eqx.Module) -> Iterator[str]:
     for name in TUNABLES:
         if _get(navigator, name) is not None:
             yield name

@@ -2,7 +2,7 @@
 
 Cameras look when they look, the odometer has a rate of its own, and a frame is as old as its
 detection took. Whoever calls keeps the last events and what was believed after some of them (see
-`runtime.history`); a late event is fused from the belief before it, and all that came after
+`loop.history`); a late event is fused from the belief before it, and all that came after
 it once more, in one call:
 
     moment, then, control, report = advance(navigator, moment, control, events, count, new, ...)
@@ -22,12 +22,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.candidates import Candidates
-from jaxnav.consistency import consistent
+from jaxnav.belief.motion import Belief
 from jaxnav.control import ControlState
-from jaxnav.motion import Belief
 from jaxnav.navigator import Estimate, Navigator, Output
-from jaxnav.observation import Observation
+from jaxnav.pose.candidates import Candidates
+from jaxnav.pose.consistency import consistent
+from jaxnav.pose.observation import Observation
 
 # A pose is predicted to the present where its last event is older: at 1 m/s that is 1 mm.
 FRESH_US = 1000

@@ -10,8 +10,8 @@ from jaxnav.calibration.rig_views import RigViews
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.markers import marker_map
 from jaxnav.files.poses import pose_from_matrix
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.sightings import simulate_sightings
 
 SIZE_M = 0.172

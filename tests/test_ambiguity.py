@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxnav.ambiguity import (
+from jaxnav.belief.ambiguity import (
     LowestReprojection,
     Mahalanobis,
     ObjectSpace,
@@ -25,10 +25,10 @@ from jaxnav.ambiguity import (
     Selection,
     Selector,
 )
-from jaxnav.candidates import Candidates, find_candidates
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.markers import MarkerMap
-from jaxnav.observation import Snapshot
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.models.markers import MarkerMap
+from jaxnav.pose.candidates import Candidates, find_candidates
+from jaxnav.pose.observation import Snapshot
 from tests import worlds
 from tests.derivatives import in_float32
 from tests.reference import paper

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav import bicycle
+from jaxnav.models import bicycle
 from tests.derivatives import check_derivatives
 from tests.reference import paper
 

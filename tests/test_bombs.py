@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 import zarr
 
+from jaxnav.datasets import bag_readers
+from jaxnav.datasets.bags import decompressed, read_bag
+from jaxnav.datasets.recordings import read_recording
 from jaxnav.detection import make_detector
 from jaxnav.detection.aruco import _CLOSER_LOOK_PX, _worth_a_look
 from jaxnav.detection.crowd import thinned
@@ -23,10 +26,7 @@ from jaxnav.files.image_headers import image_size_px
 from jaxnav.files.images import decoded_image, image_problem, read_image
 from jaxnav.files.npz import read_npz
 from jaxnav.files.reading import read_mapping
-from jaxnav.runtime import bag_readers
-from jaxnav.runtime.bags import decompressed, read_bag
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.recordings import read_recording
+from jaxnav.recording.drive_log import read_drive
 from jaxnav.studies.damage import check_sizes
 from tests.helpers import bombs
 

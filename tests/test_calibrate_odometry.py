@@ -15,11 +15,11 @@ from jaxnav.cli import main
 from jaxnav.commands.odometry_recordings import drive_of
 from jaxnav.detection import Detections
 from jaxnav.files import load_vehicle, save_markers
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.messages import input_message
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.recorder import Recorder
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.recorder import Recorder
 from tests import worlds
 from tests.helpers.odometry_drives import RECIPE, START, TRUTH, sensed, true_track
 from tests.helpers.simulated import make_setup

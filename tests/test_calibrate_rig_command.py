@@ -13,15 +13,15 @@ from jaxnav import cli
 from jaxnav.calibration.linking import turn_rad
 from jaxnav.commands import calibrate_check, calibrate_markers, calibrate_rig
 from jaxnav.commands.calibration_report import coverage
+from jaxnav.datasets.sightings import read_sightings
 from jaxnav.detection.types import Detections
 from jaxnav.files import load_markers, load_rig, save_markers, save_rig
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.messages import input_message
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.recorder import Recorder
-from jaxnav.runtime.sightings import read_sightings
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.recorder import Recorder
 from tests.helpers.setups import setup_with
 from tests.helpers.simulated import ROUTE
 

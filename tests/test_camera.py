@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.camera import LENS_COEFFICIENTS, LENSES, Camera, stack_cameras
+from jaxnav.models.camera import LENS_COEFFICIENTS, LENSES, Camera, stack_cameras
 from tests.derivatives import check_derivatives
 
 # Lens, coefficients, focal length, image size, half angle of view in degrees along the diagonal.

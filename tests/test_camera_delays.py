@@ -15,13 +15,13 @@ from jaxnav.commands import delay_watch
 from jaxnav.commands.delay_watch import DelayWatch, delays_of, warnings
 from jaxnav.commands.doctor_checks import stamps
 from jaxnav.detection import Detections
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.runtime.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.history import Told
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.pilot import Input
+from jaxnav.loop.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.history import Told
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.simulation.corners import see
 from tests import worlds
 from tests.helpers.drives import make_input, make_outcome

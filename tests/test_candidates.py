@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from jaxnav.candidates import Candidates, find_candidates
-from jaxnav.geometry import planar_from_T_world_vehicle
-from jaxnav.observation import Observation, Snapshot
-from jaxnav.residuals import e1
+from jaxnav.models.geometry import planar_from_T_world_vehicle
+from jaxnav.pose.candidates import Candidates, find_candidates
+from jaxnav.pose.observation import Observation, Snapshot
+from jaxnav.pose.residuals import e1
 from tests import worlds
 from tests.derivatives import in_float32
 

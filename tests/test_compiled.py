@@ -5,6 +5,7 @@ import json
 import os
 import pathlib
 import pickle
+import shutil
 
 import equinox as eqx
 import jax
@@ -12,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav import executable_bytes, executables
-from jaxnav.ambiguity import LowestReprojection
+from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.compiling import executable_bytes, executables
+from jaxnav.compiling.step import compiled_step, is_compiled
 from jaxnav.detection.edges import EdgeFit
 from jaxnav.navigator import Navigator
-from jaxnav.runtime.compiled import compiled_step, is_compiled
+from jaxnav.recording import drive_setup
 from tests import worlds
 
 SEEN_FROM = (0.1, -0.6, np.pi / 2)
@@ -90,14 +92,41 @@ def test_a_file_is_for_one_structure_shape_and_source(monkeypatch, tmp_path):
     monkeypatch.setenv("XLA_FLAGS", "--another")
     others.append(file(nav))
     monkeypatch.undo()
-    monkeypatch.setattr(executables, "_PACKAGE", tmp_path)
-    for folder in (tmp_path, tmp_path / "detection", tmp_path / "runtime"):
+    monkeypatch.setattr(executables, "PACKAGE", tmp_path)
+    for folder in (tmp_path, tmp_path / "detection", tmp_path / "loop"):
         folder.mkdir(exist_ok=True)
         (folder / "one.py").write_text("# changed")
         executables.sources_digest.cache_clear()  # as in another process
         others.append(file(nav))
     monkeypatch.undo()
     assert len({file(nav), *others}) == 8
+
+
+def test_the_digest_is_of_all_that_a_program_or_a_drive_depends_on(tmp_path):
+    package = tmp_path / "jaxnav"
+    shutil.copytree(executables.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+
+    def digests():
+        executables.sources_digest.cache_clear()
+        without = executables._WITHOUT, drive_setup._WITHOUT
+        return [executables.sources_digest(package, folders) for folders in without]
+
+    for name, of_program, of_drive in [
+        ("pose/refine.py", True, True),
+        ("navigator.py", True, True),
+        ("numerics/trees.py", True, True),
+        ("vehicles/sim.py", True, False),
+        ("recording/messages.py", False, True),
+        ("commands/run.py", False, False),
+    ]:
+        before = digests()
+        with (package / name).open("a") as source:
+            source.write("# changed\n")
+        changed = [a != b for a, b in zip(before, digests(), strict=True)]
+        assert changed == [of_program, of_drive], name
+    executables.sources_digest.cache_clear()
+    folders = {path.name for path in package.iterdir() if path.is_dir()}
+    assert {*executables._WITHOUT, *drive_setup._WITHOUT} <= folders
 
 
 def test_without_a_folder_or_with_foreign_parts_nothing_is_kept(monkeypatch, tmp_path):
@@ -154,7 +183,7 @@ def test_nothing_that_a_file_holds_is_run_as_python(tmp_path):
         packed(len(head)) + head + pickled,
         packed(len(pickled)) + pickled + code,
     ]
-    named = ["os:system", "jaxnav.cli:main", "jaxnav.runtime.plugins:find", "builtins:type", "no"]
+    named = ["os:system", "jaxnav.cli:main", "jaxnav.loop.plugins:find", "builtins:type", "no"]
     for name in named:
         other = head.replace(b'"tree": ["list", 0]', f'"tree": ["{name}", {{}}]'.encode())
         assert other != head

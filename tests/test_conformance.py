@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxnav.detection.types import Detections
-from jaxnav.runtime.interfaces import Frame, Odometry
+from jaxnav.loop.interfaces import Frame, Odometry
 from jaxnav.testing import check_cameras, check_vehicle
 from tests.helpers.setups import (
     FULL_THROTTLE,

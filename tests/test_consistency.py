@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.candidates import own_errors_px
-from jaxnav.consistency import consistent
 from jaxnav.navigator import Navigator
-from jaxnav.observation import Observation
+from jaxnav.pose.candidates import own_errors_px
+from jaxnav.pose.consistency import consistent
+from jaxnav.pose.observation import Observation
 from tests import worlds
 
 

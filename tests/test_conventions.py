@@ -4,7 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxnav.conventions import (
+from jaxnav.detection import make_detector
+from jaxnav.detection.families import dictionary
+from jaxnav.files import poses
+from jaxnav.files.markers import fit_square
+from jaxnav.models.conventions import (
     APRILTAG_CORNERS,
     APRILTAG_FAMILIES,
     APRILTAG_FIRST_CORNER,
@@ -13,10 +17,6 @@ from jaxnav.conventions import (
     TL_TR_BR_BL,
     WXYZ_TAG_MARKER,
 )
-from jaxnav.detection import make_detector
-from jaxnav.detection.families import dictionary
-from jaxnav.files import poses
-from jaxnav.files.markers import fit_square
 
 SIDE_PX, MARGIN_PX = 160, 60
 BOX_PX = np.array([[0, 0], [SIDE_PX, 0], [SIDE_PX, SIDE_PX], [0, SIDE_PX]]) + MARGIN_PX - 0.5

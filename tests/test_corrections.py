@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxnav.compiling.step import _jitted
 from jaxnav.errors import BadInput
 from jaxnav.files import load_vehicle, save_vehicle
 from jaxnav.files.provenance import calibrated_now
-from jaxnav.runtime.compiled import _jitted
-from jaxnav.runtime.corrections import Corrections
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.estimator import advance_packed
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.guard import Guard
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.pilot import Input
-from jaxnav.vehicles.lockstep import BEGIN_NS
+from jaxnav.loop.corrections import Corrections
+from jaxnav.loop.estimator import advance_packed
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.guard import Guard
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.testing.lockstep import BEGIN_NS
 from jaxnav.vehicles.sim import SimVehicle
 from jaxnav.vehicles.world import World
 from tests import worlds

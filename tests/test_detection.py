@@ -9,7 +9,6 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.camera import Camera
 from jaxnav.detection import (
     Detections,
     make_detector,
@@ -19,7 +18,8 @@ from jaxnav.detection import (
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.read import read_marker
 from jaxnav.errors import BadInput
-from jaxnav.markers import FAMILY_SIZES, MarkerMap
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import FAMILY_SIZES, MarkerMap
 from tests.helpers.marker_images import Scene, random_scene, rotation
 
 BACKENDS = ["aruco", "apriltag"]

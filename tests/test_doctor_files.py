@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
-from jaxnav.bicycle import Vehicle
-from jaxnav.camera import Camera
 from jaxnav.commands.doctor_checks import rig_file, route_file
 from jaxnav.commands.doctor_checks.markers_file import measured_corners, placed
 from jaxnav.commands.doctor_checks.rig_file import bearings, intrinsics, lenses, places, rotations
 from jaxnav.commands.doctor_checks.route_file import sight_along, turning_radius_m, vehicle_file
 from jaxnav.files import Route, calib_dir, load_route, save_rig
-from jaxnav.rig import CameraRig
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.camera import Camera
+from jaxnav.models.rig import CameraRig
 from tests.helpers.findings import all_well, the_problem
 from tests.worlds import marker_map, paper_markers, qcar, qcar_rig, upright
 

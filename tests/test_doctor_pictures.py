@@ -11,8 +11,8 @@ from jaxnav.commands.doctor_checks.orders import in_their_order
 from jaxnav.commands.doctor_checks.photographs import examine_pictures
 from jaxnav.detection import Observed
 from jaxnav.files import Route
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor

@@ -15,8 +15,8 @@ from jaxnav.commands.doctor_checks.findings import EXIT_UNREADABLE, Report
 from jaxnav.commands.doctor_checks.plug_ins import Reading, judge_odometry, plug_ins
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
-from jaxnav.runtime.interfaces import Frame, Odometry
-from jaxnav.runtime.limits import Limits
+from jaxnav.loop.interfaces import Frame, Odometry
+from jaxnav.loop.limits import Limits
 from tests.helpers.findings import all_well, the_problem
 from tests.helpers.setups import GoodCamera, GoodVehicle, setup_with
 

@@ -6,7 +6,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.ambiguity import LowestReprojection, PaperCost
+from jaxnav.belief.ambiguity import LowestReprojection, PaperCost
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.navigator import Navigator

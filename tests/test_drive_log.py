@@ -14,12 +14,12 @@ from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime.drive_format import encode, header_metadata
-from jaxnav.runtime.drive_log import DriveLog, read_drive
-from jaxnav.runtime.flags import Fault, Health, Reject
-from jaxnav.runtime.message_schemas import MESSAGES, json_schema
-from jaxnav.runtime.messages import input_message
-from jaxnav.runtime.recorder import Recorder
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.recording.drive_format import encode, header_metadata
+from jaxnav.recording.drive_log import DriveLog, read_drive
+from jaxnav.recording.message_schemas import MESSAGES, json_schema
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.recorder import Recorder
 from tests.helpers.drives import (
     BEGIN_NS,
     PERIOD_NS,

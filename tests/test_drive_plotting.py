@@ -19,16 +19,16 @@ from matplotlib.patches import Ellipse
 from jaxnav import cli
 from jaxnav.commands.drive_pictures import distance_m, summary_lines
 from jaxnav.files import calib_dir, load_markers, load_rig
-from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.plots.drive import drive_log_report
 from jaxnav.plots.drive_map import HEALTH_COLORS
 from jaxnav.plots.scenery import Scenery
-from jaxnav.runtime.drive_log import DriveLog, read_drive
-from jaxnav.runtime.flags import Fault, Health, Reject
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.messages import input_message
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.recorder import Recorder
+from jaxnav.recording.drive_log import DriveLog, read_drive
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.recorder import Recorder
 from tests.helpers.drives import record_drive
 
 QCAR = calib_dir() / "qcar"

@@ -15,21 +15,21 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.detection import marker_cells
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, write_params
-from jaxnav.runtime.drive_log import DriveLog, read_drive
-from jaxnav.runtime.drive_replay import (
+from jaxnav.loop.flags import Fault, Health
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.recording.drive_log import DriveLog, read_drive
+from jaxnav.recording.drive_replay import (
     check_inputs,
     first_difference,
     inputs_from_images,
     replay_drive,
 )
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Fault, Health
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.messages import input_message, outcome_message
-from jaxnav.runtime.pilot import Input, Outcome
-from jaxnav.runtime.recorder import Recorder
-from jaxnav.vehicles.faults import WAYPOINTS_M
-from jaxnav.vehicles.lockstep import BEGIN_NS
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.messages import input_message, outcome_message
+from jaxnav.recording.recorder import Recorder
+from jaxnav.testing.faults import WAYPOINTS_M
+from jaxnav.testing.lockstep import BEGIN_NS
 from tests.helpers.ros_bags import Bag
 from tests.helpers.simulated import make_setup, record, simulated
 

@@ -13,21 +13,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.bicycle import Vehicle
-from jaxnav.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, Route
 from jaxnav.files.markers import marker_map
+from jaxnav.loop.health import Timeouts
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.rig import CameraRig
 from jaxnav.parameters import parameters_of
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.drive_format import decode, encode
-from jaxnav.runtime.drive_setup import (
+from jaxnav.recording.drive_format import decode, encode
+from jaxnav.recording.drive_setup import (
     PILOT_SELECTORS,
     DriveSetup,
     made_here,
     needs_float64,
 )
-from jaxnav.runtime.health import Timeouts
 from tests import worlds
 
 WHERE = Path("drive.mcap")

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import rig_rooms
 
-from jaxnav.bicycle import advance
 from jaxnav.calibration.driven_frame import _level, driven_frame, level_follows
 from jaxnav.calibration.linking import inverted
 from jaxnav.calibration.rig import calibrate_rig
 from jaxnav.calibration.vehicle_frame import moved_to_driven
 from jaxnav.errors import BadInput
+from jaxnav.models.bicycle import advance
 
 WHEELBASE_M, DT_S = 0.256, 0.02
 SCALE, OFFSET_RAD, GAIN = 1.04, 0.015, 0.93  # of the odometry

@@ -5,8 +5,8 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.candidates import Candidates
-from jaxnav.evaluation import judge_branch, position_error_m, rotation_error_rad
+from jaxnav.belief.evaluation import judge_branch, position_error_m, rotation_error_rad
+from jaxnav.pose.candidates import Candidates
 
 
 def turned(*degrees: float) -> jaxlie.SE3:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.runtime.expect import Expected, expected
+from jaxnav.loop.expect import Expected, expected
+from jaxnav.models.geometry import T_world_vehicle_from_planar
 from tests.worlds import observe, qcar_rig, room_markers
 
 RIG, MARKERS = qcar_rig(), room_markers()

@@ -10,21 +10,21 @@ import pytest
 
 from jaxnav.cli import main
 from jaxnav.detection import make_detector
+from jaxnav.loop.estimator import advance_packed
+from jaxnav.loop.expect import expected
+from jaxnav.loop.flags import Fault, Health
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Frame
+from jaxnav.loop.pilot import Pilot
+from jaxnav.loop.seeing import Region, Search
 from jaxnav.navigator import Navigator, Output
-from jaxnav.runtime.estimator import advance_packed
-from jaxnav.runtime.expect import expected
-from jaxnav.runtime.flags import Fault, Health
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Frame
-from jaxnav.runtime.pilot import Pilot
-from jaxnav.runtime.seeing import Region, Search
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor
-from jaxnav.vehicles import injections as inject
-from jaxnav.vehicles.faults import WAYPOINTS_M, Row, Trial, line, run_trial
-from jaxnav.vehicles.lockstep import BEGIN_NS, drive
-from jaxnav.vehicles.matrix import matrix
+from jaxnav.testing import injections as inject
+from jaxnav.testing.faults import WAYPOINTS_M, Row, Trial, line, run_trial
+from jaxnav.testing.lockstep import BEGIN_NS, drive
+from jaxnav.testing.matrix import matrix
 from jaxnav.vehicles.world import World
 from tests import worlds
 

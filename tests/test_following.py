@@ -11,14 +11,14 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.bicycle import advance
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.map_fit import fit
 from jaxnav.control import Command
-from jaxnav.geometry import cayley, planar_from_T_world_vehicle
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.map_fit import fit
+from jaxnav.models.bicycle import advance
+from jaxnav.models.geometry import cayley, planar_from_T_world_vehicle
 from jaxnav.navigator import Navigator
-from jaxnav.observation import Snapshot
 from jaxnav.parameters import with_parameters
+from jaxnav.pose.observation import Snapshot
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.tuning import branches

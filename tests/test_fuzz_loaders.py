@@ -21,15 +21,15 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from jaxnav.commands.drive_pictures import summary_lines
+from jaxnav.datasets.recordings import Recording
 from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
-from jaxnav.runtime.drive_format import HEADER, PROFILE, encode
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.interfaces import Setup
-from jaxnav.runtime.message_schemas import MESSAGES, OUTCOME
-from jaxnav.runtime.messages import input_message, outcome_message
-from jaxnav.runtime.recordings import Recording
+from jaxnav.loop.interfaces import Setup
+from jaxnav.recording.drive_format import HEADER, PROFILE, encode
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.message_schemas import MESSAGES, OUTCOME
+from jaxnav.recording.messages import input_message, outcome_message
 from jaxnav.vehicles import replay
 from jaxnav.vehicles.options import number, whole_number
 from tests.helpers.drives import make_input, make_outcome

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxnav import geometry
+from jaxnav.models import geometry
 from tests.derivatives import check_derivatives
 from tests.reference.rigid import cayley, inverse_cayley, twist_matrix
 from tests.worlds import planar

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.runtime.guard import TIMEOUT_S, Guard
-from jaxnav.runtime.limits import Limits
+from jaxnav.loop.guard import TIMEOUT_S, Guard
+from jaxnav.loop.limits import Limits
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)
 SLACK_S = 0.15  # of a machine that does something else
@@ -251,9 +251,9 @@ def test_what_reaches_the_vehicle_is_inside_the_limits(commands):
 PROGRAM = """
 import math, signal, sys, threading, time
 sys.path.insert(0, {root!r})
-from jaxnav.runtime.guard import Guard
-from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.signals import Signals
+from jaxnav.loop.guard import Guard
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.signals import Signals
 
 class Car:
     timeout_s = math.inf

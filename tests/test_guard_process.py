@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime.guard import Guard
-from jaxnav.runtime.moved_vehicle import GuardProcess
+from jaxnav.loop.guard import Guard
+from jaxnav.loop.moved_vehicle import GuardProcess
 from tests.helpers import plain_car
 from tests.helpers.dying_parent import ENDS, LIMITS, make_setup
 from tests.helpers.plain_car import words
@@ -225,7 +225,7 @@ def test_a_wait_for_it_can_be_called_off():
 @pytest.mark.parametrize("module", ["qcar", "ros2"])
 def test_plug_ins_of_hardware_need_neither_jax_nor_opencv(module):
     source = (
-        f"import sys, jaxnav.vehicles.{module}, jaxnav.runtime.guard_process\n"
+        f"import sys, jaxnav.vehicles.{module}, jaxnav.loop.guard_process\n"
         "print([name for name in ('jax', 'cv2', 'jaxlib') if name in sys.modules])"
     )
     told = subprocess.run(

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.runtime.flags import Fault, Health, Reject, names
-from jaxnav.runtime.health import (
+from jaxnav.loop.flags import Fault, Health, Reject, names
+from jaxnav.loop.health import (
     LOOKS,
     MOST_RESTARTS,
     SPEED_FACTOR,

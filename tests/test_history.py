@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.runtime.history import KEPT, THIN_NS, History, Told
-from jaxnav.runtime.stamps import OLD_NS
+from jaxnav.loop.history import KEPT, THIN_NS, History, Told
+from jaxnav.loop.stamps import OLD_NS
 
 BEGIN_NS = 10**12
 MS = 1_000_000

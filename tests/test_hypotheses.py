@@ -12,17 +12,17 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from jaxnav.ambiguity import PoseBelief, Selection
-from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.candidates import Candidates, find_candidates
-from jaxnav.constant_velocity import ConstantVelocity
-from jaxnav.fan import fan
-from jaxnav.geometry import on_ground
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.map_fit import fit
-from jaxnav.motion import Belief, followed, merged, unstarted
+from jaxnav.belief.ambiguity import PoseBelief, Selection
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.fan import fan
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.map_fit import fit
+from jaxnav.belief.motion import Belief, followed, merged, unstarted
+from jaxnav.models.geometry import on_ground
 from jaxnav.navigator import Navigator
-from jaxnav.observation import Observation, Snapshot
+from jaxnav.pose.candidates import Candidates, find_candidates
+from jaxnav.pose.observation import Observation, Snapshot
 from tests import worlds
 from tests.derivatives import in_float32
 from tests.helpers.compiling import jit_to_run

@@ -11,16 +11,16 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxnav.camera import Camera
+from jaxnav.compiling.packing import Layout
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.detection.types import Detections
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.interfaces import Frame
+from jaxnav.loop.pilot import Input, Pilot, Sighted
+from jaxnav.loop.seeing import Region, Search
+from jaxnav.models.camera import Camera
+from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.interfaces import Frame
-from jaxnav.runtime.packing import Layout
-from jaxnav.runtime.pilot import Input, Pilot, Sighted
-from jaxnav.runtime.seeing import Region, Search
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor

@@ -14,8 +14,8 @@ from jaxnav.calibration.lens_choice import informative
 from jaxnav.calibration.lens_fit import fit_lens
 from jaxnav.calibration.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.calibration.view_screening import screened
-from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
+from jaxnav.models.camera import Camera
 
 SIZE_PX, SIGMA_PX = (820, 410), 0.1
 POINTS_M = grid_points_m(6, 5, 0.04)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxnav.ippe import ippe_from_rays, ippe_square
-from jaxnav.markers import CORNER_SIGNS
+from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.pose.ippe import ippe_from_rays, ippe_square
 from tests import worlds
 from tests.derivatives import check_derivatives, in_float32
 

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.ambiguity import LowestReprojection
-from jaxnav.candidates import find_candidates
-from jaxnav.evaluation import judge_branch
-from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.evaluation import judge_branch
+from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.navigator import Navigator
-from jaxnav.observation import Snapshot
+from jaxnav.pose.candidates import find_candidates
+from jaxnav.pose.observation import Snapshot
 from jaxnav.simulation.statistics import Reliability
 from tests import worlds
 from tests.helpers.compiling import jit_to_run

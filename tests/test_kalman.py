@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from jaxnav import kalman
+from jaxnav.belief import kalman
 
 update = jax.jit(kalman.update)
 hide_rows = jax.jit(kalman.hide_rows)

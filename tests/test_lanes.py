@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxnav.lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
-from jaxnav.small_matrices import cho_solve, cholesky, sandwich
+from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
+from jaxnav.numerics.small_matrices import cho_solve, cholesky, sandwich
 
 LANES = 37
 

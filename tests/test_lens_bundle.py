@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxnav.calibration import lens_bundle
 from jaxnav.calibration.lens_bundle import NO_CUT, Unknowns
 from jaxnav.calibration.simulated_views import grid_points_m, seen_from, simulated_views
-from jaxnav.camera import Camera
+from jaxnav.models.camera import Camera
 
 SIZE_PX, SIGMA_PX = (820, 410), 0.1
 POINTS_M = grid_points_m(6, 5, 0.04)

@@ -12,15 +12,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxnav.ambiguity import LowestReprojection
-from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.geometry import OFF_GROUND, T_world_vehicle_from_planar
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.kalman import white_acceleration
-from jaxnav.map_fit import fit
-from jaxnav.motion import Belief
+from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.kalman import white_acceleration
+from jaxnav.belief.map_fit import fit
+from jaxnav.belief.motion import Belief
+from jaxnav.models.geometry import OFF_GROUND, T_world_vehicle_from_planar
 from jaxnav.navigator import Navigator
-from jaxnav.observation import Observation, Snapshot, log_sigmas
+from jaxnav.pose.observation import Observation, Snapshot, log_sigmas
 from jaxnav.tuning.following import trusting
 from tests import worlds
 from tests.reference import kalman as textbook

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.runtime.limits import Limits
+from jaxnav.loop.limits import Limits
 from tests import worlds
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)

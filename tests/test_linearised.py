@@ -8,10 +8,10 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.camera import Camera
-from jaxnav.linearised import crossed, pinhole_rows, reprojection_rows, turned
-from jaxnav.observation import Sightings, cameras_of
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.linearised import crossed, pinhole_rows, reprojection_rows, turned
+from jaxnav.pose.observation import Sightings, cameras_of
 from tests.derivatives import check_derivatives
 
 LENSES = {

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from jaxnav.detection.types import Detections
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.guard import TIMEOUT_S, Guard
+from jaxnav.loop.interfaces import Frame, Odometry
+from jaxnav.loop.loop import Loop
+from jaxnav.loop.pilot import Input, Pilot
+from jaxnav.loop.seeing import Eyes, Region, Search, Seen, groups, image_fault
 from jaxnav.navigator import Navigator
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.guard import TIMEOUT_S, Guard
-from jaxnav.runtime.interfaces import Frame, Odometry
-from jaxnav.runtime.loop import Loop
-from jaxnav.runtime.pilot import Input, Pilot
-from jaxnav.runtime.seeing import Eyes, Region, Search, Seen, groups, image_fault
 from tests import worlds
 
 SLACK_S = 0.3  # of a machine that does something else

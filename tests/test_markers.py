@@ -4,7 +4,7 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.markers import FAMILY_SIZES, corners_marker_m, opencv_dictionary_name
+from jaxnav.models.markers import FAMILY_SIZES, corners_marker_m, opencv_dictionary_name
 from tests import worlds
 
 

@@ -16,13 +16,13 @@ from hypothesis.extra import numpy as hnp
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.files.validation import validate
-from jaxnav.runtime.drive_format import decode, encode, header_metadata, header_of
-from jaxnav.runtime.flags import Fault, Health, Reject
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.message_schemas import MESSAGES, REPORTED, ImageMessage, json_schema
-from jaxnav.runtime.messages import digest, input_message, input_of, outcome_message
-from jaxnav.runtime.pilot import Input
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.drive_format import decode, encode, header_metadata, header_of
+from jaxnav.recording.message_schemas import MESSAGES, REPORTED, ImageMessage, json_schema
+from jaxnav.recording.messages import digest, input_message, input_of, outcome_message
 from tests.helpers.drives import make_input, make_outcome, same_input
 
 PATH = Path("drive.mcap")

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxnav.ambiguity import PoseMeasurement, Selection
-from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.constant_velocity import ConstantVelocity
-from jaxnav.motion import Belief, Motion, restarted_where_broken
-from jaxnav.observation import Observation
+from jaxnav.belief.ambiguity import PoseMeasurement, Selection
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.motion import Belief, Motion, restarted_where_broken
+from jaxnav.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import in_float32
 from tests.reference import kalman, paper

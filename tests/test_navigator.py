@@ -12,13 +12,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxnav.ambiguity import PaperCost, PoseBelief, PoseMeasurement, Selection
-from jaxnav.candidates import Candidates
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.belief.ambiguity import PaperCost, PoseBelief, PoseMeasurement, Selection
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.models.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator, Output, State
-from jaxnav.observation import Observation, Snapshot
-from jaxnav.rig import CameraRig
+from jaxnav.pose.candidates import Candidates
+from jaxnav.pose.observation import Observation, Snapshot
 from tests import worlds
 from tests.derivatives import check_derivatives, in_float32
 from tests.reference import kalman, paper

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.observation import Observation, Snapshot, sightings
+from jaxnav.pose.observation import Observation, Snapshot, sightings
 from tests import worlds
 
 VIEW = (0.2, 0.1, 0.6)

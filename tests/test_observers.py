@@ -14,11 +14,11 @@ from jaxnav.commands.observers import Recording, StatusLine, View, open_onlooker
 from jaxnav.commands.status import WIDTH
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.interfaces import Frame
-from jaxnav.runtime.pilot import Sighted
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.interfaces import Frame
+from jaxnav.loop.pilot import Sighted
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_setup import DriveSetup
 from tests.helpers.drives import make_input, make_outcome, make_picture
 from tests.helpers.simulated import make_setup
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.odometer import Odometer
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.odometer import Odometer
 from tests import worlds
 
 MAX_MPS, PER_THROTTLE, LAG_S = 3.0, 10.0, 0.3

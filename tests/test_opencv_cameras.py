@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime.interfaces import Frame
+from jaxnav.loop.interfaces import Frame
 from jaxnav.testing import check_cameras
 from jaxnav.vehicles import opencv_cameras
 from jaxnav.vehicles.grabber import Grabber

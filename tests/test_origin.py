@@ -18,7 +18,8 @@ from jaxnav.commands.status import WIDTH, status_line
 from jaxnav.files import Route, calib_dir, load_markers, load_route, poses, save_markers, write_tum
 from jaxnav.files.markers import MarkerFile, marker_data, marker_map
 from jaxnav.files.vehicles import RouteFile
-from jaxnav.origin import (
+from jaxnav.loop.flags import Health
+from jaxnav.models.origin import (
     GRID_M,
     NEAR_M,
     ZERO,
@@ -29,11 +30,10 @@ from jaxnav.origin import (
     poses_in_world,
 )
 from jaxnav.plots.scenery import Scenery
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.drive_replay import Comparison, replay_drive
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Health
-from jaxnav.vehicles.faults import WAYPOINTS_M
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_replay import Comparison, replay_drive
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.testing.faults import WAYPOINTS_M
 from jaxnav.viewer.outcomes import Shown
 from tests import worlds
 from tests.helpers.simulated import record, simulated

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAM = """
 import os, sys, time
-from jaxnav.runtime.output import FreeOutput, fill_descriptors
+from jaxnav.loop.output import FreeOutput, fill_descriptors
 fill_descriptors()
 begin_s = time.monotonic()
 with FreeOutput():

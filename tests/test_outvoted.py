@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxnav.runtime.history import Told
-from jaxnav.runtime.outvoted import Outvoted
+from jaxnav.loop.history import Told
+from jaxnav.loop.outvoted import Outvoted
 
 IDS = (7, 3, 12)
 

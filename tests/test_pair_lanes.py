@@ -6,10 +6,10 @@ import numpy as np
 import optimistix
 import pytest
 
-from jaxnav import pair_lanes
-from jaxnav.ippe import ippe_square
-from jaxnav.markers import CORNER_SIGNS
-from jaxnav.refine import solve_marker, solve_markers
+from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.pose import pair_lanes
+from jaxnav.pose.ippe import ippe_square
+from jaxnav.pose.refine import solve_marker, solve_markers
 from tests import worlds
 
 BATCH, FOCAL_PX = 64, 500.0

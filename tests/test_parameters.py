@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.ambiguity import LowestReprojection
-from jaxnav.bicycle import sideslip_rad
-from jaxnav.constant_velocity import ConstantVelocity
+from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.control import ControlState
-from jaxnav.geometry import safe_atan2, safe_norm, wrap_angle
+from jaxnav.models.bicycle import sideslip_rad
+from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 from tests import worlds

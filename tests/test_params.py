@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.ambiguity import PaperCost
+from jaxnav.belief.ambiguity import PaperCost
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, calib_dir, load_params, write_params
 from jaxnav.navigator import Navigator

@@ -11,17 +11,17 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 from jaxnav.detection.types import Detections
+from jaxnav.loop.estimator import Estimator
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.history import Told
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.navigator import Navigator
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.estimator import Estimator
-from jaxnav.runtime.flags import Fault, Health, Reject
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.history import Told
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.messages import digest
-from jaxnav.runtime.pilot import Input, Outcome, Pilot
-from jaxnav.vehicles import injections as inject
-from jaxnav.vehicles.lockstep import BEGIN_NS, Rates, Step
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.messages import digest
+from jaxnav.testing import injections as inject
+from jaxnav.testing.lockstep import BEGIN_NS, Rates, Step
 from tests import worlds
 from tests.helpers.simulated import make_setup, simulated
 
@@ -127,7 +127,7 @@ def test_what_takes_several_calls_tells_the_same_as_one(setup, inputs, monkeypat
     late.sort(key=lambda given: given.now_ns)
     _, one = handled(setup, late)
     pilot = setup.pilot(None)
-    monkeypatch.setattr("jaxnav.runtime.estimator.EVENTS", 4)
+    monkeypatch.setattr("jaxnav.loop.estimator.EVENTS", 4)
     other = [pilot.handle(given) for given in late]
     assert {outcome.rejects for outcome in other} <= {Reject(0), Reject.INNOVATION_LARGE}
     for a, b in zip(one, other, strict=True):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.bicycle import Vehicle, curvature_per_m
 from jaxnav.control import Command
+from jaxnav.models.bicycle import Vehicle, curvature_per_m
 from jaxnav.simulation.plant import CarState, OdometryNoise, move, move_through, read_odometry
 
 VEHICLE = Vehicle.create(0.256, 0.5, 0.3, 6.0, 0.3)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.message_schemas import OUTCOME
-from jaxnav.runtime.plausible import plausible
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.message_schemas import OUTCOME
+from jaxnav.recording.plausible import plausible
 from tests.fuzz.seeds import drive_parts, write_drive
 from tests.test_regression import FOLDER
 

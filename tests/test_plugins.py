@@ -10,9 +10,9 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime import plugins
-from jaxnav.runtime.interfaces import Camera, Vehicle
-from jaxnav.runtime.plugins import CAMERAS, VEHICLES, find, open_cameras, open_vehicle
+from jaxnav.loop import plugins
+from jaxnav.loop.interfaces import Camera, Vehicle
+from jaxnav.loop.plugins import CAMERAS, VEHICLES, find, open_cameras, open_vehicle
 from tests.helpers.setups import GoodCamera, GoodVehicle, good_cameras, setup_with
 
 ROOT = Path(__file__).resolve().parents[1]

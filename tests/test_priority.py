@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from jaxnav.runtime import priority
+from jaxnav.loop import priority
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.runtime.propulsion import DOUBT_M, Propulsion
+from jaxnav.loop.propulsion import DOUBT_M, Propulsion
 
 PER_THROTTLE, LAG_S, GAP_S = 10.0, 0.3, 0.02
 

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.plugins import open_cameras as open_by_name
-from jaxnav.runtime.plugins import open_vehicle as open_vehicle_by_name
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.plugins import open_cameras as open_by_name
+from jaxnav.loop.plugins import open_vehicle as open_vehicle_by_name
 from jaxnav.testing import check_cameras, check_vehicle
 from jaxnav.vehicles.qcar import QCarVehicle, open_cameras, open_vehicle
 from jaxnav.vehicles.servo import Servo

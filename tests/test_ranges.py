@@ -12,15 +12,15 @@ from jaxnav.errors import BadInput
 from jaxnav.files.ranges import RANGES, is_within, pinhole_problem, problem_of, table
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import validate
-from jaxnav.runtime.drive_format import decode, encode
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.frames import Frames, Sighted
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.message_schemas import MESSAGES
-from jaxnav.runtime.messages import input_message, input_of
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.stamps import MOST_NS, Stamps
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Frames, Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.loop.stamps import MOST_NS, Stamps
+from jaxnav.recording.drive_format import decode, encode
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.message_schemas import MESSAGES
+from jaxnav.recording.messages import input_message, input_of
 from tests.helpers.drives import make_detections
 from tests.helpers.loader_seeds import BINARY, STRUCTURED
 from tests.helpers.simulated import make_setup

@@ -18,10 +18,10 @@ import pytest
 from mcap.reader import make_reader
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime import recorder as recorder_module
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.messages import input_message, outcome_message
-from jaxnav.runtime.recorder import Recorder
+from jaxnav.recording import recorder as recorder_module
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.messages import input_message, outcome_message
+from jaxnav.recording.recorder import Recorder
 from tests.helpers.drives import (
     make_input,
     make_outcome,
@@ -335,10 +335,10 @@ def test_a_pipe_that_nobody_empties(tmp_path):
 
 CHILD = """
 import sys, time
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.messages import input_message
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.recorder import Recorder
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.recording.messages import input_message
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.recorder import Recorder
 
 recorder = Recorder(sys.argv[1], {"rig": "a rig"})
 for index in range(3000):

@@ -16,8 +16,8 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from jaxnav import files
+from jaxnav.datasets.recordings import Recording, read_recording
 from jaxnav.errors import BadInput
-from jaxnav.runtime.recordings import Recording, read_recording
 from tests.helpers import seed_texts
 
 DECODED = {"test_5": (2716, 28062, 2715), "test_7": (347, 3235, 347)}  # frames, used, referenced

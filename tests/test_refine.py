@@ -10,12 +10,12 @@ import optimistix
 import pytest
 from jax.extend.core import jaxprs_in_params
 
-from jaxnav.levenberg_marquardt import KEEP_FOUND
-from jaxnav.markers import CORNER_SIGNS
-from jaxnav.observation import Observation
-from jaxnav.refine import refine_pose, solve_marker, solve_markers
-from jaxnav.residuals import e1
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND
+from jaxnav.pose.observation import Observation
+from jaxnav.pose.refine import refine_pose, solve_marker, solve_markers
+from jaxnav.pose.residuals import e1
 from tests import worlds
 from tests.derivatives import check_derivatives, in_float32
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxnav.runtime.drive_log import Outcomes, read_drive
-from jaxnav.runtime.drive_replay import first_difference, replay_drive
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Fault, Health, Reject, names
-from jaxnav.vehicles import injections as inject
-from jaxnav.vehicles.lockstep import BEGIN_NS, Rates
+from jaxnav.loop.flags import Fault, Health, Reject, names
+from jaxnav.recording.drive_log import Outcomes, read_drive
+from jaxnav.recording.drive_replay import first_difference, replay_drive
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.testing import injections as inject
+from jaxnav.testing.lockstep import BEGIN_NS, Rates
 from tests.helpers.simulated import make_setup, record, simulated
 
 FOLDER = Path(__file__).parent / "data" / "drives"

@@ -12,10 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
-from jaxnav.markers import CORNER_SIGNS, MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import (
     INK_GREY,

@@ -9,16 +9,16 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.ambiguity import LowestReprojection, PaperCost
+from jaxnav.belief.ambiguity import LowestReprojection, PaperCost
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.cli import main
-from jaxnav.constant_velocity import ConstantVelocity
+from jaxnav.datasets import replay as replays
+from jaxnav.datasets.recordings import Recording, read_recording
+from jaxnav.datasets.replay import CHUNK_FRAMES, Replay, errors, frames_in_view, replay
 from jaxnav.files import write_params
-from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
-from jaxnav.observation import Observation
-from jaxnav.runtime import replay as replays
-from jaxnav.runtime.recordings import Recording, read_recording
-from jaxnav.runtime.replay import CHUNK_FRAMES, Replay, errors, frames_in_view, replay
+from jaxnav.pose.observation import Observation
 from tests.helpers.compiling import jit_to_run
 
 

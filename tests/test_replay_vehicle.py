@@ -11,13 +11,13 @@ from jaxnav import cli
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.files import save_rig
-from jaxnav.runtime.drive_log import Outcomes, read_drive
-from jaxnav.runtime.flags import Fault, Health
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Ending, HasOwnFiles, Odometry, Vehicle
-from jaxnav.runtime.messages import input_message
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.recorder import Recorder
+from jaxnav.loop.flags import Fault, Health
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Ending, HasOwnFiles, Odometry, Vehicle
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.drive_log import Outcomes, read_drive
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.recorder import Recorder
 from jaxnav.testing import check_cameras, check_vehicle
 from jaxnav.vehicles.replay import ReplayVehicle, open_cameras
 from tests.helpers.drives import BEGIN_NS, make_detections, make_picture

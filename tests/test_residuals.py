@@ -6,8 +6,8 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.residuals import e1, e2
-from jaxnav.rig import CameraRig
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.residuals import e1, e2
 from tests import worlds
 from tests.derivatives import check_derivatives
 from tests.reference import paper

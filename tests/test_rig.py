@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.camera import Camera
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.rig import CameraRig
 from tests import worlds
 from tests.derivatives import check_derivatives
 from tests.reference import paper

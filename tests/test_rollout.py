@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.ambiguity import PaperCost
+from jaxnav.belief.ambiguity import PaperCost
 from jaxnav.control import Command
-from jaxnav.geometry import planar_from_T_world_vehicle
+from jaxnav.models.geometry import planar_from_T_world_vehicle
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.corners import MIN_SIDE_PX, see
 from jaxnav.simulation.plant import OdometryNoise

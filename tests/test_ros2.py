@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime.flags import Fault, Health, Reject
-from jaxnav.runtime.pilot import Outcome
-from jaxnav.runtime.plugins import open_vehicle as open_by_name
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.loop.pilot import Outcome
+from jaxnav.loop.plugins import open_vehicle as open_by_name
 from jaxnav.testing import check_vehicle
 from jaxnav.vehicles.ros2 import RosPublisher, open_vehicle
 from tests.helpers.fake_ros import AckermannDriveStamped, Bus, OdometryMessage, fake_ros

@@ -7,11 +7,11 @@ import sqlite3
 import numpy as np
 import pytest
 
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.recordings import read_recording
-from jaxnav.runtime.ros_drives import TOGETHER_NS, read_ros_drive, together
+from jaxnav.datasets.recordings import read_recording
+from jaxnav.datasets.ros_drives import TOGETHER_NS, read_ros_drive, together
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Sighted
+from jaxnav.models.rig import CameraRig
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import (
     BEGIN_NS,

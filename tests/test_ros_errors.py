@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxnav.errors import BadInput
-from jaxnav.markers import MarkerMap
+from jaxnav.models.markers import MarkerMap
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import BEGIN_NS, TOPICS, drive, problem, read, topic_map
 from tests.worlds import room_markers

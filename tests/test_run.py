@@ -17,8 +17,8 @@ import pytest
 
 from jaxnav.cli import EXIT_BAD_INPUT, main
 from jaxnav.files import write_params
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.flags import Health
+from jaxnav.loop.flags import Health
+from jaxnav.recording.drive_log import read_drive
 from jaxnav.vehicles.world import World
 from tests import worlds
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxnav.runtime.signals import Interrupted, Signals
+from jaxnav.loop.signals import Interrupted, Signals
 
 ROOT = Path(__file__).resolve().parents[1]
 ALL = ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGUSR1", "SIGALRM"]
@@ -109,7 +109,7 @@ def test_outside_the_main_thread_there_are_none():
 
 PROGRAM = """
 import ctypes, sys, time
-from jaxnav.runtime.signals import Signals
+from jaxnav.loop.signals import Signals
 signals = Signals()
 {hold}
 print("here", flush=True)

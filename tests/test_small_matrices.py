@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav import small_matrices as small
+from jaxnav.numerics import small_matrices as small
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.runtime.stamps import AGREE_NS, FUTURE_NS, JUMP_AFTER, OLD_NS, Stamps
+from jaxnav.loop.stamps import AGREE_NS, FUTURE_NS, JUMP_AFTER, OLD_NS, Stamps
 
 MS = 1_000_000
 BEGIN_NS = 10**12

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.runtime.standstill import Standstill
-from jaxnav.runtime.way import Way, between
+from jaxnav.loop.standstill import Standstill
+from jaxnav.loop.way import Way, between
 
 MS = 1_000_000
 BEGIN_NS = 10**12

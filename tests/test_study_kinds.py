@@ -15,7 +15,7 @@ import xarray as xr
 
 from jaxnav.cli import main
 from jaxnav.commands.studies import load_study, shipped_configs
-from jaxnav.markers import CORNER_SIGNS
+from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scores import Drives
 from jaxnav.studies import lanes

@@ -2,8 +2,8 @@
 
 import pytest
 
-from jaxnav.runtime.support import CONFIRMED, SLOW_M, Support
-from jaxnav.runtime.ways import Fix
+from jaxnav.loop.support import CONFIRMED, SLOW_M, Support
+from jaxnav.loop.ways import Fix
 from tests import worlds
 
 HERE = Fix(0.0, 0.0, 0.0, 0.005, 0.005)

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from jaxnav.ambiguity import LowestReprojection
 from jaxnav.arguments import TuneController
+from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.cli import main
 from jaxnav.files import load_params
 from jaxnav.tuning.drive_loss import DriveLoss

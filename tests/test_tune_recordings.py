@@ -13,19 +13,19 @@ import pytest
 from jaxnav.commands.tune_drives import Event, driven, drives, sensed
 from jaxnav.commands.tune_recordings import GAP_S, navigator_of, tracks
 from jaxnav.commands.tune_sequences import Named, joined
+from jaxnav.datasets.recording import Recording
+from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
-from jaxnav.geometry import rotation_error_rad
-from jaxnav.runtime.drive_log import DriveLog, read_drive
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Reject
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.pilot import Input, Outcome
-from jaxnav.runtime.recording import Recording
-from jaxnav.runtime.recordings import read_recording
+from jaxnav.loop.flags import Reject
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.models.geometry import rotation_error_rad
+from jaxnav.recording.drive_log import DriveLog, read_drive
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.testing.lockstep import Rates
 from jaxnav.tuning.branches import estimated, started
 from jaxnav.tuning.recorded import Recorded
-from jaxnav.vehicles.lockstep import Rates
 from tests.helpers.simulated import make_setup, record, simulated
 
 HALVES = [(0, 0.5), (0.5, 1)]

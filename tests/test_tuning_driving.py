@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.ambiguity import LowestReprojection
-from jaxnav.bicycle import Vehicle
+from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.control import Command, ControlState
-from jaxnav.geometry import planar_from_T_world_vehicle
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.geometry import planar_from_T_world_vehicle
 from jaxnav.navigator import Navigator, State
 from jaxnav.parameters import with_parameters
 from jaxnav.simulation.plant import CarState, OdometryNoise

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.linalg import cholesky
 from scipy.special import expit
 
-from jaxnav.ambiguity import LowestReprojection
+from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import TUNABLES, parameters_of, with_parameters
 from jaxnav.tuning.unconstrained import Space

@@ -20,11 +20,11 @@ import yaml
 from jaxnav import cli
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
+from jaxnav.loop.flags import Health
+from jaxnav.loop.history import Told
 from jaxnav.plots.scenery import Scenery
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.flags import Health
-from jaxnav.runtime.history import Told
-from jaxnav.runtime.recorder import Recorder
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.recorder import Recorder
 from jaxnav.viewer import rerun_view as viewing
 from jaxnav.viewer.outcomes import Shown
 from jaxnav.viewer.rerun_view import RerunView

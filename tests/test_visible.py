@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from jaxnav.calibration.board_images import source_files
 from jaxnav.cli import main
 from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.terminal import nothing_hidden
 from jaxnav.errors import BadInput, visible
 from jaxnav.files.images import decoded_image
-from jaxnav.terminal import nothing_hidden
 from jaxnav.vehicles.opencv_cameras import _device
 from tests.helpers.seed_texts import OPENCV
 

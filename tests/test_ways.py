@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.runtime.ways import Fix, Ways
+from jaxnav.loop.ways import Fix, Ways
 
 MS = 1_000_000
 WHEELBASE_M = 0.256

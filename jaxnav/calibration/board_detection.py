@@ -24,12 +24,12 @@ from jaxnav.calibration.board_tags import read_tags
 from jaxnav.calibration.boards import MIN_POINTS, Board
 from jaxnav.calibration.saddles import EDGE_WIDTH_SIGMAS, Places, Saddles, fit_saddles
 from jaxnav.calibration.views import BoardView
-from jaxnav.camera import Camera
 from jaxnav.detection import make_detector
 from jaxnav.detection.edges import PIXEL_VARIANCE_PX2
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.refine import refine_corners
 from jaxnav.detection.types import grey
+from jaxnav.models.camera import Camera
 
 _GROWTHS = 4  # times that what was found is grown by a pitch
 _RADIUS = 0.45  # of a square, around a saddle

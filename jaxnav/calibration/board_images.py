@@ -14,10 +14,10 @@ from jaxnav.calibration.board_detection import BoardLook, look_at
 from jaxnav.calibration.board_mismatch import what_is_seen
 from jaxnav.calibration.boards import Board
 from jaxnav.calibration.views import BoardView, BoardViews
-from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
 from jaxnav.files.images import read_image
+from jaxnav.models.camera import Camera
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from jaxnav.detection import marker_cells
-from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES
+from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES
 
 MIN_POINTS = 6  # of a board with saddles: fewer can't tell a wrong one among them
 
@@ -56,7 +56,7 @@ class Board:
         size_m: the side of a square, or of a tag's black outline.
         marker_m: of a charuco board, the side of a marker's black outline.
         spacing: of an aprilgrid, the gap between tags in sides of a tag.
-        family: of its markers, one of `jaxnav.markers.FAMILY_SIZES`.
+        family: of its markers, one of `jaxnav.models.markers.FAMILY_SIZES`.
         first_id: of its markers, which are numbered on from there.
         border_cells: how wide the black frame of an aprilgrid's tags is; Kalibr prints 2.
 

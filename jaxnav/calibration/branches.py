@@ -12,7 +12,7 @@ import numpy as np
 from jaxnav.calibration import bundle
 from jaxnav.calibration.linking import Linker, Links, inverted
 from jaxnav.calibration.pose_arrays import matrices, wxyz_xyz
-from jaxnav.rig import CameraRig
+from jaxnav.models.rig import CameraRig
 
 _BETTER = 1.0  # by which a cost must be lower to be another one
 

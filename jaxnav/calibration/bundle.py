@@ -19,10 +19,10 @@ from scipy import stats
 from jaxnav.calibration.pose_arrays import retracted
 from jaxnav.calibration.rig_views import RigViews
 from jaxnav.calibration.schur import Blocks, Reduced, SchurLM, reduce
-from jaxnav.camera import Camera
-from jaxnav.geometry import rotation_matrix, skew
-from jaxnav.rig import CameraRig
-from jaxnav.small_matrices import cho_solve, cholesky
+from jaxnav.models.camera import Camera
+from jaxnav.models.geometry import rotation_matrix, skew
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.small_matrices import cho_solve, cholesky
 
 # A sighting has eight coordinates; of those with Gaussian noise one in a thousand is further off.
 FAR = float(stats.chi2.ppf(0.999, 8))

@@ -15,9 +15,9 @@ import optimistix as optx
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from jaxnav.bicycle import advance
 from jaxnav.errors import BadInput
-from jaxnav.geometry import wrap_angle
+from jaxnav.models.bicycle import advance
+from jaxnav.models.geometry import wrap_angle
 
 _LEAST_S, _MOST_S = 0.3, 1.0  # between the frames of a pair
 _LEAST_PAIRS = 20

@@ -19,8 +19,8 @@ from jaxnav.calibration.lens_fit import LensFit, fit_lens
 from jaxnav.calibration.lens_start import lens_start
 from jaxnav.calibration.view_screening import screened
 from jaxnav.calibration.views import BoardViews
-from jaxnav.camera import LENSES, Camera
 from jaxnav.errors import BadInput
+from jaxnav.models.camera import LENSES, Camera
 
 FEWEST_VIEWS = 5
 _LEAST_SPREAD_DEG = 5.0  # between two views' normals

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.calibration.pose_arrays import retracted
 from jaxnav.calibration.schur import Blocks, SchurLM, SchurState, reduce
 from jaxnav.calibration.views import BoardViews
-from jaxnav.camera import Camera
-from jaxnav.geometry import rotation_matrix, skew, turn_and_shift
+from jaxnav.models.camera import Camera
+from jaxnav.models.geometry import rotation_matrix, skew, turn_and_shift
 
 # Of the shared unknowns, in their order; zero and fixed beyond what the lens has.
 NAMES = {

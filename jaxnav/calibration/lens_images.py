@@ -23,7 +23,7 @@ from jaxnav.calibration.intrinsics import (
 from jaxnav.calibration.lens_bundle import camera_of
 from jaxnav.calibration.lens_fit import LensFit, fit_lens
 from jaxnav.calibration.view_screening import screened
-from jaxnav.camera import LENSES, Camera
+from jaxnav.models.camera import LENSES, Camera
 
 _LOOKS = 5
 _STAYS = 0.1  # in sigmas, of every parameter

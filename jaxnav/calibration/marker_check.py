@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from jaxnav.calibration.linking import inverted, turn_rad
 from jaxnav.calibration.rig import RigCalibration
 from jaxnav.calibration.rig_views import RigViews, rays_camera
-from jaxnav.markers import CORNER_SIGNS
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.models.rig import CameraRig
 
 _SIGMAS = 3.0  # what noise may explain
 _WRONG_SIZE = 0.05  # part of the side that paper and print don't explain

@@ -31,8 +31,8 @@ from jaxnav.calibration.odometry_model import FULL_WEIGHT, NAMES, Model
 from jaxnav.calibration.odometry_motion import STEERED_LITTLE, Motion, driven_m
 from jaxnav.calibration.odometry_start import LOOSE, TIGHT, Trust, start
 from jaxnav.errors import BadInput
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 
 # A figure that is less sure than this is none: in parts of itself, rad and s.
 _LEAST_SURE = {

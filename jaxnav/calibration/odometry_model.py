@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnav.bicycle import advance
 from jaxnav.calibration.odometry_drive import Course, Intervals, ReadingSigma, Views
-from jaxnav.geometry import T_world_vehicle_from_planar, transform_points
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.bicycle import advance
+from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 
 NAMES = ("speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "camera_delay_s")
 # A wheel neither rolls nor turns exactly, and between two readings the servo turns as it likes:

@@ -13,13 +13,13 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnav.bicycle import advance
 from jaxnav.calibration.odometry_drive import Course, Intervals, Views
 from jaxnav.calibration.odometry_model import NODE, corrected
-from jaxnav.geometry import planar_from_T_world_vehicle
-from jaxnav.ippe import ippe_from_rays
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.bicycle import advance
+from jaxnav.models.geometry import planar_from_T_world_vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.ippe import ippe_from_rays
 
 _MOST = 25.0  # that a view, or a step between two, may cost: wrong detections are among them
 _ANCHORS_APART_S = 0.2

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from jaxnav.geometry import cayley
+from jaxnav.models.geometry import cayley
 
 
 def wxyz_xyz(Ts: np.ndarray) -> jax.Array:

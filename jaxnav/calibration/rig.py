@@ -20,10 +20,10 @@ from jaxnav.calibration.linking import Linker, Links, inverted
 from jaxnav.calibration.pose_arrays import matrices, wxyz_xyz
 from jaxnav.calibration.rig_views import RigViews, both_poses, rays_camera
 from jaxnav.calibration.schur import Reduced
-from jaxnav.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.errors import BadInput
-from jaxnav.rig import CameraRig
-from jaxnav.small_matrices import solve_upper
+from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.small_matrices import solve_upper
 
 _LEAST_SIGMA_PX = 1e-3  # of corners that are exact
 _SAME_SCALE = 0.02  # the estimate of the noise has settled when it changes by no more

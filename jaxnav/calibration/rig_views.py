@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnav.camera import Camera
-from jaxnav.markers import CORNER_SIGNS
-from jaxnav.refine import solve_markers
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.refine import solve_markers
 
 _BATCH = 1024  # sightings at a time
 

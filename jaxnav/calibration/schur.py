@@ -6,7 +6,7 @@ alone, and cost and memory grow in proportion to the number of frames.
 
 Source: Brown (1958), "A solution to the general problem of multiple station analytical
 stereotriangulation"; Triggs, McLauchlan, Hartley, Fitzgibbon (2000), "Bundle adjustment: a modern
-synthesis", section 6; damping as in `jaxnav.levenberg_marquardt`.
+synthesis", section 6; damping as in `jaxnav.numerics.levenberg_marquardt`.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxnav.small_matrices import cholesky, solve_lower, solve_upper
+from jaxnav.numerics.small_matrices import cholesky, solve_lower, solve_upper
 
 
 class Blocks(eqx.Module):

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.views import BoardView, BoardViews
-from jaxnav.camera import Camera
-from jaxnav.geometry import transform_points
+from jaxnav.models.camera import Camera
+from jaxnav.models.geometry import transform_points
 
 _FACING = np.diag([1.0, -1.0, -1.0])  # R_camera_board of a board that hangs upright, seen head-on
 

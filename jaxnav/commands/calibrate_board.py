@@ -15,7 +15,7 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.detection import marker_cells
 from jaxnav.errors import BadInput
 from jaxnav.files import atomic_path, output_folder, write_json
-from jaxnav.markers import FAMILY_SIZES
+from jaxnav.models.markers import FAMILY_SIZES
 from jaxnav.plots.board import board_page
 
 # Longer and shorter side, in squares or tags.

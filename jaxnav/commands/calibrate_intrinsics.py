@@ -13,7 +13,6 @@ from jaxnav.calibration.board_images import CollectedViews
 from jaxnav.calibration.intrinsics import LensCalibration
 from jaxnav.calibration.lens_checks import cells, reach, rim_sigma_px, tilts_deg
 from jaxnav.calibration.lens_images import calibrate_images
-from jaxnav.camera import LENS_COEFFICIENTS
 from jaxnav.commands.calibration_boards import read_board
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
@@ -30,6 +29,7 @@ from jaxnav.files.rigs import (
     save_rig,
 )
 from jaxnav.files.validation import validate
+from jaxnav.models.camera import LENS_COEFFICIENTS
 from jaxnav.plots.lens import lens_report
 
 # Where a camera of such a name looks, until somebody says where it is.

@@ -10,7 +10,6 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxnav.arguments.calibration import CalibrateOdometry as Arguments
-from jaxnav.bicycle import Vehicle
 from jaxnav.calibration.odometry import OdometryCalibration, calibrate_odometry
 from jaxnav.calibration.odometry_model import NAMES
 from jaxnav.commands.odometry_recordings import Recorded, read_recordings
@@ -19,7 +18,8 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.errors import visible
 from jaxnav.files import output_folder, save_vehicle, write_json
 from jaxnav.files.provenance import Calibrated, calibrated_now
-from jaxnav.origin import planar_in_world
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.origin import planar_in_world
 from jaxnav.plots.odometry import odometry_report
 
 

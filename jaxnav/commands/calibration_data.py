@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from jaxnav.calibration.rig_views import RigViews
+from jaxnav.datasets.sightings import Sightings, read_sightings
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
-from jaxnav.markers import FAMILY_SIZES, MarkerMap
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.sightings import Sightings, read_sightings
+from jaxnav.models.markers import FAMILY_SIZES, MarkerMap
+from jaxnav.models.rig import CameraRig
 
 _LEAST_SIGHTINGS = 3  # of a marker that is in no map
 _APART_NS = 10**12  # between recordings

@@ -11,16 +11,16 @@ from scipy.spatial.transform import Rotation
 import jaxnav
 from jaxnav.calibration.linking import inverted, turn_rad
 from jaxnav.calibration.rig import RigCalibration
-from jaxnav.camera import LENS_COEFFICIENTS
 from jaxnav.commands.calibration_data import RigData
 from jaxnav.files import save_markers, save_rig, write_tum
 from jaxnav.files.markers import MarkerSigma, marker_map
 from jaxnav.files.poses import pose_from_matrix
 from jaxnav.files.provenance import Calibrated, calibrated_now
 from jaxnav.files.rigs import CameraSigma
-from jaxnav.markers import MarkerMap
-from jaxnav.origin import poses_in_world
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import LENS_COEFFICIENTS
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.origin import poses_in_world
+from jaxnav.models.rig import CameraRig
 
 # Good enough for driving: half a degree moves the car 3 cm sideways at 3 m from a marker.
 _WELL_M, _WELL_DEG = 0.005, 0.2

@@ -7,15 +7,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxnav.origin import opposite, planar_in_world
-from jaxnav.runtime.camera_delays import CameraDelays, Delay
-from jaxnav.runtime.corrections import Corrections
-from jaxnav.runtime.drive_log import DriveLog
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.frames import Frames, Sighted
-from jaxnav.runtime.interfaces import Frame
-from jaxnav.runtime.pilot import Input, Outcome
+from jaxnav.loop.camera_delays import CameraDelays, Delay
+from jaxnav.loop.corrections import Corrections
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Frames, Sighted
+from jaxnav.loop.interfaces import Frame
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.models.origin import opposite, planar_in_world
+from jaxnav.recording.drive_log import DriveLog
+from jaxnav.recording.drive_setup import DriveSetup
 
 # The compiler can not be cut short, and the vehicle stands already.
 _CLOSE_S = 20.0

@@ -11,22 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.ambiguity import LowestReprojection
 from jaxnav.arguments import Demo
+from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.pictures import corners_in_world, save_figure, views_of
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.commands.rendered_world import Cameras, World
+from jaxnav.compiling.step import compiled_step
 from jaxnav.errors import visible
 from jaxnav.files import (
     output_folder,
     write_json,
     write_tum,
 )
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.origin import planar_in_world, points_in_world, poses_in_world
+from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.origin import planar_in_world, points_in_world, poses_in_world
 from jaxnav.plots.localisation import Track, camera_mosaic, drive_report
-from jaxnav.runtime.compiled import compiled_step
-from jaxnav.selectors import make_selector
 from jaxnav.simulation.drive import (
     DriveSettings,
     Frame,

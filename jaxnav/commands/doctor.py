@@ -114,9 +114,9 @@ def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
     import jax.numpy as jnp
     import numpy as np
 
+    from jaxnav.compiling.step import is_compiled
+    from jaxnav.loop.estimator import Estimator, advance_packed
     from jaxnav.navigator import Navigator
-    from jaxnav.runtime.compiled import is_compiled
-    from jaxnav.runtime.estimator import Estimator, advance_packed
 
     with jax.enable_x64(False):
         rig, markers, vehicle = jax.tree.map(
@@ -157,7 +157,7 @@ def _plug_ins(report: Report, args: Doctor, patient: SimpleNamespace) -> Iterabl
     if None in vars(patient).values():
         return [Finding("plug-ins", "note", "not opened: they need all four files")]
     from jaxnav.commands.doctor_checks.plug_ins import plug_ins
-    from jaxnav.runtime.interfaces import Setup
+    from jaxnav.loop.interfaces import Setup
 
     options = dict(text.split("=", 1) for text in args.option)
     setup = Setup(

@@ -10,10 +10,10 @@ from jaxnav.commands.pictures import save_figure
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder
 from jaxnav.files.ranges import is_within
+from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.plots.drive import drive_log_report
-from jaxnav.runtime.drive_log import DriveLog, read_drive
-from jaxnav.runtime.flags import Fault, Health, Reject
-from jaxnav.runtime.plausible import left_out, plausible
+from jaxnav.recording.drive_log import DriveLog, read_drive
+from jaxnav.recording.plausible import left_out, plausible
 
 _LONGEST_STEP_S = 1.0  # between readings, for the distance: beyond it nobody knows
 

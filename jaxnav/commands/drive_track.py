@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxnav.runtime.drive_log import Outcomes
-from jaxnav.runtime.flags import Fault, Health, Reject, names
-from jaxnav.runtime.pilot import Outcome
+from jaxnav.loop.flags import Fault, Health, Reject, names
+from jaxnav.loop.pilot import Outcome
+from jaxnav.recording.drive_log import Outcomes
 
 
 class Row(NamedTuple):

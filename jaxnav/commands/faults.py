@@ -6,9 +6,9 @@ from jaxnav.arguments import Faults
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
-from jaxnav.runtime.flags import names
-from jaxnav.vehicles.faults import HEADER, Result, Trial, line, run_trial
-from jaxnav.vehicles.matrix import matrix
+from jaxnav.loop.flags import names
+from jaxnav.testing.faults import HEADER, Result, Trial, line, run_trial
+from jaxnav.testing.matrix import matrix
 
 EXIT_BROKEN = 1
 

@@ -8,21 +8,21 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.ambiguity import LowestReprojection
 from jaxnav.arguments import Locate
-from jaxnav.camera import Camera
-from jaxnav.candidates import Candidates, find_candidates
+from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.constant_velocity import ConstantVelocity
 from jaxnav.detection import Detections, make_detector
 from jaxnav.errors import BadInput
 from jaxnav.files import load_camera
 from jaxnav.files.images import read_image
-from jaxnav.markers import MarkerMap
-from jaxnav.observation import Observation, Snapshot
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.plots.localisation import View, photo_with_poses
-from jaxnav.rig import CameraRig
+from jaxnav.pose.candidates import Candidates, find_candidates
+from jaxnav.pose.observation import Observation, Snapshot
 
 
 def run(args: Locate) -> int:

@@ -13,15 +13,15 @@ import numpy as np
 from jaxnav.arguments import Run
 from jaxnav.commands.delay_watch import DelayWatch
 from jaxnav.commands.status import notice, status_line
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Frame
-from jaxnav.runtime.loop import Observer
-from jaxnav.runtime.message_schemas import OUTCOME
-from jaxnav.runtime.messages import digest, input_message, outcome_message
-from jaxnav.runtime.pilot import Input, Outcome
-from jaxnav.runtime.recorder import Recorder
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Frame
+from jaxnav.loop.loop import Observer
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.message_schemas import OUTCOME
+from jaxnav.recording.messages import digest, input_message, outcome_message
+from jaxnav.recording.recorder import Recorder
 
 if TYPE_CHECKING:
     from jaxnav.viewer.rerun_view import RerunView

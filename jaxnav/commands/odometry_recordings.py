@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 
 from jaxnav.arguments.calibration import CalibrateOdometry as Arguments
-from jaxnav.bicycle import Vehicle
 from jaxnav.calibration.odometry_drive import Drive
+from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.detection import Detections
 from jaxnav.detection.observe import observe
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig, load_topics, load_vehicle
 from jaxnav.files.ranges import is_within
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.ros_drives import read_ros_drive
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_setup import DriveSetup
 
 _NONE = Detections.concatenate([])
 _SHARED = ("rig", "markers", "vehicle")  # of all recordings, as their headers have them

@@ -13,14 +13,14 @@ from matplotlib.axis import Axis, Tick
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from jaxnav.camera import Camera
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path
-from jaxnav.markers import MarkerMap
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.origin import points_in_world
+from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Output
-from jaxnav.origin import points_in_world
 from jaxnav.plots.localisation import View
-from jaxnav.rig import CameraRig
 
 PNG_DPI = 110
 _NORMAL_SIDES = 0.8  # length of a drawn normal, in sides of the marker

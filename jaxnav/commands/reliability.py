@@ -6,14 +6,14 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxnav.arguments import Reliability as Arguments
+from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.datasets.recordings import read_recording
+from jaxnav.datasets.replay import replay
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.plots.localisation import reliability_diagram
-from jaxnav.runtime.recordings import read_recording
-from jaxnav.runtime.replay import replay
-from jaxnav.selectors import make_selector
 from jaxnav.simulation.random_views import random_views
 from jaxnav.simulation.statistics import Reliability
 

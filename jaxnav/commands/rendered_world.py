@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.ambiguity import Selector
 from jaxnav.arguments import Demo
-from jaxnav.bicycle import Vehicle
+from jaxnav.belief.ambiguity import Selector
 from jaxnav.detection import Detections, Detector, make_detectors, observe
 from jaxnav.errors import BadInput
 from jaxnav.files import (
@@ -22,10 +21,11 @@ from jaxnav.files import (
     load_route,
     load_vehicle,
 )
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.markers import MarkerMap
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator, Output
-from jaxnav.rig import CameraRig
 from jaxnav.simulation.drive import DriveSettings, PoseAt
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene

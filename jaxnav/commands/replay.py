@@ -9,9 +9,12 @@ from tqdm import tqdm
 
 from jaxnav.arguments import Replay as Arguments
 from jaxnav.arguments import Selector
+from jaxnav.belief.selectors import make_selector
 from jaxnav.commands import replay_drive
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.datasets.recordings import Recording, read_recording
+from jaxnav.datasets.replay import Replay, errors, frames_in_view, replay
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     apply_params,
@@ -24,9 +27,6 @@ from jaxnav.files import (
 )
 from jaxnav.navigator import Navigator
 from jaxnav.plots.localisation import localisation_report
-from jaxnav.runtime.recordings import Recording, read_recording
-from jaxnav.runtime.replay import Replay, errors, frames_in_view, replay
-from jaxnav.selectors import make_selector
 
 DEFAULT_SELECTOR: Selector = "multi-hypothesis"
 SETTLED_FRAMES = 5  # of an appearance: a choice made later has had a history

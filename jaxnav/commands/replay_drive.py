@@ -14,6 +14,7 @@ from jaxnav.arguments import Replay as Arguments
 from jaxnav.commands.drive_track import Row, Track
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     Params,
@@ -28,23 +29,22 @@ from jaxnav.files import (
     write_json,
     write_tum,
 )
+from jaxnav.loop.pilot import Input
 from jaxnav.plots.localisation import localisation_report
-from jaxnav.runtime.drive_format import PROFILE
-from jaxnav.runtime.drive_log import DriveLog, Outcomes, read_drive
-from jaxnav.runtime.drive_replay import (
+from jaxnav.recording.drive_format import PROFILE
+from jaxnav.recording.drive_log import DriveLog, Outcomes, read_drive
+from jaxnav.recording.drive_replay import (
     Comparison,
     check_inputs,
     inputs_from_images,
     replay_drive,
 )
-from jaxnav.runtime.drive_setup import DriveSetup, needs_float64
-from jaxnav.runtime.mcap_messages import profile_of
-from jaxnav.runtime.message_schemas import OUTCOME
-from jaxnav.runtime.messages import digest, input_message, outcome_message
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.plausible import plausible
-from jaxnav.runtime.recorder import Recorder
-from jaxnav.runtime.ros_drives import read_ros_drive
+from jaxnav.recording.drive_setup import DriveSetup, needs_float64
+from jaxnav.recording.mcap_messages import profile_of
+from jaxnav.recording.message_schemas import OUTCOME
+from jaxnav.recording.messages import digest, input_message, outcome_message
+from jaxnav.recording.plausible import plausible
+from jaxnav.recording.recorder import Recorder
 
 EXIT_DIFFERS = 1
 _FOR_DRIVES = ("vehicle", "route", "images", "record")

@@ -19,22 +19,22 @@ import numpy as np
 from jaxnav.arguments import Run
 from jaxnav.commands.observers import open_onlookers
 from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.compiling.executables import keep_in
 from jaxnav.detection import make_detectors
 from jaxnav.errors import BadInput, visible
-from jaxnav.executables import keep_in
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
-from jaxnav.runtime import plugins
-from jaxnav.runtime.corrections import Corrections
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.guard import Guard
-from jaxnav.runtime.interfaces import HasOwnFiles, Setup, SharesProcess, Vehicle
-from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.loop import Loop, Observer
-from jaxnav.runtime.moved_vehicle import GuardProcess, MovedVehicle
-from jaxnav.runtime.pilot import Pilot
-from jaxnav.runtime.priority import before_others
-from jaxnav.runtime.seeing import Eyes, Search
-from jaxnav.runtime.signals import Signals
+from jaxnav.loop import plugins
+from jaxnav.loop.corrections import Corrections
+from jaxnav.loop.guard import Guard
+from jaxnav.loop.interfaces import HasOwnFiles, Setup, SharesProcess, Vehicle
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.loop import Loop, Observer
+from jaxnav.loop.moved_vehicle import GuardProcess, MovedVehicle
+from jaxnav.loop.pilot import Pilot
+from jaxnav.loop.priority import before_others
+from jaxnav.loop.seeing import Eyes, Search
+from jaxnav.loop.signals import Signals
+from jaxnav.recording.drive_setup import DriveSetup
 
 EXIT_STOPPED = 1  # by the watchdog, not by a person
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from jaxnav.ambiguity import Selector
-from jaxnav.bicycle import Vehicle
-from jaxnav.bicycle_kalman import BicycleKalman
+from jaxnav.belief.ambiguity import Selector
+from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.files import Params, apply_params, calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.markers import MarkerMap
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
-from jaxnav.rig import CameraRig
 from jaxnav.simulation.scenarios import Scenario
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 from tqdm import tqdm
 
 from jaxnav.arguments import Simulate as Arguments
+from jaxnav.belief.selectors import SELECTORS, make_selector
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.errors import BadInput
@@ -20,7 +21,6 @@ from jaxnav.files.locking import sole_writer
 from jaxnav.files.reading import parse_json, read_text
 from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.navigator import Navigator
-from jaxnav.selectors import SELECTORS, make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives

@@ -2,9 +2,9 @@
 
 import math
 
-from jaxnav.origin import ZERO
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.pilot import Outcome
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.pilot import Outcome
+from jaxnav.models.origin import ZERO
 
 WIDTH = 100  # characters, at most
 _WIDEST_NAME = 14  # of a health

@@ -9,10 +9,9 @@ import jax
 from tqdm import tqdm
 
 from jaxnav.arguments import Study as Arguments
-from jaxnav.cli import EXIT_INTERRUPTED
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.studies import KINDS, load_study, shipped_configs
-from jaxnav.errors import visible
+from jaxnav.errors import EXIT_INTERRUPTED, visible
 from jaxnav.files import output_folder
 from jaxnav.files.locking import sole_writer
 from jaxnav.studies.running import local_cluster, remote_cluster, run_here, run_on_cluster

@@ -12,17 +12,16 @@ from jaxtyping import Array, Key
 from tqdm import tqdm
 
 from jaxnav.arguments import TuneController as Arguments
-from jaxnav.cli import EXIT_INTERRUPTED
+from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.commands.tune_fit import Fitting, measure, plain_key, summary_of
-from jaxnav.errors import BadInput, visible
+from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
 from jaxnav.files import Params, load_params, output_folder, write_json
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
 from jaxnav.plots.tuning import controller_report
-from jaxnav.selectors import make_selector
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives

@@ -10,18 +10,18 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxnav.arguments import TuneFilter as Arguments
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.commands.tune_drives import drives
 from jaxnav.commands.tune_recordings import navigator_of, tracks
 from jaxnav.commands.tune_sequences import Named, joined
+from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
-from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.recordings import read_recording
-from jaxnav.selectors import make_selector
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.tuning.recorded import Recorded, simulated

@@ -16,15 +16,15 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.commands.tune_sequences import IDENTITY, bounds, cut, maps, side_by_side
 from jaxnav.errors import BadInput
-from jaxnav.observation import Observation
-from jaxnav.runtime.drive_log import DriveLog
-from jaxnav.runtime.drive_replay import check_inputs
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Reject
-from jaxnav.runtime.frames import Frames
-from jaxnav.runtime.history import Told
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.stamps import Stamps
+from jaxnav.loop.flags import Reject
+from jaxnav.loop.frames import Frames
+from jaxnav.loop.history import Told
+from jaxnav.loop.pilot import Input
+from jaxnav.loop.stamps import Stamps
+from jaxnav.pose.observation import Observation
+from jaxnav.recording.drive_log import DriveLog
+from jaxnav.recording.drive_replay import check_inputs
+from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.tuning.recorded import Recorded
 
 _NS_PER_US = 1000

@@ -10,15 +10,14 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 from jaxnav.arguments import TuneFilter as Arguments
-from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.cli import EXIT_INTERRUPTED
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.tune_data import AT_A_TIME, Data, read_data
 from jaxnav.commands.tune_fit import Fitting, measure, plain_key, summary_of
-from jaxnav.errors import BadInput, visible
+from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
 from jaxnav.files import Params, apply_params, load_params, output_folder, write_json
-from jaxnav.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of, with_parameters
 from jaxnav.plots.tuning import tuning_report

@@ -5,15 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.tune_sequences import IDENTITY, bounds, cut, maps, runs, side_by_side
-from jaxnav.constant_velocity import ConstantVelocity
+from jaxnav.datasets.recording import Recording
+from jaxnav.datasets.replay import estimate_corner_sigma_px
 from jaxnav.errors import BadInput
+from jaxnav.models.origin import opposite, poses_in_world
 from jaxnav.navigator import Navigator
-from jaxnav.observation import Observation
-from jaxnav.origin import opposite, poses_in_world
-from jaxnav.runtime.recording import Recording
-from jaxnav.runtime.replay import estimate_corner_sigma_px
-from jaxnav.selectors import make_selector
+from jaxnav.pose.observation import Observation
 from jaxnav.tuning.recorded import Recorded
 
 LEAST_SEQUENCES = 4

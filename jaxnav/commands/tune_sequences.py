@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.errors import BadInput
-from jaxnav.markers import MarkerMap
+from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Navigator
 from jaxnav.tuning.recorded import Recorded
 

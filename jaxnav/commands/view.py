@@ -9,8 +9,8 @@ from jaxnav.commands.drive_pictures import read_outcomes
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path, output_folder
 from jaxnav.plots.scenery import Scenery
-from jaxnav.runtime.drive_log import DriveLog
-from jaxnav.runtime.plausible import left_out, plausible
+from jaxnav.recording.drive_log import DriveLog
+from jaxnav.recording.plausible import left_out, plausible
 from jaxnav.viewer.outcomes import Shown
 from jaxnav.viewer.rerun_view import RerunView, import_rerun
 

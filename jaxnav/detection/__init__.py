@@ -14,7 +14,7 @@ from jaxnav.detection.families import marker_cells
 from jaxnav.detection.observe import Observed, observe
 from jaxnav.detection.types import Detections, Detector
 from jaxnav.errors import BadInput
-from jaxnav.markers import MarkerMap
+from jaxnav.models.markers import MarkerMap
 
 __all__ = [
     "AprilTagDetector",
@@ -36,7 +36,7 @@ def make_detector(backend: str = "aruco", family: str = "tag36h11") -> Detector:
 
     Args:
         backend: "aruco" (OpenCV) or "apriltag" (needs the extra of that name).
-        family: one of `jaxnav.markers.FAMILY_SIZES`.
+        family: one of `jaxnav.models.markers.FAMILY_SIZES`.
 
     Raises:
         BadInput: unknown backend or family, a family the backend lacks, or a missing extra.

@@ -4,16 +4,16 @@ import importlib
 
 import numpy as np
 
-from jaxnav.camera import Camera
-from jaxnav.conventions import (
+from jaxnav.detection.families import dictionary
+from jaxnav.detection.types import Detections, grey, refined_detections
+from jaxnav.errors import BadInput
+from jaxnav.models.camera import Camera
+from jaxnav.models.conventions import (
     APRILTAG_FAMILIES,
     APRILTAG_FIRST_CORNER_ON_OPENCV,
     APRILTAG_PIXEL_EDGE_PX,
     TL_TR_BR_BL,
 )
-from jaxnav.detection.families import dictionary
-from jaxnav.detection.types import Detections, grey, refined_detections
-from jaxnav.errors import BadInput
 
 _TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER_ON_OPENCV]
 _MIN_DECISION_MARGIN = 10.0  # grey levels; what noise decodes to stays below

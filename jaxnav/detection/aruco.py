@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 
-from jaxnav.camera import Camera
 from jaxnav.detection.crowd import thinned
 from jaxnav.detection.families import dictionary
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.read import frames_first, read_marker
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.detection.types import Detections, grey, refined_detections
+from jaxnav.models.camera import Camera
 
 # The closer look: quadrilaterals of these sides.
 _CLOSER_LOOK_PX = (8.0, 150.0)
@@ -34,7 +34,7 @@ class ArucoDetector:
         """See `make_detector`.
 
         Args:
-            family: one of `jaxnav.markers.FAMILY_SIZES`.
+            family: one of `jaxnav.models.markers.FAMILY_SIZES`.
             closer_looks: at how many quadrilaterals of an image to look again, some ms each.
         """
         self.family = family

@@ -31,7 +31,7 @@ def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.nda
 
     Args:
         image: (H, W) grey levels.
-        family: one of `jaxnav.markers.FAMILY_SIZES`.
+        family: one of `jaxnav.models.markers.FAMILY_SIZES`.
         least_perimeter_px: of the quadrilaterals that a decoder would look at.
     """
     crowd = max(_CROWD, min(1000, _CROWD * image.size // _CROWD_PIXELS))

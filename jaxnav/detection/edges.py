@@ -26,9 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxnav.compiling.executables import kept
 from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
-from jaxnav.executables import kept
-from jaxnav.small_matrices import eliminated
+from jaxnav.numerics.small_matrices import eliminated
 
 PIXELS = 1024  # of one fit: the rest are masked
 _STEPS = 20

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.markers import FAMILY_SIZES, opencv_dictionary_name
+from jaxnav.models.markers import FAMILY_SIZES, opencv_dictionary_name
 
 
 def dictionary(family: str) -> cv2.aruco.Dictionary:

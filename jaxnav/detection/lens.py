@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from jaxnav.camera import Camera
+from jaxnav.compiling.executables import kept
 from jaxnav.detection.edges import PIXELS
-from jaxnav.executables import kept
+from jaxnav.models.camera import Camera
 
 
 @kept

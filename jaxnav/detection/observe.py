@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnav.detection.types import Detections
-from jaxnav.markers import MarkerMap
+from jaxnav.models.markers import MarkerMap
 
 SAME_PX = 1.0  # nearer to each other, two detections are one
 

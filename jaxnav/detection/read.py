@@ -38,7 +38,7 @@ def read_marker(
     Args:
         image: (H, W) grey levels.
         corners_px: (4, 2), clockwise from any corner, about a pixel off at most.
-        family: one of `jaxnav.markers.FAMILY_SIZES`.
+        family: one of `jaxnav.models.markers.FAMILY_SIZES`.
         lens: through which straight edges are seen.
     """
     n = all_cells(family).shape[1]

@@ -7,11 +7,11 @@ from typing import Protocol, runtime_checkable
 import cv2
 import numpy as np
 
-from jaxnav.camera import Camera
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.refine import refine_corners
 from jaxnav.errors import BadInput
+from jaxnav.models.camera import Camera
 
 
 @dataclass(frozen=True)

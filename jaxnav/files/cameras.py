@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr
 from jaxnav.files.figures import CameraFigures
@@ -28,6 +27,7 @@ from jaxnav.files.ros_camera_info import (
     is_camera_info,
 )
 from jaxnav.files.validation import validate
+from jaxnav.models.camera import Camera
 
 ImageSizePx = tuple[int, int]  # width, height
 CameraFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.files import poses
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.rig import CameraRig
 
 Lens = Literal["none", "radtan", "equidistant"]
 
@@ -25,7 +25,7 @@ class CameraFigures:
     """One camera.
 
     Attributes:
-        lens: see `jaxnav.camera`.
+        lens: see `jaxnav.models.camera`.
         focal_px: fx, fy.
         center_px: cx, cy; the centre of the top-left pixel is (0, 0).
         distortion: as the lens counts its coefficients, all of them.

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import CameraFigures, Lens, unread
@@ -31,6 +30,7 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import yaml_text
+from jaxnav.models.camera import Camera
 
 _LENS: dict[str, Lens] = {
     "radtan": "radtan",

@@ -7,7 +7,7 @@
         corners_world_m: [[...], [...], [...], [...]]   # TL TR BR BL, as its reader sees them
 
 Instead of the corners, `T_world_marker` (4x4 or `{wxyz, xyz_m}`): x right, y up, z towards the
-reader. Wherever in the world a map is, its places are exact: see `jaxnav.origin`.
+reader. Wherever in the world a map is, its places are exact: see `jaxnav.models.origin`.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import plain_pose, with_provenance, written_pose
 from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, validate
 from jaxnav.files.writing import atomic_write, yaml_text
-from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
-from jaxnav.origin import Origin, opposite, origin_near, poses_in_world
+from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
+from jaxnav.models.origin import Origin, opposite, origin_near, poses_in_world
 
 # A corner may lie this far from the best square, as a part of the side: a tape measure's error.
 _MAX_CORNER_ERROR = 0.03

@@ -24,7 +24,6 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from jaxnav.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import (
@@ -53,7 +52,8 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import atomic_write, yaml_text
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.rig import CameraRig
 
 
 class CameraSigma(Entry):

@@ -18,9 +18,9 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from jaxnav.conventions import FirstCorner
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import CornerSigma, Entry, Name, validate
+from jaxnav.models.conventions import FirstCorner
 
 
 class TopicsFile(Entry):

@@ -20,7 +20,6 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from jaxnav.bicycle import Vehicle
 from jaxnav.files.provenance import Calibrated
 from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
@@ -36,7 +35,8 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import atomic_write
-from jaxnav.origin import Origin, opposite, planar_in_world, points_in_world
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.origin import Origin, opposite, planar_in_world, points_in_world
 
 
 class VehicleFile(Entry):

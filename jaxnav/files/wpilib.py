@@ -6,7 +6,7 @@
 
 The tags are of one family and one size, and the file says neither. The field's frame, x along its
 length and z up, is our world; how a tag is turned against our marker is told by
-`jaxnav.conventions`.
+`jaxnav.models.conventions`.
 """
 
 import json
@@ -17,7 +17,6 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from jaxnav.conventions import APRILTAG_FAMILIES, WXYZ_TAG_MARKER
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import MarkerFigures, unread
@@ -31,7 +30,8 @@ from jaxnav.files.validation import (
     at,
     validate,
 )
-from jaxnav.markers import CORNER_SIGNS, FAMILY_SIZES
+from jaxnav.models.conventions import APRILTAG_FAMILIES, WXYZ_TAG_MARKER
+from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES
 
 SIZE_M = 0.1651  # the black square of FIRST's tags, 6.5 inches
 FAMILY = "tag36h11"  # FIRST's since 2024

@@ -10,12 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from jaxnav.bicycle_kalman import BicycleKalman
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.plots.drive_map import HEALTH_COLORS, PURPLE, draw_drive_map
 from jaxnav.plots.localisation import BLACK, BLUE, GREEN, VERMILION
 from jaxnav.plots.scenery import Scenery
-from jaxnav.runtime.drive_log import DriveLog, Outcomes
-from jaxnav.runtime.flags import Fault, Health, Reject
+from jaxnav.recording.drive_log import DriveLog, Outcomes
 
 _FAULT = "#444444"  # apart from all colours of health
 _JOIN_S = 0.15  # a flag that is down for less was up all the while: not every event can raise it

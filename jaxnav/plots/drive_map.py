@@ -9,6 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
 from jaxnav.files import poses
+from jaxnav.loop.flags import Health
 from jaxnav.plots.localisation import (
     BLACK,
     BLUE,
@@ -20,8 +21,7 @@ from jaxnav.plots.localisation import (
     draw_waypoints,
 )
 from jaxnav.plots.scenery import Scenery
-from jaxnav.runtime.drive_log import Outcomes
-from jaxnav.runtime.flags import Health
+from jaxnav.recording.drive_log import Outcomes
 
 GREY, PURPLE = "#999999", "#CC79A7"
 # From pale to dark as it gets worse, so that it reads in grey too.

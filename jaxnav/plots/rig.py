@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnav.markers import CORNER_SIGNS
+from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.plots.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)

@@ -18,9 +18,9 @@ from jaxnav.files.markers import MarkerFile, marker_map
 from jaxnav.files.reading import parse_yaml
 from jaxnav.files.rigs import RigFile
 from jaxnav.files.validation import FloorPlace
-from jaxnav.markers import MarkerMap
-from jaxnav.origin import ZERO, Origin, opposite, points_in_world
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.origin import ZERO, Origin, opposite, points_in_world
+from jaxnav.models.rig import CameraRig
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

@@ -7,9 +7,9 @@ import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxnav.camera import Camera
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.prints import Print
 from jaxnav.simulation.rendering import PoseAt, Renderer
 from jaxnav.simulation.scene import (

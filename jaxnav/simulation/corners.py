@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.geometry import rotation_matrix
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.geometry import rotation_matrix
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 
 MIN_SIDE_PX = 8.0  # below this no detector reads a marker
 

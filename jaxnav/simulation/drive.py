@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.bicycle import Vehicle
+from jaxnav.belief.evaluation import Branch, judge_branch
 from jaxnav.control import Command
 from jaxnav.errors import BadInput
-from jaxnav.evaluation import Branch, judge_branch
-from jaxnav.geometry import T_world_vehicle_from_planar
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.navigator import Navigator, Output, State, Step, jitted_step
-from jaxnav.observation import Observation
+from jaxnav.pose.observation import Observation
 from jaxnav.simulation.plant import CarState, OdometryNoise, move_through, read_odometry
 
 PASSED_M = 0.30  # a waypoint counts as passed when the true car came this close

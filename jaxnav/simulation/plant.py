@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav import bicycle
-from jaxnav.bicycle import Vehicle
 from jaxnav.control import Command
+from jaxnav.models import bicycle
+from jaxnav.models.bicycle import Vehicle
 
 
 class CarState(eqx.Module):

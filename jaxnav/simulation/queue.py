@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
+from jaxnav.numerics.trees import where
 from jaxnav.simulation.kept import Kept
-from jaxnav.trees import where
 
 
 def run_lanes(

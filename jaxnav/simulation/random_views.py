@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.ambiguity import LowestReprojection
-from jaxnav.candidates import find_candidates
-from jaxnav.constant_velocity import ConstantVelocity
-from jaxnav.evaluation import judge_branch
-from jaxnav.markers import MarkerMap
-from jaxnav.observation import Snapshot
-from jaxnav.rig import CameraRig
+from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.evaluation import judge_branch
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.candidates import find_candidates
+from jaxnav.pose.observation import Snapshot
 from jaxnav.simulation.single_frames import (
     CornerErrors,
     View,

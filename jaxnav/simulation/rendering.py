@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.rig import CameraRig
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.background import render_background
 from jaxnav.simulation.prints import Print, prints_of, render_print
 from jaxnav.simulation.scene import Scene

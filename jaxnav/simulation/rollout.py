@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from jaxnav.bicycle import Vehicle
+from jaxnav.belief.kalman import nis
 from jaxnav.control import Command
-from jaxnav.geometry import T_world_vehicle_from_planar, safe_norm, wrap_angle
-from jaxnav.kalman import nis
-from jaxnav.lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
-from jaxnav.markers import MarkerMap
+from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.geometry import T_world_vehicle_from_planar, safe_norm, wrap_angle
+from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Navigator, Step
-from jaxnav.observation import Observation
+from jaxnav.pose.observation import Observation
 from jaxnav.simulation.corners import see
 from jaxnav.simulation.drive import PASSED_M
 from jaxnav.simulation.kept import Kept

@@ -11,7 +11,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.rig import CameraRig
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.plant import CarState, OdometryNoise
 
 HEADING_SIGMA_RAD = 0.05  # of the compass that `OrientationGiven` is given

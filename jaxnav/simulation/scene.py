@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.markers import FAMILY_SIZES, MarkerMap, opencv_dictionary_name
+from jaxnav.models.markers import FAMILY_SIZES, MarkerMap, opencv_dictionary_name
 
 PAPER_GREY, INK_GREY = 215.0, 25.0
 QUIET_ZONE_MODULES = 1

@@ -9,8 +9,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.corners import see
 
 

@@ -7,11 +7,11 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnav.camera import Camera
-from jaxnav.geometry import rotation_from_matrix
-from jaxnav.markers import MarkerMap
-from jaxnav.observation import Observation
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.geometry import rotation_from_matrix
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.observation import Observation
 from jaxnav.simulation.corners import see
 
 IMAGE_PX = 2048  # side of a pinhole camera's image

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.camera import Camera
 from jaxnav.errors import BadInput
+from jaxnav.models.camera import Camera
 from jaxnav.simulation.sensor import Shutter
 
 CELL_PX = 8  # the grid on which it is found out what is in sight where

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.bicycle import Vehicle
 from jaxnav.control import Command
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import State
-from jaxnav.rig import CameraRig
 from jaxnav.simulation.plant import CarState
 from jaxnav.simulation.scenarios import Scenario
 

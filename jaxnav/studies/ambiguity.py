@@ -15,14 +15,14 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnav import kalman
-from jaxnav.ambiguity import PoseBelief
-from jaxnav.candidates import Candidates, find_candidates
-from jaxnav.evaluation import judge_branch, position_error_m
-from jaxnav.geometry import inverse_cayley, rotation_error_rad, safe_sqrt
-from jaxnav.observation import Snapshot
-from jaxnav.rig import CameraRig
-from jaxnav.selectors import SELECTORS, make_selector
+from jaxnav.belief import kalman
+from jaxnav.belief.ambiguity import PoseBelief
+from jaxnav.belief.evaluation import judge_branch, position_error_m
+from jaxnav.belief.selectors import SELECTORS, make_selector
+from jaxnav.models.geometry import inverse_cayley, rotation_error_rad, safe_sqrt
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.candidates import Candidates, find_candidates
+from jaxnav.pose.observation import Snapshot
 from jaxnav.simulation.single_frames import (
     CornerErrors,
     View,

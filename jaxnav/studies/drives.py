@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.bicycle import Vehicle
-from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.markers import MarkerMap
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.selectors import SELECTORS, make_selector
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
-from jaxnav.rig import CameraRig
-from jaxnav.selectors import SELECTORS, make_selector
 from jaxnav.simulation.rollout import Rollout, Trace
 from jaxnav.simulation.scenarios import Scenario, scenarios
 from jaxnav.simulation.scores import Drives

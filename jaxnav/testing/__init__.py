@@ -1,4 +1,4 @@
-"""Whether a plug-in keeps the promises of `jaxnav.runtime.interfaces`. Call it from pytest:
+"""Whether a plug-in keeps the promises of `jaxnav.loop.interfaces`. Call it from pytest:
 
     def test_my_car():
         check_vehicle(open_vehicle, setup)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxnav.detection.types import Detections
-from jaxnav.runtime.interfaces import Camera, Frame, Odometry, OpenCameras, Setup, Vehicle
-from jaxnav.runtime.plugins import missing_members
+from jaxnav.loop.interfaces import Camera, Frame, Odometry, OpenCameras, Setup, Vehicle
+from jaxnav.loop.plugins import missing_members
 from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, started
 
 _PATIENCE_S = 3.0  # until the first frames must have come

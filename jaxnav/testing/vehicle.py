@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.runtime.interfaces import Odometry, OpenVehicle, Setup, Vehicle
-from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.plugins import missing_members
+from jaxnav.loop.interfaces import Odometry, OpenVehicle, Setup, Vehicle
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.plugins import missing_members
 from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, started
 
 _READ_S = 0.05  # "without waiting longer than some milliseconds"

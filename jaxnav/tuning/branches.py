@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.bicycle import advance
-from jaxnav.bicycle_kalman import BicycleKalman
-from jaxnav.geometry import (
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.kalman import nis
+from jaxnav.belief.motion import Belief, Motion
+from jaxnav.models.bicycle import advance
+from jaxnav.models.geometry import (
     T_world_vehicle_from_planar,
     planar_from_T_world_vehicle,
 )
-from jaxnav.kalman import nis
-from jaxnav.motion import Belief, Motion
 from jaxnav.navigator import Navigator, State
-from jaxnav.observation import Observation
+from jaxnav.pose.observation import Observation
 from jaxnav.tuning.recorded import Recorded
 
 # How far off a pose may be that was carried back: m and rad, a third of what lies between the two

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.geometry import safe_norm, safe_sqrt
+from jaxnav.models.geometry import safe_norm, safe_sqrt
 from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.world import World
 from jaxnav.tuning.soft_switch import SoftState

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxnav.lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
+from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
 from jaxnav.navigator import Step
 from jaxnav.parameters import with_parameters
 from jaxnav.simulation.kept import Kept

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.motion import Belief
+from jaxnav.belief.motion import Belief
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import with_parameters
 from jaxnav.tuning.branches import started

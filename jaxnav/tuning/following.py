@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from jaxnav.constant_velocity import ConstantVelocity
-from jaxnav.hypotheses import MultiHypothesis
-from jaxnav.kalman import log_likelihood
-from jaxnav.levenberg_marquardt import KEEP_FOUND
-from jaxnav.motion import Belief
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.kalman import log_likelihood
+from jaxnav.belief.motion import Belief
 from jaxnav.navigator import Navigator
-from jaxnav.observation import Observation
+from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND
+from jaxnav.pose.observation import Observation
 from jaxnav.tuning.branches import error_of, nees, position_states
 from jaxnav.tuning.recorded import Recorded
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.markers import MarkerMap
+from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Output, State
-from jaxnav.observation import Observation
+from jaxnav.pose.observation import Observation
 from jaxnav.simulation.rollout import Rollout
 
 

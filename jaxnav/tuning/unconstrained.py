@@ -22,8 +22,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxnav.navigator import Navigator
+from jaxnav.numerics.small_matrices import product
 from jaxnav.parameters import TUNABLES, Tunable, parameters_of
-from jaxnav.small_matrices import product
 
 # A logarithm of a ratio to what is typical stays within this, and what is no logarithm within as
 # much: e^20 either way. Squares of that are numbers in float32.

@@ -1,1 +1,1 @@
-"""Vehicles and cameras that come with jaxnav: plug-ins like anybody's, see `runtime.interfaces`."""
+"""Vehicles and cameras that come with jaxnav: plug-ins like anybody's, see `loop.interfaces`."""

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from jaxnav.runtime.interfaces import Frame
+from jaxnav.loop.interfaces import Frame
 
 _PATIENCE_S = 0.5  # what `close` grants a driver that hangs, before it leaves the thread behind
 _RETRY_S = 0.25  # after an error

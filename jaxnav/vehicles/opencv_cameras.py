@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime.interfaces import Camera, Frame, Setup, Vehicle
+from jaxnav.loop.interfaces import Camera, Frame, Setup, Vehicle
 from jaxnav.vehicles.grabber import Grabber
 from jaxnav.vehicles.options import latency_ns
 

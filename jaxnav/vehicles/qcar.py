@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime.interfaces import Camera, Frame, Odometry, Setup, Vehicle
-from jaxnav.runtime.limits import Limits
+from jaxnav.loop.interfaces import Camera, Frame, Odometry, Setup, Vehicle
+from jaxnav.loop.limits import Limits
 from jaxnav.vehicles.grabber import Grabber
 from jaxnav.vehicles.options import latency_ns, whole_number
 from jaxnav.vehicles.servo import Servo

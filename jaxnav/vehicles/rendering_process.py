@@ -9,8 +9,8 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 
 EXPOSURE_S = 0.005
 _SPREAD_S = 0.02  # before and after a stamp: what the track covers

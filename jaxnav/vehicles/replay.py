@@ -18,16 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxnav.detection.image_search import size_problem
 from jaxnav.errors import BadInput
 from jaxnav.files.images import decoded_image
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.drive_log import DriveLog, read_drive
-from jaxnav.runtime.drive_replay import check_inputs
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.flags import Fault
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.image_search import size_problem
-from jaxnav.runtime.interfaces import Camera, Frame, Odometry, OwnFiles, Setup, Vehicle
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Camera, Frame, Odometry, OwnFiles, Setup, Vehicle
+from jaxnav.models.rig import CameraRig
+from jaxnav.recording.drive_log import DriveLog, read_drive
+from jaxnav.recording.drive_replay import check_inputs
+from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.vehicles.options import choice
 
 _WAITS_NS = 50_000_000  # so long a reading waits its turn when several came between two looks

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxnav.runtime.interfaces import Odometry, Setup, Vehicle
-from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.twists import TwistReader
+from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
+from jaxnav.loop.limits import Limits
+from jaxnav.models.twists import TwistReader
 from jaxnav.vehicles.options import choice
 from jaxnav.vehicles.ros2_node import Node
 
 if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
-    from jaxnav.bicycle import Vehicle as VehicleModel
-    from jaxnav.runtime.pilot import Outcome
+    from jaxnav.loop.pilot import Outcome
+    from jaxnav.models.bicycle import Vehicle as VehicleModel
 
 _LOCK_PATIENCE_S = 0.03  # for a message that another thread publishes; then past it
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y, rotation about z among the six of a ROS covariance

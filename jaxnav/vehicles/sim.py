@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.runtime.corrections import Corrections
-from jaxnav.runtime.interfaces import Camera, Frame, Odometry, Setup, Vehicle
+from jaxnav.loop.corrections import Corrections
+from jaxnav.loop.interfaces import Camera, Frame, Odometry, Setup, Vehicle
 from jaxnav.vehicles.options import choice, number
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
 from jaxnav.vehicles.world import World, WorldSettings

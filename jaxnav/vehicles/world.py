@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.bicycle import Vehicle as VehicleModel
+from jaxnav.compiling.executables import kept
 from jaxnav.control import Command
 from jaxnav.detection.types import Detections
-from jaxnav.executables import kept
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.bicycle import Vehicle as VehicleModel
+from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.corners import see
 from jaxnav.simulation.plant import CarState, OdometryNoise, move
 

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxnav.origin import ZERO, Origin, inverses_in_world, opposite, planar_in_world
-from jaxnav.runtime.drive_log import Outcomes
-from jaxnav.runtime.flags import Fault, Health, Reject
-from jaxnav.runtime.pilot import Outcome
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.loop.pilot import Outcome
+from jaxnav.models.origin import ZERO, Origin, inverses_in_world, opposite, planar_in_world
+from jaxnav.recording.drive_log import Outcomes
 
 
 @dataclass(frozen=True)

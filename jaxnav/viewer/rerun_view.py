@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.pilot import Outcome
+from jaxnav.loop.pilot import Outcome
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.viewer.outcomes import Shown
 from jaxnav.viewer.scene import Scene
 

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from jaxnav.files import poses
-from jaxnav.markers import MarkerMap
-from jaxnav.origin import ZERO
+from jaxnav.loop.flags import Health, names
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.origin import ZERO
+from jaxnav.models.rig import CameraRig
 from jaxnav.plots.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.flags import Health, names
 from jaxnav.viewer.outcomes import Shown
 
 TIMELINE = "drive"  # seconds since the first event

@@ -14,13 +14,13 @@ from mcap.writer import Writer
 from jaxnav import files
 from jaxnav.calibration.odometry_drive import Drive
 from jaxnav.detection import Detections, marker_cells
-from jaxnav.runtime.drive_format import HEADER, PROFILE, encode, header_of
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.mcap_messages import McapMessages, Recorded
-from jaxnav.runtime.message_schemas import MESSAGES
-from jaxnav.runtime.messages import input_message
-from jaxnav.runtime.pilot import Input
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.drive_format import HEADER, PROFILE, encode, header_of
+from jaxnav.recording.mcap_messages import McapMessages, Recorded
+from jaxnav.recording.message_schemas import MESSAGES
+from jaxnav.recording.messages import input_message
 from tests.helpers import loader_seeds as loaders
 from tests.helpers.odometry_drives import RECIPE, START, sensed, true_track
 from tests.helpers.ros_drives import TOPICS

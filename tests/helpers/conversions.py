@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from jaxnav import files
 from jaxnav.arguments.calibration import CalibrateConvert
-from jaxnav.camera import LENS_COEFFICIENTS
 from jaxnav.commands import calibrate_convert
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
@@ -17,6 +16,7 @@ from jaxnav.files.cameras import camera_file, named_by_topic
 from jaxnav.files.figures import CameraFigures, MarkerFigures
 from jaxnav.files.markers import MarkerFile
 from jaxnav.files.reading import read_mapping
+from jaxnav.models.camera import LENS_COEFFICIENTS
 
 QCAR = files.calib_dir() / "qcar"
 

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.candidates import Candidates
+from jaxnav.belief.motion import Belief, Rejections
 from jaxnav.control import Command
 from jaxnav.detection.types import Detections
-from jaxnav.motion import Belief, Rejections
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.navigator import Output
-from jaxnav.runtime.flags import Fault, Health, Reject
-from jaxnav.runtime.frames import Sighted
-from jaxnav.runtime.interfaces import Odometry
-from jaxnav.runtime.messages import input_message, outcome_message
-from jaxnav.runtime.pilot import Input, Outcome
+from jaxnav.pose.candidates import Candidates
+from jaxnav.recording.messages import input_message, outcome_message
 from jaxnav.timeline import Moment, Report
 
 BEGIN_NS = 5_000_000_123

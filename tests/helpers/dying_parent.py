@@ -15,10 +15,10 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from jaxnav.runtime.guard import Guard
-from jaxnav.runtime.interfaces import Setup
-from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.moved_vehicle import GuardProcess
+from jaxnav.loop.guard import Guard
+from jaxnav.loop.interfaces import Setup
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.moved_vehicle import GuardProcess
 from tests.helpers import plain_car
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)

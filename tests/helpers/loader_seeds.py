@@ -16,6 +16,8 @@ from jaxnav import files
 from jaxnav.arguments import Simulate
 from jaxnav.commands import simulate
 from jaxnav.commands.studies import load_study, summary_of
+from jaxnav.datasets.recordings import read_recording
+from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.files.cameras import camera_file, named_by_topic
 from jaxnav.files.images import read_image
 from jaxnav.files.markers import marker_map
@@ -24,11 +26,9 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.wpilib import layout_figures, layout_left_out
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.recorder import Recorder
-from jaxnav.runtime.recordings import read_recording
-from jaxnav.runtime.ros_drives import read_ros_drive
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.recorder import Recorder
 from jaxnav.studies.store import open_store
 from tests.helpers.drives import record_drive
 from tests.helpers.ros_bags import FORMATS, Bag

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.calibration.odometry_drive import Drive
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.corners import see
 from jaxnav.simulation.plant import OdometryNoise
 

@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxnav.runtime.interfaces import Odometry, Setup
+from jaxnav.loop.interfaces import Odometry, Setup
 from jaxnav.vehicles.servo import Servo
 
 NAME = f"{__name__}:open_vehicle"

@@ -5,7 +5,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxnav.runtime.interfaces import Setup
+from jaxnav.loop.interfaces import Setup
 from jaxnav.vehicles import sim
 from jaxnav.vehicles.world import World
 

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput
 from jaxnav.files import TopicMap, load_topics
-from jaxnav.markers import MarkerMap
-from jaxnav.runtime.pilot import Input
-from jaxnav.runtime.ros_drives import read_ros_drive
+from jaxnav.loop.pilot import Input
+from jaxnav.models.markers import MarkerMap
 from tests.helpers.ros_bags import Bag
 from tests.worlds import qcar, qcar_rig, room_markers
 

@@ -5,8 +5,8 @@ import time
 
 import numpy as np
 
-from jaxnav.rig import CameraRig
-from jaxnav.runtime.interfaces import Frame, Odometry, Setup
+from jaxnav.loop.interfaces import Frame, Odometry, Setup
+from jaxnav.models.rig import CameraRig
 from tests.worlds import paper_markers, qcar, qcar_rig
 
 FULL_THROTTLE = 0.3

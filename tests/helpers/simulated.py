@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.files import Route
-from jaxnav.runtime.drive_setup import DriveSetup
-from jaxnav.runtime.messages import digest, input_message, outcome_message
-from jaxnav.runtime.pilot import Input, Outcome
-from jaxnav.runtime.recorder import Recorder
-from jaxnav.vehicles.faults import WAYPOINTS_M
-from jaxnav.vehicles.lockstep import BEGIN_NS, Step, drive
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.messages import digest, input_message, outcome_message
+from jaxnav.recording.recorder import Recorder
+from jaxnav.testing.faults import WAYPOINTS_M
+from jaxnav.testing.lockstep import BEGIN_NS, Step, drive
 from jaxnav.vehicles.world import World
 from tests import worlds
 

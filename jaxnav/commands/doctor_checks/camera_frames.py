@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from jaxnav.commands.doctor_checks.findings import Finding, listed, said
-from jaxnav.runtime.interfaces import Camera, Frame
+from jaxnav.loop.interfaces import Camera, Frame
 from jaxnav.testing.calls import Finish, started
 
 WATCH_S = 1.0

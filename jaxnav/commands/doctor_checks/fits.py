@@ -17,12 +17,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
-from jaxnav.camera import Camera
 from jaxnav.detection.observe import Observed
-from jaxnav.ippe import ippe_from_rays
-from jaxnav.markers import MarkerMap
-from jaxnav.observation import MODEL_SIGMA_PX
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.ippe import ippe_from_rays
+from jaxnav.pose.observation import MODEL_SIGMA_PX
 
 MOST_ERRORS = 6  # numbers that may be unknown beside the pose
 _HEIGHT_SIGMA_M = 0.01  # how well a floor is level and a car stands on it,

@@ -12,7 +12,7 @@ import numpy as np
 from jaxnav.commands.doctor_checks.findings import Finding, listed
 from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
-from jaxnav.markers import MarkerMap
+from jaxnav.models.markers import MarkerMap
 
 _MAX_ERROR = 0.01  # of a side, what a careful tape leaves
 _UPRIGHT = 0.3  # the normal's vertical part, below which a marker hangs on a wall

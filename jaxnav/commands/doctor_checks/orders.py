@@ -11,7 +11,7 @@ import numpy as np
 from jaxnav.commands.doctor_checks.findings import Finding
 from jaxnav.commands.doctor_checks.fits import Fit, Sighted, Unknowns, fit, poses_by_each
 from jaxnav.files import Route
-from jaxnav.markers import MarkerMap
+from jaxnav.models.markers import MarkerMap
 
 # Corner i of the map is corner order[i] of the print: turned ones, and those that are counted the
 # other way round, as seen from behind.

@@ -12,8 +12,8 @@ from jaxnav.commands.doctor_checks.orders import in_their_order
 from jaxnav.commands.doctor_checks.together import together
 from jaxnav.detection import Detections, make_detectors, observe
 from jaxnav.files import Route
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 
 _MOST_MARKERS = 6  # the largest ones are held against each other
 _SMALL_PX = 12.0

@@ -10,10 +10,10 @@ from typing import Any
 from jaxnav.commands.doctor_checks.camera_frames import Watched, judge_cameras, watch
 from jaxnav.commands.doctor_checks.findings import Finding, Report, said
 from jaxnav.errors import BadInput
-from jaxnav.runtime import plugins
-from jaxnav.runtime.interfaces import Odometry, Setup, Vehicle
-from jaxnav.runtime.limits import Limits
-from jaxnav.runtime.moved_vehicle import GuardProcess
+from jaxnav.loop import plugins
+from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.moved_vehicle import GuardProcess
 from jaxnav.testing.calls import HANGS_S, Worker, started
 from jaxnav.testing.cameras import Parked
 

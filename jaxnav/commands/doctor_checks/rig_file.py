@@ -9,7 +9,7 @@ import numpy as np
 from jaxnav.commands.doctor_checks.findings import Finding, listed
 from jaxnav.commands.doctor_checks.sight import Ts_vehicle_camera, sees_directions, through_lens
 from jaxnav.files.reading import read_mapping
-from jaxnav.rig import CameraRig
+from jaxnav.models.rig import CameraRig
 
 _LEAST_HEIGHT_M, _MOST_HEIGHT_M = 0.01, 2.5
 _MOST_DISTANCE_M = 4.0  # from the middle of the vehicle: a van

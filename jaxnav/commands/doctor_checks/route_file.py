@@ -5,12 +5,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxnav.bicycle import Vehicle, curvature_per_m
 from jaxnav.commands.doctor_checks.findings import Finding, listed
 from jaxnav.commands.doctor_checks.sight import Ts_vehicle_camera, Views, views
 from jaxnav.files import Route
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.bicycle import Vehicle, curvature_per_m
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 
 READABLE_PX = 12.0  # a marker this wide is read in every second picture of a car at rest
 _ALONG = 48  # places between start and end that are looked from

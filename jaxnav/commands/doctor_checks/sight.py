@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.camera import Camera
-from jaxnav.geometry import T_world_vehicle_from_planar, transform_points
-from jaxnav.markers import MarkerMap
-from jaxnav.rig import CameraRig
+from jaxnav.models.camera import Camera
+from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 
 _SAME_RAY = 1e-3  # between a ray and that through its own pixel: one-to-one there
 _PIXELS = 256  # are looked through at a time, so that it is compiled once

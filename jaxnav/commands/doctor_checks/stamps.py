@@ -5,9 +5,9 @@ from pathlib import Path
 
 from jaxnav.commands.delay_watch import delays_of, told, warnings
 from jaxnav.commands.doctor_checks.findings import Finding
-from jaxnav.runtime.camera_delays import HARMLESS_S
-from jaxnav.runtime.drive_log import read_drive
-from jaxnav.runtime.drive_setup import DriveSetup
+from jaxnav.loop.camera_delays import HARMLESS_S
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_setup import DriveSetup
 
 _DRIVE_EIGHTS = "drive eights, or stop and start, with a marker in view of it"
 

@@ -10,8 +10,8 @@ from jaxnav.commands.doctor_checks.explanations import SIZE_SIGMA, explained, in
 from jaxnav.commands.doctor_checks.findings import Finding
 from jaxnav.commands.doctor_checks.fits import Fit, Sighted, Unknowns, fit
 from jaxnav.files import Route
-from jaxnav.geometry import T_world_vehicle_from_planar
-from jaxnav.origin import Origin
+from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.origin import Origin
 
 _FITS = 2.0  # chi-square for each number, up to which all is well
 _SMALL_PX = 0.3  # nor is this much an error of a file

@@ -1,0 +1,1 @@
+"""Which candidate to take, and what is believed after it."""

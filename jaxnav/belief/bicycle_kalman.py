@@ -1,0 +1,195 @@
+"""The paper's filter for a car: six states, one measured pose, odometry."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.belief import kalman
+from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
+from jaxnav.belief.motion import Belief, Motion, Offer, contradicted, followed, forgotten, unstarted
+from jaxnav.models import bicycle
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.geometry import (
+    OFF_GROUND,
+    ON_GROUND,
+    T_world_vehicle_from_planar,
+    planar_covariance,
+    planar_from_T_world_vehicle,
+    wrap_angle,
+)
+from jaxnav.numerics.small_matrices import cholesky, log_det, sandwich
+from jaxnav.pose.observation import Observation
+
+
+class BicycleKalman(Motion):
+    """The paper's six-state filter for a car: x, y, psi, v_x, v_y, psi_dot in the world.
+
+    The state moves at constant velocity (Eq. 9); the pose of the chosen candidate measures the
+    first half, odometer and steering the second. Two things the paper leaves open:
+
+    * The odometry's v (cos(beta + psi), sin(beta + psi)) depends on the state's own heading. Its
+      innovation uses the predicted psi, and H carries the derivative, so a correction of
+      the heading turns the velocity along and the drift of the position corrects the heading.
+    * Q and the odometry's noise are given in the vehicle's axes, since wheels slip along and across
+      themselves: numbers learned on one course hold on another.
+    * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
+      floor, since errors of successive frames are correlated (RELIABILITY R8).
+    """
+
+    vehicle: Vehicle
+    acceleration_density: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.1**2, 0.1**2, 0.3**2])
+    )  # along, across, turning: (m/s^2)^2/Hz twice, (rad/s^2)^2/Hz; or the matrix
+    vision_floor: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.005, 0.005, 0.005])
+    )  # x, y, psi: standard deviations, m m rad; or their covariance
+    odometry_sigma: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.01, 0.01, 0.01])
+    )  # along, across, turning: standard deviations, m/s m/s rad/s; or their covariance
+    initial_velocity_sigma: Float[Array, " 3"] = eqx.field(
+        default_factory=lambda: jnp.asarray([1.0, 1.0, 2.0])
+    )  # before the first odometry, m/s m/s rad/s
+    tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
+    height_sigma_m: float = 0.002
+    gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 % (RELIABILITY R1); inf: no gate
+    max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
+    max_rejected_s: float = 7.0  # whether they agree or not
+
+    def init(self, hypotheses: int = 1) -> Belief:
+        """Hypotheses that have seen nothing."""
+        return unstarted(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, 3, hypotheses)
+
+    def predict(self, belief: Belief, obs: Observation) -> Belief:
+        """x = A x, P = A P A' + Q (Eq. 9), then the odometry (Eqs. 10 and 11).
+
+        A hypothesis that the gate has contradicted too often or too long is forgotten.
+        """
+        mean, covariance = jax.vmap(lambda x, P: self._with_odometry(*self._later(x, P, obs), obs))(
+            belief.mean, belief.covariance
+        )
+        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
+        return forgotten(predicted, self.lost(belief), obs.dt_s)
+
+    def lost(self, belief: Belief) -> Bool[Array, " K"]:
+        """Whether the gate has contradicted a hypothesis too often or too long."""
+        return contradicted(belief, self.max_rejections, self.max_rejected_s)
+
+    def poses(self, belief: Belief) -> PoseBelief:
+        """Level on the ground (Eq. 12), as far as `tilt_sigma_rad` and `height_sigma_m` go."""
+        T_world_vehicle = T_world_vehicle_from_planar(belief.mean[:, :3])
+        dtype = belief.mean.dtype
+        freedom = jnp.asarray(ON_GROUND, dtype)
+        tilt = [self.height_sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad]
+        nuisance = jnp.asarray(OFF_GROUND, dtype) * jnp.asarray(tilt, dtype)[None]
+
+        def body_covariance(pose: Array, P: Array) -> Array:
+            return sandwich(freedom, sandwich(_turn(-pose[2]), P[:3, :3]))
+
+        return PoseBelief(
+            T_world_vehicle,
+            jax.vmap(body_covariance)(belief.mean, belief.covariance),
+            belief.log_weight,
+            belief.initialised,
+            freedom,
+            nuisance,
+            self.gate_nis,
+        )
+
+    def measure(self, belief: Belief, measured: PoseMeasurement, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has chosen a candidate, in 3 dof."""
+        P = belief.covariance
+        pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
+        R = planar_covariance(measured.T_world_vehicle, measured.covariance)
+        # Height, roll and pitch were fitted as well, or were not free: then their variances are 0.
+        fitted = measured.covariance
+        fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
+        log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
+        R = R + kalman.as_covariance(self.vision_floor)
+        innovation = self.difference(pose, belief.mean[:3])
+        correction, posterior, S = kalman.update(P, innovation, jnp.eye(3, 6, dtype=P.dtype), R)
+        return Offer(
+            kalman.whitened(innovation, S),
+            gate_nis=self.gate_nis,
+            log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
+            first=self._first(pose, R, obs),
+            posterior=(self.moved(belief.mean, correction), posterior),
+        )
+
+    def follow(self, belief: Belief, measured: PosePosterior, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has corrected its pose, in 3 dof."""
+        T = measured.T_world_vehicle
+        pose = planar_from_T_world_vehicle(T)
+        eye = jnp.eye(6, dtype=belief.mean.dtype)
+        to_body = eye.at[:3, :3].set(_turn(-belief.mean[2]))
+        to_world = eye.at[:3, :3].set(_turn(pose[2]))
+        correction, P = followed(
+            jnp.where(belief.initialised, sandwich(to_body, belief.covariance), eye),
+            T_world_vehicle_from_planar(belief.mean[:3]),
+            T,
+            measured.covariance,
+            jnp.asarray(ON_GROUND, eye.dtype),
+        )
+        return Offer(
+            measured.innovation,
+            gate_nis=self.gate_nis,
+            log_likelihood=measured.log_likelihood,
+            inflation=measured.inflation,
+            first=self._first(pose, planar_covariance(T, measured.covariance), obs),
+            posterior=(jnp.append(pose, belief.mean[3:] + correction[3:]), sandwich(to_world, P)),
+        )
+
+    def difference(self, mean: Array, base: Array) -> Array:
+        """Of the states, the heading's wrapped."""
+        apart = mean - base
+        return apart.at[2].set(wrap_angle(apart[2]))
+
+    def moved(self, base: Array, error: Array) -> Array:
+        """The sum, its heading wrapped."""
+        mean = base + error
+        return mean.at[2].set(wrap_angle(mean[2]))
+
+    def _first(self, pose: Array, covariance: Array, obs: Observation) -> tuple[Array, Array]:
+        """The state of a hypothesis that starts: a pose, at rest as far as the odometry tells."""
+        zero = jnp.zeros((3, 3), pose.dtype)
+        velocity = jnp.diag(self.initial_velocity_sigma**2)
+        return self._with_odometry(
+            jnp.append(pose, jnp.zeros(3, pose.dtype)),
+            jnp.block([[covariance, zero], [zero, velocity]]),
+            obs,
+        )
+
+    def _later(self, mean: Array, P: Array, obs: Observation) -> tuple[Array, Array]:
+        """The state `dt_s` later (Eq. 9)."""
+        dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
+        eye, zero = jnp.eye(3, dtype=dtype), jnp.zeros((3, 3), dtype)
+        A = jnp.block([[eye, dt_s * eye], [zero, eye]])
+        density = sandwich(_turn(mean[2]), kalman.as_matrix(self.acceleration_density))
+        Q = kalman.white_acceleration(density, dt_s).astype(dtype)
+        mean = jnp.sum(A * mean[None], axis=1)
+        mean = mean.at[2].set(wrap_angle(mean[2]))
+        return mean, kalman.predict_covariance(P, A, Q)
+
+    def _with_odometry(self, mean: Array, P: Array, obs: Observation) -> tuple[Array, Array]:
+        """The state after speed and steering were measured, at its own heading."""
+        dtype = mean.dtype
+        speed_mps, steering_rad = (
+            jnp.asarray(value, dtype) for value in (obs.speed_mps, obs.steering_rad)
+        )
+        velocity = bicycle.velocity_world(
+            speed_mps, steering_rad, mean[2], self.vehicle.wheelbase_m
+        )
+        turned_velocity = jnp.stack([-velocity[1], velocity[0], jnp.zeros_like(speed_mps)])
+        H = jnp.eye(3, 6, k=3, dtype=dtype).at[:, 2].set(-turned_velocity)
+        R = sandwich(_turn(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(dtype)
+        present = jnp.full(3, jnp.asarray(obs.has_odometry, dtype))
+        seen = kalman.hide_rows(velocity - mean[3:], H, R, present)
+        correction, P, _ = kalman.update(P, *seen)
+        return self.moved(mean, correction), P
+
+
+def _turn(angle_rad: Array) -> Array:
+    """(x, y, psi) turned about z."""
+    c, s, zero, one = jnp.cos(angle_rad), jnp.sin(angle_rad), angle_rad * 0, angle_rad * 0 + 1
+    rows = ([c, -s, zero], [s, c, zero], [zero, zero, one])
+    return jnp.stack([jnp.stack(row) for row in rows])

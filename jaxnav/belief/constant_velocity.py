@@ -1,0 +1,136 @@
+"""A filter for bodies that move freely: pose on SE(3) and twist."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.belief import kalman
+from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
+from jaxnav.belief.motion import Belief, Motion, Offer, contradicted, followed, forgotten, unstarted
+from jaxnav.models.geometry import cayley, inverse_cayley
+from jaxnav.numerics.small_matrices import cholesky, log_det
+from jaxnav.pose.observation import Observation
+
+
+class ConstantVelocity(Motion):
+    """A body that moves freely: pose on SE(3) and body twist, for hand-held and aerial rigs.
+
+    The mean is (wxyz, xyz) of T_world_vehicle followed by the twist (m/s, rad/s) in vehicle axes;
+    the 12 error states are xi in `T_world_vehicle * cay(xi)` and the twist's own error. There is no
+    odometry. Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
+    """
+
+    acceleration_density: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([1.0**2] * 3 + [2.0**2] * 3)
+    )  # (m/s^2)^2/Hz three times, (rad/s^2)^2/Hz three times; or the matrix
+    vision_floor: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.002] * 3 + [0.002] * 3)
+    )  # standard deviations, m and rad; or their covariance
+    initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
+    )  # m/s and rad/s
+    lost_sigma_m: float = 0.5  # a prediction less certain than this is forgotten
+    gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 % (RELIABILITY R1); inf: no gate
+    max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
+    max_rejected_s: float = 7.0  # whether they agree or not
+
+    def init(self, hypotheses: int = 1) -> Belief:
+        """Hypotheses that have seen nothing."""
+        mean = jnp.zeros(13, self.acceleration_density.dtype).at[0].set(1)
+        return unstarted(mean, 12, 6, hypotheses)
+
+    def predict(self, belief: Belief, obs: Observation) -> Belief:
+        """T = T exp(twist dt); the error turns with the frame.
+
+        Without odometry a prediction is soon worth nothing: past `lost_sigma_m` the next pose
+        starts the filter anew. So it does where the gate has contradicted it too often or too long.
+        """
+        dtype, dt_s = belief.mean.dtype, jnp.asarray(obs.dt_s, belief.mean.dtype)
+        eye, zero = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
+        Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
+
+        def one(mean: Array, P: Array) -> tuple[Array, Array]:
+            motion = jaxlie.SE3.exp(mean[7:] * dt_s)
+            T_world_vehicle = (jaxlie.SE3(mean[:7]) @ motion).normalize()
+            F = jnp.block([[motion.inverse().adjoint(), dt_s * eye], [zero, eye]])
+            return (
+                jnp.append(T_world_vehicle.wxyz_xyz, mean[7:]),
+                kalman.predict_covariance(P, F, Q),
+            )
+
+        mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
+        variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
+        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
+        wrong = self.lost(belief)
+        lost = wrong | ~(variance_m2 < self.lost_sigma_m**2)
+        return forgotten(predicted, lost, dt_s)
+
+    def lost(self, belief: Belief) -> Bool[Array, " K"]:
+        """Whether the gate has contradicted a hypothesis too often or too long."""
+        return contradicted(belief, self.max_rejections, self.max_rejected_s)
+
+    def poses(self, belief: Belief) -> PoseBelief:
+        """The pose part of the state."""
+        return PoseBelief(
+            jaxlie.SE3(belief.mean[:, :7]),
+            belief.covariance[:, :6, :6],
+            belief.log_weight,
+            belief.initialised,
+            jnp.eye(6, dtype=belief.mean.dtype),
+            jnp.zeros((6, 0), belief.mean.dtype),
+            self.gate_nis,
+        )
+
+    def measure(self, belief: Belief, measured: PoseMeasurement, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has chosen a candidate, in 6 dof."""
+        mean, P = belief.mean, belief.covariance
+        wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
+        log_volume = log_det(cholesky(measured.covariance)) / 2
+        R = measured.covariance + kalman.as_covariance(self.vision_floor)
+        innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
+        correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, 12, dtype=P.dtype), R)
+        return Offer(
+            kalman.whitened(innovation, S),
+            gate_nis=self.gate_nis,
+            log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
+            first=self._first(wxyz_xyz, R),
+            posterior=(self.moved(mean, correction), posterior),
+        )
+
+    def follow(self, belief: Belief, measured: PosePosterior, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has corrected its pose, in 6 dof."""
+        T = measured.T_world_vehicle
+        correction, P = followed(
+            belief.covariance,
+            jaxlie.SE3(belief.mean[:7]),
+            T,
+            measured.covariance,
+            jnp.eye(6, dtype=belief.mean.dtype),
+        )
+        return Offer(
+            measured.innovation,
+            gate_nis=self.gate_nis,
+            log_likelihood=measured.log_likelihood,
+            inflation=measured.inflation,
+            first=self._first(T.wxyz_xyz, measured.covariance),
+            posterior=(jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:]), P),
+        )
+
+    def difference(self, mean: Array, base: Array) -> Array:
+        """(xi, twist): from the pose `base`, in its axes."""
+        T_base_other = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
+        return jnp.append(inverse_cayley(T_base_other), mean[7:] - base[7:])
+
+    def moved(self, base: Array, error: Array) -> Array:
+        """The pose times cay(xi), the twist plus its error."""
+        T = (jaxlie.SE3(base[:7]) @ cayley(error[:6])).normalize()
+        return jnp.append(T.wxyz_xyz, base[7:] + error[6:])
+
+    def _first(self, wxyz_xyz: Array, covariance: Array) -> tuple[Array, Array]:
+        """The state of a body that starts: a pose, at rest as far as anybody knows."""
+        zero = jnp.zeros((6, 6), wxyz_xyz.dtype)
+        velocity = jnp.diag(self.initial_velocity_sigma**2)
+        P = jnp.block([[covariance, zero], [zero, velocity]])
+        return jnp.append(wxyz_xyz, jnp.zeros(6, wxyz_xyz.dtype)), P

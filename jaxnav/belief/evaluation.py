@@ -1,0 +1,41 @@
+"""Estimates held against the truth: which branch was taken, and how far off it was."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.models.geometry import rotation_error_rad, safe_norm
+from jaxnav.pose.candidates import Candidates
+
+OUTLIER_DEG = 10.0
+
+
+class Branch(eqx.Module):
+    """What the truth says of one choice. A frame is at most one of `wrong` and `outlier`."""
+
+    judged: Bool[Array, ""]  # a candidate was taken
+    wrong: Bool[Array, ""]  # another candidate is closer to the truth in angle
+    outlier: Bool[Array, ""]  # no candidate lies within 10 degrees of the truth
+    ambiguous: Bool[Array, ""]  # there was more than one candidate
+
+
+def judge_branch(
+    candidates: Candidates, selected: Int[Array, ""], T_world_vehicle_true: jaxlie.SE3
+) -> Branch:
+    """Whether the selected candidate is the one nearest to the truth in angle."""
+    angles_rad = jax.vmap(
+        lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T_world_vehicle_true)
+    )(candidates.T_vehicle_world)
+    angles_rad = jnp.where(candidates.valid, angles_rad, jnp.inf)
+    nearest_rad = jnp.min(angles_rad)
+    judged = selected >= 0
+    outlier = judged & (nearest_rad > jnp.deg2rad(OUTLIER_DEG))
+    wrong = judged & ~outlier & (angles_rad[jnp.maximum(selected, 0)] > nearest_rad)
+    return Branch(judged, wrong, outlier, judged & (jnp.sum(candidates.valid) > 1))
+
+
+def position_error_m(T_a_b: jaxlie.SE3, T_a_c: jaxlie.SE3) -> Float[Array, ""]:
+    """Distance between two positions, m."""
+    return safe_norm(T_a_b.translation() - T_a_c.translation())

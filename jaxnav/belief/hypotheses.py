@@ -1,0 +1,282 @@
+"""A bank of hypotheses that postpones the choice between the poses of a marker.
+
+Range and bearing of a marker are measured well; the direction it is seen from is not, and its
+likelihood has two peaks or, under much noise, one flat valley. So the bank starts as a fan over
+the viewing direction. Each hypothesis then minimises the paper's e = e1 + e2 in its whitened form,
+
+    |r(T)|^2 / sigma^2 + |xi|^2_P,      T = T_prior exp(xi),
+
+straight on the corners, instead of comparing e at two poses. How well the minimum explains the
+corners, and how much of its prior it leaves, weighs the hypothesis; motion across the line of
+sight drives the true one and its mirror image apart.
+
+Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27 (Laplace's evidence);
+Alspach, Sorenson (1972) (Gaussian sums).
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
+from jaxnav.belief.fan import CANDIDATES, fan, normalised
+from jaxnav.belief.map_fit import Fit, fit
+from jaxnav.models.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
+from jaxnav.numerics.levenberg_marquardt import found
+from jaxnav.numerics.small_matrices import applied, cholesky, product, ranks, sandwich, solve_lower
+from jaxnav.numerics.trees import where
+from jaxnav.pose.candidates import Candidates
+from jaxnav.pose.observation import Snapshot
+
+
+class MultiHypothesis(eqx.Module):
+    """Every pose that explains what was seen so far, weighed; the heaviest is reported.
+
+    `flip_probability` is the mass farther than `far_rad` from the reported pose, its own tails
+    included. The bank calls itself decided when hypotheses of less than `decided_mass` lie that
+    far off and the orientation is known to `decided_sigma_rad`; until then the car explores (see
+    `control.py`).
+
+    It can't decide while nothing moves and the image is silent, and it takes the corner errors of
+    different frames for independent: tell it the sigma of their sum, calibration included.
+    """
+
+    hypotheses: int = eqx.field(static=True, default=24)  # >= 5
+    max_steps: int = eqx.field(static=True, default=6)
+    floor_m: float = 0.0001  # of what successive frames get wrong alike (RELIABILITY R8)
+    floor_rad: float = 0.0001
+    merge_distance: float = 0.6  # Mahalanobis, between two means that become one
+    linear_rad: float = float(np.deg2rad(3.0))  # an angle, and as much of the range
+    forget_log_weight: float = -20.0  # lighter ones are dropped
+    outlier_log_evidence: float = -12.0  # what a single frame can say against a hypothesis
+    max_inflation: float = 10.0  # of a covariance, where prediction and corners disagree
+    max_misfit: float = np.inf  # times a corner's sigma, where no pose explains the corners
+    gate: float = 30.0  # whitened squared distance to the corners' own minimum; above: an outlier
+    far_rad: float = float(np.deg2rad(20.0))
+    decided_mass: float = 3e-5
+    decided_sigma_rad: float = float(np.deg2rad(12.0))
+
+    def __check_init__(self) -> None:
+        least = CANDIDATES + 2
+        if self.hypotheses < least:
+            raise ValueError(f"hypotheses must be at least {least}: a fan and the candidates")
+
+    def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
+        """Weigh the hypotheses by the corners, and say what pose each has measured."""
+        any_seen = jnp.any(snapshot.seen.visible)
+        snapshot = self._trusted(snapshot, candidates)
+        starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
+        count, bank = prior.log_weight.shape[0], prior
+        if count == self.hypotheses:  # else whoever left the rest away knows that none starts
+            bank = _started(starts, prior, candidates, snapshot)
+        floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
+        # All slots take as many steps as the slowest: empty ones do what the heaviest does.
+        heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
+        does_as = jnp.where(bank.initialised, jnp.arange(count), heaviest)
+        starts_at = _at(_poses(bank), does_as)
+        fits = fit(
+            starts_at.T_world_vehicle, starts_at.covariance, prior, snapshot, floor, self.max_steps
+        )
+        alive = bank.initialised & fits.finite
+        inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
+        posteriors = _inflated(fits.posterior, inflation)
+        evidence = self._evidence(fits, inflation, alive, candidates, starts)
+        log_weight = normalised(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
+        alive = alive & (log_weight > self.forget_log_weight)
+
+        # What the gate keeps out moves nothing: such a hypothesis is where it was predicted.
+        passes = starts | (_nis(posteriors) <= prior.gate_nis * inflation)
+        after = where(passes, _poses(posteriors), _poses(bank))
+        best = jnp.argmax(log_weight)
+        T_best = _at(after, best).T_world_vehicle
+        apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(after.T_world_vehicle)
+        sigmas_rad = safe_sqrt(jnp.trace(after.covariance[:, 3:, 3:], axis1=1, axis2=2))
+        mass = jnp.where(alive, jnp.exp(log_weight), 0)
+        far = jnp.sum(jnp.where(apart_rad > self.far_rad, mass, 0))
+        flip_probability = jnp.sum(mass * _beyond(self.far_rad, apart_rad, sigmas_rad))
+        to_best_rad = jax.vmap(lambda T: rotation_error_rad(T.inverse(), T_best))(
+            candidates.T_vehicle_world
+        )
+        costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
+        located = jnp.any(alive)
+        own = heir = jnp.arange(count)
+        if count > 1:
+            heir = jax.lax.cond(
+                jnp.sum(alive) > 1,
+                lambda: self._heirs(after, log_weight, alive, prior.freedom, snapshot),
+                lambda: own,
+            )
+        return Selection(
+            measured=eqx.tree_at(lambda m: m.taken, posteriors, alive & any_seen),
+            kept=alive & ~starts,
+            log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
+            heir=found(heir),
+            costs=costs,
+            selected=jnp.where(jnp.any(candidates.valid) & located, jnp.argmin(costs), -1),
+            flip_probability=jnp.where(located, flip_probability, 0),
+            decided=located
+            & (far < self.decided_mass)
+            & (sigmas_rad[best] < self.decided_sigma_rad),
+        )
+
+    def _trusted(self, snapshot: Snapshot, candidates: Candidates) -> Snapshot:
+        """The corners, trusted no more than their own misfit allows.
+
+        Where not even the best pose explains them within three sigmas of chi-square, their sigma is
+        larger than they say: a blurred, bent or half hidden marker.
+        """
+        seen = snapshot.seen
+        misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+        freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
+        scale = jnp.sqrt(_excess(jnp.where(jnp.isfinite(misfit), misfit, 0), freedom))
+        scale = jnp.minimum(scale, self.max_misfit)
+        return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, seen.sigma_px * scale)
+
+    def _inflation(
+        self, fits: Fit, alive: Bool[Array, " K"], starts: Array, freedom: int
+    ) -> Float[Array, ""]:
+        """By how much more than they say predictions and corners vary.
+
+        Where they contradict each other even in the hypothesis where they do least, all are wrong
+        alike: wheels slip, a stamp is late, a camera has turned.
+        """
+        least = jnp.min(jnp.where(alive, _nis(fits.posterior), jnp.inf))
+        known = jnp.isfinite(least) & ~starts
+        excess = _excess(jnp.where(known, least, 0), jnp.asarray(freedom, least.dtype))
+        return jnp.minimum(excess, self.max_inflation).astype(least.dtype)
+
+    def _evidence(
+        self,
+        fits: Fit,
+        inflation: Float[Array, ""],
+        alive: Bool[Array, " K"],
+        candidates: Candidates,
+        starts: Array,
+    ) -> Float[Array, " K"]:
+        """What this frame adds to the log-weights, bounded; nothing where it fits none of them."""
+        forgiven = jnp.where(alive, _nis(fits.posterior), 0) * (1 - 1 / inflation) / 2
+        log_evidence = fits.log_evidence + forgiven
+        best = jnp.max(jnp.where(alive, log_evidence, -jnp.inf))
+        bounded = jnp.maximum(log_evidence - best, self.outlier_log_evidence)
+        free_cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+        least = jnp.min(jnp.where(alive, fits.cost, jnp.inf))
+        fits_one = starts | (least - free_cost < self.gate)
+        return jnp.where(alive & fits_one, bounded, 0)
+
+    def _heirs(
+        self,
+        poses: "_Poses",
+        log_weight: Array,
+        alive: Array,
+        freedom: Array,
+        snapshot: Snapshot,
+    ) -> Int[Array, " K"]:
+        """Who takes in whom: the heaviest of those close enough to be one Gaussian.
+
+        Close is a fraction of the receiver's own sigma, or of an angle so small that the corners
+        are linear in it.
+        """
+        count = log_weight.shape[0]
+        T = poses.T_world_vehicle
+        apart = jax.vmap(jax.vmap(_apart, (None, 0)), (0, None))(T.wxyz_xyz, T.wxyz_xyz)
+        apart = jax.vmap(lambda rows: product(rows, freedom))(apart)
+        nearest_m = jnp.min(
+            safe_norm(
+                T.translation()[:, None] - snapshot.markers.Ts_world_marker.translation()[None]
+            ),
+            axis=1,
+        )
+        linear = jnp.concatenate(
+            [
+                self.linear_rad * jnp.tile(nearest_m[:, None], 3),
+                jnp.full((count, 3), self.linear_rad),
+            ],
+            1,
+        )
+        P = poses.covariance + jax.vmap(jnp.diag)(linear**2)
+        factor = jax.vmap(lambda P: cholesky(sandwich(freedom.T, P)))(P)
+        whitened = jax.vmap(lambda L, a: solve_lower(L, a.T))(factor, apart)
+        close = jnp.sum(whitened**2, axis=1) < self.merge_distance**2  # [receiver, other]
+        close = close & alive[:, None] & alive[None]
+        rank = ranks(jnp.where(alive, log_weight, -jnp.inf))
+        heavier = rank[:, None] < rank[None]
+        # A receiver is taken in by nobody itself.
+        takes = close & heavier
+        takes = takes & ~jnp.any(takes, axis=0)[:, None]
+        best_rank = jnp.where(takes, rank[:, None], count)
+        return jnp.where(jnp.any(takes, axis=0), jnp.argmin(best_rank, axis=0), jnp.arange(count))
+
+
+def _started(
+    starts: Bool[Array, ""], prior: PoseBelief, candidates: Candidates, snapshot: Snapshot
+) -> PoseBelief:
+    """The prediction, or a fan where nothing has been seen before: computed only then."""
+
+    def changing(bank: PoseBelief) -> tuple[Any, ...]:
+        return bank.T_world_vehicle.wxyz_xyz, bank.covariance, bank.log_weight, bank.initialised
+
+    wxyz_xyz, *rest = jax.lax.cond(
+        starts,
+        lambda: changing(fan(prior, candidates, snapshot, prior.log_weight.shape[0])),
+        lambda: changing(prior),
+    )
+    return eqx.tree_at(changing, prior, (wxyz_xyz, *rest))
+
+
+def _nis(posteriors: PosePosterior) -> Float[Array, " K"]:
+    return jnp.sum(posteriors.innovation**2, axis=1)
+
+
+def _inflated(posteriors: PosePosterior, inflation: Float[Array, ""]) -> PosePosterior:
+    return eqx.tree_at(
+        lambda p: (p.covariance, p.inflation),
+        posteriors,
+        (posteriors.covariance * inflation, posteriors.inflation * inflation),
+    )
+
+
+def _excess(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:
+    """Of a sum of squares over three sigmas of its chi-square; 1 below.
+
+    Source: Birge (1932), "The calculation of errors by the method of least squares".
+    """
+    return jnp.maximum(chi2 / (freedom + 3 * jnp.sqrt(2 * freedom)), 1)
+
+
+class _Poses(eqx.Module):
+    T_world_vehicle: jaxlie.SE3  # batch axis (K,)
+    covariance: Float[Array, "*K 6 6"]
+
+
+def _poses(of: PoseBelief | PosePosterior) -> _Poses:
+    return _Poses(of.T_world_vehicle, of.covariance)
+
+
+def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:
+    chosen: _Poses = jax.tree.map(lambda leaf: leaf[index], poses)
+    return chosen
+
+
+def _apart(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, " 6"]:
+    """Shift in the first pose's axes, and turn (rad, to second order), from it to the other."""
+    (w, v), (w_other, v_other) = (base[0], base[1:4]), (other[0], other[1:4])
+    cosine = w * w_other + jnp.sum(v * v_other)
+    sine = w * v_other - w_other * v - jnp.cross(v, v_other)
+    shift = applied(rotation_matrix(jaxlie.SO3(base[:4])).T, other[4:] - base[4:])
+    return jnp.append(shift, 2 * jnp.where(cosine < 0, -1, 1) * sine)
+
+
+def _beyond(
+    limit_rad: Float[Array, ""] | float,
+    apart_rad: Float[Array, " K"],
+    sigma_rad: Float[Array, " K"],
+) -> Float[Array, " K"]:
+    """Probability that an angle with that mean and sigma is farther from 0 than a limit."""
+    scale = np.sqrt(2) * jnp.maximum(sigma_rad, 1e-6)
+    below, above = (limit_rad - apart_rad) / scale, (limit_rad + apart_rad) / scale
+    return (jax.scipy.special.erfc(below) + jax.scipy.special.erfc(above)) / 2

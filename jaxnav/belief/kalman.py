@@ -1,0 +1,112 @@
+"""The linear Kalman filter: predict and update, nothing about vehicles.
+
+Source: Liu, Schofield, Shan (2023), Eqs. 8-11; the covariance update in the form of Bucy and
+Joseph (1968), since Eq. 11's (I - K H) P loses positive definiteness in float32.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnav.numerics.small_matrices import (
+    applied,
+    cho_solve,
+    cholesky,
+    log_det,
+    product,
+    sandwich,
+    solve_lower,
+)
+
+# A variance never falls below this fraction of the largest one.
+_RELATIVE_FLOOR = 1e-12
+
+
+def predict_covariance(
+    P: Float[Array, "n n"], F: Float[Array, "n n"], Q: Float[Array, "n n"]
+) -> Float[Array, "n n"]:
+    """F P F' + Q (Eq. 9), symmetric."""
+    return symmetrise(sandwich(F, P) + Q)
+
+
+def update(
+    P: Float[Array, "n n"],
+    innovation: Float[Array, " m"],
+    H: Float[Array, "m n"],
+    R: Float[Array, "m m"],
+) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, "m m"]]:
+    """Correction of the mean, posterior covariance, and innovation covariance S = H P H' + R.
+
+    A measurement that is missing is a zero row of H with a zero innovation and a unit variance,
+    uncorrelated with the rest: it changes nothing (see `hide_rows`).
+
+    Source: Eqs. 10 and 11; P = (I - K H) P (I - K H)' + K R K'.
+    """
+    HP = product(H, P)
+    S = symmetrise(product(HP, H.T) + R)
+    K = cho_solve(cholesky(S), HP).T
+    I_KH = jnp.eye(P.shape[0], dtype=P.dtype) - product(K, H)
+    posterior = symmetrise(sandwich(I_KH, P) + sandwich(K, R))
+    return applied(K, innovation), floored(posterior, P), S
+
+
+def hide_rows(
+    innovation: Float[Array, " m"],
+    H: Float[Array, "m n"],
+    R: Float[Array, "m m"],
+    present: Float[Array, " m"],
+) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, "m m"]]:
+    """The measurement with the rows that are not `present` (0 or 1) made ineffective."""
+    kept = present[:, None] * present[None, :]
+    return present * innovation, present[:, None] * H, kept * R + jnp.diag(1 - present)
+
+
+def whitened(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, " m"]:
+    """The innovation in units of its own sigma."""
+    return solve_lower(cholesky(S), innovation)
+
+
+def nis(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
+    """Normalised innovation squared, chi-square with m degrees of freedom."""
+    return jnp.sum(whitened(innovation, S) ** 2)
+
+
+def log_likelihood(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
+    """log N(innovation; 0, S) but for its constant, -m log(2 pi) / 2."""
+    factor = cholesky(S)
+    return -(jnp.sum(solve_lower(factor, innovation) ** 2) + log_det(factor)) / 2
+
+
+def floored(posterior: Float[Array, "n n"], prior: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A covariance kept positive definite next to the prior's largest variance."""
+    floor = _RELATIVE_FLOOR * jnp.max(jnp.diagonal(prior))
+    return posterior + floor * jnp.eye(prior.shape[0], dtype=prior.dtype)
+
+
+def symmetrise(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """(P + P') / 2."""
+    return (P + P.T) / 2
+
+
+def as_covariance(sigma: Float[Array, " d"] | Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """The covariance that stands for itself, or of which standard deviations are given."""
+    return jnp.diag(sigma**2) if sigma.ndim == 1 else sigma
+
+
+def as_matrix(density: Float[Array, " d"] | Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """The matrix itself, or the one with that diagonal."""
+    return jnp.diag(density) if density.ndim == 1 else density
+
+
+def white_acceleration(
+    density: Float[Array, " d"] | Float[Array, "d d"], dt_s: Float[Array, ""] | float
+) -> Float[Array, "2*d 2*d"]:
+    """Q of a position-velocity state driven by white acceleration.
+
+    Args:
+        density: power spectral density, (m/s^2)^2/Hz or (rad/s^2)^2/Hz: of each axis, or a matrix.
+        dt_s: sample period.
+
+    Source: Bar-Shalom, Li, Kirubarajan (2001), Eq. 6.2.2-12.
+    """
+    D = as_matrix(density)
+    return jnp.block([[D * dt_s**3 / 3, D * dt_s**2 / 2], [D * dt_s**2 / 2, D * dt_s]])

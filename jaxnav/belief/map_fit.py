@@ -1,0 +1,245 @@
+"""The update of hypotheses: the minimum of the paper's e next to its prediction.
+
+    e(T) = |r(T)|^2 / sigma^2 + |xi|^2_P,      T = T_prior cay(xi),
+
+minimised over the directions in which the vehicle can move, instead of compared at two poses; with
+Laplace's evidence for the prediction, which weighs it.
+
+Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.belief.ambiguity import PoseBelief, PosePosterior
+from jaxnav.models.geometry import cayley, cayley_jacobian, rotation_matrix
+from jaxnav.numerics.levenberg_marquardt import ImplicitGradient, NormalEquations, NormalEquationsLM
+from jaxnav.numerics.small_matrices import (
+    applied,
+    cho_solve,
+    cholesky,
+    gram,
+    log_det,
+    product,
+    sandwich,
+    solve_lower,
+    solve_positive,
+    solve_upper,
+)
+from jaxnav.pose.linearised import crossed, reprojection_rows, turned, wrench
+from jaxnav.pose.observation import Snapshot, log_sigmas
+
+
+class Fit(eqx.Module):
+    """The minimum of e next to a prediction."""
+
+    posterior: PosePosterior
+    cost: Float[Array, "*K"]  # |r|^2 / sigma^2 at the minimum
+    log_evidence: Float[Array, "*K"]
+    finite: Bool[Array, "*K"]
+
+
+def fit(
+    T_world_prior: jaxlie.SE3,
+    covariance: Float[Array, "K 6 6"],
+    prior: PoseBelief,
+    snapshot: Snapshot,
+    floor: Float[Array, " 6"],
+    max_steps: int,
+) -> Fit:
+    """Minimise e over u, in units of the prediction's own sigma: xi = freedom L u, P = L L'.
+
+    Args:
+        T_world_prior: K predictions.
+        floor: standard deviations (m, rad) of what successive frames get wrong alike, which no
+            number of frames averages out.
+
+    Returns:
+        K minima, along the leading axis of every leaf.
+    """
+    freedom, nuisance = prior.freedom, prior.nuisance
+    d, dtype = freedom.shape[1], covariance.dtype
+    eye = jnp.eye(d, dtype=dtype)
+    P = jax.vmap(lambda P: sandwich(freedom.T, P))(covariance)
+    variances = jnp.diagonal(P, axis1=1, axis2=2)
+    usable = jnp.all(jnp.isfinite(P), axis=(1, 2)) & (jnp.min(variances, axis=1) > 0)
+    root = jax.vmap(cholesky)(jnp.where(usable[:, None, None], P, eye[None]))
+    spread = jax.vmap(lambda L: product(freedom, L))(root)
+    linearised, log_nuisance = _linearised(
+        T_world_prior, jnp.moveaxis(spread, 0, -1), nuisance, snapshot
+    )
+
+    def with_prediction(u: Array, _: None) -> tuple[Any, NormalEquations]:
+        r, normal = linearised(u)
+        return jnp.concatenate([r, u]), NormalEquations(
+            normal.information + eye[:, :, None], normal.gradient + u
+        )
+
+    tolerance = 1e-10 if dtype == jnp.float64 else 1e-5
+    solution: optx.Solution = optx.least_squares(
+        with_prediction,
+        NormalEquationsLM(rtol=tolerance, atol=tolerance),
+        jnp.zeros((d, covariance.shape[0]), dtype),
+        has_aux=True,
+        max_steps=max_steps,
+        adjoint=ImplicitGradient(),
+        throw=False,
+    )
+    r, normal = linearised(solution.value)
+    fused: Fit = jax.vmap(
+        partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 5)
+    )(
+        T_world_prior,
+        usable,
+        root,
+        spread,
+        solution.value,
+        jnp.sum(r**2, axis=0),
+        normal.gradient,
+        normal.information,
+        log_nuisance - log_sigmas(snapshot.seen),
+    )
+    return fused
+
+
+def _linearised(
+    T_world_prior: jaxlie.SE3,
+    spread: Float[Array, "6 d K"],
+    nuisance: Float[Array, "6 t"],
+    snapshot: Snapshot,
+) -> tuple[Callable[[Float[Array, "d K"]], tuple[Array, NormalEquations]], Float[Array, " K"]]:
+    """The whitened residuals (m, K) of u (d, K) in the nuisance that suits them best, with their
+    normal equations, and the logarithm of how much of its prior the corners leave the nuisance."""
+    rows = reprojection_rows(snapshot.rig, snapshot.seen)
+    corners_world = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
+    T_prior_world = T_world_prior.inverse()
+    R = jnp.moveaxis(jax.vmap(rotation_matrix)(T_prior_world.rotation()), 0, -1)
+    shift = T_prior_world.translation().T[:, None]
+    corners = jnp.sum(R[:, :, None] * corners_world.T[None, :, :, None], axis=1) + shift
+    log_nuisance = jnp.zeros_like(corners[0, 0])
+    if nuisance.shape[1]:
+        # The nuisance is small: residuals are linear in it.
+        _, slope = rows(corners)
+        J_t = -jnp.sum(_answers(slope, corners)[:, None] * nuisance[:, :, None, None], axis=0)
+        eye = jnp.eye(nuisance.shape[1], dtype=R.dtype)
+        information = gram(J_t) + eye[:, :, None]
+        best_t = solve_positive(information[:, :, None], J_t)
+        factors = jax.vmap(cholesky, in_axes=-1)(information)
+        log_nuisance = -jax.vmap(log_det)(factors) / 2
+
+    def linearised(u: Array) -> tuple[Array, NormalEquations]:
+        xi = jnp.sum(spread * u[None], axis=1)
+        half, shift = xi[3:] / 2, xi[:3]
+        per_norm = 1 / (1 + jnp.sum(half**2, axis=0))
+        # cay(-xi) moves the corners; d cay(xi) = cay(xi) cay(J d), see `cayley_jacobian`.
+        moved = turned(-half, corners) - (shift + _swung(-half, shift))[:, None]
+        turn = (spread[3:] - crossed(half[:, None], spread[3:])) * per_norm[None, None]
+        along = spread[:3] + _swung(-half[:, None], spread[:3])
+        along = along - crossed(shift[:, None] / 2, turn)
+        twist = jnp.concatenate([along, turn])
+        residual, slope = rows(moved)
+        J = -jnp.sum(_answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
+        r = residual.reshape(J.shape[1:])
+        if nuisance.shape[1]:
+            # In the best nuisance, whose own prior pays for it. J and r each by itself: the
+            # gradient follows from r and the wrench alone, and so do its derivatives.
+            best = -jnp.sum(best_t.reshape(-1, *residual.shape) * residual[None], axis=(1, 2))
+            best_J = -jnp.sum(best_t[None] * J[:, None], axis=2)
+            J = jnp.concatenate(
+                [J + jnp.sum(best_J[:, :, None] * J_t[None], axis=1), best_J], axis=1
+            )
+            shifted = jnp.sum(best[:, None] * J_t, axis=0)
+            residual = residual + shifted.reshape(residual.shape)
+            r = jnp.concatenate([r + shifted, best])
+        w = jnp.concatenate(wrench((residual, slope), moved))
+        return r, NormalEquations(gram(J), -jnp.sum(twist * w[:, None], axis=0))
+
+    return linearised, log_nuisance
+
+
+def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
+    """What cay adds to a shift: it turns while it shifts."""
+    swing = crossed(half, shift)
+    return (swing + crossed(half, swing)) / (1 + jnp.sum(half**2, axis=0))[None]
+
+
+def _answers(slope: Float[Array, "3 2 P K"], points: Float[Array, "3 P K"]) -> Array:
+    """How residuals answer to a shift and a turn of all corners about the origin, (6, 2 P, K)."""
+    answers = jnp.concatenate([slope, crossed(points[:, None], slope)])
+    return answers.reshape(6, -1, answers.shape[-1])
+
+
+def _fused(
+    T_world_prior: jaxlie.SE3,
+    usable: Bool[Array, ""],
+    root: Float[Array, "d d"],
+    spread: Float[Array, "6 d"],
+    u: Float[Array, " d"],
+    cost: Float[Array, ""],
+    gradient: Float[Array, " d"],
+    information: Float[Array, "d d"],
+    log_scale: Float[Array, ""],
+    *,
+    freedom: Float[Array, "6 d"],
+    floor: Float[Array, " 6"],
+) -> Fit:
+    """Prediction and corners at one minimum: posterior and evidence."""
+    dtype = u.dtype
+    eye = jnp.eye(u.shape[0], dtype=dtype)
+    log_evidence = -(cost + jnp.sum(u**2)) / 2 - log_det(cholesky(information + eye)) / 2
+
+    # What the corners say by themselves: u_alone, with covariance R; fused with the prediction.
+    ridge = jnp.sqrt(jnp.finfo(dtype).eps)
+    alone = cholesky(information + ridge * eye)
+    u_alone = u - cho_solve(alone, gradient)
+    unspread = solve_lower(root, eye)
+    N = sandwich(unspread, sandwich(freedom.T, jnp.diag(floor**2)))
+    R = cho_solve(alone, eye) + N
+    sigma = cholesky(R + eye)  # of u_alone about the prediction
+    contradiction = solve_lower(sigma, u_alone)
+    u_fused = solve_upper(sigma, contradiction)
+    C = _between(information + ridge * eye, N)
+    # The corners given the prediction: what fits to no pose, and the pose that fits best.
+    misfit = cost - jnp.sum(gradient * (u - u_alone))
+    log_likelihood = (
+        log_scale - (misfit + log_det(alone) + jnp.sum(contradiction**2) + log_det(sigma)) / 2
+    )
+    xi = applied(spread, u_fused)
+    T = (T_world_prior @ cayley(xi)).normalize()
+    carry = product(cayley_jacobian(xi), spread)
+    posterior_covariance = sandwich(carry, C)
+    numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], contradiction]
+    finite = usable & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
+    return Fit(
+        posterior=PosePosterior(
+            jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, T_world_prior.wxyz_xyz)),
+            jnp.where(finite, posterior_covariance, jnp.eye(6, dtype=dtype)),
+            jnp.where(finite, contradiction, jnp.inf),
+            jnp.ones((), dtype),
+            jnp.where(finite, log_likelihood, 0),
+            finite,
+        ),
+        cost=jnp.where(finite, cost, jnp.inf),
+        log_evidence=jnp.where(finite, log_evidence, -jnp.inf),
+        finite=finite,
+    )
+
+
+def _between(A: Float[Array, "d d"], N: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """R (I + R)^-1 for R = A^-1 + N: the covariance between a prediction I and a measurement R.
+
+    As sums of squares, which no rounding makes indefinite, however much surer than the prediction
+    the measurement is: with M = (I + N)^-1 it is M (A + M)^-1 M + M (N + N^2) M.
+    """
+    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+    M = gram(solve_lower(cholesky(eye + N), eye).T)
+    corners = solve_lower(cholesky(A + M), M)
+    return gram(corners.T) + sandwich(M, N) + gram(product(M, N))

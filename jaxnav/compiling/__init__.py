@@ -1,0 +1,1 @@
+"""Programs that are compiled once on a machine, and kept."""

@@ -1,0 +1,111 @@
+"""What a car calls of a navigator, compiled once on a machine: `Navigator.step`, and others."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+
+from jaxnav.compiling import executables
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.navigator import Navigator, Step, jitted_step
+
+
+def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
+    """`jax.jit(navigator.step)`, whose first call loads what another process has compiled.
+
+    See `compiled`.
+    """
+    if folder is None:
+        return partial(jitted_step, navigator)
+    return compiled(Navigator.step, navigator, folder)
+
+
+def compiled(
+    function: Callable[..., Any], navigator: Navigator, folder: Path | None
+) -> Callable[..., Any]:
+    """`jax.jit(function)` of a navigator, whose first call loads what another process has compiled.
+
+    Executables hold none of the navigator's numbers: a car that was calibrated anew loads what it
+    compiled before. The call raises TypeError when the arguments' shapes or types change from
+    call to call.
+
+    Args:
+        function: of a navigator and of further trees of arrays; one of jaxnav's own.
+        folder: of executables, see `keep_in`. Without one, and where the navigator has parts that
+            are not jaxnav's own, nothing is kept.
+
+    Returns:
+        The function of the further trees.
+    """
+    navigator = bare(navigator)
+    if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
+        return partial(_jitted(function), navigator)
+    numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
+    ready: dict[Any, tuple[Any, Any]] = {}  # a program for each set of fields that are there
+
+    def call(*told: Any) -> Any:
+        leaves, given = jax.tree.flatten(told)
+        if given not in ready:
+            ready[given] = executables.program(function, (navigator, *told), folder)
+        program, returned = ready[given]
+        return jax.tree.unflatten(returned, program([*numbers, *leaves]))
+
+    return call
+
+
+def is_compiled(
+    function: Callable[..., Any], navigator: Navigator, folder: Path, *told: Any
+) -> bool:
+    """Whether `compiled(function, navigator, folder)(*told)` finds its executable in the folder."""
+    return executables.is_kept(function, (bare(navigator), *told), folder)
+
+
+def bare(navigator: Navigator) -> Navigator:
+    """Without what its vehicle's sensors are off by and what its map counts from: those numbers
+    are static, no leaves, and nothing is computed with them."""
+
+    def without(part: Any) -> Any:
+        if isinstance(part, MarkerMap):
+            return part.without_origin()
+        if not isinstance(part, Vehicle):
+            return part
+        return replace(
+            part,
+            speed_scale=1.0,
+            steering_gain=1.0,
+            steering_offset_rad=0.0,
+            camera_delay_s=0.0,
+        )
+
+    return jax.tree.map(
+        without, navigator, is_leaf=lambda part: isinstance(part, Vehicle | MarkerMap)
+    )
+
+
+@cache
+def _jitted(function: Callable[..., Any]) -> Callable[..., Any]:
+    """One program for all navigators of a structure."""
+    return jax.jit(function)
+
+
+def _is_ours(part: Any) -> bool:
+    return isinstance(part, jaxlie.MatrixLieGroup) or type(part).__module__.startswith("jaxnav.")
+
+
+def _parts(module: Any) -> Iterator[Any]:
+    """A module and all that it consists of."""
+    yield module
+    parts = jax.tree.leaves(
+        list(vars(module).values()) if isinstance(module, eqx.Module) else [],
+        is_leaf=lambda part: isinstance(part, eqx.Module | jaxlie.MatrixLieGroup),
+    )
+    for part in parts:
+        if isinstance(part, eqx.Module | jaxlie.MatrixLieGroup):
+            yield from _parts(part)

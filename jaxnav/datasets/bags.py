@@ -1,0 +1,158 @@
+"""ROS 1 bags, compressed or not, read without ROS.
+
+Message definitions come from the bag itself. Of all its messages two kinds matter here: marker
+detections (`apriltag_msgs/ApriltagArrayStamped`, TagSLAM's) and transforms (`/tf`).
+"""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxnav.datasets.bag_readers import Ros1Reader, checked_message, typestore
+from jaxnav.datasets.recording import Rows
+from jaxnav.errors import BadInput
+from jaxnav.files import limits
+from jaxnav.files.ranges import is_within
+from jaxnav.files.unpacking import Budget, copy_bz2
+
+DETECTIONS_TYPE = "apriltag_msgs/msg/ApriltagArrayStamped"
+_TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
+
+
+@dataclass
+class Detections:
+    """What one camera saw: every message's stamp, and a row for each detection."""
+
+    message_stamps_ns: list[int] = field(default_factory=list)
+    stamps_ns: list[int] = field(default_factory=list)
+    ids: list[int] = field(default_factory=list)
+    corners_px: list[Any] = field(default_factory=list)  # (4, 2) each, in the message's order
+
+
+@dataclass
+class Bag:
+    """The contents of a bag that concern us."""
+
+    topics: dict[str, str] = field(default_factory=dict)  # every topic -> its message type
+    detections: dict[str, Detections] = field(default_factory=dict)  # by topic
+    # (parent, child) -> stamp in ns -> (7,) wxyz xyz, the pose of the child in the parent
+    transforms: dict[tuple[str, str], dict[int, tuple[float, ...]]] = field(default_factory=dict)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a file is called a ROS 1 bag."""
+    return path.name.endswith((".bag", ".bag.bz2"))
+
+
+def read_bag(path: Path) -> Bag:
+    """Read a .bag or .bag.bz2.
+
+    Raises:
+        BadInput: not a bag, or one that ends too early.
+    """
+    with decompressed(path) as plain:
+        try:
+            return _read(plain)
+        except Exception as error:
+            # The reader meets whatever bytes a file holds, and raises whatever they lead to.
+            problem = f"is not a readable ROS 1 bag ({type(error).__name__}: {error})"
+            raise BadInput(path, problem) from None
+
+
+@contextmanager
+def decompressed(path: Path) -> Iterator[Path]:
+    """The bag itself, or a temporary copy that is gone afterwards."""
+    try:
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        raise BadInput(path, f"can't be read: {(error.strerror or str(error)).lower()}") from None
+    if path.suffix != ".bz2":
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="jaxnav-") as folder:
+        plain = Path(folder) / path.stem
+        try:
+            with plain.open("wb") as target:
+                copy_bz2(path, target, Budget.of_file(path))
+        except (OSError, EOFError, ValueError) as error:
+            raise BadInput(path, f"can't be decompressed: {str(error).lower()}") from None
+        yield plain
+
+
+def _read(path: Path) -> Bag:
+    bag = Bag()
+    with Ros1Reader(path) as reader:
+        bag.topics = {connection.topic: connection.msgtype for connection in reader.connections}
+        kinds = (DETECTIONS_TYPE, *_TF_TYPES)
+        wanted = [c for c in reader.connections if c.msgtype in kinds]
+        types = typestore(wanted, {})
+        for connection, _, raw in reader.messages(connections=wanted) if wanted else ():
+            kind = connection.msgtype
+            message = types.deserialize_ros1(checked_message(kind, raw), kind)
+            if connection.msgtype == DETECTIONS_TYPE:
+                _add_detections(bag.detections.setdefault(connection.topic, Detections()), message)
+            else:
+                _add_transforms(bag.transforms, message)
+    return bag
+
+
+def _add_detections(detections: Detections, message: Any) -> None:
+    stamp_ns = _nanoseconds(message.header)
+    if len(message.apriltags) > limits.IN_VIEW:
+        raise ValueError(f"a frame of more than {limits.IN_VIEW} detections")
+    if len(detections.ids) > limits.DETECTIONS:
+        raise ValueError(f"more than {limits.DETECTIONS} detections")
+    detections.message_stamps_ns.append(stamp_ns)
+    for tag in message.apriltags:
+        if len(tag.corners) != 4:
+            raise ValueError(f"a detection of marker {tag.id} has {len(tag.corners)} corners")
+        detections.stamps_ns.append(stamp_ns)
+        detections.ids.append(int(tag.id))
+        detections.corners_px.append(np.array([(corner.x, corner.y) for corner in tag.corners]))
+
+
+def _add_transforms(
+    transforms: dict[tuple[str, str], dict[int, tuple[float, ...]]], message: Any
+) -> None:
+    for stamped in message.transforms:
+        edge = (stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/"))
+        q, p = stamped.transform.rotation, stamped.transform.translation
+        pose = (q.w, q.x, q.y, q.z, p.x, p.y, p.z)
+        if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[:4]) - 1) > 1e-3:
+            raise ValueError(f"the transform from {edge[1]} to {edge[0]} is not rigid")
+        if not is_within("position_m", pose[4:]).all():
+            raise ValueError(f"the transform from {edge[1]} to {edge[0]} leads out of the world")
+        transforms.setdefault(edge, {})[_nanoseconds(stamped.header)] = pose
+
+
+def _nanoseconds(header: Any) -> int:
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def topics_found(recorded: Sequence[Bag]) -> str:
+    """The topics of some bags, for a message."""
+    topics = sorted({f"{topic} ({kind})" for bag in recorded for topic, kind in bag.topics.items()})
+    return f"topics found: {', '.join(topics) or 'none'}"
+
+
+def rows_of_topics(topics: Sequence[Detections]) -> Rows:
+    """One table from the detections of every camera, in the order of the rig."""
+    frame_stamps = [stamp for topic in topics for stamp in topic.message_stamps_ns]
+    return Rows(
+        stamps_ns=np.array([s for topic in topics for s in topic.stamps_ns], np.int64),
+        cameras=np.repeat(np.arange(len(topics)), [len(topic.ids) for topic in topics]),
+        ids=np.array([i for topic in topics for i in topic.ids], np.int64),
+        corners_px=_corners_array([c for topic in topics for c in topic.corners_px]),
+        frame_stamps_ns=np.unique(np.array(frame_stamps, np.int64)),
+    )
+
+
+def _corners_array(corners_px: list[Any]) -> np.ndarray:
+    """(N, 4, 2), also of none."""
+    return np.asarray(corners_px, float).reshape(-1, 4, 2)

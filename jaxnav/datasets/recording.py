@@ -1,0 +1,172 @@
+"""Recorded marker detections of a camera rig, as arrays of fixed shape.
+
+The vehicle frame is the rig's body, the world is the marker map's frame.
+
+Conventions of the recordings that exist, as found in their data:
+
+* Corners come counter-clockwise from the bottom left (AprilTag's order); ours go clockwise from
+  the top left. The marker frame is ours already: x right, y up, z towards the reader.
+* Pixels are taken as they are. Calibration and reference were computed from the same corners, so
+  a shift by half a pixel would only make them disagree (reprojection of the reference over 31 297
+  detections: 1.11 px RMS a coordinate as recorded, 1.20 and 1.22 px half a pixel to either side).
+* A marker that one camera reports twice in one frame is not used in that frame and camera: one of
+  the two is false, and missing a sighting costs less than believing a false one.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxnav.errors import BadInput
+from jaxnav.files.ranges import is_within
+from jaxnav.models.conventions import APRILTAG_FIRST_CORNER, TL_TR_BR_BL
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+
+TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Where the vehicle was according to someone else, one row a frame of the recording."""
+
+    stamps_ns: Int[np.ndarray, " F"]
+    T_world_vehicle: Float[np.ndarray, "F 7"]  # wxyz xyz, m; the identity where not valid
+    valid: Bool[np.ndarray, " F"]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What C cameras saw of M markers in F frames, N sightings.
+
+    Ten minutes of a map of a thousand markers are 70 million lanes, of which as good as all are
+    hidden: `lanes` gives those of some frames.
+    """
+
+    name: str
+    stamps_ns: Int[np.ndarray, " F"]  # increasing
+    seen_at: Int[np.ndarray, "3 N"]  # frame, camera, marker of each sighting, in this order
+    seen_px: Float[np.ndarray, "N 4 2"]  # TL TR BR BL
+    rig: CameraRig
+    markers: MarkerMap
+    reference: Reference | None
+    unmapped_detections: int  # of markers that are not in the map
+    dropped_detections: int  # reported twice, or with a corner that is nowhere
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def corners_px(self) -> Float[np.ndarray, "F C M 4 2"]:
+        """Of all frames, zeros where hidden: for short recordings and small maps."""
+        return self.lanes(np.arange(len(self)))[0]
+
+    @property
+    def visible(self) -> Bool[np.ndarray, "F C M"]:
+        """Of all frames."""
+        return self.lanes(np.arange(len(self)))[1]
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "F M"]:
+        """Whether any camera saw a marker."""
+        seen = np.zeros((len(self), len(self.markers.ids)), bool)
+        seen[self.seen_at[0], self.seen_at[2]] = True
+        return seen
+
+    def lanes(
+        self, frames: Int[np.ndarray, " K"]
+    ) -> tuple[Float[np.ndarray, "K C M 4 2"], Bool[np.ndarray, "K C M"]]:
+        """Corners, zeros where hidden, and what is visible, of some frames in any order."""
+        shape = (len(frames), len(self.rig), len(self.markers.ids))
+        corners_px, visible = np.zeros((*shape, 4, 2)), np.zeros(shape, bool)
+        begin = np.searchsorted(self.seen_at[0], frames)
+        count = np.searchsorted(self.seen_at[0], frames, side="right") - begin
+        row = np.repeat(np.arange(len(frames)), count)
+        sighting = np.arange(len(row)) + np.repeat(begin - np.cumsum(count) + count, count)
+        _, camera, marker = self.seen_at[:, sighting]
+        corners_px[row, camera, marker] = self.seen_px[sighting]
+        visible[row, camera, marker] = True
+        return corners_px, visible
+
+    def first(self, frames: int) -> "Recording":
+        """The first frames alone."""
+        kept = np.searchsorted(self.seen_at[0], frames)
+        reference = self.reference
+        if reference is not None:
+            reference = Reference(
+                reference.stamps_ns[:frames],
+                reference.T_world_vehicle[:frames],
+                reference.valid[:frames],
+            )
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[:frames],
+            seen_at=self.seen_at[:, :kept],
+            seen_px=self.seen_px[:kept],
+            reference=reference,
+        )
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Detections as a table, N rows, as they come out of a file."""
+
+    stamps_ns: Int[np.ndarray, " N"]
+    cameras: Int[np.ndarray, " N"]  # index in the rig
+    ids: Int[np.ndarray, " N"]
+    corners_px: Float[np.ndarray, "N 4 2"]  # BL BR TR TL
+    frame_stamps_ns: Int[np.ndarray, " F"]  # of all frames, those without a detection as well
+
+
+def assemble(
+    name: str,
+    rows: Rows,
+    rig: CameraRig,
+    markers: MarkerMap,
+    poses: dict[int, np.ndarray] | None = None,
+) -> Recording:
+    """A recording from a table of detections.
+
+    Args:
+        poses: the reference, stamp in ns -> (7,) wxyz xyz of the vehicle in the world.
+
+    Raises:
+        BadInput: two families share an id in the map; the detections do not tell families.
+    """
+    if len(set(markers.ids)) < len(markers.ids):
+        raise BadInput("--markers-file", "ids must differ: the recording does not tell families")
+    stamps = np.unique(rows.frame_stamps_ns)
+    index_of_id = {marker_id: index for index, marker_id in enumerate(markers.ids)}
+    index = np.array([index_of_id.get(int(marker_id), -1) for marker_id in rows.ids], int)
+    mapped = index >= 0
+    finite = is_within("corner_px", rows.corners_px).all(axis=(1, 2))
+    frame = np.searchsorted(stamps, rows.stamps_ns)
+
+    used = np.flatnonzero(mapped & finite)
+    shape = (len(stamps), len(rig), len(markers.ids))
+    at = np.ravel_multi_index((frame[mapped], rows.cameras[mapped], index[mapped]), shape)
+    once = np.ones(len(rows.ids), bool)
+    _, which, reports = np.unique(at, return_inverse=True, return_counts=True)
+    once[mapped] = reports[which] == 1
+    used = used[once[used]]
+    used = used[np.lexsort((index[used], rows.cameras[used], frame[used]))]
+    return Recording(
+        name=name,
+        stamps_ns=stamps,
+        seen_at=np.stack([frame[used], rows.cameras[used], index[used]]),
+        seen_px=rows.corners_px[used][:, TO_OURS],
+        rig=rig,
+        markers=markers,
+        reference=None if poses is None else _align(stamps, poses),
+        unmapped_detections=int(np.sum(~mapped)),
+        dropped_detections=int(np.sum(mapped)) - len(used),
+    )
+
+
+def _align(stamps_ns: np.ndarray, poses: dict[int, np.ndarray]) -> Reference:
+    T_world_vehicle = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(stamps_ns), 1))
+    valid = np.array([int(stamp) in poses for stamp in stamps_ns], bool)
+    for row in np.flatnonzero(valid):
+        T_world_vehicle[row] = poses[int(stamps_ns[row])]
+    return Reference(stamps_ns, T_world_vehicle, valid)

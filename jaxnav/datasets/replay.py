@@ -1,0 +1,253 @@
+"""A recording through the estimator: every frame localised, in 6 degrees of freedom.
+
+The very `Navigator.step` that runs on a vehicle is scanned over the frames, a chunk at a time.
+"""
+
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.belief.ambiguity import Selector
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.evaluation import Branch, judge_branch
+from jaxnav.datasets.recording import Recording
+from jaxnav.errors import BadInput
+from jaxnav.files import Params, apply_params, limits
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.origin import opposite, poses_in_world
+from jaxnav.models.rig import CameraRig
+from jaxnav.navigator import Navigator, State
+from jaxnav.pose.candidates import find_candidates
+from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot
+
+CHUNK_FRAMES = 64
+SIGMA_SAMPLES = 512  # detections that tell how far a recording's corners scatter
+MAX_DT_S = 1.0  # between two frames; a longer pause is a prediction for one second
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A localised recording. `tracks` is 1 where all markers serve one pose, else the map's M."""
+
+    T_world_vehicle: Float[np.ndarray, "F tracks 7"]
+    seen: Bool[np.ndarray, "F tracks"]  # a marker of the track was in view
+    located: Bool[np.ndarray, "F tracks"]
+    flip_probability: Float[np.ndarray, "F tracks"]
+    branch: Branch  # leaves (F, tracks); meaningless where there is no reference
+    frames_per_second: float  # compilation excluded
+    corner_sigma_px: float  # what the filter was told
+
+
+class _Frames(eqx.Module):
+    """Frames as `scan` takes them, leading axis (F,) or none."""
+
+    corners_px: Float[Array, "*F C M 4 2"]
+    visible: Bool[Array, "*F C M"]
+    dt_s: Float[Array, "*F"]
+    T_world_vehicle_true: Float[Array, "*F 7"]
+
+
+def replay(
+    recording: Recording,
+    selector: Selector,
+    one_at_a_time: bool = False,
+    corner_sigma_px: float | None = None,
+    progress: Callable[[int], object] = lambda frames: None,
+    params: Params | None = None,
+) -> Replay:
+    """Localise the rig in every frame.
+
+    Args:
+        recording: frames, rig and map.
+        selector: which candidate is believed.
+        one_at_a_time: every marker for itself, as if it were the only one; M tracks.
+        corner_sigma_px: standard deviation of a corner coordinate, by default that of `params`,
+            or as the recording itself tells, see `estimate_corner_sigma_px`.
+        progress: called with the number of frames done since the last call.
+        params: in place of the navigator's own.
+
+    Raises:
+        BadInput: a parameter that does not fit a rig that moves freely.
+    """
+    params = Params.of({}, "") if params is None else params
+    if corner_sigma_px is not None:
+        params = params.without("corner_sigma_px")
+    elif "corner_sigma_px" not in params.values:
+        corner_sigma_px = estimate_corner_sigma_px(recording)
+    navigator = Navigator(
+        rig=recording.rig,
+        markers=recording.markers,
+        selector=selector,
+        motion=ConstantVelocity(),
+        corner_sigma_px=1.0 if corner_sigma_px is None else corner_sigma_px,
+    )
+    navigator = apply_params(navigator, params)
+    corner_sigma_px = float(navigator.corner_sigma_px)
+    tracks = len(recording.markers.ids) if one_at_a_time else 1
+    if tracks * len(recording) > limits.TRACKED_POSES:
+        problem = (
+            f"{len(recording)} frames of {tracks} markers are more than {limits.TRACKED_POSES}"
+        )
+        raise BadInput("--markers one-at-a-time", f"{problem} poses: take fewer frames (--limit)")
+    state = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)), navigator.init()
+    )
+    total = len(recording)
+    run_chunk = _run_chunk.lower(navigator, state, _frames(recording, 0), one_at_a_time).compile()
+    started = time.perf_counter()
+    chunks = []
+    for begin in range(0, total, CHUNK_FRAMES):
+        state, outputs = run_chunk(navigator, state, _frames(recording, begin))
+        chunks.append(jax.device_get(outputs))
+        progress(min(CHUNK_FRAMES, total - begin))
+    elapsed_s = time.perf_counter() - started
+    wxyz_xyz, seen, located, flip_probability, branch = jax.tree.map(
+        lambda *leaves: np.concatenate(leaves)[:total], *chunks
+    )
+    Ts_world_vehicle = np.asarray(poses_in_world(wxyz_xyz, recording.markers.origin_m))
+    return Replay(
+        Ts_world_vehicle,
+        seen,
+        located,
+        flip_probability,
+        branch,
+        total / elapsed_s,
+        corner_sigma_px,
+    )
+
+
+def estimate_corner_sigma_px(recording: Recording) -> float:
+    """How far a recording's corners scatter, from single markers in single cameras.
+
+    The best pose of one marker leaves 2 of 8 coordinates over: its e1 is sigma^2 times chi-square
+    with 2 degrees of freedom, whatever the map and the extrinsics are worth. The median over the
+    recording is not moved by a few bad detections. What calibration adds is `MODEL_SIGMA_PX`.
+    """
+    sightings = len(recording.seen_px)
+    if not sightings:
+        return 1.0
+    picks = np.linspace(0, sightings - 1, min(sightings, SIGMA_SAMPLES)).astype(int)
+    _, cameras, marker_indices = recording.seen_at[:, picks]
+    padding = SIGMA_SAMPLES - len(picks)
+
+    def padded(rows: np.ndarray) -> Array:
+        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)]))
+
+    e1_px2 = _best_e1_px2(
+        recording.rig,
+        recording.markers,
+        padded(recording.seen_px[picks]),
+        padded(cameras),
+        padded(marker_indices),
+    )
+    sigma_px = np.sqrt(np.median(np.asarray(e1_px2)[: len(picks)]) / (2 * np.log(2)))
+    return float(np.hypot(sigma_px, MODEL_SIGMA_PX))
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
+def _best_e1_px2(
+    rig: CameraRig, markers: MarkerMap, corners_px: Array, camera: Array, marker: Array
+) -> Array:
+    """e1 of the best pose of one marker in one camera."""
+    seen = jnp.arange(len(rig)) == camera
+    obs = Observation(jnp.broadcast_to(corners_px, (seen.shape[0], 1, 4, 2)), seen[:, None])
+    candidates = find_candidates(Snapshot.create(rig, _single(markers, marker), obs))
+    return jnp.min(jnp.where(candidates.valid, candidates.e1_px2, jnp.inf))
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _run_chunk(
+    navigator: Navigator, state: State, chunk: _Frames, one_at_a_time: bool
+) -> tuple[State, tuple]:
+    """All tracks through the frames of a chunk; `state` has a leading axis (tracks,)."""
+    markers = navigator.markers
+
+    def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, tuple]:
+        obs = Observation(frame.corners_px, frame.visible, dt_s=frame.dt_s)
+        state, out = eqx.tree_at(lambda n: n.markers, navigator, markers).step(state, obs)
+        truth = jaxlie.SE3(frame.T_world_vehicle_true)
+        branch = judge_branch(out.candidates, out.selected, truth)
+        pose = out.T_world_vehicle.wxyz_xyz
+        return state, (pose, out.selected >= 0, out.located, out.flip_probability, branch)
+
+    def step(state: State, frame: _Frames) -> tuple[State, tuple]:
+        def alone(state: State, marker: Array) -> tuple[State, tuple]:
+            seen_alone = _Frames(
+                frame.corners_px[:, marker][:, None],
+                frame.visible[:, marker][:, None],
+                frame.dt_s,
+                frame.T_world_vehicle_true,
+            )
+            return outputs_of(_single(markers, marker), state, seen_alone)
+
+        def together(state: State, _: Array) -> tuple[State, tuple]:
+            return outputs_of(markers, state, frame)
+
+        tracks = jnp.arange(len(markers.ids) if one_at_a_time else 1)
+        return jax.vmap(alone if one_at_a_time else together)(state, tracks)
+
+    return jax.lax.scan(step, state, chunk)
+
+
+def _single(markers: MarkerMap, index: Array) -> MarkerMap:
+    """A map of one marker, whichever it is."""
+    T_world_marker = jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[index][None])
+    return MarkerMap(T_world_marker, markers.size_m[index][None], ids=(0,), families=("",))
+
+
+def _frames(recording: Recording, begin: int) -> _Frames:
+    """A chunk of frames; those beyond the last one show nothing."""
+    frames = np.arange(begin, min(begin + CHUNK_FRAMES, len(recording)))
+    padding = CHUNK_FRAMES - len(frames)
+    dt_s = (
+        np.diff(recording.stamps_ns[frames], prepend=recording.stamps_ns[max(begin - 1, 0)]) / 1e9
+    )
+    reference = recording.reference
+    identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(frames), 1))
+    truth = identity
+    if reference is not None:
+        there = opposite(recording.markers.origin_m)
+        truth = poses_in_world(reference.T_world_vehicle[frames], there)
+    corners_px, visible = recording.lanes(frames)
+
+    def pad(rows: np.ndarray) -> Array:
+        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)]))
+
+    hidden = np.zeros((padding, *visible.shape[1:]), bool)
+    return _Frames(
+        corners_px=pad(corners_px),
+        visible=jnp.asarray(np.concatenate([visible, hidden])),
+        dt_s=pad(np.clip(dt_s, 0, MAX_DT_S)),
+        T_world_vehicle_true=pad(truth),
+    )
+
+
+def frames_in_view(seen: Bool[np.ndarray, "F tracks"]) -> Int[np.ndarray, "F tracks"]:
+    """How many frames in a row every track has been seen, this one included; 0 where it is not."""
+    frame = np.arange(len(seen))[:, None]
+    last_unseen = np.maximum.accumulate(np.where(seen, -1, frame), axis=0)
+    return np.where(seen, frame - last_unseen, 0)
+
+
+def errors(replay: Replay, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Position (m) and rotation (deg) error, (F, tracks), NaN where either pose is missing."""
+    reference = recording.reference
+    assert reference is not None
+    known = replay.seen & reference.valid[:, None]
+    estimate = jaxlie.SE3(jnp.asarray(replay.T_world_vehicle))
+    truth = jaxlie.SE3(
+        jnp.broadcast_to(jnp.asarray(reference.T_world_vehicle)[:, None], estimate.wxyz_xyz.shape)
+    )
+    position_m = np.linalg.norm(estimate.translation() - truth.translation(), axis=-1)
+    wxyz = np.asarray((estimate.rotation().inverse() @ truth.rotation()).wxyz)
+    rotation_rad = 2 * np.arctan2(np.linalg.norm(wxyz[..., 1:], axis=-1), np.abs(wxyz[..., 0]))
+    return np.where(known, position_m, np.nan), np.where(known, np.rad2deg(rotation_rad), np.nan)

@@ -1,0 +1,180 @@
+"""Drives recorded in ROS bags, as the inputs of a pilot.
+
+    topics = load_topics("topics.yaml")
+    inputs = read_ros_drive("drive.bag", topics, rig, markers, vehicle)
+
+An input is there when the recorder got it; its stamp is what the message's header says. Frames of
+several cameras with one stamp are one input, there when the last of them is.
+"""
+
+from collections.abc import Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxnav.datasets import ros_messages
+from jaxnav.datasets.ros_bags import Received, one_line, read_messages
+from jaxnav.detection import Detections
+from jaxnav.detection.image_search import ImageSearch, size_problem
+from jaxnav.errors import BadInput
+from jaxnav.files.topics import TopicMap
+from jaxnav.files.validation import at
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.pilot import Input
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.models.twists import TwistReader
+
+TOGETHER_NS = 100_000_000  # frames with one stamp that come in later than this are late, not one
+
+
+def read_ros_drive(
+    path: str | Path,
+    topics: TopicMap,
+    rig: CameraRig,
+    markers: MarkerMap,
+    vehicle: Vehicle,
+    corner_backend: str = "aruco",
+) -> list[Input]:
+    """All inputs of a bag, in the order in which they are there.
+
+    Args:
+        path: a .bag, a .bag.bz2, the folder of a ROS 2 bag, or one of its .db3 or .mcap files.
+        topics: which topic is what. Cameras of the rig that it leaves out never show a frame.
+        markers: says which families are looked for in images, and of which family an id is that
+            comes without one.
+        vehicle: turns a yaw rate into steering.
+        corner_backend: see `make_detector`; for images.
+
+    Raises:
+        BadInput: one line naming the file and the topic or key.
+    """
+    path = Path(path)
+    for name in topics.cameras:
+        if name not in rig.names:
+            problem = f"the rig has no such camera: it has {', '.join(rig.names)}"
+            raise BadInput(at(topics.path, f"cameras.{name}"), problem)
+    reader = _Reader(path, topics, rig, markers, corner_backend)
+    twists = TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
+    inputs: list[Input] = []
+    frames: list[tuple[int, Sighted]] = []
+    with closing(read_messages(path, reader.choose)) as messages:
+        for received in messages:
+            try:
+                if _same(received.topic, topics.odometry):
+                    reading = ros_messages.odometry(received.kind, received.message, twists)
+                    inputs.append(Input(received.received_ns, reading))
+                else:
+                    frames.append((received.received_ns, reader.sighted(received)))
+            except BadInput:
+                raise
+            except Exception as error:
+                # A definition in the bag may be any other than the one that its name promises.
+                problem = f"{received.topic}: a message can't be understood ({one_line(error)})"
+                raise BadInput(path, problem) from None
+    return sorted([*inputs, *together(frames)], key=lambda given: given.now_ns)
+
+
+def together(frames: Iterable[tuple[int, Sighted]]) -> list[Input]:
+    """Frames of several cameras with the same stamp as one input.
+
+    Args:
+        frames: when each was received, in that order.
+    """
+    groups: list[list[tuple[int, Sighted]]] = []
+    open_groups: dict[int, list[tuple[int, Sighted]]] = {}  # by stamp
+    for received_ns, frame in frames:
+        group = open_groups.get(frame.stamp_ns)
+        if (
+            group is None
+            or received_ns - group[0][0] > TOGETHER_NS
+            or frame.camera in (other.camera for _, other in group)
+        ):
+            group = open_groups[frame.stamp_ns] = []
+            groups.append(group)
+        group.append((received_ns, frame))
+    return [
+        Input(group[-1][0], frames=tuple(sorted((f for _, f in group), key=lambda f: f.camera)))
+        for group in groups
+    ]
+
+
+@dataclass
+class _Reader:
+    """Turns the messages of the cameras' topics into what the cameras show."""
+
+    path: Path
+    topics: TopicMap
+    rig: CameraRig
+    markers: MarkerMap
+    corner_backend: str
+    _images: ImageSearch | None = None
+
+    def __post_init__(self) -> None:
+        self._camera_of = {
+            topic.strip("/"): self.rig.names.index(name)
+            for name, topic in self.topics.cameras.items()
+        }
+        self._families = dict(zip(self.markers.ids, self.markers.families, strict=True))
+
+    def choose(self, kinds: Mapping[str, str]) -> list[str]:
+        """The topics to read, every one of a type that can be."""
+        wanted: dict[str, tuple[str, tuple[str, ...]]] = {
+            f"cameras.{name}": (topic, ros_messages.CAMERA_TYPES)
+            for name, topic in self.topics.cameras.items()
+        }
+        if self.topics.odometry is not None:
+            wanted["odometry"] = (self.topics.odometry, ros_messages.ODOMETRY_TYPES)
+        chosen = [self._found(kinds, key, *entry) for key, entry in wanted.items()]
+        if ros_messages.TAGSLAM in [kinds[topic] for topic in chosen]:
+            if len(set(self.markers.ids)) < len(self.markers.ids):
+                problem = "ids must differ: the recording does not tell families"
+                raise BadInput("--markers-file", problem)
+        return chosen
+
+    def _found(
+        self, kinds: Mapping[str, str], key: str, topic: str, expected: tuple[str, ...]
+    ) -> str:
+        where = at(self.topics.path, key)
+        found = [recorded for recorded in kinds if _same(recorded, topic)]
+        if not found:
+            listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(kinds.items()))
+            problem = f"{self.path} has no topic {topic}; topics found: {listed or 'none'}"
+            raise BadInput(where, problem)
+        if kinds[found[0]] not in expected:
+            problem = f"{topic} of {self.path} is of {kinds[found[0]]}, not of"
+            raise BadInput(where, f"{problem} {', '.join(expected)}")
+        return found[0]
+
+    def sighted(self, received: Received) -> Sighted:
+        """What a frame shows."""
+        camera = self._camera_of[received.topic.strip("/")]
+        stamp_ns = ros_messages.stamp_ns(received.message)
+        if received.kind in (ros_messages.IMAGE, ros_messages.COMPRESSED):
+            found = self._search(camera, received)
+            faults = Fault.FRAME_UNUSABLE if found is None else Fault(0)
+            return Sighted(camera, stamp_ns, found, faults)
+        found = ros_messages.detections(
+            received.kind,
+            received.message,
+            self.topics.first_corner,
+            self.topics.corner_sigma_px,
+            self._families,
+        )
+        return Sighted(camera, stamp_ns, found)
+
+    def _search(self, camera: int, received: Received) -> Detections | None:
+        image = ros_messages.grey_image(received.kind, received.message)
+        if image is None:
+            return None
+        self._images = self._images or ImageSearch(self.rig, self.markers, self.corner_backend)
+        if problem := size_problem(self.rig, camera, image):
+            raise BadInput(self.path, f"{received.topic}: {problem}")
+        return self._images.detections(camera, image)
+
+
+def _same(topic: str, other: str | None) -> bool:
+    """Whether two spellings of a topic's name mean the same."""
+    return other is not None and topic.strip("/") == other.strip("/")

@@ -1,0 +1,125 @@
+"""What ROS messages say, in our words: corners, speed and steering, images.
+
+    apriltag_msgs/AprilTagDetectionArray   apriltag_ros 2: pixels counted from the image's edge
+    apriltag_msgs/ApriltagArrayStamped     TagSLAM: pixels as its calibration counts them
+    nav_msgs/Odometry                      speed and yaw rate
+    ackermann_msgs/AckermannDriveStamped   speed and steering angle
+    sensor_msgs/Image, CompressedImage     8 bit, grey, colour or Bayer
+
+Corners are in the image that the detector was given. That of apriltag_ros is rectified: its camera
+in the rig is one without lens.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxnav.detection.types import Detections
+from jaxnav.files.images import decoded_image
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL, FirstCorner
+from jaxnav.models.twists import TwistReader
+
+APRILTAG_ROS = "apriltag_msgs/msg/AprilTagDetectionArray"
+TAGSLAM = "apriltag_msgs/msg/ApriltagArrayStamped"
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+NAV_ODOMETRY = "nav_msgs/msg/Odometry"
+ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
+CAMERA_TYPES = (APRILTAG_ROS, TAGSLAM, IMAGE, COMPRESSED)
+ODOMETRY_TYPES = (NAV_ODOMETRY, ACKERMANN)
+
+# Name in ROS -> channels, and OpenCV's conversion to grey. OpenCV names a Bayer pattern after its
+# second row and column.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "mono8": (1, None),
+    "8UC1": (1, None),
+    "bgr8": (3, cv2.COLOR_BGR2GRAY),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2GRAY),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
+}
+
+
+def stamp_ns(message: Any) -> int:
+    """When its header says that it was measured, on the clock of whoever measured it."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def detections(
+    kind: str,
+    message: Any,
+    first_corner: FirstCorner,
+    sigma_px: float,
+    families: Mapping[int, str],
+) -> Detections:
+    """The markers in a message of `APRILTAG_ROS` or `TAGSLAM`.
+
+    Args:
+        sigma_px: of every corner, along one axis.
+        families: of each id in the map; TagSLAM's messages do not tell.
+
+    Raises:
+        ValueError: a marker does not have four corners.
+    """
+    tags = message.detections if kind == APRILTAG_ROS else message.apriltags
+    corners_px = np.zeros((len(tags), 4, 2))
+    for row, tag in enumerate(tags):
+        if len(tag.corners) != 4:
+            raise ValueError(f"a detection of marker {tag.id} has {len(tag.corners)} corners")
+        corners_px[row] = [(corner.x, corner.y) for corner in tag.corners]
+    ids = [int(tag.id) for tag in tags]
+    return Detections(
+        ids=np.array(ids, int),
+        corners_px=corners_px[:, TL_TR_BR_BL[first_corner]]
+        - (APRILTAG_PIXEL_EDGE_PX if kind == APRILTAG_ROS else 0.0),
+        sigma_px=np.full((len(tags), 4), sigma_px),
+        refined=np.ones(len(tags), bool),
+        families=tuple(
+            str(tag.family) if kind == APRILTAG_ROS else families.get(i, "")
+            for tag, i in zip(tags, ids, strict=True)
+        ),
+    )
+
+
+def odometry(kind: str, message: Any, twists: TwistReader) -> Odometry:
+    """One reading, of a message of `NAV_ODOMETRY` or `ACKERMANN`.
+
+    Args:
+        twists: of the same topic's messages, in their order.
+    """
+    if kind == ACKERMANN:
+        drive = message.drive
+        return Odometry(stamp_ns(message), float(drive.speed), float(drive.steering_angle))
+    twist = message.twist.twist
+    return Odometry(stamp_ns(message), *twists.read(float(twist.linear.x), float(twist.angular.z)))
+
+
+def grey_image(kind: str, message: Any) -> np.ndarray | None:
+    """The picture in a message of `IMAGE` or `COMPRESSED`, (H, W) uint8; None where it is broken.
+
+    Raises:
+        ValueError: an encoding that we do not read.
+    """
+    data = np.asarray(message.data, np.uint8)
+    if kind == COMPRESSED:
+        return decoded_image(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if message.encoding not in _ENCODINGS:
+        known = ", ".join(_ENCODINGS)
+        raise ValueError(f"the encoding {message.encoding!r} is none of {known}")
+    channels, conversion = _ENCODINGS[message.encoding]
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    if not height or not width or step < width * channels or data.size != step * height:
+        return None
+    pixels = data.reshape(height, step)[:, : width * channels]
+    if channels > 1:
+        pixels = pixels.reshape(height, width, channels)
+    pixels = np.ascontiguousarray(pixels)
+    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))

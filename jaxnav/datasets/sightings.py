@@ -1,0 +1,140 @@
+"""Everything that the cameras of a recording saw of markers, whatever map they are of."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxnav.datasets import bags
+from jaxnav.datasets.decoded import decoded_rows
+from jaxnav.datasets.recording import TO_OURS, Rows
+from jaxnav.datasets.recordings import bag_rows
+from jaxnav.datasets.tagslam import tagslam_rows
+from jaxnav.errors import BadInput
+from jaxnav.files.ranges import is_within
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_replay import check_inputs
+from jaxnav.recording.drive_setup import DriveSetup
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """N sightings in the order of their frames.
+
+    Attributes:
+        rig: the cameras, as the recording has them where no others were given.
+        markers: the map that the recording brings along, if it does.
+        stamps_ns: (F,) of the frames, increasing.
+        frame, camera, ids: (N,).
+        corners_px: (N, 4, 2), TL TR BR BL.
+        families: (N,) texts; none where the recording does not tell.
+        odometry: of a drive, in the order in which it came.
+    """
+
+    rig: CameraRig
+    markers: MarkerMap | None
+    stamps_ns: Int[np.ndarray, " F"]
+    frame: Int[np.ndarray, " N"]
+    camera: Int[np.ndarray, " N"]
+    ids: Int[np.ndarray, " N"]
+    corners_px: Float[np.ndarray, "N 4 2"]
+    families: tuple[str, ...] | None
+    odometry: tuple[Odometry, ...]
+
+
+def read_sightings(path: str | Path, rig: CameraRig | None = None) -> Sightings:
+    """Read a drive (.mcap), a TagSLAM folder, a .bag of detections or an .npz.
+
+    A marker that a camera reports twice in a frame is left out there: one of the two is false.
+
+    Args:
+        rig: in place of the recording's own.
+
+    Raises:
+        BadInput: one line naming the file and what is wrong in it, or the flag that is missing.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _of_rows(*tagslam_rows(path, rig))
+    if not path.exists():
+        raise BadInput(path, "there is no such file or folder")
+    if path.suffix == ".mcap":
+        return _of_drive(path, rig)
+    if path.suffix == ".npz":
+        return _of_rows(*decoded_rows(path, rig))
+    if bags.is_bag(path):
+        return _of_rows(*bag_rows(path, rig))
+    problem = "is no recording: expected a .mcap, a folder, a .bag, a .bag.bz2 or an .npz"
+    raise BadInput(path, problem)
+
+
+def _of_rows(rows: Rows, rig: CameraRig) -> Sightings:
+    stamps_ns, frame = np.unique(rows.stamps_ns, return_inverse=True)
+    return _ordered(
+        rig, None, stamps_ns, frame, rows.cameras, rows.ids,
+        rows.corners_px[:, TO_OURS], None, (),
+    )  # fmt: skip
+
+
+def _of_drive(path: Path, rig: CameraRig | None) -> Sightings:
+    log = read_drive(path)
+    setup = DriveSetup.of_header(log.header, path)
+    check_inputs(log.inputs, setup, path)
+    if rig is not None and len(rig) != len(setup.rig):
+        raise BadInput("--rig", f"has {len(rig)} cameras, but {path} has {len(setup.rig)}")
+    stamps_ns: list[int] = []
+    rows: list[tuple[int, int, int, str]] = []
+    corners_px: list[np.ndarray] = []
+    # Cameras that looked at the same time reach the pilot together: they are one frame.
+    for given in log.inputs:
+        seen = [frame for frame in given.frames if frame.detections is not None]
+        if not seen:
+            continue
+        for one in seen:
+            found = one.detections
+            assert found is not None
+            for index, marker_id in enumerate(found.ids):
+                family = found.families[index]
+                rows.append((len(stamps_ns), one.camera, int(marker_id), family))
+                corners_px.append(found.corners_px[index])
+        stamps_ns.append(max(one.stamp_ns for one in seen))
+    frame, camera, ids = (np.array([row[k] for row in rows], int) for k in range(3))
+    return _ordered(
+        rig or setup.rig, setup.markers, np.array(stamps_ns, np.int64), frame, camera, ids,
+        np.array(corners_px, float).reshape(-1, 4, 2), tuple(row[3] for row in rows),
+        tuple(given.odometry for given in log.inputs if given.odometry is not None),
+    )  # fmt: skip
+
+
+def _ordered(
+    rig: CameraRig,
+    markers: MarkerMap | None,
+    stamps_ns: np.ndarray,
+    frame: np.ndarray,
+    camera: np.ndarray,
+    ids: np.ndarray,
+    corners_px: np.ndarray,
+    families: tuple[str, ...] | None,
+    odometry: tuple[Odometry, ...],
+) -> Sightings:
+    named = np.array(families if families is not None else [""] * len(ids), str)
+    keys = np.rec.fromarrays([frame, camera, ids, named])
+    _, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
+    once = (count[inverse] == 1) & is_within("corner_px", corners_px).all(axis=(1, 2))
+    kept = np.flatnonzero(once)
+    kept = kept[np.lexsort([ids[kept], camera[kept], frame[kept]])]
+    return Sightings(
+        rig=rig,
+        markers=markers,
+        stamps_ns=stamps_ns,
+        frame=frame[kept],
+        camera=camera[kept],
+        ids=ids[kept],
+        corners_px=corners_px[kept],
+        families=None if families is None else tuple(named[kept].tolist()),
+        odometry=odometry,
+    )

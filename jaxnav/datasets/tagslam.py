@@ -1,0 +1,228 @@
+"""TagSLAM's folders: bags with detections and with the result, and its three YAML files.
+
+cameras.yaml       intrinsics (Kalibr's keys), `tagtopic`, `rig_body`
+*.bag[.bz2]        detections; `/tf` with every camera, marker and the rig
+tagslam.yaml       sizes of the markers, and poses of the known ones
+camera_poses.yaml  poses of the cameras on the rig, where there is no /tf
+"""
+
+import re
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from jaxnav.datasets import bags
+from jaxnav.datasets.recording import Recording, Rows, assemble
+from jaxnav.errors import BadInput
+from jaxnav.files import kalibr, poses
+from jaxnav.files.figures import to_se3
+from jaxnav.files.markers import marker_map
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.validation import Count, ForeignEntry, Position, Size, at, validate
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+
+_FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
+
+
+class Vector(ForeignEntry):
+    """x y z: m, or a rotation vector in rad."""
+
+    x: Position
+    y: Position
+    z: Position
+
+    def xyz(self) -> list[float]:
+        """As a list."""
+        return [self.x, self.y, self.z]
+
+
+class PoseEntry(ForeignEntry):
+    """A pose in the enclosing frame."""
+
+    position: Vector
+    rotation: Vector
+
+    def pose(self) -> np.ndarray:
+        """(7,) wxyz xyz."""
+        return poses.pose_from_rotation_vector(self.rotation.xyz(), self.position.xyz())
+
+
+class TagEntry(ForeignEntry):
+    """A marker on a body."""
+
+    id: Count
+    size: Size | None = None
+    pose: PoseEntry | None = None
+
+
+class BodyEntry(ForeignEntry):
+    """A body that carries markers."""
+
+    is_static: bool = True
+    default_tag_size: Size | None = None
+    pose: PoseEntry | None = None
+    tags: list[TagEntry] = Field(default_factory=list)
+
+
+class TagSlamFile(ForeignEntry):
+    """tagslam.yaml."""
+
+    default_body: str | None = None
+    bodies: Annotated[list[dict[str, BodyEntry]], Field(min_length=1)]
+
+
+class CameraPoseEntry(ForeignEntry):
+    """A camera in camera_poses.yaml."""
+
+    pose: PoseEntry
+
+
+def read_tagslam(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -> Recording:
+    """Read a TagSLAM folder; see `read_recording`.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    found = _read(path, rig)
+    markers = markers or _markers(path, found.edges)
+    reference = {
+        stamp: _canonical(pose)
+        for (_, child), stamped in found.edges.items() if child == found.body
+        for stamp, pose in stamped.items()
+    }  # fmt: skip
+    return assemble(path.name, found.rows, found.rig, markers, reference or None)
+
+
+def tagslam_rows(path: Path, rig: CameraRig | None) -> tuple[Rows, CameraRig]:
+    """All detections of a TagSLAM folder, and the cameras that made them.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    found = _read(path, rig)
+    return found.rows, found.rig
+
+
+class _Found(NamedTuple):
+    rows: Rows
+    rig: CameraRig
+    edges: "Edges"
+    body: str
+
+
+def _read(path: Path, rig: CameraRig | None) -> _Found:
+    files = [file for file in sorted(path.iterdir()) if bags.is_bag(file)]
+    names = {file.name for file in files}
+    files = [file for file in files if file.name.removesuffix(".bz2") not in names - {file.name}]
+    if not files:
+        raise BadInput(path, "holds no .bag and no .bag.bz2")
+    chain = kalibr.camchain(path / "cameras.yaml")
+    recorded = [bags.read_bag(file) for file in files]
+    rows = bags.rows_of_topics(
+        [_detections(path, key, entry, recorded) for key, entry in chain.items()]
+    )
+    edges = {edge: stamped for bag in recorded for edge, stamped in bag.transforms.items()}
+    body = next(iter(chain.values())).rig_body or "rig"
+    rig = rig or _rig(path, chain, edges, body)
+    if len(rig) != len(chain):
+        problem = f"has {len(rig)} cameras, but {path / 'cameras.yaml'} has {len(chain)}"
+        raise BadInput("--rig", problem)
+    return _Found(rows, rig, edges, body)
+
+
+Edges = dict[tuple[str, str], dict[int, tuple[float, ...]]]
+
+
+def _detections(
+    path: Path, key: str, entry: kalibr.KalibrCamera, recorded: list[bags.Bag]
+) -> bags.Detections:
+    where = at(path / "cameras.yaml", key, "tagtopic")
+    if entry.tagtopic is None:
+        raise BadInput(where, "missing: on which topic are this camera's detections?")
+    found = [bag.detections[entry.tagtopic] for bag in recorded if entry.tagtopic in bag.detections]
+    if len(found) != 1:
+        problem = f"{len(found) or 'no'} bags have {entry.tagtopic} of {bags.DETECTIONS_TYPE}"
+        raise BadInput(where, f"{problem}; {bags.topics_found(recorded)}")
+    return found[0]
+
+
+def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: Edges, body: str) -> CameraRig:
+    Ts_camera_body = []
+    file = path / "camera_poses.yaml"
+    written = None
+    for key in chain:
+        if (body, key) in edges:
+            T_body_camera = _last(edges[body, key])
+        else:
+            written = read_mapping(file) if written is None else written
+            if key not in written:
+                raise BadInput(at(file, key), f"missing, and no /tf from {body} to {key} either")
+            T_body_camera = validate(CameraPoseEntry, written[key], file, key).pose.pose()
+        Ts_camera_body.append(poses.inverse(T_body_camera))
+    return CameraRig.create(
+        [entry.camera() for entry in chain.values()],
+        [to_se3(pose) for pose in Ts_camera_body],
+        list(chain),
+        [(entry.resolution[0], entry.resolution[1]) for entry in chain.values()],
+    )
+
+
+def _markers(path: Path, edges: Edges) -> MarkerMap:
+    """Poses from /tf, else the known ones of tagslam.yaml; sizes from tagslam.yaml."""
+    file = path / "tagslam.yaml"
+    settings = validate(TagSlamFile, read_mapping(file), file)
+    bodies = {name: entry for body in settings.bodies for name, entry in body.items()}
+    entry_of = {(name, tag.id): tag for name, body in bodies.items() for tag in body.tags}
+    Ts_world_marker: dict[int, tuple[str, np.ndarray]] = {}
+    parents = {child: (parent, stamped) for (parent, child), stamped in edges.items()}
+    for parent, child in edges:
+        number = child.removeprefix("tag_")
+        if number != child and re.fullmatch("[0-9]{1,9}", number):
+            Ts_world_marker[int(number)] = (parent, _to_root(child, parents))
+    if not Ts_world_marker:
+        for (name, tag_id), tag in entry_of.items():
+            body = bodies[name]
+            if tag.pose is not None and body.pose is not None and body.is_static:
+                T_world_marker = poses.compose(body.pose.pose(), tag.pose.pose())
+                Ts_world_marker[tag_id] = (name, T_world_marker)
+    if not Ts_world_marker:
+        problem = "has no static body with a tag of known pose, and no /tf has tags"
+        raise BadInput(at(file, "bodies"), problem)
+    ids = sorted(Ts_world_marker)
+    sizes_m = []
+    for tag_id in ids:
+        name = Ts_world_marker[tag_id][0]
+        tag_entry = entry_of.get((name, tag_id))
+        holder = bodies.get(name) or bodies.get(settings.default_body or "")
+        size_m = (tag_entry and tag_entry.size) or (holder and holder.default_tag_size)
+        if not size_m:
+            raise BadInput(
+                at(file, f"bodies.{name}.default_tag_size"), f"missing, for tag {tag_id}"
+            )
+        sizes_m.append(size_m)
+    stacked = np.stack([Ts_world_marker[tag_id][1] for tag_id in ids])
+    return marker_map(stacked, sizes_m, ids, [_FAMILY] * len(ids))
+
+
+def _to_root(
+    frame: str, parents: dict[str, tuple[str, dict[int, tuple[float, ...]]]]
+) -> np.ndarray:
+    T_root_frame = np.eye(4)
+    seen = set()
+    while frame in parents and frame not in seen:
+        seen.add(frame)
+        frame, stamped = parents[frame]
+        T_root_frame = poses.matrix(_last(stamped)) @ T_root_frame
+    return poses.pose_from_matrix(T_root_frame)
+
+
+def _last(stamped: dict[int, tuple[float, ...]]) -> np.ndarray:
+    """The latest value: what TagSLAM published after its last optimisation."""
+    return _canonical(stamped[max(stamped)])
+
+
+def _canonical(pose: tuple[float, ...]) -> np.ndarray:
+    return poses.pose_from_matrix(poses.matrix(np.array(pose)))

@@ -1,0 +1,47 @@
+"""Markers of a map looked for in the images of a rig, whatever the families."""
+
+import numpy as np
+
+from jaxnav.detection import Detections, make_detectors
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+
+
+class ImageSearch:
+    """One detector for each family of the map. Not for several threads."""
+
+    def __init__(self, rig: CameraRig, markers: MarkerMap, corner_backend: str = "aruco"):
+        """Args:
+        corner_backend: see `make_detector`.
+
+        Raises:
+            BadInput: as `make_detector`.
+        """
+        self._rig = rig
+        self._detectors = make_detectors(markers, corner_backend)
+        self._lenses: dict[int, Camera] = {}
+
+    def detections(self, camera: int, image: np.ndarray) -> Detections:
+        """All markers of the map's families in a camera's image.
+
+        Args:
+            camera: index in the rig.
+            image: (H, W) or (H, W, 3) in BGR order, uint8, of the rig's size.
+        """
+        if camera not in self._lenses:
+            self._lenses[camera] = self._rig.camera(camera)
+        lens = self._lenses[camera]
+        return Detections.concatenate([found.detect(image, lens) for found in self._detectors])
+
+
+def size_problem(rig: CameraRig, camera: int, image: np.ndarray) -> str | None:
+    """What is wrong with the size of an image of a rig's camera; None: nothing."""
+    height, width = image.shape[:2]
+    expected = rig.image_sizes_px[camera]
+    if (width, height) == expected:
+        return None
+    return (
+        f"the images are {width} x {height} px, but the rig's {rig.names[camera]!r} has "
+        f"{expected[0]} x {expected[1]} px"
+    )

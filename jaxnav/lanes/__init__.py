@@ -1,0 +1,1 @@
+"""A vmap whose lanes lie last: what simulation and tuning run thousands of drives by."""

@@ -1,0 +1,374 @@
+"""How much later than its stamps say each camera is, from a few seconds of driving.
+
+    delays = CameraDelays(rig, markers, vehicle)
+    delays.take(outcome)                 # every one of a pilot: some microseconds
+    while delays.due:                    # where nobody waits: tens of milliseconds
+        delays.solve()
+    delays.found                         # one `Delay` a camera
+
+The car drives a stretch of `STRETCH_S` as its odometer says; the corners that a camera sees on it
+lie where the car was a delay before their stamps. Little else is believed: unknown are, beside the
+delay, where the stretch began, how far the odometer's speed, steering gain and zero are off, and
+how the camera is turned, each with a prior as wide as a car needs that was never calibrated. So
+wheels that slip and cameras that hang askew don't pass for a delay; what does is that the image
+moves later than the wheels. While speed and steering stay as they are nothing tells, and sigma
+says so. `jaxnav.calibration.odometry` finds one delay for all cameras ten times as exactly, from a
+drive of a minute.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.compiling.executables import kept
+from jaxnav.loop.history import Told
+from jaxnav.loop.pilot import Outcome
+from jaxnav.models.bicycle import Vehicle, advance
+from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.observation import MODEL_SIGMA_PX
+
+STRETCH_S = 2.0  # longer ones tell more, and believe the odometer for longer
+# What a long exposure or a driver's jitter does to stamps, and the filter takes without harm: the
+# scenario `blur`.
+HARMLESS_S = 0.02
+SURE_SIGMAS = 3.0
+KNOWN_S = 0.008  # sigma, from which on a delay counts as known
+
+_READINGS, _VIEWS = 160, 96  # of a stretch, at most: 70 Hz for 2.3 s; more are thinned out
+_LEAST_VIEWS = 12
+_LEAST_MPS = 0.05  # a car that stands tells nothing
+_ROOM_S = 0.25  # of readings on either side of a stretch: as long as a delay may be
+_STRETCH_NS, _ROOM_NS = int(STRETCH_S * 1e9), int(_ROOM_S * 1e9)
+_LIMIT_S = 0.2
+_TELLS_S = 0.05  # sigma, beyond which a stretch tells nothing that would count
+_WAITING = 8  # stretches that may wait to be solved
+_EAGER = 20  # stretches of cameras, after which one every now and then will do
+_LATER_NS = 10_000_000_000
+_LEAST_SIGMA_S = 0.001
+# A view counts in full up to the 99.9th percentile of chi-square with 8 degrees of freedom.
+_FULL_WEIGHT = 26.1
+_STEPS = 15
+_DONE = 5e-3  # of a prior sigma: after such a step the next one would change nothing
+# Of x, y (m), psi (rad) at the start, the camera's turn about its axes (rad), the odometer's speed
+# and steering gain (shares), the steering's zero (rad), and the delay (s).
+_PRIOR = np.array([1.0, 1.0, 0.5, 0.03, 0.03, 0.03, 0.15, 0.15, 0.03, 0.3])
+_DELAY = len(_PRIOR) - 1
+# Readings scatter, and what they carry the car off by stays with the views that follow: beside the
+# corners' own error, and in sigmas of a stretch. So that estimates scatter as their sigmas say
+# (`benchmarks/bench_delays.py`).
+_SCATTER_PX, _INFLATION = 0.6, 1.5
+
+
+class Delay(NamedTuple):
+    """One camera's, s: how much earlier than its stamps say, corrected ones, its images were taken.
+
+    Attributes:
+        delay_s: NaN where nothing is known.
+        sigma_s: inf where nothing is known.
+        stretches: how many tell.
+    """
+
+    delay_s: float
+    sigma_s: float
+    stretches: int
+
+    @property
+    def known(self) -> bool:
+        """Whether the drive told enough."""
+        return self.sigma_s <= KNOWN_S
+
+    @property
+    def late(self) -> bool:
+        """Whether it is surely more than is harmless, to either side."""
+        return self.known and abs(self.delay_s) - SURE_SIGMAS * self.sigma_s > HARMLESS_S
+
+
+class Stretch(NamedTuple):
+    """What one camera saw on a stretch, and how the car went; times in s since its beginning."""
+
+    camera: int
+    start_pose: Float[np.ndarray, " 3"]
+    edges_s: Float[np.ndarray, " K"]  # from when on each reading holds
+    speed_mps: Float[np.ndarray, " K"]
+    steering_rad: Float[np.ndarray, " K"]
+    times_s: Float[np.ndarray, " V"]
+    marker: Int[np.ndarray, " V"]
+    corners_px: Float[np.ndarray, "V 4 2"]
+    sigma_px: Float[np.ndarray, "V 4"]
+    used: Bool[np.ndarray, " V"]
+
+
+class _View(NamedTuple):
+    """Markers seen at one instant, a row each."""
+
+    stamp_ns: int
+    camera: Int[np.ndarray, " N"]
+    marker: Int[np.ndarray, " N"]
+    corners_px: Float[np.ndarray, "N 4 2"]
+    sigma_px: Float[np.ndarray, "N 4"]
+
+
+class CameraDelays:
+    """The delays of a rig on one drive. `take` for one thread, `solve` for one, any other."""
+
+    def __init__(self, rig: CameraRig, markers: MarkerMap, vehicle: Vehicle):
+        """What the drive is driven with. What the vehicle's description corrects is corrected."""
+        self._world = rig, markers.without_origin(), vehicle.wheelbase_m
+        self._dtype = np.asarray(vehicle.wheelbase_m).dtype
+        # Nothing here grows: half a minute at 30 Hz, and a third of one at 50 Hz.
+        self._readings: deque[tuple[int, float, float]] = deque(maxlen=1024)
+        self._views: deque[_View] = deque(maxlen=1024)
+        self._open: deque[tuple[int, np.ndarray]] = deque(maxlen=_WAITING)  # begin, pose there
+        self._next_ns = 0
+        # Of every camera: sums of information, information * delay, information * delay^2.
+        self._sums = np.zeros((len(rig), 3))
+        self._counts = np.zeros(len(rig), int)
+
+    def take(self, outcome: Outcome) -> None:
+        """Remember what a pilot was told, and where it believes to be."""
+        told = outcome.told
+        if told is not None and told.odometry is not None:
+            self.read(outcome.stamp_ns, *told.odometry)
+        if told is not None and told.corners_px is not None:
+            self.seen(outcome.stamp_ns, told)
+        output = outcome.report.output
+        if outcome.now_ns >= self._next_ns and bool(output.decided):
+            self.at(outcome.now_ns, np.asarray(output.pose, float))
+
+    def read(self, stamp_ns: int, speed_mps: float, steering_rad: float) -> None:
+        """A reading, corrected; one that is older than the last is left out."""
+        if not self._readings or stamp_ns > self._readings[-1][0]:
+            self._readings.append((stamp_ns, speed_mps, steering_rad))
+
+    def seen(self, stamp_ns: int, told: Told) -> None:
+        """Corners, their stamp corrected."""
+        assert told.corners_px is not None
+        assert told.visible is not None
+        assert told.sigma_px is not None
+        camera, marker = np.nonzero(told.visible)
+        corners_px, sigma_px = told.corners_px[camera, marker], told.sigma_px[camera, marker]
+        self._views.append(_View(stamp_ns, camera, marker, corners_px, sigma_px))
+
+    def at(self, now_ns: int, pose: np.ndarray) -> None:
+        """Where the car is, about: a stretch begins if it is time for one."""
+        if now_ns >= self._next_ns:
+            self._open.append((now_ns, pose))
+            eager = self._counts.sum() < _EAGER
+            self._next_ns = now_ns + (_STRETCH_NS if eager else _LATER_NS)
+
+    @property
+    def due(self) -> bool:
+        """Whether a stretch is over and not solved."""
+        if not (self._open and self._readings):
+            return False
+        return self._readings[-1][0] > self._open[0][0] + _STRETCH_NS + _ROOM_NS
+
+    def warm_up(self) -> None:
+        """Compile, or load what was compiled."""
+        one = _View(10**9, np.zeros(1, int), np.zeros(1, int), np.zeros((1, 4, 2)), np.ones((1, 4)))
+        readings = [(k * 10**8, 0.1, 0.0) for k in range(30)]
+        self._equations(_stretch(0, 0, np.zeros(3), readings, [one], self._dtype), 0 * _PRIOR)
+
+    def solve(self) -> None:
+        """The oldest stretch that is over, camera by camera."""
+        begin_ns, pose = self._open.popleft()
+        end_ns = begin_ns + _STRETCH_NS
+        # Copied in one go: whoever drives may add to them meanwhile.
+        readings = [r for r in self._readings.copy() if r[0] - begin_ns >= -_ROOM_NS]
+        readings = [r for r in readings if r[0] <= end_ns + _ROOM_NS]
+        views = [view for view in self._views.copy() if begin_ns <= view.stamp_ns < end_ns]
+        moved = max((abs(speed_mps) for _, speed_mps, _ in readings), default=0.0) > _LEAST_MPS
+        if not moved or len(readings) < 3:
+            return
+        for camera in range(len(self._counts)):
+            among = [row for view in views if (row := _of_camera(view, camera)) is not None]
+            if len(among) < _LEAST_VIEWS:
+                continue
+            stretch = _stretch(camera, begin_ns, pose, readings, among, self._dtype)
+            delay_s, information = self._solved(stretch)
+            if information > 0:
+                self._sums[camera] += information * np.array([1.0, delay_s, delay_s**2])
+                self._counts[camera] += 1
+
+    @property
+    def found(self) -> list[Delay]:
+        """So far, of each camera."""
+        return list(map(_of_stretches, self._sums, self._counts))
+
+    @property
+    def together(self) -> Delay:
+        """So far, of all cameras as if they had one."""
+        return _of_stretches(self._sums.sum(axis=0), self._counts.sum())
+
+    @property
+    def late(self) -> bool:
+        """Whether some are surely later, or earlier, than is harmless."""
+        return self.together.late or any(one.late for one in self.found)
+
+    def _solved(self, stretch: Stretch) -> tuple[float, float]:
+        """Delay in s and its information in 1/s^2, 0 where it can't be told."""
+        p = np.zeros(len(_PRIOR))
+        p[:3] = stretch.start_pose
+        start = p.copy()
+        for _ in range(_STEPS):
+            A, b, chi2 = self._equations(stretch, p)
+            A = A + np.diag(1 / _PRIOR**2)
+            step = np.linalg.solve(A, -(b + (p - start) / _PRIOR**2))
+            if not np.isfinite(step).all():
+                return 0.0, 0.0
+            p = p + step
+            p[_DELAY] = np.clip(p[_DELAY], -_LIMIT_S, _LIMIT_S)
+            if np.max(np.abs(step) / _PRIOR) < _DONE:
+                break
+        else:
+            return 0.0, 0.0
+        numbers = 8 * int(stretch.used.sum()) - len(p)
+        variance = np.linalg.inv(A)[_DELAY, _DELAY]
+        if not variance > 0 or abs(p[_DELAY]) >= _LIMIT_S:
+            return 0.0, 0.0
+        # What the stretch alone tells, without the prior: stretches are added up.
+        information = 1 / variance - 1 / _PRIOR[_DELAY] ** 2
+        if not information > 1 / _TELLS_S**2:
+            return 0.0, 0.0
+        delay_s = p[_DELAY] / (variance * information)
+        return float(delay_s), information / (_INFLATION**2 * max(chi2 / max(numbers, 1), 1.0))
+
+    def _equations(self, stretch: Stretch, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        told = (np.int32(stretch.camera), *stretch[2:], p.astype(self._dtype))
+        A, b, chi2 = jax.device_get(_normal(*self._world, *told))
+        return A.astype(float), b.astype(float), float(chi2)
+
+
+def _of_camera(view: _View, camera: int) -> _View | None:
+    which = view.camera == camera
+    if not which.any():
+        return None
+    return _View(view.stamp_ns, *(column[which] for column in view[1:]))
+
+
+def _of_stretches(sums: np.ndarray, count: int) -> Delay:
+    """Of several stretches; where they contradict each other sigma is as large as that."""
+    information, first, second = sums
+    if not information > 0:
+        return Delay(math.nan, math.inf, 0)
+    mean_s = first / information
+    scatter = max(second - information * mean_s**2, 0.0) / max(count - 1, 1)
+    sigma_s = math.sqrt(max(scatter, 1.0) / information)
+    return Delay(float(mean_s), max(sigma_s, _LEAST_SIGMA_S), int(count))
+
+
+def _stretch(
+    camera: int,
+    begin_ns: int,
+    start_pose: np.ndarray,
+    readings: Sequence[tuple[int, float, float]],
+    views: Sequence[_View],
+    dtype: np.dtype,
+) -> Stretch:
+    """In arrays of one size: readings hold from midway after the one before."""
+    readings = _thinned(readings, _READINGS)
+    # A row for each marker of each instant.
+    rows = [(view.stamp_ns, *row) for view in views for row in zip(*view[2:], strict=True)]
+    stamps_ns, marker, corners_px, sigmas_px = zip(*_thinned(rows, _VIEWS), strict=True)
+    stamps_s = np.array([(stamp_ns - begin_ns) / 1e9 for stamp_ns, _, _ in readings])
+    edges_s = np.concatenate([stamps_s[:1], (stamps_s[1:] + stamps_s[:-1]) / 2])
+    rest, more = _READINGS - len(readings), _VIEWS - len(stamps_ns)
+
+    def padded(values: Sequence[Any] | np.ndarray, extra: int) -> np.ndarray:
+        array = np.array(values, dtype)
+        return np.concatenate([array, np.repeat(array[-1:], extra, axis=0)])
+
+    sigma_px = np.hypot(sigmas_px, math.hypot(MODEL_SIGMA_PX, _SCATTER_PX))
+    return Stretch(
+        camera,
+        start_pose,
+        # What pads begins after all that is asked for.
+        np.concatenate([edges_s, np.full(rest, 1e3)]).astype(dtype),
+        padded([speed_mps for _, speed_mps, _ in readings], rest),
+        padded([steering_rad for _, _, steering_rad in readings], rest),
+        padded([(stamp_ns - begin_ns) / 1e9 for stamp_ns in stamps_ns], more),
+        padded(marker, more).astype(np.int32),
+        padded(corners_px, more),
+        padded(sigma_px, more),
+        np.arange(_VIEWS) < len(stamps_ns),
+    )
+
+
+def _thinned(rows: Sequence[Any], most: int) -> list[Any]:
+    """Evenly, as many as there is room for."""
+    which = np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))
+    return [rows[index] for index in which]
+
+
+@kept
+def _normal(
+    rig: CameraRig,
+    markers: MarkerMap,
+    wheelbase_m: Array,
+    camera: Array,
+    edges_s: Array,
+    speed_mps: Array,
+    steering_rad: Array,
+    times_s: Array,
+    marker: Array,
+    corners_px: Array,
+    sigma_px: Array,
+    used: Array,
+    p: Array,
+) -> tuple[Array, Array, Array]:
+    """Normal equations of the views' whitened residuals, and their chi-square, at `_PRIOR`'s p."""
+
+    def residuals(p: Array) -> Array:
+        speed, steering = (1 + p[6]) * speed_mps, (1 + p[7]) * steering_rad + p[8]
+        dt_s = jnp.diff(edges_s, append=edges_s[-1:])
+        dt_s = jnp.where(dt_s < _ROOM_S + STRETCH_S, dt_s, 0.0)
+
+        # Where each reading begins to hold: sums, which cost a tenth of one step after the other.
+        zero = jnp.zeros_like(p[:3])
+        dx, dy, dpsi = jax.vmap(advance, in_axes=(None, 0, 0, 0, None))(
+            zero, speed, steering, dt_s, wheelbase_m
+        ).T
+        psi = jnp.cumsum(dpsi) - dpsi
+        dx, dy = jnp.cos(psi) * dx - jnp.sin(psi) * dy, jnp.sin(psi) * dx + jnp.cos(psi) * dy
+        nodes = jnp.stack([jnp.cumsum(dx) - dx, jnp.cumsum(dy) - dy, psi], axis=1)
+
+        def along(time_s: Array) -> Array:
+            """The pose by the odometer, from where the readings begin."""
+            at = jnp.clip(jnp.searchsorted(edges_s, time_s, side="right") - 1, 0, None)
+            after_s = time_s - edges_s[at]
+            return advance(nodes[at], speed[at], steering[at], after_s, wheelbase_m)
+
+        # From the odometer's own world to the true one.
+        T_vehicle_world = T_world_vehicle_from_planar(along(jnp.zeros_like(p[0]))).inverse()
+        T_world_world = T_world_vehicle_from_planar(p[:3]) @ T_vehicle_world
+        points_world = markers.corners_world_m[marker]
+        one = jax.tree.map(lambda leaf: leaf[camera], rig.cameras)
+        T_camera_vehicle = jax.tree.map(lambda leaf: leaf[camera], rig.Ts_camera_vehicle)
+
+        def seen(time_s: Array, points: Array) -> Array:
+            T_world_vehicle = T_world_world @ T_world_vehicle_from_planar(along(time_s - p[9]))
+            points = transform_points(T_camera_vehicle @ T_world_vehicle.inverse(), points)
+            return one.project(points + jnp.cross(p[3:6][None], points))
+
+        px = jax.vmap(seen)(times_s, points_world) - corners_px
+        return (px / sigma_px[..., None]).reshape(len(times_s), 8)
+
+    J, r = jax.jacfwd(residuals)(p), residuals(p)
+    chi2 = jnp.sum(r**2, axis=1)
+    fine = used & jnp.isfinite(chi2)
+    r, J = jnp.where(fine[:, None], r, 0), jnp.where(fine[:, None, None], J, 0)
+    # As Cauchy's where it is far off.
+    excess = jnp.maximum(chi2 / _FULL_WEIGHT, 1.0)
+    weight = jnp.where(fine, 1 / excess, 0.0)
+    rho = jnp.where(excess > 1, _FULL_WEIGHT * (1 + jnp.log(excess)), chi2)
+    A = jnp.einsum("v,vri,vrj->ij", weight, J, J)
+    b = jnp.einsum("v,vri,vr->i", weight, J, r)
+    return A, b, jnp.sum(jnp.where(fine, rho, 0.0))

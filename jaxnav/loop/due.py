@@ -1,0 +1,40 @@
+"""Which way corners should have gone in the images, where the vehicle went some way."""
+
+import math
+
+import numpy as np
+
+from jaxnav.loop.expect import expected
+from jaxnav.loop.way import Place
+from jaxnav.navigator import Navigator
+
+
+def due_px(
+    navigator: Navigator, pose: np.ndarray | None, motion: Place
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Corners before and after a motion, (C, M, 4, 2) each; None where the pose is not known.
+
+    Args:
+        pose: (x_m, y_m, psi_rad) after it, as believed. That it is not exact matters little: shifts
+            differ by as much as the distance to the marker does.
+        motion: (x_m, y_m, psi_rad) in the vehicle's axes before it.
+    """
+    if pose is None:
+        return None
+    x_m, y_m, psi_rad = map(float, pose)
+    before_rad = psi_rad - motion[2]
+    c, s = math.cos(before_rad), math.sin(before_rad)
+    before = (
+        x_m - c * motion[0] + s * motion[1],
+        y_m - s * motion[0] - c * motion[1],
+        before_rad,
+    )
+    return _quads_px(navigator, before), _quads_px(navigator, (x_m, y_m, psi_rad))
+
+
+def _quads_px(navigator: Navigator, place: Place) -> np.ndarray:
+    """Corners as seen from a place, by the program that says where to look for them."""
+    (x_m, y_m, psi_rad), dtype = place, np.asarray(navigator.corner_sigma_px).dtype
+    wxyz_xyz = np.array([math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0], dtype)
+    found = expected(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))
+    return np.asarray(found.quads_px)

@@ -1,0 +1,223 @@
+"""The filter as the loop calls it: one compiled call an event, and the history of what was told."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from jaxnav.compiling.packing import Layout, Packed
+from jaxnav.compiling.step import compiled
+from jaxnav.loop.history import Entry, History, Told
+from jaxnav.navigator import Navigator
+from jaxnav.timeline import Corners, Events, Moment, Report, advance, begin
+
+EVENTS = 64  # that one call fuses: 800 ms of odometry at 50 Hz, and of frames at 30 Hz
+
+_NOTHING = Told()
+
+# (moment, control, events, numbers) -> (moment, then, control, report), see `advance_packed`
+Program = Callable[..., tuple[Packed, Packed, Packed, Packed]]
+
+
+def advance_packed(
+    navigator: Navigator,
+    moment: Packed,
+    control: Packed,
+    events: Packed,
+    numbers: Int[Array, "4"],
+) -> tuple[Packed, Packed, Packed, Packed]:
+    """`advance`, whose arguments and results are few vectors.
+
+    Args:
+        numbers: count, new, now_us, elapsed_us.
+    """
+    given = (part.unpacked() for part in (moment, control, events))
+    returned = advance(navigator, *given, *numbers)
+    moment, then, control, report = (Layout.of(part).pack(part) for part in returned)
+    return moment, then, control, report
+
+
+def _beginning(navigator: Navigator) -> tuple[Packed, Packed]:
+    """Moment and control at the start of a drive."""
+    moment, control = begin(navigator), navigator.init().control
+    return Layout.of(moment).pack(moment), Layout.of(control).pack(control)
+
+
+@dataclass(frozen=True)
+class Fused:
+    """What came of an event. Leaves of `report` and `moment` are NumPy's."""
+
+    report: Report
+    moment: Moment
+    refused: bool  # older than all that is kept
+    events: int  # that were fused, this one and those after it
+
+
+class Estimator:
+    """One drive. The same calls give the same bits."""
+
+    def __init__(self, navigator: Navigator, program: Program | None = None):
+        """Args:
+        navigator: what to run.
+        program: `advance_packed` of the navigator, compiled; by default by `jax.jit`, see
+            `compiled`.
+        """
+        self._program = program or compiled(advance_packed, navigator, None)
+        self._first, self._control = compiled(_beginning, navigator, None)()
+        self._layouts = {seeing: _layout(navigator, seeing) for seeing in (False, True)}
+        self._odometry = (np.nan, np.nan)  # speed_mps, steering_rad: the last
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was sensed; the route goes on."""
+        self._history: History | None = None
+        self._moment = self._first
+        self._moment_ns = 0
+
+    def forget_speed(self) -> None:
+        """Command as if it had never been known: the last that was told was not true."""
+        self._odometry = (np.nan, self._odometry[1])
+
+    def warm_up(self) -> None:
+        """Compile, once for events with corners and once for those without."""
+        for seeing in (False, True):
+            numbers = np.zeros(4, np.int32)
+            self._program(self._first, self._control, self._events([], 0, seeing), numbers)
+
+    def fuse(self, told: Told | None, stamp_ns: int, now_ns: int, elapsed_ns: int) -> Fused:
+        """Take an event in, or none.
+
+        Args:
+            told: None to look at the clock only.
+            stamp_ns: when it was true.
+            now_ns: for which the pose and the command are meant.
+            elapsed_ns: since the last command.
+        """
+        if told is not None and told.odometry is not None:
+            self._odometry = told.odometry
+        placed = None
+        if told is not None:
+            if self._history is None:
+                self._history = History(self._first, stamp_ns)
+            placed = self._history.place(stamp_ns, told)
+        if placed is None:
+            base_ns = self._moment_ns if self._history is not None else now_ns
+            moment, _, report = self._call(self._moment, [], base_ns, 0, now_ns, elapsed_ns)
+            told_of = moment.fetched().unpacked()
+            return Fused(report.fetched().unpacked(), told_of, told is not None, 0)
+        base, entries = placed
+        assert self._history is not None
+        new = next(index for index, entry in enumerate(entries) if entry.told is told)
+        moment, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
+        self._moment, self._moment_ns = moment, entries[-1].stamp_ns
+        self._history.fused(moment, entries[new], then)
+        return Fused(known, moment.fetched().unpacked(), False, len(entries))
+
+    def _fused(
+        self, base: Entry, entries: list[Entry], new: int, now_ns: int, elapsed_ns: int
+    ) -> tuple[Packed, Packed, Report]:
+        """What is believed after the entries, and after the new one, and the report: in one call
+        nearly always, in several where a frame is late and the cameras are many."""
+        assert base.moment is not None
+        rows = [(entry.stamp_ns, entry.told or _NOTHING) for entry in entries]
+        moment, base_ns = base.moment, base.stamp_ns
+        if len(rows) <= EVENTS:
+            moment, then, report = self._call(moment, rows, base_ns, new, now_ns, elapsed_ns)
+            return moment, then, report.fetched().unpacked()
+        # One less: its place is what `new` means where the new event is of another part.
+        size, control = EVENTS - 1, self._control
+        for first in range(0, len(rows), size):
+            part, holds = rows[first : first + size], first <= new < first + size
+            self._control = control  # there is one command
+            index = new - first if holds else size
+            moment, after, report = self._call(moment, part, base_ns, index, now_ns, elapsed_ns)
+            base_ns = part[-1][0]
+            if holds:
+                then, found = after, report
+        return moment, then, _finding(report.fetched().unpacked(), found.fetched().unpacked())
+
+    def _call(
+        self,
+        moment: Packed,
+        rows: Sequence[tuple[int, Told]],
+        base_ns: int,
+        new: int,
+        now_ns: int,
+        elapsed_ns: int,
+    ) -> tuple[Packed, Packed, Packed]:
+        seeing = any(told.corners_px is not None for _, told in rows)
+        events = self._events(rows, base_ns, seeing)
+        now_us, elapsed_us = _us_between(base_ns, now_ns), elapsed_ns // 1000
+        numbers = np.array([len(rows), new, _int32(now_us), _int32(elapsed_us)], np.int32)
+        moment, then, self._control, report = self._program(moment, self._control, events, numbers)
+        return moment, then, report
+
+    def _events(self, rows: Sequence[tuple[int, Told]], base_ns: int, seeing: bool) -> Packed:
+        packed, events = self._layouts[seeing].room()
+        # What float32 can't hold is infinite, and so left out by the filter.
+        with np.errstate(over="ignore"):
+            self._fill(events, rows, base_ns)
+        return packed
+
+    def _fill(self, events: Events, rows: Sequence[tuple[int, Told]], base_ns: int) -> None:
+        into = vars(events)  # an attribute of an equinox module takes a us
+        speed_mps, steering_rad = into["speed_mps"], into["steering_rad"]
+        speed_mps[:], steering_rad[:] = self._odometry
+        for index, (stamp_ns, told) in enumerate(rows):
+            into["stamps_us"][index] = _int32(_us_between(base_ns, stamp_ns))
+            if told.odometry is not None:
+                speed_mps[index], steering_rad[index] = told.odometry
+                into["has_odometry"][index] = True
+            if told.corners_px is not None:
+                corners = vars(into["corners"])
+                corners["corners_px"][index] = told.corners_px
+                corners["visible"][index] = told.visible
+                corners["corner_sigma_px"][index] = told.sigma_px
+
+
+def _finding(report: Report, other: Report) -> Report:
+    """A report with what another one has found in the corners."""
+
+    def found(of: Report) -> tuple[Any, ...]:
+        output = of.output
+        return output.candidates, output.costs, output.selected, output.nis
+
+    merged: Report = eqx.tree_at(found, report, found(other))
+    return merged
+
+
+def _layout(navigator: Navigator, seeing: bool) -> Layout:
+    """Of `EVENTS`, with room for corners or without."""
+    lanes = EVENTS, len(navigator.rig), len(navigator.markers.ids)
+    dtype = navigator.corner_sigma_px.dtype
+
+    def events() -> Events:
+        corners = Corners(
+            corners_px=jnp.zeros((*lanes, 4, 2), dtype),
+            visible=jnp.zeros(lanes, bool),
+            corner_sigma_px=jnp.zeros((*lanes, 4), dtype),
+        )
+        return Events(
+            stamps_us=jnp.zeros(EVENTS, jnp.int32),
+            speed_mps=jnp.zeros(EVENTS, dtype),
+            steering_rad=jnp.zeros(EVENTS, dtype),
+            has_odometry=jnp.zeros(EVENTS, bool),
+            corners=corners if seeing else None,
+        )
+
+    return Layout.of(jax.eval_shape(events))
+
+
+def _us_between(earlier_ns: int, later_ns: int) -> int:
+    """So that times add up, whichever events they are measured from."""
+    return later_ns // 1000 - earlier_ns // 1000
+
+
+def _int32(number: int) -> int:
+    """Inside of what it can be: half an hour, in us, within which nothing came."""
+    return min(max(number, 0), 2**31 - 1)

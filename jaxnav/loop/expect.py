@@ -1,0 +1,133 @@
+"""Where each marker should appear from the present belief, so that a detector can look there first.
+
+    quads_px, visible, radius_px = expected(rig, markers, T_world_vehicle, covariance)
+
+A corner is looked for in the circle of that radius around its place in `quads_px`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.compiling.executables import kept
+from jaxnav.models.geometry import (
+    on_last_axis,
+    rotation_matrix,
+    safe_norm,
+    safe_sqrt,
+    transform_points,
+)
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+
+SIGMAS = 3.0
+# The corner's own noise, and how far a corner moves while the exposure lasts.
+MARGIN_PX = 4.0
+_SPENT = 1e-6  # of a variance is rounding
+
+
+class Expected(NamedTuple):
+    """What C cameras should see of M markers.
+
+    Attributes:
+        quads_px: corners from the mean pose, TL TR BR BL.
+        visible: the marker may be seen: printed side towards the camera, and every corner in front
+            of it and in the image, or outside of it by no more than the radius.
+        radius_px: how far a corner may be from its place.
+    """
+
+    quads_px: Float[Array, "C M 4 2"]
+    visible: Bool[Array, "C M"]
+    radius_px: Float[Array, "C M"]
+
+
+@kept
+def expected(
+    rig: CameraRig,
+    markers: MarkerMap,
+    T_world_vehicle: Float[Array, " 7"],
+    covariance: Float[Array, "3 3"],
+    margin_px: Float[Array, ""] | float = MARGIN_PX,
+) -> Expected:
+    """Where each marker should appear.
+
+    With vectors a_k whose sum of a_k a_k' is the pose's covariance, and u(x) a corner,
+
+        radius = sqrt(sum over k of max |u(x +- 3 a_k) - u(x)|^2) + margin.
+
+    Where u is straight that is 3 sqrt(trace) of the corner's covariance, beyond which a Gaussian
+    lies in at most 0.27 % of all cases. Moving the pose instead of taking a derivative keeps it
+    close to that where u bends.
+
+    Args:
+        T_world_vehicle: wxyz xyz, the mean.
+        covariance: of (x_m, y_m, psi_rad) in the world. Where it is not finite nothing is visible.
+        margin_px: added to every radius.
+    """
+    mean = jaxlie.SE3(T_world_vehicle)
+    offsets = SIGMAS * _axes(covariance)
+    # Half a turn further the vehicle would look where it looked before.
+    limit = jnp.asarray([jnp.inf, jnp.inf, jnp.pi / 2], offsets.dtype)
+    offsets = jnp.clip(offsets, -limit[None], limit[None])
+
+    def corners_px(offset: Array) -> Array:
+        return rig.project(_moved(mean, offset).inverse(), markers.corners_world_m)
+
+    quads_px = corners_px(jnp.zeros_like(offsets[0]))
+    moved_px = jax.vmap(corners_px)(jnp.stack([offsets, -offsets]).reshape(-1, 3))
+    shifts_px = safe_norm(moved_px - quads_px[None]).reshape(2, 3, *quads_px.shape[:-1])
+    spread_px = safe_norm(jnp.moveaxis(jnp.max(shifts_px, axis=0), 0, -1))
+    radius_px = jnp.max(spread_px, axis=-1) + margin_px
+    visible = _inside(rig, quads_px, radius_px) & _towards(rig, markers, mean)
+    finite = jnp.isfinite(radius_px) & jnp.all(jnp.isfinite(covariance))
+    return Expected(quads_px, visible & finite, radius_px)
+
+
+def _axes(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Rows a_k: Cholesky's columns, none where a variance is spent. No call of LAPACK, which a
+    program that is loaded from a disk does not find."""
+    rows: list[Array] = []
+    for k in range(3):
+        rest = covariance[k] - sum((row[k] * row for row in rows), jnp.zeros_like(covariance[k]))
+        spent = ~(rest[k] > _SPENT * covariance[k, k])
+        row = rest * jnp.where(spent, 0, 1 / safe_sqrt(jnp.where(spent, 1, rest[k])))
+        rows.append(jnp.where(jnp.arange(3) < k, 0, row))
+    return jnp.stack(rows)
+
+
+def _moved(T_world_vehicle: jaxlie.SE3, offset: Float[Array, " 3"]) -> jaxlie.SE3:
+    """The pose at another (x, y, psi), with the same tilt and height."""
+    shift_m = jnp.concatenate([offset[:2], jnp.zeros_like(offset[:1])])
+    return jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3.from_z_radians(offset[2]) @ T_world_vehicle.rotation(),
+        T_world_vehicle.translation() + shift_m,
+    )
+
+
+def _inside(
+    rig: CameraRig, quads_px: Float[Array, "C M 4 2"], radius_px: Float[Array, "C M"]
+) -> Bool[Array, "C M"]:
+    """Whether all corners are in the image, or beside it by no more than the radius."""
+
+    def one(quads_px: Array, radius_px: Array, size_px: Array) -> Array:
+        outside_px = jnp.maximum(-0.5 - quads_px, quads_px - on_last_axis(size_px - 0.5, quads_px))
+        return jnp.all(jnp.max(outside_px, axis=-1) <= radius_px[:, None], axis=-1)
+
+    sizes_px = jnp.asarray(rig.image_sizes_px, quads_px.dtype)
+    return jax.vmap(one)(quads_px, radius_px, sizes_px)
+
+
+def _towards(rig: CameraRig, markers: MarkerMap, T_world_vehicle: jaxlie.SE3) -> Bool[Array, "C M"]:
+    """Whether each camera is on a marker's printed side, and has all of it in front."""
+    normals = jax.vmap(rotation_matrix)(markers.Ts_world_marker.rotation())[:, :, 2]
+    Ts_world_camera = jax.vmap(lambda T: T_world_vehicle @ T.inverse())(rig.Ts_camera_vehicle)
+    towards = Ts_world_camera.translation()[:, None] - markers.Ts_world_marker.translation()[None]
+    in_front = jax.vmap(
+        lambda camera, T_world_camera: camera.in_front(
+            transform_points(T_world_camera.inverse(), markers.corners_world_m)
+        )
+    )(rig.cameras, Ts_world_camera)
+    return (jnp.sum(towards * normals[None], axis=-1) > 0) & jnp.all(in_front, axis=-1)

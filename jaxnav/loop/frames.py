@@ -1,0 +1,151 @@
+"""From frames to what they tell: which to use, and what is wrong with the others."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxnav.detection.observe import Observed, observe
+from jaxnav.detection.types import Detections
+from jaxnav.files.ranges import RANGES
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.history import Told
+from jaxnav.loop.stamps import Stamps
+from jaxnav.models.markers import MarkerMap
+
+FROZEN_AFTER = 3  # frames with the very same corners, or pictures
+_NO_FAULT = Fault(0)
+_MOST_PX = RANGES["corner_px"].most  # beyond, a corner is as good as infinite
+_NONE = Detections.concatenate([])
+
+# Whether a camera shows what it should not see any more: camera, stamp_ns, now_ns, corners_px
+# (M, 4, 2), visible (M,), their sigma_px; see `Standstill.frozen`.
+Frozen = Callable[[int, int, int, np.ndarray, np.ndarray, float], bool]
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """What one camera's frame shows.
+
+    Attributes:
+        camera: index in the rig.
+        stamp_ns: as the camera says.
+        detections: None where the frame could not be used.
+        faults: of the frame, found by whoever looked at its pixels.
+    """
+
+    camera: int
+    stamp_ns: int
+    detections: Detections | None
+    faults: Fault = _NO_FAULT
+
+
+class Frames:
+    """The frames of a drive, camera by camera.
+
+    Attributes:
+        newest_ns: when each camera last gave a frame that could be used, None: never.
+    """
+
+    def __init__(self, cameras: int, markers: MarkerMap, corner_sigma_px: float | None = None):
+        """Args:
+        corner_sigma_px: of every corner along one axis; by default as each detection says.
+        """
+        self.newest_ns: list[int | None] = [None] * cameras
+        self._newest_before_ns = list(self.newest_ns)
+        self._markers, self._corner_sigma_px = markers, corner_sigma_px
+        self._stamps = [Stamps() for _ in range(cameras)]
+        self._corners: list[tuple[bytes, int]] = [(b"", 0)] * cameras  # and how often the same
+
+    def refused(self) -> None:
+        """What was told last came too late for the filter: it is as if it had not come."""
+        self.newest_ns = list(self._newest_before_ns)
+
+    def told(
+        self, frames: Sequence[Sighted], now_ns: int, frozen: Frozen | None = None
+    ) -> tuple[Told | None, int, Fault]:
+        """What frames tell, when it was true, and what is wrong with them.
+
+        Args:
+            frozen: asked of each camera that shows markers; None: nobody knows.
+        """
+        self._newest_before_ns = list(self.newest_ns)
+        if not frames:
+            return None, now_ns, _NO_FAULT
+        faults = _NO_FAULT
+        found = [_NONE] * len(self.newest_ns)
+        stamps_ns: dict[int, int] = {}
+        for frame in frames:
+            if frame.faults:
+                faults |= frame.faults
+            stamps = self._stamps[frame.camera]
+            jumps = stamps.jumps
+            stamp_ns = stamps.take(frame.stamp_ns, now_ns)
+            if stamp_ns is None:
+                faults |= Fault.STAMP_INVALID
+                continue
+            if stamps.jumps > jumps:
+                faults |= Fault.CLOCK_JUMPED
+            if frame.detections is None:
+                continue
+            if self._frozen(frame.camera, frame.detections):
+                faults |= Fault.FRAME_FROZEN
+                continue
+            self.newest_ns[frame.camera] = max(stamp_ns, self.newest_ns[frame.camera] or 0)
+            if len(frame.detections):
+                found[frame.camera], stamps_ns[frame.camera] = frame.detections, stamp_ns
+        seen = observe(found, self._markers)
+        if seen.unknown:
+            faults |= Fault.UNKNOWN_MARKER
+        if seen.duplicates:
+            faults |= Fault.DUPLICATE_MARKER
+        if not _are_finite(seen.corners_px, seen.sigma_px):
+            faults |= Fault.CORNERS_NOT_FINITE
+            for lane in zip(*np.nonzero(seen.visible), strict=True):
+                if not _are_finite(seen.corners_px[lane], seen.sigma_px[lane]):
+                    _hide(seen, lane)
+        taken_ns, frozen_seen = self._leave_out_frozen(seen, stamps_ns, now_ns, frozen)
+        if frozen_seen:
+            faults |= Fault.FRAME_FROZEN
+        if taken_ns is None or not seen.visible.any():
+            return None, now_ns, faults
+        if self._corner_sigma_px is not None:
+            seen.sigma_px[seen.visible] = self._corner_sigma_px
+        return Told(None, seen.corners_px, seen.visible, seen.sigma_px), taken_ns, faults
+
+    def _leave_out_frozen(
+        self, seen: Observed, stamps_ns: dict[int, int], now_ns: int, frozen: Frozen | None
+    ) -> tuple[int | None, bool]:
+        """When what is left was true, and whether a camera was left out."""
+        taken_ns, left_out = None, False
+        for camera, stamp_ns in stamps_ns.items():
+            shown, corners_px = seen.visible[camera], seen.corners_px[camera]
+            if frozen is not None and shown.any():
+                sigma_px = float(seen.sigma_px[camera][shown].max())
+                if frozen(camera, stamp_ns, now_ns, corners_px, shown.copy(), sigma_px):
+                    left_out = True
+                    _hide(seen, (camera,))
+                    self.newest_ns[camera] = self._newest_before_ns[camera]
+                    continue
+            taken_ns = stamp_ns
+        return taken_ns, left_out
+
+    def _frozen(self, camera: int, detections: Detections) -> bool:
+        """Whether a camera shows the very same corners once too often."""
+        shown = detections.corners_px.tobytes() if len(detections) else b""
+        last, times = self._corners[camera]
+        repeats = shown and shown == last and np.isfinite(detections.corners_px).all()
+        times = times + 1 if repeats else 1
+        self._corners[camera] = shown, times
+        return times >= FROZEN_AFTER
+
+
+def _are_finite(corners_px: np.ndarray, sigma_px: np.ndarray) -> bool:
+    """Whether all are numbers that a vehicle can have; those of NaN compare as none."""
+    near = np.abs(corners_px).max() <= _MOST_PX
+    return bool(near and sigma_px.min() > 0 and sigma_px.max() < np.inf)
+
+
+def _hide(seen: Observed, lane: tuple[int, ...]) -> None:
+    """Make it one that shows nothing."""
+    seen.visible[lane], seen.corners_px[lane], seen.sigma_px[lane] = False, 0, 1

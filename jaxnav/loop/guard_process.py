@@ -1,0 +1,261 @@
+"""The process that owns the vehicle: it stops it, whatever becomes of the one that computes.
+
+    python -m jaxnav.loop.guard_process COMMANDS READINGS     # two descriptors of sockets
+
+`moved_vehicle` starts it and talks to it. It holds no JAX and no OpenCV, is up in a fifth of a
+second, and runs the `Guard` with its limits and corrections beside the plug-in. Each command says
+by when the next one must have come, on the clock that all processes of a machine share: one that
+comes too late is not obeyed, and where none comes in time the vehicle is stopped. So it is at once
+where the other process ends, which closes its sockets, however it ends.
+
+On the first socket JSON and commands come in and events go out; on the second a byte asks for a
+reading. All are in frames, see `Link`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import select
+import signal
+import socket
+import struct
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from jaxnav.errors import BadInput
+from jaxnav.loop import plugins
+from jaxnav.loop.corrections import Corrections
+from jaxnav.loop.guard import Guard
+from jaxnav.loop.interfaces import Ending, Setup, SharesProcess, Vehicle
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.output import FreeOutput
+from jaxnav.loop.priority import NICE, lower_nice
+
+COMMAND = struct.Struct("<cQqdd")  # kind, sequence, deadline_ns, steering_rad, throttle
+READING = struct.Struct("<cqdd?")  # kind, stamp_ns, speed_mps, steering_rad, valid
+KIND_COMMAND, KIND_TEXT, KIND_READING, KIND_FAILED = b"c", b"t", b"r", b"f"
+HEARD_WITHIN_S = 600.0  # an orphan says stop for so long to a vehicle that does not hear
+_HEAVY = ("jax", "cv2")  # what the guard's process must do without
+_PRIORITY = 20  # of the real-time class: above what computes, below the kernel's own threads
+_LARGEST = 2**24
+
+
+class Link:
+    """Frames over a stream socket: four bytes of length, then the content."""
+
+    def __init__(self, end: socket.socket):
+        self.socket = end
+        self._begun = b""
+        self._frames: list[bytes] = []
+
+    def send(self, content: bytes) -> None:
+        """All of it, or OSError."""
+        self.socket.sendall(struct.pack("<I", len(content)) + content)
+
+    def tell(self, **said: Any) -> None:
+        """A mapping as JSON."""
+        self.send(KIND_TEXT + json.dumps(said).encode())
+
+    def receive(self) -> list[bytes]:
+        """Whole frames that have come, none perhaps; waits for some bytes where none had.
+
+        Raises:
+            EOFError: the other end is closed.
+            OSError: the socket's time is over, or it broke.
+        """
+        frames, self._frames = self._frames, []
+        if frames:
+            return frames
+        more = self.socket.recv(65536)
+        if not more:
+            raise EOFError
+        self._begun += more
+        while len(self._begun) >= 4:
+            (size,) = struct.unpack_from("<I", self._begun)
+            if size > _LARGEST:
+                raise OSError(f"a frame of {size} bytes")
+            if len(self._begun) < 4 + size:
+                break
+            frames.append(self._begun[4 : 4 + size])
+            self._begun = self._begun[4 + size :]
+        return frames
+
+    def mapping(self) -> dict[str, Any]:
+        """The next one, waited for."""
+        while not (frames := self.receive()):
+            pass
+        self._frames = frames[1:]
+        said: dict[str, Any] = json.loads(frames[0][1:])
+        return said
+
+
+class CanNotMoveError(Exception):
+    """A vehicle that needs the process that computes, and why."""
+
+
+class _Missing:
+    """Rig and markers, which the guard's process does not know."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __getattr__(self, asked: str) -> Any:
+        raise CanNotMoveError(f"it looks at setup.{self._name}")
+
+
+def main(commands: int, readings: int) -> None:
+    """Serve until the vehicle may be let go of."""
+    for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTOU", "SIGPIPE"):
+        signal.signal(getattr(signal, name), signal.SIG_IGN)  # the other process hears them
+    told = os.pipe()
+    os.set_blocking(told[1], False)
+    signal.set_wakeup_fd(told[1], warn_on_full_buffer=False)
+    signal.signal(signal.SIGTERM, lambda number, frame: None)  # of a machine that shuts down
+    link = Link(socket.socket(fileno=commands))
+    asked = Link(socket.socket(fileno=readings))
+    with suppress(EOFError, OSError):
+        order = link.mapping()
+        try:
+            factory = _factory(order["vehicle"], order["path"])
+            link.tell(ready=True)
+            order = {**order, **link.mapping()}
+            vehicle = _opened(factory, order)
+        except CanNotMoveError as problem:
+            link.tell(stays=str(problem))
+            return
+        except BadInput as bad:
+            link.tell(bad=str(bad))
+            return
+        if order.get("only_stop"):
+            _stop_for_good(vehicle, order)
+            return
+        priority = _preferred()  # of this thread, and of the guard's, which it begins
+        guard = Guard(
+            vehicle,
+            Limits(**order["limits"]),
+            order["timeout_s"],
+            corrections=Corrections(**order["corrections"]),
+        )
+        threading.Thread(target=_report, args=(guard, link), daemon=True).start()
+        try:
+            link.tell(opened=float(vehicle.timeout_s), priority=priority)
+            _Server(vehicle, guard, link, asked, told[0]).serve()
+        finally:
+            guard.close(HEARD_WITHIN_S)
+            with suppress(OSError):
+                link.tell(closed=True, unheard=guard.unheard)
+
+
+class _Server:
+    """What comes in, until there is nothing left to do."""
+
+    def __init__(self, vehicle: Vehicle, guard: Guard, link: Link, asked: Link, signals: int):
+        self._vehicle, self._guard = vehicle, guard
+        self._link, self._asked, self._signals = link, asked, signals
+        self._sequence = 0
+
+    def serve(self) -> None:
+        """Commands before readings: these may take a driver's time."""
+        look = select.poll()
+        for descriptor in (self._link.socket, self._asked.socket, self._signals):
+            look.register(descriptor, select.POLLIN)
+        try:
+            while True:
+                ready = {descriptor for descriptor, _ in look.poll()}
+                if self._signals in ready:
+                    self._guard.trip("the guard's process was told to end (SIGTERM)")
+                    os.read(self._signals, 64)
+                if self._link.socket.fileno() in ready:
+                    for frame in self._link.receive():
+                        if not self._obey(frame):
+                            return
+                elif self._asked.socket.fileno() in ready:
+                    for _ in self._asked.receive():
+                        self._asked.send(self._reading())
+        except (EOFError, OSError):
+            self._guard.trip("the process that computes is gone")
+
+    def _obey(self, frame: bytes) -> bool:
+        """Whether there is more to come."""
+        if frame[:1] != KIND_COMMAND:
+            said = json.loads(frame[1:])
+            if "stop" in said:
+                self._guard.trip(said["stop"])
+            return "close" not in said
+        _, sequence, deadline_ns, steering_rad, throttle = COMMAND.unpack(frame)
+        if sequence > self._sequence:
+            if not self._sequence:
+                self._guard.arm()  # the first command: from now on they must come
+            self._sequence = sequence
+            self._guard.write(steering_rad, throttle, deadline_ns)
+        return True
+
+    def _reading(self) -> bytes:
+        over = self._vehicle.over if isinstance(self._vehicle, Ending) else None
+        try:
+            read = self._vehicle.read()
+            numbers = READING.pack(
+                KIND_READING, read.stamp_ns, read.speed_mps, read.steering_rad, read.valid
+            )
+        except OSError as error:
+            return KIND_FAILED + str(error).encode()[:1000]
+        except Exception as error:  # it can't be known what it means: the vehicle stops
+            self._guard.trip(f"the vehicle: {type(error).__name__}: {error}")
+            return KIND_FAILED + f"{type(error).__name__}: {error}".encode()[:1000]
+        return numbers + (over or "").encode()
+
+
+def _report(guard: Guard, link: Link) -> None:
+    """Say at once that it tripped: by a thread, for the other one may hang in the driver."""
+    guard.wait()
+    with suppress(OSError):
+        link.tell(tripped=guard.reason)
+
+
+def _factory(name: str, path: list[str]) -> Any:
+    sys.path[:] = path
+    factory = plugins.find("--vehicle", plugins.VEHICLES, name)
+    if isinstance(factory, SharesProcess) and factory.shares_process:
+        raise CanNotMoveError("it shares its process")
+    if found := [module for module in _HEAVY if module in sys.modules]:
+        raise CanNotMoveError(f"its module imports {' and '.join(found)}")
+    return factory
+
+
+def _opened(factory: Any, order: dict[str, Any]) -> Vehicle:
+    told: Any = order["setup"]
+    missing: Any = _Missing
+    numbers: Any = SimpleNamespace(**told["vehicle"])
+    start: Any = tuple(told["start_pose"])
+    setup = Setup(missing("rig"), missing("markers"), numbers, start, told["seed"], told["options"])
+    return plugins.opened_vehicle(order["vehicle"], factory, setup)
+
+
+def _stop_for_good(vehicle: Vehicle, order: dict[str, Any]) -> None:
+    """Of a guard whose forerunner has died."""
+    guard = Guard(vehicle, Limits(**order["limits"]), order["timeout_s"])
+    guard.close(HEARD_WITHIN_S)
+
+
+def _preferred() -> str:
+    """Have the kernel run this process first and keep its memory, as far as it may."""
+    with suppress(OSError):  # the last that is ended where memory runs out
+        Path("/proc/self/oom_score_adj").write_text("-900")
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mlockall(1)  # what is there now: MCL_CURRENT
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+        return "real-time priority"
+    return "raised priority" if lower_nice(NICE) else "no priority: it may not be raised here"
+
+
+if __name__ == "__main__":
+    with FreeOutput():  # a driver that prints of its troubles must not wait for a reader
+        main(int(sys.argv[1]), int(sys.argv[2]))
+    os._exit(0)  # the vehicle is let go of: what else a plug-in has loaded needs no end

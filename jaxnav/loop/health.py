@@ -1,0 +1,138 @@
+"""How well the vehicle is, and how fast it may go (RELIABILITY R4 and R13)."""
+
+from dataclasses import dataclass, field
+
+from jaxnav.loop.flags import Fault, Health
+
+# From bad to better only after so many good looks in a row. What merely contradicts counts up with
+# every contradiction and down with every agreement, and is bad at ten (ArduPilot's EKF check).
+LOOKS = 10
+_OFTEN = 10
+# A vehicle that is carried off restarts once, or twice where it takes the mirror pose first. Who
+# restarts more often than that believes something new every other second, and stands, until it is
+# so long ago. It is no trip of the watchdog: the drive goes on by itself.
+MOST_RESTARTS, RESTARTS_S = 3, 10.0
+
+SPEED_FACTOR = {
+    Health.INIT: 0.0,
+    Health.ALIGNED: 1.0,
+    Health.OK: 1.0,
+    Health.DEAD_RECKONING: 1.0,
+    Health.DEGRADED: 0.5,
+    Health.STOP: 0.0,
+}
+
+
+_NO_FAULT = Fault(0)
+_BROKEN = Fault.NOT_FINITE | Fault.VEHICLE_FAILED | Fault.NOTHING_MOVES | Fault.RESTARTED_OFTEN
+_LOST = Fault.UNSURE | Fault.FAR_FROM_FIX
+_SLOW = (
+    Fault.CAMERAS_STALE
+    | Fault.ODOMETRY_STALE
+    | Fault.ODOMETRY_STUCK
+    | Fault.RELOCATED
+    | Fault.WAYS_DISPUTED
+    | Fault.ODOMETRY_DOUBTFUL
+)
+
+
+@dataclass(frozen=True)
+class Timeouts:
+    """When missing data count, and when they count as too much."""
+
+    camera_stale_s: float = 0.2  # PX4
+    odometry_stale_s: float = 0.1  # PX4
+    flag_s: float = 1.0  # without a marker: dead reckoning
+    slow_s: float = 2.0
+    stop_s: float = 5.0  # PX4
+    blind_s: float = 1.0  # without a marker and without odometry: nothing tells where it goes
+    position_sigma_m: float = 0.5
+    distance_m: float = 3.0  # driven without a marker
+
+
+@dataclass(frozen=True)
+class Senses:
+    """What is known of the data at one instant. Ages in s, inf: never."""
+
+    located: bool
+    decided: bool
+    fix_age_s: float  # since corners were last believed
+    odometry_age_s: float
+    cameras_age_s: tuple[float, ...]
+    position_sigma_m: float
+    distance_m: float  # driven since corners were last believed
+    faults: Fault  # that are seen elsewhere
+    restarts: int = 0  # in the last RESTARTS_S
+    confirmed: bool = True  # by corners, more than once (R2)
+    refused: bool = False  # what is located is not where it may be
+
+
+@dataclass
+class Monitor:
+    """The health of the vehicle from one look to the next."""
+
+    timeouts: Timeouts = field(default_factory=Timeouts)
+    health: Health = Health.INIT
+    _better: int = 0  # looks in a row that would allow a better state
+    _doubts: int = 0
+
+    def look(self, senses: Senses) -> tuple[Health, Fault]:
+        """The health now, and what is wrong. Call it at a steady rate."""
+        missing = self._missing(senses)
+        faults = senses.faults | missing if missing else senses.faults
+        wanted = self._wanted(senses, faults)
+        if wanted >= self.health or self.health <= Health.OK:
+            self.health, self._better = wanted, 0
+        else:
+            self._better += 1
+            if self._better >= LOOKS:
+                self.health, self._better = wanted, 0
+        return self.health, faults
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether corners contradict what is believed more often than not."""
+        return self._doubts >= _OFTEN
+
+    def corners(self, believed: bool) -> None:
+        """Count a frame's corners that were believed, or not."""
+        self._doubts = max(self._doubts - 1, 0) if believed else min(self._doubts + 1, 2 * _OFTEN)
+
+    def _missing(self, senses: Senses) -> Fault:
+        limits = self.timeouts
+        stale = [age_s > limits.camera_stale_s for age_s in senses.cameras_age_s]
+        found = _NO_FAULT
+        if any(stale):
+            found |= Fault.CAMERA_STALE
+        if stale and all(stale):
+            found |= Fault.CAMERAS_STALE
+        if senses.odometry_age_s > limits.odometry_stale_s:
+            found |= Fault.ODOMETRY_STALE
+        if senses.restarts > MOST_RESTARTS:
+            found |= Fault.RESTARTED_OFTEN
+        if senses.located:
+            if senses.fix_age_s > limits.flag_s:
+                found |= Fault.NO_MARKER
+            if not senses.position_sigma_m <= limits.position_sigma_m and senses.decided:
+                found |= Fault.UNSURE
+            if senses.distance_m > limits.distance_m:
+                found |= Fault.FAR_FROM_FIX
+        return found
+
+    def _wanted(self, senses: Senses, faults: Fault) -> Health:
+        limits = self.timeouts
+        if faults & _BROKEN or senses.refused:
+            return Health.STOP
+        if not senses.located or (senses.decided and not senses.confirmed):
+            return Health.INIT
+        without_odometry = (
+            senses.odometry_age_s > limits.blind_s or Fault.ODOMETRY_DOUBTFUL in faults
+        )
+        blind = without_odometry and senses.fix_age_s > limits.blind_s
+        if senses.fix_age_s > limits.stop_s or blind or faults & _LOST:
+            return Health.STOP
+        if senses.fix_age_s > limits.slow_s or faults & _SLOW or self.contradicted:
+            return Health.DEGRADED
+        if Fault.NO_MARKER in faults:
+            return Health.DEAD_RECKONING
+        return Health.OK if senses.decided else Health.ALIGNED

@@ -1,0 +1,318 @@
+"""A vehicle that lives in its guard's process, as the loop sees it: like any other.
+
+guarding = GuardProcess("qcar")                  # starts; beside other work
+vehicle = guarding.open(setup, timeout_s)        # None: it can't be moved, `stays` says why
+vehicle.watch(guard.trip)                        # told when it was stopped there, or is dead
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, fields
+from typing import Any
+
+from jaxnav.errors import BadInput
+from jaxnav.loop.corrections import Corrections
+from jaxnav.loop.guard_process import (
+    COMMAND,
+    KIND_COMMAND,
+    KIND_FAILED,
+    KIND_READING,
+    READING,
+    Link,
+)
+from jaxnav.loop.interfaces import Odometry, Setup
+from jaxnav.loop.limits import Limits
+
+_MODULE = "jaxnav.loop.guard_process"
+_READ_S = 0.02  # so long a reading is waited for: a tick of the loop
+_DEAF_S = 1.0  # without an answer: then the process hangs, and another one stops the vehicle
+_CLOSES_S = 15.0  # longer than its guard says stop to a vehicle that answers now and then
+_LATEST_S = 0.03  # the guard looks every 20 ms: its deadline is so much before the time's end
+
+
+class GuardProcess:
+    """The process, from its start until it has a vehicle or is not needed.
+
+    Attributes:
+        stays: why the vehicle can't be moved; None: it can, or nobody knows yet.
+    """
+
+    def __init__(self, name: str):
+        """Start it.
+
+        Args:
+            name: of the vehicle, as `plugins.find` takes it.
+
+        Raises:
+            OSError: the machine has no room for another process.
+        """
+        self.name = name
+        self.stays: str | None = None
+        self._opens = False
+        ours, theirs = zip(socket.socketpair(), socket.socketpair(), strict=True)
+        # OpenBLAS would take memory for a thread a core, all of which would be locked.
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", _MODULE, *(str(end.fileno()) for end in theirs)],
+            pass_fds=[end.fileno() for end in theirs],
+            stdin=subprocess.DEVNULL,
+            env=environment | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # what a terminal sends is for the process that computes
+        )
+        for end in theirs:
+            end.close()
+        self.commands, self.readings = Link(ours[0]), Link(ours[1])
+        self._order: dict[str, Any] = {"vehicle": name, "path": sys.path}
+        self.commands.tell(**self._order)
+
+    def prepare(self, check: Callable[[], None]) -> None:
+        """Wait until the plug-in is imported there, or is known to stay here.
+
+        Args:
+            check: called while it waits; may raise.
+
+        Raises:
+            BadInput: the process has ended.
+        """
+        if "bad" in (answer := self._answer(check)):  # who found it here can drive it here
+            self.stays = f"there {answer['bad']}"
+
+    def open(
+        self,
+        setup: Setup,
+        limits: Limits,
+        timeout_s: float,
+        check: Callable[[], None] = lambda: None,
+    ) -> MovedVehicle | None:
+        """Open the vehicle there; None: it can't be moved after all, see `stays`.
+
+        Args:
+            timeout_s: from the last command until the vehicle has been stopped.
+            check: called while it waits; may raise.
+
+        Raises:
+            BadInput: as `plugins.open_vehicle`.
+        """
+        if self.stays is not None:
+            return None
+        numbers = {
+            field.name: float(getattr(setup.vehicle, field.name)) for field in fields(setup.vehicle)
+        }
+        told = {
+            "setup": {
+                "vehicle": numbers,
+                "start_pose": [float(value) for value in setup.start_pose],
+                "seed": setup.seed,
+                "options": dict(setup.options),
+            },
+            "limits": asdict(limits),
+            "corrections": asdict(Corrections.of(setup.vehicle)),
+            "timeout_s": timeout_s,
+        }
+        self._order |= told
+        self._opens = True
+        self.commands.tell(**told)
+        answer = self._answer(check)
+        if "bad" in answer:
+            raise BadInput(*answer["bad"].split(": ", 1))
+        if "opened" not in answer:
+            return None
+        return MovedVehicle(self, answer["opened"], answer["priority"], timeout_s)
+
+    def rescue(self) -> bool:
+        """Once this process is dead: let another one open the vehicle and stop it; whether it has.
+
+        Waits until it has.
+        """
+        another = GuardProcess(self.name)
+        try:
+            another.prepare(lambda: None)
+            another._opens = True
+            another.commands.tell(**self._order, only_stop=True)
+            return another.process.wait(_CLOSES_S) == 0
+        except (BadInput, OSError, EOFError, subprocess.TimeoutExpired):
+            return False
+        finally:
+            another.end()
+
+    def end(self) -> None:
+        """Let go of it: it stops its vehicle, if it has one, and ends by itself."""
+        if not self._opens:
+            self.process.kill()
+        for link in (self.commands, self.readings):
+            link.socket.close()
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(1.0)
+
+    def _answer(self, check: Callable[[], None]) -> dict[str, Any]:
+        while not select.select([self.commands.socket], [], [], 0.05)[0]:
+            check()
+        try:
+            answer = self.commands.mapping()
+        except (EOFError, OSError):
+            raise BadInput(
+                f"--vehicle {self.name}", f"the guard's process {ending(self.process)}"
+            ) from None
+        self.stays = answer.get("stays")
+        return answer
+
+
+class MovedVehicle:
+    """A `Vehicle`. Commands are sent and not waited for; a reading is asked for."""
+
+    def __init__(
+        self, guarding: GuardProcess, own_timeout_s: float, priority: str, timeout_s: float
+    ):
+        """See `GuardProcess.open`."""
+        self._guarding, self._own_timeout_s, self.priority = guarding, own_timeout_s, priority
+        self._timeout_ns = int((timeout_s - _LATEST_S) * 1e9)
+        self._sequence = 0
+        self._over: str | None = None
+        self._asked_s: float | None = None  # since when a reading is waited for
+        self._closing = self._closed = False
+        self._dead: str | None = None
+        self._unheard: str | None = None
+        self._told: Callable[[str], None] = lambda reason: None
+        self._ended = threading.Event()
+        guarding.readings.socket.settimeout(_READ_S)
+        self._thread = threading.Thread(target=self._listen, name="jaxnav-events", daemon=True)
+
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._guarding.process.pid
+
+    @property
+    def timeout_s(self) -> float:
+        """See `Vehicle`."""
+        return self._own_timeout_s if self._own_timeout_s > 0 else math.inf
+
+    @property
+    def over(self) -> str | None:
+        """See `Ending`: what the vehicle said with its last reading."""
+        return self._over
+
+    def watch(self, told: Callable[[str], None]) -> None:
+        """Call this with the reason when the guard there has stopped the vehicle, or has died."""
+        self._told = told
+        self._thread.start()
+
+    def read(self) -> Odometry:
+        """See `Vehicle`.
+
+        Raises:
+            OSError: no answer within a tick, or the plug-in's own.
+        """
+        link = self._guarding.readings
+        now_s = time.monotonic()
+        if self._asked_s is None:
+            link.send(b"?")
+            self._asked_s = now_s
+        elif now_s - self._asked_s > _DEAF_S:
+            self._guarding.process.kill()  # whereupon `_listen` hears of its end
+            raise OSError("the guard's process does not answer")
+        try:
+            answer = link.receive()
+        except TimeoutError:
+            raise OSError("no reading within a tick") from None
+        except EOFError:
+            raise OSError("the guard's process is gone") from None
+        if not answer:
+            raise OSError("no reading within a tick")
+        self._asked_s = None
+        kind = answer[-1][:1]
+        if kind != KIND_READING:
+            assert kind == KIND_FAILED
+            raise OSError(answer[-1][1:].decode(errors="replace"))
+        _, stamp_ns, speed_mps, steering_rad, valid = READING.unpack_from(answer[-1])
+        self._over = answer[-1][READING.size :].decode() or None
+        return Odometry(stamp_ns, speed_mps, steering_rad, valid)
+
+    def write(self, steering_rad: float, throttle: float) -> None:
+        """See `Vehicle`. Limits and corrections are applied there.
+
+        Raises:
+            OSError: the process is gone, or has not read for long.
+        """
+        if self._dead or self._closed:
+            raise OSError(self._dead or "the vehicle is closed")
+        self._sequence += 1
+        deadline_ns = time.monotonic_ns() + self._timeout_ns
+        self._guarding.commands.send(
+            COMMAND.pack(KIND_COMMAND, self._sequence, deadline_ns, steering_rad, throttle)
+        )
+
+    def stop(self) -> None:
+        """See `Vehicle`: the guard there trips, and says stop until the vehicle hears it.
+
+        Raises:
+            OSError: the process is dead, and no other one has stopped the vehicle yet.
+        """
+        if self._closed:
+            return
+        if self._dead:
+            raise OSError(self._dead)
+        with suppress(OSError):  # it is ending: then it stops the vehicle without being told
+            self._guarding.commands.tell(stop="told to stop")
+
+    def close(self) -> None:
+        """See `Vehicle`. Waits until the vehicle has heard that it should stop."""
+        if self._closed:  # or stopped by another process, after this one's death
+            self._guarding.end()
+            return
+        self._closing = True
+        with suppress(OSError):
+            self._guarding.commands.tell(close=True)
+        with suppress(subprocess.TimeoutExpired):
+            self._guarding.process.wait(_CLOSES_S)
+        self._ended.wait(_CLOSES_S if self._dead else 1.0)
+        self._closed = True
+        self._guarding.end()
+
+    @property
+    def unheard(self) -> str | None:
+        """What a person must know once it is closed: why the vehicle may not have stopped."""
+        if self._guarding.process.poll() is None:
+            return "the guard's process still tells it to stop"
+        return self._unheard
+
+    def _listen(self) -> None:
+        """Of a thread: what the guard there says, and whether it lives."""
+        link = self._guarding.commands
+        try:
+            while True:
+                said = link.mapping()
+                if "tripped" in said:
+                    self._told(said["tripped"])
+                if "closed" in said:
+                    self._unheard = said["unheard"]
+        except (EOFError, OSError, ValueError):
+            pass
+        with suppress(subprocess.TimeoutExpired):
+            self._guarding.process.wait(1.0)
+        if not self._closing or self._guarding.process.returncode:
+            how = f"the guard's process {ending(self._guarding.process)}"
+            self._dead = self._unheard = how
+            self._told(how)
+            if self._guarding.rescue():
+                self._dead = self._unheard = None
+                self._closed = True
+        self._ended.set()
+
+
+def ending(process: subprocess.Popen[bytes]) -> str:
+    """How a process ended, in words."""
+    code = process.poll()
+    if code is None:
+        return "closed its connection"
+    return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"

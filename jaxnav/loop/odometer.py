@@ -1,0 +1,150 @@
+"""Which odometry to believe: a wheel can't do everything that its sensor says."""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from jaxnav.loop.flags import Fault
+from jaxnav.models.bicycle import Vehicle
+
+_MARGIN_MPS = 0.05  # beside what the vehicle can reach
+_SIGMAS = 2.0
+_AGREE_MPS = 0.2  # two refused readings that tell the same
+_AGREEING = 10  # of them in a row are believed where no camera knows better
+_DISTRUSTED = 5  # refusals in a row: then a speed that fits does not suffice, the way must too
+_PATH_NS = 1_000_000_000
+_PATH_M, _PATH_SHARE = 0.02, 0.1  # how well
+_STUCK_AFTER = 25  # readings, none different from the one before, of a vehicle that moves
+_PULLED_MPS = 0.1  # a change that any encoder shows
+_MAX_GAP_NS = 1_000_000_000
+
+
+@dataclass
+class Odometer:
+    """Readings in a row. Physically impossible ones are refused."""
+
+    max_mps: float
+    speed_per_throttle_mps: float
+    time_constant_s: float
+    last: tuple[float, float] | None = None  # speed_mps, steering_rad, believed
+    _last_ns: int = 0
+    _raw: tuple[float, float] | None = None
+    _raw_ns: int = 0
+    _repeated: int = 0
+    _same_speed: int = 0
+    _pulled_mps: float = 0.0  # after what the motor was told
+    _pulled_range_mps: tuple[float, float] = (0.0, 0.0)  # since the speed that is read changed
+    _refused_mps: float = 0.0
+    _refusals: int = 0
+    _path: deque[tuple[int, float, float]] = field(default_factory=deque)  # see _agrees
+
+    @staticmethod
+    def of(vehicle: Vehicle) -> "Odometer":
+        """For a vehicle: how fast it may be, and how soon."""
+        speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
+        return Odometer(
+            float(vehicle.throttle_limit) * speed_per_throttle_mps,
+            speed_per_throttle_mps,
+            float(vehicle.speed_time_constant_s),
+        )
+
+    def judge(
+        self,
+        speed_mps: float,
+        steering_rad: float,
+        stamp_ns: int,
+        believed: tuple[float, float] | None,
+        seeing: bool,
+        throttle: float,
+        contradicted: bool = False,
+    ) -> tuple[bool, Fault]:
+        """Whether to fuse a reading, and what is wrong with the sensor.
+
+        Args:
+            believed: the estimate's speed and its sigma, m/s, where there is one.
+            seeing: cameras tell the speed too, so that odometry which insists is not believed.
+            throttle: last commanded.
+            contradicted: corners move, and have done so for a while, where it says it stands.
+        """
+        if self._stuck(speed_mps, steering_rad, stamp_ns, throttle) or contradicted:
+            return False, Fault.ODOMETRY_STUCK
+        if self._possible(speed_mps, stamp_ns, believed, throttle):
+            if (
+                seeing
+                and self._refusals >= _DISTRUSTED
+                and not self._agrees(speed_mps, stamp_ns, believed)
+            ):
+                return False, Fault(0)
+            self._refusals = 0
+            self._path.clear()
+        else:
+            self._agrees(speed_mps, stamp_ns, believed)
+            agrees = abs(speed_mps - self._refused_mps) < _AGREE_MPS
+            self._refusals = self._refusals + 1 if agrees else 1
+            self._refused_mps = speed_mps
+            insists = self._refusals > _AGREEING and abs(speed_mps) <= 1.5 * self.max_mps
+            if seeing or not insists:
+                return False, Fault(0)
+        self.last, self._last_ns = (speed_mps, steering_rad), stamp_ns
+        return True, Fault(0)
+
+    def _possible(
+        self,
+        speed_mps: float,
+        stamp_ns: int,
+        believed: tuple[float, float] | None,
+        throttle: float,
+    ) -> bool:
+        if abs(speed_mps) > 1.5 * self.max_mps + _MARGIN_MPS:
+            return False
+        reference, sigma = believed or (None, 0.0)
+        if reference is None:
+            if self.last is None:
+                return True
+            reference = self.last[0]
+        gap_s = min(max(stamp_ns - self._last_ns, 0), _MAX_GAP_NS) / 1e9
+        # The throttle pulls towards a speed of its own, brakes and friction towards none.
+        done = 1 - math.exp(-gap_s / self.time_constant_s)
+        targets = (reference, throttle * self.speed_per_throttle_mps, 0.0)
+        reached = [reference + done * (target - reference) for target in targets]
+        margin = _MARGIN_MPS + _SIGMAS * sigma
+        return min(reached) - margin <= speed_mps <= max(reached) + margin
+
+    def _agrees(
+        self, speed_mps: float, stamp_ns: int, believed: tuple[float, float] | None
+    ) -> bool:
+        """Whether a sensor that was refused has gone the way that the cameras saw, for a while.
+
+        Speeds that cameras tell are rough, ways are not.
+        """
+        if believed is None:
+            self._path.clear()
+            return False
+        self._path.append((stamp_ns, speed_mps, believed[0]))
+        while self._path[0][0] < stamp_ns - _PATH_NS:
+            self._path.popleft()
+        stamps, told, seen = zip(*self._path, strict=True)
+        gaps_s = [max(b - a, 0) / 1e9 for a, b in pairwise(stamps)]
+        off_m = sum((a - b) * dt for a, b, dt in zip(told, seen, gaps_s, strict=False))
+        way_m = sum(abs(b) * dt for b, dt in zip(seen, gaps_s, strict=False))
+        long_enough = stamp_ns - stamps[0] > _PATH_NS / 2
+        return long_enough and abs(off_m) < _PATH_M + _PATH_SHARE * way_m
+
+    def _stuck(self, speed_mps: float, steering_rad: float, stamp_ns: int, throttle: float) -> bool:
+        """Whether a sensor tells the same too often: all of it, or a speed that the motor was told
+        to change meanwhile (who has no sensor for the steering gives what was commanded)."""
+        gap_s = min(max(stamp_ns - self._raw_ns, 0), _MAX_GAP_NS) / 1e9
+        done = 1 - math.exp(-gap_s / self.time_constant_s)
+        self._pulled_mps += done * (throttle * self.speed_per_throttle_mps - self._pulled_mps)
+        same_speed = speed_mps != 0 and self._raw is not None and self._raw[0] == speed_mps
+        same = same_speed and self._raw == (speed_mps, steering_rad)
+        self._raw, self._raw_ns = (speed_mps, steering_rad), stamp_ns
+        self._repeated = self._repeated + 1 if same else 0
+        self._same_speed = self._same_speed + 1 if same_speed else 0
+        least, most = self._pulled_range_mps if same_speed else (math.inf, -math.inf)
+        least, most = min(least, self._pulled_mps), max(most, self._pulled_mps)
+        self._pulled_range_mps = least, most
+        return self._repeated >= _STUCK_AFTER or (
+            self._same_speed >= _STUCK_AFTER and most - least > _PULLED_MPS
+        )

@@ -1,0 +1,443 @@
+"""From events to commands: the deterministic half of the loop, without a clock, a thread or a file.
+
+    pilot = Pilot(navigator)
+    outcome = pilot.handle(Input(now_ns, odometry=reading))
+    outcome = pilot.handle(Input(now_ns, frames=sighted))
+
+The same events give the same outcomes: what is recorded can be replayed bit for bit (RELIABILITY
+R11). Every event is one call of one compiled program.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxnav.belief.motion import Belief
+from jaxnav.loop.corrections import Corrections
+from jaxnav.loop.due import due_px
+from jaxnav.loop.estimator import Estimator, Program
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.loop.frames import Frames, Sighted
+from jaxnav.loop.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
+from jaxnav.loop.history import Told
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.odometer import Odometer
+from jaxnav.loop.outvoted import Outvoted
+from jaxnav.loop.stamps import Stamps
+from jaxnav.loop.standstill import Standstill
+from jaxnav.loop.support import Support
+from jaxnav.loop.way import Place, Way
+from jaxnav.loop.ways import Fix
+from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
+from jaxnav.navigator import Navigator
+from jaxnav.timeline import Moment, Report
+
+SLEPT_NS = 1_000_000_000  # a loop that was away for so long believes what is of another time
+_SEEING_NS = 500_000_000  # for so long after a marker the estimate's speed is worth the odometer's
+_NO_FAULT, _NO_REJECT = Fault(0), Reject(0)
+
+
+@dataclass(frozen=True)
+class Input:
+    """What reaches the pilot at one instant: odometry, frames, both, or neither (a tick).
+
+    Attributes:
+        frames: of different cameras. Those that show markers were captured together.
+        faults: found by whoever brings it.
+    """
+
+    now_ns: int
+    odometry: Odometry | None = None
+    frames: tuple[Sighted, ...] = ()
+    faults: Fault = _NO_FAULT
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the pilot makes of an event. Its report and moment count from `origin_m`."""
+
+    now_ns: int
+    health: Health
+    faults: Fault
+    rejects: Reject
+    steering_rad: float
+    throttle: float
+    report: Report  # NumPy's leaves, as of `moment`
+    moment: Moment
+    told: Told | None  # what was fused, and when it was true
+    stamp_ns: int
+    restarts: int  # so far, and why the last one
+    restart_reason: str
+    outvoted: tuple[int, ...] = ()  # ids of markers that were left out, since others contradict
+    origin_m: Origin = ZERO  # see `MarkerMap`
+
+    @property
+    def pose(self) -> np.ndarray:
+        """x_m, y_m, psi_rad in the world."""
+        return np.asarray(planar_in_world(self.report.output.pose, self.origin_m))
+
+    @property
+    def T_world_vehicle(self) -> np.ndarray:
+        """(7,) wxyz_xyz."""
+        wxyz_xyz = self.report.output.T_world_vehicle.wxyz_xyz
+        return np.asarray(poses_in_world(wxyz_xyz, self.origin_m))
+
+
+class _Known(NamedTuple):
+    """What the pilot looks at in a report."""
+
+    pose: np.ndarray  # x_m, y_m, psi_rad
+    covariance: np.ndarray
+    located: bool
+    decided: bool
+    selected: int
+    nis: float
+    steering_rad: float
+    throttle: float
+    mean: np.ndarray
+
+    @staticmethod
+    def of(report: Report) -> "_Known":
+        told = vars(report)  # an attribute of an equinox module takes a us
+        output = vars(told["output"])
+        command = vars(output["command"])
+        return _Known(
+            output["pose"],
+            output["covariance"],
+            bool(output["located"]),
+            bool(output["decided"]),
+            int(output["selected"]),
+            float(output["nis"]),
+            float(command["steering_rad"]),
+            float(command["throttle"]),
+            told["mean"],
+        )
+
+    @property
+    def is_finite(self) -> bool:
+        numbers = (*self.pose.tolist(), *self.covariance.ravel().tolist())
+        return all(map(math.isfinite, numbers))
+
+    def sigma(self, *states: int) -> float:
+        """Of several states together."""
+        return math.sqrt(max(sum(float(self.covariance[state, state]) for state in states), 0.0))
+
+
+class Pilot:
+    """One drive. Not for several threads."""
+
+    def __init__(
+        self,
+        navigator: Navigator,
+        timeouts: Timeouts | None = None,
+        program: Program | None = None,
+        corner_sigma_px: float | None = None,
+        relocate: bool = True,
+    ):
+        """Args:
+        navigator: with a vehicle and waypoints.
+        timeouts: see there.
+        program: `advance_packed` of the navigator, compiled; by default by `jax.jit`.
+        corner_sigma_px: of every corner along one axis; by default as each detection says.
+        relocate: whether to drive on from a pose that no slip explains, slowly at first; else stop.
+        """
+        if navigator.controller is None:
+            raise ValueError("a pilot's navigator needs a vehicle and waypoints")
+        self.navigator = navigator
+        self._origin_m = navigator.markers.origin_m
+        self.limits = Limits.of(navigator.controller.vehicle)
+        self._corrections = Corrections.of(navigator.controller.vehicle)
+        self._estimator = Estimator(navigator, program)
+        self._gate_nis = float(getattr(navigator.motion, "gate_nis", math.inf))
+        self._frames = Frames(len(navigator.rig), navigator.markers, corner_sigma_px)
+        self._monitor = Monitor(timeouts or Timeouts())
+        self._odometry_stamps = Stamps()
+        self._odometer = Odometer.of(navigator.controller.vehicle)
+        self._standstill = Standstill(
+            Way(float(navigator.controller.vehicle.wheelbase_m)),
+            self._odometer.speed_per_throttle_mps,
+            self._odometer.time_constant_s,
+        )
+        self._frozen = partial(self._standstill.frozen, due=self._due_px)
+        self._support = Support(navigator.controller.vehicle, relocate)
+        self._outvoted = Outvoted(navigator.markers.ids)
+        self._hidden: tuple[int, ...] = ()  # of the last frames
+        self._odometer_ns: int | None = None
+        self._fix_ns: int | None = None
+        self._distance_m = 0.0
+        self._now_ns: int | None = None
+        self._began_ns: int | None = None
+        self._known: _Known | None = None
+        self._restarts = self._restarts_before = 0
+        self._restart_reason = ""
+        self._restarts_ns: deque[int] = deque()  # the last ones
+        self._left: _Known | None = None  # what was believed before a restart
+        self._command = (0.0, 0.0)
+        self._commanded_ns: int | None = None
+
+    def warm_up(self) -> None:
+        """Compile, and leave no trace of it."""
+        self._estimator.warm_up()
+        due_px(self.navigator, np.zeros(3), (0.0, 0.0, 0.0))
+
+    def handle(self, given: Input) -> Outcome:
+        """Fuse what came in, frames first. `now_ns` is never less than that of the input before."""
+        now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
+        frames = [self._corrections.frame(frame) for frame in given.frames]
+        told, stamp_ns, seen_faults = self._frames.told(frames, now_ns, self._frozen)
+        faults |= seen_faults
+        if told is not None:
+            told, self._hidden = self._outvoted.without(told)
+            if self._hidden:
+                faults |= Fault.MARKER_OUTVOTED
+        if told is not None:
+            outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
+        if given.odometry is not None:
+            return self._odometry(self._corrections.reading(given.odometry), now_ns, faults)
+        return outcome if told is not None else self._tick(now_ns, faults)
+
+    def _odometry(self, reading: Odometry, now_ns: int, faults: Fault) -> Outcome:
+        jumps = self._odometry_stamps.jumps
+        stamp_ns = self._odometry_stamps.take(reading.stamp_ns, now_ns)
+        if not reading.valid or not (
+            math.isfinite(reading.speed_mps) and math.isfinite(reading.steering_rad)
+        ):
+            return self._tick(now_ns, faults | Fault.ODOMETRY_INVALID)
+        if stamp_ns is None:
+            return self._tick(now_ns, faults | Fault.STAMP_INVALID)
+        if self._odometry_stamps.jumps > jumps:
+            faults |= Fault.CLOCK_JUMPED
+        believable, faults_seen = self._odometer.judge(
+            reading.speed_mps,
+            reading.steering_rad,
+            stamp_ns,
+            self._speed(),
+            self._seeing(now_ns),
+            self._command[1],
+            self._standstill.read(stamp_ns, now_ns, reading.speed_mps),
+        )
+        faults |= faults_seen
+        if Fault.ODOMETRY_STUCK in faults_seen:
+            self._estimator.forget_speed()
+        if not believable:
+            return self._tick(now_ns, faults, Reject.ODOMETRY)
+        if self._odometer_ns is not None:
+            gap_s = min(max(stamp_ns - self._odometer_ns, 0), SLEPT_NS) / 1e9
+            self._distance_m += abs(reading.speed_mps) * gap_s
+            self._support.drove(
+                reading.speed_mps,
+                reading.steering_rad,
+                0.0 if self._known is None else float(self._known.pose[2]),
+                gap_s,
+                self._command[1],
+                self._seeing(now_ns),
+            )
+        self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
+        self._standstill.went(stamp_ns, now_ns, reading.speed_mps, reading.steering_rad)
+        told = Told(odometry=(reading.speed_mps, reading.steering_rad))
+        return self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
+
+    def _tick(self, now_ns: int, faults: Fault, rejects: Reject = _NO_REJECT) -> Outcome:
+        return self._fuse(None, now_ns, now_ns, faults, rejects)
+
+    def _fuse(
+        self, told: Told | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
+    ) -> Outcome:
+        elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
+        fused = self._estimator.fuse(told, stamp_ns, now_ns, elapsed_ns)
+        known = _Known.of(fused.report)
+        finite = known.is_finite
+        if not finite:
+            faults |= Fault.NOT_FINITE
+            self._begin_anew("the estimate was no number")
+        if fused.refused:
+            rejects |= Reject.TOO_LATE
+        if told is not None and told.corners_px is not None and fused.refused:
+            self._frames.refused()
+        restarts = self._restarts_before + int(fused.moment.restarts)
+        if finite and restarts > self._restarts:
+            self._restarts, self._restart_reason = restarts, "contradicted by the corners"
+            faults |= Fault.RESTARTED
+            self._left = self._known
+            self._restarts_ns.append(now_ns)
+            self._support.restarted()
+        outvoted: tuple[int, ...] = ()
+        if told is not None and told.corners_px is not None and not fused.refused:
+            outvoted = self._outvoted.count(told, np.asarray(fused.report.outvoted))
+            if outvoted:
+                faults |= Fault.MARKER_OUTVOTED
+            rejects |= self._judge(known, fused.moment.belief, stamp_ns, now_ns)
+        faults |= self._contradictions()
+        report, known = self._honest(fused.report, known)
+        if self._left is not None and report.output.decided:
+            self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
+            self._left = None
+        self._known, self._now_ns = known, now_ns
+        if self._standstill.nothing_moves:
+            faults |= Fault.NOTHING_MOVES
+        health, faults = self._monitor.look(self._senses(known, now_ns, faults))
+        steering_rad, throttle = self._limited(known, health, now_ns, elapsed_ns)
+        return Outcome(
+            now_ns,
+            health,
+            faults,
+            rejects,
+            steering_rad,
+            throttle,
+            report,
+            fused.moment,
+            told,
+            stamp_ns,
+            self._restarts,
+            self._restart_reason,
+            outvoted or (self._hidden if Fault.MARKER_OUTVOTED in faults else ()),
+            self._origin_m,
+        )
+
+    def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
+        """Whether the corners were believed."""
+        gate, nis = self._gate_nis, known.nis
+        believed = known.selected >= 0 and nis <= gate
+        self._monitor.corners(believed)
+        fix = _fix(known.pose, known.covariance) if known.decided else None
+        alive = zip(belief.mean, belief.covariance, belief.initialised, strict=True)
+        support = self._support
+        before = support.relocations, support.refused
+        if support.corners(
+            believed,
+            now_ns,
+            fix,
+            lambda: [_fix(mean, covariance) for mean, covariance, lives in alive if lives],
+        ):
+            self._fix_ns, self._distance_m = max(stamp_ns, self._fix_ns or 0), 0.0
+        if support.relocations > before[0] or support.refused > before[1]:
+            self._explain("refused" if support.refused else "relocated")
+        if believed:
+            return Reject.INNOVATION_LARGE if nis > gate / 2 else _NO_REJECT
+        return Reject.INNOVATION
+
+    def _explain(self, what: str) -> None:
+        """Add to the reason of the last restart."""
+        parts = [self._restart_reason, f"{what}: no slip explains the way there"]
+        self._restart_reason = "; ".join(part for part in parts if part)
+
+    def _contradictions(self) -> Fault:
+        """What speaks against where the estimate says that the vehicle is."""
+        support, found = self._support, _NO_FAULT
+        if support.relocated:
+            found |= Fault.RELOCATED
+        if support.disputed:
+            found |= Fault.WAYS_DISPUTED
+        if support.odometry_doubtful:
+            found |= Fault.ODOMETRY_DOUBTFUL
+        return found
+
+    def _honest(self, report: Report, known: _Known) -> tuple[Report, _Known]:
+        """What is told of an estimate that nothing confirms: not decided, and how far off."""
+        doubt = self._support.doubt(self._monitor.contradicted)
+        if not (doubt.is_doubted and known.decided):
+            return report, known
+        covariance = known.covariance.copy()
+        covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
+        honest: Report = eqx.tree_at(
+            lambda r: (r.output.decided, r.output.covariance),
+            report,
+            (np.asarray(False), covariance),
+        )
+        return honest, known._replace(covariance=covariance)
+
+    def _limited(
+        self, known: _Known, health: Health, now_ns: int, elapsed_ns: int
+    ) -> tuple[float, float]:
+        self._command = self.limits.applied(
+            known.steering_rad,
+            known.throttle * SPEED_FACTOR[health],
+            self._command[0],
+            elapsed_ns / 1e9,
+        )
+        self._commanded_ns = now_ns
+        self._standstill.commanded(self._command[1], now_ns)
+        return self._command
+
+    def _senses(self, known: _Known, now_ns: int, faults: Fault) -> Senses:
+        began_ns = self._began_ns if self._began_ns is not None else now_ns
+
+        def age_s(stamp_ns: int | None) -> float:
+            return max(now_ns - (began_ns if stamp_ns is None else stamp_ns), 0) / 1e9
+
+        return Senses(
+            located=known.located,
+            decided=known.decided,
+            fix_age_s=age_s(self._fix_ns),
+            odometry_age_s=age_s(self._odometer_ns),
+            cameras_age_s=tuple(age_s(stamp_ns) for stamp_ns in self._frames.newest_ns),
+            position_sigma_m=known.sigma(0, 1),
+            distance_m=self._distance_m,
+            faults=faults,
+            restarts=self._restarts_lately(now_ns),
+            confirmed=self._support.confirmed,
+            refused=self._support.refused,
+        )
+
+    def _restarts_lately(self, now_ns: int) -> int:
+        while self._restarts_ns and now_ns - self._restarts_ns[0] > RESTARTS_S * 1e9:
+            self._restarts_ns.popleft()
+        return len(self._restarts_ns)
+
+    def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
+        """See `due_px`."""
+        known = self._known
+        return due_px(self.navigator, known.pose if known and known.located else None, motion)
+
+    def _slept(self, now_ns: int) -> Fault:
+        """Whether the loop was away so long that what it believes is of another time."""
+        self._began_ns = now_ns if self._began_ns is None else self._began_ns
+        if self._now_ns is None or abs(now_ns - self._now_ns) <= SLEPT_NS:
+            return _NO_FAULT
+        self._begin_anew("the loop was away for over a second")
+        self._now_ns = None
+        return Fault.CLOCK_JUMPED | Fault.RESTARTED
+
+    def _begin_anew(self, reason: str) -> None:
+        self._estimator.reset()
+        self._support.begin_anew()
+        self._restarts += 1
+        if self._now_ns is not None:
+            self._restarts_ns.append(self._now_ns)
+        self._restarts_before, self._restart_reason = self._restarts, reason
+        self._fix_ns, self._distance_m = None, 0.0
+        self._left = self._known
+
+    def _seeing(self, now_ns: int) -> bool:
+        """Whether corners tell of late how fast the vehicle is."""
+        return self._fix_ns is not None and now_ns - self._fix_ns < _SEEING_NS
+
+    def _speed(self) -> tuple[float, float] | None:
+        """Speed along the course and its sigma, m/s, as far as they are known."""
+        known = self._known
+        if known is None or not known.decided:
+            return None
+        heading, *velocity = map(float, known.mean[2:5])
+        forward = math.cos(heading) * velocity[0] + math.sin(heading) * velocity[1]
+        speed = math.copysign(math.hypot(*velocity), forward)
+        return speed, known.sigma(3, 4)
+
+
+def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
+    """Of a state that begins with x_m, y_m, psi_rad."""
+    x_m, y_m, psi_rad = map(float, pose[:3])
+    sigma_m = math.sqrt(max(float(covariance[0, 0] + covariance[1, 1]), 0.0))
+    return Fix(x_m, y_m, psi_rad, sigma_m, math.sqrt(max(float(covariance[2, 2]), 0.0)))
+
+
+def _apart(pose: np.ndarray, other: np.ndarray) -> str:
+    """How far the other one is, in words."""
+    x_m, y_m, psi_rad = other - pose
+    psi_deg = math.degrees(math.remainder(float(psi_rad), math.tau))
+    return f"{math.hypot(x_m, y_m):.2f} m and {psi_deg:.0f} deg"

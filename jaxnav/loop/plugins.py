@@ -1,0 +1,187 @@
+"""Vehicles and cameras by name: what is installed, or `module:name` of anybody's.
+
+    vehicle = open_vehicle("qcar", setup)
+    cameras = open_cameras("my_cameras:open_cameras", setup, vehicle)
+
+Whatever is wrong with a plug-in is one line for a person.
+"""
+
+import contextlib
+import importlib
+from collections.abc import Callable, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from jaxnav.errors import BadInput
+from jaxnav.loop.interfaces import Camera, Setup, Vehicle
+
+VEHICLES = "jaxnav.vehicles"
+CAMERAS = "jaxnav.cameras"
+
+# Modules that no package registry has, and who brings them.
+_COMES_WITH = {
+    "pal": "it comes with Quanser's software for the QCar: put its folder on PYTHONPATH",
+    "quanser": "it comes with Quanser's software for the QCar, for that car's own Python",
+    "rclpy": "it comes with ROS 2: source its setup.bash first",
+    "nav_msgs": "it comes with ROS 2: source its setup.bash first",
+    "ackermann_msgs": "it is a package of ROS 2: install ackermann-msgs and source setup.bash",
+}
+
+
+def vehicle_names() -> list[str]:
+    """Of the vehicles that are installed."""
+    return sorted(_installed(VEHICLES))
+
+
+def camera_names() -> list[str]:
+    """Of the camera drivers that are installed."""
+    return sorted(_installed(CAMERAS))
+
+
+def open_vehicle(name: str, setup: Setup) -> Vehicle:
+    """Open a vehicle.
+
+    Args:
+        name: of an entry point, or `module:name`.
+
+    Raises:
+        BadInput: there is none of that name, it can't be imported or opened, or what it gives is
+            not a vehicle.
+    """
+    return opened_vehicle(name, find("--vehicle", VEHICLES, name), setup)
+
+
+def opened_vehicle(name: str, factory: Callable[..., Any], setup: Setup) -> Vehicle:
+    """`open_vehicle` of a factory that was found before."""
+    flag = "--vehicle"
+    vehicle: Vehicle = _opened(flag, name, factory, setup)
+    if lacking := missing_members(vehicle, Vehicle):
+        _close([vehicle])
+        raise BadInput(flag, f"{name} gives {_what(vehicle)}, which has no {_listed(lacking)}")
+    return vehicle
+
+
+def open_cameras(name: str, setup: Setup, vehicle: Vehicle) -> tuple[Camera, ...]:
+    """Open the cameras of the rig, in its order.
+
+    Args:
+        name: of an entry point, or `module:name`.
+
+    Raises:
+        BadInput: there is none of that name, it can't be imported or opened, or what it gives are
+            not the rig's cameras.
+    """
+    flag = "--cameras"
+    found = _opened(flag, name, find(flag, CAMERAS, name), setup, vehicle)
+    if not isinstance(found, Sequence) or isinstance(found, str | bytes):
+        _close([found])
+        raise BadInput(flag, f"{name} gives {_what(found)}, expected a sequence of cameras")
+    cameras = tuple(found)
+    if problem := _wrong_with(cameras, setup.rig.names):
+        _close(cameras)
+        raise BadInput(flag, f"{name} {problem}")
+    return cameras
+
+
+def find(flag: str, group: str, name: str) -> Callable[..., Any]:
+    """The factory of a plug-in.
+
+    Args:
+        flag: for the message.
+        group: of entry points.
+        name: of one of them, or `module:name`.
+
+    Raises:
+        BadInput: there is none of that name, or it can't be imported or called.
+    """
+    installed = _installed(group)
+    target = installed[name].value if name in installed else name
+    module, colon, attribute = target.partition(":")
+    if not (colon and module and attribute):
+        raise BadInput(
+            flag,
+            f"there is no {name!r}: expected {', '.join(sorted(installed)) or 'an installed name'}"
+            " or module:name",
+        )
+    found: Any = _imported(flag, name, module)
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            raise BadInput(flag, f"{name}: the module {module} has no {attribute!r}")
+        found = getattr(found, part)
+    if not callable(found):
+        raise BadInput(flag, f"{name}: {target} is {_what(found)}, expected a function")
+    return found
+
+
+def missing_members(opened: object, protocol: type) -> list[str]:
+    """What a protocol asks for and an object does not have, methods with their brackets."""
+    asked = {name: value for name, value in vars(protocol).items() if not name.startswith("_")}
+    lacking = []
+    for name, value in asked.items():
+        if isinstance(value, property):
+            if not hasattr(opened, name):
+                lacking.append(name)
+        elif callable(value) and not callable(getattr(opened, name, None)):
+            lacking.append(f"{name}()")
+    return lacking
+
+
+def _installed(group: str) -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=group)}
+
+
+def _imported(flag: str, name: str, module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise _not_importable(flag, name, error) from error
+    except Exception as error:
+        # A plug-in is anybody's code: on import it may do, and so raise, anything.
+        raise BadInput(flag, f"{name}: importing {module} failed: {_said(error)}") from error
+
+
+def _opened(flag: str, name: str, factory: Callable[..., Any], *args: object) -> Any:
+    try:
+        return factory(*args)
+    except ImportError as error:  # drivers are imported when they are needed
+        raise _not_importable(flag, name, error) from error
+    except OSError as error:
+        raise BadInput(flag, f"{name} could not be opened: {_said(error)}") from error
+
+
+def _not_importable(flag: str, name: str, error: ImportError) -> BadInput:
+    if not isinstance(error, ModuleNotFoundError) or error.name is None:
+        return BadInput(flag, f"{name} could not be imported: {_said(error)}")
+    top = error.name.partition(".")[0]
+    hint = _COMES_WITH.get(top, "is it installed, or its folder on PYTHONPATH?")
+    return BadInput(flag, f"{name} needs the module {error.name}, which is missing: {hint}")
+
+
+def _wrong_with(cameras: tuple[Any, ...], names: tuple[str, ...]) -> str:
+    for index, camera in enumerate(cameras):
+        if lacking := missing_members(camera, Camera):
+            return f"gives {_what(camera)} as camera {index}, which has no {_listed(lacking)}"
+    given = tuple(camera.name for camera in cameras)
+    if given != names:
+        return f"gives the cameras {_listed(given)}, expected those of the rig: {_listed(names)}"
+    return ""
+
+
+def _close(things: Sequence[Any]) -> None:
+    """Let go of what was opened and will not be used."""
+    for thing in things:
+        if callable(getattr(thing, "close", None)):
+            with contextlib.suppress(OSError):
+                thing.close()
+
+
+def _what(thing: object) -> str:
+    return "None" if thing is None else f"an object of the class {type(thing).__name__}"
+
+
+def _listed(names: Sequence[object]) -> str:
+    return ", ".join(map(str, names)) or "none"
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -1,0 +1,283 @@
+"""From cameras to sightings: a thread for each camera, and some that look for markers.
+
+A camera's thread hands over its latest frame, older ones are dropped. Who looks for markers takes
+them camera by camera, searches first where the filter expects the markers, and the whole
+image now and then, and whenever nothing was found where it should be.
+"""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from jaxnav.detection.families import marker_cells
+from jaxnav.detection.types import Detections, Detector, RegionDetector
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import FROZEN_AFTER, Sighted
+from jaxnav.loop.guard import Guard
+from jaxnav.loop.interfaces import Camera, Frame
+from jaxnav.models.camera import Camera as CameraModel
+
+_READ_S = 0.05  # a camera's thread is back at least so often
+_RETRY_S = 0.05
+_MIN_SPREAD = 2.0  # grey levels: below, an image shows nothing at all
+_SAMPLE = 16  # every so-manieth row and column of an image is looked at
+
+WHOLE_EVERY = 10  # frames of a camera
+
+_NONE = Detections.concatenate([])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame, and what was found in it."""
+
+    sighted: Sighted
+    frame: Frame
+    camera_name: str
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where markers should be in an image: (K, 4, 2) corners, and how far off each may be, (K,)."""
+
+    quads_px: np.ndarray
+    radius_px: np.ndarray
+
+
+class Search:
+    """Markers in the frames of one camera. For one thread at a time."""
+
+    def __init__(
+        self,
+        camera: int,
+        size_px: tuple[int, int],
+        model: CameraModel,
+        detectors: Sequence[Detector],
+    ):
+        """Args:
+        camera: its index in the rig.
+        size_px: width and height of its images.
+        """
+        self._camera, self._size_px, self._model = camera, size_px, model
+        self._detectors = list(detectors)
+        self._since_whole = camera  # so that cameras take turns
+        self._picture, self._pictures = b"", 0  # the last, and how often the same
+
+    def warm_up(self) -> None:
+        """Look at a picture of a marker, so that the first frame takes no longer than others."""
+        width, height = self._size_px
+        image = np.full((height, width), 200, np.uint8)
+        side = max(min(16 * (min(width, height) // 32), 64), 1)
+        for detector in self._detectors:
+            printed = (255 * marker_cells(detector.family, 0)).astype(np.uint8)
+            # In a picture that is too small for a marker there is nothing but its beginning.
+            picture = cv2.resize(printed, (side, side), interpolation=cv2.INTER_NEAREST)
+            image[8 : 8 + side, 8 : 8 + side] = picture[: height - 8, : width - 8]
+        corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        region = Region((8 + side * corner)[None], np.array([4.0]))
+        self._near(image, region)
+        self._everywhere(image, region)
+
+    def look(self, frame: Frame, region: Region | None) -> Sighted:
+        """What a frame shows.
+
+        Args:
+            region: where markers should be, nowhere perhaps; None where nobody knows.
+        """
+        if frame.detections is not None:
+            return Sighted(self._camera, frame.stamp_ns, frame.detections)
+        fault = image_fault(frame.image, self._size_px)
+        if fault or frame.image is None:
+            return Sighted(self._camera, frame.stamp_ns, None, fault)
+        if self._repeats(frame.image):
+            return Sighted(self._camera, frame.stamp_ns, None, Fault.FRAME_FROZEN)
+        self._since_whole += 1
+        found = _NONE
+        if region is not None and self._since_whole < WHOLE_EVERY:
+            if not len(region.quads_px):
+                return Sighted(self._camera, frame.stamp_ns, _NONE)
+            found = self._near(frame.image, region)
+        if not len(found):
+            self._since_whole = 0
+            found = self._everywhere(frame.image, region)
+        return Sighted(self._camera, frame.stamp_ns, found)
+
+    def _repeats(self, image: np.ndarray) -> bool:
+        """Whether a picture is the same once too often. No sensor is without noise; bytes are
+        compared, since 20 us of that see more than any digest of the same time."""
+        picture = image.tobytes()
+        self._pictures = self._pictures + 1 if picture == self._picture else 1
+        self._picture = picture
+        return self._pictures >= FROZEN_AFTER
+
+    def _near(self, image: np.ndarray, region: Region) -> Detections:
+        parts = [
+            detector.detect_near(image, self._model, region.quads_px, region.radius_px)
+            for detector in self._detectors
+            if isinstance(detector, RegionDetector)
+        ]
+        return Detections.concatenate(parts)
+
+    def _everywhere(self, image: np.ndarray, region: Region | None) -> Detections:
+        quads_px = None if region is None else region.quads_px
+        return Detections.concatenate(
+            [detector.detect(image, self._model, quads_px) for detector in self._detectors]
+        )
+
+
+def image_fault(image: np.ndarray | None, size_px: tuple[int, int]) -> Fault:
+    """What is wrong with an image, before anything is looked for in it."""
+    if image is None or not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        return Fault.FRAME_UNUSABLE
+    if image.ndim not in (2, 3) or image.shape[1::-1] != tuple(size_px):
+        return Fault.FRAME_UNUSABLE
+    if image.ndim == 3 and image.shape[2] != 3:
+        return Fault.FRAME_UNUSABLE
+    flat = float(np.std(image[::_SAMPLE, ::_SAMPLE])) < _MIN_SPREAD
+    return Fault.FRAME_UNUSABLE if flat else Fault(0)
+
+
+class Eyes:
+    """All cameras of a rig, and the threads behind them."""
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        searches: Sequence[Search],
+        guard: Guard,
+        workers: int = 2,
+    ):
+        """Args:
+        searches: one for each camera.
+        guard: told of every sign of life, and of what breaks.
+        workers: threads that look for markers.
+        """
+        self._cameras, self._searches, self._guard = list(cameras), list(searches), guard
+        self._woken = threading.Condition()
+        self._frames: list[Frame | None] = [None] * len(cameras)
+        self._busy = [False] * len(cameras)
+        self._turn = 0
+        self._waiting = threading.Condition()
+        self._seen: list[Seen] = []
+        self._over = threading.Event()
+        self.dropped = 0  # frames that gave way to newer ones
+        self.errors = [0] * len(cameras)  # reads that failed
+        self.expected: Callable[[int], Region | None] = lambda camera: None
+        names = [f"camera {camera.name}" for camera in cameras]
+        self._threads = [
+            threading.Thread(target=self._reading, args=(c, name), name=name, daemon=True)
+            for c, name in enumerate(names)
+        ] + [
+            threading.Thread(target=self._looking, args=(name,), name=name, daemon=True)
+            for name in (f"detector {number}" for number in range(workers))
+        ]
+
+    def start(self) -> None:
+        """Open the eyes."""
+        self._searches[0].warm_up()
+        for thread in self._threads:
+            thread.start()
+
+    def take(self) -> list[Seen]:
+        """What was seen since the last time, in the order of the stamps."""
+        with self._woken:
+            seen, self._seen = self._seen, []
+        return sorted(seen, key=lambda one: one.sighted.stamp_ns)
+
+    def wait(self, timeout_s: float) -> None:
+        """Until something was seen, or the time is over."""
+        with self._woken:
+            if not self._seen and timeout_s > 0:
+                self._woken.wait(timeout_s)
+
+    def close(self) -> None:
+        """End the threads, as far as they can be, and close the cameras."""
+        self._over.set()
+        with self._waiting:
+            self._waiting.notify_all()
+        for camera in self._cameras:
+            try:
+                camera.close()
+            except OSError:
+                continue
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join(0.5)
+
+    def _reading(self, index: int, name: str) -> None:
+        camera = self._cameras[index]
+        try:
+            while not self._over.is_set():
+                self._guard.beat(name)
+                try:
+                    frame = camera.read(_READ_S)
+                except OSError:
+                    self.errors[index] += 1
+                    self._over.wait(_RETRY_S)
+                    continue
+                if frame is not None:
+                    with self._waiting:
+                        self.dropped += self._frames[index] is not None
+                        self._frames[index] = frame
+                        self._waiting.notify()
+        except Exception as error:  # it can't be known what it means: the vehicle stops
+            self._guard.trip(f"{name}: {_told(error)}")
+        finally:
+            self._guard.leave(name)
+
+    def _looking(self, name: str) -> None:
+        try:
+            while not self._over.is_set():
+                self._guard.beat(name)
+                taken = self._next()
+                if taken is None:
+                    continue
+                index, frame = taken
+                try:
+                    # A camera that detects by itself needs not be told where to look.
+                    region = self.expected(index) if frame.detections is None else None
+                    sighted = self._searches[index].look(frame, region)
+                finally:
+                    self._busy[index] = False
+                seen = Seen(sighted, frame, self._cameras[index].name)
+                with self._woken:
+                    self._seen.append(seen)
+                    self._woken.notify()
+        except Exception as error:
+            self._guard.trip(f"{name}: {_told(error)}")
+        finally:
+            self._guard.leave(name)
+
+    def _next(self) -> tuple[int, Frame] | None:
+        """A frame to look at: of the camera whose turn it is."""
+        with self._waiting:
+            for attempt in (0, 1):
+                for offset in range(len(self._frames)):
+                    index = (self._turn + offset) % len(self._frames)
+                    frame = self._frames[index]
+                    if frame is not None and not self._busy[index]:
+                        self._frames[index], self._busy[index] = None, True
+                        self._turn = index + 1
+                        return index, frame
+                if attempt == 0:
+                    self._waiting.wait(_READ_S)
+        return None
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def groups(seen: Sequence[Seen]) -> tuple[list[tuple[Sighted, ...]], tuple[Sighted, ...]]:
+    """Sightings as the pilot takes them: those that show something, of one instant together, and
+    those that show nothing, which need no call of their own."""
+    by_stamp: dict[int, list[Sighted]] = {}
+    empty: list[Sighted] = []
+    for one in seen:
+        sighted = one.sighted
+        shows = sighted.detections is not None and len(sighted.detections) > 0
+        (by_stamp.setdefault(sighted.stamp_ns, []) if shows else empty).append(sighted)
+    return [tuple(by_stamp[stamp_ns]) for stamp_ns in sorted(by_stamp)], tuple(empty)

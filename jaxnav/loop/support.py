@@ -1,0 +1,149 @@
+"""What an estimate rests on, and so whether to act upon it.
+
+    support.drove(reading, heading_rad, gap_s, throttle, seeing)    # with every odometry
+    is_fix = support.corners(believed, now_ns, fix, possible)   # with every frame
+    support.doubt(contradicted)
+
+The filter can't know that its pose is nonsense: all that it has was fused into it. So a pose is
+taken for what it says only after CONFIRMED frames in a row have fitted it (R2), and no longer than
+corners, or odometer and throttle, don't contradict it. After a restart it is held against the way
+that the wheels have gone since the last fix: a copy of the marker elsewhere looks like the marker.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from jaxnav.loop.propulsion import Propulsion
+from jaxnav.loop.ways import Fix, Ways
+from jaxnav.models.bicycle import Vehicle
+
+CONFIRMED = 2  # frames in a row, with the first: R2's never on a single one
+# Driven slowly after a relocation, for a person to look at the car: about five seconds at half of
+# its speed in a room, and R4 gives no more to a car that sees nothing.
+SLOW_M = 1.0
+# Every further restart on that way asks for twice as many frames, up to three seconds' of a camera.
+_MOST_CONFIRMED = 96
+
+
+class Doubt(NamedTuple):
+    """Why an estimate is not to be acted upon, and how far off it may be beside its sigma."""
+
+    is_doubted: bool
+    off_m: float
+
+
+class Support:
+    """Of one drive's estimate.
+
+    Attributes:
+        refused: the pose is out of reach and must not be (`relocate` is False).
+        relocations: so far.
+    """
+
+    def __init__(self, vehicle: Vehicle, relocate: bool = True):
+        """Args:
+        relocate: whether to believe, after a while, a pose that no slip explains.
+        """
+        self.refused = False
+        self.relocations = 0
+        self._relocate = relocate
+        self._ways = Ways(float(vehicle.wheelbase_m))
+        self._propulsion = Propulsion.of(vehicle)
+        self._confirmations, self._needed = 0, CONFIRMED
+        self._restarted = False
+        self._slow_until_m = 0.0
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether so many frames in a row have fitted the pose."""
+        return self._confirmations >= self._needed
+
+    @property
+    def relocated(self) -> bool:
+        """Whether it was where no slip can have brought it, a short way ago, or still is."""
+        return self.refused or self._ways.way_m < self._slow_until_m
+
+    @property
+    def disputed(self) -> bool:
+        """Whether corners and odometer tell of different ways."""
+        return self._ways.disputed
+
+    @property
+    def odometry_doubtful(self) -> bool:
+        """Whether the odometer contradicts the throttle, and no marker has confirmed it since."""
+        return self._propulsion.doubtful
+
+    def drove(
+        self,
+        speed_mps: float,
+        steering_rad: float,
+        heading_rad: float,
+        gap_s: float,
+        throttle: float,
+        seeing: bool,
+    ) -> None:
+        """A reading of the odometer that was believed; see `Ways` and `Propulsion`."""
+        self._ways.drove(speed_mps, steering_rad, heading_rad, gap_s)
+        self._propulsion.look(speed_mps, throttle, gap_s, seeing, self._ways.disputed)
+
+    def restarted(self) -> None:
+        """All that was believed was given up; what was confirmed tells where it can be now."""
+        self._needed = min(2 * self._needed, _MOST_CONFIRMED) if self.relocated else CONFIRMED
+        self._confirmations, self._restarted = 0, True
+
+    def begin_anew(self) -> None:
+        """The same, and anything may have happened meanwhile."""
+        self._confirmations, self._needed = 0, CONFIRMED
+        self._restarted = self.refused = False
+        self._ways.forget()
+
+    def corners(
+        self,
+        believed: bool,
+        now_ns: int,
+        fix: Fix | None,
+        possible: Callable[[], Sequence[Fix]],
+    ) -> bool:
+        """Take in a frame, and say whether it is a fix.
+
+        Args:
+            believed: its corners fit the pose.
+            fix: that pose; None: several are possible.
+            possible: these.
+        """
+        self._ways.glimpse(now_ns)
+        if not believed:
+            if not self.confirmed:
+                self._confirmations = 0
+            return False
+        self._confirmations += 1
+        if not self.confirmed:
+            return False
+        slack_m = self._propulsion.off_m
+        if fix is None:
+            if self._restarted and not self._relocate:
+                self.refused = all(self._ways.out_of_reach(one, slack_m) for one in possible())
+            return not self.refused
+        if self._ways.out_of_reach(fix, slack_m):
+            self.refused = not self._relocate
+            if self.refused:
+                return False
+            self.relocations += 1
+            self._slow_until_m = self._ways.way_m + SLOW_M
+            self._ways.forget()
+        self._restarted = self.refused = False
+        self._propulsion.confirmed()
+        self._ways.look(now_ns, fix)
+        return True
+
+    def doubt(self, contradicted: bool) -> Doubt:
+        """Whether to act upon the estimate.
+
+        Args:
+            contradicted: by the corners, more often than not.
+        """
+        off_m = self._propulsion.off_m if self.odometry_doubtful else 0.0
+        if contradicted or self.refused:
+            off_m += self._ways.since_fix_m
+        is_doubted = not self.confirmed or self.refused or contradicted or self.odometry_doubtful
+        return Doubt(is_doubted, off_m)

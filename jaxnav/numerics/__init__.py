@@ -1,0 +1,1 @@
+"""Small matrices, trees and least squares."""

@@ -1,0 +1,1 @@
+"""From the corners of one instant to candidate poses."""

@@ -1,0 +1,196 @@
+"""All vehicle poses that one observation admits: both IPPE poses of every sighting, refined.
+
+Source: Liu, Schofield, Shan (2023), Algorithm 1, "get both possible poses using the IPPE method
+and Eq. 3".
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.models.camera import Camera
+from jaxnav.models.geometry import (
+    on_ground,
+    rotation_matrix,
+    safe_norm,
+    safe_sqrt,
+    transform_points,
+)
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.small_matrices import in_order
+from jaxnav.pose.ippe import ippe_from_rays
+from jaxnav.pose.observation import Sightings, Snapshot, cameras_of
+from jaxnav.pose.refine import refine_sightings
+from jaxnav.pose.residuals import reprojection_residuals
+
+# Two local minima this close are one: 1.1 degrees, and as much of the distance to the markers.
+_SAME_POSE_RAD = 0.02
+
+
+class Candidates(eqx.Module):
+    """N poses of the vehicle, sorted by e1. Lanes that are not `valid` hold finite numbers.
+
+    `cost` is what the refinement minimised, whitened by the corners' sigma; `e1_px2` is the
+    paper's.
+    """
+
+    T_vehicle_world: jaxlie.SE3  # batch axis (N,)
+    e1_px2: Float[Array, " N"]
+    cost: Float[Array, " N"]  # sum of (residual / sigma)^2
+    covariance: Float[Array, "N 6 6"]  # of xi in T_world_vehicle * exp(xi)
+    valid: Bool[Array, " N"]
+    converged: Bool[Array, " N"]
+    steps: Int[Array, " N"]
+
+    @staticmethod
+    def none(count: int, dtype: DTypeLike) -> "Candidates":
+        """So many lanes, none of them valid."""
+        zeros = jnp.zeros(count, dtype)
+        return Candidates(
+            T_vehicle_world=jaxlie.SE3(jnp.zeros((count, 7), dtype).at[:, 0].set(1)),
+            e1_px2=zeros,
+            cost=zeros,
+            covariance=jnp.zeros((count, 6, 6), dtype),
+            valid=zeros > 0,
+            converged=zeros > 0,
+            steps=jnp.zeros(count, int),
+        )
+
+    def padded(self, count: int) -> "Candidates":
+        """So many lanes; those that are added are not valid."""
+        kept = self.valid.shape[0]
+        more = jax.tree.map(
+            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:1], count - kept, axis=0)]), self
+        )
+        return eqx.tree_at(lambda c: c.valid, more, more.valid & (jnp.arange(count) < kept))
+
+
+def find_candidates(
+    snapshot: Snapshot, max_candidates: int = 4, max_steps: int = 12, ground_plane: bool = False
+) -> Candidates:
+    """Every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
+
+    One camera that sees one marker gives two; two cameras on one marker give up to four, which
+    the refinement usually draws together into two (DESIGN 3.4). With many markers the
+    `max_candidates` that explain all corners best are refined.
+
+    Args:
+        snapshot: what is seen.
+        max_steps: bound on the LM steps.
+        ground_plane: keep the vehicle level on the ground, z = 0: only (x, y, psi) are refined.
+    """
+    rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
+    Ts_vehicle_world, owner_visible = _both_poses(rig, markers, seen)
+    if ground_plane:
+        Ts_vehicle_world = jax.vmap(lambda T: on_ground(T.inverse()).inverse())(Ts_vehicle_world)
+
+    residuals = reprojection_residuals(rig, seen)
+
+    def joint_e1(T_vehicle_world: jaxlie.SE3) -> Array:
+        corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
+        return jnp.sum(residuals(corners_vehicle) ** 2)
+
+    count = min(max_candidates, owner_visible.shape[0])
+    if count < owner_visible.shape[0]:
+        first_guess = jnp.where(owner_visible, jax.vmap(joint_e1)(Ts_vehicle_world), jnp.inf)
+        _, best = jax.lax.top_k(-first_guess, count)
+        Ts_vehicle_world = jaxlie.SE3(Ts_vehicle_world.wxyz_xyz[best])
+        owner_visible = owner_visible[best]
+
+    refined = refine_sightings(
+        rig, markers, seen, Ts_vehicle_world, max_steps, ground_plane, wanted=owner_visible
+    )
+    e1_px2 = refined.e1_px2
+    # Corners far outside of any image can overflow; such a lane is no candidate.
+    finite = jnp.isfinite(e1_px2) & jnp.isfinite(refined.cost)
+    valid = owner_visible & finite
+    e1_px2 = jnp.where(finite, e1_px2, 0)
+    refined = eqx.tree_at(lambda r: r.cost, refined, jnp.where(finite, refined.cost, 0))
+    order = in_order(-jnp.where(valid, e1_px2, jnp.inf), count)
+    refined, e1_px2, valid = jax.tree.map(lambda leaf: leaf[order], (refined, e1_px2, valid))
+    return Candidates(
+        T_vehicle_world=refined.T_vehicle_world,
+        e1_px2=e1_px2,
+        cost=refined.cost,
+        covariance=refined.covariance,
+        valid=valid & ~_repeats(refined.T_vehicle_world, seen, markers, valid),
+        converged=refined.converged,
+        steps=refined.steps,
+    )
+
+
+def own_errors_px(snapshot: Snapshot) -> Float[Array, " D"]:
+    """How far the corners of each sighting are from those of the better of its own two poses, RMS.
+
+    Large where they are not the image of a square at all.
+    """
+    rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
+    Ts_vehicle_world, _ = _both_poses(rig, markers, seen)
+
+    def one(
+        camera: Camera, T_camera_vehicle: jaxlie.SE3, Ts: jaxlie.SE3, corners: Array, px: Array
+    ) -> Array:
+        def error(T_vehicle_world: jaxlie.SE3) -> Array:
+            corners_camera = transform_points(T_camera_vehicle @ T_vehicle_world, corners)
+            return jnp.mean(jnp.sum((camera.project(corners_camera) - px) ** 2, axis=1))
+
+        return jnp.min(jax.vmap(error)(Ts))
+
+    squared = jax.vmap(one)(
+        cameras_of(rig, seen),
+        jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index]),
+        jaxlie.SE3(Ts_vehicle_world.wxyz_xyz.reshape(-1, 2, 7)),
+        markers.corners_world_m[seen.marker_index],
+        seen.corners_px,
+    )
+    return safe_sqrt(squared)
+
+
+def _both_poses(
+    rig: CameraRig, markers: MarkerMap, seen: Sightings
+) -> tuple[jaxlie.SE3, Bool[Array, " twice_D"]]:
+    """Two vehicle poses (2D,) from every sighting by itself, and whether it is visible."""
+
+    def one(
+        camera: Camera,
+        T_camera_vehicle: jaxlie.SE3,
+        T_world_marker: jaxlie.SE3,
+        size_m: Array,
+        corners_px: Array,
+    ) -> jaxlie.SE3:
+        Ts_camera_marker = ippe_from_rays(camera.unproject(corners_px), size_m)
+        return jax.vmap(
+            lambda T_camera_marker: (
+                T_camera_vehicle.inverse() @ T_camera_marker @ T_world_marker.inverse()
+            )
+        )(Ts_camera_marker)
+
+    Ts_vehicle_world = jax.vmap(one)(
+        cameras_of(rig, seen),
+        jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index]),
+        jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[seen.marker_index]),
+        markers.size_m[seen.marker_index],
+        seen.corners_px,
+    )
+    return jaxlie.SE3(Ts_vehicle_world.wxyz_xyz.reshape(-1, 7)), jnp.repeat(seen.visible, 2)
+
+
+def _repeats(
+    T_vehicle_world: jaxlie.SE3, seen: Sightings, markers: MarkerMap, valid: Bool[Array, " N"]
+) -> Bool[Array, " N"]:
+    """Whether an earlier valid lane holds the same pose, as the markers in view tell."""
+    first_seen = seen.marker_index[jnp.argmax(seen.visible)]
+    center_world = markers.Ts_world_marker.translation()[first_seen]
+    centers_vehicle = jax.vmap(lambda T: transform_points(T, center_world))(T_vehicle_world)
+    range_m = jnp.maximum(safe_norm(centers_vehicle), 1e-3)
+    R = jax.vmap(rotation_matrix)(T_vehicle_world.rotation())
+    # |R_i - R_j|_F = 2 sqrt(2) sin(angle / 2)
+    turn = safe_norm((R[:, None] - R[None]).reshape(*R.shape[:1], *R.shape[:1], 9)) / jnp.sqrt(2.0)
+    shift = safe_norm(centers_vehicle[:, None] - centers_vehicle[None]) / range_m[:, None]
+    same = (turn < _SAME_POSE_RAD) & (shift < _SAME_POSE_RAD)
+    earlier = jnp.tri(same.shape[0], k=-1, dtype=bool)
+    return jnp.any(same & earlier & valid[None], axis=1)

@@ -1,0 +1,110 @@
+"""Which markers in view to hold a pose against: those that can be markers, and agree.
+
+    found = consistent(snapshot, navigator.find_candidates)
+
+Four corners at random places fit no pose at all, and a marker that was moved, or a copy of it, fits
+no pose that the others agree on. A belief that takes them in all the same, however little it trusts
+them, goes astray.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.numerics.trees import where
+from jaxnav.pose.candidates import Candidates, own_errors_px
+from jaxnav.pose.observation import Sightings, Snapshot
+
+# Corners are those of a square in space where they miss the best projection of one by less than so
+# many of their sigmas, or than such a share of the marker's side: 2 px of blur on a marker of 17 px
+# is 12 %. Of quads drawn at random over an image 2 % come as near.
+_MISFIT_SIGMAS = 10.0
+_MISFIT_SHARE = 0.12
+# A joint misfit beyond three sigmas of its chi-square, times this, is a contradiction: corners off
+# by four times their sigma, more than cameras off by 1 deg or a map off by 1 cm come to in a room.
+_CONTRADICTION = 16.0
+_GAIN = 4.0  # by which it must fall without one marker, and without no other as far
+LEAST_MARKERS = 3  # two can't outvote each other
+
+
+class Consistent(NamedTuple):
+    """What is left of a snapshot, the candidate poses for that, and which markers are not in it
+    because the others outvote them."""
+
+    snapshot: Snapshot
+    candidates: Candidates
+    outvoted: Bool[Array, " M"]
+
+
+def consistent(snapshot: Snapshot, find: Callable[[Snapshot], Candidates]) -> Consistent:
+    """What is seen without nonsense and without a marker that the others outvote.
+
+    Args:
+        find: see `find_candidates`.
+    """
+    snapshot = _among(snapshot, _can_be_markers(snapshot))
+    candidates = find(snapshot)
+    nobody = jnp.zeros(len(snapshot.markers.ids), bool)
+    if nobody.shape[0] < LEAST_MARKERS or snapshot.seen.visible.shape[0] < LEAST_MARKERS:
+        return Consistent(snapshot, candidates, nobody)
+    seen = snapshot.seen
+    in_view = jnp.sum(_in_view(seen, nobody.shape[0]))
+    all_of_them = _excess(candidates, seen)
+
+    def outvote() -> tuple[Bool[Array, " D"], Candidates]:
+        # One slot of each marker stands for it; slots of the same marker come to the same.
+        def without(marker: Array) -> tuple[Array, Candidates]:
+            rest = _among(snapshot, seen.marker_index != marker)
+            found = find(rest)
+            return _excess(found, rest.seen), found
+
+        excess, found = jax.vmap(without)(seen.marker_index)
+        excess = jnp.where(seen.visible, excess, jnp.inf)
+        best = jnp.argmin(excess)
+        is_other = seen.marker_index != seen.marker_index[best]
+        second = jnp.min(jnp.where(is_other, excess, jnp.inf))
+        clear = (excess[best] <= _CONTRADICTION) & (
+            excess[best] * _GAIN <= jnp.minimum(second, all_of_them)
+        )
+        kept = is_other | ~clear
+        rest = jax.tree.map(lambda leaf: leaf[best], found)
+        return kept, where(clear, rest, candidates)
+
+    kept, candidates = jax.lax.cond(
+        (in_view >= LEAST_MARKERS) & (all_of_them > _CONTRADICTION),
+        outvote,
+        lambda: (jnp.ones_like(seen.visible), candidates),
+    )
+    outvoted = _in_view(_among(snapshot, ~kept).seen, nobody.shape[0])
+    return Consistent(_among(snapshot, kept), candidates, outvoted)
+
+
+def _can_be_markers(snapshot: Snapshot) -> Bool[Array, " D"]:
+    seen = snapshot.seen
+    errors_px = own_errors_px(snapshot)
+    sides_px = jnp.linalg.norm(seen.corners_px - jnp.roll(seen.corners_px, 1, axis=1), axis=2)
+    bound_px = jnp.maximum(
+        _MISFIT_SIGMAS * jnp.mean(seen.sigma_px, axis=1),
+        _MISFIT_SHARE * jnp.mean(sides_px, axis=1),
+    )
+    return errors_px <= bound_px
+
+
+def _among(snapshot: Snapshot, kept: Bool[Array, " D"]) -> Snapshot:
+    visible = snapshot.seen.visible & kept
+    return eqx.tree_at(lambda s: s.seen.visible, snapshot, visible)
+
+
+def _in_view(seen: Sightings, markers: int) -> Bool[Array, " M"]:
+    return jnp.zeros(markers, bool).at[seen.marker_index].max(seen.visible)
+
+
+def _excess(candidates: Candidates, seen: Sightings) -> Float[Array, ""]:
+    """The misfit of the best pose over three sigmas of its chi-square."""
+    misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+    freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
+    return misfit / (freedom + 3 * jnp.sqrt(2 * freedom))

@@ -1,0 +1,186 @@
+"""What the vehicle senses at one instant, and its compact form for the solvers."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.models.camera import Camera
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.small_matrices import in_order
+
+# What lens calibration and rolling shutter leave in a corner, beside its own scatter.
+MODEL_SIGMA_PX = 0.15
+# Beyond these a reading is an error of the sensor, or of its unit.
+_MAX_SPEED_MPS = 1e3
+_MAX_DT_S = 1e4
+# Up to here comparing every lane with every other is faster than a sort.
+_FEW_LANES = 32
+
+
+class Observation(eqx.Module):
+    """One synchronous reading of cameras, odometer and steering sensor.
+
+    Lanes that are not visible hold any finite numbers. What no sensor can mean is left out, see
+    `usable`.
+    """
+
+    corners_px: Float[Array, "C M 4 2"]  # raw pixels, M in the order of the map
+    visible: Bool[Array, "C M"]
+    speed_mps: Float[Array, ""] | float = 0.0
+    steering_rad: Float[Array, ""] | float = 0.0
+    dt_s: Float[Array, ""] | float = 0.0  # since the previous observation
+    corner_sigma_px: Float[Array, "C M 4"] | None = None  # None: the estimator's own figure
+    has_odometry: Bool[Array, ""] | bool = True  # False: speed and steering are not known
+    # What another sensor knows, for `OrientationGiven`; a NaN is no reading.
+    heading_rad: Float[Array, ""] | None = None  # psi in the world
+    heading_sigma_rad: Float[Array, ""] | float = 0.02
+    normals_camera: Float[Array, "C M 3"] | None = None  # unit normal of each marker
+    normal_sigma_rad: Float[Array, ""] | float = 0.05
+    T_world_vehicle_true: jaxlie.SE3 | None = None  # simulations only, for `Oracle`
+
+    def usable(self) -> "Observation":
+        """The same with everything finite that a filter looks at.
+
+        A lane with a non-finite corner is not visible; without a speed and a steering angle that
+        a vehicle can have there is no odometry; a `dt_s` that is no positive time is 0.
+        """
+        can_steer = jnp.abs(self.steering_rad) < jnp.pi / 2
+        has_odometry = self.has_odometry & (jnp.abs(self.speed_mps) < _MAX_SPEED_MPS) & can_steer
+        dt_s = jnp.asarray(self.dt_s)
+        usable_dt = (dt_s > 0) & (dt_s < _MAX_DT_S)
+        return dataclasses.replace(
+            self,
+            visible=self.visible & jnp.all(jnp.isfinite(self.corners_px), axis=(2, 3)),
+            speed_mps=jnp.where(has_odometry, self.speed_mps, 0.0),
+            steering_rad=jnp.where(can_steer, self.steering_rad, 0.0),
+            dt_s=jnp.where(usable_dt, dt_s, 0.0),
+            has_odometry=has_odometry,
+        )
+
+
+class Sightings(eqx.Module):
+    """The D largest visible markers, each with the camera that sees it."""
+
+    camera_index: Int[Array, " D"]
+    marker_index: Int[Array, " D"]
+    corners_px: Float[Array, "D 4 2"]
+    sigma_px: Float[Array, "D 4"]
+    visible: Bool[Array, " D"]
+
+
+def sightings(
+    rig: CameraRig,
+    markers: MarkerMap,
+    corners_px: Float[Array, "C M 4 2"],
+    visible: Bool[Array, "C M"],
+    sigma_px: Float[Array, "*sigma"] | float = 1.0,
+    max_count: int | None = None,
+) -> Sightings:
+    """The visible (camera, marker) lanes in a fixed number of slots.
+
+    A lane with a non-finite corner, or a sigma that is not a positive number, is not visible.
+
+    Args:
+        corners_px: (C, M, 4, 2).
+        visible: (C, M).
+        sigma_px: standard deviation of a corner coordinate, one for all or (C, M, 4).
+        max_count: slots; by default one for each lane. Smaller images beyond it are dropped.
+
+    Raises:
+        ValueError: shapes that do not fit the rig and the map.
+    """
+    lanes = (len(rig), len(markers.ids))
+    if corners_px.shape != (*lanes, 4, 2) or visible.shape != lanes:
+        raise ValueError(
+            f"corners_px (C, M, 4, 2) and visible (C, M) with C, M = {lanes} expected, "
+            f"got {corners_px.shape} and {visible.shape}"
+        )
+    count = lanes[0] * lanes[1]
+    kept = min(count, max_count or count)
+    dtype = rig.cameras.focal_px.dtype
+    corners = corners_px.reshape(count, 4, 2).astype(dtype)
+    seen = visible.reshape(count) & jnp.all(jnp.isfinite(corners), axis=(1, 2))
+    sigma = jnp.broadcast_to(jnp.asarray(sigma_px, dtype), (*lanes, 4)).reshape(count, 4)
+    seen = seen & jnp.all(jnp.isfinite(sigma) & (sigma > 0), axis=1)
+    sigma = jnp.where(seen[:, None], sigma, 1)
+    # A hidden lane becomes a plain square near the principal point: every formula stays finite.
+    camera_index = jnp.repeat(jnp.arange(lanes[0]), lanes[1])
+    dummy = jnp.asarray([[-20.0, -20.0], [20.0, -20.0], [20.0, 20.0], [-20.0, 20.0]], dtype)
+    centers = rig.cameras.center_px[camera_index]
+    corners = jnp.where(seen[:, None, None], corners, centers[:, None] + dummy[None])
+    if kept < count:
+        diagonals = corners[:, :2] - corners[:, 2:]
+        area = jnp.abs(
+            diagonals[:, 0, 0] * diagonals[:, 1, 1] - diagonals[:, 0, 1] * diagonals[:, 1, 0]
+        )
+        area = jnp.where(seen, area, -1)
+        few = count <= _FEW_LANES
+        slots = in_order(area, kept) if few else jax.lax.top_k(area, kept)[1]
+    else:
+        slots = jnp.arange(count)
+    return Sightings(
+        camera_index=camera_index[slots],
+        marker_index=jnp.tile(jnp.arange(lanes[1]), lanes[0])[slots],
+        corners_px=corners[slots],
+        sigma_px=sigma[slots],
+        visible=seen[slots],
+    )
+
+
+def slots(rig: CameraRig, markers: MarkerMap, max_sightings: int | None) -> int:
+    """How many sightings are used, the largest: by default two of every marker, 16 at most."""
+    count = len(markers.ids)
+    return min(max_sightings or min(2 * count, 16), len(rig) * count)
+
+
+class Snapshot(eqx.Module):
+    """One observation by a rig in a map: all that a pose can be held against."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    obs: Observation
+    seen: Sightings
+
+    @staticmethod
+    def create(
+        rig: CameraRig,
+        markers: MarkerMap,
+        obs: Observation,
+        corner_sigma_px: Float[Array, ""] | float = 1.0,
+        model_sigma_px: Float[Array, ""] | float = MODEL_SIGMA_PX,
+        max_sightings: int | None = None,
+    ) -> "Snapshot":
+        """An observation together with what it is an observation of.
+
+        Args:
+            corner_sigma_px: for observations that bring no sigma of their own.
+            model_sigma_px: what lens calibration and rolling shutter leave in a corner, added
+                in quadrature to the sigma that an observation brings.
+            max_sightings: see `slots`.
+        """
+        sigma_px = corner_sigma_px
+        if obs.corner_sigma_px is not None:
+            sigma_px = jnp.sqrt(obs.corner_sigma_px**2 + model_sigma_px**2)
+        count = slots(rig, markers, max_sightings)
+        seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, count)
+        return Snapshot(rig, markers, obs, seen)
+
+    def largest(self, count: int) -> "Snapshot":
+        """The same with the first sightings alone."""
+        seen = jax.tree.map(lambda leaf: leaf[:count], self.seen)
+        return dataclasses.replace(self, seen=seen)
+
+
+def log_sigmas(seen: Sightings) -> Float[Array, ""]:
+    """The sum over all visible coordinates: what a likelihood pays for doubting them."""
+    return 2 * jnp.sum(jnp.where(seen.visible[:, None], jnp.log(seen.sigma_px), 0))
+
+
+def cameras_of(rig: CameraRig, seen: Sightings) -> Camera:
+    """The camera of every sighting, batch axis (D,)."""
+    return jax.tree.map(lambda leaf: leaf[seen.camera_index], rig.cameras)

@@ -1,0 +1,1 @@
+"""Our own drives: recorded, read back and replayed."""

@@ -1,0 +1,245 @@
+"""A recorded drive, read back: what reached the pilot, what it made of it, what the cameras saw."""
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Metadata
+
+from jaxnav.errors import BadInput
+from jaxnav.files import limits
+from jaxnav.files.validation import Model, validate
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.drive_format import HEADER, decode, header_of
+from jaxnav.recording.mcap_messages import McapMessages, Recorded
+from jaxnav.recording.message_schemas import (
+    IMAGE_SCHEMA,
+    MESSAGES,
+    OUTCOME,
+    AnyMessage,
+    ImageMessage,
+    OutcomeMessage,
+)
+from jaxnav.recording.messages import input_of
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """N outcomes, a row each. NaN, none of them or -1 where there was no report.
+
+    Attributes:
+        now_ns: (N,), when.
+        times_s: (N,), since the first.
+        health, faults, rejects: (N,), values of `Health`, `Fault` and `Reject`.
+        steering_rad, throttle: (N,), what was commanded, within the limits.
+        pose: (N, 3), x_m y_m psi_rad.
+        covariance: (N, d, d).
+        located, decided, done: (N,) bool.
+        flip_probability, nis: (N,).
+        hypothesis, restarts: (N,) int.
+        hypotheses, log_weight: N arrays, (K, 3) and (K,), of those alive.
+        Ts_vehicle_world, costs: N arrays, (M, 7) wxyz_xyz and (M,), of the candidates.
+        selected: (N,) int, which of them.
+        reasons, digests: N texts: why it last started anew, and of the pilot's state.
+    """
+
+    now_ns: np.ndarray
+    times_s: np.ndarray
+    health: np.ndarray
+    faults: np.ndarray
+    rejects: np.ndarray
+    steering_rad: np.ndarray
+    throttle: np.ndarray
+    pose: np.ndarray
+    covariance: np.ndarray
+    located: np.ndarray
+    decided: np.ndarray
+    done: np.ndarray
+    flip_probability: np.ndarray
+    nis: np.ndarray
+    hypothesis: np.ndarray
+    restarts: np.ndarray
+    hypotheses: tuple[np.ndarray, ...]
+    log_weight: tuple[np.ndarray, ...]
+    Ts_vehicle_world: tuple[np.ndarray, ...]
+    costs: tuple[np.ndarray, ...]
+    selected: np.ndarray
+    reasons: tuple[str, ...]
+    digests: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RecordedImage:
+    """A JPEG and its camera's stamp."""
+
+    topic: str
+    stamp_ns: int
+    jpeg: bytes
+
+
+@dataclass(frozen=True)
+class DriveLog:
+    """A recorded drive.
+
+    Attributes:
+        header: as it was given to the recorder.
+        inputs: in the order in which the pilot handled them.
+        missing: topic -> how many of its messages were left out, as far as one can tell.
+        truncated: the recording was not brought to its end; what was, is here.
+    """
+
+    path: Path
+    header: dict[str, Any]
+    inputs: tuple[Input, ...]
+    outcomes: Outcomes
+    missing: dict[str, int]
+    truncated: bool
+
+    def images(self, topic: str | None = None) -> Iterator[RecordedImage]:
+        """The images, read from the file one by one: of a topic or, by default, of all.
+
+        Raises:
+            BadInput: one that is damaged.
+        """
+        for record in McapMessages(self.path):
+            if isinstance(record, Recorded) and record.schema == IMAGE_SCHEMA:
+                if topic in (None, record.topic):
+                    message = _checked(ImageMessage, record, self.path, record.topic)
+                    yield RecordedImage(record.topic, record.stamp_ns, message.data)
+
+
+def read_drive(path: str | Path) -> DriveLog:
+    """Read what `Recorder` wrote, to its end or as far as it goes.
+
+    Raises:
+        BadInput: one line naming file and topic: not such a file, of a newer format, or damaged.
+    """
+    with _uncollected():
+        return _read(Path(path))
+
+
+def _read(path: Path) -> DriveLog:
+    header: dict[str, Any] | None = None
+    inputs: list[Input] = []
+    # Not as messages: one takes four times the memory of what it says.
+    told: dict[str, list[Any]] = {name: [] for name in OutcomeMessage.model_fields}
+    detections = 0
+    gaps = _Gaps()
+    records = McapMessages(path)
+    for record in records:
+        if isinstance(record, Metadata):
+            if record.name == HEADER and header is None:
+                header = header_of(record.metadata, path)
+            continue
+        gaps.count(record)
+        if record.topic in MESSAGES:
+            index = len(told["now_ns"] if record.topic == OUTCOME else inputs)
+            message = _message(record, path, index)
+            if isinstance(message, OutcomeMessage):
+                for name, value in vars(message).items():
+                    told[name].append(value)
+                continue
+            inputs.append(input_of(message))
+            found = (frame.detections for frame in inputs[-1].frames)
+            detections += sum(len(one) for one in found if one is not None)
+            if detections > limits.DETECTIONS:
+                problem = f"holds more than {limits.DETECTIONS} detections"
+                raise BadInput(f"{path}: {record.topic}", problem)
+    if header is None:
+        problem = "is cut off before its header" if records.truncated else "is no recorded drive"
+        raise BadInput(path, problem)
+    table = _table(told, path)
+    return DriveLog(path, header, tuple(inputs), table, gaps.missing, records.truncated)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without the search for cycles, a third of the time: a drive's messages have none."""
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+@dataclass
+class _Gaps:
+    """What the sequence numbers tell."""
+
+    missing: dict[str, int] = field(default_factory=dict)
+    _last: dict[str, int] = field(default_factory=dict)
+
+    def count(self, record: Recorded) -> None:
+        gap = record.sequence - self._last.get(record.topic, -1) - 1
+        if gap > 0:
+            self.missing[record.topic] = self.missing.get(record.topic, 0) + gap
+        self._last[record.topic] = record.sequence
+
+
+def _message(record: Recorded, path: Path, index: int) -> AnyMessage:
+    name, model = MESSAGES[record.topic]
+    if (record.schema, record.encoding) != (name, "json"):
+        problem = f"expected {name} in json, got {record.schema!r} in {record.encoding!r}"
+        raise BadInput(f"{path}: {record.topic}", problem)
+    if len(record.data) > limits.MESSAGE_BYTES:
+        raise BadInput(f"{path}: {record.topic}[{index}]", f"has {len(record.data)} bytes")
+    return _checked(model, record, path, f"{record.topic}[{index}]")
+
+
+def _checked(model: type[Model], record: Recorded, path: Path, key: str) -> Model:
+    try:
+        data = decode(record.data)
+    except ValueError as error:
+        raise BadInput(f"{path}: {key}", f"is not valid JSON: {error}") from None
+    return validate(model, data, path, key)
+
+
+def _table(told: dict[str, list[Any]], path: Path) -> Outcomes:
+    def column(name: str, dtype: type, missing: Any = None) -> np.ndarray:
+        return np.array([missing if value is None else value for value in told[name]], dtype)
+
+    def rows(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        missing = np.full(shape, np.nan)
+        filled = [missing if value is None else value for value in told[name]]
+        return np.array(filled, float).reshape(len(filled), *shape)
+
+    def ragged(name: str, *row: int) -> tuple[np.ndarray, ...]:
+        return tuple(np.zeros((0, *row)) if value is None else value for value in told[name])
+
+    sides = {len(covariance) for covariance in told["covariance"] if covariance is not None}
+    if len(sides) > 1:
+        raise BadInput(f"{path}: {OUTCOME}.covariance", f"differ in size: {sorted(sides)}")
+    side = sides.pop() if sides else 0
+    now_ns = column("now_ns", np.int64)
+    return Outcomes(
+        now_ns=now_ns,
+        times_s=(now_ns - now_ns[:1]) / 1e9,
+        health=column("health", int),
+        faults=column("faults", int),
+        rejects=column("rejects", int),
+        steering_rad=column("steering_rad", float),
+        throttle=column("throttle", float),
+        pose=rows("pose", (3,)),
+        covariance=rows("covariance", (side, side)),
+        located=column("located", bool),
+        decided=column("decided", bool),
+        done=column("done", bool),
+        flip_probability=column("flip_probability", float, np.nan),
+        nis=column("nis", float, np.nan),
+        hypothesis=column("hypothesis", int, -1),
+        restarts=column("restarts", int),
+        hypotheses=ragged("hypotheses", 3),
+        log_weight=ragged("log_weight"),
+        Ts_vehicle_world=ragged("Ts_vehicle_world", 7),
+        costs=ragged("costs"),
+        selected=column("selected", int, -1),
+        reasons=tuple(told["reason"]),
+        digests=tuple(told["digest"]),
+    )

@@ -1,0 +1,217 @@
+"""A recorded drive driven again: the same inputs, and where what comes of them differs.
+
+    log = read_drive(path)
+    setup = DriveSetup.of_header(log.header, path)
+    difference = first_difference(log, replay_drive(log.inputs, setup, folder))
+
+On the machine and with the versions that it was recorded with every bit is the same, elsewhere
+every number but for rounding (RELIABILITY R11).
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxnav.detection import Detections
+from jaxnav.detection.image_search import ImageSearch, size_problem
+from jaxnav.errors import BadInput
+from jaxnav.files.images import decoded_image
+from jaxnav.loop.flags import Fault, Health, Reject, names
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.models.origin import opposite, planar_in_world
+from jaxnav.recording.drive_log import DriveLog, Outcomes
+from jaxnav.recording.drive_setup import DriveSetup, made_here
+from jaxnav.recording.messages import digest
+
+# As rounding differs between machines, relative to values above 1.
+TOLERANCE_FLOAT64, TOLERANCE_FLOAT32 = 1e-9, 1e-3
+_MAGNIFIED = 1e3  # a NIS is in units of sigma, which is a millimetre
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Where a replay first differs from what was recorded.
+
+    Attributes:
+        index: of the outcome in the recording.
+        time_s: since the first.
+        what: which value, and by how much.
+    """
+
+    index: int
+    time_s: float
+    what: str
+
+
+def check_inputs(inputs: Iterable[Input], setup: DriveSetup, where: Path) -> None:
+    """Whether inputs can be of a rig.
+
+    Raises:
+        BadInput: a frame is of a camera that the rig does not have, or the clock runs backwards.
+    """
+    before_ns = 0
+    for index, given in enumerate(inputs):
+        if given.now_ns < before_ns:
+            raise BadInput(f"{where}: now_ns[{index}]", "is less than that of the input before")
+        before_ns = given.now_ns
+        for frame in given.frames:
+            if not 0 <= frame.camera < len(setup.rig):
+                problem = f"must be from 0 to {len(setup.rig) - 1}, got {frame.camera}"
+                raise BadInput(f"{where}: /frames.camera", problem)
+
+
+def replay_drive(
+    inputs: Sequence[Input], setup: DriveSetup, folder: Path | None
+) -> Iterator[Outcome]:
+    """What a pilot at its beginning makes of recorded inputs, one after the other.
+
+    Args:
+        folder: of executables, see `compiled`.
+    """
+    pilot = setup.pilot(folder)
+    for given in inputs:
+        yield pilot.handle(given)
+
+
+class Comparison:
+    """Outcomes of a replay held against those of the recording, one after the other.
+
+    Bit for bit where the drive was recorded by what runs now, else within the tolerance of its
+    precision. Outcomes that the recording has lost are passed over.
+
+    Attributes:
+        bit_for_bit: whether bits are compared.
+        compared: how many outcomes were.
+        first: where they first differ; None: nowhere yet.
+    """
+
+    def __init__(self, log: DriveLog):
+        self.bit_for_bit = made_here(log.header)
+        self.compared = 0
+        self.first: Difference | None = None
+        self._recorded, self._index = log.outcomes, 0
+        float64 = bool(log.header.get("float64"))
+        self._tolerance = TOLERANCE_FLOAT64 if float64 else TOLERANCE_FLOAT32
+
+    def look(self, outcome: Outcome) -> None:
+        """Compare the next outcome."""
+        recorded, count = self._recorded, len(self._recorded.now_ns)
+        while self._index < count and recorded.now_ns[self._index] < outcome.now_ns:
+            self._index += 1
+        index = self._index
+        if index == count or recorded.now_ns[index] > outcome.now_ns:
+            return
+        self._index, self.compared = index + 1, self.compared + 1
+        if self.first is not None:
+            return
+        what = _difference(recorded, index, outcome, self._tolerance)
+        if self.bit_for_bit and recorded.digests[index] not in ("", digest(outcome)):
+            what = what or _difference(recorded, index, outcome, 0.0) or "bits that are not shown"
+        if what is not None:
+            self.first = Difference(index, float(recorded.times_s[index]), what)
+
+
+def first_difference(log: DriveLog, outcomes: Iterable[Outcome]) -> Difference | None:
+    """The first recorded outcome that a replay does not come to; None: there is none."""
+    comparison = Comparison(log)
+    for outcome in outcomes:
+        comparison.look(outcome)
+    return comparison.first
+
+
+def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: float) -> str | None:
+    output, away_m = outcome.report.output, opposite(outcome.origin_m)
+    for name, kind in (("health", Health), ("faults", Fault), ("rejects", Reject)):
+        before, now = kind(int(getattr(recorded, name)[index])), getattr(outcome, name)
+        if before != now:
+            return f"{name}: {_words(now)}, recorded {_words(before)}"
+    for name, now in (
+        ("restarts", outcome.restarts),
+        ("located", bool(output.located)),
+        ("decided", bool(output.decided)),
+        ("done", bool(output.done)),
+    ):
+        if (before := getattr(recorded, name)[index]) != now:
+            return f"{name}: {now}, recorded {before}"
+    for name, value in (
+        ("pose", outcome.pose),
+        ("covariance", output.covariance),
+        ("steering_rad", outcome.steering_rad),
+        ("throttle", outcome.throttle),
+        ("flip_probability", output.flip_probability),
+        ("nis", output.nis),
+    ):
+        before, bound = getattr(recorded, name)[index], tolerance
+        if name == "nis":
+            bound *= _MAGNIFIED
+        if name == "pose":  # by the numbers that were computed with, less what was rounded since
+            value, before = (planar_in_world(pose, away_m) for pose in (value, before))
+            bound += float(np.spacing(max(map(abs, away_m)))) if tolerance else 0.0
+        off = _off(np.asarray(value, float), np.asarray(before, float))
+        if not off <= bound:
+            return f"{name}: off by {off:.3g}"
+    return None
+
+
+def _off(now: np.ndarray, before: np.ndarray) -> float:
+    """The largest difference, relative to values above 1; NaN is as good as NaN."""
+    if now.shape != before.shape:
+        return np.inf
+    off = np.abs(now - before) / np.maximum(np.abs(before), 1.0)
+    same = (now == before) | (np.isnan(now) & np.isnan(before))
+    return float(np.max(np.where(same, 0.0, np.where(np.isnan(off), np.inf, off)), initial=0.0))
+
+
+def _words(flags: Any) -> str:
+    return flags.name if isinstance(flags, Health) else " ".join(names(flags)) or "none"
+
+
+def inputs_from_images(
+    log: DriveLog, setup: DriveSetup, corner_backend: str
+) -> tuple[list[Input], int]:
+    """The inputs with what is found now in the recorded images, in the recorded order.
+
+    A frame whose image was not recorded stays as it was, and so does one that was not usable.
+
+    Args:
+        corner_backend: see `make_detector`.
+
+    Returns:
+        The inputs, and how many frames were searched anew.
+
+    Raises:
+        BadInput: no image of a camera is there, or one has a wrong size; as `make_detector`.
+    """
+    search, found = ImageSearch(setup.rig, setup.markers, corner_backend), {}
+    camera_of = {f"/camera/{name}": index for index, name in enumerate(setup.rig.names)}
+    for image in log.images():
+        if image.topic not in camera_of:
+            continue
+        camera = camera_of[image.topic]
+        pixels = decoded_image(image.jpeg)
+        if pixels is None:
+            raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
+        if problem := size_problem(setup.rig, camera, pixels):
+            raise BadInput(f"{log.path}: {image.topic}", problem)
+        found[camera, image.stamp_ns] = search.detections(camera, pixels)
+    if not found:
+        raise BadInput(log.path, f"holds no image on {', '.join(camera_of)}")
+    searched = 0
+
+    def anew(frame: Sighted) -> Sighted:
+        nonlocal searched
+        seen: Detections | None = found.get((frame.camera, frame.stamp_ns))
+        if seen is None or frame.detections is None:
+            return frame
+        searched += 1
+        return dataclasses.replace(frame, detections=seen)
+
+    inputs = [
+        dataclasses.replace(given, frames=tuple(map(anew, given.frames))) for given in log.inputs
+    ]
+    return inputs, searched

@@ -1,0 +1,266 @@
+"""What a drive is driven with: all that a replay must know to come to the same bits.
+
+    setup = DriveSetup(rig, markers, vehicle, route)
+    pilot = setup.pilot(folder)
+    recorder = Recorder(path, setup.header())
+
+    log = read_drive(path)
+    setup = DriveSetup.of_header(log.header, path)
+
+The header is plain JSON and holds rig, markers, vehicle and parameters as their files do.
+"""
+
+import hashlib
+import os
+import platform
+from dataclasses import asdict, dataclass, field, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+from pydantic import Field, create_model, field_validator
+
+from jaxnav.belief.selectors import SELECTORS, make_selector
+from jaxnav.compiling.executables import PACKAGE, sources_digest
+from jaxnav.compiling.step import compiled
+from jaxnav.errors import BadInput
+from jaxnav.files import Params, Route, apply_params
+from jaxnav.files.markers import MarkerFile, marker_data
+from jaxnav.files.ranges import problem_of
+from jaxnav.files.rigs import RigFile, rig_data
+from jaxnav.files.validation import (
+    CornerSigma,
+    Entry,
+    FloorPlace,
+    Point,
+    Position,
+    Radius,
+    Text,
+    at,
+    validate,
+)
+from jaxnav.files.vehicles import VehicleFile, vehicle_data
+from jaxnav.loop.estimator import advance_packed
+from jaxnav.loop.health import Timeouts
+from jaxnav.loop.pilot import Pilot
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.origin import ZERO, Origin
+from jaxnav.models.rig import CameraRig
+from jaxnav.navigator import Navigator
+from jaxnav.recording.message_fields import Flag
+
+SETUP_VERSION = 1
+# What the bits of a drive don't depend on.
+_WITHOUT = (
+    "arguments", "calibration", "commands", "datasets", "lanes", "plots", "simulation", "studies",
+    "testing", "tuning", "vehicles", "viewer",
+)  # fmt: skip
+# The others need what only a simulation has: another sensor, the truth.
+PILOT_SELECTORS = tuple(name for name in SELECTORS if name not in ("orientation-given", "oracle"))
+
+_Limit = Annotated[float, Field(strict=True, ge=0)]  # also inf: never
+
+
+class RouteEntry(Entry):
+    """See `Route`."""
+
+    waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
+    waypoint_radius_m: Radius
+    start_pose: Annotated[list[Position], Field(min_length=3, max_length=3)]
+
+    @field_validator("start_pose")
+    @classmethod
+    def _turned_little(cls, start_pose: list[float]) -> list[float]:
+        if problem := problem_of("angle_rad", start_pose[2]):
+            raise ValueError(f"psi {problem}")
+        return start_pose
+
+    def route(self) -> Route:
+        """The route."""
+        x_m, y_m, psi_rad = self.start_pose
+        waypoints_m = tuple((x, y) for x, y in self.waypoints_m)
+        return Route(waypoints_m, self.waypoint_radius_m, (x_m, y_m, psi_rad))
+
+
+_timeouts: dict[str, Any] = {limit.name: (_Limit, ...) for limit in fields(Timeouts)}
+TimeoutsEntry: Any = create_model("TimeoutsEntry", __base__=Entry, **_timeouts)
+
+
+class SetupEntry(Entry):
+    """The header of a recorded drive; see `DriveSetup`."""
+
+    setup_version: Annotated[int, Field(strict=True)]
+    rig: RigFile
+    markers: MarkerFile
+    origin_m: Point | None = None  # that the map counts from; maps near zero have none
+    vehicle: VehicleFile
+    route: RouteEntry
+    selector: Text
+    corner_sigma_px: CornerSigma | None
+    parameters: dict[str, Any] = Field(default_factory=dict)  # older drives have none
+    timeouts: TimeoutsEntry
+    float64: Flag
+    relocate: Flag = True  # older drives don't say
+    made_by: dict[str, str]
+
+    def origin(self) -> Origin:
+        """What the map counted from when it was recorded."""
+        if self.origin_m is None:
+            return ZERO
+        x_m, y_m, z_m = self.origin_m
+        return x_m, y_m, z_m
+
+    @field_validator("selector")
+    @classmethod
+    def _known(cls, selector: str) -> str:
+        if selector not in PILOT_SELECTORS:
+            expected = ", ".join(PILOT_SELECTORS)
+            raise ValueError(f"unknown {selector!r}: expected one of {expected}")
+        return selector
+
+
+@dataclass(frozen=True, eq=False)
+class DriveSetup:
+    """What a drive is driven with.
+
+    Attributes:
+        markers: what is driven with counts from their `origin_m`, the route from zero.
+        selector: one of `PILOT_SELECTORS`.
+        corner_sigma_px: of every corner along one axis; None: as whoever detects it says.
+        float64: precision of the process, in which rig, markers and vehicle are made too.
+        parameters: name -> number or nested lists, in place of the navigator's own; see
+            `with_params`.
+        relocate: whether the car drives on from a pose that no slip explains; see `Pilot`.
+    """
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle
+    route: Route
+    selector: str = "multi-hypothesis"
+    corner_sigma_px: float | None = None
+    timeouts: Timeouts = field(default_factory=Timeouts)
+    float64: bool = False
+    parameters: dict[str, Any] = field(default_factory=dict)
+    relocate: bool = True
+
+    def with_params(self, params: Params) -> "DriveSetup":
+        """The setup with these parameters, and none of those that it had.
+
+        Raises:
+            BadInput: a parameter that does not fit the navigator; names file and key.
+        """
+        apply_params(replace(self, parameters={}).navigator(), params)
+        return replace(self, parameters=params.plain())
+
+    @property
+    def route_on_map(self) -> Route:
+        """The route in the coordinates of the markers."""
+        return self.route.relative_to(self.markers.origin_m)
+
+    def navigator(self) -> Navigator:
+        """What the pilot runs."""
+        navigator = Navigator(
+            rig=self.rig,
+            markers=self.markers,
+            vehicle=self.vehicle,
+            waypoints_m=self.route_on_map.waypoints_m,
+            waypoint_radius_m=self.route.waypoint_radius_m,
+            selector=make_selector(self.selector),
+        )
+        return apply_params(navigator, Params.of(self.parameters, Path("DriveSetup")))
+
+    def pilot(self, folder: Path | None) -> Pilot:
+        """A pilot at the beginning of a drive.
+
+        Args:
+            folder: of executables, see `compiled`.
+        """
+        navigator = self.navigator()
+        program = compiled(advance_packed, navigator, folder)
+        return Pilot(navigator, self.timeouts, program, self.corner_sigma_px, self.relocate)
+
+    def header(self) -> dict[str, Any]:
+        """All of it, every number bit for bit, and what this process is."""
+        header = {
+            "setup_version": SETUP_VERSION,
+            "rig": rig_data(self.rig),
+            "markers": marker_data(self.markers),
+            "vehicle": vehicle_data(self.vehicle),
+            "route": asdict(self.route),
+            "selector": self.selector,
+            "corner_sigma_px": self.corner_sigma_px,
+            "timeouts": asdict(self.timeouts),
+            "float64": self.float64,
+            "made_by": this_process(),
+        }
+        # Without them any version of the program reads it.
+        if self.parameters:
+            header["parameters"] = dict(self.parameters)
+        if self.markers.origin_m != ZERO:
+            header["origin_m"] = list(self.markers.origin_m)
+        return header if self.relocate else header | {"relocate": False}
+
+    @staticmethod
+    def of_header(header: dict[str, Any], where: Path) -> "DriveSetup":
+        """What `header` was made of. The process must have its precision, see `needs_float64`.
+
+        Args:
+            where: the file that the header is of.
+
+        Raises:
+            BadInput: one line naming file and key; also where it is of a newer kind.
+        """
+        entry = _checked(header, where)
+        setup = DriveSetup(
+            rig=entry.rig.rig(),
+            markers=entry.markers.map(entry.origin()),
+            vehicle=entry.vehicle.vehicle(),
+            route=entry.route.route(),
+            selector=entry.selector,
+            corner_sigma_px=entry.corner_sigma_px,
+            timeouts=Timeouts(**entry.timeouts.model_dump()),
+            float64=entry.float64,
+            relocate=entry.relocate,
+        )
+        if not entry.parameters:
+            return setup
+        return setup.with_params(Params.of(entry.parameters, where, prefix="header"))
+
+
+def needs_float64(header: dict[str, Any], where: Path) -> bool:
+    """The precision of a recorded drive, without making an array.
+
+    Raises:
+        BadInput: as `DriveSetup.of_header`.
+    """
+    return _checked(header, where).float64
+
+
+def made_here(header: dict[str, Any]) -> bool:
+    """Whether a drive was recorded by what runs now, so that a replay has the same bits."""
+    return bool(header.get("made_by") == this_process())
+
+
+def this_process() -> dict[str, str]:
+    """All that the bits of a result depend on beside the setup."""
+    libraries = ("jaxnav", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax", "numpy")
+    return {name: version(name) for name in libraries} | {
+        "opencv": str(cv2.__version__),
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "host": hashlib.blake2b(platform.node().encode(), digest_size=8).hexdigest(),
+        "sources": sources_digest(PACKAGE, _WITHOUT),
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
+        "PJRT_NPROC": os.environ.get("PJRT_NPROC", ""),
+    }
+
+
+def _checked(header: dict[str, Any], where: Path) -> SetupEntry:
+    found = header.get("setup_version")
+    if isinstance(found, int) and found != SETUP_VERSION:
+        problem = f"this program reads {SETUP_VERSION}, the file has {found}"
+        raise BadInput(at(where, "header.setup_version"), problem)
+    return validate(SetupEntry, header, where, "header")

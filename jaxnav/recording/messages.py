@@ -1,0 +1,173 @@
+"""Inputs and outcomes of the pilot as messages of a recorded drive, and inputs back from them.
+
+What is made here is cheap: arrays are handed on as they are, and become JSON where they are
+written. So they must not be changed afterwards.
+"""
+
+import hashlib
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+
+from jaxnav.belief.motion import Belief
+from jaxnav.detection.types import Detections
+from jaxnav.files.ranges import RANGES
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.models.origin import Origin, inverses_in_world, planar_in_world
+from jaxnav.recording.message_schemas import (
+    FRAMES,
+    ODOMETRY,
+    TICK,
+    FramesMessage,
+    OdometryMessage,
+    SightedMessage,
+    TickMessage,
+)
+from jaxnav.timeline import Report
+
+# Beyond, a stamp is none, see `Stamps`; what is recorded of it is not one either.
+_LEAST_NS, _MOST_NS = int(RANGES["stamp_ns"].least), int(RANGES["stamp_ns"].most)
+_NONE = Detections.concatenate([])
+
+
+def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
+    """Topic, stamp in ns and message of an input: what `Recorder.put` takes."""
+    message: dict[str, Any] = {"now_ns": given.now_ns, "faults": given.faults}
+    if given.frames:
+        message["frames"] = [_sighted_message(frame) for frame in given.frames]
+    if given.odometry is None:
+        topic, stamp_ns = (FRAMES, given.frames[0].stamp_ns) if given.frames else (TICK, None)
+        return topic, given.now_ns if stamp_ns is None else stamp_ns, message
+    reading = given.odometry
+    message |= {
+        "stamp_ns": _recordable(reading.stamp_ns),
+        "speed_mps": float(reading.speed_mps),
+        "steering_rad": float(reading.steering_rad),
+        "valid": bool(reading.valid),
+    }
+    return ODOMETRY, reading.stamp_ns, message
+
+
+def input_of(message: OdometryMessage | FramesMessage | TickMessage) -> Input:
+    """The input that a message was made of."""
+    match message:
+        case OdometryMessage():
+            reading = Odometry(
+                message.stamp_ns, message.speed_mps, message.steering_rad, message.valid
+            )
+            frames = tuple(_sighted(frame) for frame in message.frames)
+            return Input(message.now_ns, reading, frames, message.faults)
+        case FramesMessage():
+            frames = tuple(_sighted(frame) for frame in message.frames)
+            return Input(message.now_ns, frames=frames, faults=message.faults)
+    return Input(message.now_ns, faults=message.faults)
+
+
+def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
+    """The message of an outcome; see `OutcomeMessage`.
+
+    Args:
+        outcome: its report with NumPy leaves.
+        digest: of the pilot's state, for who replays the drive.
+    """
+    message: dict[str, Any] = {
+        "now_ns": outcome.now_ns,
+        "health": outcome.health,
+        "faults": outcome.faults,
+        "rejects": outcome.rejects,
+        "steering_rad": float(outcome.steering_rad),
+        "throttle": float(outcome.throttle),
+        "restarts": outcome.restarts,
+        "reason": outcome.restart_reason,
+        "digest": digest,
+        "stamp_ns": outcome.stamp_ns,
+    }
+    if outcome.outvoted:
+        message["outvoted"] = list(outcome.outvoted)
+    return message | _reported(outcome.report, outcome.moment.belief, outcome.origin_m)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of an array in one list, taken by whoever writes them, not by the driving thread."""
+
+    array: Any
+    which: Any = ...
+    in_world: Callable[[Any], Any] | None = None  # to the world's coordinates
+
+    def tolist(self) -> list[Any]:
+        rows = self.array[self.which]
+        if self.in_world is not None:
+            rows = self.in_world(rows)
+        values: list[Any] = rows.ravel().tolist()
+        return values
+
+
+def _reported(report: Report, belief: Belief, origin_m: Origin) -> dict[str, Any]:
+    output, alive, valid = report.output, belief.initialised, report.output.candidates.valid
+    selected = int(output.selected)
+    planar = partial(planar_in_world, origin_m=origin_m)
+    inverses = partial(inverses_in_world, origin_m=origin_m)
+    return {
+        "pose": _Rows(output.pose, in_world=planar),
+        "covariance": _Rows(output.covariance),
+        "located": output.located,
+        "decided": output.decided,
+        "done": output.done,
+        "flip_probability": output.flip_probability,
+        "nis": output.nis,
+        "hypothesis": output.hypothesis,
+        "hypotheses": _Rows(belief.mean[:, :3], alive, planar),
+        "log_weight": _Rows(belief.log_weight, alive),
+        "Ts_vehicle_world": _Rows(output.candidates.T_vehicle_world.wxyz_xyz, valid, inverses),
+        "costs": _Rows(output.costs, valid),
+        "selected": sum(valid[:selected].tolist()) if selected >= 0 else -1,
+    }
+
+
+def _sighted_message(frame: Sighted) -> dict[str, Any]:
+    found = _NONE if frame.detections is None else frame.detections
+    return {
+        "camera": frame.camera,
+        "stamp_ns": _recordable(frame.stamp_ns),
+        "usable": frame.detections is not None,
+        "ids": found.ids,
+        "families": found.families,
+        "corners_px": _Rows(found.corners_px),
+        "sigma_px": _Rows(found.sigma_px),
+        "refined": found.refined,
+        "faults": frame.faults,
+    }
+
+
+def _recordable(stamp_ns: int) -> int:
+    return min(max(stamp_ns, _LEAST_NS), _MOST_NS)
+
+
+def _sighted(message: SightedMessage) -> Sighted:
+    found = Detections(
+        ids=message.ids,
+        corners_px=message.corners_px,
+        sigma_px=message.sigma_px,
+        refined=message.refined,
+        families=tuple(message.families),
+    )
+    detections = found if message.usable else None
+    return Sighted(message.camera, message.stamp_ns, detections, message.faults)
+
+
+def digest(outcome: Outcome) -> str:
+    """Of all that was believed and commanded: two drives with the same digests are the same."""
+    output = outcome.report.output
+    told = (outcome.moment, output.pose, output.covariance, output.command)
+    state = hashlib.blake2b(digest_size=8)
+    for leaf in jax.tree.leaves(told):
+        state.update(leaf.tobytes())
+    state.update(struct.pack("<2d", outcome.steering_rad, outcome.throttle))
+    return state.hexdigest()

@@ -1,1 +1,0 @@
-"""What runs on and around the vehicle: recordings in and out."""

@@ -1,0 +1,265 @@
+"""The fault matrix: what can go wrong on a drive, and what must come of it (RELIABILITY).
+
+    for row in matrix():
+        print(line(run_trial(row, trial)))
+
+All at corner level: drives of the simulated car through a loop of waypoints, in lockstep. What a
+fault does to images is tried where frames are looked at, threads and signals where the loop is.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from jaxnav.compiling.step import bare
+from jaxnav.files.markers import MarkerFile, marker_data
+from jaxnav.files.vehicles import Route
+from jaxnav.loop.camera_delays import CameraDelays
+from jaxnav.loop.estimator import Program
+from jaxnav.loop.flags import Fault, Health, Reject, names
+from jaxnav.loop.pilot import Pilot
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.origin import ZERO, Origin, planar_in_world, points_in_world
+from jaxnav.models.rig import CameraRig
+from jaxnav.navigator import Navigator
+from jaxnav.testing.injections import between
+from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates, Step, drive
+from jaxnav.vehicles.world import World
+
+BEGIN_S, END_S = 2.5, 4.0  # of most faults
+ALL_CAMERAS = range(4)  # of the rig that is driven with
+SETTLE_S = 2.0  # after a fault: then the position must be right again (R3)
+WAYPOINTS_M = (
+    (1.3, 0.0), (0.3, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5),
+    (0.5, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5), (0.5, 0.2),
+)  # fmt: skip
+_RADIUS_M = 0.15
+
+Happens = Callable[[int, World], None]
+
+
+def lasting(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
+    """A change while most faults last."""
+    return lambda: between(BEGIN_S, end_s, change())
+
+
+def _unchanged() -> Change:
+    return lambda given: [given]
+
+
+def _nothing_happens() -> Happens:
+    return lambda now_ns, world: None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fault, and what is asked of a drive with it.
+
+    Attributes:
+        name: as RELIABILITY calls it.
+        change: what happens to the data on their way, made anew for each drive.
+        happens: what happens to the world, the same.
+        faults, rejects: one of these at least must be seen while it lasts; none: nothing is asked.
+        at_least, at_most: the worst health that it costs lies between these.
+        error_m: largest error of a decided position while it lasts and SETTLE_S after.
+        error_after_m: the largest thereafter.
+        begins_s, ends_s: of the fault; inf: it lasts.
+        drive_s: of the whole drive.
+        telling: how the navigator's rig and markers differ from the true ones.
+        markers: where there are others than the trial's: made of these.
+        relocate: see `Pilot`.
+        well: the health at which the car has recovered.
+        shift_m: so far from the trial's world the map and the route are written down.
+    """
+
+    name: str
+    change: Callable[[], Change] = _unchanged
+    happens: Callable[[], Happens] = _nothing_happens
+    faults: Fault = Fault(0)  # noqa: RUF009
+    rejects: Reject = Reject(0)  # noqa: RUF009
+    at_least: Health = Health.OK
+    at_most: Health = Health.OK
+    error_m: float = 0.05
+    error_after_m: float = 0.05
+    begins_s: float = BEGIN_S
+    ends_s: float = END_S
+    drive_s: float = 7.0
+    rates: Rates = field(default_factory=Rates)
+    telling: str = ""
+    markers: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
+    relocate: bool = True
+    well: Health = Health.OK
+    shift_m: Origin = ZERO
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of it."""
+
+    row: Row
+    faults: Fault
+    rejects: Reject
+    worst: Health
+    error_m: float
+    error_after_m: float
+    recovered_s: float  # after the end until it was well for good; inf: never, or it lasts
+    restarts: int
+    broken: tuple[str, ...]  # promises that were not kept
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The car that the faults happen to."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle
+    start_pose: tuple[float, float, float] = (2.0, -1.0, math.radians(125.0))
+    seed: int = 0
+    program: Callable[[Navigator], Program] | None = None  # see `Pilot`; by default by `jax.jit`
+
+
+def run_trial(row: Row, trial: Trial) -> Result:
+    """A drive with the fault in it."""
+    trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
+    markers, route = written_down(trial, row.shift_m)
+    navigator = Navigator(
+        rig=told_rig(trial.rig, row.telling),
+        markers=markers,
+        vehicle=trial.vehicle,
+        waypoints_m=route.waypoints_m,
+        waypoint_radius_m=route.waypoint_radius_m,
+    )
+    program = trial.program and trial.program(bare(navigator))
+    pilot = Pilot(navigator, program=program, relocate=row.relocate)
+    world = World(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
+    delays = None
+    if Fault.CAMERA_LATE in row.faults:
+        delays = CameraDelays(navigator.rig, markers, trial.vehicle)
+    steps = list(drive(pilot, world, row.drive_s, row.change(), row.rates, row.happens(), delays))
+    return judge(row, steps, pilot)
+
+
+def written_down(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
+    """Map and route as a drive has them when their files count from elsewhere.
+
+    What the trial counts from is that of its map.
+    """
+    if shift_m == ZERO:
+        return trial.markers, Route(WAYPOINTS_M, _RADIUS_M, trial.start_pose)
+    x_m, y_m, z_m = np.add(trial.markers.origin_m, shift_m).tolist()
+    data = marker_data(dataclasses.replace(trial.markers, origin_m=(x_m, y_m, z_m)))
+    markers = MarkerFile.model_validate(data).map()
+    waypoints_m = points_in_world(WAYPOINTS_M, (x_m, y_m, z_m))
+    start_pose = planar_in_world(trial.start_pose, (x_m, y_m, z_m))
+    return markers, Route(waypoints_m, _RADIUS_M, start_pose).relative_to(markers.origin_m)
+
+
+def told_rig(rig: CameraRig, telling: str) -> CameraRig:
+    """What the navigator is told of the cameras: their calibration, or a wrong one."""
+    Ts = rig.Ts_camera_vehicle
+    if telling == "focal":
+        return eqx.tree_at(lambda r: r.cameras.focal_px, rig, 1.02 * rig.cameras.focal_px)
+    if telling == "swapped":
+        order = np.array([0, *range(len(rig) - 1, 0, -1)])
+        return eqx.tree_at(lambda r: r.Ts_camera_vehicle.wxyz_xyz, rig, Ts.wxyz_xyz[order])
+    if telling == "extrinsics":
+        directions = np.random.default_rng(0).standard_normal((len(rig), 2, 3))
+        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+        xi = np.concatenate([0.01 * directions[:, 0], np.deg2rad(1.0) * directions[:, 1]], axis=1)
+        moved = Ts @ jaxlie.SE3.exp(jnp.asarray(xi, Ts.wxyz_xyz.dtype))
+        return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, moved)
+    return rig
+
+
+def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
+    """What a drive shows, held against what is asked."""
+    times_s = np.array([(step.input.now_ns - BEGIN_NS) / 1e9 for step in steps])
+    outcomes = [step.outcome for step in steps]
+    healths = np.array([outcome.health for outcome in outcomes])
+    errors_m = np.array([_error_m(step) for step in steps])
+    lasts = (times_s >= row.begins_s) & (times_s < row.ends_s)
+    shaken = (times_s >= row.begins_s) & (times_s < row.ends_s + SETTLE_S)
+    faults, rejects = Fault(0), Reject(0)
+    for index in np.flatnonzero(shaken):
+        faults |= outcomes[index].faults
+        rejects |= outcomes[index].rejects
+    after = times_s >= row.ends_s
+    is_well = (healths >= Health.OK) & (healths <= row.well)
+    well = np.flatnonzero(after & is_well)
+    ill = np.flatnonzero(after & ~is_well)
+    recovered_s = math.inf
+    if len(well) and (not len(ill) or ill[-1] < well[-1]):
+        first = well[0] if not len(ill) else well[well > ill[-1]][0]
+        recovered_s = float(times_s[first] - row.ends_s)
+    result = Result(
+        row,
+        faults,
+        rejects,
+        Health(int(healths[lasts | shaken].max(initial=0))),
+        float(np.nanmax(errors_m[shaken], initial=0.0)),
+        float(np.nanmax(errors_m[times_s >= row.ends_s + SETTLE_S], initial=0.0)),
+        recovered_s,
+        outcomes[-1].restarts,
+        (),
+    )
+    return dataclasses.replace(result, broken=tuple(_broken(result, steps, pilot)))
+
+
+def _error_m(step: Step) -> float:
+    """Of a position that is acted upon; NaN where there is none."""
+    outcome = step.outcome
+    if not outcome.report.output.decided or outcome.throttle == 0:
+        return math.nan
+    truth = planar_in_world(step.truth[:3], outcome.origin_m)
+    return float(np.hypot(*(outcome.pose[:2] - truth[:2])))
+
+
+def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:
+    row, said = result.row, []
+    if row.faults and not result.faults & row.faults:
+        said.append(f"no {'/'.join(names(row.faults))}")
+    if row.rejects and not result.rejects & row.rejects:
+        said.append(f"no {'/'.join(names(row.rejects))}")
+    if not row.at_least <= result.worst <= row.at_most:
+        said.append(f"health {result.worst.name}")
+    if result.error_m > row.error_m:
+        said.append(f"error {result.error_m:.3f} m")
+    if result.error_after_m > row.error_after_m:
+        said.append(f"error afterwards {result.error_after_m:.3f} m")
+    if math.isfinite(row.ends_s) and result.recovered_s > SETTLE_S:
+        said.append(f"recovered after {result.recovered_s:.1f} s")
+    limits = pilot.limits
+    for step in steps:
+        steering_rad, throttle = step.outcome.steering_rad, step.outcome.throttle
+        if not (abs(steering_rad) <= limits.steering_rad and abs(throttle) <= limits.throttle):
+            said.append(f"command {steering_rad}, {throttle}")
+            break
+        if step.outcome.health in (Health.STOP, Health.INIT) and throttle != 0:
+            said.append("drives in STOP")
+            break
+    return said
+
+
+HEADER = (
+    "| fault | seen | worst health | error m | afterwards | recovered s | restarts | kept |\n"
+    "|---|---|---|---|---|---|---|---|"
+)
+
+
+def line(result: Result) -> str:
+    """A row of the table."""
+    seen = ", ".join([*names(result.faults), *names(result.rejects)]).lower() or "-"
+    recovered = "-" if math.isinf(result.recovered_s) else f"{result.recovered_s:.2f}"
+    kept = "; ".join(result.broken) or "yes"
+    return (
+        f"| {result.row.name} | {seen} | {result.worst.name} | {result.error_m:.3f} | "
+        f"{result.error_after_m:.3f} | {recovered} | {result.restarts} | {kept} |"
+    )

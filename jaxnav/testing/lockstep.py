@@ -1,0 +1,115 @@
+"""A drive of the simulated car as fast as the machine can: the loop, event by event, no threads.
+
+What reaches the pilot may be changed on its way: that is how faults are tried.
+"""
+
+import dataclasses
+import heapq
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxnav.loop.camera_delays import CameraDelays
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input, Outcome, Pilot
+from jaxnav.vehicles.world import World
+
+BEGIN_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Rates:
+    """When things happen."""
+
+    odometry_period_s: float = 0.02
+    frame_period_s: float = 1 / 30
+    frame_delay_s: float = 0.03  # from the exposure until its corners are known
+    camera_skew_s: float = 0.0  # by which each camera looks later than the one before
+
+
+@dataclass(frozen=True)
+class Step:
+    """One event, what the pilot made of it, and the truth: x_m y_m psi_rad speed steering."""
+
+    input: Input
+    outcome: Outcome
+    truth: np.ndarray
+
+
+# What came in at its time -> what reaches the pilot instead, each at its own time, not before.
+Change = Callable[[Input], list[Input]]
+
+
+def drive(
+    pilot: Pilot,
+    world: World,
+    duration_s: float,
+    change: Change = lambda given: [given],
+    rates: Rates | None = None,
+    happens: Callable[[int, World], None] = lambda now_ns, world: None,
+    delays: CameraDelays | None = None,
+) -> Iterator[Step]:
+    """Drive, an event at a time, until the time is over.
+
+    Args:
+        change: what happens to an input on its way.
+        delays: who watches the cameras' stamps, if anybody does.
+        happens: to the world, called with the time before each input is made.
+    """
+    rates = rates or Rates()
+    end_ns = BEGIN_NS + int(duration_s * 1e9)
+    waiting: list[tuple[int, int, Input]] = []
+    count = 0
+    sources = _inputs(world, rates, end_ns, happens)
+    upcoming = next(sources, None)
+    while upcoming is not None or waiting:
+        if upcoming is not None and (not waiting or upcoming[0] <= waiting[0][0]):
+            for given in change(upcoming[1]()):
+                heapq.heappush(waiting, (given.now_ns, count, given))
+                count += 1
+            upcoming = next(sources, None)
+            continue
+        given = heapq.heappop(waiting)[2]
+        if delays is not None and delays.late:
+            given = dataclasses.replace(given, faults=given.faults | Fault.CAMERA_LATE)
+        outcome = pilot.handle(given)
+        if delays is not None:
+            delays.take(outcome)
+            while delays.due:
+                delays.solve()
+        world.write(outcome.steering_rad, outcome.throttle, given.now_ns)
+        yield Step(given, outcome, world.state(given.now_ns))
+
+
+def _inputs(
+    world: World, rates: Rates, end_ns: int, happens: Callable[[int, World], None]
+) -> Iterator[tuple[int, Callable[[], Input]]]:
+    """When the next input is there, and how it is made: in their order."""
+    odometry_ns = int(rates.odometry_period_s * 1e9)
+    frame_ns, delay_ns = int(rates.frame_period_s * 1e9), int(rates.frame_delay_s * 1e9)
+    cameras = len(world.rig)
+    skewed = rates.camera_skew_s > 0
+    groups = [(c,) for c in range(cameras)] if skewed else [tuple(range(cameras))]
+    due = [(BEGIN_NS, -1)] + [
+        (BEGIN_NS + delay_ns + int(number * rates.camera_skew_s * 1e9), number)
+        for number in range(len(groups))
+    ]
+    heapq.heapify(due)
+    while due[0][0] < end_ns:
+        now_ns, number = heapq.heappop(due)
+        heapq.heappush(due, (now_ns + (odometry_ns if number < 0 else frame_ns), number))
+
+        def made(now_ns: int = now_ns, number: int = number) -> Input:
+            happens(now_ns, world)
+            if number < 0:
+                return Input(now_ns, Odometry(now_ns, *world.odometry(now_ns)))
+            stamp_ns = now_ns - delay_ns
+            found = world.detections(stamp_ns)
+            return Input(
+                now_ns, frames=tuple(Sighted(c, stamp_ns, found[c]) for c in groups[number])
+            )
+
+        yield now_ns, made
