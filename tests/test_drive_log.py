@@ -57,6 +57,12 @@ def test_inputs_come_back_in_their_order(whole):
     assert (whole.truncated, whole.missing) == (False, {})
 
 
+def test_who_waits_is_told_how_far_it_is(path):
+    told = []
+    read_drive(path, told.append)
+    assert sum(told) == path.stat().st_size
+
+
 def test_outcomes_are_tables(whole):
     outcomes = whole.outcomes
     expected = [make_outcome(index) for index in range(COUNT)]

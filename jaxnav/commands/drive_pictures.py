@@ -7,12 +7,13 @@ import numpy as np
 
 from jaxnav.arguments import Plot as Arguments
 from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.reading import read_shown
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder
 from jaxnav.files.ranges import is_within
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.plots.drive import drive_log_report
-from jaxnav.recording.drive_log import DriveLog, read_drive
+from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.plausible import left_out, plausible
 
 _LONGEST_STEP_S = 1.0  # between readings, for the distance: beyond it nobody knows
@@ -23,13 +24,13 @@ def is_recording(path: Path) -> bool:
     return path.suffix.lower() == ".mcap"
 
 
-def read_outcomes(path: Path) -> DriveLog:
+def read_outcomes(path: Path, headless: bool) -> DriveLog:
     """A recorded drive that there is something to show of.
 
     Raises:
         BadInput: not such a file, damaged, or without outcomes.
     """
-    log = read_drive(path)
+    log = read_shown(path, headless)
     if not len(log.outcomes.now_ns):
         raise BadInput(path, "holds no outcome of the pilot, so there is nothing to show")
     return log
@@ -37,7 +38,7 @@ def read_outcomes(path: Path) -> DriveLog:
 
 def draw_drive(args: Arguments) -> int:
     """Write drive.png, and print what happened."""
-    log = read_outcomes(args.store)
+    log = read_outcomes(args.store, args.headless)
     outcomes, odd = plausible(log.outcomes)
     log = replace(log, outcomes=outcomes)
     out = output_folder(args.out)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxnav.arguments.calibration import CalibrateOdometry as Arguments
 from jaxnav.calibration.odometry_drive import Drive
+from jaxnav.commands.reading import read_shown
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.detection import Detections
 from jaxnav.detection.observe import observe
@@ -20,7 +21,6 @@ from jaxnav.loop.pilot import Input
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
-from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_setup import DriveSetup
 
 _NONE = Detections.concatenate([])
@@ -60,7 +60,7 @@ def _own(args: Arguments, files: tuple[Path, ...]) -> Recorded:
         if path.is_dir() or path.suffix != ".mcap":
             problem = "is no recording of jaxnav (.mcap): a ROS bag needs --topics"
             raise BadInput(path, problem)
-        logs.append(read_drive(path))
+        logs.append(read_shown(path))
     for log in logs[1:]:
         for key in _SHARED:
             if flags[key] is None and log.header.get(key) != logs[0].header.get(key):

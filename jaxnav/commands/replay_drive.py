@@ -14,6 +14,7 @@ from jaxnav.arguments import Replay as Arguments
 from jaxnav.commands.drive_track import Row, Track
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.commands.reading import read_shown
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
@@ -32,7 +33,7 @@ from jaxnav.files import (
 from jaxnav.loop.pilot import Input
 from jaxnav.plots.localisation import localisation_report
 from jaxnav.recording.drive_format import PROFILE
-from jaxnav.recording.drive_log import DriveLog, Outcomes, read_drive
+from jaxnav.recording.drive_log import DriveLog, Outcomes
 from jaxnav.recording.drive_replay import (
     Comparison,
     check_inputs,
@@ -121,7 +122,7 @@ _Drive = tuple[DriveLog | None, DriveSetup, Sequence[Input]]
 
 
 def _own_drive(args: Arguments, params: Params | None) -> _Drive:
-    log = read_drive(args.recording)
+    log = read_shown(args.recording, args.headless)
     configure_jax(float64=needs_float64(log.header, args.recording), threads=1)
     setup = _overridden(DriveSetup.of_header(log.header, args.recording), args, params)
     if args.images:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from jaxnav.arguments import TuneFilter as Arguments
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.reading import read_shown
 from jaxnav.commands.scenario_car import ScenarioCar
 from jaxnav.commands.tune_drives import drives
 from jaxnav.commands.tune_recordings import navigator_of, tracks
@@ -20,7 +21,6 @@ from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
 from jaxnav.navigator import Navigator
-from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
@@ -137,7 +137,7 @@ def _known(recorded: Recorded) -> Callable[[Progress], Recorded]:
 
 def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> Named:
     if path.suffix == _DRIVE:
-        log = read_drive(path)
+        log = read_shown(path, args.headless)
         setup = DriveSetup.of_header(log.header, path)
         return Named(str(path), setup.navigator(), drives(log, setup, part))
     recording = read_recording(

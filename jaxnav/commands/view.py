@@ -18,7 +18,7 @@ from jaxnav.viewer.rerun_view import RerunView, import_rerun
 def run(args: Arguments) -> int:
     """Show the whole drive, and leave the window open."""
     import_rerun()
-    log = read_outcomes(args.recording)
+    log = read_outcomes(args.recording, args.headless)
     scenery = Scenery.of(log.header)
     if args.out is not None:
         output_folder(args.out.parent)

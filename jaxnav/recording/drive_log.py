@@ -1,7 +1,7 @@
 """A recorded drive, read back: what reached the pilot, what it made of it, what the cameras saw."""
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -112,24 +112,27 @@ class DriveLog:
                     yield RecordedImage(record.topic, record.stamp_ns, message.data)
 
 
-def read_drive(path: str | Path) -> DriveLog:
+def read_drive(path: str | Path, told: Callable[[int], object] = lambda size: None) -> DriveLog:
     """Read what `Recorder` wrote, to its end or as far as it goes.
+
+    Args:
+        told: how many bytes of the file were read, piece by piece; for a progress bar.
 
     Raises:
         BadInput: one line naming file and topic: not such a file, of a newer format, or damaged.
     """
     with _uncollected():
-        return _read(Path(path))
+        return _read(Path(path), told)
 
 
-def _read(path: Path) -> DriveLog:
+def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
     header: dict[str, Any] | None = None
     inputs: list[Input] = []
     # Not as messages: one takes four times the memory of what it says.
     told: dict[str, list[Any]] = {name: [] for name in OutcomeMessage.model_fields}
     detections = 0
     gaps = _Gaps()
-    records = McapMessages(path)
+    records = McapMessages(path, told_bytes)
     for record in records:
         if isinstance(record, Metadata):
             if record.name == HEADER and header is None:

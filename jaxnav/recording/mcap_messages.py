@@ -6,7 +6,7 @@ bounded, and checksums are compared where there are any.
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple, cast
@@ -69,9 +69,13 @@ class McapMessages:
         truncated: whether the file had an end, once all was read.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, told: Callable[[int], object] = lambda size: None):
+        """Args:
+        told: how many bytes were read, piece by piece.
+        """
         self.path = path
         self.truncated = True
+        self._told = told
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._messages = 0
@@ -96,7 +100,7 @@ class McapMessages:
             raise BadInput(self.path, problem) from None
 
     def _read(self, file: IO[bytes]) -> Iterator[Metadata | Recorded]:
-        bounded = cast(IO[bytes], _Bounded(file))
+        bounded = cast(IO[bytes], _Bounded(file, self._told))
         reader = _Reader(
             bounded, emit_chunks=True, validate_crcs=True, record_size_limit=limits.CHUNK_BYTES
         )
@@ -151,8 +155,8 @@ class _CutOff(Exception):
 class _Bounded:
     """A file that gives all that is asked for, or says that it is cut off."""
 
-    def __init__(self, file: IO[bytes]):
-        self._file, self._begun = file, False
+    def __init__(self, file: IO[bytes], told: Callable[[int], object]):
+        self._file, self._told, self._begun = file, told, False
 
     def read(self, size: int) -> bytes:
         if size > limits.CHUNK_BYTES:
@@ -161,6 +165,7 @@ class _Bounded:
         if len(data) < size:
             raise _CutOff(self._begun)
         self._begun = True
+        self._told(size)
         return data
 
 
