@@ -17,10 +17,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from jaxnav.calibration import board_detection
-from jaxnav.calibration.board_sheets import sheet_of
-from jaxnav.calibration.boards import Board
-from jaxnav.calibration.saddles import fit_saddles
+from jaxnav.calibration.boards import detection as board_detection
+from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.saddles import fit_saddles
+from jaxnav.calibration.boards.sheets import sheet_of
 from jaxnav.detection.families import dictionary
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.simulation.boards import BoardRenderer, facing_pose

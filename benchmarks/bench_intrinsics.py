@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from jaxnav.calibration import lens_bundle
-from jaxnav.calibration.lens_bundle import NO_CUT, Unknowns
-from jaxnav.calibration.lens_fit import LensFit, fit_lens
-from jaxnav.calibration.lens_start import board_poses, opencv_calibration
-from jaxnav.calibration.simulated_views import grid_points_m, seen_from, simulated_views
-from jaxnav.calibration.views import BoardViews
+from jaxnav.calibration.lenses import bundle as lens_bundle
+from jaxnav.calibration.lenses.bundle import NO_CUT, Unknowns
+from jaxnav.calibration.lenses.fit import LensFit, fit_lens
+from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
+from jaxnav.calibration.lenses.start import board_poses, opencv_calibration
+from jaxnav.calibration.lenses.views import BoardViews
 from jaxnav.commands.process import configure_jax
 from jaxnav.models.camera import Camera
 

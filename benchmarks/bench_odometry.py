@@ -14,8 +14,8 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.calibration.odometry import OdometryCalibration, calibrate_odometry
-from jaxnav.calibration.odometry_model import NAMES
+from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
+from jaxnav.calibration.odometry.model import NAMES
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.simulation.statistics import anees_band

@@ -58,8 +58,8 @@ def trials(count: int, frames: int) -> None:
     import rig_rooms
     from tqdm import trange
 
-    from jaxnav.calibration.linking import turn_rad
-    from jaxnav.calibration.rig import calibrate_rig
+    from jaxnav.calibration.rigs.calibrate import calibrate_rig
+    from jaxnav.calibration.rigs.linking import turn_rad
 
     rig, markers = rig_rooms.qcar(), rig_rooms.room()
     path, true = rig_rooms.lemniscate(frames), rig_rooms.Ts_vehicle_camera(rig)
@@ -106,9 +106,9 @@ def trials(count: int, frames: int) -> None:
 def branches(frames: int) -> None:
     import rig_rooms
 
-    from jaxnav.calibration.linking import inverted, turn_rad
-    from jaxnav.calibration.rig import calibrate_rig
-    from jaxnav.calibration.rig_views import both_poses, rays_camera
+    from jaxnav.calibration.rigs.calibrate import calibrate_rig
+    from jaxnav.calibration.rigs.linking import inverted, turn_rad
+    from jaxnav.calibration.rigs.views import both_poses, rays_camera
 
     rig, path = rig_rooms.qcar(), rig_rooms.lemniscate(frames)
     true = rig_rooms.Ts_vehicle_camera(rig)
@@ -146,9 +146,9 @@ def rendered(frames: int) -> None:
     from scipy.interpolate import CubicSpline
     from tqdm import tqdm
 
-    from jaxnav.calibration.linking import turn_rad
-    from jaxnav.calibration.rig import calibrate_rig
-    from jaxnav.calibration.rig_views import RigViews
+    from jaxnav.calibration.rigs.calibrate import calibrate_rig
+    from jaxnav.calibration.rigs.linking import turn_rad
+    from jaxnav.calibration.rigs.views import RigViews
     from jaxnav.commands.rendered_world import READOUT_S, SENSOR
     from jaxnav.detection import make_detector
     from jaxnav.files.poses import pose_from_matrix
@@ -221,12 +221,12 @@ def tagslam() -> None:
     import jax.numpy as jnp
     import rig_rooms
 
-    from jaxnav.calibration import bundle
-    from jaxnav.calibration.linking import inverted, turn_rad
-    from jaxnav.calibration.pose_arrays import wxyz_xyz
-    from jaxnav.calibration.rig import calibrate_rig
-    from jaxnav.calibration.rig_views import RigViews
-    from jaxnav.calibration.vehicle_frame import moved_to_places
+    from jaxnav.calibration.rigs import bundle
+    from jaxnav.calibration.rigs.calibrate import calibrate_rig
+    from jaxnav.calibration.rigs.linking import inverted, turn_rad
+    from jaxnav.calibration.rigs.pose_arrays import wxyz_xyz
+    from jaxnav.calibration.rigs.vehicle_frame import moved_to_places
+    from jaxnav.calibration.rigs.views import RigViews
     from jaxnav.datasets.recordings import read_recording
 
     data = Path(os.environ.get("JAXNAV_DATA", ROOT.parent / "shared" / "data")) / "tagslam"
@@ -285,8 +285,8 @@ def _localise(data: Path, Ts_vehicle_camera: np.ndarray, theirs: np.ndarray) -> 
     import jax.numpy as jnp
     import jaxlie
 
-    from jaxnav.calibration.linking import inverted
-    from jaxnav.calibration.pose_arrays import wxyz_xyz
+    from jaxnav.calibration.rigs.linking import inverted
+    from jaxnav.calibration.rigs.pose_arrays import wxyz_xyz
     from jaxnav.datasets.recordings import read_recording
     from jaxnav.files import save_rig
     from jaxnav.models.rig import CameraRig
@@ -318,7 +318,7 @@ def _localise(data: Path, Ts_vehicle_camera: np.ndarray, theirs: np.ndarray) -> 
 def scale(frames: int) -> None:
     import rig_rooms
 
-    from jaxnav.calibration.rig import calibrate_rig
+    from jaxnav.calibration.rigs.calibrate import calibrate_rig
 
     rig, markers = rig_rooms.qcar(), rig_rooms.room()
     views = rig_rooms.views_of(rig, markers, rig_rooms.lemniscate(frames), NOISE_PX, 0)

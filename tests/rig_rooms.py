@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.calibration.linking import inverted
-from jaxnav.calibration.rig import RigCalibration
-from jaxnav.calibration.rig_views import RigViews
+from jaxnav.calibration.rigs.calibrate import RigCalibration
+from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.views import RigViews
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.markers import marker_map
 from jaxnav.files.poses import pose_from_matrix

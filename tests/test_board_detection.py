@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.calibration.board_detection import find_board
-from jaxnav.calibration.board_images import board_views, collect_views, source_files
-from jaxnav.calibration.board_sheets import sheet_of
-from jaxnav.calibration.boards import Board
-from jaxnav.calibration.saddles import Places, fit_saddles
+from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.detection import find_board
+from jaxnav.calibration.boards.images import board_views, collect_views, source_files
+from jaxnav.calibration.boards.saddles import Places, fit_saddles
+from jaxnav.calibration.boards.sheets import sheet_of
 from jaxnav.errors import BadInput
 from jaxnav.simulation.boards import BoardRenderer, facing_pose
 from jaxnav.simulation.sensor import Sensor, Shutter

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from jaxnav import cli
 from jaxnav.arguments.calibration import CalibrateIntrinsics
-from jaxnav.calibration import lens_comparison
-from jaxnav.calibration.board_sheets import sheet_of
-from jaxnav.calibration.boards import Board
-from jaxnav.calibration.lens_images import calibrate_images
-from jaxnav.calibration.simulated_views import simulated_views
+from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.sheets import sheet_of
+from jaxnav.calibration.lenses import comparison as lens_comparison
+from jaxnav.calibration.lenses.images import calibrate_images
+from jaxnav.calibration.lenses.simulated_views import simulated_views
 from jaxnav.commands import calibrate_intrinsics
 from jaxnav.commands.calibration_boards import write_board
 from jaxnav.errors import BadInput

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from jaxnav.calibration.odometry_drive import Drive
-from jaxnav.calibration.odometry_model import NAMES
+from jaxnav.calibration.odometry.drive import Drive
+from jaxnav.calibration.odometry.model import NAMES
 from jaxnav.cli import main
 from jaxnav.commands.odometry_recordings import drive_of
 from jaxnav.detection import Detections

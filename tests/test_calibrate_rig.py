@@ -10,15 +10,15 @@ import pytest
 import rig_rooms
 from scipy import stats
 
-from jaxnav.calibration import bundle
-from jaxnav.calibration.linking import inverted, turn_rad
-from jaxnav.calibration.marker_check import checked, sizes_m
-from jaxnav.calibration.pose_arrays import wxyz_xyz
-from jaxnav.calibration.rig import RigCalibration, calibrate_rig
-from jaxnav.calibration.rig_views import RigViews, both_poses, rays_camera
-from jaxnav.calibration.schur import Blocks, reduce
-from jaxnav.calibration.vehicle_frame import moved_to_places
+from jaxnav.calibration.rigs import bundle
+from jaxnav.calibration.rigs.calibrate import RigCalibration, calibrate_rig
+from jaxnav.calibration.rigs.linking import inverted, turn_rad
+from jaxnav.calibration.rigs.marker_check import checked, sizes_m
+from jaxnav.calibration.rigs.pose_arrays import wxyz_xyz
+from jaxnav.calibration.rigs.vehicle_frame import moved_to_places
+from jaxnav.calibration.rigs.views import RigViews, both_poses, rays_camera
 from jaxnav.errors import BadInput
+from jaxnav.numerics.schur import Blocks, reduce
 
 FRAMES, NOISE_PX = 120, 0.3
 

@@ -10,7 +10,7 @@ import rig_rooms
 import yaml
 
 from jaxnav import cli
-from jaxnav.calibration.linking import turn_rad
+from jaxnav.calibration.rigs.linking import turn_rad
 from jaxnav.commands import calibrate_check, calibrate_markers, calibrate_rig
 from jaxnav.commands.calibration_report import coverage
 from jaxnav.datasets.sightings import read_sightings

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import rig_rooms
 
-from jaxnav.calibration.driven_frame import _level, driven_frame, level_follows
-from jaxnav.calibration.linking import inverted
-from jaxnav.calibration.rig import calibrate_rig
-from jaxnav.calibration.vehicle_frame import moved_to_driven
+from jaxnav.calibration.rigs.calibrate import calibrate_rig
+from jaxnav.calibration.rigs.driven_frame import _level, driven_frame, level_follows
+from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven
 from jaxnav.errors import BadInput
 from jaxnav.models.bicycle import advance
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxnav.calibration import lens_start
-from jaxnav.calibration.board_shape import check_board
-from jaxnav.calibration.intrinsics import calibrate_lens
-from jaxnav.calibration.lens_choice import informative
-from jaxnav.calibration.lens_fit import fit_lens
-from jaxnav.calibration.simulated_views import grid_points_m, seen_from, simulated_views
-from jaxnav.calibration.view_screening import screened
+from jaxnav.calibration.lenses import start as lens_start
+from jaxnav.calibration.lenses.board_shape import check_board
+from jaxnav.calibration.lenses.choice import informative
+from jaxnav.calibration.lenses.fit import fit_lens
+from jaxnav.calibration.lenses.intrinsics import calibrate_lens
+from jaxnav.calibration.lenses.screening import screened
+from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxnav.calibration import lens_bundle
-from jaxnav.calibration.lens_bundle import NO_CUT, Unknowns
-from jaxnav.calibration.simulated_views import grid_points_m, seen_from, simulated_views
+from jaxnav.calibration.lenses import bundle as lens_bundle
+from jaxnav.calibration.lenses.bundle import NO_CUT, Unknowns
+from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.models.camera import Camera
 
 SIZE_PX, SIGMA_PX = (820, 410), 0.1

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
-from jaxnav.calibration.odometry import calibrate_odometry
-from jaxnav.calibration.odometry_drive import Drive, lay_out, reading_sigma
-from jaxnav.calibration.odometry_fit import Prior, _System
-from jaxnav.calibration.odometry_model import NAMES, Model
-from jaxnav.calibration.odometry_start import start
+from jaxnav.calibration.odometry.calibrate import calibrate_odometry
+from jaxnav.calibration.odometry.drive import Drive, lay_out, reading_sigma
+from jaxnav.calibration.odometry.fit import Prior, _System
+from jaxnav.calibration.odometry.model import NAMES, Model
+from jaxnav.calibration.odometry.start import start
 from jaxnav.errors import BadInput
 from tests import worlds
 from tests.helpers.odometry_drives import (
@@ -261,6 +261,6 @@ def test_nothing_is_compiled_anew_for_another_drive_of_this_length(recipe):
 
 
 def _programs() -> int:
-    from jaxnav.calibration import odometry_model
+    from jaxnav.calibration.odometry import model as odometry_model
 
     return odometry_model._blocks._cache_size()

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxnav.calibration.odometry import OdometryCalibration
-from jaxnav.calibration.odometry_drive import ReadingSigma
+from jaxnav.calibration.odometry.calibrate import OdometryCalibration
+from jaxnav.calibration.odometry.drive import ReadingSigma
 from jaxnav.plots.odometry import odometry_report
 from tests import worlds
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jaxnav.calibration.board_images import source_files
+from jaxnav.calibration.boards.images import source_files
 from jaxnav.cli import main
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.terminal import nothing_hidden

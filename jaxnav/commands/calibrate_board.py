@@ -7,9 +7,9 @@ from matplotlib.figure import Figure
 
 from jaxnav import __version__
 from jaxnav.arguments.calibration import CalibrateBoard
-from jaxnav.calibration.board_pages import PAPERS_MM, check_fit, largest
-from jaxnav.calibration.board_sheets import sheet_of
-from jaxnav.calibration.boards import Board
+from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.pages import PAPERS_MM, check_fit, largest
+from jaxnav.calibration.boards.sheets import sheet_of
 from jaxnav.commands.calibration_boards import write_board
 from jaxnav.commands.process import configure_jax
 from jaxnav.detection import marker_cells

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from jaxnav.arguments.calibration import CalibrateCheck as Arguments
-from jaxnav.calibration.linking import inverted
-from jaxnav.calibration.marker_check import Check, Verdict, checked
-from jaxnav.calibration.rig import calibrate_rig
-from jaxnav.calibration.vehicle_frame import moved_world
+from jaxnav.calibration.rigs.calibrate import calibrate_rig
+from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.marker_check import Check, Verdict, checked
+from jaxnav.calibration.rigs.vehicle_frame import moved_world
 from jaxnav.commands.calibration_data import RigData, gathered
 from jaxnav.commands.calibration_report import provenance, summary, write_files
 from jaxnav.commands.pictures import save_figure

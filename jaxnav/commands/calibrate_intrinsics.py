@@ -9,10 +9,10 @@ from tqdm import tqdm
 
 from jaxnav import __version__
 from jaxnav.arguments.calibration import CalibrateIntrinsics
-from jaxnav.calibration.board_images import CollectedViews
-from jaxnav.calibration.intrinsics import LensCalibration
-from jaxnav.calibration.lens_checks import cells, reach, rim_sigma_px, tilts_deg
-from jaxnav.calibration.lens_images import calibrate_images
+from jaxnav.calibration.boards.images import CollectedViews
+from jaxnav.calibration.lenses.checks import cells, reach, rim_sigma_px, tilts_deg
+from jaxnav.calibration.lenses.images import calibrate_images
+from jaxnav.calibration.lenses.intrinsics import LensCalibration
 from jaxnav.commands.calibration_boards import read_board
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax

@@ -3,8 +3,8 @@
 import numpy as np
 
 from jaxnav.arguments.calibration import CalibrateMarkers as Arguments
-from jaxnav.calibration.linking import inverted
-from jaxnav.calibration.rig import calibrate_rig
+from jaxnav.calibration.rigs.calibrate import calibrate_rig
+from jaxnav.calibration.rigs.linking import inverted
 from jaxnav.commands.calibrate_rig import publish, refuse_wrong_sizes
 from jaxnav.commands.calibration_data import gathered
 from jaxnav.commands.process import configure_jax

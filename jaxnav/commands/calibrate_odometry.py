@@ -10,8 +10,8 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxnav.arguments.calibration import CalibrateOdometry as Arguments
-from jaxnav.calibration.odometry import OdometryCalibration, calibrate_odometry
-from jaxnav.calibration.odometry_model import NAMES
+from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
+from jaxnav.calibration.odometry.model import NAMES
 from jaxnav.commands.odometry_recordings import Recorded, read_recordings
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax

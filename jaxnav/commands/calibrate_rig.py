@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from jaxnav.arguments.calibration import CalibrateRig as Arguments
-from jaxnav.calibration.driven_frame import driven_frame
-from jaxnav.calibration.linking import inverted
-from jaxnav.calibration.marker_check import sizes_m
-from jaxnav.calibration.rig import RigCalibration, calibrate_rig
-from jaxnav.calibration.vehicle_frame import moved_to_driven, moved_to_places
+from jaxnav.calibration.rigs.calibrate import RigCalibration, calibrate_rig
+from jaxnav.calibration.rigs.driven_frame import driven_frame
+from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.marker_check import sizes_m
+from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven, moved_to_places
 from jaxnav.commands.calibration_data import RigData, gathered
 from jaxnav.commands.calibration_report import (
     found_markers,

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from jaxnav.calibration.boards import Board
+from jaxnav.calibration.boards.board import Board
 from jaxnav.errors import BadInput
 from jaxnav.files import boards
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnav.calibration.rig_views import RigViews
+from jaxnav.calibration.rigs.views import RigViews
 from jaxnav.datasets.sightings import Sightings, read_sightings
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig

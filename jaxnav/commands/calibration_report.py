@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import jaxnav
-from jaxnav.calibration.linking import inverted, turn_rad
-from jaxnav.calibration.rig import RigCalibration
+from jaxnav.calibration.rigs.calibrate import RigCalibration
+from jaxnav.calibration.rigs.linking import inverted, turn_rad
 from jaxnav.commands.calibration_data import RigData
 from jaxnav.files import save_markers, save_rig, write_tum
 from jaxnav.files.markers import MarkerSigma, marker_map

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.arguments.calibration import CalibrateOdometry as Arguments
-from jaxnav.calibration.odometry_drive import Drive
+from jaxnav.calibration.odometry.drive import Drive
 from jaxnav.commands.reading import read_shown
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.detection import Detections

@@ -40,7 +40,7 @@ class Charuco(Entry):
     first_id: Count = 0
 
     def figures(self) -> dict[str, Any]:
-        """As `jaxnav.calibration.boards.Board` takes them, as all of these."""
+        """As `jaxnav.calibration.boards.board.Board` takes them, as all of these."""
         return _figures(self, size_m=self.square_m)
 
 

@@ -12,7 +12,7 @@ delay, where the stretch began, how far the odometer's speed, steering gain and 
 how the camera is turned, each with a prior as wide as a car needs that was never calibrated. So
 wheels that slip and cameras that hang askew don't pass for a delay; what does is that the image
 moves later than the wheels. While speed and steering stay as they are nothing tells, and sigma
-says so. `jaxnav.calibration.odometry` finds one delay for all cameras ten times as exactly, from a
+says so. `jaxnav calibrate odometry` finds one delay for all cameras ten times as exactly, from a
 drive of a minute.
 """
 

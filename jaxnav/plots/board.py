@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
-from jaxnav.calibration.board_pages import MARGIN_MM, RULER_MM, TEXT_MM, centre_mm
-from jaxnav.calibration.board_sheets import Sheet
+from jaxnav.calibration.boards.pages import MARGIN_MM, RULER_MM, TEXT_MM, centre_mm
+from jaxnav.calibration.boards.sheets import Sheet
 
 _MM_PER_INCH = 25.4
 _RULERS_MM = (100, 50, 20)  # the longest that fits

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from jaxnav.calibration.intrinsics import LensCalibration
-from jaxnav.calibration.lens_bundle import gathered
-from jaxnav.calibration.lens_checks import Cells, cells
+from jaxnav.calibration.lenses.bundle import gathered
+from jaxnav.calibration.lenses.checks import Cells, cells
+from jaxnav.calibration.lenses.intrinsics import LensCalibration
 from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
 
 _ARROW = 0.5  # of a cell, the longest one

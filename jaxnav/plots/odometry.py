@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnav.calibration.odometry import OdometryCalibration
+from jaxnav.calibration.odometry.calibrate import OdometryCalibration
 from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
 
 _GROUPS = 60  # of views, whose mean and scatter are drawn

@@ -12,7 +12,7 @@ import numpy as np
 from mcap.writer import Writer
 
 from jaxnav import files
-from jaxnav.calibration.odometry_drive import Drive
+from jaxnav.calibration.odometry.drive import Drive
 from jaxnav.detection import Detections, marker_cells
 from jaxnav.loop.frames import Sighted
 from jaxnav.loop.interfaces import Odometry

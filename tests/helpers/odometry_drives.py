@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.calibration.odometry_drive import Drive
+from jaxnav.calibration.odometry.drive import Drive
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig

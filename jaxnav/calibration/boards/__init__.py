@@ -1,0 +1,1 @@
+"""Calibration boards: printed, found in pictures, and told apart."""

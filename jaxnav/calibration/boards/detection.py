@@ -1,0 +1,216 @@
+"""A board in an image: its points to some hundredths of a pixel.
+
+The tags of a charuco board or an aprilgrid say where on the board one looks, and each point is
+then predicted from the tags around it; of a chessboard OpenCV finds all points at once. From
+there all three go the same way: `fit_saddles`, the edges first taken for straight, then bent as
+the neighbours in their rows and columns show. What does not fit to its neighbours is dropped.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from jaxnav.calibration.boards.board import MIN_POINTS, Board
+from jaxnav.calibration.boards.places import (
+    bent_places,
+    chosen_places,
+    joined_places,
+    mapped,
+    no_places,
+    predicted_places,
+    straight_places,
+)
+from jaxnav.calibration.boards.saddles import EDGE_WIDTH_SIGMAS, Places, Saddles, fit_saddles
+from jaxnav.calibration.boards.tags import read_tags
+from jaxnav.calibration.lenses.views import BoardView
+from jaxnav.detection import make_detector
+from jaxnav.detection.edges import PIXEL_VARIANCE_PX2
+from jaxnav.detection.lens import Lens
+from jaxnav.detection.refine import refine_corners
+from jaxnav.detection.types import grey
+from jaxnav.models.camera import Camera
+
+_GROWTHS = 4  # times that what was found is grown by a pitch
+_RADIUS = 0.45  # of a square, around a saddle
+_MIN_RADIUS_PX, _MAX_RADIUS_PX = 3.0, 9.0
+_FIRST_MOVE, _SECOND_MOVE_PX = 0.25, 1.5  # part of a square, px
+_NEIGHBOURS = 12
+# A point is wrong when it is this many times further from where its neighbours want it than the
+# median point, and this many pixels.
+_MAX_STRAY, _MIN_STRAY_PX = 6.0, 0.7
+
+
+@dataclass(frozen=True)
+class BoardLook:
+    """What there is of a board in one image.
+
+    Attributes:
+        view: its points; None where there are too few.
+        foreign_ids: markers of its family that are not on the board.
+        own_ids: and those that are.
+    """
+
+    view: BoardView | None
+    foreign_ids: tuple[int, ...] = ()
+    own_ids: tuple[int, ...] = ()
+
+
+def find_board(
+    board: Board, image: np.ndarray, name: str, camera: Camera | None = None
+) -> BoardView | None:
+    """The board's points in an image, None where it is not seen, or too little of it.
+
+    Args:
+        board: what to look for.
+        image: (H, W) or (H, W, 3) in BGR order, uint8.
+        name: of the view.
+        camera: makes the edges of a marker straight in the world instead of in the image. The
+            edges around a saddle are as bent as its neighbours show, with a camera or without.
+
+    Raises:
+        BadInput: not such an image.
+    """
+    return look_at(board, image, name, camera).view
+
+
+def look_at(board: Board, image: np.ndarray, name: str, camera: Camera | None = None) -> BoardLook:
+    """`find_board`, and what else was seen."""
+    levels = grey(image)
+    if board.kind == "marker":
+        return _look_for_marker(board, levels, name, camera)
+    foreign: tuple[int, ...] = ()
+    own: tuple[int, ...] = ()
+    if board.kind == "chessboard":
+        ids, places = _chessboard_places(board, levels)
+    else:
+        tags = read_tags(board, levels)
+        foreign, own = tags.foreign_ids, tuple(board.tags[place].id for place in tags.places)
+        corners_m = [board.tags[place].corners_board_m for place in tags.places]
+        known_m, known_px = np.reshape(corners_m, (-1, 2)), tags.corners_px.reshape(-1, 2)
+        ids, places = predicted_places(
+            board, np.arange(len(board.points_board_m)), known_m, known_px
+        )
+    return BoardLook(_view(board, levels, name, ids, places), foreign, own)
+
+
+def _view(
+    board: Board, levels: np.ndarray, name: str, ids: np.ndarray, places: Places
+) -> BoardView | None:
+    """What is seen at the places, and around them."""
+    ids, places = _first_look(board, levels, ids, places)
+    if len(ids) < MIN_POINTS:
+        return None
+    saddles = fit_saddles(
+        levels, bent_places(board, ids, places), _radius_px(places), _SECOND_MOVE_PX
+    )
+    ids, places, saddles = _kept(board, ids, places, saddles)
+    steady = _with_neighbours(board, ids, places.points_px)
+    if steady.sum() < MIN_POINTS:
+        return None
+    sigma_px = float(np.median(saddles.sigma_px[steady].max(axis=1)))
+    width_px = EDGE_WIDTH_SIGMAS * sigma_px
+    return BoardView(name, ids[steady], places.points_px[steady], width_px)
+
+
+def _first_look(
+    board: Board, levels: np.ndarray, ids: np.ndarray, places: Places
+) -> tuple[np.ndarray, Places]:
+    """The saddles at the places, and at those that they lead to."""
+    found, there = np.zeros(0, int), no_places(board)[1]
+    for _ in range(1 + _GROWTHS):
+        if len(ids) == 0:
+            break
+        square_px = float(np.median(np.linalg.norm(places.along_px, axis=2)))
+        move_px = max(2.0, _FIRST_MOVE * square_px)
+        saddles = fit_saddles(levels, places, _radius_px(places), move_px)
+        ids, places, _ = _kept(board, ids, places, saddles)
+        if len(ids) == 0:
+            break
+        found, there = np.append(found, ids), joined_places(there, places)
+        unfound = np.setdiff1d(np.arange(len(board.points_board_m)), found)
+        points_m = board.points_board_m[found, :2]
+        ids, places = predicted_places(board, unfound, points_m, there.points_px)
+    order = np.argsort(found, kind="stable")
+    return found[order], chosen_places(there, order)
+
+
+def _radius_px(places: Places) -> float:
+    square_px = float(np.median(np.linalg.norm(places.along_px, axis=2)))
+    return float(np.clip(_RADIUS * square_px, _MIN_RADIUS_PX, _MAX_RADIUS_PX))
+
+
+def _look_for_marker(
+    board: Board, levels: np.ndarray, name: str, camera: Camera | None
+) -> BoardLook:
+    found = make_detector("aruco", board.family).detect(levels, camera)
+    own = np.flatnonzero((found.ids == board.first_id) & found.refined)
+    foreign = tuple(sorted({int(i) for i in found.ids if i != board.first_id}))
+    if len(own) != 1:
+        return BoardLook(None, foreign, (board.first_id,) * len(own))
+    corners_px = found.corners_px[own[0]]
+    fit = refine_corners(levels, corners_px, board.tags[0].cells, Lens(camera))
+    width_px = float("nan")
+    if fit.fitted is not None:
+        xx, _, yy = np.asarray(fit.fitted.edges.blur_px2, float)
+        variance_px2 = max(xx, yy, 0.0) + PIXEL_VARIANCE_PX2
+        width_px = EDGE_WIDTH_SIGMAS * float(np.sqrt(variance_px2))
+    return BoardLook(
+        BoardView(name, np.arange(4), corners_px, width_px), foreign, (board.first_id,)
+    )
+
+
+def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[np.ndarray, Places]:
+    """Where OpenCV sees all inner corners of the chessboard; nothing where it does not."""
+    pattern = (board.pattern_columns, board.pattern_rows)
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    found, corners = cv2.findChessboardCornersSB(levels, pattern, flags=flags)
+    if not found:
+        return no_places(board)
+    grid = np.asarray(corners, float).reshape(board.pattern_rows, board.pattern_columns, 2)
+    right, down = np.mean(grid[:, -1] - grid[:, 0], axis=0), np.mean(grid[-1] - grid[0], axis=0)
+    if right[0] * down[1] - right[1] * down[0] < 0:
+        grid = grid[:, ::-1]
+    ids = np.arange(len(board.points_board_m))
+    places = straight_places(board, ids, grid.reshape(-1, 2))
+    first = fit_saddles(levels, places, _MAX_RADIUS_PX, _MAX_RADIUS_PX)
+    if np.sum(np.sign(first.amplitude) * np.where(board.dark_top_left, 1, -1)) < 0:
+        places = straight_places(board, ids, grid.reshape(-1, 2)[::-1])
+    return ids, places
+
+
+def _kept(
+    board: Board, ids: np.ndarray, places: Places, saddles: Saddles
+) -> tuple[np.ndarray, Places, Saddles]:
+    """The good saddles, black where the board is."""
+    sign = np.where(board.dark_top_left[ids], 1, -1)
+    keep = saddles.good & (saddles.amplitude * sign > 0)
+    # Two that ended in one place: neither can be trusted.
+    apart = np.linalg.norm(saddles.points_px[:, None] - saddles.points_px, axis=2)
+    np.fill_diagonal(apart, np.inf)
+    keep &= apart.min(axis=1, initial=np.inf) > 1.0
+    moved = replace(chosen_places(places, keep), points_px=saddles.points_px[keep])
+    kept = Saddles(
+        saddles.points_px[keep],
+        saddles.amplitude[keep],
+        saddles.sigma_px[keep],
+        saddles.noise[keep],
+        saddles.good[keep],
+    )
+    return ids[keep], moved, kept
+
+
+def _with_neighbours(board: Board, ids: np.ndarray, points_px: np.ndarray) -> np.ndarray:
+    """(N,) bool: the points that are where the homography of their neighbours wants them."""
+    if len(ids) < MIN_POINTS:
+        return np.zeros(len(ids), bool)
+    places = board.points_board_m[ids, :2] / board.pitch_m
+    stray_px = np.full(len(ids), np.inf)
+    for index, place in enumerate(places):
+        distance = np.linalg.norm(places - place, axis=1)
+        near = np.argsort(distance, kind="stable")[1 : _NEIGHBOURS + 1]
+        at = mapped(places[near] - place, points_px[near], np.zeros((1, 2)))
+        if at is not None:
+            stray_px[index] = np.linalg.norm(at[0] - points_px[index])
+    limit_px = max(_MIN_STRAY_PX, _MAX_STRAY * float(np.median(stray_px)))
+    return stray_px <= limit_px

@@ -1,0 +1,273 @@
+"""Images, folders of images and videos in, views of a board out."""
+
+import hashlib
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.detection import BoardLook, look_at
+from jaxnav.calibration.boards.mismatch import what_is_seen
+from jaxnav.calibration.lenses.views import BoardView, BoardViews
+from jaxnav.errors import BadInput
+from jaxnav.files import limits
+from jaxnav.files.images import read_image
+from jaxnav.models.camera import Camera
+
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
+
+_MOST_FRAMES = 600  # of a video that are looked at
+# A frame is looked at when it differs by this much from the last that was kept.
+_THUMBNAIL_PX, _MIN_CHANGE_GREY = (64, 48), 1.5
+_EXAMPLES = 5  # images kept to find out why no board is seen
+
+
+@dataclass(frozen=True)
+class CollectedViews:
+    """The views of a board, and what became of the other images.
+
+    Attributes:
+        views: what calibration takes.
+        files: all that was read, in order: for the hash of the data.
+        duplicates: (name, name of the image that it repeats).
+        without_board: names of images in which the board is not seen.
+        foreign_ids: markers of the board's family that are not on it.
+    """
+
+    views: BoardViews
+    files: tuple[Path, ...]
+    duplicates: tuple[tuple[str, str], ...]
+    without_board: tuple[str, ...]
+    foreign_ids: tuple[int, ...]
+
+
+def board_views(
+    board: Board,
+    sources: Sequence[Path],
+    camera: Camera | None = None,
+    min_move_px: float = 10.0,
+    headless: bool = True,
+) -> BoardViews:
+    """The views alone: see `collect_views`."""
+    return collect_views(board, sources, camera, min_move_px, headless).views
+
+
+def collect_views(
+    board: Board,
+    sources: Sequence[Path],
+    camera: Camera | None = None,
+    min_move_px: float = 10.0,
+    headless: bool = True,
+) -> CollectedViews:
+    """Find the board in images and videos of one camera.
+
+    Of images with the same pixels the first counts. Of a video those frames are taken in which the
+    board has moved since the last one that was taken.
+
+    Args:
+        board: what to look for.
+        sources: folders of images, images, videos; a folder's in the order of their names, numbers
+            by value.
+        camera: see `find_board`.
+        min_move_px: how far the board's points must have moved, in the median.
+        headless: no progress bar.
+
+    Raises:
+        BadInput: a file that can't be read, images of different sizes, or a board that is not
+            seen, with what is seen instead.
+    """
+    files = source_files(sources)
+    collector = _Collector(board, camera, min_move_px)
+    names = _names(files)
+    for file, name in tqdm(zip(files, names, strict=True), total=len(files), disable=headless):
+        if file.suffix.lower() in VIDEOS:
+            frames = tqdm(_frames(file), unit=" frame", leave=False, disable=headless)
+            collector.add_video(file, name, frames)
+        else:
+            collector.add_image(file, name)
+    return collector.collected(files)
+
+
+def source_files(sources: Sequence[Path]) -> tuple[Path, ...]:
+    """The images and videos that the sources name, in order.
+
+    Raises:
+        BadInput: a source that is none, or a folder without images.
+    """
+    files: list[Path] = []
+    for source in sources:
+        if not source.is_dir():
+            if source.suffix.lower() not in IMAGES + VIDEOS:
+                raise BadInput(source, f"is neither a folder, an image nor a video ({_known()})")
+            files.append(source)
+            continue
+        inside = sorted(
+            (
+                path
+                for path in source.iterdir()
+                if path.suffix.lower() in IMAGES and not path.name.startswith(".")
+            ),
+            key=_by_number,
+        )
+        if not inside:
+            raise BadInput(source, f"has no images in it ({', '.join(IMAGES)})")
+        files += inside
+    if not files:
+        raise BadInput("images", "none are given")
+    return tuple(files)
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """What the views are called: file names, whole paths where these repeat."""
+    names = [file.name for file in files]
+    return [
+        name if names.count(name) == 1 else str(file)
+        for file, name in zip(files, names, strict=True)
+    ]
+
+
+def _known() -> str:
+    return ", ".join(IMAGES + VIDEOS)
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """A key that sorts 2.png before 10.png."""
+    return [
+        (int(part), "") if re.fullmatch("[0-9]{1,300}", part) else (-1, part)
+        for part in re.split(r"([0-9]+)", path.name)
+    ]
+
+
+class _Collector:
+    """What was seen so far."""
+
+    def __init__(self, board: Board, camera: Camera | None, min_move_px: float):
+        self._board, self._camera, self._min_move_px = board, camera, min_move_px
+        self._size_px: tuple[int, int] | None = None
+        self._first = ""
+        self._digests: dict[bytes, str] = {}
+        self._views: list[BoardView] = []
+        self._looks: list[BoardLook] = []
+        self._duplicates: list[tuple[str, str]] = []
+        self._without: list[str] = []
+        self._examples: list[np.ndarray] = []
+
+    def add_image(self, file: Path, name: str) -> None:
+        # As the sensor gave it: what a viewer turns upright is of another camera.
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        image = read_image(file, flags)
+        self._same_size(str(file), image)
+        if not self._is_repeated(name, image):
+            look = self._look(name, image)
+            if look.view is not None:
+                self._views.append(look.view)
+
+    def add_video(self, file: Path, name: str, frames: Iterable[tuple[int, np.ndarray]]) -> None:
+        last_view: BoardView | None = None
+        last_thumbnail: np.ndarray | None = None
+        for number, image in frames:
+            self._same_size(str(file), image)
+            thumbnail = cv2.resize(image, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA).astype(float)
+            if last_thumbnail is not None:
+                if np.mean(np.abs(thumbnail - last_thumbnail)) < _MIN_CHANGE_GREY:
+                    continue
+            view = self._look(f"{name}#{number}", image).view
+            if view is None or _move_px(last_view, view) < self._min_move_px:
+                continue
+            self._views.append(view)
+            last_view, last_thumbnail = view, thumbnail
+
+    def collected(self, files: tuple[Path, ...]) -> CollectedViews:
+        foreign = sorted({i for look in self._looks for i in look.foreign_ids})
+        strange = sum(bool(look.foreign_ids) for look in self._looks)
+        # Another marker may hang in the room; a board brings several into most images.
+        wrong = len(foreign) > 1 and strange > len(self._looks) / 2
+        if wrong or not self._views:
+            raise BadInput(
+                files[0] if len(files) == 1 else files[0].parent,
+                what_is_seen(self._board, self._looks, self._examples),
+            )
+        assert self._size_px is not None
+        return CollectedViews(
+            BoardViews(self._board.points_board_m, self._size_px, tuple(self._views)),
+            files,
+            tuple(self._duplicates),
+            tuple(self._without),
+            tuple(foreign),
+        )
+
+    def _look(self, name: str, image: np.ndarray) -> BoardLook:
+        look = look_at(self._board, image, name, self._camera)
+        self._looks.append(look)
+        if look.view is None:
+            self._without.append(name)
+            if len(self._examples) < _EXAMPLES:
+                self._examples.append(image)
+        return look
+
+    def _same_size(self, name: str, image: np.ndarray) -> None:
+        height, width = image.shape
+        if self._size_px is None:
+            self._size_px, self._first = (width, height), name
+        elif (width, height) != self._size_px:
+            raise BadInput(
+                name,
+                f"is {width} x {height} pixels, but {self._first} is {self._size_px[0]} x "
+                f"{self._size_px[1]}: calibrate one camera at one resolution",
+            )
+
+    def _is_repeated(self, name: str, image: np.ndarray) -> bool:
+        digest = hashlib.sha256(np.ascontiguousarray(image).tobytes()).digest()
+        if digest in self._digests:
+            self._duplicates.append((name, self._digests[digest]))
+            return True
+        self._digests[digest] = name
+        return False
+
+
+def _frames(file: Path) -> Iterator[tuple[int, np.ndarray]]:
+    """Numbers and grey images (H, W) of a video's frames, thinned out where it is long.
+
+    Raises:
+        BadInput: not a video that OpenCV can read.
+    """
+    capture = cv2.VideoCapture(str(file))
+    try:
+        if not file.is_file():
+            raise BadInput(file, "can't be read: no such file")
+        if not capture.isOpened():
+            raise BadInput(file, "is not a video that OpenCV can read")
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as of images
+        width, height = map(capture.get, (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if width * height > limits.IMAGE_PIXELS:
+            raise BadInput(file, f"has frames of {width:.0f} x {height:.0f} pixels, too many")
+        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        stride = max(1, -(-count // _MOST_FRAMES))
+        number = 0
+        while capture.grab():
+            if number % stride == 0:
+                got, image = capture.retrieve()
+                if got:
+                    if image.ndim == 3:
+                        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+                    yield number, np.asarray(image)
+            number += 1
+    finally:
+        capture.release()
+
+
+def _move_px(before: BoardView | None, now: BoardView) -> float:
+    """How far the points that both views have are apart, in the median."""
+    if before is None:
+        return np.inf
+    _, then, here = np.intersect1d(before.ids, now.ids, return_indices=True)
+    if len(then) < 4:
+        return np.inf
+    apart_px = np.linalg.norm(now.corners_px[here] - before.corners_px[then], axis=1)
+    return float(np.median(apart_px))

@@ -1,0 +1,91 @@
+"""No board is seen: what is it that is seen instead?"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.detection import BoardLook
+from jaxnav.detection.families import dictionary
+
+# The largest of each kind of code, which hold the smaller ones.
+_FAMILIES = (
+    "tag36h11", "tag25h9", "tag16h5", "4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000",
+    "aruco_original", "aruco_mip_36h12",
+)  # fmt: skip
+_MANY = 4  # markers in an image: fewer may be chance
+
+
+def what_is_seen(board: Board, looks: Sequence[BoardLook], examples: Sequence[np.ndarray]) -> str:
+    """One line for a person: why the board is not what the images show, and what to do.
+
+    Args:
+        board: that was looked for.
+        looks: at every image.
+        examples: some of the images without it, (H, W) grey.
+    """
+    foreign = sorted({marker_id for look in looks for marker_id in look.foreign_ids})
+    own = sorted({marker_id for look in looks for marker_id in look.own_ids})
+    images = f"{len(looks)} image{'s' * (len(looks) != 1)}"
+    if foreign:
+        return (
+            f"markers {_listed(foreign)} of {board.family} are seen, which are not on the "
+            f"{board}: describe the board that is in the images"
+        )
+    if len(own) >= _MANY:
+        return (
+            f"markers {_listed(own)} are seen, but not arranged as on the {board}: check its kind, "
+            "columns and rows"
+        )
+    if board.kind == "chessboard":
+        other = _largest_chessboard(examples)
+        if other is not None and sorted(other) != sorted((board.columns, board.rows)):
+            return (
+                f"shows a chessboard of {other[0]} x {other[1]} squares, not the {board}: count "
+                "the squares, not the corners between them"
+            )
+    else:
+        other_code = _other_code(board, examples)
+        if other_code is not None:
+            return f"shows {other_code}, not the {board}: describe the board that is in the images"
+    whole = " All of a chessboard must be in the image." if board.kind == "chessboard" else ""
+    return (
+        f"no {board} is found in {images}: is it the right board, sharp, with white around it, and "
+        f"at least some 20 px a square?{whole}"
+    )
+
+
+def _listed(ids: Sequence[int], most: int = 6) -> str:
+    listed = ", ".join(str(marker_id) for marker_id in ids[:most])
+    return listed if len(ids) <= most else f"{listed}, ..."
+
+
+def _largest_chessboard(examples: Sequence[np.ndarray]) -> tuple[int, int] | None:
+    """Columns and rows of squares of the largest chessboard in the images."""
+    best: tuple[int, int] | None = None
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    for image in examples:
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
+        if found:
+            rows, columns = np.asarray(meta).shape
+            if best is None or rows * columns > (best[0] - 1) * (best[1] - 1):
+                best = (columns + 1, rows + 1)
+    return best
+
+
+def _other_code(board: Board, examples: Sequence[np.ndarray]) -> str | None:
+    """The family of markers that is seen instead, in words."""
+    most, named = _MANY - 1, None
+    for family in _FAMILIES:
+        for border in (1, 2):
+            parameters = cv2.aruco.DetectorParameters()
+            parameters.markerBorderBits = border
+            parameters.errorCorrectionRate = 0.0
+            decoder = cv2.aruco.ArucoDetector(dictionary(family), parameters)
+            for image in examples:
+                _, ids, _ = decoder.detectMarkers(image)
+                if ids is not None and len(ids) > most:
+                    most = len(ids)
+                    named = f"markers of {family} with a frame of {border} cell{'s' * (border > 1)}"
+    return named

@@ -1,0 +1,142 @@
+"""Where the points of a board must be in an image, and how its lines run through them.
+
+Points are predicted from others near them by a homography, which holds over a square or two
+through any lens. The lines through a point, and how the lens bends them, follow from its neighbours
+in its row and its column.
+"""
+
+import cv2
+import numpy as np
+
+from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.saddles import Places
+
+_KNOWN_AROUND = 16  # points that predict another
+_NEAREST_KNOWN = 1.1  # pitches from a point to the nearest of them, at most
+_SPREAD = 2.0  # pitches that the others may be further away
+_LONGEST_REACH = 2.6  # pitches, to a neighbour in a row
+
+
+def no_places(board: Board) -> tuple[np.ndarray, Places]:
+    """Not one point."""
+    return np.zeros(0, int), _places(board, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+def predicted_places(
+    board: Board, wanted: np.ndarray, known_m: np.ndarray, known_px: np.ndarray
+) -> tuple[np.ndarray, Places]:
+    """Those of the wanted points (W,) that have known ones (N, 2) near them, by the homography of
+    these."""
+    ids, points_px, along_px = [], [], []
+    steps = np.array([[0, 0], [1, 0], [-1, 0], [0, -1], [0, 1]]) / 4
+    for point_id in wanted:
+        offset = (known_m - board.points_board_m[point_id, :2]) / board.pitch_m
+        distance = np.linalg.norm(offset, axis=1)
+        around = np.argsort(distance, kind="stable")[:_KNOWN_AROUND]
+        if len(around) < 4 or distance[around[0]] > _NEAREST_KNOWN:
+            continue
+        around = around[distance[around] <= distance[around[0]] + _SPREAD]
+        seen = mapped(offset[around], known_px[around], steps) if len(around) >= 4 else None
+        if seen is not None:
+            ids.append(point_id)
+            points_px.append(seen[0])
+            along_px.append([2 * (seen[1] - seen[2]), 2 * (seen[3] - seen[4])])
+    if not ids:
+        return no_places(board)
+    return np.array(ids), _places(board, np.array(points_px), np.array(along_px))
+
+
+def straight_places(board: Board, ids: np.ndarray, points_px: np.ndarray) -> Places:
+    """Places whose edges lead to their neighbours."""
+    steps, _ = _steps_and_bends(board, ids, points_px)
+    return _places(board, points_px, steps)
+
+
+def bent_places(board: Board, ids: np.ndarray, places: Places) -> Places:
+    """The places again, their edges along parabolas through their neighbours."""
+    steps, bends = _steps_and_bends(board, ids, places.points_px)
+    known = np.isfinite(steps).all(axis=2)
+    along_px = np.where(known[..., None], steps, places.along_px)
+    bend_px = np.where(known & np.isfinite(bends), bends, 0)
+    return Places(places.points_px, along_px, bend_px, places.clear, places.cross)
+
+
+def joined_places(first: Places, second: Places) -> Places:
+    """Both, one after the other."""
+    return Places(
+        np.concatenate([first.points_px, second.points_px]),
+        np.concatenate([first.along_px, second.along_px]),
+        np.concatenate([first.bend_px, second.bend_px]),
+        first.clear,
+        first.cross,
+    )
+
+
+def chosen_places(places: Places, which: np.ndarray) -> Places:
+    """Some of them, by index or by mask."""
+    return Places(
+        places.points_px[which],
+        places.along_px[which],
+        places.bend_px[which],
+        places.clear,
+        places.cross,
+    )
+
+
+def _places(board: Board, points_px: np.ndarray, along_px: np.ndarray) -> Places:
+    pitch_m = board.pitch_m
+    return Places(
+        points_px,
+        along_px,
+        np.zeros((len(points_px), 2)),
+        board.clear_m / pitch_m,
+        board.cross_m / pitch_m,
+    )
+
+
+def mapped(source: np.ndarray, target: np.ndarray, at: np.ndarray) -> np.ndarray | None:
+    """Points (M, 2) under the homography that takes source (N, 2) to target (N, 2) best."""
+    H, _ = cv2.findHomography(source, target)
+    if H is None:
+        return None
+    homogeneous = np.column_stack([at, np.ones(len(at))]) @ H.T
+    # Past the horizon of the homography there is nothing.
+    if np.any(homogeneous[:, 2] < 0.1) or not np.all(np.isfinite(homogeneous)):
+        return None
+    return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
+
+
+def _steps_and_bends(
+    board: Board, ids: np.ndarray, points_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """As in `Places`, (N, 2, 2) and (N, 2), from three neighbours in a row and in a column.
+
+    NaN where there are none; a step from two, without a bend, where there is no third.
+    """
+    columns, rows = board.grid[ids].T
+    table = np.full((2, board.pattern_rows, board.pattern_columns), np.nan)
+    table[:, rows, columns] = points_px.T
+    places_m = np.full((2, board.pattern_rows, board.pattern_columns), np.nan)
+    places_m[:, board.grid[:, 1], board.grid[:, 0]] = board.points_board_m[:, :2].T * [[1], [-1]]
+    places = places_m / board.pitch_m
+    steps, bends = np.full((len(ids), 2, 2), np.nan), np.full((len(ids), 2), np.nan)
+    for index, (column, row) in enumerate(zip(columns, rows, strict=True)):
+        for axis in (0, 1):
+            line = table[:, row, :] if axis == 0 else table[:, :, column]
+            at = places[0, row, :] if axis == 0 else places[1, :, column]
+            own = column if axis == 0 else row
+            seen = np.flatnonzero(np.isfinite(line[0]) & (np.arange(len(at)) != own))
+            seen = seen[np.abs(at[seen] - at[own]) < _LONGEST_REACH]
+            seen = seen[np.argsort(np.abs(at[seen] - at[own]), kind="stable")[:2]]
+            if len(seen) == 0:
+                continue
+            t = (at[seen] - at[own])[:, None]
+            slope = (line[:, seen].T - line[:, own]) / t
+            if len(seen) == 1:
+                steps[index, axis] = slope[0]
+                continue
+            second = (slope[1] - slope[0]) / (t[1] - t[0])
+            steps[index, axis] = slope[0] - second * t[0]
+            u, v = steps[index, axis] / np.linalg.norm(steps[index, axis])
+            bends[index, axis] = second[1] * u - second[0] * v
+    return steps, bends

@@ -1,0 +1,1 @@
+"""A camera of its own: its lens from views of a board."""

@@ -1,0 +1,90 @@
+"""Whether a calibration board is as its file says, by what is left of its corners' residuals."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy import stats
+
+from jaxnav.calibration.lenses import bundle as lens_bundle
+from jaxnav.calibration.lenses.bundle import Unknowns
+from jaxnav.calibration.lenses.fit import LensFit
+from jaxnav.numerics.schur import reduce
+
+
+@dataclass(frozen=True)
+class BoardCheck:
+    """Whether the board is as its file says.
+
+    Attributes:
+        stretch: its height is so much larger in parts of its width, with its sigma.
+        offset_m: root mean square by which its points lie elsewhere, beyond chance.
+        p_value: of no more than noise being in that.
+    """
+
+    stretch: float
+    stretch_sigma: float
+    offset_m: float
+    p_value: float
+
+
+def check_board(fit: LensFit) -> BoardCheck:
+    """One Gauss-Newton step with the board free to stretch; then every point free to move.
+
+    A board that is as a whole too large or too small moves all views away and nothing else: that
+    can't be seen by one camera.
+    """
+    seen = lens_bundle.gathered(fit.views)
+    rows = len(seen.corners_px)
+    count = len(fit.views.views)
+    poses = lens_bundle.padded_poses(fit.Ts_camera_board, rows)
+    weights = np.zeros(seen.present.shape)
+    weights[:count] = fit.weights
+    y = Unknowns(jnp.asarray(fit.parameters), jnp.asarray(poses))
+    free = lens_bundle.free_mask(fit.lens, fit.fixed)
+    J, information, gradient = jax.device_get(
+        _board_freedom(fit.lens, y, seen, jnp.asarray(weights))
+    )
+    kept = np.append(free, True)
+    scale = 1 / np.sqrt(np.maximum(np.diag(information)[kept], 1e-300))
+    scaled = information[np.ix_(kept, kept)] * np.outer(scale, scale)
+    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * np.outer(scale, scale)
+    residual_px = np.zeros((*weights.shape, 2))
+    residual_px[:count] = fit.residual_px
+
+    # (P, 2, 2) and (P, 2): each point's place on the board from all views of it.
+    H = np.einsum("vp,vpci,vpcj->pij", weights, J, J)
+    g = np.einsum("vp,vpci,vpc->pi", weights, J, residual_px)
+    often = (weights > 0).sum(axis=0) >= 2
+    offsets = -np.linalg.solve(H[often], g[often][..., None])[..., 0]
+    chance = fit.sigma_px**2 * np.linalg.inv(H[often])
+    statistic = np.einsum("pi,pij,pj->", offsets, H[often], offsets) / fit.sigma_px**2
+    beyond = np.sum(offsets**2, axis=1) - np.trace(chance, axis1=1, axis2=2)
+    return BoardCheck(
+        stretch=float(-(inverse @ gradient[kept])[-1]),
+        stretch_sigma=float(fit.sigma_px * np.sqrt(max(inverse[-1, -1], 0))),
+        offset_m=float(np.sqrt(max(np.mean(beyond), 0))) if often.any() else 0.0,
+        p_value=float(stats.chi2.sf(statistic, 2 * often.sum())),
+    )
+
+
+@partial(jax.jit, static_argnames="lens")
+def _board_freedom(
+    lens: str, y: Unknowns, seen: lens_bundle.Seen, weights: Array
+) -> tuple[Array, Array, Array]:
+    """Derivatives (V, P, 2, 2) by a point's x and y; information (10, 10) and gradient (10,) of the
+    lens and the board's stretch when no pose is known."""
+    residual_px, of_lens, of_pose = lens_bundle.linearised(lens, y, seen)
+    of_point = of_pose[..., :2]  # a pose that shifts along the board's x and y
+    stretch = of_point[..., 1:] * seen.points_board_m[None, :, None, 1:2]
+    blocks = lens_bundle.normal_equations(
+        residual_px,
+        jnp.concatenate([of_lens, stretch], axis=-1),
+        of_pose,
+        jnp.sqrt(jnp.where(seen.present, weights, 0)),
+    )
+    reduced = reduce(blocks, jnp.ones(of_lens.shape[-1] + 1, bool), jnp.zeros(()))
+    return of_point, reduced.system, reduced.gradient

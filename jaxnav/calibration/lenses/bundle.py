@@ -1,0 +1,228 @@
+"""One camera and all its views of a board, as one least-squares problem.
+
+Unknown are the lens, nine numbers that all views share, and a pose of the board in every view. The
+poses are eliminated (`jaxnav.numerics.schur`), so time and memory grow with the number of views.
+The frame is the board's: nothing is left to fix.
+"""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.calibration.lenses.views import BoardViews
+from jaxnav.calibration.rigs.pose_arrays import retracted
+from jaxnav.models.camera import Camera
+from jaxnav.models.geometry import rotation_matrix, skew, turn_and_shift
+from jaxnav.numerics.schur import Blocks, SchurLM, SchurState, reduce
+
+# Of the shared unknowns, in their order; zero and fixed beyond what the lens has.
+NAMES = {
+    "none": ("fx", "fy", "cx", "cy"),
+    "radtan": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
+    "equidistant": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
+COUNT = 9
+NO_CUT = 1e8  # in sigmas: plain least squares
+_BATCH = 16  # views are padded to a multiple of so many, so that few sizes are compiled
+
+
+class Seen(eqx.Module):
+    """What is known, padded: V views, P points of the board. On the host until it is solved."""
+
+    points_board_m: Float[Array | np.ndarray, "P 3"]
+    corners_px: Float[Array | np.ndarray, "V P 2"]
+    present: Bool[Array | np.ndarray, "V P"]
+
+
+class Unknowns(eqx.Module):
+    """What is to be found."""
+
+    lens: Float[Array, " 9"]  # fx fy cx cy, then the coefficients as the camera counts them
+    Ts_camera_board: Float[Array, "V 7"]  # wxyz_xyz
+
+
+class Bundle(eqx.Module):
+    """A minimum."""
+
+    unknowns: Unknowns
+    residual_px: Float[Array, "V P 2"]  # predicted - seen; 0 where nothing was
+    blocks: Blocks  # in pixels, weighed as the fit was
+    steps: Array
+    converged: Array
+
+
+def free_mask(lens: str, fixed: tuple[str, ...] = ()) -> np.ndarray:
+    """(9,) bool: which shared unknowns may move."""
+    names = NAMES[lens]
+    return np.array([i < len(names) and names[i] not in fixed for i in range(COUNT)])
+
+
+def camera_of(lens: str, parameters: Array) -> Camera:
+    """The camera of nine numbers."""
+    return Camera(parameters[:2], parameters[2:4], parameters[4:], jnp.asarray(0), (lens,))
+
+
+def gathered(views: BoardViews) -> Seen:
+    """The views as arrays, on the host; after the last come empty ones."""
+    rows = -(-len(views.views) // _BATCH) * _BATCH
+    points = len(views.points_board_m)
+    corners_px, present = np.zeros((rows, points, 2)), np.zeros((rows, points), bool)
+    for row, view in enumerate(views.views):
+        corners_px[row, view.ids] = view.corners_px
+        present[row, view.ids] = True
+    return Seen(np.asarray(views.points_board_m, float), corners_px, present)
+
+
+def padded_poses(Ts_camera_board: np.ndarray, rows: int) -> np.ndarray:
+    """(rows, 7): those given, then some that look at the board from a metre away."""
+    away = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    return np.concatenate([Ts_camera_board, np.tile(away, (rows - len(Ts_camera_board), 1))])
+
+
+@partial(jax.jit, static_argnames=("lens", "max_steps"))
+def solve(
+    lens: str,
+    start: Unknowns,
+    seen: Seen,
+    weights: Float[Array, "V P"],
+    free: Bool[Array, " 9"],
+    sigma_px: Float[Array, ""],
+    cut: Float[Array, ""],
+    max_steps: int = 100,
+) -> Bundle:
+    """The unknowns that explain the corners best.
+
+    With the distance d of a corner from its prediction, in sigmas, a corner costs
+    cut^2 log(1 + d^2 / cut^2) (Cauchy): d^2 next to 0, and ever less more beyond the cut.
+
+    Args:
+        weights: of every corner, on its squared distance; 0 leaves it out.
+        free: which of the nine move.
+        cut: in sigmas; `NO_CUT` for plain least squares.
+    """
+    weights = jnp.where(seen.present, weights, 0)
+    scale = jnp.sqrt(weights) / sigma_px
+
+    def fn(y: Unknowns, args: Any) -> Any:
+        residual_px, of_lens, of_pose = linearised(lens, y, seen)
+        squared = jnp.sum(residual_px**2, axis=-1) * scale**2
+        cost = cut**2 * jnp.log1p(squared / cut**2)
+        counts = scale / jnp.sqrt(1 + squared / cut**2)
+        return jnp.sqrt(cost), normal_equations(residual_px, of_lens, of_pose, counts)
+
+    solution: optx.Solution = optx.least_squares(
+        fn,
+        SchurLM(rtol=1e-12, atol=1e-12, norm=optx.max_norm, retract=_moved, free=free),
+        start,
+        has_aux=True,
+        max_steps=max_steps,
+        throw=False,
+    )
+    state: SchurState = solution.state
+    residual_px = _predicted(lens, solution.value, seen) - seen.corners_px
+    blocks = jax.tree.map(lambda leaf: leaf * sigma_px**2, state.blocks)
+    return Bundle(
+        unknowns=solution.value,
+        residual_px=jnp.where(seen.present[..., None], residual_px, 0),
+        blocks=blocks,
+        steps=state.steps,
+        converged=state.done,
+    )
+
+
+@jax.jit
+def lens_information(blocks: Blocks, free: Bool[Array, " 9"]) -> Float[Array, "9 9"]:
+    """Of the nine when no pose is known, 1 / px^2 of noise; identity where one is fixed."""
+    return reduce(blocks, free, jnp.zeros(())).system
+
+
+@partial(jax.jit, static_argnames="lens")
+def view_information(
+    lens: str, y: Unknowns, seen: Seen, weights: Float[Array, "V P"]
+) -> Float[Array, "V 9 9"]:
+    """What every view alone tells of the nine, its own pose being unknown; 1 / px^2 of noise."""
+    _, of_lens, of_pose = linearised(lens, y, seen)
+    root = jnp.sqrt(jnp.where(seen.present, weights, 0))[..., None, None]
+    A, B = (
+        (root * J).reshape(J.shape[0], -1, J.shape[-1]) for J in (of_lens, of_pose)
+    )  # (V, 2P, 9), (V, 2P, 6)
+    length = jnp.sqrt(jnp.sum(B**2, axis=1, keepdims=True))
+    Q, _ = jnp.linalg.qr(B / jnp.where(length > 0, length, 1))
+    rest = A - Q @ (jnp.swapaxes(Q, 1, 2) @ A)
+    return jnp.swapaxes(rest, 1, 2) @ rest
+
+
+@partial(jax.jit, static_argnames="lens")
+def residuals_px(lens: str, y: Unknowns, seen: Seen) -> Float[Array, "V P 2"]:
+    """Predicted - seen, 0 where nothing was."""
+    return jnp.where(seen.present[..., None], _predicted(lens, y, seen) - seen.corners_px, 0)
+
+
+def _predicted(lens: str, y: Unknowns, seen: Seen) -> Float[Array, "V P 2"]:
+    camera = camera_of(lens, y.lens)
+    points_board_m = jnp.asarray(seen.points_board_m)
+
+    def view(wxyz_xyz: Array) -> Array:
+        T_camera_board = jaxlie.SE3(wxyz_xyz)
+        R_camera_board = rotation_matrix(T_camera_board.rotation())
+        t_m = T_camera_board.translation()
+        return camera.project(turn_and_shift(R_camera_board, t_m, points_board_m))
+
+    return jax.vmap(view)(y.Ts_camera_board)
+
+
+def linearised(lens: str, y: Unknowns, seen: Seen) -> tuple[Array, Array, Array]:
+    """Residuals (V, P, 2), their derivatives by the nine (V, P, 2, 9) and by xi (V, P, 2, 6)."""
+
+    def pixel(parameters: Array, point_camera: Array) -> tuple[Array, Array]:
+        projected = camera_of(lens, parameters).project(point_camera)
+        return projected, projected
+
+    def corner(R_camera_board: Array, t_m: Array, point_board: Array) -> tuple[Array, ...]:
+        point_camera = R_camera_board @ point_board + t_m
+        (of_lens, of_point), projected = jax.jacfwd(pixel, argnums=(0, 1), has_aux=True)(
+            y.lens, point_camera
+        )
+        by_xi = jnp.concatenate([R_camera_board, -R_camera_board @ skew(point_board)], axis=1)
+        return projected, of_lens, of_point @ by_xi
+
+    def view(wxyz_xyz: Array) -> tuple[Array, ...]:
+        T_camera_board = jaxlie.SE3(wxyz_xyz)
+        R_camera_board = rotation_matrix(T_camera_board.rotation())
+        t_m = T_camera_board.translation()
+        return jax.vmap(partial(corner, R_camera_board, t_m))(jnp.asarray(seen.points_board_m))
+
+    projected, of_lens, of_pose = jax.vmap(view)(y.Ts_camera_board)
+    return projected - seen.corners_px, of_lens, of_pose
+
+
+def normal_equations(residual_px: Array, of_lens: Array, of_pose: Array, counts: Array) -> Blocks:
+    """Normal equations of residuals that count so much each, (V, P)."""
+    views = residual_px.shape[0]
+    r = (counts[..., None] * residual_px).reshape(views, -1)
+    A, B = (
+        (counts[..., None, None] * J).reshape(views, -1, J.shape[-1]) for J in (of_lens, of_pose)
+    )
+    flat = A.reshape(-1, A.shape[-1])
+    B_transposed = jnp.swapaxes(B, 1, 2)
+    return Blocks(
+        own=B_transposed @ B,
+        cross=B_transposed @ A,
+        shared=flat.T @ flat,
+        own_gradient=(B_transposed @ r[..., None])[..., 0],
+        shared_gradient=flat.T @ r.reshape(-1),
+    )
+
+
+def _moved(y: Unknowns, own: Array, shared: Array) -> Unknowns:
+    # A focal length that turned negative would mirror the image: at most a halving a step.
+    lens = y.lens + shared
+    lens = lens.at[:2].set(jnp.maximum(lens[:2], y.lens[:2] / 2))
+    return Unknowns(lens, retracted(y.Ts_camera_board, own))

@@ -1,0 +1,64 @@
+"""Of many views, those that tell most about the lens.
+
+Source: Fedorov (1972), "Theory of optimal experiments": the determinant of the information
+(D-optimality), raised by one view after the other.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.calibration.lenses import bundle as lens_bundle
+from jaxnav.calibration.lenses.bundle import Unknowns
+from jaxnav.calibration.lenses.start import board_poses
+from jaxnav.calibration.lenses.views import BoardViews
+
+_WRONG = 10.0  # times the median view's error: what such a view tells is not about the lens
+_NO_CURVE = 1e-9  # of the best known parameter, so that the first views have a determinant
+
+
+def informative(views: BoardViews, lens: str, parameters: np.ndarray, most: int) -> tuple[int, ...]:
+    """Numbers of at most so many views, in their order.
+
+    Args:
+        parameters: (9,) of the lens, roughly.
+    """
+    if len(views.views) <= most:
+        return tuple(range(len(views.views)))
+    seen = lens_bundle.gathered(views)
+    poses = board_poses(views, lens, parameters)
+    posed = ~np.isnan(poses[:, 0])
+    poses = np.where(posed[:, None], poses, lens_bundle.padded_poses(poses[:0], len(poses)))
+    padded = lens_bundle.padded_poses(poses, len(seen.corners_px))
+    y = Unknowns(jnp.asarray(parameters), jnp.asarray(padded))
+    held = lens_bundle.solve(  # the poses alone, by pixels instead of rays
+        lens,
+        y,
+        seen,
+        jnp.asarray(seen.present, float),
+        jnp.zeros(lens_bundle.COUNT, bool),
+        jnp.asarray(1.0),
+        jnp.asarray(lens_bundle.NO_CUT),
+    )
+    squared = np.sum(np.asarray(held.residual_px) ** 2, axis=(1, 2))[: len(poses)]
+    rms_px = np.sqrt(squared / np.maximum([len(view.ids) for view in views.views], 1))
+    sound = posed & (rms_px < _WRONG * np.median(rms_px[posed]))
+    information = np.asarray(
+        lens_bundle.view_information(lens, held.unknowns, seen, jnp.asarray(seen.present, float))
+    )[: len(poses)]
+    free = lens_bundle.free_mask(lens)
+    return _greedy(information[:, free][:, :, free], sound, most)
+
+
+def _greedy(information: np.ndarray, sound: np.ndarray, most: int) -> tuple[int, ...]:
+    total = np.sum(information[sound], axis=0)
+    scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-300))
+    scaled = information * np.outer(scale, scale)
+    known = _NO_CURVE * np.eye(len(scale))
+    left = list(np.flatnonzero(sound))
+    chosen: list[int] = []
+    while left and len(chosen) < most:
+        _, gain = np.linalg.slogdet(known + scaled[left])
+        best = int(left.pop(int(np.argmax(gain))))
+        chosen.append(best)
+        known = known + scaled[best]
+    return tuple(sorted(chosen))

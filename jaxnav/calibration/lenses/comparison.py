@@ -1,0 +1,91 @@
+"""Which lens model the views support, by views that it was not fitted to.
+
+Every lens is fitted to three quarters of the views and has to explain the last one, whose poses
+alone are then free; four times, so that each view was left out once.
+
+Source: Stone (1974), "Cross-validatory choice and assessment of statistical predictions".
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.calibration.lenses import bundle as lens_bundle
+from jaxnav.calibration.lenses.bundle import COUNT, NO_CUT, Unknowns
+from jaxnav.calibration.lenses.fit import LensFit
+
+_FOLDS = 4
+FEWEST_VIEWS = 8
+_WORSE = 1.02  # times the error of the best: a lens of fewer coefficients may be so much worse
+_CLEARLY = 1.05, 3.0  # times the error, and standard errors of the difference
+SIMPLEST_FIRST = ("none", "equidistant", "radtan")
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of views that a lens was not fitted to.
+
+    Attributes:
+        view_px: (V,) standard deviation of a corner's x and of its y; NaN of views without weight.
+        rms_px: of all of them.
+    """
+
+    view_px: np.ndarray
+    rms_px: float
+
+
+def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
+    """Every view's error when the lens was fitted without it.
+
+    Args:
+        weights: (V, P) of the corners, the same for all lenses that are compared.
+    """
+    seen = lens_bundle.gathered(fit.views)
+    count, rows = len(fit.views.views), len(seen.corners_px)
+    padded = np.zeros(seen.present.shape)
+    padded[:count] = weights
+    free = jnp.asarray(lens_bundle.free_mask(fit.lens, fit.fixed))
+    poses = jnp.asarray(lens_bundle.padded_poses(fit.Ts_camera_board, rows))
+    y = Unknowns(jnp.asarray(fit.parameters), poses)
+    sigma_px, no_cut = jnp.asarray(fit.sigma_px), jnp.asarray(NO_CUT)
+    fold = np.arange(rows) % _FOLDS
+    view_px = np.full(count, np.nan)
+    for number in range(_FOLDS):
+        others = jnp.asarray(np.where((fold != number)[:, None], padded, 0))
+        trained = lens_bundle.solve(fit.lens, y, seen, others, free, sigma_px, no_cut)
+        held = lens_bundle.solve(
+            fit.lens,
+            Unknowns(trained.unknowns.lens, poses),
+            seen,
+            jnp.asarray(padded),
+            jnp.zeros(COUNT, bool),
+            sigma_px,
+            no_cut,
+        )
+        squared = np.sum(padded * np.sum(np.asarray(held.residual_px) ** 2, axis=-1), axis=1)
+        freedom = 2 * np.sum(padded > 0, axis=1) - 6
+        told = np.flatnonzero((fold[:count] == number) & (freedom[:count] > 0))
+        view_px[told] = np.sqrt(squared[told] / freedom[told])
+    return HeldOut(view_px, float(np.sqrt(np.nanmean(view_px**2))))
+
+
+def best_lens(compared: Mapping[str, HeldOut]) -> str:
+    """The lens of the lowest error, or one of fewer coefficients that is hardly worse."""
+    least = min(one.rms_px for one in compared.values())
+    return next(
+        lens
+        for lens in SIMPLEST_FIRST
+        if lens in compared and compared[lens].rms_px <= _WORSE * least
+    )
+
+
+def clearly_better(one: HeldOut, other: HeldOut) -> bool:
+    """Whether one lens explains unseen views better than another, more than by chance."""
+    ratio, errors = _CLEARLY
+    difference = np.log(other.view_px / one.view_px)
+    difference = difference[np.isfinite(difference)]
+    if len(difference) < 2 or other.rms_px < ratio * one.rms_px:
+        return False
+    return bool(difference.mean() > errors * difference.std(ddof=1) / np.sqrt(len(difference)))

@@ -1,0 +1,238 @@
+"""A lens from views of which some corners, and whole views, may be wrong.
+
+First corners count less the further off they are (Cauchy), which finds what is wrong without being
+led by it. Then what is wrong is left out and the rest is plain least squares, whose covariance
+means what it says; both until nothing changes.
+
+Source: Rousseeuw and Leroy (1987), "Robust regression and outlier detection", chapter 5.2
+(reweighted least squares).
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from jaxnav.calibration.lenses import bundle as lens_bundle
+from jaxnav.calibration.lenses.bundle import COUNT, NAMES, NO_CUT, Bundle, Seen, Unknowns
+from jaxnav.calibration.lenses.start import board_poses, lens_start
+from jaxnav.calibration.lenses.views import BoardViews
+
+_CUT = 2.0  # in sigmas, of Cauchy's cost
+_FAR = 5.0  # in sigmas: Gaussian noise takes one corner in 270 000 there
+_WEAK, _WRONG = 1.5, 4.0  # a view whose corners are so many times as far off counts less, or not
+_CHANCE = 1e-6  # of a good view's being taken for a worse one
+_ROBUST_ROUNDS, _ROUNDS = 3, 10
+_LEAST_SIGMA_PX = 1e-6
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """A lens and its views.
+
+    Attributes:
+        parameters: (9,) fx fy cx cy and the coefficients as the camera counts them.
+        covariance: (9, 9) of these; zero where one is fixed.
+        fixed: names of those held at zero.
+        Ts_camera_board: (V, 7) wxyz_xyz.
+        residual_px: (V, P, 2) predicted - seen; 0 where nothing was.
+        used: (V, P) which corners were in the fit.
+        view_weights: (V,) 1, less where a view is worse than the others, 0 where it was left out.
+        view_sigma_px: (V,) standard deviation of a corner's x and of its y; inf without a pose.
+        sigma_px: the same of all views of weight 1.
+        converged: whether the search ended by itself.
+    """
+
+    lens: str
+    views: BoardViews
+    parameters: np.ndarray
+    covariance: np.ndarray
+    fixed: tuple[str, ...]
+    Ts_camera_board: np.ndarray
+    residual_px: np.ndarray
+    used: np.ndarray
+    view_weights: np.ndarray
+    view_sigma_px: np.ndarray
+    sigma_px: float
+    converged: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters that the lens has."""
+        return NAMES[self.lens]
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(9,) one standard deviation; 0 where one is fixed."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean squared distance of the corners in the fit, as OpenCV counts it."""
+        return float(np.sqrt(np.mean(np.sum(self.residual_px[self.used] ** 2, axis=-1))))
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(V, P) of every corner."""
+        return self.used * self.view_weights[:, None]
+
+
+def fit_lens(
+    views: BoardViews,
+    lens: str,
+    fixed: tuple[str, ...] = (),
+    start: np.ndarray | None = None,
+) -> LensFit:
+    """The lens, the pose of every view, and which corners and views are wrong.
+
+    Args:
+        fixed: names of parameters to hold at zero.
+        start: (9,); found if not given.
+    """
+    free = lens_bundle.free_mask(lens, fixed)
+    parameters = np.where(free, lens_start(views, lens)[0] if start is None else start, 0)
+    count = len(views.views)
+    poses = board_poses(views, lens, parameters)
+    posed = ~np.isnan(poses[:, 0])
+    seen = lens_bundle.gathered(views)
+    rows = len(seen.corners_px)
+    problem = _Problem(lens, seen, free, np.append(posed, np.zeros(rows - count, bool)))
+    poses = np.where(posed[:, None], poses, lens_bundle.padded_poses(poses[:0], count))
+    padded = jnp.asarray(lens_bundle.padded_poses(poses, rows))
+    y = Unknowns(jnp.asarray(parameters), padded)
+
+    weights = problem.posed[:, None] * seen.present
+    sigma_px = problem.typical_px(np.asarray(lens_bundle.residuals_px(lens, y, seen)))
+    for _ in range(_ROBUST_ROUNDS):
+        bundle = problem.solved(y, weights, sigma_px, _CUT)
+        sigma_px = problem.typical_px(np.asarray(bundle.residual_px))
+        y = _posed_anew(views, problem, bundle, sigma_px)
+
+    bundle = problem.solved(y, weights, sigma_px, _CUT)
+    used, view_weights = problem.judged(np.asarray(bundle.residual_px), sigma_px)
+    for _ in range(_ROUNDS):
+        weights = used * view_weights[:, None]
+        bundle = problem.solved(bundle.unknowns, weights, sigma_px, NO_CUT)
+        residual_px = np.asarray(bundle.residual_px)
+        sigma_px = problem.sigma_px(residual_px, weights)
+        before = used, view_weights
+        used, view_weights = problem.judged(residual_px, sigma_px)
+        if np.array_equal(used, before[0]) and np.allclose(view_weights, before[1], rtol=0.05):
+            break
+    used, view_weights = before  # what the fit was made with
+    return LensFit(
+        lens=lens,
+        views=views,
+        parameters=np.asarray(bundle.unknowns.lens),
+        covariance=problem.covariance(bundle, sigma_px),
+        fixed=fixed,
+        Ts_camera_board=np.asarray(bundle.unknowns.Ts_camera_board)[:count],
+        residual_px=residual_px[:count],
+        used=used[:count],
+        view_weights=view_weights[:count],
+        view_sigma_px=problem.view_sigma_px(residual_px)[:count],
+        sigma_px=sigma_px,
+        converged=bool(bundle.converged),
+    )
+
+
+@dataclass(frozen=True)
+class _Problem:
+    lens: str
+    seen: Seen
+    free: np.ndarray
+    posed: np.ndarray  # (V,) whether there is a pose to begin with
+
+    def solved(self, y: Unknowns, weights: np.ndarray, sigma_px: float, cut: float) -> Bundle:
+        return jax.block_until_ready(
+            lens_bundle.solve(
+                self.lens,
+                y,
+                self.seen,
+                jnp.asarray(weights, float),
+                jnp.asarray(self.free),
+                jnp.asarray(sigma_px),
+                jnp.asarray(cut),
+            )
+        )
+
+    def view_sigma_px(self, residual_px: np.ndarray) -> np.ndarray:
+        """(V,), by the median, of which up to half of the corners may be wrong; inf without a pose.
+
+        The squared length of two Gaussian coordinates has the median 2 ln 2 sigma^2.
+        """
+        squared = np.where(self.seen.present, np.sum(residual_px**2, axis=-1), np.nan)
+        squared[~self.posed] = np.inf
+        corners = np.sum(self.seen.present, axis=1)
+        known = np.where(corners[:, None] > 0, squared, np.inf)
+        # Six of the 2 n coordinates go into the pose.
+        freedom = np.maximum(2 * corners - 6, 1) / np.maximum(2 * corners, 1)
+        return np.sqrt(np.nanmedian(known, axis=1) / (2 * np.log(2)) / freedom)
+
+    def typical_px(self, residual_px: np.ndarray) -> float:
+        """Standard deviation in the median view."""
+        each = self.view_sigma_px(residual_px)[self.posed]
+        return max(float(np.median(each)) if len(each) else 1.0, _LEAST_SIGMA_PX)
+
+    def sigma_px(self, residual_px: np.ndarray, weights: np.ndarray) -> float:
+        """Standard deviation at weight 1, of what is in the fit."""
+        views = np.any(weights > 0, axis=1).sum()
+        freedom = 2 * np.sum(weights > 0) - 6 * views - self.free.sum()
+        squared = float(np.sum(weights * np.sum(residual_px**2, axis=-1)))
+        return max(float(np.sqrt(squared / max(freedom, 1))), _LEAST_SIGMA_PX)
+
+    def judged(self, residual_px: np.ndarray, sigma_px: float) -> tuple[np.ndarray, np.ndarray]:
+        """Which corners are right (V, P), and what each view weighs (V,)."""
+        each = self.view_sigma_px(residual_px)
+        # Views of few corners must be granted the spread of a sample median, those of hardly more
+        # than their pose needs that of what is left over.
+        corners = np.maximum(np.sum(self.seen.present, axis=1), 1)
+        freedom = np.maximum(2 * corners - 6, 1)
+        median_spread = 5 / (np.log(2) * np.sqrt(corners))
+        granted = np.maximum(1 + median_spread, stats.chi2.isf(_CHANCE, freedom) / freedom)
+        ratio = each / sigma_px
+        worse = (ratio > _WEAK) & (ratio**2 > granted)
+        right = self.posed & ~(worse & (ratio > _WRONG))
+        weights = np.where(right, np.where(worse, 1 / np.maximum(ratio, 1) ** 2, 1.0), 0.0)
+        expected_px = sigma_px / np.sqrt(np.where(right, weights, 1))
+        distance_px = np.linalg.norm(residual_px, axis=-1)
+        used = self.seen.present & right[:, None] & (distance_px < _FAR * expected_px[:, None])
+        # What keeps no pose in place is worth nothing.
+        few = used.sum(axis=1) < 4
+        return used & ~few[:, None], np.where(few, 0.0, weights)
+
+    def covariance(self, bundle: Bundle, sigma_px: float) -> np.ndarray:
+        """(9, 9), zero where fixed; infinite where the views tell nothing."""
+        information = np.asarray(
+            lens_bundle.lens_information(bundle.blocks, jnp.asarray(self.free))
+        )[np.ix_(self.free, self.free)]
+        result = np.zeros((COUNT, COUNT))
+        scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        try:
+            inverse = np.linalg.inv(information * np.outer(scale, scale))
+            inside = sigma_px**2 * inverse * np.outer(scale, scale)
+        except np.linalg.LinAlgError:
+            inside = np.full_like(information, np.inf)
+        if not np.all(np.diag(inside) > 0):
+            inside = np.full_like(information, np.inf)
+        result[np.ix_(self.free, self.free)] = inside
+        return result
+
+
+def _posed_anew(views: BoardViews, problem: _Problem, bundle: Bundle, sigma_px: float) -> Unknowns:
+    """With views that are far off begun again: they may hang in the mirrored pose."""
+    each = problem.view_sigma_px(np.asarray(bundle.residual_px))
+    far = np.flatnonzero(problem.posed & (each > 2 * sigma_px))
+    y = bundle.unknowns
+    if not len(far):
+        return y
+    poses = board_poses(views, problem.lens, np.asarray(y.lens), far.tolist())
+    Ts_camera_board = np.array(y.Ts_camera_board)
+    Ts_camera_board[far] = np.where(np.isnan(poses), Ts_camera_board[far], poses)
+    again = Unknowns(y.lens, jnp.asarray(Ts_camera_board))
+    residual_px = np.asarray(lens_bundle.residuals_px(problem.lens, again, problem.seen))
+    worse = problem.view_sigma_px(residual_px) >= each
+    Ts_camera_board[worse] = np.asarray(y.Ts_camera_board)[worse]
+    return Unknowns(y.lens, jnp.asarray(Ts_camera_board))

@@ -1,0 +1,259 @@
+"""A camera's lens from views of a board: what was found, how sure it is, and what to do about it.
+
+What the views can't tell is refused in one line, or held at zero and named; it never comes back as
+noise.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.calibration.lenses import bundle as lens_bundle
+from jaxnav.calibration.lenses import comparison as lens_comparison
+from jaxnav.calibration.lenses.advice import advice, findings
+from jaxnav.calibration.lenses.checks import reach, rim_sigma_px, tilts_deg
+from jaxnav.calibration.lenses.choice import informative
+from jaxnav.calibration.lenses.fit import LensFit, fit_lens
+from jaxnav.calibration.lenses.screening import screened
+from jaxnav.calibration.lenses.start import lens_start
+from jaxnav.calibration.lenses.views import BoardViews
+from jaxnav.errors import BadInput
+from jaxnav.models.camera import LENSES, Camera
+
+FEWEST_VIEWS = 5
+_LEAST_SPREAD_DEG = 5.0  # between two views' normals
+_NO_FOCAL = 0.1  # one sigma of a focal length, in parts of it: whatever is held at zero
+_WORST_FOCAL = 0.01  # one sigma of a focal length, in parts of it
+_WORST_CENTER = 0.02  # of the centre, in parts of the image's width
+_LOOSE_CENTER = 0.003  # beyond which the tangential coefficients are held at zero
+_WORST_RIM_PX = 1.0  # one sigma of the radial function at the image's border
+_RIM_SIGMAS = 5.0  # of the corners' noise, where that is more
+_FAR_ENOUGH = 0.85  # of the way to the image's corner
+_WRONG_BOARD = 0.004  # of the image's width: noise larger than this is no noise
+_NO_START = 0.012  # of the image's width, by which the median corner misses the best start
+_WHICH_BOARD = (
+    "is it the board of the file, with as many squares in its rows and columns, and is the lens of "
+    "this kind?"
+)
+_LAST_FIRST = {
+    "none": (),
+    "radtan": ("k3", "k2", "k1"),
+    "equidistant": ("k4", "k3", "k2", "k1"),
+}
+
+
+@dataclass(frozen=True)
+class LensCalibration:
+    """A lens and all there is to say of it.
+
+    Attributes:
+        fit: the lens, its views and their residuals.
+        held_out_px: by lens, the error of views that it was not fitted to; empty where there
+            were too few views to leave any out.
+        given: how many views there were.
+        left_out: by view, why it is not in the fit; those that only would not have told more
+            are not named.
+        downweighted: by view, its weight, where it counts less than the others.
+        findings: sentences about what is wrong or was held at zero.
+        advice: sentences about what to collect next.
+    """
+
+    fit: LensFit
+    held_out_px: dict[str, float]
+    given: int
+    left_out: dict[str, str]
+    downweighted: dict[str, float]
+    findings: tuple[str, ...]
+    advice: tuple[str, ...]
+
+    @property
+    def camera(self) -> Camera:
+        """The lens, in the process's precision."""
+        return lens_bundle.camera_of(self.fit.lens, jnp.asarray(self.fit.parameters, float))
+
+
+def calibrate_lens(
+    views: BoardViews,
+    lens: str = "auto",
+    max_views: int = 100,
+    where: str = "the views",
+    tell: Callable[[str], None] = lambda stage: None,
+    gone: Mapping[str, str] = MappingProxyType({}),
+) -> LensCalibration:
+    """The lens that explains the views best.
+
+    Args:
+        lens: "none", "radtan", "equidistant", or "auto" for whichever explains unseen views best.
+        max_views: at most so many, those that tell most.
+        where: what a person gave, for messages.
+        tell: is called with a word for every stage.
+        gone: images without a view, by name, and why; for messages.
+
+    Raises:
+        BadInput: the views can't tell the focal length or the centre, or show another board.
+    """
+    good, left_out = screened(views)
+    _require_views(good, {**left_out, **gone}, where)
+    lenses = LENSES if lens == "auto" else (lens,)
+    tell("start")
+    starts = {one: lens_start(good, one) for one in lenses}
+    rough = min(starts, key=lambda one: starts[one][1])
+    _require_board(starts[rough][1], good.image_size_px[0], where)
+    tell("choose")
+    chosen = informative(good, rough, starts[rough][0], max_views)
+    good = replace(good, views=tuple(good.views[i] for i in chosen))
+    fits = {}
+    for one in sorted(LENSES, key=lambda one: one not in lenses):
+        if one in lenses or len(good.views) >= lens_comparison.FEWEST_VIEWS:
+            tell(f"fit {one}")
+            start = starts[one][0] if one in starts else None
+            fits[one] = fit_lens(good, one, start=start)
+        if one == lens:  # before the others are fitted
+            _require_sound(fits[one], where)
+    tell("compare")
+    compared = _compared(fits)
+    best = lens if lens != "auto" else _best(fits, compared)
+    tell("check")
+    _require_sound(fits[best], where)
+    better = min(compared, key=lambda one: compared[one].rms_px, default=best)
+    if better != best and not lens_comparison.clearly_better(compared[better], compared[best]):
+        better = best
+    fit = within_reach(fits[best], tell)
+    _require_observed(fit, better, where)
+    for row in np.flatnonzero(fit.view_weights == 0):
+        name, sigma_px = good.views[row].name, fit.view_sigma_px[row]
+        left_out[name] = (
+            f"its corners are {sigma_px:.2g} px off, {sigma_px / fit.sigma_px:.0f} times as far as "
+            "the others'"
+            if np.isfinite(sigma_px)
+            else "no pose of the board explains it"
+        )
+    less = np.flatnonzero((fit.view_weights > 0) & (fit.view_weights < 1))
+    return LensCalibration(
+        fit=fit,
+        held_out_px={one: value.rms_px for one, value in compared.items()},
+        given=len(views.views),
+        left_out=left_out,
+        downweighted={good.views[row].name: float(fit.view_weights[row]) for row in less},
+        findings=findings(fit, better),
+        advice=advice(fit),
+    )
+
+
+def _require_views(views: BoardViews, left_out: dict[str, str], where: str) -> None:
+    count = len(views.views)
+    if count >= FEWEST_VIEWS:
+        return
+    why = ""
+    if left_out:
+        name, reason = next(iter(left_out.items()))
+        others = f", and {len(left_out) - 1} more" if len(left_out) > 1 else ""
+        why = f"; left out: {name} ({reason}){others}"
+    raise BadInput(
+        where,
+        f"{count} different, sharp views of the board are too few: take at least {FEWEST_VIEWS}, "
+        f"better 20 to 40, tilted and all over the image{why}",
+    )
+
+
+def _compared(fits: dict[str, LensFit]) -> dict[str, lens_comparison.HeldOut]:
+    if len(fits) < 2:
+        return {}
+    trusted = min(fits.values(), key=lambda fit: fit.sigma_px)
+    if np.sum(trusted.view_weights > 0) < lens_comparison.FEWEST_VIEWS:
+        return {}
+    return {one: lens_comparison.held_out(fit, trusted.weights) for one, fit in fits.items()}
+
+
+def _best(fits: dict[str, LensFit], compared: dict[str, lens_comparison.HeldOut]) -> str:
+    if compared:
+        return lens_comparison.best_lens(compared)
+    return min(fits, key=lambda one: fits[one].sigma_px)
+
+
+def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
+    """The fit again, with what the corners don't reach held at zero."""
+    width = fit.views.image_size_px[0]
+    for name in _LAST_FIRST[fit.lens]:
+        rim_px = rim_sigma_px(fit)
+        folds = np.isinf(rim_px) and reach(fit) > _FAR_ENOUGH  # no want of corners
+        if folds or rim_px < max(_WORST_RIM_PX, _RIM_SIGMAS * fit.sigma_px):
+            break
+        tell(f"hold {name}")
+        fit = fit_lens(fit.views, fit.lens, (*fit.fixed, name), fit.parameters)
+    if fit.lens == "radtan" and np.max(fit.sigma[2:4]) > _LOOSE_CENTER * width:
+        tell("hold p1 p2")
+        fit = fit_lens(fit.views, fit.lens, (*fit.fixed, "p1", "p2"), fit.parameters)
+    return fit
+
+
+def _require_sound(fit: LensFit, where: str) -> None:
+    _require_agreement(fit, where)
+    _require_tilt(fit, where)
+
+
+def _require_agreement(fit: LensFit, where: str) -> None:
+    width = fit.views.image_size_px[0]
+    kept = int(np.sum(fit.view_weights > 0))
+    if fit.sigma_px > _WRONG_BOARD * width or kept < max(FEWEST_VIEWS, len(fit.view_weights) / 2):
+        raise BadInput(
+            where,
+            f"the corners miss lens {fit.lens} by {fit.sigma_px:.2g} px and {kept} of "
+            f"{len(fit.view_weights)} views agree: {_WHICH_BOARD}",
+        )
+
+
+def _require_board(misfit_px: float, width: int, where: str) -> None:
+    # A wrong board fits no view, and then the search would last long.
+    if misfit_px > _NO_START * width:
+        raise BadInput(
+            where, f"no lens explains the corners to less than {misfit_px:.2g} px: {_WHICH_BOARD}"
+        )
+
+
+def _require_tilt(fit: LensFit, where: str) -> None:
+    _, spread_deg = tilts_deg(fit)
+    if spread_deg < _LEAST_SPREAD_DEG:
+        raise BadInput(
+            where,
+            f"the board is parallel to itself in all views, within {spread_deg:.1f} deg, so focal "
+            "length and distance can't be told apart: tilt it by 30 to 45 deg, to all sides",
+        )
+    if not _relative_focal(fit) < _NO_FOCAL:
+        raise BadInput(
+            where,
+            "the views don't tell the focal length at all: tilt the board by 30 to 45 deg, to all "
+            "sides, in 20 to 40 views",
+        )
+
+
+def _relative_focal(fit: LensFit) -> float:
+    """One sigma of the focal length, in parts of it; of the less known one."""
+    return float(np.max(fit.sigma[:2] / np.abs(fit.parameters[:2])))
+
+
+def _require_observed(fit: LensFit, better: str, where: str) -> None:
+    width = fit.views.image_size_px[0]
+    relative = _relative_focal(fit)
+    if not relative < _WORST_FOCAL and better != fit.lens:
+        raise BadInput(
+            where,
+            f"lens {fit.lens} misses the corners by {fit.sigma_px:.2g} px, lens {better} explains "
+            f"them clearly better: calibrate with --lens {better}",
+        )
+    if not relative < _WORST_FOCAL:
+        raise BadInput(
+            where,
+            f"the views tell the focal length to {100 * relative:.2g} % only: tilt the board by 30 "
+            "to 45 deg to all sides, fill the image with it and take 20 to 40 views",
+        )
+    center_px = float(np.max(fit.sigma[2:4]))
+    if center_px > _WORST_CENTER * width:
+        raise BadInput(
+            where,
+            f"the views tell the image's centre to {center_px:.2g} px only: take views with the "
+            "board near every side of the image, tilted, and turned by 90 deg in some",
+        )

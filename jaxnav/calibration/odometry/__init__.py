@@ -1,0 +1,1 @@
+"""What wheels and steering get wrong, from drives past markers."""

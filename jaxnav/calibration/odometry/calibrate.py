@@ -1,0 +1,323 @@
+"""Odometry's own figures from drives past markers, each with its uncertainty.
+
+    found = calibrate_odometry(drives, rig, markers, before)
+    found.value["speed_scale"], found.sigma["speed_scale"]
+
+All poses of all drives are unknown, one for each reading, and eliminated: dead reckoning from one
+pose would drift away within seconds, and cutting a drive in pieces throws away what leads from one
+to the next. With the readings' errors as unknowns too (see `model`) the figures are those
+of maximum likelihood, and the Schur complement of all the rest is their information.
+
+What a drive can't tell is kept as it was, and named. Speed scale and course come from markers
+passed at a known distance. Steering and wheelbase enter the turning as gain * steering / wheelbase;
+only the car's sideslip, and the bend of the tangent at large angles, tell one from the other. The
+delay shows where speed or steering change.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxnav.calibration.odometry.drive import (
+    Course,
+    Drive,
+    ReadingSigma,
+    lay_out,
+    reading_sigma,
+)
+from jaxnav.calibration.odometry.fit import Fit, Prior, fit
+from jaxnav.calibration.odometry.model import FULL_WEIGHT, NAMES, Model
+from jaxnav.calibration.odometry.motion import STEERED_LITTLE, Motion, driven_m
+from jaxnav.calibration.odometry.start import LOOSE, TIGHT, Trust, start
+from jaxnav.errors import BadInput
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+
+# A figure that is less sure than this is none: in parts of itself, rad and s.
+_LEAST_SURE = {
+    "speed_scale": 0.02,
+    "steering_gain": 0.02,
+    "steering_offset_rad": 0.01,
+    "wheelbase_m": 0.02,
+    "camera_delay_s": 0.01,
+}
+_RELATIVE = ("speed_scale", "steering_gain", "wheelbase_m")
+# Of two that can't be told apart the first is kept: a tape measures it, or it matters less.
+_KEPT_FIRST = ("wheelbase_m", "camera_delay_s", "steering_gain", "steering_offset_rad")
+_GAIN_SIGMA = 0.1  # of a gain that was kept, in what it does to the offset
+_LEAST_WAY_M = 1.0
+_REFUSED_CHI2, _AGAIN_CHI2 = 4.0, 1.2  # per degree of freedom
+_MOST_OUTLIERS, _AGAIN_OUTLIERS = 0.3, 0.05
+_OTHER = (Trust(per_m=0.1, per_rad=0.1), TIGHT, TIGHT)  # for further starts
+
+_WHY = {
+    "wheelbase_m": "steering gain and wheelbase can't be told apart: drive circles at full lock "
+    "both ways, or measure the wheelbase with a tape",
+    "camera_delay_s": "the drive does not tell it: stop and start more often in view of a marker",
+    "steering_gain": "the drive does not tell it: drive circles at full lock both ways, near a "
+    "marker",
+    "steering_offset_rad": "the drive does not tell it: drive longer in view of a marker",
+}
+
+
+@dataclass(frozen=True)
+class OdometryCalibration:
+    """What drives tell of the odometry.
+
+    Attributes:
+        before: name -> figure at the start, see `odometry_model.NAMES`.
+        value: name -> figure; what was fixed is as before.
+        sigma: name -> one standard deviation, of what was found.
+        fixed: name -> why it was not looked for.
+        correlation: between those found, in the order of `sigma`.
+        chi2_per_dof: 1 where readings and corners are as good as they say. Above 1 all sigma
+            are larger by its root.
+        rms_px: of corners along one axis, without outliers.
+        outliers: (V,) bool, views that count less since they are far off.
+        views_px: (V, 4, 2), residuals.
+        view_times_s: (V,), on the time axis of the course.
+        node_times_s: (N + 1,).
+        poses: (N + 1, 3), x_m y_m psi_rad.
+        read: (N, 2), speed and steering as read, m/s and rad.
+        reading_sigma: their noise.
+        way_m: driven while being observed.
+        advice: what to drive next.
+    """
+
+    before: dict[str, float]
+    value: dict[str, float]
+    sigma: dict[str, float]
+    fixed: dict[str, str]
+    correlation: np.ndarray
+    chi2_per_dof: float
+    rms_px: float
+    outliers: np.ndarray
+    views_px: np.ndarray
+    view_times_s: np.ndarray
+    node_times_s: np.ndarray
+    poses: np.ndarray
+    read: np.ndarray
+    reading_sigma: ReadingSigma
+    way_m: float
+    duration_s: float
+    advice: tuple[str, ...]
+
+
+def calibrate_odometry(
+    drives: Sequence[Drive],
+    rig: CameraRig,
+    markers: MarkerMap,
+    before: Mapping[str, float],
+    fixed: Sequence[str] = (),
+    wheelbase_sigma_m: float | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> OdometryCalibration:
+    """The figures that explain the drives best.
+
+    Args:
+        drives: of one car.
+        before: the figures as they stand; see `odometry_model.NAMES`.
+        fixed: names that are not looked for.
+        wheelbase_sigma_m: of the wheelbase as it stands, where a tape has measured it so well.
+        progress: called at every evaluation.
+
+    Raises:
+        BadInput: naming the drives, and what to do: too little was seen, the car did not move, or
+            odometry and cameras contradict each other.
+    """
+    where = ", ".join(drive.name for drive in drives)
+    try:
+        return _calibrated(where, drives, rig, markers, before, fixed, wheelbase_sigma_m, progress)
+    except np.linalg.LinAlgError:
+        problem = (
+            "odometry, cameras and map have no course of a car in common that can be computed: "
+            "check --markers-file, --rig and --vehicle"
+        )
+        raise BadInput(where, problem) from None
+
+
+def _calibrated(
+    where: str,
+    drives: Sequence[Drive],
+    rig: CameraRig,
+    markers: MarkerMap,
+    before: Mapping[str, float],
+    fixed: Sequence[str],
+    wheelbase_sigma_m: float | None,
+    progress: Callable[[], object],
+) -> OdometryCalibration:
+    theta = np.array([before[name] for name in NAMES])
+    course = lay_out(drives)
+    sigma = reading_sigma(course.intervals)
+    way_m = theta[0] * driven_m(course.intervals)
+    if way_m < _LEAST_WAY_M:
+        problem = (
+            f"by its odometry the car drove {way_m:.2f} m in view of markers, at least "
+            f"{_LEAST_WAY_M:g} m are needed: drive eights in front of a marker for a minute"
+        )
+        raise BadInput(where, problem)
+    why = dict.fromkeys(fixed, "as told by --fix")
+    motion = Motion.of(course.intervals, sigma)
+    why |= motion.cannot_tell(where, fixed)
+    information = np.zeros(len(NAMES))
+    if wheelbase_sigma_m is not None:
+        information[NAMES.index("wheelbase_m")] = wheelbase_sigma_m**-2
+    prior = Prior(theta, information)
+    search = _Search(Model(course, rig, markers, sigma), course, rig, markers, prior, progress)
+    found = search.best(theta, why)
+    chi2 = _chi2_per_dof(found, course)
+    outliers = found.blocks.view_chi2 > FULL_WEIGHT
+    _refuse_contradiction(where, found, chi2, outliers)
+    while (name := _least_sure(found, why, max(chi2, 1.0))) is not None:
+        if name == "speed_scale":
+            problem = (
+                "the drive does not tell the scale of the speed to 2 %: drive further, along "
+                "and around a marker, in view of the cameras"
+            )
+            raise BadInput(where, problem)
+        why[name] = _WHY[name]
+        found = search.again(found, why)
+        chi2 = _chi2_per_dof(found, course)
+        outliers = found.blocks.view_chi2 > FULL_WEIGHT
+    _refuse_contradiction(where, found, chi2, outliers)
+    free = [name for name in NAMES if name not in why]
+    covariance = np.linalg.inv(found.information) * max(chi2, 1.0)
+    if why.get("steering_gain") == STEERED_LITTLE and "steering_offset_rad" in free:
+        row = free.index("steering_offset_rad")
+        covariance[row, row] += (_GAIN_SIGMA * motion.steering_rad) ** 2
+    deviation = np.sqrt(np.diag(covariance))
+    return OdometryCalibration(
+        before={name: float(before[name]) for name in NAMES},
+        value=dict(zip(NAMES, found.theta.tolist(), strict=True)),
+        sigma=dict(zip(free, deviation.tolist(), strict=True)),
+        fixed=why,
+        correlation=covariance / np.outer(deviation, deviation),
+        chi2_per_dof=chi2,
+        rms_px=float(np.sqrt(np.mean(found.blocks.views_px[~outliers] ** 2))),
+        outliers=outliers,
+        views_px=found.blocks.views_px,
+        view_times_s=course.views.time_s,
+        node_times_s=course.node_times_s,
+        poses=found.nodes[:, :3],
+        read=np.column_stack([course.intervals.speed_mps, course.intervals.steering_rad]),
+        reading_sigma=sigma,
+        way_m=way_m,
+        duration_s=course.duration_s,
+        advice=_advice(why, chi2, outliers, wheelbase_sigma_m),
+    )
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Fits of one course."""
+
+    model: Model
+    course: Course
+    rig: CameraRig
+    markers: MarkerMap
+    prior: Prior
+    progress: Callable[[], object]
+
+    def best(self, theta: np.ndarray, fixed: Mapping[str, str]) -> Fit:
+        """From the odometry as it stands; where that ends badly, from other ways through the poses
+        of single views, and from what was found."""
+        found = self._started(theta, fixed, LOOSE)
+        for again in range(3):
+            outliers = float(np.mean(found.blocks.view_chi2 > FULL_WEIGHT))
+            chi2 = _chi2_per_dof(found, self.course)
+            if found.converged and chi2 < _AGAIN_CHI2 and outliers < _AGAIN_OUTLIERS:
+                break
+            other = self._started(found.theta if again == 1 else theta, fixed, _OTHER[again])
+            found = min(found, other, key=lambda one: one.blocks.cost)
+        return found
+
+    def _started(self, theta: np.ndarray, fixed: Mapping[str, str], trust: Trust) -> Fit:
+        nodes = start(self.course, self.rig, self.markers, theta, trust)
+        return self._from(nodes, theta, fixed)
+
+    def again(self, found: Fit, fixed: Mapping[str, str]) -> Fit:
+        """With more fixed, at the figures before."""
+        kept = np.array([name in fixed for name in NAMES])
+        return self._from(found.nodes, np.where(kept, self.prior.mean, found.theta), fixed)
+
+    def _from(self, nodes: np.ndarray, theta: np.ndarray, fixed: Mapping[str, str]) -> Fit:
+        free = np.array([name not in fixed for name in NAMES])
+        return fit(self.model, nodes, theta, free, self.prior, self.progress)
+
+
+def _chi2_per_dof(found: Fit, course: Course) -> float:
+    """Outliers among the views counting neither in the sum nor in the freedom."""
+    chi2 = found.blocks.view_chi2
+    good = chi2 <= FULL_WEIGHT
+    far = chi2[~good]
+    extra = float(np.sum(FULL_WEIGHT * (1 + np.log(far / FULL_WEIGHT))))
+    dof = 8 * int(good.sum()) - 3 * course.stretches - found.information.shape[0]
+    return (float(found.blocks.cost) - extra) / max(dof, 1)
+
+
+def _least_sure(found: Fit, fixed: Mapping[str, str], scale: float) -> str | None:
+    """The figure to keep next; None: all are sure enough.
+
+    The weakest direction of the information, every figure in units of what is asked of it, says
+    which can't be told apart.
+    """
+    free = [name for name in NAMES if name not in fixed]
+    values = dict(zip(NAMES, found.theta, strict=True))
+    asked = np.array(
+        [_LEAST_SURE[name] * (abs(values[name]) if name in _RELATIVE else 1.0) for name in free]
+    )
+    weakest, directions = np.linalg.eigh(found.information * np.outer(asked, asked) / scale)
+    if not len(free) or weakest[0] >= 1.0:
+        return None
+    share = np.abs(directions[:, 0])
+    involved = [name for name, part in zip(free, share, strict=True) if part > 0.5 * share.max()]
+    return next((name for name in _KEPT_FIRST if name in involved), "speed_scale")
+
+
+def _refuse_contradiction(where: str, found: Fit, chi2: float, outliers: np.ndarray) -> None:
+    if outliers.mean() > _MOST_OUTLIERS:
+        problem = (
+            f"{outliers.mean():.0%} of the markers seen are not where the map says: check "
+            "--markers-file and --rig, with calibrate check"
+        )
+        raise BadInput(where, problem)
+    if not found.converged:
+        problem = (
+            "no figures explain the drive best, whatever the search tries: drive eights in view of "
+            "a marker, or keep some by --fix"
+        )
+        raise BadInput(where, problem)
+    if chi2 > _REFUSED_CHI2:
+        problem = (
+            f"odometry and cameras contradict each other (chi-square per degree of freedom "
+            f"{chi2:.1f}): check --rig, --markers-file and --vehicle, drive slowly enough that no "
+            "wheel slips, and keep a marker in view"
+        )
+        raise BadInput(where, problem)
+
+
+def _advice(
+    fixed: Mapping[str, str],
+    chi2: float,
+    outliers: np.ndarray,
+    wheelbase_sigma_m: float | None,
+) -> tuple[str, ...]:
+    found = [f"{name}: {why}" for name, why in fixed.items() if not why.startswith("as told")]
+    if "wheelbase_m" in fixed and "steering_gain" not in fixed and wheelbase_sigma_m is None:
+        found.append(
+            "The steering gain is as sure as the wheelbase that was taken as exact: an error of "
+            "1 % there is one of 1 % here."
+        )
+    if chi2 > 1.5:
+        found.append(
+            f"Residuals are {np.sqrt(chi2):.1f} times as large as readings and corners say of "
+            "themselves; all sigma are larger by that. Calibrate the cameras and the rig first, "
+            "and drive more slowly."
+        )
+    if outliers.mean() > 0.02:
+        found.append(
+            f"{outliers.mean():.0%} of the views are far off: look for reflections, and for "
+            "markers that were moved."
+        )
+    return tuple(found) or ("Nothing: every figure is found.",)

@@ -1,0 +1,201 @@
+"""Levenberg-Marquardt over a whole course: nodes in a band, and a few parameters beside them.
+
+The normal equations are block-tridiagonal in the nodes, with a border for the parameters. LAPACK's
+banded Cholesky eliminates the nodes and leaves the parameters' own information, its Schur
+complement: the time grows with the length of the course, and not with its cube. optimistix has no
+solver of this shape: its Levenberg-Marquardt would hold a dense Jacobian of some GiB.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+
+from jaxnav.calibration.odometry.model import NEXT, NODE, Blocks, Model
+
+_BELOW = NODE + NEXT - 1  # diagonals below the main one
+_RTOL = 1e-9
+_HOLDS = 1e-9  # of a pose that nothing tells of, as the last of a stretch before its first view
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the parameters beforehand.
+
+    Attributes:
+        mean: (5,).
+        information: (5,), one over the variance; 0: nothing is known.
+    """
+
+    mean: np.ndarray
+    information: np.ndarray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The most likely course.
+
+    Attributes:
+        nodes: (N + 1, 5), x_m, y_m, psi_rad, and the errors of readings in standard deviations.
+        theta: (5,), see `odometry_model.NAMES`.
+        information: (p, p), of the free parameters, all nodes being unknown.
+        blocks: at this point.
+        converged: no step lowers the cost any more.
+        steps: evaluations.
+    """
+
+    nodes: np.ndarray
+    theta: np.ndarray
+    information: np.ndarray
+    blocks: Blocks
+    converged: bool
+    steps: int
+
+
+def fit(
+    model: Model,
+    nodes: np.ndarray,
+    theta: np.ndarray,
+    free: np.ndarray,
+    prior: Prior,
+    progress: Callable[[], object] = lambda: None,
+    most_steps: int = 100,
+) -> Fit:
+    """From a start to the nearest minimum, with Nielsen's damping relative to the diagonal.
+
+    Source: Madsen, Nielsen, Tingleff (2004), "Methods for non-linear least squares problems",
+    Algorithm 3.16; the scaling is Marquardt's (1963).
+
+    Args:
+        free: (5,) bool, parameters to be found; the others stay.
+        progress: called at every evaluation.
+
+    Raises:
+        LinAlgError: the equations at the end can't be solved.
+    """
+
+    def evaluated(nodes: np.ndarray, theta: np.ndarray) -> tuple[float, Blocks]:
+        progress()
+        blocks = model.blocks(nodes, theta)
+        off = theta - prior.mean
+        return float(blocks.cost + np.sum(prior.information * off**2)), blocks
+
+    cost, blocks = evaluated(nodes, theta)
+    damping, growth, converged = 1e-3, 2.0, False
+    step = 0
+    while step < most_steps and not converged:
+        step += 1
+        system = _System.of(blocks, theta, free, prior)
+        try:
+            moved = system.solved(damping)
+        except LinAlgError:
+            damping *= 10.0
+            continue
+        new_nodes, new_theta = nodes + moved.nodes, theta.copy()
+        new_theta[free] += moved.theta
+        possible = bool(new_theta[0] > 0 and new_theta[3] > 0)
+        new_cost, new_blocks = evaluated(new_nodes, new_theta) if possible else (np.inf, blocks)
+        converged = moved.promised <= _RTOL * cost
+        if new_cost < cost:
+            ratio = (cost - new_cost) / max(moved.promised, 1e-300)
+            nodes, theta, blocks, cost = new_nodes, new_theta, new_blocks, new_cost
+            damping *= max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3)
+            growth = 2.0
+        else:
+            damping, growth = damping * growth, 2 * growth
+            converged = converged or damping > 1e12
+    return Fit(
+        nodes,
+        theta,
+        _System.of(blocks, theta, free, prior).reduced(),
+        blocks,
+        converged,
+        step,
+    )
+
+
+@dataclass(frozen=True)
+class _Step:
+    nodes: np.ndarray
+    theta: np.ndarray
+    promised: float  # by which the quadratic model lowers the cost
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations: a band (8, 5 N), a border (5 N, p), a corner (p, p) and the gradients."""
+
+    band: np.ndarray
+    border: np.ndarray
+    corner: np.ndarray
+    gradient_nodes: np.ndarray
+    gradient_theta: np.ndarray
+
+    @staticmethod
+    def of(blocks: Blocks, theta: np.ndarray, free: np.ndarray, prior: Prior) -> "_System":
+        """Put together what the intervals know."""
+        H, g = blocks.information, blocks.gradient
+        nodes = len(H) + 1
+        own = np.zeros((nodes, NODE, NODE))
+        own[:-1] += H[:, :NODE, :NODE]
+        own[1:, :NEXT, :NEXT] += H[:, NODE : NODE + NEXT, NODE : NODE + NEXT]
+        own[:, range(NODE), range(NODE)] += _HOLDS
+        own[-1, range(NEXT, NODE), range(NEXT, NODE)] += 1.0  # the last node has no reading
+        band = np.zeros((_BELOW + 1, nodes, NODE))
+        for column in range(NODE):
+            for row in range(column, NODE):
+                band[row - column, :, column] += own[:, row, column]
+            for row in range(NEXT):
+                band[NODE + row - column, :-1, column] += H[:, NODE + row, column]
+        border = np.zeros((nodes, NODE, int(free.sum())))
+        border[:-1] += H[:, :NODE, NODE + NEXT :][:, :, free]
+        border[1:, :NEXT] += H[:, NODE : NODE + NEXT, NODE + NEXT :][:, :, free]
+        corner = H[:, NODE + NEXT :, NODE + NEXT :].sum(axis=0) + np.diag(prior.information)
+        gradient = np.zeros((nodes, NODE))
+        gradient[:-1] += g[:, :NODE]
+        gradient[1:, :NEXT] += g[:, NODE : NODE + NEXT]
+        of_theta = g[:, NODE + NEXT :].sum(axis=0) + prior.information * (theta - prior.mean)
+        return _System(
+            band.reshape(_BELOW + 1, -1),
+            border.reshape(nodes * NODE, -1),
+            corner[np.ix_(free, free)],
+            gradient.reshape(-1),
+            of_theta[free],
+        )
+
+    def reduced(self, damping: float = 0.0) -> np.ndarray:
+        """(p, p): the parameters' information when the nodes are eliminated.
+
+        Raises:
+            LinAlgError: as `solved`.
+        """
+        return self._eliminated(damping)[0]
+
+    def solved(self, damping: float) -> _Step:
+        """The damped step.
+
+        Raises:
+            LinAlgError: the damped equations are not positive definite.
+        """
+        schur, inner = self._eliminated(damping)
+        right = self.border.T @ inner[:, -1] - self.gradient_theta
+        theta = cho_solve(cho_factor(schur), right) if len(right) else right
+        nodes = -(inner[:, -1] + inner[:, :-1] @ theta)
+        extra = damping * (
+            np.sum(self.band[0] * nodes**2) + np.sum(np.diag(self.corner) * theta**2)
+        )
+        promised = extra - self.gradient_nodes @ nodes - self.gradient_theta @ theta
+        return _Step(nodes.reshape(-1, NODE), theta, float(promised))
+
+    def _eliminated(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """The Schur complement, and the band's inverse times border and gradient."""
+        band, corner = self.band.copy(), self.corner.copy()
+        if not all(np.isfinite(part).all() for part in (band, self.border, corner)):
+            raise LinAlgError("the equations are not finite")
+        band[0] *= 1 + damping
+        corner[range(len(corner)), range(len(corner))] *= 1 + damping
+        factor = cholesky_banded(band, lower=True, check_finite=False)
+        right = np.column_stack([self.border, self.gradient_nodes])
+        inner = cho_solve_banded((factor, True), right, check_finite=False)
+        return corner - self.border.T @ inner[:, :-1], inner

@@ -1,0 +1,192 @@
+"""What a drive looks like to a car whose odometry is off: the residuals of odometry's calibration.
+
+Unknowns of a drive are the five parameters and, at every node, the planar pose and the errors of
+the reading that follows it. One interval, with one reading, leads from node to node:
+
+    speed    = speed_scale * (read - sigma_v e_v)
+    steering = steering_gain * (read - sigma_d e_d) + steering_offset
+    node'    = advance(node, speed, steering, dt, wheelbase) + slip
+
+and a view shows the corners of a marker from the pose at `stamp - camera_delay`. The errors are
+unknowns, not variances added to the slip: a regression on noisy readings would find too small a
+gain (Fuller 1987, "Measurement Error Models", section 1.1), and noise would look like steering.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnav.calibration.odometry.drive import Course, Intervals, ReadingSigma, Views
+from jaxnav.models.bicycle import advance
+from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+
+NAMES = ("speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "camera_delay_s")
+# A wheel neither rolls nor turns exactly, and between two readings the servo turns as it likes:
+# along, across (m) and about (rad), for a second. Well below what the noise of usual readings does,
+# so that it decides little where they are honest.
+SLIP_PER_SQRT_S = (5e-4, 3e-4, 1e-3)
+# A view counts in full up to the 99.9th percentile of chi-square with 8 degrees of freedom.
+FULL_WEIGHT = 26.1
+NODE, NEXT, LOCAL = 5, 3, 13  # unknowns of a node; of the next that an interval knows; all of it
+_PADDED = 512  # sizes are rounded up, so that drives of about one length share a program
+
+
+class Blocks(NamedTuple):
+    """Everything around one point, interval by interval.
+
+    Attributes:
+        cost: sum of squares, outliers counting less.
+        information: (N, 13, 13), of a node (5), the next pose (3) and the parameters (5).
+        gradient: (N, 13).
+        view_chi2: (V,), of each view's eight residuals.
+        views_px: (V, 4, 2), residuals in pixels.
+    """
+
+    cost: float
+    information: np.ndarray
+    gradient: np.ndarray
+    view_chi2: np.ndarray
+    views_px: np.ndarray
+
+
+class Model:
+    """The residuals of one course under one rig and one map."""
+
+    def __init__(self, course: Course, rig: CameraRig, markers: MarkerMap, sigma: ReadingSigma):
+        self._count = len(course.intervals.dt_s), len(course.views.time_s)
+        intervals, views = Intervals(*_padded(course.intervals)), Views(*_padded(course.views))
+        # What pads links nothing and begins after all others.
+        intervals.begin_s[self._count[0] :] = np.inf
+        intervals.linked[self._count[0] :] = 0.0
+        used = np.arange(len(views.time_s)) < self._count[1]
+        self._data = jax.tree.map(jnp.asarray, (intervals, views, used))
+        self._world = rig, markers, jnp.asarray(sigma)
+
+    def blocks(self, nodes: np.ndarray, theta: np.ndarray) -> Blocks:
+        """At (N + 1, 5) nodes and (5,) parameters, on the host."""
+        intervals, views = self._count
+        size = len(self._data[0].dt_s) + 1
+        filled = np.concatenate([nodes, np.repeat(nodes[-1:], size - len(nodes), axis=0)])
+        filled[len(nodes) :, 3:] = 0.0
+        cost, information, gradient, chi2, views_px = jax.device_get(
+            _blocks(*self._world, *self._data, filled, theta)
+        )
+        return Blocks(
+            float(cost),
+            information[:intervals],
+            gradient[:intervals],
+            chi2[:views],
+            views_px[:views],
+        )
+
+
+def view_weights(chi2: Array | np.ndarray) -> Array:
+    """How much views count: in full, or as Cauchy's where they are far off."""
+    return jnp.where(chi2 <= FULL_WEIGHT, 1.0, FULL_WEIGHT / jnp.maximum(chi2, FULL_WEIGHT))
+
+
+def corrected(
+    theta: Float[Array, " 5"],
+    speed_mps: Float[Array, ""],
+    steering_rad: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The true speed and steering of a reading."""
+    return theta[0] * speed_mps, theta[1] * steering_rad + theta[2]
+
+
+def _process(local: Array, interval: Intervals, sigma: Array) -> Float[Array, " 5"]:
+    """Whitened: the errors of the reading, and what the car slipped along, across and about."""
+    node, following, theta = local[:NODE], local[NODE : NODE + NEXT], local[NODE + NEXT :]
+    led = _led(node, theta, interval, sigma, interval.dt_s)
+    cosine, sine = jnp.cos(node[2]), jnp.sin(node[2])
+    dx, dy, dpsi = following - led
+    slip = jnp.stack([cosine * dx + sine * dy, cosine * dy - sine * dx, dpsi])
+    slip = slip / (jnp.asarray(SLIP_PER_SQRT_S) * jnp.sqrt(interval.dt_s))
+    return jnp.concatenate([node[3:], interval.linked * slip])
+
+
+def _view(
+    local: Array, interval: Intervals, sigma: Array, view: Views, rig: CameraRig, markers: MarkerMap
+) -> Float[Array, " 8"]:
+    """A marker's corners in one camera, in pixels, less those seen.
+
+    Between two nodes the pose follows the arc; what the car slipped in the interval is spread
+    evenly over it.
+    """
+    node, following, theta = local[:NODE], local[NODE : NODE + NEXT], local[NODE + NEXT :]
+    after_s = view.time_s - theta[4] - interval.begin_s
+    pose = _led(node, theta, interval, sigma, after_s)
+    slip = following - _led(node, theta, interval, sigma, interval.dt_s)
+    pose = pose + interval.linked * (after_s / interval.dt_s) * slip
+    T_vehicle_world = T_world_vehicle_from_planar(pose).inverse()
+    points_vehicle = transform_points(T_vehicle_world, markers.corners_world_m[view.marker])
+    camera = jax.tree.map(lambda leaf: leaf[view.camera], rig.cameras)
+    T_camera_vehicle = jax.tree.map(lambda leaf: leaf[view.camera], rig.Ts_camera_vehicle)
+    pixels = camera.project(transform_points(T_camera_vehicle, points_vehicle))
+    return (pixels - view.corners_px).reshape(8)
+
+
+def _led(node: Array, theta: Array, interval: Intervals, sigma: Array, dt_s: Array) -> Array:
+    """The pose after some time of an interval."""
+    errors = sigma * node[3:]
+    speed_mps, steering_rad = corrected(
+        theta, interval.speed_mps - errors[0], interval.steering_rad - errors[1]
+    )
+    return advance(node[:3], speed_mps, steering_rad, dt_s, theta[3])
+
+
+@jax.jit
+def _blocks(
+    rig: CameraRig,
+    markers: MarkerMap,
+    sigma: Array,
+    intervals: Intervals,
+    views: Views,
+    used: Array,
+    nodes: Array,
+    theta: Array,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """See `Blocks`; of padding, too."""
+    count = intervals.dt_s.shape[0]
+    shared = jnp.broadcast_to(theta, (count, theta.shape[0]))
+    local = jnp.concatenate([nodes[:-1], nodes[1:, :NEXT], shared], axis=1)
+
+    def process(one: Array, interval: Intervals) -> tuple[Array, Array]:
+        residual = _process(one, interval, sigma)
+        return residual, residual
+
+    J, r = jax.vmap(jax.jacfwd(process, has_aux=True))(local, intervals)
+    information = jnp.einsum("nri,nrj->nij", J, J)
+    gradient = jnp.einsum("nri,nr->ni", J, r)
+
+    found = jnp.searchsorted(intervals.begin_s, views.time_s - theta[4], side="right") - 1
+    index = jnp.clip(found, views.first, views.last)
+
+    def seen(one: Array, interval: Intervals, view: Views) -> tuple[Array, Array]:
+        pixels = _view(one, interval, sigma, view, rig, markers)
+        return pixels / jnp.repeat(view.sigma_px, 2), pixels
+
+    at = jax.tree.map(lambda column: column[index], intervals)
+    Jv, px = jax.vmap(jax.jacfwd(seen, has_aux=True))(local[index], at, views)
+    rv = px / jnp.repeat(views.sigma_px, 2, axis=1)
+    chi2 = jnp.sum(rv**2, axis=1)
+    weight = jnp.where(used, view_weights(chi2), 0.0)
+    beyond = 1 + jnp.log(jnp.maximum(chi2, FULL_WEIGHT) / FULL_WEIGHT)
+    rho = jnp.where(chi2 <= FULL_WEIGHT, chi2, FULL_WEIGHT * beyond)
+    information = information.at[index].add(
+        jnp.einsum("vri,vrj->vij", Jv * weight[:, None, None], Jv)
+    )
+    gradient = gradient.at[index].add(jnp.einsum("vri,vr->vi", Jv, rv * weight[:, None]))
+    cost = jnp.sum(r**2) + jnp.sum(jnp.where(used, rho, 0.0))
+    return cost, information, gradient, chi2, px.reshape(-1, 4, 2)
+
+
+def _padded(columns: Intervals | Views) -> list[np.ndarray]:
+    """Columns with as many rows as a multiple of `_PADDED`, the last one repeated."""
+    extra = -len(columns[0]) % _PADDED
+    return [np.concatenate([column, np.repeat(column[-1:], extra, axis=0)]) for column in columns]

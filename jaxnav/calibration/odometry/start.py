@@ -1,0 +1,228 @@
+"""Where a calibration of odometry starts: a course that is roughly right, branch by branch.
+
+Every view of a marker has two poses (IPPE). Of all the ways through them the one is taken that
+fits the odometry as it stands best: Viterbi (1967). Between the chosen poses the car is led by its
+odometry, and what is missing in the end is spread over the way.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnav.calibration.odometry.drive import Course, Intervals, Views
+from jaxnav.calibration.odometry.model import NODE, corrected
+from jaxnav.models.bicycle import advance
+from jaxnav.models.geometry import planar_from_T_world_vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.pose.ippe import ippe_from_rays
+
+_MOST = 25.0  # that a view, or a step between two, may cost: wrong detections are among them
+_ANCHORS_APART_S = 0.2
+
+
+class Trust(NamedTuple):
+    """How far two views in a row may disagree with the odometry: poses of single views are rough.
+
+    Attributes:
+        step_m, step_rad: anyway.
+        per_m, per_rad: and for every metre driven, for every radian turned.
+    """
+
+    step_m: float = 0.1
+    step_rad: float = 0.15
+    per_m: float = 0.2
+    per_rad: float = 0.2
+
+
+LOOSE = Trust()  # what is to be calibrated is wrong yet
+TIGHT = Trust(per_m=0.02, per_rad=0.02)  # once it is nearly right
+
+
+class _Chosen(NamedTuple):
+    poses: np.ndarray  # (V, 3), one of the two of each view
+    good: np.ndarray  # (V,), whether it fits one of its neighbours
+
+
+def start(
+    course: Course, rig: CameraRig, markers: MarkerMap, theta: np.ndarray, trust: Trust = LOOSE
+) -> np.ndarray:
+    """(N + 1, 5) nodes, see `model`.
+
+    Args:
+        theta: (5,), the parameters as they stand.
+        trust: in the odometry with them.
+    """
+    times_s = course.node_times_s
+    led = _led(course.intervals, theta)
+    chosen = _branches(course, rig, markers, theta, times_s, led, trust)
+    seen_s = course.views.time_s - theta[4]
+    nodes = np.zeros((len(times_s), NODE))
+    begins = np.concatenate([[0], np.flatnonzero(course.intervals.linked == 0) + 1])
+    ends = np.concatenate([begins[1:], [len(times_s)]])
+    for begin, end in zip(begins, ends, strict=True):
+        own = (course.views.first == begin) & chosen.good
+        if not own.any():
+            own = course.views.first == begin
+        anchor_s, poses = _thinned(seen_s[own], chosen.poses[own])
+        nodes[begin:end, :3] = _bent(times_s[begin:end], led[begin:end], anchor_s, poses)
+    return nodes
+
+
+def _led(intervals: Intervals, theta: np.ndarray) -> np.ndarray:
+    """(N + 1, 3): where odometry alone leads from the origin."""
+
+    @jax.jit
+    def run(speed: Array, steering: Array, dt_s: Array, wheelbase_m: Array) -> Array:
+        def one(pose: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            moved = advance(pose, *row, wheelbase_m)
+            return moved, moved
+
+        return jax.lax.scan(one, jnp.zeros(3), (speed, steering, dt_s))[1]
+
+    extra = -len(intervals.dt_s) % 512  # drives of about one length share a program
+    speed, steering = corrected(jnp.asarray(theta), intervals.speed_mps, intervals.steering_rad)
+    columns = (speed, steering, np.where(intervals.linked > 0, intervals.dt_s, 0.0))
+    padded = [jnp.asarray(np.pad(column, (0, extra))) for column in columns]
+    moved = np.asarray(run(*padded, jnp.asarray(theta[3])))[: len(intervals.dt_s)]
+    return np.concatenate([np.zeros((1, 3)), moved])
+
+
+def _branches(
+    course: Course,
+    rig: CameraRig,
+    markers: MarkerMap,
+    theta: np.ndarray,
+    times_s: np.ndarray,
+    led: np.ndarray,
+    trust: Trust,
+) -> _Chosen:
+    """The way through both poses of every view that costs least."""
+    views = course.views
+    poses, cost = _both_poses(views, rig, markers)
+    at = np.column_stack([np.interp(views.time_s - theta[4], times_s, c) for c in led.T])
+    new = np.concatenate([[True], np.diff(views.first) != 0])
+    total, came = cost[0], np.zeros((len(at), 2), int)
+    steps = np.zeros((len(at), 2, 2))
+    for v in range(1, len(at)):
+        if not new[v]:
+            steps[v] = _step_cost(at[v - 1], at[v], poses[v - 1], poses[v], trust)
+        through = total[:, None] + steps[v]
+        came[v] = np.argmin(through, axis=0)
+        total = through[came[v], [0, 1]] + cost[v]
+    ways = np.zeros(len(at), int)
+    ways[-1] = int(np.argmin(total))
+    for v in range(len(at) - 1, 0, -1):
+        ways[v - 1] = came[v, ways[v]]
+    rows = np.arange(len(at))
+    own = cost[rows, ways]
+    taken = np.concatenate([[_MOST], steps[rows[1:], ways[:-1], ways[1:]]])
+    taken[new] = _MOST
+    following = np.concatenate([taken[1:], [_MOST]])
+    good = (own < _MOST) & (np.minimum(taken, following) < _MOST / 2)
+    return _Chosen(poses[rows, ways], good)
+
+
+def _both_poses(views: Views, rig: CameraRig, markers: MarkerMap) -> tuple[np.ndarray, np.ndarray]:
+    """(V, 2, 3) planar poses of the vehicle, and (V, 2) how badly each explains the corners."""
+    extra = -len(views.camera) % 512
+    rows = np.concatenate([np.arange(len(views.camera)), np.zeros(extra, int)])
+    padded = jax.tree.map(lambda column: jnp.asarray(column[rows]), views)
+    poses, distance = jax.device_get(_poses_of_views(rig, markers, padded))
+    count = len(views.camera)
+    cost = np.sum(distance[:count] ** 2, axis=2)
+    cost = np.where(np.isfinite(cost), np.minimum(cost, _MOST), _MOST)
+    return np.where(np.isfinite(poses[:count]), poses[:count], 0.0), cost
+
+
+@jax.jit
+def _poses_of_views(
+    rig: CameraRig, markers: MarkerMap, views: Views
+) -> tuple[Float[Array, "V 2 3"], Float[Array, "V 2 4"]]:
+    """Poses, and the distance of each corner in standard deviations."""
+
+    def one(view: Views) -> tuple[Array, Array]:
+        camera = jax.tree.map(lambda leaf: leaf[view.camera], rig.cameras)
+        rays_camera = camera.unproject(view.corners_px)
+        Ts_camera_marker = ippe_from_rays(rays_camera, markers.size_m[view.marker])
+        T_camera_vehicle = jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[view.camera])
+        T_world_marker = jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[view.marker])
+
+        def posed(wxyz_xyz: Array) -> tuple[Array, Array]:
+            T_camera_marker = jaxlie.SE3(wxyz_xyz)
+            T_world_vehicle = T_world_marker @ T_camera_marker.inverse() @ T_camera_vehicle
+            points_camera = jax.vmap((T_camera_marker @ T_world_marker.inverse()).apply)(
+                markers.corners_world_m[view.marker]
+            )
+            off_px = camera.project(points_camera) - view.corners_px
+            distance = jnp.sqrt(jnp.sum(off_px**2, axis=1)) / view.sigma_px
+            return planar_from_T_world_vehicle(T_world_vehicle), distance
+
+        poses, distance = jax.vmap(posed)(Ts_camera_marker.wxyz_xyz)
+        return poses, distance
+
+    poses, distance = jax.vmap(one)(views)
+    return poses, distance
+
+
+def _step_cost(
+    a: np.ndarray, b: np.ndarray, befores: np.ndarray, afters: np.ndarray, trust: Trust
+) -> np.ndarray:
+    """(2, 2): how far each of two poses is from where the odometry leads each of two before."""
+    turn = b[2] - a[2]
+    led_m = _turned(b[:2] - a[:2], -a[2])
+    seen_m = _turned(afters[None, :, :2] - befores[:, None, :2], -befores[:, None, 2])
+    off_m = np.linalg.norm(seen_m - led_m, axis=-1)
+    off_rad = np.abs(_wrapped(afters[None, :, 2] - befores[:, None, 2] - turn))
+    off_m = off_m / (trust.step_m + trust.per_m * float(np.linalg.norm(led_m)))
+    off_rad = off_rad / (trust.step_rad + trust.per_rad * abs(turn))
+    return np.asarray(np.minimum(off_m**2 + off_rad**2, _MOST))
+
+
+def _thinned(times_s: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means over short times, with headings that go on where they left off."""
+    psi = np.unwrap(poses[:, 2])
+    groups = np.floor((times_s - times_s[0]) / _ANCHORS_APART_S).astype(int)
+    rows = [np.flatnonzero(groups == group) for group in np.unique(groups)]
+    return (
+        np.array([times_s[row].mean() for row in rows]),
+        np.array([[*np.median(poses[row, :2], axis=0), np.median(psi[row])] for row in rows]),
+    )
+
+
+def _bent(
+    times_s: np.ndarray, led: np.ndarray, anchor_s: np.ndarray, poses: np.ndarray
+) -> np.ndarray:
+    """(n, 3): the led course, moved so that it goes through the anchors."""
+    at = np.column_stack([np.interp(anchor_s, times_s, column) for column in led.T])
+    # Turns that odometry saw while nothing was seen count too.
+    psi = poses[:, 2] + 2 * np.pi * np.cumsum(
+        np.round(np.diff(at[:, 2] - poses[:, 2], prepend=at[0, 2] - poses[0, 2]) / (2 * np.pi))
+    )
+    bent = np.zeros_like(led)
+    leg = np.clip(np.searchsorted(anchor_s, times_s, side="right") - 1, 0, len(anchor_s) - 1)
+    following = np.minimum(leg + 1, len(anchor_s) - 1)
+
+    def from_anchor(rows: np.ndarray) -> np.ndarray:
+        turn = psi[rows] - at[rows, 2]
+        moved = _turned(led[:, :2] - at[rows, :2], turn)
+        return np.column_stack([poses[rows, :2] + moved, led[:, 2] + turn])
+
+    span = np.maximum(anchor_s[following] - anchor_s[leg], 1e-9)
+    share = np.clip((times_s - anchor_s[leg]) / span, 0.0, 1.0)[:, None]
+    bent = (1 - share) * from_anchor(leg) + share * from_anchor(following)
+    return np.asarray(bent)
+
+
+def _turned(vectors: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -1,0 +1,1 @@
+"""Where the cameras of a rig and the markers are."""

@@ -1,0 +1,90 @@
+"""The other poses that sightings admit, tried where a search has ended.
+
+Each frame has two, and each marker some from as many sightings: a search that began at a mirrored
+pose ends there, and only a comparison tells.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from jaxnav.calibration.rigs import bundle
+from jaxnav.calibration.rigs.linking import Linker, Links, inverted
+from jaxnav.calibration.rigs.pose_arrays import matrices, wxyz_xyz
+from jaxnav.models.rig import CameraRig
+
+_BETTER = 1.0  # by which a cost must be lower to be another one
+
+
+def other_branches(
+    rig: CameraRig,
+    linker: Linker,
+    links: Links,
+    poses: bundle.Unknowns,
+    free: np.ndarray,
+    sigma_px: float,
+) -> tuple[bundle.Unknowns, int]:
+    """Put frames and markers where another pose that their sightings admit costs less.
+
+    Args:
+        links: brought to where the poses are.
+        free: (S, 6).
+
+    Returns:
+        The poses, and how many of them are others.
+    """
+    C, views = len(rig), linker.views
+    links.Ts_group_camera[:] = matrices(poses.Ts_vehicle_camera)
+    links.Ts_group_marker[:] = matrices(poses.Ts_world_marker)
+    known = bundle.seen(rig, views, sigma_px)
+
+    def cost(of: bundle.Unknowns, groups: np.ndarray, count: int) -> np.ndarray:
+        residuals = np.asarray(bundle.reprojection_residuals_px(of, known))
+        return np.bincount(groups, bundle.losses(residuals, float(known.sigma_px)), count)
+
+    def best_of(
+        of: bundle.Unknowns, name: str, groups: np.ndarray, tries: Iterable[np.ndarray]
+    ) -> tuple[bundle.Unknowns, int]:
+        """Each of the poses of that name where it costs its sightings least."""
+        best, changed = matrices(getattr(of, name)), 0
+        least = cost(of, groups, len(best))
+        for tried in tries:
+            found = cost(replace(of, **{name: wxyz_xyz(tried)}), groups, len(best))
+            better = found < least - _BETTER
+            changed += int(better.sum())
+            best[better] = tried[better]
+            least = np.minimum(least, found)
+        return replace(of, **{name: wxyz_xyz(best)}), changed
+
+    candidates = inverted(linker.sights(links).Ts_cameras_markers)
+    poses, frames = best_of(
+        poses, "Ts_world_vehicle", views.frame, (candidates[:, branch] for branch in (0, 1))
+    )
+
+    Ts_world_marker, M = matrices(poses.Ts_world_marker), len(views.size_m)
+    Ts_world_vehicle = matrices(poses.Ts_world_vehicle)
+    Ts_vehicle_camera = matrices(poses.Ts_vehicle_camera)
+    Ts_world_camera = Ts_world_vehicle[views.frame] @ Ts_vehicle_camera[views.camera]
+    proposed = Ts_world_camera[:, None] @ linker.Ts_camera_marker
+    tries = (
+        np.where(
+            ((row >= 0) & free[C : C + M, 0])[:, None, None],
+            proposed[row, branch],
+            Ts_world_marker,
+        )
+        for row in _spread(views.marker, M)
+        for branch in (0, 1)
+    )
+    poses, markers = best_of(poses, "Ts_world_marker", views.marker, tries)
+    return poses, frames + markers
+
+
+def _spread(marker: np.ndarray, markers: int, count: int = 10) -> np.ndarray:
+    """(count, M) sightings of every marker, spread over the recording; -1 where there is none."""
+    chosen = np.full((count, markers), -1)
+    for index in range(markers):
+        rows = np.flatnonzero(marker == index)
+        if len(rows):
+            chosen[:, index] = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
+    return chosen

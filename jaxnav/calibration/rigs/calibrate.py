@@ -1,0 +1,299 @@
+"""Where the cameras of a rig and the markers are, from sightings of one camera after another.
+
+First everything is linked by what frames agree on (`linking`), from no start at all; then all poses
+are adjusted at once (`bundle`), at a scale of noise that falls with what the residuals say; then
+every frame and every marker is tried at the other poses that its sightings admit, until none is
+better there.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxnav.calibration.rigs import bundle
+from jaxnav.calibration.rigs.branches import other_branches
+from jaxnav.calibration.rigs.linking import Linker, Links, inverted
+from jaxnav.calibration.rigs.pose_arrays import matrices, wxyz_xyz
+from jaxnav.calibration.rigs.views import RigViews, both_poses, rays_camera
+from jaxnav.errors import BadInput
+from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.schur import Reduced
+from jaxnav.numerics.small_matrices import solve_upper
+
+_LEAST_SIGMA_PX = 1e-3  # of corners that are exact
+_SAME_SCALE = 0.02  # the estimate of the noise has settled when it changes by no more
+_ROUNDS, _STEPS = 8, 30
+_PARTS = 40  # of a recording, that are held against each other
+_NOTICED = 1.3  # variances that grow by less are as they should be: 40 parts tell no better
+
+
+@dataclass(frozen=True)
+class RigCalibration:
+    """Where everything is.
+
+    Attributes:
+        views: the sightings that took part; its frames are those with a pose.
+        Ts_vehicle_camera: (C, 4, 4); of a camera that is not `calibrated`, as it was given.
+        Ts_world_marker: (M, 4, 4), of all markers of `views`.
+        Ts_world_vehicle: (F, 4, 4).
+        calibrated: (C,) whether anything linked the camera to the others.
+        mapped: (M,) whether anything linked the marker to the known ones.
+        sigma_px: standard deviation of a corner's coordinate, as the residuals say.
+        residuals_px: (N, 4, 2) projected minus observed.
+        weight: (N,), 1 where a sighting counts in full.
+        cameras: their lenses, as given where they were not to be refined.
+        covariance: (6 S, 6 S) of the twists xi in T * cay(xi) of T_vehicle_camera and
+            T_world_marker and of the lenses, see `bundle.Unknowns`; zero of what was given.
+        frames_follow: (F, 6, 6 S) how the twists of the frames answer to those unknowns.
+        inflation: by which the covariance is larger than noise that is new in every frame would
+            make it, 1 where that is all there is.
+        turned: how many frames and markers changed their branch after the first adjustment.
+    """
+
+    views: RigViews
+    Ts_vehicle_camera: np.ndarray
+    Ts_world_marker: np.ndarray
+    Ts_world_vehicle: np.ndarray
+    calibrated: np.ndarray
+    mapped: np.ndarray
+    cameras: Camera
+    sigma_px: float
+    residuals_px: np.ndarray
+    weight: np.ndarray
+    covariance: np.ndarray
+    frames_follow: np.ndarray
+    inflation: float
+    turned: int
+
+    def rms_px(self) -> float:
+        """Of a corner's coordinate, over all sightings, outliers among them."""
+        return float(np.sqrt(np.mean(self.residuals_px**2)))
+
+    def sigmas(self) -> np.ndarray:
+        """(C + M, 6): m and rad, along and about the axes of the camera or the marker."""
+        placed = len(self.calibrated) + len(self.mapped)
+        return self._sixes()[:placed]
+
+    def lens_sigmas(self) -> np.ndarray:
+        """(C, 9): of fx fy cx cy in px and of the five coefficients."""
+        C = len(self.calibrated)
+        lenses = self._sixes()[C + len(self.mapped) :]
+        if not len(lenses):
+            return np.zeros((C, 9))
+        return np.concatenate([lenses[:C], lenses[C:, :3]], axis=1)
+
+    def _sixes(self) -> np.ndarray:
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0)).reshape(-1, 6)
+
+
+def calibrate_rig(
+    views: RigViews,
+    rig: CameraRig,
+    known: Mapping[int, np.ndarray],
+    reference_camera: int | None,
+    refine_lenses: bool = False,
+) -> RigCalibration:
+    """Find the cameras and the markers that are not known.
+
+    Args:
+        views: what was seen, ordered by frame.
+        rig: lenses, and the places of those cameras that are given.
+        known: T_world_marker (4, 4) of the markers that tie the world down, by their index.
+        reference_camera: the one whose given place ties the vehicle frame down; None where all
+            places are given and only markers are looked for.
+        refine_lenses: whether the lenses move too, rather than stay as they are given.
+
+    Raises:
+        BadInput: nothing ties the world down, or no camera can be linked.
+    """
+    given = inverted(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))
+    start = _start(views, rig, given, known, reference_camera, refine_lenses)
+    views, links, linker = start.views, start.links, start.linker
+    free = _free(views, rig, start, known, reference_camera, refine_lenses)
+    poses, turned, adjusted = start.poses, 0, None
+    sigma_px = bundle.sigma_px_of(
+        np.asarray(bundle.reprojection_residuals_px(poses, bundle.seen(rig, views, 1.0)))
+    )
+    for _ in range(_ROUNDS):
+        adjusted, used_px = _adjusted(rig, views, poses, free, sigma_px)
+        sigma_px = bundle.sigma_px_of(np.asarray(adjusted.residuals_px))
+        poses, changed = other_branches(rig, linker, links, adjusted.poses, free, sigma_px)
+        turned += changed
+        if not changed:
+            break
+    assert adjusted is not None  # there is a round
+    return _calibration(views, rig, given, start, adjusted, free, used_px, turned)
+
+
+def _free(
+    views: RigViews,
+    rig: CameraRig,
+    start: "_Start",
+    known: Mapping[int, np.ndarray],
+    reference_camera: int | None,
+    refine_lenses: bool,
+) -> np.ndarray:
+    """(S, 6) which of the shared unknowns move, see `bundle.Unknowns`."""
+    C, M = len(rig), len(views.size_m)
+    sixes = (C, M, 2 * C if refine_lenses else 0)
+    cameras, markers, lenses = (np.zeros((count, 6), bool) for count in sixes)
+    if reference_camera is not None:
+        cameras[start.calibrated] = True
+        cameras[reference_camera] = False
+    markers[start.mapped] = True
+    markers[list(known)] = False
+    if refine_lenses:
+        for index in np.flatnonzero(start.calibrated):
+            camera = rig.cameras
+            lens = camera.lenses[int(camera.lens_index[index])]
+            figures = np.arange(12) < 4 + LENS_COEFFICIENTS[lens]
+            lenses[index], lenses[C + index] = figures[:6], figures[6:]
+    return np.concatenate([cameras, markers, lenses])
+
+
+@dataclass(frozen=True)
+class _Start:
+    views: RigViews
+    links: Links
+    linker: Linker
+    poses: bundle.Unknowns
+    calibrated: np.ndarray
+    mapped: np.ndarray
+
+
+def _start(
+    views: RigViews,
+    rig: CameraRig,
+    given: np.ndarray,
+    known: Mapping[int, np.ndarray],
+    reference_camera: int | None,
+    refine_lenses: bool,
+) -> _Start:
+    """Link what can be linked, and leave out what can't."""
+    rays = rays_camera(rig, views)
+    Ts_camera_marker = both_poses(rays, views.size_m[views.marker])
+    sound = np.isfinite(Ts_camera_marker).all(axis=(1, 2, 3))
+    linker = Linker(views.only(sound), rays[sound], Ts_camera_marker[sound])
+    links = Links.none(len(rig), len(views.size_m))
+    if reference_camera is None:
+        links.group_of_camera[:], links.Ts_group_camera[:] = 0, given
+    anchors = list(known)
+    links.group_of_marker[anchors] = anchors[0]
+    links.Ts_group_marker[anchors] = [known[index] for index in anchors]
+    linker.link(links)
+
+    root = anchors[0]
+    mapped = links.group_of_marker == links.group_of_marker[root]
+    reference = 0 if reference_camera is None else reference_camera
+    calibrated = links.group_of_camera == links.group_of_camera[reference]
+    rows = mapped[linker.views.marker] & calibrated[linker.views.camera]
+    if not rows.any():
+        problem = "saw none of the known markers: start with one of them in view of this camera"
+        raise BadInput(rig.names[reference], problem)
+    T_world_group = known[root] @ inverted(links.Ts_group_marker[root])
+    links.Ts_group_marker[mapped] = T_world_group @ links.Ts_group_marker[mapped]
+    if reference_camera is not None:
+        T_vehicle_group = given[reference] @ inverted(links.Ts_group_camera[reference])
+        links.Ts_group_camera[calibrated] = T_vehicle_group @ links.Ts_group_camera[calibrated]
+
+    linker = linker.only(rows)
+    Ts_vehicle_world = linker.sights(links).Ts_cameras_markers[:, 0]
+    return _Start(
+        linker.views,
+        links,
+        linker,
+        bundle.Unknowns(
+            wxyz_xyz(inverted(Ts_vehicle_world)),
+            wxyz_xyz(np.where(calibrated[:, None, None], links.Ts_group_camera, given)),
+            wxyz_xyz(links.Ts_group_marker),
+            bundle.lenses_of(rig.cameras)[: len(rig) if refine_lenses else 0],
+        ),
+        calibrated,
+        mapped,
+    )
+
+
+def _adjusted(
+    rig: CameraRig, views: RigViews, poses: bundle.Unknowns, free: np.ndarray, sigma_px: float
+) -> tuple[bundle.Adjusted, float]:
+    """The most likely poses, at the noise that they leave, and that noise."""
+    for _ in range(_ROUNDS):
+        used_px = max(sigma_px, _LEAST_SIGMA_PX)
+        known = bundle.seen(rig, views, used_px)
+        adjusted = bundle.adjust(
+            poses,
+            known,
+            jnp.asarray(free.reshape(-1)),
+            parts=min(_PARTS, views.frames),
+            max_steps=_STEPS,
+        )
+        poses = adjusted.poses
+        sigma_px = bundle.sigma_px_of(np.asarray(adjusted.residuals_px))
+        if abs(sigma_px - used_px) <= _SAME_SCALE * used_px and bool(adjusted.converged):
+            break
+    return adjusted, used_px
+
+
+def _calibration(
+    views: RigViews,
+    rig: CameraRig,
+    given: np.ndarray,
+    start: _Start,
+    adjusted: bundle.Adjusted,
+    free: np.ndarray,
+    used_px: float,
+    turned: int,
+) -> RigCalibration:
+    flat = free.reshape(-1)
+    inverse = np.linalg.inv(np.asarray(adjusted.reduced.system))
+    inverse = np.where(flat[:, None] & flat[None], (inverse + inverse.T) / 2, 0)
+    residuals = np.asarray(adjusted.residuals_px)
+    unknowns = 6 * views.frames + int(flat.sum())
+    # What was fitted has taken up its part of the noise.
+    left = max(residuals.size - unknowns, 1) / residuals.size
+    sigma_px = bundle.sigma_px_of(residuals) / np.sqrt(left)
+    inflation = _inflation(np.asarray(adjusted.scores), inverse, int(flat.sum()))
+    lenses = adjusted.poses.lenses
+    return RigCalibration(
+        views=views,
+        Ts_vehicle_camera=np.where(
+            start.calibrated[:, None, None], matrices(adjusted.poses.Ts_vehicle_camera), given
+        ),
+        Ts_world_marker=matrices(adjusted.poses.Ts_world_marker),
+        Ts_world_vehicle=matrices(adjusted.poses.Ts_world_vehicle),
+        calibrated=start.calibrated,
+        mapped=start.mapped,
+        cameras=bundle.with_lenses(rig.cameras, lenses) if len(lenses) else rig.cameras,
+        sigma_px=sigma_px,
+        residuals_px=residuals,
+        weight=np.asarray(adjusted.weight),
+        covariance=inverse * (sigma_px / used_px) ** 2 * max(1.0, inflation),
+        frames_follow=np.asarray(_follows(adjusted.reduced)),
+        inflation=inflation,
+        turned=turned,
+    )
+
+
+@jax.jit
+def _follows(reduced: Reduced) -> Array:
+    return -jax.vmap(solve_upper)(reduced.factor, reduced.carried)
+
+
+def _inflation(scores: np.ndarray, inverse: np.ndarray, unknowns: int) -> float:
+    """How much larger variances are than noise that is new in every frame would make them.
+
+    A lens that is a little off, or a marker that is not flat, errs alike for seconds. Parts of the
+    recording disagree by more then than their residuals tell; one where they don't.
+
+    Source: Liang, Zeger (1986), "Longitudinal data analysis using generalized linear models": the
+    robust variance, of which this is the mean over all unknowns.
+    """
+    parts = len(scores)
+    spread = np.einsum("bi,ij,bj->", scores, inverse, scores) * parts / max(parts - 1, 1)
+    ratio = spread / max(unknowns, 1)
+    return float(ratio) if ratio > _NOTICED else 1.0

@@ -1,0 +1,243 @@
+"""Markers that are not where, or not as large as, a map says; and markers that moved meanwhile.
+
+The map is found anew from sightings, freely, and the given one is laid over it so that as many
+markers as can agree. How large a marker is follows from the rays to its corners alone.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxnav.calibration.rigs.calibrate import RigCalibration
+from jaxnav.calibration.rigs.linking import inverted, turn_rad
+from jaxnav.calibration.rigs.views import RigViews, rays_camera
+from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.models.rig import CameraRig
+
+_SIGMAS = 3.0  # what noise may explain
+_WRONG_SIZE = 0.05  # part of the side that paper and print don't explain
+_MOVED = 0.2  # part of a marker's sightings that don't fit the others
+_FEW = 8  # sightings that say nothing of a size or a second place
+_AGREE_RAD = 0.02  # between a ray and a corner, for the corner to be of one place
+_STEPS = 30
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found about one marker of the map.
+
+    Attributes:
+        seen: how often.
+        apart_m, apart_rad: between the map and where it was found; None where nothing linked it.
+        wrong: whether that is more than tolerance and sigma explain.
+        size_m: as its corners are apart; None where too few rays tell.
+        wrong_size: whether the map has another one.
+        moved_m: how far it went while it was watched, 0 where it stood still.
+    """
+
+    seen: int
+    apart_m: float | None
+    apart_rad: float | None
+    wrong: bool
+    size_m: float | None
+    wrong_size: bool
+    moved_m: float
+
+    @property
+    def right(self) -> bool:
+        """Whether nothing is the matter with it, as far as one can tell."""
+        return not (self.wrong or self.wrong_size or self.moved_m > 0)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A map held against what was seen.
+
+    Attributes:
+        verdicts: by index of the marker.
+        T_map_world: (4, 4) that lays what was found over the map.
+        agreeing: how many markers agree with each other about it.
+    """
+
+    verdicts: dict[int, Verdict]
+    T_map_world: np.ndarray
+    agreeing: int
+
+
+def checked(
+    found: RigCalibration,
+    views: RigViews,
+    rig: CameraRig,
+    given: Mapping[int, np.ndarray],
+    tolerance_m: float,
+    tolerance_rad: float,
+) -> Check:
+    """Hold a map against a calibration that did not believe it.
+
+    Args:
+        found: with a single marker known, the gauge.
+        views: all sightings, those among them that were not linked.
+        given: T_map_marker (4, 4) of the map's markers, by their index.
+    """
+    C = len(rig)
+    linked = [index for index in given if found.mapped[index]]
+    T_map_world, agree = _laid_over(
+        np.stack([given[index] for index in linked]),
+        found.Ts_world_marker[linked],
+        found.views.size_m[linked],
+        tolerance_m,
+        tolerance_rad,
+    )
+    rays = _Rays.of(found, views, rig)
+    sigmas = found.sigmas()
+    verdicts = {}
+    for index in given:
+        seen = int(np.sum(views.marker == index))
+        apart_m = apart_rad = None
+        wrong = False
+        if found.mapped[index]:
+            T = T_map_world @ found.Ts_world_marker[index]
+            apart_m = float(np.linalg.norm((T - given[index])[:3, 3]))
+            apart_rad = float(turn_rad(T, given[index]))
+            sigma_m = float(np.linalg.norm(sigmas[C + index, :3]))
+            sigma_rad = float(np.linalg.norm(sigmas[C + index, 3:]))
+            wrong = apart_m > max(tolerance_m, _SIGMAS * sigma_m) or apart_rad > max(
+                tolerance_rad, _SIGMAS * sigma_rad
+            )
+        size_m, moved_m = rays.size_and_move(index)
+        said_m = float(views.size_m[index])
+        verdicts[index] = Verdict(
+            seen=seen,
+            apart_m=apart_m,
+            apart_rad=apart_rad,
+            wrong=wrong,
+            size_m=size_m,
+            wrong_size=size_m is not None and abs(size_m / said_m - 1) > _WRONG_SIZE,
+            moved_m=moved_m,
+        )
+    return Check(verdicts, T_map_world, agree)
+
+
+def sizes_m(found: RigCalibration, views: RigViews, rig: CameraRig) -> dict[int, float]:
+    """How large markers are by the rays to their corners, of those that tell, by their index."""
+    rays = _Rays.of(found, views, rig)
+    sizes = {index: rays.size_and_move(index)[0] for index in range(len(views.size_m))}
+    return {index: size for index, size in sizes.items() if size is not None}
+
+
+def _laid_over(
+    given: np.ndarray,
+    found: np.ndarray,
+    size_m: np.ndarray,
+    tolerance_m: float,
+    tolerance_rad: float,
+) -> tuple[np.ndarray, int]:
+    """T_map_world under which most markers agree, fitted to the corners of those."""
+
+    def agreeing(T: np.ndarray, slack: float) -> np.ndarray:
+        over = T @ found
+        apart_m = np.linalg.norm((over - given)[:, :3, 3], axis=1)
+        turned = np.array([turn_rad(a, b) for a, b in zip(over, given, strict=True)])
+        return (apart_m < slack * tolerance_m) & (turned < slack * tolerance_rad)
+
+    corners = size_m[:, None, None] / 2 * CORNER_SIGNS
+
+    def fitted(of: np.ndarray) -> np.ndarray:
+        to, fro = (
+            (Ts[of, None, :3, :3] @ corners[of][..., None])[..., 0] + Ts[of, None, :3, 3]
+            for Ts in (given, found)
+        )
+        to, fro = to.reshape(-1, 3), fro.reshape(-1, 3)
+        turn, _ = Rotation.align_vectors(to - to.mean(axis=0), fro - fro.mean(axis=0))
+        T = np.eye(4)
+        T[:3, :3] = turn.as_matrix()
+        T[:3, 3] = to.mean(axis=0) - T[:3, :3] @ fro.mean(axis=0)
+        return T
+
+    best, most = np.eye(4), np.zeros(len(given), bool)
+    for one in range(len(given)):
+        # A single marker turns its neighbours by its own error: they may be further off at first.
+        T = given[one] @ inverted(found[one])
+        near = agreeing(T, 3)
+        near[one] = True
+        T = fitted(near)
+        for _ in range(3):
+            inside = agreeing(T, 1)
+            if not inside.any():
+                break
+            T = fitted(inside)
+        inside = agreeing(T, 1)
+        if inside.sum() > most.sum():
+            best, most = T, inside
+    if not most.any():  # everyone alone: the first is as good as any
+        best = given[0] @ inverted(found[0])
+        most[0] = True
+    return best, int(most.sum())
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """The rays to every corner, in the world of a calibration."""
+
+    marker: np.ndarray
+    origins: np.ndarray  # (N, 3)
+    directions: np.ndarray  # (N, 4, 3)
+
+    @staticmethod
+    def of(found: RigCalibration, views: RigViews, rig: CameraRig) -> "_Rays":
+        """Of the sightings by calibrated cameras in frames with a pose."""
+        frame_of = {int(stamp): index for index, stamp in enumerate(found.views.stamps_ns)}
+        frames = np.array([frame_of.get(int(stamp), -1) for stamp in views.stamps_ns], int)
+        posed = (frames[views.frame] >= 0) & found.calibrated[views.camera]
+        rays = rays_camera(rig, views)[posed]
+        Ts = (
+            found.Ts_world_vehicle[frames[views.frame[posed]]]
+            @ found.Ts_vehicle_camera[views.camera[posed]]
+        )
+        directions = np.einsum("nij,nkj->nki", Ts[:, :3, :3], rays)
+        return _Rays(views.marker[posed], Ts[:, :3, 3], directions)
+
+    def size_and_move(self, index: int) -> tuple[float | None, float]:
+        """How large a marker is and how far it went, None and 0 where that can't be told."""
+        rows = np.flatnonzero(self.marker == index)
+        first = self._corners(rows)
+        if first is None:
+            return None, 0.0
+        corners, near = first
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+        size_m = float(edges.mean())
+        if np.ptp(edges) > 4 * _WRONG_SIZE * size_m:
+            return None, 0.0
+        rest = rows[~near]
+        if len(rest) < max(_FEW, _MOVED * len(rows)):
+            return size_m, 0.0
+        second = self._corners(rest)
+        if second is None or second[1].mean() < 0.5:
+            return size_m, 0.0
+        moved_m = float(np.linalg.norm(second[0].mean(axis=0) - corners.mean(axis=0)))
+        return size_m, moved_m if moved_m > _WRONG_SIZE * size_m else 0.0
+
+    def _corners(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """(4, 3) where most rays to each corner meet, and which rows agree; None: nowhere."""
+        if len(rows) < _FEW:
+            return None
+        origins, directions = self.origins[rows], self.directions[rows]
+        across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
+        weight = np.ones(len(rows))
+        for _ in range(_STEPS):
+            A = np.einsum("n,ncij->cij", weight, across)
+            b = np.einsum("n,ncij,nj->ci", weight, across, origins)
+            if np.linalg.cond(A).max() > 1e6:
+                return None
+            corners = np.linalg.solve(A, b[..., None])[..., 0]
+            way = corners - origins[:, None]
+            distance = np.linalg.norm(way, axis=2)
+            off = np.einsum("ncij,ncj->nci", across, way)
+            angle = np.sqrt(np.mean(np.sum(off**2, axis=2) / distance**2, axis=1))
+            # Nearer rays tell more; those that point elsewhere, next to nothing.
+            scale = max(float(np.median(angle)), 1e-4)
+            weight = 1 / (distance.mean(axis=1) ** 2 * (1 + (angle / scale) ** 2) ** 2)
+            weight /= weight.sum()
+        return corners, angle < _AGREE_RAD

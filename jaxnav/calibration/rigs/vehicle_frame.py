@@ -1,0 +1,111 @@
+"""Where the vehicle frame is on a rig whose cameras know their places relative to each other.
+
+Cameras alone can't tell. The frame is where the places that were given by hand fit best, or where
+driving puts it (`driven_frame`); a rig calibrated about one camera is moved there with its
+uncertainty.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from jaxnav.calibration.rigs.calibrate import RigCalibration
+from jaxnav.calibration.rigs.driven_frame import DrivenFrame, level_follows
+from jaxnav.calibration.rigs.linking import inverted
+
+# What a tape measure and an eye are good for.
+_PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 0.01, np.deg2rad(3)
+
+
+def moved_to_places(found: RigCalibration, given: np.ndarray) -> RigCalibration:
+    """The vehicle frame in which the cameras are nearest to where they were said to be.
+
+    Args:
+        given: (C, 4, 4) T_vehicle_camera as measured by hand; those of cameras that were not
+            calibrated have no say.
+    """
+    cameras = np.flatnonzero(found.calibrated)
+    Ts_vehicle_camera, wanted = found.Ts_vehicle_camera[cameras], given[cameras]
+    weight = np.repeat([1 / _PLACE_SIGMA_M, 1 / _PLACE_SIGMA_RAD], 3)
+    start = wanted[0] @ inverted(Ts_vehicle_camera[0])
+
+    def misfit(x: np.ndarray) -> np.ndarray:
+        apart = inverted(wanted) @ (_rigid(x) @ start) @ Ts_vehicle_camera
+        turned = Rotation.from_matrix(apart[:, :3, :3]).as_rotvec()
+        return np.ravel(np.concatenate([apart[:, :3, 3], turned], axis=1) * weight)
+
+    T_tied_vehicle = _rigid(least_squares(misfit, np.zeros(6)).x) @ start
+    # The fit takes up what all cameras have in common.
+    A = np.concatenate([adjoint(T) for T in inverted(T_tied_vehicle @ Ts_vehicle_camera)])
+    W = np.tile(weight**2, len(cameras))
+    keep = np.eye(len(A)) - A @ np.linalg.solve((A.T * W) @ A, A.T * W)
+    G = np.eye(len(found.covariance))
+    rows = (6 * cameras[:, None] + np.arange(6)).ravel()
+    G[np.ix_(rows, rows)] = keep
+    return moved(found, T_tied_vehicle, G @ found.covariance @ G.T)
+
+
+def moved_to_driven(found: RigCalibration, driven: DrivenFrame) -> RigCalibration:
+    """The vehicle frame where driving puts it, with the uncertainty of the drive and the ground."""
+    cameras = np.flatnonzero(found.calibrated)
+    T_tied_vehicle = inverted(driven.T_rig_level @ driven.T_level_vehicle)
+    Ts_tied_camera = T_tied_vehicle @ found.Ts_vehicle_camera[cameras]
+    A = np.concatenate([adjoint(T) for T in inverted(Ts_tied_camera)])
+    follows = adjoint(inverted(driven.T_level_vehicle)) @ level_follows(
+        found.Ts_world_vehicle, found.frames_follow
+    )
+    rows = (6 * cameras[:, None] + np.arange(6)).ravel()
+    G = np.eye(len(found.covariance))
+    G[rows] -= A @ follows
+    covariance = G @ found.covariance @ G.T
+    covariance[np.ix_(rows, rows)] += A @ driven.covariance @ A.T
+    return moved(found, T_tied_vehicle, covariance)
+
+
+def moved(
+    found: RigCalibration, T_tied_vehicle: np.ndarray, covariance: np.ndarray
+) -> RigCalibration:
+    """A calibration seen from another vehicle frame; cameras that were not calibrated stay."""
+    Ts = np.where(
+        found.calibrated[:, None, None],
+        T_tied_vehicle @ found.Ts_vehicle_camera,
+        found.Ts_vehicle_camera,
+    )
+    return replace(
+        found,
+        Ts_vehicle_camera=Ts,
+        Ts_world_vehicle=found.Ts_world_vehicle @ inverted(T_tied_vehicle),
+        covariance=covariance,
+    )
+
+
+def moved_world(found: RigCalibration, move: np.ndarray) -> RigCalibration:
+    """A calibration seen from another world frame; twists of markers are their own, and stay.
+
+    Args:
+        move: (4, 4), of the old world in the new.
+    """
+    return replace(
+        found,
+        Ts_world_marker=move @ found.Ts_world_marker,
+        Ts_world_vehicle=move @ found.Ts_world_vehicle,
+    )
+
+
+def adjoint(T: np.ndarray) -> np.ndarray:
+    """(6, 6) A in T exp(xi) = exp(A xi) T, twists ordered (translation, rotation)."""
+    R, t = T[:3, :3], T[:3, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = R
+    A[:3, 3:] = cross @ R
+    return A
+
+
+def _rigid(x: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(x[3:]).as_matrix()
+    T[:3, 3] = x[:3]
+    return T
