@@ -28,7 +28,7 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
-from jaxnav.commands.rendered_world import SENSOR  # noqa: E402
+from jaxnav.commands.simulate.rendered_world import SENSOR  # noqa: E402
 from jaxnav.detection import make_detector  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
 from jaxnav.loop.expect import expected  # noqa: E402

@@ -149,7 +149,7 @@ def rendered(frames: int) -> None:
     from jaxnav.calibration.rigs.calibrate import calibrate_rig
     from jaxnav.calibration.rigs.linking import turn_rad
     from jaxnav.calibration.rigs.views import RigViews
-    from jaxnav.commands.rendered_world import READOUT_S, SENSOR
+    from jaxnav.commands.simulate.rendered_world import READOUT_S, SENSOR
     from jaxnav.detection import make_detector
     from jaxnav.files.poses import pose_from_matrix
     from jaxnav.simulation.rendering import Renderer

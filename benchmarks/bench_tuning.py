@@ -214,8 +214,8 @@ def cost_table(out: Path) -> None:
             functools.partial(gradient, start),
         )
 
-    from jaxnav.arguments import TuneController
-    from jaxnav.commands.tune_controller import closed_loop, gains_of
+    from jaxnav.commands.tune.arguments import TuneController
+    from jaxnav.commands.tune.controller import closed_loop, gains_of
 
     args = TuneController(headless=True)
     loop = closed_loop(args, args.scenario)
@@ -255,14 +255,14 @@ def _print_cost(
 
 def _filter_loss(seeds: int) -> tuple[Any, Any, Any]:
     """The likelihood of drives, Q ten times too large and R ten times too small."""
-    from jaxnav.arguments import TuneFilter
     from jaxnav.commands.process import configure_jax
+    from jaxnav.commands.tune.arguments import TuneFilter
 
     configure_jax(float64=False)
     import jax.numpy as jnp
 
-    from jaxnav.commands.tune_data import read_data
-    from jaxnav.commands.tune_filter import space_of
+    from jaxnav.commands.tune.data import read_data
+    from jaxnav.commands.tune.filter import space_of
     from jaxnav.parameters import with_parameters
     from jaxnav.tuning.filter import FilterCost
     from jaxnav.tuning.objective import Objective

@@ -1,7 +1,7 @@
 """The command line: `jaxnav COMMAND`.
 
 What a command does lies in `jaxnav.commands` and is imported when the command runs, so that
-`--help` stays instant; what it can be told lies in `jaxnav.arguments`.
+`--help` stays instant; they are registered in `jaxnav/commands/__init__.py`.
 
 Exit codes: 0 done, 1 what was to be found out is not well (a replay is not what was recorded, the
 doctor found an error, a fault came to worse than it must, the watchdog stopped the car), 2 bad
@@ -98,9 +98,9 @@ def _main(args: list[str], dispatch: Callable[[list[str]], int]) -> int:
 
 def _name(args: list[str]) -> str:
     """What a message begins with."""
-    from jaxnav.arguments import COMMANDS
+    from jaxnav.commands import names
 
-    return f"jaxnav {args[0]}" if args and args[0] in COMMANDS else "jaxnav"
+    return f"jaxnav {args[0]}" if args and args[0] in names() else "jaxnav"
 
 
 def _dispatch(args: list[str], *signals: Signals) -> int:
@@ -109,6 +109,7 @@ def _dispatch(args: list[str], *signals: Signals) -> int:
 
         print(f"jaxnav {__version__}")
         return 0
+    from jaxnav.commands import registered
     from jaxnav.commands.outputs import check_outputs
 
     command = _parse(args)
@@ -120,7 +121,7 @@ def _dispatch(args: list[str], *signals: Signals) -> int:
         # small that sharing one out takes longer than it does, and the cores are theirs.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        module = importlib.import_module(f"jaxnav.commands.{type(command).__name__.lower()}")
+        module = importlib.import_module(f"jaxnav.commands.{registered(command).module}")
         with nothing_hidden():
             code: int = module.run(command, *signals)
     except ModuleNotFoundError as missing:
@@ -135,7 +136,7 @@ def _parse(args: list[str]) -> Any:
     """The command, or None where help was asked for and printed."""
     import tyro
 
-    from jaxnav.arguments import Command
+    from jaxnav.commands import all_arguments
 
     messages = io.StringIO()
     wide = not {"-h", "--help"} & set(args)
@@ -145,12 +146,12 @@ def _parse(args: list[str]) -> Any:
             _unwrapped() if wide else contextlib.nullcontext(),
         ):
             command: Any = tyro.cli(
-                Command,
+                all_arguments(),
                 prog="jaxnav",
                 description=DESCRIPTION,
                 args=args,
             )
-            return command
+            return getattr(command, "what", command)  # of a group
     except SystemExit as finished:
         if not finished.code:
             return None

@@ -11,14 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxnav import cli
-from jaxnav.arguments.calibration import CalibrateIntrinsics
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.sheets import sheet_of
 from jaxnav.calibration.lenses import comparison as lens_comparison
 from jaxnav.calibration.lenses.images import calibrate_images
 from jaxnav.calibration.lenses.simulated_views import simulated_views
-from jaxnav.commands import calibrate_intrinsics
-from jaxnav.commands.calibration_boards import write_board
+from jaxnav.commands.calibrate import intrinsics as calibrate_intrinsics
+from jaxnav.commands.calibrate.arguments.intrinsics import CalibrateIntrinsics
+from jaxnav.commands.calibrate.boards import write_board
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.reading import read_mapping

@@ -12,7 +12,7 @@ import yaml
 from jaxnav.calibration.odometry.drive import Drive
 from jaxnav.calibration.odometry.model import NAMES
 from jaxnav.cli import main
-from jaxnav.commands.odometry_recordings import drive_of
+from jaxnav.commands.calibrate.odometry_recordings import drive_of
 from jaxnav.detection import Detections
 from jaxnav.files import load_vehicle, save_markers
 from jaxnav.loop.frames import Sighted
@@ -28,7 +28,7 @@ from tests.helpers.simulated import make_setup
 @pytest.fixture(autouse=True)
 def keep_the_settings_of_jax(monkeypatch):
     """Commands choose a precision and a cache of their own; tests keep theirs."""
-    monkeypatch.setattr("jaxnav.commands.calibrate_odometry.configure_jax", lambda float64: None)
+    monkeypatch.setattr("jaxnav.commands.calibrate.odometry.configure_jax", lambda float64: None)
 
 
 def sensed_drive(seed: int = 0) -> Drive:

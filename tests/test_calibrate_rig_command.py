@@ -11,8 +11,10 @@ import yaml
 
 from jaxnav import cli
 from jaxnav.calibration.rigs.linking import turn_rad
-from jaxnav.commands import calibrate_check, calibrate_markers, calibrate_rig
-from jaxnav.commands.calibration_report import coverage
+from jaxnav.commands.calibrate import check as calibrate_check
+from jaxnav.commands.calibrate import markers as calibrate_markers
+from jaxnav.commands.calibrate import rig as calibrate_rig
+from jaxnav.commands.calibrate.report import coverage
 from jaxnav.datasets.sightings import read_sightings
 from jaxnav.detection.types import Detections
 from jaxnav.files import load_markers, load_rig, save_markers, save_rig

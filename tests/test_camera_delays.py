@@ -11,9 +11,9 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnav.commands import delay_watch
-from jaxnav.commands.delay_watch import DelayWatch, delays_of, warnings
-from jaxnav.commands.doctor_checks import stamps
+from jaxnav.commands.doctor import stamps
+from jaxnav.commands.drive import delay_watch
+from jaxnav.commands.drive.delay_watch import DelayWatch, delays_of, warnings
 from jaxnav.detection import Detections
 from jaxnav.loop.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
 from jaxnav.loop.flags import Fault

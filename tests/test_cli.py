@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from jaxnav import cli
-from jaxnav.arguments import COMMANDS, Demo, Locate, Replay, TuneController, TuneFilter
-from jaxnav.arguments.calibration import CALIBRATIONS
-from jaxnav.commands import process
+from jaxnav.commands import COMMANDS, names, process
+from jaxnav.commands.drive.arguments import Locate, Replay
+from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.errors import BadInput
 
 JAXNAV = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
@@ -26,10 +26,10 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], list]:
 
     def install(run: Callable) -> list:
         received = []
-        for name in COMMANDS:
-            module = types.ModuleType(name)
+        for one in COMMANDS.values():
+            module = types.ModuleType(one.module)
             module.run = lambda args: received.append(args) or run()
-            monkeypatch.setitem(sys.modules, f"jaxnav.commands.{name}", module)
+            monkeypatch.setitem(sys.modules, f"jaxnav.commands.{one.module}", module)
         return received
 
     return install
@@ -171,21 +171,10 @@ POSITIONAL = {
 }
 
 
-# `jaxnav tune` and `jaxnav calibrate` have commands of their own.
-HELPED = (
-    {name: ([name], it) for name, it in COMMANDS.items() if name not in ("tune", "calibrate")}
-    | {
-        "tune filter": (["tune", "filter"], TuneFilter),
-        "tune controller": (["tune", "controller"], TuneController),
-    }
-    | {f"calibrate {name}": (["calibrate", name], it) for name, it in CALIBRATIONS.items()}
-)
-
-
-@pytest.mark.parametrize("name", HELPED)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_help_explains_every_flag(name, capsys) -> None:
-    words, command = HELPED[name]
-    assert cli.main([*words, "--help"]) == 0
+    command = COMMANDS[name].kind
+    assert cli.main([*name.split(), "--help"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
     assert "{None}" not in out
@@ -205,7 +194,7 @@ def test_help_explains_every_flag(name, capsys) -> None:
 def test_help_and_version_name_themselves(capsys) -> None:
     assert cli.main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(name in out for name in COMMANDS)
+    assert all(name in out for name in names())
     assert cli.main(["--version"]) == 0
     assert re.fullmatch(r"jaxnav \d+\.\d+\.\d+\n", capsys.readouterr().out)
 

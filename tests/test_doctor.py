@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxnav import cli
-from jaxnav.commands import doctor
-from jaxnav.commands.doctor_checks.findings import Finding, Report
+from jaxnav.commands.doctor import doctor
+from jaxnav.commands.doctor.findings import Finding, Report
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from jaxnav.commands.doctor_checks import rig_file, route_file
-from jaxnav.commands.doctor_checks.markers_file import measured_corners, placed
-from jaxnav.commands.doctor_checks.rig_file import bearings, intrinsics, lenses, places, rotations
-from jaxnav.commands.doctor_checks.route_file import sight_along, turning_radius_m, vehicle_file
+from jaxnav.commands.doctor import rig_file, route_file
+from jaxnav.commands.doctor.markers_file import measured_corners, placed
+from jaxnav.commands.doctor.rig_file import bearings, intrinsics, lenses, places, rotations
+from jaxnav.commands.doctor.route_file import sight_along, turning_radius_m, vehicle_file
 from jaxnav.files import Route, calib_dir, load_route, save_rig
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.camera import Camera

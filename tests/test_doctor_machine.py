@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxnav.commands.doctor_checks.machine import Clocks, clock, disk, processor
-from jaxnav.commands.doctor_checks.software import compile_cache, jax_device, opencv, packages
+from jaxnav.commands.doctor.machine import Clocks, clock, disk, processor
+from jaxnav.commands.doctor.software import compile_cache, jax_device, opencv, packages
 from tests.helpers.findings import all_well, the_problem
 
 

@@ -6,9 +6,9 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.commands.doctor_checks.fits import Sighted
-from jaxnav.commands.doctor_checks.orders import in_their_order
-from jaxnav.commands.doctor_checks.photographs import examine_pictures
+from jaxnav.commands.doctor.fits import Sighted
+from jaxnav.commands.doctor.orders import in_their_order
+from jaxnav.commands.doctor.photographs import examine_pictures
 from jaxnav.detection import Observed
 from jaxnav.files import Route
 from jaxnav.models.markers import MarkerMap

@@ -8,11 +8,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from jaxnav.commands.doctor_checks import camera_frames
-from jaxnav.commands.doctor_checks import plug_ins as examined
-from jaxnav.commands.doctor_checks.camera_frames import Watched, judge_cameras, skew
-from jaxnav.commands.doctor_checks.findings import EXIT_UNREADABLE, Report
-from jaxnav.commands.doctor_checks.plug_ins import Reading, judge_odometry, plug_ins
+from jaxnav.commands.doctor import camera_frames
+from jaxnav.commands.doctor import plug_ins as examined
+from jaxnav.commands.doctor.camera_frames import Watched, judge_cameras, skew
+from jaxnav.commands.doctor.findings import EXIT_UNREADABLE, Report
+from jaxnav.commands.doctor.plug_ins import Reading, judge_odometry, plug_ins
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.loop.interfaces import Frame, Odometry

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from jaxnav import cli
-from jaxnav.commands.drive_pictures import distance_m, summary_lines
+from jaxnav.commands.drive.pictures import distance_m, summary_lines
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry
@@ -271,7 +271,7 @@ def test_the_command_draws_a_drive_without_the_packages_for_studies(
     recorded, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, "xarray", None)
-    monkeypatch.delitem(sys.modules, "jaxnav.commands.study_pictures", raising=False)
+    monkeypatch.delitem(sys.modules, "jaxnav.commands.study.pictures", raising=False)
     out = tmp_path / "pictures"
     assert cli.main(["plot", str(recorded), "--out", str(out)]) == 0
     printed, errors = capsys.readouterr()

@@ -132,7 +132,7 @@ def test_rows_have_names_of_their_own():
 
 
 def test_a_fault_that_is_not_there_is_one_line(capsys, monkeypatch):
-    monkeypatch.setattr("jaxnav.commands.faults.configure_jax", lambda **_: None)
+    monkeypatch.setattr("jaxnav.commands.drive.faults.configure_jax", lambda **_: None)
     assert main(["faults", "--only", "earthquake"]) == 2
     error = capsys.readouterr().err.strip().splitlines()
     assert len(error) == 1

@@ -30,7 +30,7 @@ LAYERS = {
         "vehicles",
     },
     "pictures": {"plots", "viewer"},
-    "shell": {"arguments", "cli", "commands"},
+    "shell": {"cli", "commands"},
 }
 ORDER = list(LAYERS)
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
@@ -47,9 +47,7 @@ SIDE_BY_SIDE = {
     ("vehicles", "recording"),
     ("testing", "vehicles"),
     ("viewer", "plots"),
-    ("cli", "arguments"),
     ("cli", "commands"),
-    ("commands", "arguments"),
 }
 MAY_IMPORT_LANES = {"simulation", "tuning"}
 MOST_NODES, MOST_ARROWS, LONGEST_CHAIN = 30, 170, 14
@@ -236,7 +234,7 @@ def test_the_house_is_seen_at_a_glance() -> None:
         ("simulation.plant", "import jax\njax.config.update('jax_enable_x64', True)"),
         ("simulation.plant", "import jax\ndef f():\n    jax.config.update('jax_enable_x64', 1)"),
         ("studies.grid", "from jax import config"),
-        ("commands.demo", "import jax\nX64 = jax.config.jax_enable_x64"),
+        ("commands.simulate.demo", "import jax\nX64 = jax.config.jax_enable_x64"),
         ("errors", "from jaxnav.models.geometry import wrap_angle"),
         ("novelty", "import math"),
     ],
@@ -253,7 +251,10 @@ def test_a_forbidden_arrow_is_caught(module: str, source: str) -> None:
         ("studies.grid", "from jaxnav.simulation import rollout\nimport xarray"),
         ("tuning.driving", "from jaxnav.lanes.over_lanes import over_lanes"),
         ("files.rigs", "from .reading import read\nfrom jaxnav.errors import BadInput"),
-        ("commands.demo", "from jaxnav import plots\nfrom jaxnav.arguments import Demo"),
+        (
+            "commands.simulate.demo",
+            "from jaxnav import plots\nfrom jaxnav.commands.simulate.arguments import Demo",
+        ),
         (
             "cli",
             "from jaxnav import __version__\nimport jax\ndef f():\n    jax.config.update('a', 1)",

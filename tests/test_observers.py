@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxnav import cli
-from jaxnav.arguments import Run
-from jaxnav.commands.delay_watch import DelayWatch
-from jaxnav.commands.observers import Recording, StatusLine, View, open_onlookers
-from jaxnav.commands.status import WIDTH
+from jaxnav.commands.drive.arguments import Run
+from jaxnav.commands.drive.delay_watch import DelayWatch
+from jaxnav.commands.drive.observers import Recording, StatusLine, View, open_onlookers
+from jaxnav.commands.drive.status import WIDTH
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.loop.flags import Fault
@@ -115,7 +115,7 @@ def test_a_missing_rerun_gets_one_line_before_anything_is_compiled(monkeypatch, 
     def compiles(self, folder):
         raise AssertionError("compiled")
 
-    monkeypatch.setattr("jaxnav.commands.run.configure_jax", lambda float64, threads: None)
+    monkeypatch.setattr("jaxnav.commands.drive.run.configure_jax", lambda float64, threads: None)
     monkeypatch.setattr(DriveSetup, "pilot", compiles)
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert cli.main(["run", "--view"]) == cli.EXIT_BAD_INPUT

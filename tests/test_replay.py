@@ -131,7 +131,7 @@ def test_a_recording_without_a_reference_gives_a_track_and_no_errors(
     test_7, tmp_path, monkeypatch, capsys
 ):
     blind = dataclasses.replace(test_7.first(20), reference=None)
-    monkeypatch.setattr("jaxnav.commands.replay.read_recording", lambda *_: blind)
+    monkeypatch.setattr("jaxnav.commands.drive.replay.read_recording", lambda *_: blind)
     command = ["replay", "whatever", "--selector", "lowest-reprojection", "--headless"]
     assert main([*command, "--out", str(tmp_path)]) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -155,7 +155,7 @@ def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
 
 def test_parameters_go_before_what_the_recording_tells(test_7, tmp_path, monkeypatch, capsys):
     short = test_7.first(20)
-    monkeypatch.setattr("jaxnav.commands.replay.read_recording", lambda *_: short)
+    monkeypatch.setattr("jaxnav.commands.drive.replay.read_recording", lambda *_: short)
     values = {"corner_sigma_px": 3.0, "motion.vision_floor": [1.0] * 6, "controller.lookahead_m": 1}
     write_params(tmp_path / "p.yaml", values, {"loss": 0.5})
     command = ["replay", "whatever", "--selector", "lowest-reprojection", "--headless"]

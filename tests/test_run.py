@@ -353,7 +353,7 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
 def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys, arguments, line):
     monkeypatch.chdir(tmp_path)
     write_params("p.yaml", {"motion.vision_floor": [1.0] * 6})
-    monkeypatch.setattr("jaxnav.commands.run.configure_jax", lambda **_: None)
+    monkeypatch.setattr("jaxnav.commands.drive.run.configure_jax", lambda **_: None)
     vehicle = [] if "--vehicle" in arguments else ["--vehicle", recorded_vehicle.NAME]
     log = tmp_path / "told"
     options = [*vehicle, "--cameras", "sim", "--option", f"log={log}", "--headless"]

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from jaxnav.arguments import Simulate as Arguments
 from jaxnav.cli import main
-from jaxnav.commands.simulate import _load, _navigator
+from jaxnav.commands.simulate.arguments import Simulate as Arguments
+from jaxnav.commands.simulate.simulate import _load, _navigator
 from jaxnav.files import write_params
 from jaxnav.parameters import parameters_of
 from jaxnav.simulation.rollout import Trace
@@ -25,8 +25,8 @@ SCENARIO = scenarios()["paper"]
 def keep_the_settings_of_jax(monkeypatch):
     """Commands choose a precision and a cache of their own; tests keep theirs."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
-    monkeypatch.setattr("jaxnav.commands.simulate.configure_jax", lambda float64: None)
-    monkeypatch.setattr("jaxnav.commands.reliability.configure_jax", lambda float64: None)
+    monkeypatch.setattr("jaxnav.commands.simulate.simulate.configure_jax", lambda float64: None)
+    monkeypatch.setattr("jaxnav.commands.study.reliability.configure_jax", lambda float64: None)
 
 
 def trace(drives=4, frames=60, **changes) -> Trace:
@@ -140,7 +140,7 @@ def test_parameters_drive_and_are_what_a_result_belongs_to(tmp_path, capsys, mon
         return {name: value for name, value in result.items() if name != "run"}
 
     driven: list[dict] = []
-    monkeypatch.setattr("jaxnav.commands.simulate._drive", drive)
+    monkeypatch.setattr("jaxnav.commands.simulate.simulate._drive", drive)
     assert main(["simulate", *arguments, "--resume"]) == 0
     assert driven == []
     for others, told_px in (([], 1.0), (["--params", str(params), "--told-noise-px", "2"], 2.0)):

@@ -413,7 +413,7 @@ def test_a_bad_command_is_one_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("jaxnav.commands.study.configure_jax", lambda float64: None)
+    monkeypatch.setattr("jaxnav.commands.study.study.configure_jax", lambda float64: None)
     monkeypatch.chdir(tmp_path)
     Path("study.yaml").write_text("trials: 2\naxes:\n  view_angle_deg: [1]\n")
     code = main([word if word != "STUDY" else "study.yaml" for word in args])
@@ -426,7 +426,7 @@ def test_a_bad_command_is_one_line(
 def test_a_second_process_at_one_store_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("jaxnav.commands.study.configure_jax", lambda float64: None)
+    monkeypatch.setattr("jaxnav.commands.study.study.configure_jax", lambda float64: None)
     monkeypatch.chdir(tmp_path)
     Path("study.yaml").write_text("trials: 2\naxes:\n  view_angle_deg: [1]\n")
     Path("out").mkdir()

@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 
 from jaxnav.cli import main
-from jaxnav.commands.studies import load_study, shipped_configs
+from jaxnav.commands.study.studies import load_study, shipped_configs
 from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scores import Drives
@@ -225,8 +225,8 @@ def test_an_interrupted_study_says_how_to_go_on(
     def interrupted(store: object, progress: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("jaxnav.commands.study.configure_jax", lambda float64: None)
-    monkeypatch.setattr("jaxnav.commands.study.run_here", interrupted)
+    monkeypatch.setattr("jaxnav.commands.study.study.configure_jax", lambda float64: None)
+    monkeypatch.setattr("jaxnav.commands.study.study.run_here", interrupted)
     (tmp_path / "s.yaml").write_text("trials: 5\naxes: {range_m: [1]}\n")
     out = tmp_path / "s.zarr"
     command = ["study", "ambiguity", str(tmp_path / "s.yaml"), "--out", str(out), "--headless"]
@@ -279,6 +279,6 @@ def test_the_shipped_configs_are_studies(kind: str, capsys: pytest.CaptureFixtur
 def test_a_rig_has_as_many_cameras_as_it_has(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("jaxnav.commands.study.configure_jax", lambda float64: None)
+    monkeypatch.setattr("jaxnav.commands.study.study.configure_jax", lambda float64: None)
     (tmp_path / "s.yaml").write_text("trials: 1\nrig: qcar\naxes: {cameras: [1, 5]}\n")
     assert main(["study", "ambiguity", str(tmp_path / "s.yaml")]) == 2

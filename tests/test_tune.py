@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from jaxnav.arguments import TuneController
 from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.cli import main
+from jaxnav.commands.tune.arguments import TuneController
 from jaxnav.files import load_params
 from jaxnav.tuning.drive_loss import DriveLoss
 
@@ -65,7 +65,7 @@ def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch):
     """A better loss on what was held out; the same command has nothing left to do, another one is
     refused, and so are parameters that nothing can be learned about."""
     # A driver and a selector without a bank compile in a fifth of the time.
-    monkeypatch.setattr("jaxnav.commands.tune_data.MultiHypothesis", LowestReprojection)
+    monkeypatch.setattr("jaxnav.commands.tune.data.MultiHypothesis", LowestReprojection)
     few = (*FEW, "--selector", "lowest-reprojection", "--corner-noise-px", "0.3")
     start = tmp_path / "start.yaml"
     start.write_text("parameters:\n  motion.acceleration_density: [0.1, 0.1, 0.9]\n")

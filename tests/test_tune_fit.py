@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.commands.tune_fit import Fitting
+from jaxnav.commands.tune.fit import Fitting
 from jaxnav.errors import BadInput
 from jaxnav.files import load_params
 from jaxnav.files.locking import sole_writer

@@ -10,9 +10,9 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.commands.tune_drives import Event, driven, drives, sensed
-from jaxnav.commands.tune_recordings import GAP_S, navigator_of, tracks
-from jaxnav.commands.tune_sequences import Named, joined
+from jaxnav.commands.tune.drives import Event, driven, drives, sensed
+from jaxnav.commands.tune.recordings import GAP_S, navigator_of, tracks
+from jaxnav.commands.tune.sequences import Named, joined
 from jaxnav.datasets.recording import Recording
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput

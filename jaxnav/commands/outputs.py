@@ -5,48 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from jaxnav.arguments import (
-    Calibrate,
-    Demo,
-    Doctor,
-    Faults,
-    Locate,
-    Plot,
-    Reliability,
-    Replay,
-    Run,
-    Simulate,
-    Study,
-    Tune,
-    View,
-)
-from jaxnav.arguments.calibration import CALIBRATIONS, CalibrateIntrinsics
+from jaxnav.commands import COMMANDS, registered
+from jaxnav.commands.calibrate.arguments.intrinsics import CalibrateIntrinsics
 
-# Files of a command in its folder --out.
-_REPORT = ("report.png", "report.json")
-_MAP = ("markers.yaml", "trajectory.tum", *_REPORT)
-_IN_FOLDER: dict[type, tuple[str, ...]] = {
-    Demo: tuple(
-        f"{folder}{name}"
-        for folder in ("", "seed_*/")
-        for name in ("*.tum", "report.png", "mosaic.png", "summary.json")
-    ),
-    Replay: ("*.tum", "report.png", "summary.json"),
-    Reliability: ("reliability.png", "summary.json"),
-    Plot: ("drive.png", "map_*.png", "curves*.png", "reliability.png", "summary.json"),
-    Tune: ("params.yaml", "checkpoint.npz", "report.png", "summary.json"),
-    CALIBRATIONS["board"]: ("board.pdf", "board.png", "board.yaml", "report.json"),
-    CALIBRATIONS["check"]: _MAP,
-    CALIBRATIONS["intrinsics"]: ("camera.yaml", *_REPORT),
-    CALIBRATIONS["markers"]: _MAP,
-    CALIBRATIONS["odometry"]: ("vehicle.yaml", *_REPORT),
-    CALIBRATIONS["rig"]: ("rig.yaml", *_MAP),
-}
-# Those whose file must have its folder already: what can't be written shows before the work.
-_FILE: dict[type, str] = {Simulate: "json", Faults: "json", Doctor: "json", Locate: "out"}
-# Those that make a folder for it. What CalibrateConvert writes depends on what it reads: it asks
-# by itself.
-_ELSEWHERE: dict[type, str] = {View: "out", Study: "out", Run: "record"}
 _OUTPUTS = {"out", "json", "record"}  # fields that are no inputs
 
 
@@ -56,24 +17,21 @@ def check_outputs(command: Any) -> None:
     Raises:
         BadInput: names the flag.
     """
-    kind = type(command.what if isinstance(command, Calibrate) else command)
-    told = command.what if isinstance(command, Calibrate | Tune) else command
-    flag, outputs = "--out", list[Path]()
-    if kind in _IN_FOLDER:
-        names = _IN_FOLDER[kind]
-        if isinstance(command, Replay) and command.record:
+    one, flag, outputs = registered(command), "--out", list[Path]()
+    if one.in_folder:
+        names = one.in_folder
+        if one is COMMANDS["replay"] and command.record:
             names += ("replay.mcap",)
-        outputs = [path for name in names for path in told.out.glob(name)]
-    elif kind in _FILE or kind in _ELSEWHERE:
-        name = (_FILE | _ELSEWHERE)[kind]
-        flag, given = f"--{name}", getattr(told, name)
+        outputs = [path for name in names for path in command.out.glob(name)]
+    elif name := one.file or one.made:
+        flag, given = f"--{name}", getattr(command, name)
         outputs = [] if given is None else [given]
     if not outputs:
         return
     from jaxnav.files.writing import refuse_overwriting, require_writable  # takes JAX along
 
-    refuse_overwriting(flag, outputs, _inputs(told))
-    if kind in _FILE:
+    refuse_overwriting(flag, outputs, _inputs(command))
+    if one.file:
         require_writable(outputs[0])
 
 

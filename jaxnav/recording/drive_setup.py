@@ -54,7 +54,7 @@ from jaxnav.recording.message_fields import Flag
 SETUP_VERSION = 1
 # What the bits of a drive don't depend on.
 _WITHOUT = (
-    "arguments", "calibration", "commands", "datasets", "lanes", "plots", "simulation", "studies",
+    "calibration", "commands", "datasets", "lanes", "plots", "simulation", "studies",
     "testing", "tuning", "vehicles", "viewer",
 )  # fmt: skip
 # The others need what only a simulation has: another sensor, the truth.

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from jaxnav.commands.doctor_checks.findings import Finding
+from jaxnav.commands.doctor.findings import Finding
 
 
 def all_well(findings: Iterable[Finding]) -> bool:

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from jaxnav import files
-from jaxnav.arguments import Simulate
-from jaxnav.commands import simulate
-from jaxnav.commands.studies import load_study, summary_of
+from jaxnav.commands.simulate import simulate
+from jaxnav.commands.simulate.arguments import Simulate
+from jaxnav.commands.study.studies import load_study, summary_of
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.files.cameras import camera_file, named_by_topic

@@ -1,0 +1,1 @@
+"""What `jaxnav calibrate` can be told: one file for each of its commands."""

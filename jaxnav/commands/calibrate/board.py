@@ -1,0 +1,117 @@
+"""`jaxnav calibrate board`: a target on paper, at true scale."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from jaxnav import __version__
+from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.pages import PAPERS_MM, check_fit, largest
+from jaxnav.calibration.boards.sheets import sheet_of
+from jaxnav.commands.calibrate.arguments.boards import CalibrateBoard
+from jaxnav.commands.calibrate.boards import write_board
+from jaxnav.commands.process import configure_jax
+from jaxnav.detection import marker_cells
+from jaxnav.errors import BadInput
+from jaxnav.files import atomic_path, output_folder, write_json
+from jaxnav.models.markers import FAMILY_SIZES
+from jaxnav.plots.board import board_page
+
+# Longer and shorter side, in squares or tags.
+_GRIDS = {"charuco": (9, 6), "aprilgrid": (6, 4), "chessboard": (10, 7), "marker": (1, 1)}
+_ADVICE = (
+    "Print at 100 %: no scaling to the page, no borderless mode.",
+    "Measure both rulers. Where one is off, write the measured size into board.yaml; where the two "
+    "differ, use another printer.",
+    "Glue the print to something flat and stiff: a millimetre of bend is seen.",
+)
+
+
+def run(args: CalibrateBoard) -> int:
+    """Write the PDF, the PNG, what is on them, and how to check them."""
+    configure_jax(float64=True)
+    paper_mm = _paper_mm(args)
+    board = _board(args, paper_mm)
+    folder = output_folder(args.out)
+    words = str(board)
+    figure = board_page(sheet_of(board), words, paper_mm)
+    _save(figure, folder / "board.pdf", "pdf", args.dpi)
+    _save(figure, folder / "board.png", "png", args.dpi)
+    write_board(folder / "board.yaml", board)
+    write_json(
+        folder / "report.json",
+        {
+            "date": datetime.now(UTC).date().isoformat(),
+            "tool": f"jaxnav {__version__} calibrate board",
+            "board": words,
+            "points": len(board.points_board_m),
+            "ink_mm": [1e3 * board.width_m, 1e3 * board.height_m],
+            "paper_mm": paper_mm,
+            "dpi": args.dpi,
+            "advice": _ADVICE,
+        },
+    )
+    print(f"{words}, on {paper_mm[0]:g} x {paper_mm[1]:g} mm")
+    print(f"{folder / 'board.pdf'}, {folder / 'board.png'}, {folder / 'board.yaml'}")
+    print("\n".join(_ADVICE))
+    return 0
+
+
+def _paper_mm(args: CalibrateBoard) -> tuple[float, float]:
+    width_mm, height_mm = args.paper_size_mm or PAPERS_MM[args.paper.lower()]
+    lies = width_mm > height_mm
+    return (height_mm, width_mm) if args.landscape and not lies else (width_mm, height_mm)
+
+
+def _board(args: CalibrateBoard, paper_mm: tuple[float, float]) -> Board:
+    long, short = _GRIDS[args.target]
+    across, down = (long, short) if paper_mm[0] > paper_mm[1] else (short, long)
+    columns, rows = args.columns or across, args.rows or down
+    family = _family(args, columns * rows // 2)
+    # A metre a square, to be scaled, where no size is given.
+    size_m = 1.0 if args.size_mm is None else args.size_mm / 1e3
+    marker_m = 0.0
+    if args.marker_mm is not None:
+        marker_m = args.marker_mm / 1e3
+    elif args.target == "charuco":
+        cells = len(marker_cells(family, 0))
+        marker_m = size_m * cells / (cells + 2)
+    try:
+        board = Board(
+            args.target,
+            columns,
+            rows,
+            size_m,
+            marker_m=marker_m,
+            spacing=args.spacing if args.target == "aprilgrid" else 0.0,
+            family=family,
+            first_id=0 if args.target == "chessboard" else args.first_id,
+            border_cells=args.border_cells if args.target == "aprilgrid" else 1,
+        )
+        if args.size_mm is None:
+            board = largest(board, paper_mm)
+        check_fit(board, paper_mm)
+    except ValueError as error:
+        raise BadInput(args.target, str(error)) from None
+    return board
+
+
+def _family(args: CalibrateBoard, charuco_markers: int) -> str:
+    if args.target == "chessboard":
+        return ""
+    if args.family is not None:
+        if args.family not in FAMILY_SIZES:
+            raise BadInput("--family", f"must be one of {', '.join(FAMILY_SIZES)}")
+        return args.family
+    if args.target != "charuco":
+        return "tag36h11"
+    needed = args.first_id + charuco_markers
+    return next((f"4x4_{n}" for n in (50, 100, 250, 1000) if n >= needed), "4x4_1000")
+
+
+def _save(figure: Figure, path: Path, form: str, dpi: int) -> None:
+    # Without a date the same board is the same file.
+    metadata = {"CreationDate": None} if form == "pdf" else None
+    with atomic_path(path) as beside:
+        figure.savefig(beside, dpi=dpi, format=form, metadata=metadata)

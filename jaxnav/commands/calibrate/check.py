@@ -1,0 +1,109 @@
+"""`jaxnav calibrate check`: markers that are not where the map says."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxnav.calibration.rigs.calibrate import calibrate_rig
+from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.marker_check import Check, Verdict, checked
+from jaxnav.calibration.rigs.vehicle_frame import moved_world
+from jaxnav.commands.calibrate.arguments.check import CalibrateCheck as Arguments
+from jaxnav.commands.calibrate.data import RigData, gathered
+from jaxnav.commands.calibrate.report import provenance, summary, write_files
+from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.process import configure_jax
+from jaxnav.errors import BadInput, visible
+from jaxnav.files import output_folder, write_json
+from jaxnav.plots.rig import map_check
+
+EXIT_WRONG = 1
+
+
+def run(args: Arguments) -> int:
+    """Look, write, and name what is wrong."""
+    configure_jax(float64=True)
+    data = gathered(
+        args.recordings, args.rig, args.markers_file, None, args.family, only_known=True
+    )
+    if len(data.known) < 2:
+        raise BadInput(
+            args.markers_file or args.recordings[0],
+            "one marker of the map was seen, two at least must be: nothing else can contradict it",
+        )
+    counts = np.bincount(data.views.marker, minlength=len(data.keys))
+    anchor = max(data.known, key=lambda index: int(counts[index]))
+    given = inverted(np.asarray(data.rig.Ts_camera_vehicle.as_matrix(), float))
+    found = calibrate_rig(data.views, data.rig, {anchor: data.known[anchor]}, None)
+    check = checked(
+        found, data.views, data.rig, data.known, args.tolerance_m, np.deg2rad(args.tolerance_deg)
+    )
+    found = moved_world(found, check.T_map_world)
+    out = output_folder(args.out)
+    calibrated = provenance(data, "check")
+    report = summary(data, found, given, calibrated) | {
+        "agreeing": check.agreeing,
+        "verdicts": {_name(data, i): _told(verdict) for i, verdict in check.verdicts.items()},
+    }
+    write_files(out, data, found, calibrated, with_rig=False, all_found=True)
+    write_json(out / "report.json", report)
+    mapped = [int(index) for index in np.flatnonzero(found.mapped)]
+    figure = map_check(
+        given=np.stack([data.known[index] for index in mapped]),
+        found=found.Ts_world_marker[mapped],
+        size_m=data.views.size_m[mapped],
+        ids=[data.keys[index][1] for index in mapped],
+        wrong=[not check.verdicts[index].right for index in mapped],
+    )
+    save_figure(figure, out / "report.png")
+    print(_text(data, check))
+    print(f"the map as it was found, and the report, in {visible(out)}")
+    return 0 if all(verdict.right for verdict in check.verdicts.values()) else EXIT_WRONG
+
+
+def _name(data: RigData, index: int) -> str:
+    family, marker_id = data.keys[index]
+    return f"{family} {marker_id}"
+
+
+def _told(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "right": verdict.right,
+        "sightings": verdict.seen,
+        "apart_m": verdict.apart_m,
+        "apart_deg": None if verdict.apart_rad is None else np.rad2deg(verdict.apart_rad),
+        "size_m": verdict.size_m,
+        "wrong_size": verdict.wrong_size,
+        "moved_m": verdict.moved_m,
+    }
+
+
+def _text(data: RigData, check: Check) -> str:
+    lines = [f"{check.agreeing} of {len(check.verdicts)} markers agree with each other"]
+    for index, verdict in check.verdicts.items():
+        lines += [
+            f"  marker {data.keys[index][1]}: {said}" for said in _sentences(data, index, verdict)
+        ]
+    if all(verdict.right for verdict in check.verdicts.values()):
+        lines.append("all markers that could be linked are where the map says")
+    if check.agreeing < 2:
+        lines.append("no two markers agree: which of them is right can't be told")
+    return "\n".join(lines)
+
+
+def _sentences(data: RigData, index: int, verdict: Verdict) -> list[str]:
+    told = []
+    if verdict.wrong_size and verdict.size_m is not None:
+        told.append(
+            f"is {verdict.size_m:.4g} m large, the map says {data.views.size_m[index]:.4g} m"
+        )
+    if verdict.moved_m:
+        told.append(f"moved by {verdict.moved_m:.3g} m while it was watched")
+    if verdict.apart_m is None and not told:
+        told.append(f"seen {verdict.seen} times, nothing links it to the others")
+    if verdict.wrong and verdict.apart_m is not None and verdict.apart_rad is not None:
+        told.append(
+            f"is {verdict.apart_m:.3g} m and {np.rad2deg(verdict.apart_rad):.3g} deg from where "
+            "the map says: it has moved, or was entered wrongly"
+        )
+    return told

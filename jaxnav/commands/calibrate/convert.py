@@ -1,0 +1,193 @@
+"""`jaxnav calibrate convert`: cameras and marker maps from one tool's file to another's."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from jaxnav.commands.calibrate.arguments.convert import CalibrateConvert
+from jaxnav.errors import BadInput, visible
+from jaxnav.files import output_folder, wpilib
+from jaxnav.files.cameras import camera_file, choose_camera, named_by_topic
+from jaxnav.files.figures import CameraFigures, MarkerFigures
+from jaxnav.files.kalibr import camchain_text
+from jaxnav.files.markers import MarkerFile, markers_left_out, markers_text
+from jaxnav.files.opencv_storage import opencv_text
+from jaxnav.files.photonvision import photonvision_text
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import place, rig_text
+from jaxnav.files.ros_camera_info import camera_info_text
+from jaxnav.files.validation import validate
+from jaxnav.files.writing import atomic_write_all, refuse_overwriting
+
+_MANY: dict[str, Callable[[Sequence[CameraFigures]], str]] = {
+    "jaxnav": rig_text,
+    "kalibr": camchain_text,
+}
+_ONE: dict[str, Callable[[CameraFigures], str]] = {
+    "ros": camera_info_text,
+    "opencv": opencv_text,
+    "photonvision": photonvision_text,
+}
+_SUFFIXES = {"photonvision": (".json",), "wpilib": (".json",)}
+_YAML = (".yaml", ".yml")
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What was read: cameras or markers, of which format, and what is not carried over."""
+
+    format: str
+    cameras: tuple[CameraFigures, ...]
+    markers: tuple[MarkerFigures, ...]
+    left_out: tuple[str, ...]
+
+
+def run(args: CalibrateConvert) -> int:
+    """Read, refuse or write, and tell what was left out."""
+    source = _read(args)
+    _refuse_flags(args, source)
+    if source.format == args.to:
+        raise BadInput(args.source, f"is {args.to}'s already: nothing to convert")
+    if source.markers:
+        told, left_out = _write_markers(args, source)
+    else:
+        told, left_out = _write_cameras(args, source)
+    for path, what in told.items():
+        print(f"{visible(path)}: {what}")
+    if left_out:
+        print(f"not carried over: {', '.join(left_out)}")
+    return 0
+
+
+def _read(args: CalibrateConvert) -> _Source:
+    path = args.source
+    data = read_mapping(path)
+    if "markers" in data:
+        map_file = validate(MarkerFile, data, path)
+        markers = tuple(entry.figures() for entry in map_file.markers)
+        return _Source("jaxnav", (), markers, tuple(markers_left_out(map_file)))
+    if wpilib.is_layout(data):
+        size_m = args.marker_size_m or wpilib.SIZE_M
+        markers = tuple(wpilib.layout_figures(path, data, size_m, args.family or wpilib.FAMILY))
+        return _Source("wpilib", (), markers, tuple(wpilib.layout_left_out(data)))
+    file = named_by_topic(path, data, camera_file(path, data))
+    return _Source(file.format, file.cameras, (), file.left_out)
+
+
+def _refuse_flags(args: CalibrateConvert, source: _Source) -> None:
+    """A flag that would do nothing is a mistake."""
+    layout, cameras = "goes with a WPILib layout as SOURCE", "goes with cameras as SOURCE"
+    for flag, given, fits, problem in (
+        ("--marker-size-m", args.marker_size_m, source.format == "wpilib", layout),
+        ("--family", args.family, source.format == "wpilib", layout),
+        ("--field-size-m", args.field_size_m, args.to == "wpilib", "goes with --to wpilib"),
+        ("--camera-name", args.camera_name, bool(source.cameras), cameras),
+        ("--position-m", args.position_m, bool(source.cameras), cameras),
+        ("--position-m", args.position_m, args.to in _MANY, "goes with --to jaxnav or kalibr"),
+    ):
+        if given is not None and not fits:
+            raise BadInput(flag, problem)
+
+
+def _write_markers(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, str], list[str]]:
+    if args.to not in ("jaxnav", "wpilib"):
+        raise BadInput(args.source, f"holds markers, and {args.to} does not: --to jaxnav or wpilib")
+    markers, left_out = source.markers, list(source.left_out)
+    count = f"{len(markers)} marker{'s' if len(markers) > 1 else ''}"
+    if args.to == "jaxnav":
+        text, told = markers_text(markers), f"{count} of {markers[0].family}, "
+        told += f"{markers[0].size_m:g} m, as jaxnav's detectors see them"
+    else:
+        length, width = args.field_size_m or wpilib.extent_m(markers)
+        if min(length, width) <= 0:
+            raise BadInput("--field-size-m", "missing: the map has no extent to take it from")
+        text = wpilib.layout_text(markers, (length, width))
+        told = f"{count} on a field of {length:g} x {width:g} m"
+        left_out.append(f"family {markers[0].family}")
+        left_out.append(f"size_m {markers[0].size_m!r} (--marker-size-m on the way back)")
+    _require_suffix(args.to, args.out)
+    _write(args.source, {args.out: text})
+    return {args.out: told}, left_out
+
+
+def _write_cameras(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, str], list[str]]:
+    if args.to == "wpilib":
+        raise BadInput(args.source, "holds cameras, and a WPILib layout holds markers")
+    cameras = _chosen(args, source)
+    left_out = list(source.left_out)
+    if args.to in _MANY:
+        _require_suffix(args.to, args.out)
+        contents = {args.out: _MANY[args.to](cameras)}
+        told = {args.out: ", ".join(_told(camera) for camera in cameras)}
+    else:
+        write = _ONE[args.to]
+        paths = _paths(args, cameras)
+        contents = {path: write(camera) for path, camera in zip(paths, cameras, strict=True)}
+        told = {path: _told(camera) for path, camera in zip(paths, cameras, strict=True)}
+        placed = [camera.name for camera in cameras if camera.T_camera_vehicle is not None]
+        if placed:
+            left_out.append(f"where on the vehicle {', '.join(placed)} {_is(placed)}")
+        bare = [camera.name for camera in cameras if camera.lens == "none"]
+        if bare:
+            left_out.append(f"that {', '.join(bare)} {_is(bare)} without lens: written as zeros")
+        renamed = [c.name for c, path in zip(cameras, paths, strict=True) if c.name != path.stem]
+        if renamed and args.to == "photonvision":
+            left_out.append(f"the name{'s' if len(renamed) > 1 else ''} {', '.join(renamed)}")
+    _write(args.source, contents)
+    return told, left_out
+
+
+def _chosen(args: CalibrateConvert, source: _Source) -> tuple[CameraFigures, ...]:
+    """The cameras that are asked for, under the names and at the places that are given."""
+    cameras = source.cameras
+    if args.camera_name is not None:
+        if len(cameras) > 1:
+            cameras = (choose_camera(args.source, cameras, args.camera_name),)
+        else:
+            cameras = (replace(cameras[0], name=args.camera_name),)
+    if args.position_m is not None:
+        if len(cameras) > 1:
+            raise BadInput("--position-m", "is of one camera: choose it with --camera-name")
+        if cameras[0].T_camera_vehicle is not None:
+            raise BadInput("--position-m", f"{args.source} says where the camera is already")
+        angles_deg = (args.yaw_deg, args.elevation_deg, args.roll_deg)
+        cameras = (replace(cameras[0], T_camera_vehicle=place(args.position_m, angles_deg)),)
+    return cameras
+
+
+def _paths(args: CalibrateConvert, cameras: Sequence[CameraFigures]) -> list[Path]:
+    """A file for each camera: --out itself, or in it."""
+    suffixes = _SUFFIXES.get(args.to, _YAML)
+    if len(cameras) == 1 and args.out.suffix and not args.out.is_dir():
+        _require_suffix(args.to, args.out)
+        return [args.out]
+    if args.out.suffix in (*_YAML, ".json"):
+        problem = f"{args.source} has {len(cameras)} cameras, and {args.to} takes a file each: "
+        raise BadInput("--out", problem + "name a folder, or choose one with --camera-name")
+    stems = [re.sub(r"[^\w.\-]+", "_", camera.name).strip("._") for camera in cameras]
+    if not all(stems) or len({stem.lower() for stem in stems}) < len(stems):
+        raise BadInput(args.source, f"{', '.join(c.name for c in cameras)} make no file names")
+    return [args.out / f"{stem}{suffixes[0]}" for stem in stems]
+
+
+def _require_suffix(to: str, path: Path) -> None:
+    suffixes = _SUFFIXES.get(to, _YAML)
+    if path.suffix.lower() not in suffixes:
+        raise BadInput("--out", f"must be a file that ends in {suffixes[0]}, got {path}")
+
+
+def _write(source: Path, contents: dict[Path, str]) -> None:
+    refuse_overwriting("--out", contents, [source])
+    for folder in {path.parent for path in contents}:
+        output_folder(folder)
+    atomic_write_all(contents)
+
+
+def _told(camera: CameraFigures) -> str:
+    width, height = camera.image_size_px
+    return f"{camera.name} {width} x {height} {camera.lens}"
+
+
+def _is(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"

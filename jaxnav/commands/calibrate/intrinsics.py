@@ -1,0 +1,188 @@
+"""`jaxnav calibrate intrinsics`: the lens of a camera, or of several."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxnav import __version__
+from jaxnav.calibration.boards.images import CollectedViews
+from jaxnav.calibration.lenses.checks import cells, reach, rim_sigma_px, tilts_deg
+from jaxnav.calibration.lenses.images import calibrate_images
+from jaxnav.calibration.lenses.intrinsics import LensCalibration
+from jaxnav.commands.calibrate.arguments.intrinsics import CalibrateIntrinsics
+from jaxnav.commands.calibrate.boards import read_board
+from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.process import configure_jax
+from jaxnav.errors import BadInput
+from jaxnav.files import output_folder, write_json
+from jaxnav.files.provenance import Calibrated, calibrated_now
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import (
+    CameraEntry,
+    CameraSigma,
+    RigFile,
+    load_rig,
+    rig_data,
+    save_rig,
+)
+from jaxnav.files.validation import validate
+from jaxnav.models.camera import LENS_COEFFICIENTS
+from jaxnav.plots.lens import lens_report
+
+# Where a camera of such a name looks, until somebody says where it is.
+_YAWS_DEG = {"front": 0.0, "left": 90.0, "rear": 180.0, "back": 180.0, "right": -90.0}
+
+
+def run(args: CalibrateIntrinsics) -> int:
+    """Find the board, fit the lenses, write what was found."""
+    configure_jax(float64=True)
+    board = read_board(args.board)
+    placed = _placed(args.rig)
+    unknown = [name for name in args.by_camera if placed and name not in placed]
+    if unknown:
+        raise BadInput(
+            args.rig, f"has no camera {unknown[0]!r}: expected one of {', '.join(placed)}"
+        )
+    folder = output_folder(args.out)
+    collected: dict[str, CollectedViews] = {}
+    found: dict[str, LensCalibration] = {}
+    for name, sources in args.by_camera.items():
+        with tqdm(unit=" step", desc=name, disable=args.headless) as bar:
+
+            def tell(stage: str, bar: tqdm = bar) -> None:
+                bar.set_postfix_str(stage, refresh=False)
+                bar.update()
+
+            collected[name], found[name] = calibrate_images(
+                board, sources, args.lens, args.max_views, tell, args.headless
+            )
+
+    files = [args.board, *(file for one in collected.values() for file in one.files)]
+    calibrated = calibrated_now(f"jaxnav {__version__} calibrate intrinsics", files)
+    entries = {name: _entry(name, one, placed.get(name)) for name, one in found.items()}
+    rig = RigFile(cameras=list((placed | entries).values()))
+    sigmas = [entry.sigma or CameraSigma() for entry in rig.cameras]
+    save_rig(folder / "camera.yaml", rig.rig(), calibrated, sigmas)
+    write_json(folder / "report.json", _report(str(board), calibrated, collected, found))
+    save_figure(lens_report(found), folder / "report.png")
+    for name, one in found.items():
+        print(_text(name, one, collected[name]))
+    if not placed:
+        print("where the cameras are is not measured: write it into camera.yaml, or give --rig")
+    print(", ".join(str(folder / name) for name in ("camera.yaml", "report.json", "report.png")))
+    return 0
+
+
+def _placed(path: Path | None) -> dict[str, CameraEntry]:
+    """The cameras of a rig file, by name."""
+    if path is None:
+        return {}
+    data = read_mapping(path)
+    # A camchain has no sigmas to keep.
+    if "cameras" not in data:
+        data = rig_data(load_rig(path))
+    return {entry.name: entry for entry in validate(RigFile, data, path).cameras}
+
+
+def _entry(name: str, found: LensCalibration, placed: CameraEntry | None) -> CameraEntry:
+    """A camera of a rig file, at its place."""
+    fit = found.fit
+    coefficients = slice(4, 4 + LENS_COEFFICIENTS[fit.lens])
+    before = placed.sigma if placed and placed.sigma else CameraSigma()
+    update: dict[str, Any] = {
+        "lens": fit.lens,
+        "focal_px": fit.parameters[:2].tolist(),
+        "center_px": fit.parameters[2:4].tolist(),
+        "distortion": fit.parameters[coefficients].tolist(),
+        "image_size_px": list(fit.views.image_size_px),
+        "sigma": CameraSigma(
+            focal_px=fit.sigma[:2].tolist(),
+            center_px=fit.sigma[2:4].tolist(),
+            distortion=fit.sigma[coefficients].tolist() or None,
+            position_m=before.position_m,
+            rotation_deg=before.rotation_deg,
+        ),
+    }
+    if placed is not None:
+        return placed.model_copy(update=update)
+    yaw_deg = _YAWS_DEG.get(name, 0.0)
+    return CameraEntry(name=name, position_m=[0.0, 0.0, 0.0], yaw_deg=yaw_deg, **update)
+
+
+def _report(
+    board: str,
+    calibrated: Calibrated,
+    collected: Mapping[str, CollectedViews],
+    found: Mapping[str, LensCalibration],
+) -> dict[str, Any]:
+    several = len(found) > 1
+    return calibrated.model_dump() | {
+        "board": board,
+        "cameras": {name: _camera_report(one, collected[name]) for name, one in found.items()},
+        "advice": [
+            f"{name}: {sentence}" if several else sentence
+            for name, one in found.items()
+            for sentence in one.advice
+        ],
+    }
+
+
+def _camera_report(found: LensCalibration, collected: CollectedViews) -> dict[str, Any]:
+    fit, seen = found.fit, cells(found.fit)
+    median_deg, spread_deg = tilts_deg(fit)
+    return {
+        "lens": fit.lens,
+        "image_size_px": fit.views.image_size_px,
+        "reprojection_rms_px": fit.rms_px,
+        "corner_sigma_px": fit.sigma_px,
+        "corners": int(fit.used.sum()),
+        "parameters": {
+            name: {"value": float(value), "sigma": float(sigma), "held_at_zero": name in fit.fixed}
+            for name, value, sigma in zip(fit.names, fit.parameters, fit.sigma, strict=False)
+        },
+        "border_sigma_px": rim_sigma_px(fit),
+        "held_out_sigma_px": found.held_out_px,
+        "views": {
+            "given": found.given,
+            "in_the_fit": int(np.sum(fit.view_weights > 0)),
+            "sigma_px": {
+                view.name: float(sigma_px)
+                for view, sigma_px in zip(fit.views.views, fit.view_sigma_px, strict=True)
+            },
+            "left_out": found.left_out,
+            "downweighted": found.downweighted,
+            "duplicates": dict(collected.duplicates),
+            "without_board": collected.without_board,
+        },
+        "coverage": {
+            "corners_in_cells": seen.corners,
+            "reach": reach(fit),
+            "median_tilt_deg": median_deg,
+            "largest_angle_between_views_deg": spread_deg,
+        },
+        "systematic_residual_px": seen.systematic_px,
+        "findings": found.findings,
+        "advice": found.advice,
+    }
+
+
+def _text(name: str, found: LensCalibration, collected: CollectedViews) -> str:
+    fit = found.fit
+    used, given = int(np.sum(fit.view_weights > 0)), found.given + len(collected.without_board)
+    lines = [
+        f"{name}: {fit.lens}, {used} of {given} views, {int(fit.used.sum())} corners, "
+        f"RMS {fit.rms_px:.3f} px, corner noise {fit.sigma_px:.3f} px"
+    ]
+    for number, parameter in enumerate(fit.names):
+        value, sigma = fit.parameters[number], fit.sigma[number]
+        sure = "held at zero" if parameter in fit.fixed else f"+- {sigma:.2g}"
+        lines.append(f"  {parameter:>2} {value:12.6g} {sure}")
+    lines += [f"  left out: {view}: {why}" for view, why in found.left_out.items()]
+    lines += [f"  left out: {view}: repeats {twin}" for view, twin in collected.duplicates]
+    lines += [f"  counts {weight:.2g}: {view}" for view, weight in found.downweighted.items()]
+    lines += [f"  note: {sentence}" for sentence in found.findings]
+    lines += [f"  next: {sentence}" for sentence in found.advice]
+    return "\n".join(lines)

@@ -1,0 +1,117 @@
+"""`jaxnav calibrate odometry`: speed scale, steering, wheelbase and the cameras' delay."""
+
+import dataclasses
+import math
+from importlib.metadata import version
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
+from jaxnav.calibration.odometry.model import NAMES
+from jaxnav.commands.calibrate.arguments.odometry import CalibrateOdometry as Arguments
+from jaxnav.commands.calibrate.odometry_recordings import Recorded, read_recordings
+from jaxnav.commands.pictures import corners_in_world, save_figure
+from jaxnav.commands.process import configure_jax
+from jaxnav.errors import visible
+from jaxnav.files import output_folder, save_vehicle, write_json
+from jaxnav.files.provenance import Calibrated, calibrated_now
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.origin import planar_in_world
+from jaxnav.plots.odometry import odometry_report
+
+
+def run(args: Arguments) -> int:
+    """Calibrate, write, and say what was found."""
+    configure_jax(float64=True)
+    recorded = read_recordings(args)
+    before = {name: float(getattr(recorded.vehicle, name)) for name in NAMES}
+    with tqdm(unit="step", disable=args.headless, leave=False) as bar:
+        found = calibrate_odometry(
+            recorded.drives,
+            recorded.rig,
+            recorded.markers,
+            before,
+            args.fix,
+            args.wheelbase_sigma_m,
+            bar.update,
+        )
+    calibrated = calibrated_now(f"jaxnav {version('jaxnav')} calibrate odometry", recorded.files)
+    out = output_folder(args.out)
+    save_vehicle(
+        out / "vehicle.yaml", calibrated_vehicle(recorded.vehicle, found), calibrated, found.sigma
+    )
+    write_json(out / "report.json", report(args, recorded, found, calibrated))
+    origin_m = recorded.markers.origin_m
+    drawn = dataclasses.replace(found, poses=planar_in_world(found.poses, origin_m))
+    figure = odometry_report(drawn, corners_in_world(recorded.markers), table(found))
+    save_figure(figure, out / "report.png")
+    print(f"{head(found)}\n{table(found)}")
+    if left_out := sum(drive.left_out for drive in recorded.drives):
+        print(f"left out: {left_out} readings and views that are not finite, or of no car")
+    for sentence in found.advice:
+        print(f"next: {sentence}")
+    print(f"vehicle.yaml, report.json and report.png in {visible(out)}")
+    return 0
+
+
+def calibrated_vehicle(vehicle: Vehicle, found: OdometryCalibration) -> Vehicle:
+    """The vehicle with the figures found."""
+    values: dict[str, Any] = dict(found.value)
+    values["wheelbase_m"] = jnp.asarray(values["wheelbase_m"], vehicle.wheelbase_m.dtype)
+    return dataclasses.replace(vehicle, **values)
+
+
+def report(
+    args: Arguments, recorded: Recorded, found: OdometryCalibration, calibrated: Calibrated
+) -> dict[str, Any]:
+    """What report.json holds."""
+    speed_mps, steering_rad = np.abs(found.read[:, 0]), found.read[:, 1]
+    return calibrated.model_dump() | {
+        "recordings": list(args.recordings),
+        "reprojection_rms_px": found.rms_px,
+        "chi2_per_dof": found.chi2_per_dof,
+        "parameters": {
+            name: {
+                "value": found.value[name],
+                "sigma": found.sigma.get(name),
+                "before": found.before[name],
+                "kept": found.fixed.get(name),
+            }
+            for name in NAMES
+        },
+        "correlation": {"of": list(found.sigma), "matrix": found.correlation},
+        "reading_sigma": found.reading_sigma._asdict(),
+        "coverage": {
+            "duration_s": found.duration_s,
+            "way_m": found.way_m,
+            "views": len(found.outliers),
+            "outliers": int(found.outliers.sum()),
+            "speed_read_mps": [float(np.median(speed_mps)), float(np.percentile(speed_mps, 95))],
+            "steering_read_rad": [float(q) for q in np.percentile(steering_rad, (5, 95))],
+            "markers": sorted({recorded.markers.ids[m] for d in recorded.drives for m in d.marker}),
+            "cameras": sorted({recorded.rig.names[c] for d in recorded.drives for c in d.camera}),
+        },
+        "advice": list(found.advice),
+    }
+
+
+def head(found: OdometryCalibration) -> str:
+    """What was driven, and how well it is explained."""
+    return (
+        f"{found.way_m:.1f} m in {found.duration_s:.0f} s, {len(found.outliers)} views "
+        f"({int(found.outliers.sum())} far off), {found.rms_px:.2f} px RMS, chi-square "
+        f"{found.chi2_per_dof:.2f} per degree of freedom"
+    )
+
+
+def table(found: OdometryCalibration) -> str:
+    """A line for each figure: before, found, one sigma."""
+    lines = [f"{'':20}{'before':>10}{'found':>11}{'sigma':>10}"]
+    for name in NAMES:
+        sigma = found.sigma.get(name, math.nan)
+        told = f"{sigma:10.5f}" if name in found.sigma else f"{'kept':>10}"
+        lines.append(f"{name:20}{found.before[name]:10.4f}{found.value[name]:11.5f}{told}")
+    return "\n".join(lines)

@@ -1,0 +1,168 @@
+"""Recorded drives as what odometry is calibrated from."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxnav.calibration.odometry.drive import Drive
+from jaxnav.commands.calibrate.arguments.odometry import CalibrateOdometry as Arguments
+from jaxnav.commands.reading import read_shown
+from jaxnav.datasets.ros_drives import read_ros_drive
+from jaxnav.detection import Detections
+from jaxnav.detection.observe import observe
+from jaxnav.errors import BadInput
+from jaxnav.files import load_markers, load_rig, load_topics, load_vehicle
+from jaxnav.files.ranges import is_within
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.recording.drive_setup import DriveSetup
+
+_NONE = Detections.concatenate([])
+_SHARED = ("rig", "markers", "vehicle")  # of all recordings, as their headers have them
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Drives, and what they were driven with.
+
+    Attributes:
+        files: all that was read, in an order that does not change.
+    """
+
+    drives: tuple[Drive, ...]
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle
+    files: tuple[Path, ...]
+
+
+def read_recordings(args: Arguments) -> Recorded:
+    """Everything that the command is given. The process has its precision already.
+
+    Raises:
+        BadInput: naming file or flag.
+    """
+    given = [path for path in (args.rig, args.markers_file, args.vehicle) if path is not None]
+    files = (*(file for path in args.recordings for file in _files(path)), *given)
+    return _ros(args, files) if args.topics is not None else _own(args, files)
+
+
+def _own(args: Arguments, files: tuple[Path, ...]) -> Recorded:
+    flags = dict(zip(_SHARED, (args.rig, args.markers_file, args.vehicle), strict=True))
+    logs = []
+    for path in args.recordings:
+        if path.is_dir() or path.suffix != ".mcap":
+            problem = "is no recording of jaxnav (.mcap): a ROS bag needs --topics"
+            raise BadInput(path, problem)
+        logs.append(read_shown(path))
+    for log in logs[1:]:
+        for key in _SHARED:
+            if flags[key] is None and log.header.get(key) != logs[0].header.get(key):
+                flag = "--markers-file" if key == "markers" else f"--{key}"
+                problem = f"was driven with another {key} than {logs[0].path}: say which by {flag}"
+                raise BadInput(log.path, problem)
+    setup = DriveSetup.of_header(logs[0].header, logs[0].path)
+    rig = setup.rig if args.rig is None else load_rig(args.rig)
+    markers = setup.markers if args.markers_file is None else load_markers(args.markers_file)
+    vehicle = setup.vehicle if args.vehicle is None else load_vehicle(args.vehicle)
+    drives = [
+        drive_of(str(log.path), log.inputs, rig, markers, setup.corner_sigma_px) for log in logs
+    ]
+    return Recorded(tuple(drives), rig, markers, vehicle, files)
+
+
+def _ros(args: Arguments, files: tuple[Path, ...]) -> Recorded:
+    def needed(flag: str, path: Path | None, load: Callable[[Path], Any]) -> Any:
+        if path is None:
+            raise BadInput(flag, f"missing: a ROS bag ({args.recordings[0]}) does not hold it")
+        return load(path)
+
+    assert args.topics is not None
+    rig: CameraRig = needed("--rig", args.rig, load_rig)
+    markers: MarkerMap = needed("--markers-file", args.markers_file, load_markers)
+    vehicle: Vehicle = needed("--vehicle", args.vehicle, load_vehicle)
+    topics = load_topics(args.topics)
+    drives = []
+    for path in args.recordings:
+        inputs = read_ros_drive(path, topics, rig, markers, vehicle, args.corner_backend)
+        drives.append(drive_of(str(path), inputs, rig, markers))
+    return Recorded(tuple(drives), rig, markers, vehicle, (*files, args.topics))
+
+
+def drive_of(
+    name: str,
+    inputs: Iterable[Input],
+    rig: CameraRig,
+    markers: MarkerMap,
+    corner_sigma_px: float | None = None,
+) -> Drive:
+    """The readings and views among the inputs of a pilot, as the sensors gave them.
+
+    Args:
+        corner_sigma_px: of every corner along one axis; by default as each detection says.
+    """
+    left_out = 0
+    readings: list[tuple[int, float, float]] = []
+    views: list[tuple[int, int, int, np.ndarray, np.ndarray]] = []
+    looked: set[tuple[int, int]] = set()
+    for given in inputs:
+        if given.odometry is not None and given.odometry.valid:
+            read = given.odometry
+            if _is_sound(read):
+                readings.append((read.stamp_ns, read.speed_mps, read.steering_rad))
+            else:
+                left_out += 1
+        for frame in given.frames:
+            key = frame.camera, frame.stamp_ns
+            if not frame.detections or key in looked or not 0 <= frame.camera < len(rig):
+                continue
+            looked.add(key)
+            found = [_NONE] * len(rig)
+            found[frame.camera] = frame.detections
+            seen = observe(found, markers)
+            for marker in np.flatnonzero(seen.visible[frame.camera]):
+                sigma_px = seen.sigma_px[frame.camera, marker]
+                if corner_sigma_px is not None:
+                    sigma_px = np.full(4, corner_sigma_px)
+                corners_px = seen.corners_px[frame.camera, marker]
+                known = is_within("corner_px", corners_px).all() and frame.stamp_ns > 0
+                if known and is_within("seen_sigma_px", sigma_px).all():
+                    views.append((frame.stamp_ns, frame.camera, int(marker), corners_px, sigma_px))
+                else:
+                    left_out += 1
+    read_columns = _columns(readings, 3)
+    columns = _columns(views, 5)
+    return Drive(
+        name,
+        np.array(read_columns[0], np.int64),
+        np.array(read_columns[1], float),
+        np.array(read_columns[2], float),
+        np.array(columns[0], np.int64),
+        np.array(columns[1], int),
+        np.array(columns[2], int),
+        np.array(columns[3], float).reshape(-1, 4, 2),
+        np.array(columns[4], float).reshape(-1, 4),
+        left_out,
+    )
+
+
+def _is_sound(read: Odometry) -> bool:
+    sound = is_within("speed_mps", read.speed_mps) and is_within("steering_rad", read.steering_rad)
+    return bool(sound) and read.stamp_ns > 0
+
+
+def _columns(rows: Sequence[tuple[Any, ...]], count: int) -> list[tuple[Any, ...]]:
+    return list(zip(*rows, strict=True)) if rows else [()] * count
+
+
+def _files(path: Path) -> list[Path]:
+    """A recording's files: a ROS 2 bag is a folder of some."""
+    if not path.exists():
+        raise BadInput(path, "there is no such recording")
+    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]

@@ -1,0 +1,169 @@
+"""`jaxnav calibrate rig`: where the cameras are, and the markers with them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxnav.calibration.rigs.calibrate import RigCalibration, calibrate_rig
+from jaxnav.calibration.rigs.driven_frame import driven_frame
+from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.marker_check import sizes_m
+from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven, moved_to_places
+from jaxnav.commands.calibrate.arguments.rig import CalibrateRig as Arguments
+from jaxnav.commands.calibrate.data import RigData, gathered
+from jaxnav.commands.calibrate.report import (
+    found_markers,
+    provenance,
+    summary,
+    text,
+    write_files,
+)
+from jaxnav.commands.pictures import corners_in_world, save_figure
+from jaxnav.commands.process import configure_jax
+from jaxnav.errors import BadInput, visible
+from jaxnav.files import calib_dir, load_vehicle, output_folder, write_json
+from jaxnav.plots.rig import rig_report
+
+_WRONG_SCALE = 3.0  # between how far apart cameras are and were said to be
+_WRONG_SIZE = 1.5  # between how large a marker looks and was said to be
+_APART_M = 0.05  # a given distance that says anything
+
+
+def run(args: Arguments) -> int:
+    """Find, write, and say in a few lines what came of it."""
+    configure_jax(float64=True)
+    data = gathered(args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family)
+    names = data.rig.names
+    ties = ("places", "drive", *names)
+    if args.vehicle_frame not in ties:
+        problem = f"must be one of {', '.join(ties)}, got {args.vehicle_frame!r}"
+        raise BadInput("--vehicle-frame", problem)
+    wheelbase_m = _wheelbase_m(args, data) if args.vehicle_frame == "drive" else 0.0
+    reference = _reference_camera(args, data)
+    given = inverted(np.asarray(data.rig.Ts_camera_vehicle.as_matrix(), float))
+    found = calibrate_rig(data.views, data.rig, data.known, reference, args.refine_lenses)
+    _refuse_nonsense(args, data, found, given)
+    found = _tied(args, data, found, given, wheelbase_m)
+    publish(args.out, data, found, given, with_rig=True)
+    return 0
+
+
+def publish(
+    folder: Path, data: RigData, found: RigCalibration, given: np.ndarray, with_rig: bool
+) -> None:
+    """Write all files, and say in a few lines what they hold.
+
+    Args:
+        given: (C, 4, 4) T_vehicle_camera before.
+        with_rig: whether cameras were looked for, or markers alone.
+
+    Raises:
+        BadInput: they can't be written.
+    """
+    out = output_folder(folder)
+    calibrated = provenance(data, "rig" if with_rig else "markers")
+    report = summary(data, found, given, calibrated)
+    write_files(out, data, found, calibrated, with_rig)
+    write_json(out / "report.json", report)
+    _write_picture(out, data, found, given)
+    print(text(report))
+    print(f"{'rig, markers' if with_rig else 'markers'} and report in {visible(out)}")
+
+
+def _write_picture(out: Path, data: RigData, found: RigCalibration, given: np.ndarray) -> None:
+    markers, mapped = found_markers(data, found)
+    views = found.views
+    figure = rig_report(
+        names=data.rig.names,
+        image_sizes_px=data.rig.image_sizes_px,
+        camera=views.camera,
+        centers_px=views.corners_px.mean(axis=1),
+        residuals_px=found.residuals_px.mean(axis=1),
+        weight=found.weight,
+        corners_world_m=corners_in_world(markers),
+        marker_ids=[data.keys[index][1] for index in mapped],
+        path_m=found.Ts_world_vehicle[:, :3, 3],
+        Ts_vehicle_camera=found.Ts_vehicle_camera,
+        given=given,
+    )
+    save_figure(figure, out / "report.png")
+
+
+def _reference_camera(args: Arguments, data: RigData) -> int:
+    """The camera that stays where it is while all others move: the one that saw most."""
+    if args.vehicle_frame in data.rig.names:
+        return data.rig.names.index(args.vehicle_frame)
+    return int(np.argmax(np.bincount(data.views.camera, minlength=len(data.rig))))
+
+
+def refuse_wrong_sizes(data: RigData, found: RigCalibration) -> None:
+    """Raise BadInput where a marker is far from as large as it was said to be."""
+    for index, size_m in sizes_m(found, data.views, data.rig).items():
+        said_m = float(data.views.size_m[index])
+        if not 1 / _WRONG_SIZE < size_m / said_m < _WRONG_SIZE:
+            problem = (
+                f"marker {data.keys[index][1]} looks {size_m:.3g} m large next to the others, and "
+                f"{said_m:.3g} m was given: measure its black square, edge to edge, in m"
+            )
+            raise BadInput("size_m" if index in data.known else "--marker-size-m", problem)
+
+
+def _refuse_nonsense(
+    args: Arguments, data: RigData, found: RigCalibration, given: np.ndarray
+) -> None:
+    """Raise BadInput where what was found can't be what was meant."""
+    refuse_wrong_sizes(data, found)
+    cameras = np.flatnonzero(found.calibrated)
+    if len(cameras) < 2:
+        problem = (
+            "no two cameras could be linked: two of them must see the same markers, at once or one "
+            "after the other while a third marker is in view; drive slowly around the markers"
+        )
+        raise BadInput(", ".join(map(str, args.recordings)), problem)
+
+    def apart_m(Ts: np.ndarray) -> float:
+        positions = Ts[cameras, :3, 3]
+        return float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))))
+
+    was, is_now = apart_m(given), apart_m(found.Ts_vehicle_camera)
+    if was > _APART_M and not 1 / _WRONG_SCALE < is_now / was < _WRONG_SCALE:
+        problem = (
+            f"the cameras come out {is_now / was:.1f} times as far apart as the rig says: is the "
+            "size of the markers right (in m, edge to edge of the black square)?"
+        )
+        raise BadInput("--marker-size-m", problem)
+
+
+def _wheelbase_m(args: Arguments, data: RigData) -> float:
+    """What a drive needs beside itself, asked for before any work is done."""
+    if len(data.parts) != 1 or not any(one.valid for one in data.parts[0].odometry):
+        problem = "needs one recording, of a drive with odometry (a .mcap)"
+        raise BadInput("--vehicle-frame drive", problem)
+    vehicle = load_vehicle(args.vehicle or calib_dir() / "qcar" / "vehicle.yaml")
+    return float(vehicle.wheelbase_m)
+
+
+def _tied(
+    args: Arguments,
+    data: RigData,
+    found: RigCalibration,
+    given: np.ndarray,
+    wheelbase_m: float,
+) -> RigCalibration:
+    """The vehicle frame where it was asked to be."""
+    if args.vehicle_frame in data.rig.names:
+        return found
+    if args.vehicle_frame == "places":
+        return moved_to_places(found, given)
+    readings = (one for one in data.parts[0].odometry if one.valid)
+    odometry = sorted(readings, key=lambda one: one.stamp_ns)
+    start_ns = found.views.stamps_ns[0]
+    driven = driven_frame(
+        (found.views.stamps_ns - start_ns) / 1e9,
+        found.Ts_world_vehicle,
+        np.array([(one.stamp_ns - start_ns) / 1e9 for one in odometry]),
+        np.array([one.speed_mps for one in odometry]),
+        np.array([one.steering_rad for one in odometry]),
+        wheelbase_m,
+    )
+    return moved_to_driven(found, driven)

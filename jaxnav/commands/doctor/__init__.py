@@ -1,0 +1,1 @@
+"""What a car will run with, looked at."""

@@ -1,0 +1,67 @@
+"""What `jaxnav doctor` can be told."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxnav.commands.kinds import (
+    QCarFile,
+    require,
+)
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check what a car will run with, and say what to do about each finding.
+
+    Looked at are the computer (packages, OpenCV, JAX, clock, disk), the four files, pictures that
+    the car's cameras took while it stood, and the plug-ins, which are opened and read but not
+    driven. Exit code 0: no error; 1: an error was found; 2: a file or a flag is not understood.
+    """
+
+    rig: QCarFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers: QCarFile = None
+    """Marker map."""
+    vehicle_file: QCarFile = None
+    """Vehicle parameters and limits."""
+    route: QCarFile = None
+    """Start and waypoints."""
+    vehicle: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
+    ] = None
+    """Vehicle plug-in to open and read: an installed name or module:name."""
+    cameras: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
+    ] = None
+    """Camera plug-in to open and read: an installed name or module:name."""
+    option: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """What the plug-ins are told."""
+    frame: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="CAMERA=IMAGE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """A picture by one of the rig's cameras, the car standing anywhere with a marker in view."""
+    drive: Annotated[
+        Path | None, tyro.conf.arg(metavar="FILE.mcap", help_behavior_hint="(optional)")
+    ] = None
+    """A recorded drive with eights, or stops and starts: are the cameras later than they say?"""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
+        None
+    )
+    """Write all findings into this file too."""
+
+    def __post_init__(self) -> None:
+        for flag, texts in (("--option", self.option), ("--frame", self.frame)):
+            expected = "KEY=VALUE" if flag == "--option" else "CAMERA=IMAGE"
+            keys = [text.partition("=")[0] for text in texts]
+            for text, key in zip(texts, keys, strict=True):
+                require("=" in text and key != "", flag, f"expected {expected}, got {text!r}")
+                require(keys.count(key) == 1, flag, f"{key} is given twice")

@@ -1,0 +1,167 @@
+"""`jaxnav doctor`: is what a car will run with in order, and what is to be done about it?
+
+What is examined may be broken: all but the findings is imported when it is its turn.
+"""
+
+import importlib
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from jaxnav.commands.doctor.arguments import Doctor
+from jaxnav.commands.doctor.findings import Finding, Report
+from jaxnav.errors import BadInput
+
+_CHECKS = "jaxnav.commands.doctor_checks"
+
+
+def run(args: Doctor) -> int:
+    """Examine computer, files, pictures and plug-ins, in this order, and sum up."""
+    report = Report(lambda finding: print(finding, flush=True))
+    _computer(report)
+    patient = _files(report, args)
+    report.examine("compile cache", lambda: _cache(patient))
+    if args.frame:
+        report.examine("picture", lambda: _pictures(args, patient))
+    if args.vehicle is not None or args.cameras is not None:
+        report.examine("plug-ins", lambda: _plug_ins(report, args, patient))
+    if args.drive is not None:
+        report.examine("stamps", lambda: _check("stamps", "stamps")(args.drive))
+    print(report.summary())
+    if args.json is not None:
+        from jaxnav.files import write_json
+
+        write_json(args.json, report.as_json())
+    return report.exit_code
+
+
+def _check(module: str, name: str) -> Any:
+    """A function of the checks, imported now."""
+    return getattr(importlib.import_module(f"{_CHECKS}.{module}"), name)
+
+
+def _computer(report: Report) -> None:
+    report.examine("packages", lambda: _check("software", "packages")())
+    report.examine("OpenCV", lambda: _check("software", "opencv")())
+    report.examine("JAX", _jax)
+    report.examine("clock", lambda: _check("machine", "clock")())
+    report.examine("CPU", lambda: _check("machine", "processor")())
+    report.examine("disk", lambda: _check("machine", "disk")(Path.cwd()))
+
+
+def _jax() -> Iterable[Finding]:
+    """As the car will be started: one thread, float64."""
+    process = importlib.import_module("jaxnav.commands.process")
+    process.configure_jax(float64=True, threads=1)
+    found: Iterable[Finding] = _check("software", "jax_device")()
+    return found
+
+
+def _files(report: Report, args: Doctor) -> SimpleNamespace:
+    """What can be read of rig, markers, vehicle and route, each examined; None for the others."""
+    patient = SimpleNamespace(rig=None, markers=None, vehicle=None, route=None)
+    files = report.read("files", lambda: importlib.import_module("jaxnav.files"))
+    if files is None:
+        return patient
+    qcar = files.calib_dir() / "qcar"
+    paths = {
+        "rig": args.rig or qcar / "rig.yaml",
+        "markers": args.markers or qcar / "markers.yaml",
+        "vehicle": args.vehicle_file or qcar / "vehicle.yaml",
+        "route": args.route or qcar / "route.yaml",
+    }
+    for name, path in paths.items():
+        setattr(patient, name, report.read(name, partial(getattr(files, f"load_{name}"), path)))
+    if patient.markers is not None and patient.route is not None:
+        patient.route = patient.route.relative_to(patient.markers.origin_m)
+    rig, markers, vehicle, route = vars(patient).values()
+    if rig is not None:
+        report.examine("rig", lambda: _check("rig_file", "rig_file")(paths["rig"], rig))
+    report.examine("markers", lambda: _check("markers_file", "measured_corners")(paths["markers"]))
+    if markers is not None:
+        report.examine("markers", lambda: _check("markers_file", "placed")(markers))
+    if vehicle is not None:
+        report.examine("vehicle", lambda: _check("route_file", "vehicle_file")(vehicle))
+    if None not in (route, vehicle, markers):
+        report.examine("route", lambda: _check("route_file", "route_file")(route, vehicle, markers))
+    if None not in (rig, route, markers):
+        report.examine("sight", lambda: _check("route_file", "sight_along")(rig, markers, route))
+    return patient
+
+
+def _cache(patient: SimpleNamespace) -> Iterable[Finding]:
+    """Whether the program that a car runs with these files is compiled."""
+    import jax
+
+    from jaxnav.commands.process import cache_refused, step_folder
+
+    folder, compiled = step_folder(), None
+    if folder is not None and None not in vars(patient).values():
+        compiled = _is_compiled(patient, folder)
+    directory = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    found: Iterable[Finding] = _check("software", "compile_cache")(
+        Path(directory) if directory else None, compiled, cache_refused()
+    )
+    return found
+
+
+def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
+    """As `jaxnav run` would look for it: in single precision."""
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxnav.compiling.step import is_compiled
+    from jaxnav.loop.estimator import Estimator, advance_packed
+    from jaxnav.navigator import Navigator
+
+    with jax.enable_x64(False):
+        rig, markers, vehicle = jax.tree.map(
+            lambda leaf: jnp.asarray(np.asarray(leaf)) if eqx.is_array(leaf) else leaf,
+            (patient.rig, patient.markers, patient.vehicle),
+        )
+        navigator = Navigator(
+            rig=rig,
+            markers=markers,
+            vehicle=vehicle,
+            waypoints_m=patient.route.waypoints_m,
+            waypoint_radius_m=patient.route.waypoint_radius_m,
+        )
+        asked: list[tuple[Any, ...]] = []  # with what the estimator would call it
+        Estimator(navigator, program=lambda *told: asked.append(told)).warm_up()  # type: ignore
+        return all(is_compiled(advance_packed, navigator, folder, *told) for told in asked)
+
+
+def _pictures(args: Doctor, patient: SimpleNamespace) -> Iterable[Finding]:
+    from jaxnav.commands.doctor.photographs import examine_pictures
+    from jaxnav.files.images import read_image
+
+    if patient.rig is None or patient.markers is None:
+        return [Finding("picture", "note", "not looked at: rig and markers are needed")]
+    images = {}
+    for text in args.frame:
+        name, _, path = text.partition("=")
+        if name not in patient.rig.names:
+            raise BadInput(
+                f"--frame {text}",
+                f"the rig has no camera {name!r}: expected one of {', '.join(patient.rig.names)}",
+            )
+        images[name] = read_image(Path(path))
+    return examine_pictures(patient.rig, patient.markers, patient.route, images)
+
+
+def _plug_ins(report: Report, args: Doctor, patient: SimpleNamespace) -> Iterable[Finding]:
+    if None in vars(patient).values():
+        return [Finding("plug-ins", "note", "not opened: they need all four files")]
+    from jaxnav.commands.doctor.plug_ins import plug_ins
+    from jaxnav.loop.interfaces import Setup
+
+    options = dict(text.split("=", 1) for text in args.option)
+    setup = Setup(
+        patient.rig, patient.markers, patient.vehicle, patient.route.start_pose, options=options
+    )
+    plug_ins(report, setup, args.vehicle, args.cameras)
+    return ()

@@ -1,0 +1,283 @@
+"""Do the vehicle and its cameras answer: opened, read for a moment, closed. Nothing is driven."""
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from jaxnav.commands.doctor.camera_frames import Watched, judge_cameras, watch
+from jaxnav.commands.doctor.findings import Finding, Report, said
+from jaxnav.errors import BadInput
+from jaxnav.loop import plugins
+from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.moved_vehicle import GuardProcess
+from jaxnav.testing.calls import HANGS_S, Worker, started
+from jaxnav.testing.cameras import Parked
+
+READINGS = 20
+_PAUSE_S = 0.01
+_PATIENCE_S = 3.0  # until a driver must have measured something
+_SLOW_S = 0.02  # a whole tick of the loop
+_OLD_S = 0.1  # the loop calls older odometry stale
+_LEAST_RATE_HZ = 20.0
+_STANDS_MPS = 0.05
+_OPENS_WITHIN_S = 30.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One `read` of a vehicle: what it gave, when it returned, and how long it took."""
+
+    odometry: Odometry
+    now_ns: int
+    took_s: float
+
+
+def plug_ins(
+    report: Report, setup: Setup, vehicle_name: str | None, cameras_name: str | None
+) -> None:
+    """Examine what was named. What one of the two does wrong hides nothing of the other.
+
+    Cameras without a vehicle get one that stands still.
+    """
+    vehicle: Any = Parked()
+    if vehicle_name is not None:
+        opened: list[Vehicle] = []
+        report.examine("vehicle", lambda: _open_vehicle(vehicle_name, setup, opened))
+        if opened:
+            vehicle = opened[0]
+            report.examine("odometry", lambda: _odometry(vehicle, Limits.of(setup.vehicle)))
+        elif cameras_name is not None:
+            report.add(
+                Finding("cameras", "note", "opened beside a vehicle that stands still instead")
+            )
+    if cameras_name is not None:
+        report.examine("cameras", lambda: _cameras(cameras_name, setup, vehicle))
+    if vehicle_name is not None and opened:
+        report.examine("vehicle", lambda: _close("vehicle", [vehicle]))
+
+
+def _open_vehicle(name: str, setup: Setup, opened: list[Vehicle]) -> Iterator[Finding]:
+    plugins.find("--vehicle", plugins.VEHICLES, name)
+    try:
+        vehicle = started(partial(plugins.open_vehicle, name, setup))("opening it", _OPENS_WITHIN_S)
+    except (BadInput, OSError, AssertionError) as error:
+        yield _not_opened("vehicle", name, error)
+        return
+    opened.append(vehicle)
+    yield Finding("vehicle", "ok", f"{name} opens")
+    yield _guard(name)
+    if not vehicle.timeout_s < math.inf:
+        yield Finding(
+            "vehicle",
+            "warning",
+            f"{name} does not stop by itself when nothing is written any more",
+            "a computer that fails as a whole leaves it driving: have a switch at hand that cuts "
+            "its power",
+        )
+
+
+def _guard(name: str) -> Finding:
+    """Whether `jaxnav run` would open it in the guard's process, as far as its import tells."""
+    guarding = GuardProcess(name)
+    until_s = time.monotonic() + _OPENS_WITHIN_S
+
+    def check() -> None:
+        if time.monotonic() > until_s:
+            raise BadInput("vehicle", f"{name} is not imported within {_OPENS_WITHIN_S:g} s")
+
+    try:
+        guarding.prepare(check)
+    finally:
+        guarding.end()
+    if guarding.stays is None:
+        return Finding("guard", "ok", f"{name} can be owned by a process that outlives the rest")
+    return Finding(
+        "guard",
+        "note",
+        f"a thread alone watches {name}, which can't be moved to another process: {guarding.stays}",
+        "a library that holds the interpreter, or the end of the program, stops the thread too",
+    )
+
+
+def _not_opened(part: str, name: str, error: Exception) -> Finding:
+    problem = str(error) if isinstance(error, BadInput) else f"{name}: {said(error)}"
+    return Finding(
+        part, "error", problem, "is it plugged in, switched on, and free of other programs?"
+    )
+
+
+def _close(part: str, things: Sequence[Any]) -> Iterator[Finding]:
+    for thing in things:
+        try:
+            started(thing.close)("close()", HANGS_S)
+        except Exception as error:
+            yield Finding(part, "warning", f"closing failed: {said(error)}", "the driver's author")
+
+
+def _odometry(vehicle: Vehicle, limits: Limits) -> Iterator[Finding]:
+    """Read it some times, in a thread of its own: a driver may hang."""
+    worker = Worker()
+    readings: list[Reading] = []
+    failures: list[OSError] = []
+    until_s = time.monotonic() + _PATIENCE_S
+    try:
+        while len(readings) < READINGS and time.monotonic() < until_s:
+            called_s = time.monotonic()
+            odometry, failure = worker.call("read()", vehicle.read)
+            took_s = time.monotonic() - called_s
+            if failure is not None:
+                failures.append(failure)
+            else:
+                readings.append(Reading(odometry, time.monotonic_ns(), took_s))
+            time.sleep(_PAUSE_S)
+    finally:
+        worker.close()
+    yield from judge_odometry(readings, failures, limits)
+
+
+def judge_odometry(
+    readings: Sequence[Reading], failures: Sequence[OSError], limits: Limits
+) -> Iterator[Finding]:
+    """What is wrong with the readings of a vehicle that stands.
+
+    Args:
+        readings: in their order.
+        failures: of further attempts to read.
+    """
+    if failures:
+        yield Finding(
+            "odometry",
+            "warning" if readings else "error",
+            f"{len(failures)} of {len(failures) + len(readings)} readings failed: "
+            f"{said(failures[-1])}",
+            "look at the cable to the car's controller, and at its driver",
+        )
+    if not readings:
+        return
+    problems = [*_wrong_stamps(readings), *_wrong_values(readings, limits)]
+    yield from problems
+    if problems or failures:
+        return
+    stamps_ns = [reading.odometry.stamp_ns for reading in readings]
+    last = readings[-1].odometry
+    yield Finding(
+        "odometry",
+        "ok",
+        f"{len(readings)} readings at {_rate_hz(stamps_ns):.0f} Hz, "
+        f"{max(_ages_s(readings)) * 1e3:.0f} ms old at most; "
+        f"{last.speed_mps:+.2f} m/s, steering {last.steering_rad:+.2f} rad",
+    )
+
+
+def _ages_s(readings: Sequence[Reading]) -> list[float]:
+    return [(reading.now_ns - reading.odometry.stamp_ns) / 1e9 for reading in readings]
+
+
+def _rate_hz(stamps_ns: Sequence[int]) -> float:
+    """Of fresh stamps; 0 where there is one alone."""
+    fresh = sorted(set(stamps_ns))
+    return (len(fresh) - 1) / max((fresh[-1] - fresh[0]) / 1e9, 1e-9) if len(fresh) > 1 else 0.0
+
+
+def _wrong_stamps(readings: Sequence[Reading]) -> Iterator[Finding]:
+    ages_s = _ages_s(readings)
+    rate_hz = _rate_hz([reading.odometry.stamp_ns for reading in readings])
+    slow = sum(reading.took_s > _SLOW_S for reading in readings)
+    if min(ages_s) < 0:
+        yield Finding(
+            "odometry",
+            "error",
+            f"stamps lie up to {-min(ages_s):.3g} s in the future",
+            "stamp_ns must be of time.monotonic_ns() of this computer",
+        )
+    elif rate_hz == 0:
+        yield Finding(
+            "odometry",
+            "error",
+            f"{len(readings)} readings have one and the same stamp: nothing new is measured",
+            "does the car's controller run? Is its cable in?",
+        )
+    elif max(ages_s) > _OLD_S:
+        yield Finding(
+            "odometry",
+            "error",
+            f"readings are up to {max(ages_s):.3g} s old, over {_OLD_S:g} s counts as none",
+            "stamp_ns is of time.monotonic_ns(), when it was measured; read the driver's queue dry",
+        )
+    elif rate_hz < _LEAST_RATE_HZ:
+        yield Finding(
+            "odometry",
+            "warning",
+            f"{rate_hz:.0f} readings a second",
+            f"let the driver measure at {_LEAST_RATE_HZ:.0f} Hz or more",
+        )
+    if slow > len(readings) // 10:
+        yield Finding(
+            "odometry",
+            "warning",
+            f"read() took over {_SLOW_S * 1e3:.0f} ms, {slow} of {len(readings)} times",
+            "it must give the latest reading at once: read in a thread of the driver's own",
+        )
+
+
+def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Finding]:
+    valid = [reading.odometry for reading in readings if reading.odometry.valid]
+    finite = [o for o in valid if math.isfinite(o.speed_mps) and math.isfinite(o.steering_rad)]
+    if len(valid) < len(readings):
+        yield Finding(
+            "odometry",
+            "warning" if valid else "error",
+            f"{len(readings) - len(valid)} of {len(readings)} readings are marked as not valid",
+            "the driver says so itself: look at its messages",
+        )
+    if len(finite) < len(valid):
+        yield Finding(
+            "odometry",
+            "error",
+            f"{len(valid) - len(finite)} of {len(valid)} valid readings are no numbers",
+            "the driver should say valid=False where it can't tell",
+        )
+    if not finite:
+        return
+    fastest = max(finite, key=lambda o: abs(o.speed_mps))
+    widest = max(finite, key=lambda o: abs(o.steering_rad))
+    if abs(fastest.speed_mps) > _STANDS_MPS:
+        same = len({(o.speed_mps, o.steering_rad) for o in finite}) == 1 < len(finite)
+        yield Finding(
+            "odometry",
+            "warning",
+            f"it says {fastest.speed_mps:+.2f} m/s"
+            + (f", {len(finite)} times the very same" if same else "")
+            + ": does the car stand?",
+            "a car at rest must read 0: look at the encoder and its offset, at a driver that "
+            "repeats old values",
+        )
+    if abs(widest.steering_rad) > 1.1 * limits.steering_rad:
+        yield Finding(
+            "odometry",
+            "warning",
+            f"steering reads {widest.steering_rad:+.2f} rad, its limit is "
+            f"{limits.steering_rad:.2f}",
+            "steering_rad is in rad, positive to the left",
+        )
+
+
+def _cameras(name: str, setup: Setup, vehicle: Vehicle) -> Iterator[Finding]:
+    plugins.find("--cameras", plugins.CAMERAS, name)
+    try:
+        cameras = started(partial(plugins.open_cameras, name, setup, vehicle))(
+            "opening them", _OPENS_WITHIN_S
+        )
+    except (BadInput, OSError, AssertionError) as error:
+        yield _not_opened("cameras", name, error)
+        return
+    try:
+        watched: list[Watched] = watch(cameras)
+    finally:
+        closing = list(_close("cameras", cameras))
+    yield from judge_cameras(watched, setup.rig.image_sizes_px)
+    yield from closing

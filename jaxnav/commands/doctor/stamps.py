@@ -1,0 +1,33 @@
+"""Do the cameras' stamps tell when their images were taken? A recorded drive knows."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from jaxnav.commands.doctor.findings import Finding
+from jaxnav.commands.drive.delay_watch import delays_of, told, warnings
+from jaxnav.loop.camera_delays import HARMLESS_S
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_setup import DriveSetup
+
+_DRIVE_EIGHTS = "drive eights, or stop and start, with a marker in view of it"
+
+
+def stamps(path: Path) -> Iterator[Finding]:
+    """Each camera's delay against the odometer, by a drive that `jaxnav run --record` wrote.
+
+    Raises:
+        BadInput: the recording is none, or damaged.
+    """
+    log = read_drive(path)
+    setup = DriveSetup.of_header(log.header, path)
+    delays = delays_of(log, setup)
+    for text in warnings(delays, setup):
+        what, _, do = text.partition(": ")
+        yield Finding("stamps", "warning", what, do)
+    for name, one in zip(setup.rig.names, delays.found, strict=True):
+        if not one.known:
+            text = f"camera {name!r}: {path.name} does not tell how late it is"
+            yield Finding("stamps", "note", text, _DRIVE_EIGHTS)
+        elif not one.late:
+            allowed = f"up to {HARMLESS_S * 1e3:.0f} ms is harmless"
+            yield Finding("stamps", "ok", f"camera {name!r} is {told(one)}; {allowed}")

@@ -1,1 +1,0 @@
-"""What `jaxnav doctor` looks at, a file for each part of the car."""

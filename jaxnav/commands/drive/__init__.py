@@ -1,0 +1,1 @@
+"""A car that drives, and recorded drives."""

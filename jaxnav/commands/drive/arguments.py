@@ -1,0 +1,250 @@
+"""What the commands that drive a car, or read a recording or a photograph, can be told."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jaxnav.commands.kinds import (
+    CornerBackend,
+    OptionalFile,
+    QCarFile,
+    Selector,
+    Switch,
+    require,
+    require_finite,
+    require_within,
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Drive a vehicle through its route.
+
+    Everything is compiled before the vehicle is armed. The last that it hears, however this ends,
+    is zero throttle: at the last waypoint, on Ctrl-C, Ctrl-Z and any other signal, when data are
+    missing for too long, and when anything hangs, fails or is killed. A vehicle that can be moved
+    is opened in a small process of its own, which stops it whatever becomes of this one; others,
+    `sim` and `replay` among them, are watched by a thread. `--vehicle sim` is a simulated car in
+    real time; `--vehicle replay --option drive=FILE` is a recorded drive, with its own rig,
+    markers, vehicle and route.
+
+    Exit codes: 0 arrived, out of time or recording, 1 stopped by a guard, 2 bad input, 128 plus the
+    number of the signal that ended it: 130 Ctrl-C, 143 SIGTERM, 129 a closed terminal, 131 SIGQUIT,
+    148 Ctrl-Z.
+    """
+
+    vehicle: str = "sim"
+    """An installed vehicle (sim, qcar, ros2, replay and those of plug-ins), or MODULE:NAME."""
+    cameras: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="NAME", constructor=str, help_behavior_hint="(default: as --vehicle)"
+        ),
+    ] = None
+    """Installed cameras (sim, qcar, opencv, replay and those of plug-ins), or MODULE:NAME."""
+    option: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """What the vehicle and the cameras are told, e.g. images=true for sim."""
+    rig: QCarFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers: QCarFile = None
+    """Marker map."""
+    vehicle_file: QCarFile = None
+    """Vehicle parameters and limits."""
+    route: QCarFile = None
+    """Waypoints, and where a simulated car starts."""
+    params: OptionalFile = None
+    """Tuned parameters of filter and controller."""
+    selector: Selector = "multi-hypothesis"
+    """Which of the two poses of a marker is believed."""
+    corner_backend: CornerBackend = "aruco"
+    """Marker detector. apriltag needs the extra of that name."""
+    relocate: bool = True
+    """Drive on, slowly at first, where the corners say that the car is where its wheels can't have
+    brought it: somebody carried it there, or shows it a copy of the marker. Without: stop."""
+    record: Annotated[
+        Path | None, tyro.conf.arg(metavar="MCAP", help_behavior_hint="(optional)")
+    ] = None
+    """Record the drive into this file."""
+    record_images: Switch = False
+    """Record the cameras' images too, as JPEG."""
+    view: Switch = False
+    """Open Rerun and look on. Needs the extra viz."""
+    duration_s: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="S", help_behavior_hint="(default: until the last waypoint)"),
+    ] = None
+    """End after this time, s."""
+    period_s: float = 0.02
+    """Between two readings of the odometer, s."""
+    timeout_s: float = 0.2
+    """So long after the last sign of life of any thread the vehicle has been stopped, s."""
+    float64: Switch = False
+    """Estimate in double precision."""
+    seed: int = 0
+    """Of a simulated vehicle."""
+    headless: Switch = False
+    """No status line."""
+
+    def __post_init__(self) -> None:
+        require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
+        require(
+            0.002 <= self.period_s <= 0.1,
+            "--period-s",
+            f"must be from 0.002 to 0.1, got {self.period_s}",
+        )
+        require(
+            0.1 <= self.timeout_s <= 10,
+            "--timeout-s",
+            f"must be from 0.1 to 10, got {self.timeout_s}",
+        )
+        if self.duration_s is not None:
+            require_finite("--duration-s", self.duration_s)
+        require(
+            self.record is not None or not self.record_images, "--record-images", "needs --record"
+        )
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Drive the simulated car with every fault of the fault matrix, and print what came of it.
+
+    Cameras, stamps, odometry, calibration, the world and the loop fail in some fifty ways, one at a
+    time, at corner level. Exit code 1 when one of them did not come to what it must.
+    """
+
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()
+    """Faults whose names hold one of these."""
+    rig: QCarFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers: QCarFile = None
+    """Marker map."""
+    vehicle_file: QCarFile = None
+    """Vehicle parameters and limits."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
+        None
+    )
+    """Write the table into this file too."""
+    float64: Switch = False
+    """Estimate in double precision."""
+    headless: Switch = False
+    """No progress bar."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Drive a recorded drive again, or localise a recorded camera rig in every frame.
+
+    A drive is a .mcap of `jaxnav`, or a ROS bag with --topics, --rig, --markers-file, --vehicle and
+    --route. A .mcap with nothing changed is held against what was recorded, and the exit code is 1
+    where it differs.
+
+    A rig is localised in 6 degrees of freedom from a folder with bags and their calibration as
+    TagSLAM writes it, a ROS 1 bag with --rig and --markers-file, or an .npz of detections. Where
+    there is a reference trajectory the errors against it are measured.
+
+    Written to --out: a TUM trajectory, summary.json, and a PNG where something is to be compared.
+    """
+
+    recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
+    """Drive (.mcap), ROS bag, folder of TagSLAM or .npz."""
+    rig: OptionalFile = None
+    """Cameras, a rig file or a Kalibr camchain, in place of the recording's own."""
+    markers_file: OptionalFile = None
+    """Marker map in place of the recording's own."""
+    vehicle: OptionalFile = None
+    """Vehicle in place of the drive's own."""
+    route: OptionalFile = None
+    """Waypoints in place of the drive's own."""
+    params: OptionalFile = None
+    """Tuned parameters, of a drive in place of all of its own; --corner-sigma-px goes before."""
+    topics: OptionalFile = None
+    """Which topic of a ROS bag is what: it is a drive then."""
+    images: Switch = False
+    """Look for the markers once more in the drive's recorded images."""
+    corner_backend: CornerBackend = "aruco"
+    """Marker detector, for images. apriltag needs the extra of that name."""
+    record: Switch = False
+    """Record the drive anew, as replay.mcap."""
+    markers: Literal["all", "one-at-a-time"] = "all"
+    """One pose from all markers in view, or every marker alone as in the paper."""
+    selector: Annotated[
+        Selector | None,
+        tyro.conf.arg(help_behavior_hint="(default: the drive's, or multi-hypothesis)"),
+    ] = None
+    """Which of the two poses of a marker is believed."""
+    corner_sigma_px: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="PX", help_behavior_hint="(default: as the recording tells)"),
+    ] = None
+    """Standard deviation of a corner coordinate."""
+    limit: Annotated[
+        int | None,
+        tyro.conf.arg(metavar="N", constructor=int, help_behavior_hint="(default: all)"),
+    ] = None
+    """Stop after N frames, of a drive after N inputs."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
+    """Folder for the results."""
+    headless: Switch = False
+    """No progress bar."""
+
+    def __post_init__(self) -> None:
+        if self.limit is not None:
+            require(self.limit >= 1, "--limit", f"must be at least 1, got {self.limit}")
+        if self.corner_sigma_px is not None:
+            require_within("--corner-sigma-px", self.corner_sigma_px, "corner_sigma_px")
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a recorded drive in Rerun: map, cameras, candidates, health, over time.
+
+    Opens a window, or writes an .rrd file to --out. Needs the extra `viz`.
+    """
+
+    recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
+    """Recorded drive (.mcap)."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
+        None
+    )
+    """Write this file (.rrd) instead of opening a window."""
+    headless: Switch = False
+    """No progress bar."""
+
+
+@dataclass(frozen=True)
+class Locate:
+    """Find markers in a photograph and print both poses of each.
+
+    With each marker: reprojection errors, their ratio, the probability that the better pose is
+    the mirrored one, and sigma. No marker in view is a result and not an error.
+    """
+
+    image: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGE")]
+    """Photograph, in any format that OpenCV reads."""
+    camera: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """Calibration: a rig file, a Kalibr camchain or a ROS camera_info YAML."""
+    marker_size_m: Annotated[float, tyro.conf.arg(metavar="S")]
+    """Side of the black square, m."""
+    camera_name: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
+    ] = None
+    """Which camera of the file took it, where the file holds several."""
+    family: str = "tag36h11"
+    """Marker family."""
+    corner_backend: CornerBackend = "aruco"
+    """Marker detector. apriltag needs the extra of that name."""
+    json: Switch = False
+    """Print JSON instead of a table."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="PNG", help_behavior_hint="(optional)")] = (
+        None
+    )
+    """Draw the markers and both poses into this file."""
+
+    def __post_init__(self) -> None:
+        require_within("--marker-size-m", self.marker_size_m, "size_m")

@@ -1,0 +1,53 @@
+"""`jaxnav faults`: the fault matrix as a table."""
+
+from tqdm import tqdm
+
+from jaxnav.commands.drive.arguments import Faults
+from jaxnav.commands.process import configure_jax
+from jaxnav.errors import BadInput
+from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
+from jaxnav.loop.flags import names
+from jaxnav.testing.faults import HEADER, Result, Trial, line, run_trial
+from jaxnav.testing.matrix import matrix
+
+EXIT_BROKEN = 1
+
+
+def run(args: Faults) -> int:
+    """Drive with every fault, print what came of it; 1 where a promise was not kept."""
+    configure_jax(float64=args.float64, threads=1)
+    qcar = calib_dir() / "qcar"
+    trial = Trial(
+        load_rig(args.rig or qcar / "rig.yaml"),
+        load_markers(args.markers or qcar / "markers.yaml"),
+        load_vehicle(args.vehicle_file or qcar / "vehicle.yaml"),
+    )
+    rows = [row for row in matrix() if not args.only or any(p in row.name for p in args.only)]
+    if not rows:
+        known = ", ".join(row.name for row in matrix())
+        raise BadInput("--only", f"names no fault: there are {known}")
+    results: list[Result] = []
+    print(HEADER)
+    with tqdm(rows, unit="fault", disable=args.headless) as bar:
+        for row in bar:
+            bar.set_postfix_str(row.name)
+            results.append(run_trial(row, trial))
+            tqdm.write(line(results[-1]))
+    if args.json is not None:
+        write_json(args.json, {"faults": [_told(result) for result in results]})
+    broken = sum(bool(result.broken) for result in results)
+    print(f"{len(results) - broken} of {len(results)} faults came to what they must")
+    return EXIT_BROKEN if broken else 0
+
+
+def _told(result: Result) -> dict[str, object]:
+    return {
+        "fault": result.row.name,
+        "seen": [*names(result.faults), *names(result.rejects)],
+        "worst_health": result.worst.name,
+        "error_m": result.error_m,
+        "error_after_m": result.error_after_m,
+        "recovered_s": result.recovered_s,
+        "restarts": result.restarts,
+        "broken": list(result.broken),
+    }

@@ -1,0 +1,193 @@
+"""Who looks on while `jaxnav run` drives: the recording, Rerun's window, the status line.
+
+None of them waits for a disk or a screen, and none raises: see `Observer`.
+"""
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from jaxnav.commands.drive.arguments import Run
+from jaxnav.commands.drive.delay_watch import DelayWatch
+from jaxnav.commands.drive.status import notice, status_line
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import Sighted
+from jaxnav.loop.interfaces import Frame
+from jaxnav.loop.loop import Observer
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.message_schemas import OUTCOME
+from jaxnav.recording.messages import digest, input_message, outcome_message
+from jaxnav.recording.recorder import Recorder
+
+if TYPE_CHECKING:
+    from jaxnav.viewer.rerun_view import RerunView
+
+_STATUS_NS = 200_000_000
+_MARKER_NS = 200_000_000  # for so long after a marker it counts as seen
+
+
+class Onlooker(Observer, Protocol):
+    """An observer of a command: it is closed, and then says in a line what came of it."""
+
+    def close(self) -> None:
+        """Bring what it does to an end."""
+        ...
+
+    @property
+    def told(self) -> str | None:
+        """For the person; None: nothing to say."""
+        ...
+
+
+def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onlooker]:
+    """Those that the arguments ask for.
+
+    Args:
+        closing: closes them.
+
+    Raises:
+        BadInput: the file can't be written, Rerun is missing or its window does not open.
+    """
+    found: list[Onlooker] = []
+
+    def add(onlooker: Onlooker) -> None:
+        closing.callback(onlooker.close)
+        found.append(onlooker)
+
+    if args.record is not None:
+        add(Recording(args.record, setup, args.record_images))
+    if args.view:
+        from jaxnav.viewer.rerun_view import RerunView  # with all that draws
+
+        waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
+        add(View(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
+    add(DelayWatch(setup, warns=not args.headless))
+    if not args.headless:
+        add(StatusLine())
+    return found
+
+
+class Recording:
+    """What the loop does, into a file."""
+
+    def __init__(self, path: Path, setup: DriveSetup, images: bool):
+        """Args:
+        images: the cameras' images too, as JPEG.
+
+        Raises:
+            BadInput: the file can't be written.
+        """
+        self._recorder = Recorder(path, setup.header())
+        self._images = images
+        self._path = path
+        self._dropped = 0
+
+    @property
+    def faults(self) -> Fault:
+        """What it can't do any more."""
+        found = Fault(0)
+        if self._recorder.dropped > self._dropped:
+            self._dropped, found = self._recorder.dropped, Fault.RECORDER_BEHIND
+        return found | Fault.RECORDER_FAILED if self._recorder.failed else found
+
+    def handled(self, given: Input, outcome: Outcome) -> None:
+        """See `Observer`."""
+        self._recorder.put(*input_message(given))
+        message = outcome_message(outcome, digest(outcome))
+        self._recorder.put(OUTCOME, given.now_ns, message)
+
+    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+        """See `Observer`."""
+        if self._images and frame.image is not None:
+            self._recorder.image(f"/camera/{name}", frame.stamp_ns, frame.image)
+
+    def close(self) -> None:
+        """See `Onlooker`. A drive that was called off leaves no file."""
+        self._recorder.close(keep_empty=False)
+
+    @property
+    def told(self) -> str:
+        """See `Onlooker`."""
+        text = f"recorded {self._recorder.written} messages in {self._path}"
+        if self._recorder.dropped:
+            text += f", {self._recorder.dropped} left out"
+        return f"{text}; {self._recorder.failed}" if self._recorder.failed else text
+
+
+class View:
+    """What the loop does, in Rerun's window. That it is closed is no fault of the vehicle's."""
+
+    faults = Fault(0)
+
+    def __init__(self, view: "RerunView"):
+        """Args:
+        view: a live one.
+        """
+        self._view = view
+
+    def handled(self, given: Input, outcome: Outcome) -> None:
+        """See `Observer`."""
+        self._view.show(outcome)
+
+    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+        """See `Observer`."""
+        detections = sighted.detections
+        corners_px = None if detections is None else detections.corners_px
+        self._view.image(name, frame.stamp_ns, frame.image, corners_px)
+
+    def close(self) -> None:
+        """See `Onlooker`."""
+        self._view.close()
+
+    @property
+    def told(self) -> str | None:
+        """See `Onlooker`."""
+        if self._view.failed:
+            return f"view: {self._view.failed}"
+        left_out = self._view.dropped
+        return f"view: {left_out} outcomes and images left out" if left_out else None
+
+
+class StatusLine:
+    """One line in the terminal, five times a second."""
+
+    faults = Fault(0)
+    told: str | None = None
+
+    def __init__(self) -> None:
+        self._last_ns, self._count, self._marker_ns = 0, 0, 0
+        self._faults = Fault(0)
+
+    def handled(self, given: Input, outcome: Outcome) -> None:
+        """See `Observer`."""
+        self._count += 1
+        if outcome.told is not None and outcome.told.corners_px is not None:
+            self._marker_ns = given.now_ns
+        if outcome.faults != self._faults:
+            text, self._faults = notice(outcome, self._faults), outcome.faults
+            if text is not None:
+                sys.stderr.write(f"\r{text:<100}\n")
+        elapsed_ns = given.now_ns - self._last_ns
+        if elapsed_ns < _STATUS_NS:
+            return
+        line = status_line(
+            outcome,
+            rate_hz=self._count / (elapsed_ns / 1e9),
+            latency_ms=(given.now_ns - outcome.stamp_ns) / 1e6,
+            marker_seen=given.now_ns - self._marker_ns < _MARKER_NS,
+        )
+        sys.stderr.write(f"\r{line:<100}")
+        sys.stderr.flush()
+        self._last_ns, self._count = given.now_ns, 0
+
+    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+        """See `Observer`."""
+
+    def close(self) -> None:
+        """See `Onlooker`."""
+        if self._last_ns:
+            sys.stderr.write("\n")

@@ -1,0 +1,102 @@
+"""`jaxnav plot DRIVE.mcap`: a recorded drive as a picture and in a few lines."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.reading import read_shown
+from jaxnav.commands.study.arguments import Plot as Arguments
+from jaxnav.errors import BadInput, visible
+from jaxnav.files import output_folder
+from jaxnav.files.ranges import is_within
+from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.plots.drive import drive_log_report
+from jaxnav.recording.drive_log import DriveLog
+from jaxnav.recording.plausible import left_out, plausible
+
+_LONGEST_STEP_S = 1.0  # between readings, for the distance: beyond it nobody knows
+
+
+def is_recording(path: Path) -> bool:
+    """Whether it is called like a recorded drive."""
+    return path.suffix.lower() == ".mcap"
+
+
+def read_outcomes(path: Path, headless: bool) -> DriveLog:
+    """A recorded drive that there is something to show of.
+
+    Raises:
+        BadInput: not such a file, damaged, or without outcomes.
+    """
+    log = read_shown(path, headless)
+    if not len(log.outcomes.now_ns):
+        raise BadInput(path, "holds no outcome of the pilot, so there is nothing to show")
+    return log
+
+
+def draw_drive(args: Arguments) -> int:
+    """Write drive.png, and print what happened."""
+    log = read_outcomes(args.store, args.headless)
+    outcomes, odd = plausible(log.outcomes)
+    log = replace(log, outcomes=outcomes)
+    out = output_folder(args.out)
+    save_figure(drive_log_report(log, visible(args.store.name)), out / "drive.png")
+    for line in summary_lines(log):
+        print(visible(line))
+    if odd:
+        print(left_out(odd))
+    print(f"picture in {visible(out / 'drive.png')}")
+    return 0
+
+
+def summary_lines(log: DriveLog) -> list[str]:
+    """Duration, distance, shares of health by time, faults and rejects, restarts, what is missing.
+
+    Args:
+        log: with one outcome at least.
+    """
+    outcomes = log.outcomes
+    count, duration_s = len(outcomes.now_ns), float(outcomes.times_s[-1])
+    # An outcome counts until the next one.
+    weights = np.append(np.diff(outcomes.times_s), 0.0) if duration_s > 0 else np.ones(count)
+    shares = {
+        state.name: float(weights[outcomes.health == state].sum() / weights.sum())
+        for state in Health
+    }
+    healths = ", ".join(f"{name} {share:.1%}" for name, share in shares.items() if share > 0)
+    faults = _counted(Fault, outcomes.faults) + _counted(Reject, outcomes.rejects)
+    restarts = int(outcomes.restarts[-1])
+    reason = f", the last one: {outcomes.reasons[-1]}" if restarts else ""
+    lines = [
+        f"{duration_s:.1f} s, {count} outcomes, {distance_m(log):.2f} m by the odometer",
+        f"health by time: {healths}",
+        f"outcomes with faults: {', '.join(faults) or 'none'}",
+        f"restarts: {restarts}{reason}",
+    ]
+    if log.missing:
+        left_out = ", ".join(f"{topic} {number}" for topic, number in log.missing.items())
+        lines.append(f"left out of the recording: {left_out}")
+    if log.truncated:
+        lines.append("the recording was not brought to its end")
+    return lines
+
+
+def distance_m(log: DriveLog) -> float:
+    """How far the vehicle drove, forwards and backwards, by what its odometer said."""
+    readings = [
+        given.odometry
+        for given in log.inputs
+        if given.odometry is not None and given.odometry.valid
+    ]
+    stamps_s = np.array([reading.stamp_ns for reading in readings], float) / 1e9
+    speeds_mps = np.abs([reading.speed_mps for reading in readings])
+    usable = is_within("speed_mps", speeds_mps)
+    steps_s = np.clip(np.diff(stamps_s[usable]), 0, _LONGEST_STEP_S)
+    return float(steps_s @ speeds_mps[usable][1:])
+
+
+def _counted(kind: type[Fault] | type[Reject], values: np.ndarray) -> list[str]:
+    counts = {flag.name: int(np.sum((values & flag.value) > 0)) for flag in kind}
+    return [f"{name} {count}" for name, count in counts.items() if count]

@@ -1,0 +1,181 @@
+"""`jaxnav replay`: a recorded rig localised in every frame, or a drive driven again."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.drive import replay_drive
+from jaxnav.commands.drive.arguments import Replay as Arguments
+from jaxnav.commands.kinds import Selector
+from jaxnav.commands.pictures import corners_in_world, save_figure
+from jaxnav.commands.process import configure_jax
+from jaxnav.datasets.recordings import Recording, read_recording
+from jaxnav.datasets.replay import Replay, errors, frames_in_view, replay
+from jaxnav.errors import BadInput, visible
+from jaxnav.files import (
+    apply_params,
+    load_markers,
+    load_params,
+    load_rig,
+    output_folder,
+    write_json,
+    write_tum,
+)
+from jaxnav.navigator import Navigator
+from jaxnav.plots.localisation import localisation_report
+
+DEFAULT_SELECTOR: Selector = "multi-hypothesis"
+SETTLED_FRAMES = 5  # of an appearance: a choice made later has had a history
+
+
+def run(args: Arguments) -> int:
+    """Localise, write the trajectory, and measure it where there is a reference."""
+    if replay_drive.is_for(args):
+        return replay_drive.run(args)
+    args = dataclasses.replace(args, selector=args.selector or DEFAULT_SELECTOR)
+    configure_jax(float64=True, threads=1)
+    params = None if args.params is None else load_params(args.params)
+    recording = read_recording(
+        args.recording,
+        None if args.rig is None else load_rig(args.rig),
+        None if args.markers_file is None else load_markers(args.markers_file),
+    )
+    if args.limit is not None:
+        recording = recording.first(args.limit)
+    if not len(recording):
+        raise BadInput(args.recording, "holds no frame")
+    if params is not None:  # bad input shows before the folder is made
+        apply_params(Navigator(recording.rig, recording.markers), params)
+    out = output_folder(args.out)
+    if params is not None:
+        print(params.told())
+    with tqdm(total=len(recording), unit="frame", disable=args.headless) as bar:
+        bar.set_postfix_str("compiling")
+
+        def advance(frames: int) -> None:
+            bar.set_postfix_str("", refresh=False)
+            bar.update(frames)
+
+        result = replay(
+            recording,
+            make_selector(str(args.selector)),
+            one_at_a_time=args.markers == "one-at-a-time",
+            corner_sigma_px=args.corner_sigma_px,
+            progress=advance,
+            params=params,
+        )
+    summary = summarise(args, recording, result)
+    _write_tracks(args, recording, result)
+    save_figure(_report(args, recording, result, summary), out / "report.png")
+    write_json(out / "summary.json", summary)
+    print(_text(summary))
+    print(f"report in {visible(out)}")
+    return 0
+
+
+def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str, Any]:
+    """Counts, speed and, against a reference, errors and branches."""
+    summary: dict[str, Any] = {
+        "recording": recording.name,
+        "markers": args.markers,
+        "selector": args.selector,
+        "params": args.params,
+        "frames": len(recording),
+        "frames_located": int(result.seen.any(axis=1).sum()),
+        "detections": len(recording.seen_px),
+        "detections_not_in_map": recording.unmapped_detections,
+        "detections_dropped": recording.dropped_detections,
+        "poses": int(result.seen.sum()),
+        "frames_per_second": result.frames_per_second,
+        "corner_sigma_px": result.corner_sigma_px,
+    }
+    if recording.reference is None:
+        return summary
+    position_m, rotation_deg = errors(result, recording)
+    judged = result.seen & recording.reference.valid[:, None]
+    settled = judged & (frames_in_view(result.seen) > SETTLED_FRAMES)
+
+    wrong, outlier = np.asarray(result.branch.wrong), np.asarray(result.branch.outlier)
+
+    def fraction(of: np.ndarray, among: np.ndarray) -> float:
+        return float((of & among).sum()) / max(int(among.sum()), 1)
+
+    return summary | {
+        "poses_with_reference": int(judged.sum()),
+        "position_error_m": _spread(position_m),
+        "rotation_error_deg": _spread(rotation_deg),
+        "wrong_branch_fraction": fraction(wrong, judged),
+        f"wrong_branch_fraction_after_{SETTLED_FRAMES}_frames": fraction(wrong, settled),
+        "outlier_fraction": fraction(outlier, judged),
+    }
+
+
+def _spread(values: np.ndarray) -> dict[str, float]:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return {"median": np.nan, "p95": np.nan}
+    return {"median": np.median(values), "p95": np.percentile(values, 95)}
+
+
+def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None:
+    """One TUM file; one for each marker where every marker has a track of its own."""
+    stamps_s = recording.stamps_ns / 1e9
+    for track in range(result.seen.shape[1]):
+        name = "trajectory"
+        if args.markers == "one-at-a-time":
+            name = f"trajectory_marker_{recording.markers.ids[track]}"
+        seen = result.seen[:, track]
+        write_tum(args.out / f"{name}.tum", stamps_s[seen], result.T_world_vehicle[seen, track])
+    if recording.reference is not None:
+        valid = recording.reference.valid
+        write_tum(
+            args.out / "reference.tum", stamps_s[valid], recording.reference.T_world_vehicle[valid]
+        )
+
+
+def _report(
+    args: Arguments, recording: Recording, result: Replay, summary: dict[str, Any]
+) -> Figure:
+    times_s = (recording.stamps_ns - recording.stamps_ns[0]) / 1e9
+    # Tracks one after the other, so that every pose is drawn.
+    positions_m = np.where(result.seen[..., None], result.T_world_vehicle[..., 4:], np.nan)
+    tracks = result.seen.shape[1]
+    reference_m, drawn = None, {}
+    if recording.reference is not None:
+        valid = recording.reference.valid[:, None]
+        reference_m = np.where(valid, recording.reference.T_world_vehicle[:, 4:], np.nan)
+        position_m, rotation_deg = errors(result, recording)
+        drawn = {
+            "position error (m)": position_m.T.ravel(),
+            "rotation error (deg)": rotation_deg.T.ravel(),
+        }
+    return localisation_report(
+        np.tile(times_s, tracks),
+        positions_m.transpose(1, 0, 2).reshape(-1, 3),
+        reference_m,
+        drawn,
+        corners_in_world(recording.markers),
+        title=_text(summary),
+        connected=tracks == 1,
+    )
+
+
+def _text(summary: dict[str, Any]) -> str:
+    head = (
+        f"{visible(summary['recording'])}, {summary['selector']}, markers {summary['markers']}: "
+        f"{summary['poses']} poses in {summary['frames']} frames, "
+        f"{summary['frames_per_second']:.0f} frames/s"
+    )
+    if "position_error_m" not in summary:
+        return head
+    position, rotation = summary["position_error_m"], summary["rotation_error_deg"]
+    return (
+        f"{head}\nposition error {position['median'] * 1e3:.1f} mm median, "
+        f"{position['p95'] * 1e3:.1f} mm 95 %; rotation {rotation['median']:.2f} / "
+        f"{rotation['p95']:.2f} deg; wrong branch {summary['wrong_branch_fraction']:.2%}, "
+        f"outliers {summary['outlier_fraction']:.2%}"
+    )

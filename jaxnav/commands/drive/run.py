@@ -1,0 +1,234 @@
+"""`jaxnav run`: the loop that drives, with all that looks on.
+
+Every step of the start asks whether a signal has come, and arming above all: see `Signals`.
+"""
+
+import gc
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxnav.commands.drive.arguments import Run
+from jaxnav.commands.drive.observers import open_onlookers
+from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.compiling.executables import keep_in
+from jaxnav.detection import make_detectors
+from jaxnav.errors import BadInput, visible
+from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
+from jaxnav.loop import plugins
+from jaxnav.loop.corrections import Corrections
+from jaxnav.loop.guard import Guard
+from jaxnav.loop.interfaces import HasOwnFiles, Setup, SharesProcess, Vehicle
+from jaxnav.loop.limits import Limits
+from jaxnav.loop.loop import Loop, Observer
+from jaxnav.loop.moved_vehicle import GuardProcess, MovedVehicle
+from jaxnav.loop.pilot import Pilot
+from jaxnav.loop.priority import before_others
+from jaxnav.loop.seeing import Eyes, Search
+from jaxnav.loop.signals import Signals
+from jaxnav.recording.drive_setup import DriveSetup
+
+EXIT_STOPPED = 1  # by the watchdog, not by a person
+
+
+@before_others()
+def run(args: Run, signals: Signals) -> int:
+    """Drive, and say why it ended.
+
+    Args:
+        signals: of the process, since its first line.
+
+    Raises:
+        Interrupted: a signal came before it drove.
+    """
+    configure_jax(float64=args.float64, threads=1)
+    keep_in(step_folder())
+    options = _options(args.option)
+    setup = _setup(args, options)
+    signals.check()
+    if args.params is not None:
+        params = load_params(args.params)
+        setup = setup.with_params(params)
+        _say(args, params.told())
+    told = Setup(
+        setup.rig, setup.markers, setup.vehicle, setup.route_on_map.start_pose, args.seed, options
+    )
+    with ExitStack() as closing:
+        guarding = _guarding(args)
+        if guarding is not None:
+            closing.callback(guarding.end)
+            guarding.prepare(signals.check)  # what is wrong with it is said before it compiles
+        searches = _searches(args, setup)
+        onlookers = open_onlookers(args, setup, closing)
+        signals.check()
+        pilot = _compiled(args, setup, searches)
+        signals.check()
+        drive = _Drive(args, told, guarding, signals)
+        reason = drive.run(pilot, searches, onlookers)
+    _summarise(drive.loop, drive.eyes, reason)
+    print(f"guard: {drive.kept_by}")
+    for onlooker in onlookers:
+        if onlooker.told is not None:
+            print(onlooker.told)
+    if drive.unheard is not None:
+        print(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {drive.unheard}")
+    return EXIT_STOPPED if drive.loop.stopped or drive.unheard is not None else 0
+
+
+def _options(given: Sequence[str]) -> dict[str, str]:
+    options = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise BadInput("--option", f"expected KEY=VALUE, got {text!r}")
+        if key in options:
+            raise BadInput("--option", f"{key} is given twice")
+        options[key] = value
+    return options
+
+
+def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
+    """Read all files and find all plug-ins first: bad input is found before anything is compiled,
+    let alone moves."""
+    factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
+    plugins.find("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
+    own = factory.own_files(options) if isinstance(factory, HasOwnFiles) else None
+    qcar = calib_dir() / "qcar"
+
+    def chosen(name: str, path: Path | None, load: Callable[[Path], Any]) -> Any:
+        if path is None and own is not None:
+            return getattr(own, name)
+        return load(path or qcar / f"{name}.yaml")
+
+    return DriveSetup(
+        rig=chosen("rig", args.rig, load_rig),
+        markers=chosen("markers", args.markers, load_markers),
+        vehicle=chosen("vehicle", args.vehicle_file, load_vehicle),
+        route=chosen("route", args.route, load_route),
+        selector=args.selector,
+        float64=args.float64,
+        relocate=args.relocate,
+    )
+
+
+def _guarding(args: Run) -> GuardProcess | None:
+    """The process that will own the vehicle; None where its plug-in wants to stay in this one."""
+    factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
+    if isinstance(factory, SharesProcess) and factory.shares_process:
+        return None
+    try:
+        return GuardProcess(args.vehicle)
+    except OSError as error:
+        problem = f"the guard's process can't be started: {error.strerror or error}"
+        raise BadInput(f"--vehicle {args.vehicle}", problem) from None
+
+
+def _searches(args: Run, setup: DriveSetup) -> list[Search]:
+    """One for each camera."""
+    detectors = make_detectors(setup.markers, args.corner_backend)
+    rig = jax.device_get(setup.rig)  # of which NumPy takes a camera without compiling anything
+    return [Search(c, rig.image_sizes_px[c], rig.camera(c), detectors) for c in range(len(rig))]
+
+
+def _compiled(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot:
+    """A pilot that need not compile any more, nor need those who look for markers."""
+    _say(args, "compiling")
+    began_s = time.monotonic()
+    with ThreadPoolExecutor(1) as beside:
+        looked = beside.submit(searches[0].warm_up)
+        pilot = setup.pilot(step_folder())
+        pilot.warm_up()
+        looked.result()
+    _say(args, f"compiled in {time.monotonic() - began_s:.1f} s")
+    return pilot
+
+
+class _Drive:
+    """What moves, from opening it to letting go of it.
+
+    Attributes:
+        kept_by: who stops the vehicle whatever happens here, in words.
+        unheard: why the vehicle may not have heard the last stop; None: it has.
+    """
+
+    loop: Loop
+    eyes: Eyes
+    kept_by = ""
+    unheard: str | None = None
+
+    def __init__(self, args: Run, told: Setup, guarding: GuardProcess | None, signals: Signals):
+        """Nothing is opened yet.
+
+        Args:
+            guarding: the process for the vehicle; None: it stays in this one.
+        """
+        self._args, self._told, self._guarding, self._signals = args, told, guarding, signals
+
+    def run(self, pilot: Pilot, searches: list[Search], onlookers: Sequence[Observer]) -> str:
+        """Open, drive, stop, and let go. Returns why it ended."""
+        args, signals = self._args, self._signals
+        with ExitStack() as closing:
+            # Python looks through all objects now and then: not through those of JAX, 50 ms a time.
+            gc.freeze()
+            closing.callback(gc.unfreeze)
+            signals.hold()
+            vehicle, guard = self._guarded(pilot.limits)
+            closing.callback(self._close, vehicle, guard)
+            signals.on_signal(guard.trip)
+            signals.check()
+            cameras = plugins.open_cameras(args.cameras or args.vehicle, self._told, vehicle)
+            self.eyes = Eyes(cameras, searches, guard, workers=max(1, os.cpu_count() or 1))
+            closing.callback(self.eyes.close)
+            # Before the eyes are closed, for which their threads may take a while.
+            closing.callback(guard.trip, "the drive is over")
+            self.loop = Loop(pilot, guard, vehicle, self.eyes, onlookers, args.period_s)
+            signals.check()
+            return self.loop.run(args.duration_s if args.duration_s is not None else float("inf"))
+
+    def _guarded(self, limits: Limits) -> tuple[Vehicle, Guard]:
+        """The vehicle, in a process of its own where that can be, and the guard of this one."""
+        args, why = self._args, "it shares its process"
+        if self._guarding is not None:
+            moved = self._guarding.open(self._told, limits, args.timeout_s, self._signals.check)
+            if moved is not None:
+                guard = Guard(moved, limits, args.timeout_s)
+                moved.watch(guard.trip)
+                self.kept_by = f"a process of its own, {moved.priority}"
+                _say(args, f"guard: {self.kept_by}")
+                return moved, guard
+            why = self._guarding.stays or why
+        self.kept_by = f"a thread, {args.vehicle} can't be moved to another process: {why}"
+        _say(args, f"guard: {self.kept_by}")
+        vehicle = plugins.open_vehicle(args.vehicle, self._told)
+        corrections = Corrections.of(self._told.vehicle)
+        return vehicle, Guard(vehicle, limits, args.timeout_s, corrections=corrections)
+
+    def _close(self, vehicle: Vehicle, guard: Guard) -> None:
+        guard.close()
+        self.unheard = vehicle.unheard if isinstance(vehicle, MovedVehicle) else guard.unheard
+
+
+def _say(args: Run, text: str) -> None:
+    if not args.headless:
+        sys.stderr.write(f"{visible(text)}\n")
+
+
+def _summarise(loop: Loop, eyes: Eyes, reason: str) -> None:
+    print(f"ended: {reason}")
+    statistics = loop.statistics
+    for name in sorted(statistics.counts):
+        median, late = (statistics.quantile_ms(name, share) for share in (0.5, 0.99))
+        count = int(statistics.counts[name].sum())
+        print(f"{name}: {count}, {median:.2f} ms median, {late:.2f} ms 99 %")
+    print(
+        f"deadlines missed: {statistics.deadlines_missed}; frames dropped: {eyes.dropped}; "
+        f"camera errors: {int(np.sum(eyes.errors))}"
+    )

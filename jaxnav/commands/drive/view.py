@@ -1,0 +1,57 @@
+"""`jaxnav view`: a recorded drive in Rerun, or as a file for it."""
+
+from contextlib import ExitStack
+
+from tqdm import tqdm
+
+from jaxnav.commands.drive.arguments import View as Arguments
+from jaxnav.commands.drive.pictures import read_outcomes
+from jaxnav.errors import visible
+from jaxnav.files import atomic_path, output_folder
+from jaxnav.plots.scenery import Scenery
+from jaxnav.recording.drive_log import DriveLog
+from jaxnav.recording.plausible import left_out, plausible
+from jaxnav.viewer.outcomes import Shown
+from jaxnav.viewer.rerun_view import RerunView, import_rerun
+
+
+def run(args: Arguments) -> int:
+    """Show the whole drive, and leave the window open."""
+    import_rerun()
+    log = read_outcomes(args.recording, args.headless)
+    scenery = Scenery.of(log.header)
+    if args.out is not None:
+        output_folder(args.out.parent)
+    with ExitStack() as stack:
+        save = None if args.out is None else stack.enter_context(atomic_path(args.out))
+        view = RerunView(
+            scenery.rig,
+            scenery.markers,
+            scenery.on_map_m(scenery.waypoints_m),
+            live=save is None,
+            save=save,
+            waits=True,
+        )
+        stack.callback(view.close)
+        show_drive(view, log, scenery, args.headless)
+    if args.out is not None:
+        print(f"written to {visible(args.out)}: rerun {visible(args.out)} opens it")
+    if view.dropped:
+        print(f"{view.dropped} outcomes or images could not be shown")
+    return 0
+
+
+def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool) -> None:
+    """All outcomes, all frames, all images."""
+    outcomes, odd = plausible(log.outcomes)
+    if odd:
+        print(left_out(odd))
+    names = () if scenery.rig is None else scenery.rig.names
+    for index in tqdm(range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False):
+        view.show(Shown.of_row(outcomes, index, scenery.origin_m))
+    for frame in (frame for given in log.inputs for frame in given.frames):
+        name = names[frame.camera] if frame.camera < len(names) else f"camera_{frame.camera}"
+        if frame.detections is not None:
+            view.image(name, frame.stamp_ns, None, frame.detections.corners_px)
+    for image in log.images():
+        view.image(image.topic.rpartition("/")[2], image.stamp_ns, image.jpeg, None)

@@ -1,0 +1,124 @@
+"""What the commands that simulate cars can be told."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxnav.commands.kinds import (
+    CornerBackend,
+    OptionalFile,
+    QCarFile,
+    Scenario,
+    Selector,
+    SimulatedSelector,
+    Switch,
+    require,
+    require_finite,
+    require_within,
+)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Drive the paper's experiment: a simulated car, four rendered cameras, one marker.
+
+    The car is driven by the method of --selector alone; Method A (the pose of lowest reprojection
+    error) with the same filter runs alongside on the same frames. Written to --out: report.png,
+    a mosaic of camera frames, summary.json, and trajectories in TUM format.
+    """
+
+    seed: int = 0
+    """Seed of every random number: first belief, image noise, odometry noise."""
+    seeds: int = 1
+    """Drive this many times, with seeds counting up from --seed, and print the success rates."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("demo")
+    """Folder for the report."""
+    selector: Selector = "multi-hypothesis"
+    """Which of the two poses of a marker the driving method believes."""
+    rig: QCarFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers: QCarFile = None
+    """Marker map."""
+    vehicle: QCarFile = None
+    """Vehicle parameters and limits."""
+    route: QCarFile = None
+    """Start and waypoints."""
+    params: OptionalFile = None
+    """Tuned parameters, for both methods: the noise of their filter is the same."""
+    blur: bool = True
+    """Integrate each image over its exposure while the car moves."""
+    exposure_ms: float = 10.0
+    """Exposure time, ms."""
+    corner_noise_px: float = 0.0
+    """Spoil the detected corners by this much (standard deviation, px)."""
+    rolling_shutter: bool = True
+    """Expose the rows of an image one after the other."""
+    corner_backend: CornerBackend = "aruco"
+    """Marker detector. apriltag needs the extra of that name."""
+    duration_s: float = 30.0
+    """Give up when the car has not arrived after this simulated time, s."""
+    headless: Switch = False
+    """No progress bar."""
+
+    def __post_init__(self) -> None:
+        require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
+        require(self.seeds >= 1, "--seeds", f"must be at least 1, got {self.seeds}")
+        require_finite("--exposure-ms", self.exposure_ms, zero_allowed=True)
+        require_finite("--corner-noise-px", self.corner_noise_px, zero_allowed=True)
+        require_finite("--duration-s", self.duration_s)
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Drive many seeds at corner level, without images, and count what became of them.
+
+    Prints a table, one row for each selector and noise level. A drive succeeds when the true car
+    has passed within 0.30 m of every waypoint in order, in 40 s, without leaving the 5 x 5 m
+    floor; parked, when its last pose is not the wrong one. A pose is wrong when its heading is off
+    by more than 20 degrees. Position error and ANEES (3 degrees of freedom) are those of poses that
+    are decided.
+    """
+
+    scenario: Scenario = "paper"
+    """What happens: the paper's drive, or one with trouble in it."""
+    selector: tuple[SimulatedSelector, ...] = ("multi-hypothesis",)
+    """Which pose is believed; several names, or `all`."""
+    corner_noise_px: tuple[float, ...] = (1.0,)
+    """Standard deviation of the corners, one or several."""
+    told_noise_px: Annotated[
+        float | None, tyro.conf.arg(metavar="PX", help_behavior_hint="(default: the truth)")
+    ] = None
+    """What the navigator is told of it."""
+    seeds: int = 100
+    """How many drives."""
+    seed: int = 0
+    """The first seed."""
+    rig: QCarFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers: QCarFile = None
+    """Marker map."""
+    vehicle: QCarFile = None
+    """Bicycle parameters and limits."""
+    params: OptionalFile = None
+    """Tuned parameters, before what the scenario tells; --told-noise-px goes before both."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
+        None
+    )
+    """Write all numbers, each with its 95 % interval, into this file after every row."""
+    resume: Switch = False
+    """Keep the rows that --json holds already."""
+    headless: Switch = False
+    """No progress bar."""
+
+    def __post_init__(self) -> None:
+        require(self.seeds >= 1, "--seeds", f"must be at least 1, got {self.seeds}")
+        require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
+        require(bool(self.selector), "--selector", "names no selector")
+        require(bool(self.corner_noise_px), "--corner-noise-px", "holds no number")
+        for value in self.corner_noise_px:
+            require_within("--corner-noise-px", value, "corner_sigma_px")
+        if self.told_noise_px is not None:
+            require_within("--told-noise-px", self.told_noise_px, "corner_sigma_px")
+        require(not self.resume or self.json is not None, "--resume", "needs --json")

@@ -1,0 +1,226 @@
+"""`jaxnav demo`: the paper's experiment on rendered cameras.
+
+Source: Liu, Schofield, Shan (2023), section III.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.pictures import corners_in_world, save_figure, views_of
+from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.commands.simulate.arguments import Demo
+from jaxnav.commands.simulate.rendered_world import Cameras, World
+from jaxnav.compiling.step import compiled_step
+from jaxnav.errors import visible
+from jaxnav.files import (
+    output_folder,
+    write_json,
+    write_tum,
+)
+from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.origin import planar_in_world, points_in_world, poses_in_world
+from jaxnav.plots.localisation import Track, camera_mosaic, drive_report
+from jaxnav.simulation.drive import (
+    DriveSettings,
+    Frame,
+    Methods,
+    drive,
+    waypoints_passed,
+)
+
+OURS = "our_method"
+METHOD_A = "method_a_kf"
+LABELS = {OURS: "our method", METHOD_A: "Method A + KF"}
+START_SPREAD = np.array([0.05, 0.05, np.deg2rad(5.0)])  # around the route's start, m m rad
+MOSAIC_ROWS = 3
+KEEP_EVERY = 8  # of so many frames one keeps its images, for the mosaic
+
+
+def run(args: Demo) -> int:
+    """Drive, report, and say in one line how it went."""
+    configure_jax(float64=True, threads=1)
+    world = World.load(args)
+    navigators = {
+        OURS: world.navigator(make_selector(args.selector)),
+        METHOD_A: world.navigator(LowestReprojection()),
+    }
+    out = output_folder(args.out)
+    if world.params is not None:
+        print(world.params.told())
+    methods = Methods(navigators, lambda navigator: compiled_step(navigator, step_folder()))
+    summaries = []
+    for seed in range(args.seed, args.seed + args.seeds):
+        record = _drive(args, world, methods, seed)
+        folder = out if args.seeds == 1 else output_folder(out / f"seed_{seed}")
+        summary = _summary(args, world, record, seed)
+        _write(folder, world, record, summary)
+        print(_one_line(summary))
+        summaries.append(summary)
+    if args.seeds > 1:
+        overall = _overall(summaries)
+        write_json(out / "summary.json", overall)
+        print(f"reached in {overall['reached']} of {overall['runs']} drives")
+    print(f"report in {visible(out)}")
+    return 0
+
+
+@dataclass(frozen=True)
+class Record:
+    """A finished drive."""
+
+    frames: list[Frame]
+    kept: dict[int, list[np.ndarray]]  # frame number -> images
+
+    @property
+    def true_poses(self) -> np.ndarray:
+        """(N, 3)."""
+        return np.array([frame.true_pose for frame in self.frames])
+
+    def poses(self, method: str) -> np.ndarray:
+        """(N, 3), NaN before the first pose."""
+        outputs = [frame.outputs[method] for frame in self.frames]
+        return np.array([o.pose if o.located else np.full(3, np.nan) for o in outputs])
+
+
+def _drive(args: Demo, world: World, methods: Methods, seed: int) -> Record:
+    rng = np.random.default_rng(seed)
+    start = np.asarray(world.route.start_pose) + START_SPREAD * rng.uniform(-1, 1, 3)
+    settings = DriveSettings(
+        start_pose=(float(start[0]), float(start[1]), float(start[2])),
+        duration_s=args.duration_s,
+        floor_m=world.floor_m(),
+    )
+    cameras = Cameras(world, rng, args.corner_noise_px)
+    frames: list[Frame] = []
+    kept: dict[int, list[np.ndarray]] = {}
+    with tqdm(
+        total=round(args.duration_s, 1),
+        unit="s",
+        desc=f"drive, seed {seed}",
+        disable=args.headless,
+        bar_format="{desc}: {n:.1f} of at most {total:.0f} s [{elapsed}]{postfix}",
+    ) as bar:
+        bar.set_postfix_str("compiling")
+        for frame in drive(methods, world.vehicle, cameras.look, settings, seed):
+            if len(frames) % KEEP_EVERY == 0:
+                kept[len(frames)] = cameras.images
+            frames.append(frame)
+            bar.update(settings.frame_period_s)
+            pose = planar_in_world(frame.outputs[OURS].pose, world.markers.origin_m)
+            x_m, y_m, psi_rad = pose
+            bar.set_postfix_str(f"at ({x_m:.2f}, {y_m:.2f}) m, {np.rad2deg(psi_rad):.0f} deg")
+    return Record(frames, kept)
+
+
+def _summary(args: Demo, world: World, record: Record, seed: int) -> dict[str, Any]:
+    passed = waypoints_passed(record.true_poses, np.asarray(world.route.waypoints_m))
+    finished = bool(record.frames[-1].outputs[OURS].done)
+    return {
+        "reached": finished and passed == len(world.route.waypoints_m),
+        "believes_done": finished,
+        "waypoints_passed": passed,
+        "duration_s": record.frames[-1].stamp_s,
+        "steps": len(record.frames),
+        "seed": seed,
+        "selector": args.selector,
+        "params": args.params,
+        "corner_backend": args.corner_backend,
+        "exposure_ms": args.exposure_ms if args.blur else 0.0,
+        "rolling_shutter": args.rolling_shutter,
+        "corner_noise_px": args.corner_noise_px,
+        "marker_seen_fraction": np.mean([np.any(f.observation.visible) for f in record.frames]),
+        "methods": {name: _score(record, name) for name in (OURS, METHOD_A)},
+    }
+
+
+def _score(record: Record, method: str) -> dict[str, float]:
+    errors = record.poses(method) - record.true_poses
+    errors = errors[np.isfinite(errors[:, 0])]
+    yaw_deg = np.rad2deg((errors[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+    branches = [frame.branches[method] for frame in record.frames]
+    judged = max(sum(bool(b.judged) for b in branches), 1)
+    distance_m = np.linalg.norm(errors[:, :2], axis=1)
+    return {
+        "position_rmse_m": np.sqrt(np.mean(distance_m**2)) if len(errors) else np.nan,
+        "position_median_m": np.median(distance_m) if len(errors) else np.nan,
+        "yaw_rmse_deg": np.sqrt(np.mean(yaw_deg**2)) if len(errors) else np.nan,
+        "wrong_branch_fraction": sum(bool(b.wrong) for b in branches) / judged,
+        "outlier_fraction": sum(bool(b.outlier) for b in branches) / judged,
+    }
+
+
+def _overall(summaries: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "runs": len(summaries),
+        "reached": sum(summary["reached"] for summary in summaries),
+        "success_rate": np.mean([summary["reached"] for summary in summaries]),
+        "methods": {
+            name: {
+                key: np.median([summary["methods"][name][key] for summary in summaries])
+                for key in summaries[0]["methods"][name]
+            }
+            for name in (OURS, METHOD_A)
+        },
+        "drives": summaries,
+    }
+
+
+def _write(folder: Path, world: World, record: Record, summary: dict[str, Any]) -> None:
+    times_s = np.array([frame.stamp_s for frame in record.frames])
+    origin_m = world.markers.origin_m
+    poses = {"truth": record.true_poses} | {name: record.poses(name) for name in (OURS, METHOD_A)}
+    for name, rows in poses.items():
+        known = np.isfinite(rows[:, 0])
+        wxyz_xyz = T_world_vehicle_from_planar(jnp.asarray(rows[known])).wxyz_xyz
+        Ts_world_vehicle = np.asarray(poses_in_world(wxyz_xyz, origin_m))
+        write_tum(folder / f"{name}.tum", times_s[known], Ts_world_vehicle)
+    poses = {name: planar_in_world(rows, origin_m) for name, rows in poses.items()}
+    report = drive_report(
+        times_s,
+        Track("truth", poses["truth"]),
+        [Track(LABELS[name], poses[name]) for name in (OURS, METHOD_A)],
+        np.asarray(points_in_world(world.route.waypoints_m, origin_m)),
+        world.route.waypoint_radius_m,
+        corners_in_world(world.markers),
+        title=_one_line(summary),
+    )
+    save_figure(report, folder / "report.png")
+    numbers = sorted(record.kept)
+    chosen = [numbers[round(i)] for i in np.linspace(0, len(numbers) - 1, MOSAIC_ROWS)]
+    rows_of_views = [
+        views_of(
+            world.rig,
+            world.markers.Ts_world_marker,
+            world.markers.size_m,
+            record.kept[number],
+            np.asarray(record.frames[number].observation.corners_px),
+            np.asarray(record.frames[number].observation.visible),
+            record.frames[number].outputs[OURS],
+            record.frames[number].stamp_s,
+        )
+        for number in dict.fromkeys(chosen)
+    ]
+    mosaic = camera_mosaic(
+        rows_of_views,
+        title="detected marker: green; normal of the pose taken: blue, of the other pose: orange",
+    )
+    save_figure(mosaic, folder / "mosaic.png")
+    write_json(folder / "summary.json", summary)
+
+
+def _one_line(summary: dict[str, Any]) -> str:
+    ours, method_a = (summary["methods"][name] for name in (OURS, METHOD_A))
+    verdict = "reached all waypoints" if summary["reached"] else "did NOT reach all waypoints"
+    return (
+        f"seed {summary['seed']}: {verdict} in {summary['duration_s']:.1f} s; "
+        f"position RMSE {ours['position_rmse_m']:.3f} m (Method A + KF "
+        f"{method_a['position_rmse_m']:.3f} m), wrong branch {ours['wrong_branch_fraction']:.1%} "
+        f"({method_a['wrong_branch_fraction']:.1%})"
+    )

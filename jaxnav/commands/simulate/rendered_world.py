@@ -1,0 +1,155 @@
+"""The world of a demo: its files as objects, and cameras that look at the rendered scene."""
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.belief.ambiguity import Selector
+from jaxnav.commands.simulate.arguments import Demo
+from jaxnav.detection import Detections, Detector, make_detectors, observe
+from jaxnav.errors import BadInput
+from jaxnav.files import (
+    Params,
+    Route,
+    apply_params,
+    calib_dir,
+    load_markers,
+    load_params,
+    load_rig,
+    load_route,
+    load_vehicle,
+)
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.navigator import Navigator, Output
+from jaxnav.simulation.drive import DriveSettings, PoseAt
+from jaxnav.simulation.rendering import Renderer
+from jaxnav.simulation.scene import Scene
+from jaxnav.simulation.sensor import Sensor, Shutter
+
+READOUT_S = 12e-3  # from the first row to the last, usual for a small CSI sensor
+# A small lens and a cheap sensor indoors: blurred by 0.7 px, 2 grey levels in the dark.
+SENSOR = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0, full_well_e=6000.0)
+FLOOR_M = 5.0  # side of the floor around start, waypoints and markers, at least
+
+
+@dataclass(frozen=True)
+class World:
+    """The files of a demo as objects, and the cameras that look at the scene."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle
+    route: Route  # in the coordinates of the markers
+    params: Params | None
+    renderer: Renderer
+    detectors: list[Detector]
+
+    @staticmethod
+    def load(args: Demo) -> "World":
+        """Read all files first, so that bad input is found before any work is done."""
+        qcar = calib_dir() / "qcar"
+        rig = load_rig(args.rig or qcar / "rig.yaml")
+        markers = load_markers(args.markers or qcar / "markers.yaml")
+        rows = max(height for _, height in rig.image_sizes_px)
+        shutter = Shutter(
+            exposure_s=args.exposure_ms / 1e3 if args.blur else 0.0,
+            row_time_s=READOUT_S / rows if args.rolling_shutter else 0.0,
+        )
+        if shutter.exposure_s / 2 + READOUT_S / 2 > DriveSettings.latency_s:
+            raise BadInput(
+                "--exposure-ms",
+                f"the last row would be read after the command is due "
+                f"({DriveSettings.latency_s * 1e3:.0f} ms after the stamp), got {args.exposure_ms}",
+            )
+        return World(
+            rig=rig,
+            markers=markers,
+            vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
+            route=load_route(args.route or qcar / "route.yaml").relative_to(markers.origin_m),
+            params=None if args.params is None else load_params(args.params),
+            renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, SENSOR),
+            detectors=make_detectors(markers, args.corner_backend),
+        )
+
+    def navigator(self, selector: Selector) -> Navigator:
+        """A navigator for this world.
+
+        Raises:
+            BadInput: a parameter that does not fit it.
+        """
+        navigator = Navigator(
+            rig=self.rig,
+            markers=self.markers,
+            vehicle=self.vehicle,
+            waypoints_m=self.route.waypoints_m,
+            waypoint_radius_m=self.route.waypoint_radius_m,
+            selector=selector,
+        )
+        return navigator if self.params is None else apply_params(navigator, self.params)
+
+    def floor_m(self) -> tuple[float, float, float, float]:
+        """The part of the map the car may use: x_min, x_max, y_min, y_max."""
+        points = np.vstack(
+            [
+                self.route.waypoints_m,
+                [self.route.start_pose[:2]],
+                np.asarray(self.markers.corners_world_m)[..., :2].reshape(-1, 2),
+            ]
+        )
+        center, half = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0) / 2
+        half = np.maximum(half + 1.0, FLOOR_M / 2)
+        low, high = center - half, center + half
+        return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+
+
+@dataclass
+class Cameras:
+    """Rendered images, searched for markers around the driver's belief and everywhere else."""
+
+    world: World
+    rng: np.random.Generator
+    corner_noise_px: float = 0.0  # on top of what detection leaves
+    images: list[np.ndarray] = field(default_factory=list)  # the latest, one a camera
+
+    def look(
+        self, T_world_vehicle_at: PoseAt, stamp_s: float, believed: Output | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Corners, visibility and sigma of one instant."""
+        world = self.world
+        self.images = world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)
+        predicted_px, expected = self._predicted(believed)
+        found = [
+            Detections.concatenate(
+                [
+                    detector.detect(image, world.rig.camera(c), predicted_px[c][expected[c]])
+                    for detector in world.detectors
+                ]
+            )
+            for c, image in enumerate(self.images)
+        ]
+        observed = observe(found, world.markers)
+        noise_px = self.corner_noise_px * self.rng.standard_normal(observed.corners_px.shape)
+        sigma_px = np.hypot(observed.sigma_px, self.corner_noise_px)
+        return observed.corners_px + noise_px, observed.visible, sigma_px
+
+    def _predicted(self, believed: Output | None) -> tuple[np.ndarray, np.ndarray]:
+        lanes = (len(self.world.rig), len(self.world.markers.ids))
+        if believed is None or not believed.located:
+            return np.zeros((*lanes, 4, 2)), np.zeros(lanes, bool)
+        return jax.device_get(_expect(self.world.rig, self.world.markers, believed.pose))
+
+
+@jax.jit
+def _expect(rig: CameraRig, markers: MarkerMap, pose: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where each marker should appear from a pose, (C, M, 4, 2), and whether it should, (C, M)."""
+    T_vehicle_world = T_world_vehicle_from_planar(jnp.asarray(pose)).inverse()
+    corners_world_m = markers.corners_world_m
+    return (
+        rig.project(T_vehicle_world, corners_world_m),
+        jnp.all(rig.sees(T_vehicle_world, corners_world_m), axis=-1),
+    )

@@ -1,0 +1,173 @@
+"""`jaxnav simulate`: many closed-loop drives at corner level, counted."""
+
+import itertools
+import math
+from contextlib import nullcontext
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from pydantic import Field
+from tqdm import tqdm
+
+from jaxnav.belief.selectors import SELECTORS, make_selector
+from jaxnav.commands.process import configure_jax
+from jaxnav.commands.simulate.arguments import Simulate as Arguments
+from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.errors import BadInput
+from jaxnav.files import limits, load_params, write_json
+from jaxnav.files.locking import sole_writer
+from jaxnav.files.reading import parse_json, read_text
+from jaxnav.files.validation import ForeignEntry, validate
+from jaxnav.navigator import Navigator
+from jaxnav.simulation.rollout import Rollout
+from jaxnav.simulation.scenarios import scenarios
+from jaxnav.simulation.scores import Drives
+
+
+def run(args: Arguments) -> int:
+    """Drive every combination of selector and noise; print a table, and keep the numbers."""
+    with nullcontext() if args.json is None else sole_writer(args.json):
+        return _run(args)
+
+
+def _run(args: Arguments) -> int:
+    configure_jax(float64=False)
+    names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
+    wanted = list(itertools.product(names, args.corner_noise_px))
+    done = _resumed(args)
+    car = _load(args)
+    if car.params is not None:
+        print(car.params.told())
+    print(_HEADER)
+    for name, noise_px in wanted:
+        key = _key(args, car, name, noise_px)
+        # A result of a version that knew no parameters had none.
+        found = [one for one in done if {"params": None} | one["run"] == key]
+        result = found[0] if found else {"run": key} | _drive(args, car, key)
+        if not found:
+            done.append(result)
+        if args.json is not None:
+            several = len(wanted) > 1 or len(done) > 1
+            write_json(args.json, {"runs": done} if several else result)
+        print(_row(result), flush=True)
+    return 0
+
+
+def _load(args: Arguments) -> ScenarioCar:
+    params = None if args.params is None else load_params(args.params)
+    car = ScenarioCar.load(args, params)
+    _navigator(car, args.scenario, "multi-hypothesis", told_noise_px=1.0)  # bad input shows
+    return car
+
+
+def _navigator(car: ScenarioCar, scenario: str, selector: str, told_noise_px: float) -> Navigator:
+    """What drives, and takes its corners for so good whatever its parameters say."""
+    navigator = car.navigator(scenarios()[scenario], make_selector(selector))
+    told_sigma_px = jnp.asarray(told_noise_px, navigator.corner_sigma_px.dtype)
+    return eqx.tree_at(lambda n: n.corner_sigma_px, navigator, told_sigma_px)
+
+
+def _drive(args: Arguments, car: ScenarioCar, key: dict[str, Any]) -> dict[str, Any]:
+    """All drives of one row of the table."""
+    name, noise_px = key["selector"], key["corner_noise_px"]
+    scenario = scenarios()[args.scenario]
+    navigator = _navigator(car, args.scenario, name, key["told_noise_px"])
+    rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px)
+    with tqdm(
+        total=args.seeds,
+        unit="drive",
+        desc=f"{name}, {noise_px} px",
+        disable=args.headless,
+        leave=False,
+    ) as bar:
+        keys = jax.vmap(jax.random.key)(args.seed + jnp.arange(args.seeds))
+        trace = rollout.run(keys, bar.update)
+    return Drives.of(trace, scenario).summary()
+
+
+def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[str, Any]:
+    """What a result belongs to."""
+    told_noise_px = noise_px
+    if car.params is not None and "corner_sigma_px" in car.params.values:
+        told_noise_px = float(car.params.values["corner_sigma_px"])
+    return {
+        "scenario": args.scenario,
+        "selector": name,
+        "corner_noise_px": noise_px,
+        "told_noise_px": told_noise_px if args.told_noise_px is None else args.told_noise_px,
+        "seeds": [args.seed, args.seed + args.seeds - 1],
+        "rig": None if args.rig is None else str(args.rig),
+        "markers": None if args.markers is None else str(args.markers),
+        "vehicle": None if args.vehicle is None else str(args.vehicle),
+        "params": None if args.params is None else str(args.params),
+    }
+
+
+def _resumed(args: Arguments) -> list[dict[str, Any]]:
+    if not args.resume or args.json is None or not args.json.exists():
+        return []
+    text = read_text(args.json, limits.JSON_BYTES)
+    try:
+        kept = parse_json(args.json, text)
+    except BadInput as bad:
+        raise BadInput(args.json, f"can't resume: {bad}") from None
+    if not isinstance(kept, dict) or not kept.keys() & {"run", "runs"}:
+        problem = "is not a result of jaxnav simulate, which has `run` or `runs`; can't resume"
+        raise BadInput(args.json, problem)
+    runs = kept.get("runs", [kept])
+    if not isinstance(runs, list):
+        raise BadInput(f"{args.json}: runs", "must be a list; can't resume")
+    for index, one in enumerate(runs):
+        validate(_Kept, one, args.json, f"runs[{index}]" if "runs" in kept else "")
+    return runs
+
+
+class _Measure(ForeignEntry):
+    """A number, null where there was none."""
+
+    value: Annotated[float, Field(strict=True)] | None
+
+
+class _Quantiles(ForeignEntry):
+    """Of a distribution."""
+
+    median: _Measure
+    p95: _Measure
+
+
+class _Kept(ForeignEntry):
+    """What is read of a row of an earlier result."""
+
+    run: dict[str, Any]
+    success_rate: _Measure
+    wrong_branch_fraction_after_2s: _Measure
+    wrong_once_decided_fraction: _Measure
+    time_to_decide_s: _Quantiles
+    median_position_error_m: _Measure
+    anees: _Measure
+
+
+_HEADER = (
+    "| selector | noise px | success | wrong after 2 s | decided s, median / 95 % | "
+    "wrong once decided | position error cm | ANEES |\n|---|---|---|---|---|---|---|---|"
+)
+
+
+def _row(result: dict[str, Any]) -> str:
+    run, decide = result["run"], result["time_to_decide_s"]
+
+    def number(measure: dict[str, Any]) -> float:
+        value = measure["value"]
+        return math.nan if value is None else float(value)
+
+    return (
+        f"| {run['selector']} | {run['corner_noise_px']:g} | "
+        f"{number(result['success_rate']):.1%} | "
+        f"{number(result['wrong_branch_fraction_after_2s']):.3%} | "
+        f"{number(decide['median']):.2f} / {number(decide['p95']):.2f} | "
+        f"{number(result['wrong_once_decided_fraction']):.3%} | "
+        f"{number(result['median_position_error_m']) * 100:.2f} | "
+        f"{number(result['anees']):.2f} |"
+    )

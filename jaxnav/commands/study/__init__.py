@@ -1,0 +1,1 @@
+"""Monte-Carlo studies, and pictures of them."""

@@ -1,0 +1,79 @@
+"""`jaxnav reliability`: whether flip probabilities mean what they say, as a diagram."""
+
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.process import configure_jax
+from jaxnav.commands.study.arguments import Reliability as Arguments
+from jaxnav.datasets.recordings import read_recording
+from jaxnav.datasets.replay import replay
+from jaxnav.errors import BadInput, visible
+from jaxnav.files import output_folder, write_json
+from jaxnav.plots.localisation import reliability_diagram
+from jaxnav.simulation.random_views import random_views
+from jaxnav.simulation.statistics import Reliability
+
+
+def run(args: Arguments) -> int:
+    """Predict, look, count, draw."""
+    configure_jax(float64=True)
+    name, probability, flipped = _simulated(args) if args.recording is None else _recorded(args)
+    if not len(probability):
+        raise BadInput(args.recording or "--frames", "gave no frame with two poses to choose from")
+    out = output_folder(args.out)
+    found = Reliability.of(probability, flipped)
+    summary: dict[str, Any] = {
+        "frames": name,
+        "pairs": len(probability),
+        "flipped_fraction": float(np.mean(flipped)),
+        "expected_calibration_error": found.expected_calibration_error,
+        "bins": {
+            "predicted": found.predicted.tolist(),
+            "observed": found.observed.tolist(),
+            "counts": found.counts.tolist(),
+        },
+    }
+    text = (
+        f"{name}: {summary['pairs']} pairs, {summary['flipped_fraction']:.2%} flipped, "
+        f"expected calibration error {found.expected_calibration_error:.4f}"
+    )
+    figure = reliability_diagram(
+        found.predicted, found.observed, found.intervals, found.counts, title=text
+    )
+    save_figure(figure, out / "reliability.png")
+    write_json(out / "summary.json", summary)
+    print(text)
+    print(f"diagram in {visible(out)}")
+    return 0
+
+
+def _simulated(args: Arguments) -> tuple[str, np.ndarray, np.ndarray]:
+    """What the image alone says of a pair, on random views."""
+    with tqdm(total=args.frames, unit="frame", disable=args.headless) as bar:
+        frames = random_views(args.frames, args.seed, progress=bar.update)
+    pair = np.asarray(frames.pair)
+    return (
+        "random views",
+        np.asarray(frames.flip_probability)[pair],
+        np.asarray(frames.flipped)[pair],
+    )
+
+
+def _recorded(args: Arguments) -> tuple[str, np.ndarray, np.ndarray]:
+    """What a selector says of every marker of a recording, each by itself."""
+    assert args.recording is not None
+    recording = read_recording(args.recording, None, None)
+    if recording.reference is None:
+        raise BadInput(args.recording, "has no reference trajectory to tell the true pose")
+    with tqdm(total=len(recording), unit="frame", disable=args.headless) as bar:
+        result = replay(
+            recording, make_selector(args.selector), one_at_a_time=True, progress=bar.update
+        )
+    branch = result.branch
+    pair = np.asarray(branch.ambiguous & ~branch.outlier) & recording.reference.valid[:, None]
+    name = f"{recording.name}, {args.selector}"
+    return name, result.flip_probability[pair], np.asarray(branch.wrong)[pair]

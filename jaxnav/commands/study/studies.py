@@ -1,0 +1,123 @@
+"""Studies by their config files: what `study` and `plot` share."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import xarray as xr
+
+from jaxnav.errors import BadInput
+from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
+from jaxnav.files.reading import read_mapping
+from jaxnav.studies.ambiguity import AmbiguityStudy
+from jaxnav.studies.config import Config
+from jaxnav.studies.damage import check_layout, check_trials, reading
+from jaxnav.studies.drives import DriveStudy
+from jaxnav.studies.store import count_done, read_attributes, read_dataset, read_layout
+from jaxnav.studies.study import Grid, Study
+from jaxnav.studies.summary import summarise
+
+KINDS: dict[str, type[Study]] = {"ambiguity": AmbiguityStudy, "drive": DriveStudy}
+SHIPPED = Path(__file__).resolve().parents[2] / "studies" / "configs"
+
+
+def shipped_configs(kind: str) -> dict[str, Path]:
+    """The configs of a kind that come with jaxnav, by name."""
+    return {path.stem: path for path in sorted((SHIPPED / kind).glob("*.yaml"))}
+
+
+def load_study(kind: str, path: Path) -> Study:
+    """The study that a config file describes.
+
+    Args:
+        path: the file, or the name of a shipped one.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    if not path.exists():
+        path = shipped_configs(kind).get(str(path), path)
+    data = read_mapping(path)
+    calibration = _calibration(data, path, kind)
+    files = {name: _digest(file) for name, file in calibration.items()}
+    config = Config.parse(kind, KINDS[kind].schema.parameters, data, path, files)
+    with jax.enable_x64(True):  # as exact as the files are; a study rounds to its own precision
+        rig = load_rig(calibration["rig"]) if "rig" in calibration else None
+        markers = load_markers(calibration["markers"]) if "markers" in calibration else None
+        vehicle = load_vehicle(calibration["vehicle"]) if "vehicle" in calibration else None
+    if rig is not None:
+        for section, given in (("axes", config.axes), ("fixed", config.fixed)):
+            counts = given.get("cameras")
+            for count in counts if isinstance(counts, list) else [counts]:
+                if isinstance(count, int) and count > len(rig):
+                    raise BadInput(
+                        f"{path}: {section}.cameras", f"the rig has {len(rig)}, got {count}"
+                    )
+    if kind == "ambiguity":
+        return AmbiguityStudy(config, rig)
+    assert rig is not None
+    assert markers is not None
+    assert vehicle is not None
+    return DriveStudy(config, rig, markers, vehicle)
+
+
+def summary_of(path: Path, bar: Any) -> tuple[str, int, xr.Dataset]:
+    """Kind of a store, how many trials it holds, and its summary.
+
+    Args:
+        bar: a tqdm that is told what has been read.
+
+    Raises:
+        BadInput: it is not a store of a study.
+    """
+    grid = _stored_grid(path)
+    layout, trials = read_layout(path), read_dataset(path)
+    check_layout(path, layout, grid)
+    check_trials(path, trials, grid)
+    bar.reset(total=layout.trials)
+    with reading(path):  # box by box, while it is summed up
+        summary = summarise(trials, grid, layout, bar.update)
+    return grid.config.kind, count_done(path), summary
+
+
+def _stored_grid(path: Path) -> Grid:
+    """What a store says that it is the result of, checked as if a person had written it."""
+    stored = read_attributes(path)["config"]
+    kind = stored.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise BadInput(f"{path}: config.kind", f"must be {' or '.join(KINDS)}, got {kind!r}")
+    schema = KINDS[kind].schema
+    data = {key: value for key, value in stored.items() if key not in ("kind", "files")}
+    return Grid(schema, Config.parse(kind, schema.parameters, data, f"{path}: config"))
+
+
+def _calibration(data: Mapping[str, Any], path: Path, kind: str) -> dict[str, Path]:
+    """The calibration files, relative to the config; `qcar` is the shipped one."""
+    wanted = ("rig",) if kind == "ambiguity" else ("rig", "markers", "vehicle")
+    found = {}
+    for name in ("rig", "markers", "vehicle"):
+        given = data.get(name, None if kind == "ambiguity" else "qcar")
+        if given is None:
+            continue
+        if name not in wanted:
+            raise BadInput(f"{path}: {name}", f"is not used by a study of kind {kind}")
+        if not isinstance(given, str) or not given:
+            raise BadInput(f"{path}: {name}", f"must be a file, or qcar, got {given!r}")
+        shipped = calib_dir() / "qcar" / f"{name}.yaml"
+        found[name] = shipped if given == "qcar" else path.parent / given
+        if not _is_file(found[name]):
+            raise BadInput(f"{path}: {name}", f"there is no file {found[name]}")
+    return found
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

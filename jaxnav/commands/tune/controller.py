@@ -1,0 +1,245 @@
+"""`jaxnav tune controller`: gains from simulated drives, every step other ones."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+from tqdm import tqdm
+
+from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.process import configure_jax
+from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.commands.tune.arguments import TuneController as Arguments
+from jaxnav.commands.tune.fit import Fitting, measure, plain_key, summary_of
+from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
+from jaxnav.files import Params, load_params, output_folder, write_json
+from jaxnav.navigator import Navigator
+from jaxnav.parameters import parameters_of
+from jaxnav.plots.tuning import controller_report
+from jaxnav.simulation.rollout import Rollout
+from jaxnav.simulation.scenarios import scenarios
+from jaxnav.simulation.scores import Drives
+from jaxnav.simulation.statistics import resampled, wilson_interval
+from jaxnav.simulation.world import Spread
+from jaxnav.tuning.descent import Noisy
+from jaxnav.tuning.drive_loss import DriveLoss
+from jaxnav.tuning.driving import ClosedLoop
+from jaxnav.tuning.fit import Fit, Problem
+from jaxnav.tuning.objective import Batch, NotFinite
+from jaxnav.tuning.unconstrained import Space
+
+GAINS = (
+    "controller.proportional_per_m",
+    "controller.integral_per_ms",
+    "controller.integral_limit_ms",
+    "controller.lookahead_m",
+    "controller.slows_at_rad",
+)
+# What the cars differ in; most odometers report too much where wheels slip.
+_CARS = Spread(odometer_scale=(0.95, 1.2))
+_SOFTNESS_M = (0.06, 0.01)  # of the switch between waypoints, at the first step and at the last
+_HELD_OUT_SEED, _TEST_SEED = 10**8, 10**9
+
+
+def run(args: Arguments) -> int:
+    """Learn, report, and say in a few lines what came of it."""
+    configure_jax(float64=False)
+    params = None if args.params is None else load_params(args.params)
+    loop, *tests = (closed_loop(args, name, params) for name in (args.scenario, *_tests(args)))
+    navigator = loop.rollout.navigator
+    space = gains_of(args, navigator)
+    gains = Gains(args, loop, dict(zip(_tests(args), tests, strict=True)), space)
+    out = output_folder(args.out)
+    key = plain_key("tune controller", args)
+    fitting = Fitting(out, key, gains.problem(), space, named=args.train)
+    try:
+        fit = fitting.run(args.headless)
+        found = gains.tested(fit)
+    except KeyboardInterrupt:
+        print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
+        return EXIT_INTERRUPTED
+    known = parameters_of(navigator)
+    summary = summary_of(
+        key,
+        fit,
+        {name: known[name] for name in space.free},
+        space.values(fit.best_x),
+        {name: (_told(before), _told(after)) for name, (before, after) in found.items()},
+    )
+    write_json(out / "summary.json", summary)
+    save_figure(controller_report(fit, space, found), out / "report.png")
+    print(_text(summary))
+    print(f"parameters and report in {visible(out)}")
+    return 0
+
+
+def _tests(args: Arguments) -> list[str]:
+    return list(dict.fromkeys(args.test_scenario))
+
+
+def closed_loop(args: Arguments, name: str, params: Params | None = None) -> ClosedLoop:
+    """Drives of a scenario, each by a car of its own.
+
+    Raises:
+        BadInput: a file that is no good, or a scenario in which nothing drives.
+    """
+    scenario = scenarios()[name]
+    if not scenario.drives:
+        raise BadInput("--scenario", f"nothing drives in {name}")
+    car = ScenarioCar.load(args, params)
+    navigator = car.navigator(scenario, make_selector(args.selector))
+    noise_px = jnp.asarray(args.corner_noise_px)
+    rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px, spread=_CARS)
+    return ClosedLoop(rollout, DriveLoss(args.time, args.cross_track, args.effort, args.smoothness))
+
+
+def gains_of(args: Arguments, navigator: Navigator) -> Space:
+    """What is to be learned, where a navigator stands.
+
+    Raises:
+        BadInput: names that its controller does not have.
+    """
+    known = [name for name in parameters_of(navigator) if name.startswith("controller.")]
+    for name in args.train:
+        if name not in known:
+            expected = ", ".join(known)
+            raise BadInput("--train", f"there is no {name} to learn: expected one of {expected}")
+    return Space.of(navigator, dict.fromkeys(args.train or GAINS, True))
+
+
+@dataclass(frozen=True)
+class Tested:
+    """A controller in one scenario, on seeds never trained on."""
+
+    loss: tuple[float, float, float]  # mean with its 95 % interval
+    parts: dict[str, float]
+    time_s: tuple[float, float, float]  # to the last waypoint
+    success: tuple[float, float, float]
+    poses: np.ndarray  # (frames, 3) of the first drive
+    waypoints_m: np.ndarray
+
+
+class Gains:
+    """The loss of drives, as a fit asks for it."""
+
+    def __init__(
+        self, args: Arguments, loop: ClosedLoop, tests: dict[str, ClosedLoop], space: Space
+    ):
+        self._args, self._loop, self._tests, self._space = args, loop, tests, space
+
+    def problem(self) -> Problem:
+        """Other seeds in every step; the same ones held out."""
+        args = self._args
+        return Problem(
+            optimiser=Noisy(self._evaluate, args.learning_rate, args.steps),
+            batch=lambda x, stage, step: Batch(step, jnp.ones(())),
+            held_out=lambda x, stage_x, stage: self._held_out(x),
+            softness=self._softness,
+            explain=self._explain,
+            steps=args.steps,
+            patience=max(10, args.steps // 3),
+            same_batch=False,
+        )
+
+    def tested(self, fit: Fit) -> dict[str, tuple[Tested, Tested]]:
+        """Before and after, by scenario."""
+        count = self._args.test_seeds
+        with tqdm(
+            total=2 * count * len(self._tests),
+            unit="drive",
+            desc="test",
+            disable=self._args.headless,
+            leave=False,
+        ) as bar:
+            return {
+                name: (
+                    self._test(loop, {}, bar.update),
+                    self._test(loop, self._space.values(fit.best_x), bar.update),
+                )
+                for name, loop in self._tests.items()
+            }
+
+    def _softness(self, step: int) -> float:
+        begin, end = _SOFTNESS_M
+        return float(begin * (end / begin) ** min(1.0, step / max(1, self._args.steps - 1)))
+
+    def _training(self, step: int) -> Key[Array, " S"]:
+        return _keys(self._args.seed + step * self._args.seeds, self._args.seeds)
+
+    def _evaluate(self, x: Array, batch: Batch, softness: Array) -> tuple[Array, Array]:
+        """Mean loss and gradient of a step's drives."""
+        soft = dataclasses.replace(self._loop, softness_m=softness)
+        losses, gradients = soft.value_and_grad(x, self._space, self._training(batch.items))
+        return jnp.mean(losses), jnp.mean(gradients, axis=0)
+
+    def _explain(self, x: Array, batch: Batch, softness: Array) -> NotFinite | None:
+        keys = self._training(batch.items)
+        soft = dataclasses.replace(self._loop, softness_m=softness)
+        broken = ~np.isfinite(np.asarray(soft.value_and_grad(x, self._space, keys)[1]))
+        if not broken.any():
+            return None
+        item = int(np.argmax(broken.any(axis=1)))
+        frame = soft.first_not_finite(x, self._space, keys[item])
+        return NotFinite(int(np.argmax(broken[item])), item, frame)
+
+    def _held_out(self, x: Array) -> float:
+        keys = _keys(_HELD_OUT_SEED, self._args.held_out_seeds)
+        return float(np.mean(self._loop.value(self._space.values(x), keys)[0]))
+
+    def _test(
+        self, loop: ClosedLoop, values: Mapping[str, Array], progress: Callable[[int], object]
+    ) -> Tested:
+        """The car is the scenario's own: nothing is drawn but what its seed draws."""
+        nominal = dataclasses.replace(loop, rollout=dataclasses.replace(loop.rollout, spread=None))
+        keys = _keys(_TEST_SEED, self._args.test_seeds)
+        losses, costs, trace = nominal.value(values, keys, progress)
+        once = np.ones(len(losses))
+        success = Drives.of(trace, loop.rollout.scenario).success
+        rate = float(np.mean(success))
+        low, high = wilson_interval(np.array(rate), np.array(len(success)))
+        own = np.asarray(trace.active)[0]
+        return Tested(
+            loss=resampled(losses, once),
+            parts={name: float(np.mean(p)) for name, p in loop.loss.parts(costs).items()},
+            time_s=resampled(np.asarray(costs.time_s), once),
+            success=(rate, float(low), float(high)),
+            poses=np.asarray(trace.true_pose)[0][own],
+            waypoints_m=np.asarray(loop.rollout.scenario.waypoints_m),
+        )
+
+
+def _keys(first: int, count: int) -> Key[Array, " S"]:
+    keys: Key[Array, " S"] = jax.vmap(jax.random.key)(first + jnp.arange(count))
+    return keys
+
+
+def _told(tested: Tested) -> dict[str, Any]:
+    return {
+        "loss": measure(tested.loss),
+        "parts": tested.parts,
+        "time_s": measure(tested.time_s),
+        "success_rate": measure(tested.success),
+    }
+
+
+def _text(summary: dict[str, Any]) -> str:
+    lines = [f"{summary['steps']} steps: {summary['ended']}"]
+    before, after = summary["parameters"]["before"], summary["parameters"]["after"]
+    lines += [f"  {name}: {before[name]:.3g} -> {after[name]:.3g}" for name in before]
+    lines.append("drives never seen before, before -> after:")
+    for name, of in summary["test"].items():
+        was, now = of["before"], of["after"]
+        change = now["loss"]["value"] / was["loss"]["value"] - 1
+        lines.append(
+            f"  {name}: loss {was['loss']['value']:.3f} -> {now['loss']['value']:.3f} "
+            f"({change:+.1%}), time {was['time_s']['value']:.2f} -> "
+            f"{now['time_s']['value']:.2f} s, success {was['success_rate']['value']:.1%} -> "
+            f"{now['success_rate']['value']:.1%}"
+        )
+    return "\n".join(lines)

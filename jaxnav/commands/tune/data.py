@@ -1,0 +1,149 @@
+"""What a filter is tuned on, stopped by and judged by: simulated drives, or recordings."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.reading import read_shown
+from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.commands.tune.arguments import TuneFilter as Arguments
+from jaxnav.commands.tune.drives import drives
+from jaxnav.commands.tune.recordings import navigator_of, tracks
+from jaxnav.commands.tune.sequences import Named, joined
+from jaxnav.datasets.recordings import read_recording
+from jaxnav.errors import BadInput
+from jaxnav.files import load_markers, load_rig
+from jaxnav.navigator import Navigator
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.simulation.rollout import Rollout
+from jaxnav.simulation.scenarios import scenarios
+from jaxnav.tuning.recorded import Recorded, simulated
+
+AT_A_TIME = 64  # sequences side by side, where nothing is to be differentiated
+_TEST_SEED = 10**6
+_HELD_OUT = 4  # of so many sequences of a recording one
+_DRIVE = ".mcap"
+
+Progress = Callable[[int], object]
+
+
+@dataclass(frozen=True)
+class Test:
+    """Sequences that have no part in the tuning, and the navigator that they are of."""
+
+    name: str
+    navigator: Navigator
+    size: int  # how many there are
+    recorded: Callable[[Progress], Recorded]
+
+
+@dataclass(frozen=True)
+class Data:
+    """A navigator as it stands, and what it is tuned on, stopped by and judged by."""
+
+    navigator: Navigator
+    learned: Recorded
+    held_out: Recorded
+    tests: tuple[Test, ...]
+
+
+def read_data(args: Arguments) -> Data:
+    """Everything, read before any work is done; simulated tests are driven when they are asked for.
+
+    Raises:
+        BadInput: names file or flag.
+    """
+    return _recorded(args) if args.recordings else _simulated(args)
+
+
+def _simulated(args: Arguments) -> Data:
+    car, scenario = ScenarioCar.load(args), scenarios()[args.scenario]
+    # Whoever is tuned, the drives are the same.
+    driver = car.navigator(scenario, MultiHypothesis())
+    noise_px = jnp.asarray(args.corner_noise_px)
+    rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px)
+
+    def drive(first: int, count: int, progress: Progress) -> Recorded:
+        """In batches of one size, of which the last repeats its last drive."""
+        size, parts = min(count, AT_A_TIME), []
+        for begin in range(0, count, size):
+            seeds = first + np.minimum(np.arange(begin, begin + size), count - 1)
+            part = simulated(rollout, jax.vmap(jax.random.key)(jnp.asarray(seeds)))
+            parts.append(part.rows(slice(0, min(size, count - begin))))
+            progress(len(parts[-1]))
+        return Recorded.together(parts)
+
+    count = args.seeds + args.held_out_seeds
+    with tqdm(total=count, unit="drive", desc="drive", disable=args.headless, leave=False) as bar:
+        known = drive(args.seed, count, bar.update)
+    own = car.navigator(scenario, make_selector(args.selector))
+    return Data(
+        navigator=own,
+        learned=known.rows(slice(0, args.seeds)),
+        held_out=known.rows(slice(args.seeds, None)),
+        tests=(
+            Test(
+                f"{args.test_seeds} drives, {args.scenario}",
+                own,
+                args.test_seeds,
+                lambda progress: drive(_TEST_SEED, args.test_seeds, progress),
+            ),
+        ),
+    )
+
+
+def _recorded(args: Arguments) -> Data:
+    learned = [_sequences(args, path, args.part) for path in args.recordings]
+    together = joined(learned)
+    rows = np.arange(len(together))
+    held_out = rows % _HELD_OUT == _HELD_OUT - 1
+    if not held_out.any():
+        some = ", ".join(str(path) for path in args.recordings)
+        problem = f"{len(together)} sequences: at least {_HELD_OUT} are needed, one to be held out"
+        raise BadInput(some, problem)
+    begin, end = args.part
+    rest = [(0.0, begin)] * (begin > 0) + [(end, 1.0)] * (end < 1)
+    tests = [(path, part) for path in args.recordings for part in rest]
+    tests += [(path, (0.0, 1.0)) for path in args.test]
+    return Data(
+        navigator=learned[0].navigator,
+        learned=together.rows(rows[~held_out]),
+        held_out=together.rows(rows[held_out]),
+        tests=tuple(_judging(args, tests)),
+    )
+
+
+def _judging(args: Arguments, tests: Sequence[tuple[Path, tuple[float, float]]]) -> list[Test]:
+    """Those of which somebody knows where the vehicle was."""
+    found = []
+    for path, part in tests:
+        named = _sequences(args, path, part)
+        if bool(jnp.any(named.recorded.judged)):
+            name = named.name if part == (0.0, 1.0) else f"{named.name}, {part[0]:g} to {part[1]:g}"
+            found.append(Test(name, named.navigator, len(named.recorded), _known(named.recorded)))
+    return found
+
+
+def _known(recorded: Recorded) -> Callable[[Progress], Recorded]:
+    return lambda progress: recorded
+
+
+def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> Named:
+    if path.suffix == _DRIVE:
+        log = read_shown(path, args.headless)
+        setup = DriveSetup.of_header(log.header, path)
+        return Named(str(path), setup.navigator(), drives(log, setup, part))
+    recording = read_recording(
+        path,
+        None if args.rig is None else load_rig(args.rig),
+        None if args.markers is None else load_markers(args.markers),
+    )
+    navigator = navigator_of(recording, True, args.selector)
+    return Named(str(path), navigator, tracks(recording, True, part))

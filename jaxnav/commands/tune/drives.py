@@ -1,0 +1,220 @@
+"""Recorded drives of a car as what a filter is tuned on.
+
+Inputs become what the pilot would make of them: the same stamps, frames and readings are believed.
+But everything is in its place in time, as if nothing had ever come late.
+"""
+
+import math
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.commands.tune.sequences import IDENTITY, bounds, cut, maps, side_by_side
+from jaxnav.errors import BadInput
+from jaxnav.loop.flags import Reject
+from jaxnav.loop.frames import Frames
+from jaxnav.loop.history import Told
+from jaxnav.loop.pilot import Input
+from jaxnav.loop.stamps import Stamps
+from jaxnav.pose.observation import Observation
+from jaxnav.recording.drive_log import DriveLog
+from jaxnav.recording.drive_replay import check_inputs
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.tuning.recorded import Recorded
+
+_NS_PER_US = 1000
+
+
+class Event(NamedTuple):
+    """Something that was sensed, and when."""
+
+    stamp_ns: int
+    told: Told  # odometry, or corners of some cameras
+
+
+def drives(
+    log: DriveLog, setup: DriveSetup, part: tuple[float, float], length: int = 400
+) -> Recorded:
+    """Sequences of a drive. Nobody knows where the car was: none of it is judged.
+
+    Odometry that the pilot refused on the way is left out.
+
+    Args:
+        setup: its `navigator()` goes with the sequences.
+        part: which of the events, as shares of them: (0, 0.5) is the first half.
+        length: events of a sequence, at most.
+
+    Raises:
+        BadInput: a frame of a camera that the rig does not have, or no marker is in view.
+    """
+    outcomes = log.outcomes
+    refused_ns = {
+        int(now_ns)
+        for now_ns, rejects in zip(outcomes.now_ns, outcomes.rejects, strict=True)
+        if rejects & Reject.ODOMETRY
+    }
+    return driven(log.inputs, setup, log.path, part, length, refused_ns)
+
+
+def driven(
+    inputs: Sequence[Input],
+    setup: DriveSetup,
+    where: Path,
+    part: tuple[float, float],
+    length: int = 400,
+    refused_ns: Collection[int] = (),
+) -> Recorded:
+    """`drives` of what reached a pilot, a ROS bag's perhaps.
+
+    Args:
+        where: the file that the inputs are of.
+        refused_ns: `now_ns` of inputs whose odometry is left out.
+    """
+    check_inputs(inputs, setup, where)
+    events = sensed(inputs, setup, refused_ns)
+    begin, end = bounds(len(events), part)
+    if not any(event.told.corners_px is not None for event in events[begin:end]):
+        problem = f"{end - begin} of its {len(events)} events, and none shows a marker of the map"
+        raise BadInput(where, problem)
+    rows = _Rows.of(events, len(setup.rig), len(setup.markers.ids))
+    indices, used = side_by_side(cut(np.arange(begin, end), length))
+    stamps_us = rows.stamps_us[indices]
+    dt_s = np.diff(stamps_us, axis=1, prepend=stamps_us[:, :1]) * 1e-6
+    lanes = np.tile(np.arange(len(setup.markers.ids)), (len(indices), 1))
+    obs = _observations(
+        jnp.asarray(rows.corners_px[indices], float),
+        jnp.asarray(rows.visible[indices] & used[..., None, None]),
+        jnp.asarray(rows.sigma_px[indices], float),
+        jnp.asarray(rows.odometry[indices], float),
+        jnp.asarray(rows.has_odometry[indices] & used),
+        jnp.asarray(dt_s, float),
+    )
+    return Recorded(
+        markers=maps(setup.markers, lanes),
+        obs=obs,
+        used=jnp.asarray(used),
+        T_world_vehicle_true=jnp.asarray(np.tile(IDENTITY, (*used.shape, 1)), float),
+        judged=jnp.zeros(used.shape, bool),
+    )
+
+
+def sensed(
+    inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int] = ()
+) -> list[Event]:
+    """What a pilot would believe of its inputs, in the order of the stamps.
+
+    What cameras show at one instant is one event.
+    """
+    events = sorted(_told(inputs, setup, refused_ns), key=_order)
+    merged: list[Event] = []
+    for event in events:
+        if merged and (both := _both(merged[-1], event)):
+            merged[-1] = both
+        else:
+            merged.append(event)
+    return merged
+
+
+def _told(
+    inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int]
+) -> Iterator[Event]:
+    """As `Pilot.handle` does, without an estimate."""
+    frames = Frames(len(setup.rig), setup.markers, setup.corner_sigma_px)
+    stamps = Stamps()
+    for given in inputs:
+        told, told_ns, _ = frames.told(given.frames, given.now_ns)
+        if told is not None:
+            yield Event(told_ns, told)
+        reading = given.odometry
+        if reading is None:
+            continue
+        stamp_ns = stamps.take(reading.stamp_ns, given.now_ns)
+        odometry = (reading.speed_mps, reading.steering_rad)
+        believed = reading.valid and all(map(math.isfinite, odometry))
+        if stamp_ns is not None and believed and given.now_ns not in refused_ns:
+            yield Event(stamp_ns, Told(odometry=odometry))
+
+
+def _order(event: Event) -> tuple[int, bool]:
+    """By stamp, corners first."""
+    return event.stamp_ns, event.told.corners_px is None
+
+
+def _both(one: Event, other: Event) -> Event | None:
+    """Two events as one; None where they are not of one instant, or of the same camera."""
+    a, b = one.told, other.told
+    if one.stamp_ns != other.stamp_ns or a.visible is None or b.visible is None:
+        return None
+    if np.any(np.any(a.visible, axis=1) & np.any(b.visible, axis=1)):
+        return None
+    assert a.corners_px is not None
+    assert b.corners_px is not None
+    assert a.sigma_px is not None
+    assert b.sigma_px is not None
+    there = np.any(b.visible, axis=1)[:, None]
+    told = Told(
+        corners_px=np.where(there[..., None, None], b.corners_px, a.corners_px),
+        visible=a.visible | b.visible,
+        sigma_px=np.where(there[..., None], b.sigma_px, a.sigma_px),
+    )
+    return Event(one.stamp_ns, told)
+
+
+class _Rows(NamedTuple):
+    """N events as arrays."""
+
+    stamps_us: np.ndarray
+    odometry: Float[np.ndarray, "N 2"]  # speed_mps, steering_rad: the last known
+    has_odometry: Bool[np.ndarray, " N"]
+    corners_px: Float[np.ndarray, "N C M 4 2"]
+    visible: Bool[np.ndarray, "N C M"]
+    sigma_px: Float[np.ndarray, "N C M 4"]
+
+    @staticmethod
+    def of(events: Sequence[Event], cameras: int, markers: int) -> "_Rows":
+        """Whole microseconds, as the pilot counts them."""
+        lanes = (len(events), cameras, markers)
+        rows = _Rows(
+            stamps_us=np.array([event.stamp_ns // _NS_PER_US for event in events], np.int64),
+            odometry=np.zeros((len(events), 2)),
+            has_odometry=np.array([event.told.odometry is not None for event in events], bool),
+            corners_px=np.zeros((*lanes, 4, 2)),
+            visible=np.zeros(lanes, bool),
+            sigma_px=np.ones((*lanes, 4)),
+        )
+        odometry = (0.0, 0.0)
+        for index, (_, told) in enumerate(events):
+            odometry = told.odometry or odometry
+            rows.odometry[index] = odometry
+            if told.corners_px is not None:
+                rows.corners_px[index] = told.corners_px
+                rows.visible[index] = told.visible
+                rows.sigma_px[index] = told.sigma_px
+        return rows
+
+
+@jax.vmap
+@jax.vmap
+def _observations(
+    corners_px: Float[Array, "C M 4 2"],
+    visible: Array,
+    sigma_px: Float[Array, "C M 4"],
+    odometry: Float[Array, " 2"],
+    has_odometry: Array,
+    dt_s: Float[Array, ""],
+) -> Observation:
+    """Events as `step` takes them, (B, T)."""
+    return Observation(
+        corners_px,
+        visible,
+        speed_mps=odometry[0],
+        steering_rad=odometry[1],
+        dt_s=dt_s,
+        corner_sigma_px=sigma_px,
+        has_odometry=has_odometry,
+    )

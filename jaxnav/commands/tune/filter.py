@@ -1,0 +1,216 @@
+"""`jaxnav tune filter`: Q and R from recordings or simulated drives."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+from tqdm import tqdm
+
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.process import configure_jax
+from jaxnav.commands.tune.arguments import TuneFilter as Arguments
+from jaxnav.commands.tune.data import AT_A_TIME, Data, read_data
+from jaxnav.commands.tune.fit import Fitting, measure, plain_key, summary_of
+from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
+from jaxnav.files import Params, apply_params, load_params, output_folder, write_json
+from jaxnav.navigator import Navigator
+from jaxnav.parameters import parameters_of, with_parameters
+from jaxnav.plots.tuning import tuning_report
+from jaxnav.simulation.statistics import anees_band, resampled
+from jaxnav.tuning.branches import estimated
+from jaxnav.tuning.descent import Smooth
+from jaxnav.tuning.filter import FilterCost
+from jaxnav.tuning.fit import Fit, Problem
+from jaxnav.tuning.objective import Batch, Objective, where_not_finite
+from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.unconstrained import Space
+
+_STAGES = 4
+
+
+def run(args: Arguments) -> int:
+    """Learn, report, and say in a few lines what came of it."""
+    configure_jax(float64=False)
+    params = None if args.params is None else load_params(args.params)
+    data = read_data(args)
+    navigator = data.navigator if params is None else apply_params(data.navigator, params)
+    space = space_of(args, navigator, data.learned)
+    cost = FilterCost(navigator, space, args.loss)
+    objective = Objective(cost)
+    out = output_folder(args.out)
+    problem = _problem(args, cost, objective, data)
+    key = plain_key("tune filter", args)
+    fitting = Fitting(out, key, problem, space, objective.prior_sigma, named=args.train)
+    try:
+        fit = fitting.run(args.headless)
+    except KeyboardInterrupt:
+        print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
+        return EXIT_INTERRUPTED
+    found = _tested(args, data, params, space, fit)
+    summary = summary_of(
+        key,
+        fit,
+        space.values(space.start),
+        space.values(fit.best_x),
+        {name: (_told(before), _told(after)) for name, (before, after) in found.items()},
+    )
+    write_json(out / "summary.json", summary)
+    save_figure(tuning_report(fit, space, found), out / "report.png")
+    print(_text(summary))
+    print(f"parameters and report in {visible(out)}")
+    return 0
+
+
+def space_of(args: Arguments, navigator: Navigator, learned: Recorded) -> Space:
+    """What is to be learned, where a navigator stands.
+
+    Raises:
+        BadInput: names that it does not have.
+    """
+    names = args.train or _by_default(navigator, learned)
+    for flag, given in (("--train", args.train), ("--full", args.full)):
+        for name in given:
+            if name not in parameters_of(navigator) or name.startswith("controller."):
+                known = [n for n in parameters_of(navigator) if not n.startswith("controller.")]
+                problem = f"there is no {name} in this filter: expected one of {', '.join(known)}"
+                raise BadInput(flag, problem)
+    try:
+        return Space.of(navigator, dict.fromkeys(names, True), frozenset(args.full))
+    except ValueError as error:
+        raise BadInput("--full", str(error)) from None
+
+
+def _by_default(navigator: Navigator, learned: Recorded) -> tuple[str, ...]:
+    """Of a car Q, and all of R that this estimator looks at; of a free body Q alone: how far its
+    corners scatter its recordings tell by themselves."""
+    names = ("motion.acceleration_density",)
+    if not isinstance(navigator.motion, BicycleKalman):
+        return names
+    is_bank = isinstance(navigator.selector, MultiHypothesis)
+    floors = ("selector.floor_m", "selector.floor_rad") if is_bank else ("motion.vision_floor",)
+    brings_sigma = learned.obs.corner_sigma_px is not None
+    corners = "model_sigma_px" if brings_sigma else "corner_sigma_px"
+    return (*names, "motion.odometry_sigma", *floors, corners)
+
+
+def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: Data) -> Problem:
+    made: dict[int, tuple[Batch, Batch]] = {}
+
+    def of_stage(x: Array, stage: int) -> tuple[Batch, Batch]:
+        if stage not in made:
+            made.clear()
+            made[stage] = (cost.batch(x, data.learned), cost.batch(x, data.held_out))
+        return made[stage]
+
+    return Problem(
+        optimiser=Smooth(objective),
+        batch=lambda x, stage, step: of_stage(x, stage)[0],
+        held_out=lambda x, stage_x, stage: float(cost.mean(x, of_stage(stage_x, stage)[1])),
+        explain=lambda x, batch, soft: where_not_finite(cost, x, batch.items, soft),
+        steps=args.steps,
+        stages=_STAGES,
+    )
+
+
+@dataclass(frozen=True)
+class Tested:
+    """An estimator on drives that had no part in the tuning."""
+
+    rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
+    anees: tuple[float, float, float]
+    band: tuple[float, float]  # in which ANEES is consistent, 99.9 %
+    error_m: np.ndarray  # of every judged frame
+    indefinite: int  # judged frames whose covariance is none, by rounding; not in ANEES
+
+
+def _tested(
+    args: Arguments, data: Data, params: Params | None, space: Space, fit: Fit
+) -> dict[str, tuple[Tested, Tested]]:
+    """Before and after, by the name of what they were held against."""
+    found = {}
+    for test in data.tests:
+        with tqdm(
+            total=3 * test.size, unit="drive", desc="test", disable=args.headless, leave=False
+        ) as bar:
+            recorded = test.recorded(bar.update)
+            before = test.navigator if params is None else apply_params(test.navigator, params)
+            after = with_parameters(before, space.values(fit.best_x))
+            found[test.name] = (
+                _test(before, recorded, bar.update),
+                _test(after, recorded, bar.update),
+            )
+    return found
+
+
+def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object]) -> Tested:
+    size, parts = min(len(test), AT_A_TIME), []
+    for begin in range(0, len(test), size):
+        rows = np.minimum(np.arange(begin, begin + size), len(test) - 1)
+        some = jax.device_get(estimated(navigator, test.rows(rows)))
+        kept = min(size, len(test) - begin)
+        parts.append((np.asarray(some.square_m2)[:kept], np.asarray(some.nees)[:kept]))
+        progress(kept)
+    judged = np.asarray(test.judged)
+    square_m2, nees = (np.concatenate(leaf) for leaf in zip(*parts, strict=True))
+    definite = judged & ~np.isnan(nees)
+
+    def mean(values: np.ndarray, counted: np.ndarray) -> tuple[float, float, float]:
+        return resampled(np.where(counted, values, 0).sum(axis=1), counted.sum(axis=1))
+
+    rmse_m = tuple(float(np.sqrt(value)) for value in mean(square_m2, judged))
+    freedom = 3 if isinstance(navigator.motion, BicycleKalman) else 6
+    return Tested(
+        rmse_m=(rmse_m[0], rmse_m[1], rmse_m[2]),
+        anees=mean(nees, definite),
+        band=anees_band(len(test), freedom),
+        error_m=np.sqrt(square_m2[judged]),
+        indefinite=int(np.sum(judged & ~definite)),
+    )
+
+
+def _told(tested: Tested) -> dict[str, Any]:
+    return {
+        "position_median_m": float(np.median(tested.error_m)),
+        "position_rmse_m": measure(tested.rmse_m),
+        "anees": measure(tested.anees),
+        "anees_consistent": list(tested.band),
+        "frames": {"judged": len(tested.error_m), "covariance_indefinite": tested.indefinite},
+    }
+
+
+def _text(summary: dict[str, Any]) -> str:
+    """What a person wants to know first."""
+    lines = [f"{summary['steps']} steps, {summary['stages']} stages: {summary['ended']}"]
+    before, after = summary["parameters"]["before"], summary["parameters"]["after"]
+    for name in before:
+        lines.append(f"  {name}: {_short(before[name])} -> {_short(after[name])}")
+    losses = summary["held_out_loss"]
+    lines.append(f"loss on what was held out: {losses['before']:.5g} -> {losses['after']:.5g}")
+    for name, of in summary["test"].items():
+        low, high = of["after"]["anees_consistent"]
+        lines.append(f"{name}, never seen before (ANEES of {low:.2f} to {high:.2f} is honest):")
+        lines += [f"  {when}: {_judgement(of[when])}" for when in ("before", "after")]
+    return "\n".join(lines)
+
+
+def _judgement(of: dict[str, Any]) -> str:
+    rmse, anees = of["position_rmse_m"], of["anees"]
+    low, high = (100 * end for end in rmse["interval"])
+    frames, without = of["frames"]["judged"], of["frames"]["covariance_indefinite"]
+    less = f", without {without} of {frames} frames whose covariance is indefinite"
+    return (
+        f"position RMSE {100 * rmse['value']:.2f} cm ({low:.2f} to {high:.2f}), median "
+        f"{100 * of['position_median_m']:.2f} cm, ANEES {anees['value']:.2f} "
+        f"({anees['interval'][0]:.2f} to {anees['interval'][1]:.2f}{less if without else ''})"
+    )
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ", ".join(_short(entry) for entry in value) + "]"
+    return f"{value:.3g}"
