@@ -117,7 +117,7 @@ def test_the_digest_is_of_all_that_a_program_or_a_drive_depends_on(tmp_path):
         ("numerics/trees.py", True, True),
         ("vehicles/sim.py", True, False),
         ("recording/messages.py", False, True),
-        ("commands/run.py", False, False),
+        ("commands/drive/run.py", False, False),
     ]:
         before = digests()
         with (package / name).open("a") as source:

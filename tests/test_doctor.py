@@ -14,7 +14,7 @@ from jaxnav.commands.doctor.findings import Finding, Report
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
 
-CHECKS = "jaxnav.commands.doctor_checks"
+CHECKS = "jaxnav.commands.doctor"
 
 
 @pytest.fixture(autouse=True)

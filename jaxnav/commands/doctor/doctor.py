@@ -14,7 +14,7 @@ from jaxnav.commands.doctor.arguments import Doctor
 from jaxnav.commands.doctor.findings import Finding, Report
 from jaxnav.errors import BadInput
 
-_CHECKS = "jaxnav.commands.doctor_checks"
+_CHECKS = "jaxnav.commands.doctor"
 
 
 def run(args: Doctor) -> int:
