@@ -161,7 +161,7 @@ def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """Without the search for cycles, a third of the time: a drive's messages have none."""
+    """Without the search for cycles, a tenth of the time: a drive's messages have none."""
     if not gc.isenabled():
         yield
         return

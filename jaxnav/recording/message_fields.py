@@ -46,6 +46,8 @@ class Array:
         dtype, shape = _ITEMS[self.items][1], self.shape
         row, is_fixed = math.prod(size for size in shape if size > 0), -1 not in shape
         of_none = (0, *shape[1:])
+        if shape == (-1,):
+            return lambda values: np.array(values, dtype)
 
         def shaped(values: list[Any]) -> np.ndarray:
             if len(values) % row or (is_fixed and len(values) != row):

@@ -130,8 +130,9 @@ class OutcomeMessage(Entry):
 
     @model_validator(mode="after")
     def _is_whole(self) -> "OutcomeMessage":
-        reported = [getattr(self, name) is not None for name in REPORTED]
-        if any(reported) and not all(reported):
+        told = vars(self)
+        missing = sum(told[name] is None for name in REPORTED)
+        if 0 < missing < len(REPORTED):
             raise ValueError(f"must have all of {', '.join(REPORTED)}, or none")
         return self
 
