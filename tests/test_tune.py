@@ -15,8 +15,8 @@ from jaxnav.tuning.drive_loss import DriveLoss
 @pytest.fixture(autouse=True)
 def keep_the_settings_of_jax(monkeypatch):
     """Commands choose a precision and a cache of their own; tests keep theirs."""
-    for command in ("tune_filter", "tune_controller"):
-        name = f"jaxnav.commands.{command}.configure_jax"
+    for command in ("filter", "controller"):
+        name = f"jaxnav.commands.tune.{command}.configure_jax"
         monkeypatch.setattr(name, lambda float64: None)
 
 
