@@ -216,7 +216,9 @@ def test_help_takes_little_more_than_what_reads_the_command_line() -> None:
     assert least_s([*JAXNAV, "--help"]) <= 4 * least_s([sys.executable, "-c", "import tyro"])
 
 
-@pytest.mark.parametrize("command", ["replay", "calibrate rig", "demo --out"])
+@pytest.mark.parametrize(
+    "command", ["replay", "plot", "calibrate rig", "study ambiguity", "tune filter", "demo --out"]
+)
 def test_a_name_that_is_too_long_is_one_line(command: str, tmp_path: Path) -> None:
     run = subprocess.run(
         [*JAXNAV, *command.split(), "x" * 300], capture_output=True, text=True, cwd=tmp_path

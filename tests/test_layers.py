@@ -1,7 +1,7 @@
 """Who may import whom: every import in jaxnav/ is parsed and held against the arrows.
 
-shell -> pictures -> uses -> users -> navigator -> belief & control -> pose -> models -> numerics,
-never upward.
+shell -> pictures -> users -> navigator -> belief & control -> pose -> models -> numerics, never
+upward.
 """
 
 import ast
@@ -14,16 +14,20 @@ PACKAGE = Path(__file__).resolve().parents[1] / "jaxnav"
 
 # From the bottom up. A new folder, or file beside them, must be placed here before the test passes.
 LAYERS = {
-    "numerics": {"numerics"},
+    "numerics": {"lanes", "numerics"},
     "models": {"models"},
     "pose": {"pose"},
     "belief & control": {"belief", "control"},
-    "navigator": {"lanes", "navigator", "parameters", "timeline"},
-    "users": {"compiling", "detection", "files", "loop", "simulation"},
-    "uses": {
+    "navigator": {"navigator", "parameters", "timeline"},
+    "users": {
         "calibration",
+        "compiling",
         "datasets",
+        "detection",
+        "files",
+        "loop",
         "recording",
+        "simulation",
         "studies",
         "testing",
         "tuning",
@@ -35,19 +39,21 @@ LAYERS = {
 ORDER = list(LAYERS)
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
 PURE_CORE = set(ORDER[: ORDER.index("users")])
-# What stands side by side: these arrows alone lead from one to another.
+# What stands side by side in a layer: these arrows alone lead from one to another.
 SIDE_BY_SIDE = {
-    ("timeline", "navigator"),
-    ("compiling", "files"),
-    ("detection", "compiling"),
-    ("loop", "compiling"),
-    ("loop", "detection"),
-    ("loop", "files"),
-    ("datasets", "recording"),
-    ("vehicles", "recording"),
-    ("testing", "vehicles"),
-    ("viewer", "plots"),
-    ("cli", "commands"),
+    "timeline": {"navigator"},
+    "compiling": {"files"},
+    "detection": {"compiling"},
+    "loop": {"compiling", "detection", "files"},
+    "recording": {"compiling", "detection", "files", "loop"},
+    "datasets": {"detection", "files", "loop", "recording"},
+    "vehicles": {"compiling", "detection", "files", "loop", "recording", "simulation"},
+    "testing": {"compiling", "detection", "files", "loop", "vehicles"},
+    "calibration": {"detection", "files"},
+    "studies": {"files", "simulation"},
+    "tuning": {"simulation"},
+    "viewer": {"plots"},
+    "cli": {"commands"},
 }
 MAY_IMPORT_LANES = {"simulation", "tuning"}
 MOST_NODES, MOST_ARROWS, LONGEST_CHAIN = 30, 170, 14
@@ -113,7 +119,7 @@ def _may_import(top: str, target: str) -> bool:
     if target == "lanes":
         return top in MAY_IMPORT_LANES
     if LAYER_OF[target] == layer:
-        return (top, target) in SIDE_BY_SIDE
+        return target in SIDE_BY_SIDE.get(top, set())
     return ORDER.index(LAYER_OF[target]) < ORDER.index(layer)
 
 
@@ -231,6 +237,9 @@ def test_the_house_is_seen_at_a_glance() -> None:
         ("files.rigs", "from jaxnav.detection import detect"),
         ("detection.edges", "import jaxnav.simulation.rendering"),
         ("loop.pilot", "from jaxnav.recording.drive_log import DriveLog"),
+        ("lanes.rules", "from jaxnav.navigator import Navigator"),
+        ("datasets.replay", "from jaxnav.simulation import rollout"),
+        ("calibration.rigs.bundle", "from jaxnav.simulation import rollout"),
         ("simulation.plant", "import jax\njax.config.update('jax_enable_x64', True)"),
         ("simulation.plant", "import jax\ndef f():\n    jax.config.update('jax_enable_x64', 1)"),
         ("studies.grid", "from jax import config"),

@@ -276,7 +276,7 @@ def test_a_start_that_is_called_off_opens_nothing(workplace, tmp_path, after_s):
         text=True,
     )
     with process:
-        while not hears(process):
+        while process.poll() is None and not hears(process):
             time.sleep(0.002)
         time.sleep(after_s)
         process.send_signal(signal.SIGINT)

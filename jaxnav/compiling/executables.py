@@ -33,8 +33,7 @@ _NAME = re.compile(r"[0-9a-f]{64}\.step")
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 # All of the package but what only calls what is compiled, or draws what came of it.
 _WITHOUT = (
-    "calibration", "commands", "datasets", "plots", "recording", "studies", "testing",
-    "tuning", "viewer",
+    "calibration", "commands", "datasets", "plots", "studies", "testing", "tuning", "viewer",
 )  # fmt: skip
 PACKAGE = Path(__file__).resolve().parents[1]
 

@@ -1,8 +1,8 @@
 """A process that runs before what else the computer has to do, and a thread before its siblings.
 
-A nice value counts among the processes of one terminal only, where the kernel groups them by
-session (sched(7), autogroups; on by default in most of Linux): what another terminal runs gets as
-much time as all of this one. So the group's value is lowered as well.
+A nice value counts among the processes of one terminal only, where the kernel groups them so
+(sched(7), autogroups): what another terminal runs gets as much time as all of this one. So the
+group's value is lowered as well.
 """
 
 import os
@@ -37,9 +37,11 @@ def before_others() -> Iterator[None]:
 @contextmanager
 def before_siblings() -> Iterator[None]:
     """Meanwhile the calling thread comes before the others of its process that run already."""
+    if sys.platform != "linux":  # a nice value is the process's, and its siblings have it as well
+        yield
+        return
     before = os.getpriority(os.PRIO_PROCESS, 0)
-    # Elsewhere than on Linux a nice value is the process's, and its siblings have it as well.
-    if sys.platform != "linux" or before <= FIRST_NICE or not lower_nice(FIRST_NICE):
+    if before <= FIRST_NICE or not lower_nice(FIRST_NICE):
         yield
         return
     try:

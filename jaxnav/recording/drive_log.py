@@ -162,14 +162,13 @@ def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
 @contextmanager
 def _uncollected() -> Iterator[None]:
     """Without the search for cycles, a tenth of the time: a drive's messages have none."""
-    if not gc.isenabled():
-        yield
-        return
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        gc.enable()
+        if was_enabled:
+            gc.enable()
 
 
 @dataclass
