@@ -76,10 +76,8 @@ def line(spoof: Spoof, drives: list[list[Step]]) -> str:
         times_s = np.array([(step.input.now_ns - BEGIN_NS) / 1e9 - BEGIN_S for step in steps])
         gaps_s = np.diff(times_s, append=times_s[-1]) * (times_s >= 0)
         outcomes = [step.outcome for step in steps]
-        acts = np.array([bool(o.report.output.decided) and o.throttle != 0 for o in outcomes])
-        errors_m = np.array(
-            [np.hypot(*(s.outcome.report.output.pose - s.truth[:3])[:2]) for s in steps]
-        )
+        acts = np.array([bool(o.output.decided) and o.throttle != 0 for o in outcomes])
+        errors_m = np.array([np.hypot(*(s.outcome.output.pose - s.truth[:3])[:2]) for s in steps])
         healths = np.array([outcome.health for outcome in outcomes])
         wrong = acts & (errors_m > WRONG_M)
         slow = healths >= Health.DEGRADED

@@ -80,8 +80,8 @@ def main() -> None:
             outcome = pilot.handle(later(inputs[index], lap * span_ns))
             healths[outcome.health] += 1
             not_finite += Fault.NOT_FINITE in outcome.faults
-            if outcome.report.output.located:
-                P = outcome.report.output.covariance
+            if outcome.output.located:
+                P = outcome.output.covariance
                 eigenvalues = np.linalg.eigvalsh(P.astype(float))
                 least, largest = min(least, eigenvalues[0]), max(largest, eigenvalues[-1])
                 asymmetry = max(asymmetry, float(np.abs(P - P.T).max()))

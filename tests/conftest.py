@@ -35,13 +35,15 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Tracing makes millions of small objects that are not garbage; to look for it costs a tenth.
 gc.set_threshold(1_000_000, 50, 100)
-# The pure core is all that lies beside the package's __init__, less the shell. The hook sees what
-# is imported after it, so nothing of jaxnav may be imported above.
-CORE = sorted(
-    f"jaxnav.{path.stem}"
-    for path in (Path(__file__).resolve().parents[1] / "jaxnav").glob("*.py")
-    if path.stem not in ("__init__", "cli", "errors", "plotting")
-)
+# The pure core: folders, and what lies beside them. The hook sees what is imported after it, so
+# nothing of jaxnav may be imported above.
+CORE = [
+    f"jaxnav.{name}"
+    for name in (
+        "belief", "control", "lanes", "models", "navigator", "numerics", "parameters", "pose",
+        "timeline",
+    )
+]  # fmt: skip
 install_import_hook(CORE, "beartype.beartype")
 
 

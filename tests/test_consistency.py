@@ -27,7 +27,7 @@ def told():
     @jax.jit
     def told(navigator, obs):
         snapshot = navigator.snapshot(obs)
-        found = consistent(snapshot, navigator.find_candidates)
+        found = consistent(snapshot, navigator.find_candidates, navigator.no_candidates())
         return snapshot, found, own_errors_px(snapshot)
 
     return told

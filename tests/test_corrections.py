@@ -132,11 +132,9 @@ def test_a_pilot_whose_sensors_are_off_believes_the_same():
         outcome = pilot.handle(_as_sensed(step.input, corrections))
         expected = step.outcome
         assert outcome.stamp_ns == expected.stamp_ns
-        np.testing.assert_allclose(
-            outcome.report.output.pose, expected.report.output.pose, atol=1e-9
-        )
+        np.testing.assert_allclose(outcome.output.pose, expected.output.pose, atol=1e-9)
         assert outcome.steering_rad == pytest.approx(expected.steering_rad, abs=1e-9)
-    assert steps[-1].outcome.report.output.located
+    assert steps[-1].outcome.output.located
     assert _jitted(advance_packed)._cache_size() == programs
 
 

@@ -66,7 +66,7 @@ def test_who_waits_is_told_how_far_it_is(path):
 def test_outcomes_are_tables(whole):
     outcomes = whole.outcomes
     expected = [make_outcome(index) for index in range(COUNT)]
-    output, belief = expected[0].report.output, expected[0].moment.belief
+    output, belief = expected[0].output, expected[0].belief.bank
     np.testing.assert_array_equal(outcomes.now_ns, BEGIN_NS + PERIOD_NS * np.arange(COUNT))
     np.testing.assert_allclose(outcomes.times_s, 0.01 * np.arange(COUNT))
     np.testing.assert_array_equal(outcomes.steering_rad, [one.steering_rad for one in expected])

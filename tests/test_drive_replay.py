@@ -97,8 +97,8 @@ def test_a_replay_has_the_recorded_bits(log, drive):
 
 
 def changed(outcome: Outcome, name: str, value) -> Outcome:
-    report = eqx.tree_at(lambda r: getattr(r.output, name), outcome.report, np.asarray(value))
-    return dataclasses.replace(outcome, report=report)
+    output = eqx.tree_at(lambda o: getattr(o, name), outcome.output, np.asarray(value))
+    return dataclasses.replace(outcome, output=output)
 
 
 def by_others(log: DriveLog) -> DriveLog:
@@ -107,7 +107,7 @@ def by_others(log: DriveLog) -> DriveLog:
 
 
 def test_the_last_bit_counts_where_the_same_program_recorded(log, outcomes):
-    output = outcomes[60].report.output
+    output = outcomes[60].output
     off = np.nextafter(output.pose, np.inf)
     other = [*outcomes[:60], changed(outcomes[60], "pose", off), *outcomes[61:]]
     difference = first_difference(log, other)
@@ -117,8 +117,8 @@ def test_the_last_bit_counts_where_the_same_program_recorded(log, outcomes):
 
 
 def test_what_is_believed_counts_also_where_it_is_not_shown(log, outcomes):
-    moment = eqx.tree_at(lambda m: m.belief.number, outcomes[40].moment, replace_fn=lambda n: n + 1)
-    other = dataclasses.replace(outcomes[40], moment=moment)
+    belief = eqx.tree_at(lambda b: b.bank.number, outcomes[40].belief, replace_fn=lambda n: n + 1)
+    other = dataclasses.replace(outcomes[40], belief=belief)
     difference = first_difference(log, [*outcomes[:40], other])
     assert (difference.index, difference.what) == (40, "bits that are not shown")
 
@@ -126,9 +126,9 @@ def test_what_is_believed_counts_also_where_it_is_not_shown(log, outcomes):
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda o: changed(o, "pose", o.report.output.pose + 2e-9), "pose: off by 2e-09"),
-        (lambda o: changed(o, "pose", o.report.output.pose * np.nan), "pose: off by inf"),
-        (lambda o: changed(o, "nis", o.report.output.nis + 1e-5), "nis: off by "),
+        (lambda o: changed(o, "pose", o.output.pose + 2e-9), "pose: off by 2e-09"),
+        (lambda o: changed(o, "pose", o.output.pose * np.nan), "pose: off by inf"),
+        (lambda o: changed(o, "nis", o.output.nis + 1e-5), "nis: off by "),
         (
             lambda o: changed(o, "decided", False),
             "decided: False, recorded True",
@@ -158,7 +158,7 @@ def test_outcomes_that_were_lost_are_passed_over(drive, setup, outcomes, tmp_pat
     recorder.close()
     log = read_drive(recorder.path)
     assert first_difference(log, outcomes) is None
-    shifted = [changed(o, "pose", o.report.output.pose + 1e-3) for o in outcomes[80:]]
+    shifted = [changed(o, "pose", o.output.pose + 1e-3) for o in outcomes[80:]]
     assert first_difference(log, [*outcomes[:80], *shifted]) is not None
 
 
@@ -256,9 +256,9 @@ def test_a_drive_is_replayed_bit_for_bit_and_recorded_anew(drive, tmp_path, caps
     assert summary["first_difference"] is None
     assert summary["rms_position_difference_m"] == 0
     assert sum(summary["health_shares"].values()) == pytest.approx(1)
-    assert summary["final_pose"] == drive[1][-1][1].report.output.pose.tolist()
+    assert summary["final_pose"] == drive[1][-1][1].output.pose.tolist()
     rows = np.loadtxt(tmp_path / "trajectory.tum")
-    assert len(rows) == sum(bool(o.report.output.located) for _, o in drive[1])
+    assert len(rows) == sum(bool(o.output.located) for _, o in drive[1])
     np.testing.assert_allclose(rows[-1, 1:3], summary["final_pose"][:2], rtol=1e-8)
     code, summary = replayed(tmp_path / "again", tmp_path / "replay.mcap", "--limit", 40)
     assert (code, summary["states"], summary["compared"]) == (0, 40, 40)
@@ -349,7 +349,7 @@ def test_a_ros_bag_is_driven_too(drive, route, tmp_path):
     assert code == 0
     assert summary["states"] == 80
     assert summary["located_share"] > 0.9
-    off_m = np.hypot(*(summary["final_pose"] - drive[1][79][1].report.output.pose)[:2])
+    off_m = np.hypot(*(summary["final_pose"] - drive[1][79][1].output.pose)[:2])
     assert off_m < 0.1
     assert (tmp_path / "out" / "report.png").exists()
 

@@ -99,13 +99,13 @@ def test_a_picture_that_freezes_does_not_lead_the_car_astray(trial):
     frozen = FrozenPicture(trial, world, navigator, begin_s)
     steps = []
     for step in drive(pilot, world, begin_s + 4.0, inject.frames(frozen.edit)):
-        frozen.output = step.outcome.report.output
+        frozen.output = step.outcome.output
         steps.append(step)
     faults = [(step.input.now_ns - BEGIN_NS, step.outcome.faults) for step in steps]
     seen_s = [ns / 1e9 - begin_s for ns, fault in faults if Fault.FRAME_FROZEN in fault]
     assert 0 < seen_s[0] < 1.3
     truths = np.array([step.truth[:2] for step in steps])
-    poses = np.array([step.outcome.report.output.pose[:2] for step in steps])
+    poses = np.array([step.outcome.output.pose[:2] for step in steps])
     lasts = np.array([ns > begin_s * 1e9 for ns, _ in faults])
     assert np.hypot(*np.diff(truths[lasts], axis=0).T).sum() > 0.5  # it has driven
     assert np.hypot(*(poses - truths)[lasts].T).max() < 0.2

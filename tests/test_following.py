@@ -119,7 +119,7 @@ def at_start(start, recorded) -> Followed:
 
 @functools.cache
 def gradient():
-    start, drive = first_of((starts().belief, recorded()))
+    start, drive = first_of((starts().bank, recorded()))
     compiled = jax.jit(jax.grad(weighed)).lower(0 * SPACE.start, jnp.ones(3), start, drive)
     return compiled.compile()
 
@@ -138,7 +138,7 @@ LONG = 1000
 @functools.cache
 def long_gradient():
     """Of a thousand frames, in float32."""
-    start, drive = first_of((starts().belief, recorded().padded(LONG)))
+    start, drive = first_of((starts().bank, recorded().padded(LONG)))
     with jax.enable_x64(False):
         start, drive, navigator, space = in_float32((start, drive, NAVIGATOR, SPACE))
 
@@ -206,16 +206,16 @@ def test_shorter_recordings_are_filled_with_frames_that_are_not_used():
 def test_it_starts_in_the_true_branch():
     found, poses = starts(), true_poses(recorded())[:, 0]
     assert np.all(found.chosen)
-    gaps = np.asarray(found.belief.mean[:, 0, :3]) - poses
+    gaps = np.asarray(found.bank.mean[:, 0, :3]) - poses
     assert np.abs(gaps[:, :2]).max() < 0.3
     assert np.abs(wrapped(gaps[:, 2])).max() < 0.3
     assert np.linalg.norm(mirrored(poses[0])[:2] - poses[0, :2]) > 1
-    np.testing.assert_array_equal(found.belief.mean[:, 0, 3:], 0)
+    np.testing.assert_array_equal(found.bank.mean[:, 0, 3:], 0)
 
 
 def test_the_mirror_image_is_less_likely():
     """Followed as well, from as wide a start, and at the end of the drive still mirrored."""
-    start, drive = first_of((starts().belief, recorded()))
+    start, drive = first_of((starts().bank, recorded()))
     pose = true_poses(recorded())[0, 0]
     other = eqx.tree_at(
         lambda b: b.mean, start, start.mean.at[0, :3].set(jnp.asarray(mirrored(pose)))
@@ -258,7 +258,7 @@ def test_a_pose_is_carried_back_along_its_arcs():
 @pytest.mark.parametrize("loss", [0, 1, 2], ids=["likelihood", "score", "error"])
 def test_gradients_are_central_differences(loss):
     """Every entry of x by itself, in a drive that loses sight of its marker."""
-    start, drive = first_of((starts().belief, recorded()))
+    start, drive = first_of((starts().bank, recorded()))
     size, step = SPACE.start.size, 1e-4
     told = steps_of(start, drive, jnp.asarray(step * np.vstack([np.eye(size), -np.eye(size)])))
     ahead, behind = np.split(np.asarray(sums(told, axis=1))[loss], 2)
@@ -271,7 +271,7 @@ def test_gradients_are_central_differences(loss):
 
 def test_frames_that_are_not_used_say_nothing():
     """Whatever they hold; and what was said before them stays, bit for bit."""
-    start, drive = first_of((starts().belief, recorded()))
+    start, drive = first_of((starts().bank, recorded()))
     unused = eqx.tree_at(lambda r: r.used, drive, drive.used.at[5:].set(False))
     garbled = eqx.tree_at(
         lambda r: (r.obs.corners_px, r.obs.speed_mps, r.obs.dt_s, r.obs.visible),
@@ -294,7 +294,7 @@ def test_frames_that_are_not_used_say_nothing():
 
 def test_a_filter_that_breaks_is_worth_nothing():
     """Once nothing is believed any more there is nothing to be wrong about: no way to save cost."""
-    start, drive = first_of((starts().belief, recorded()))
+    start, drive = first_of((starts().bank, recorded()))
     broken = at_start(eqx.tree_at(lambda b: b.mean, start, jnp.nan * start.mean), drive)
     np.testing.assert_array_equal(broken.log_likelihood, -np.inf)
     np.testing.assert_array_equal(broken.log_score[DECIDES:], -np.inf)
@@ -335,7 +335,7 @@ def test_gradients_are_finite(kind):
     program, (step, start, drive) = long_gradient()
     if kind != "padded":
         pose = (0.9, -0.6, 2.2) if kind == "oblique" else (0.0, -0.4, np.pi / 2)
-        start, drive = first_of((starts().belief, recorded().padded(LONG)))
+        start, drive = first_of((starts().bank, recorded().padded(LONG)))
         drive = standing(drive, pose, visible=kind != "nothing seen")
         start = eqx.tree_at(lambda b: b.mean, start, start.mean.at[0, :3].set(jnp.asarray(pose)))
         used = jnp.ones_like(drive.used)
@@ -359,7 +359,7 @@ def test_the_implicit_gradient_is_that_of_all_steps():
     motion = eqx.tree_at(
         lambda m: (m.tilt_sigma_rad, m.height_sigma_m), NAVIGATOR.motion, (0.0, 0.0)
     )
-    belief = first_of(starts().belief)
+    belief = first_of(starts().bank)
     mean = jnp.asarray([[*(pose + np.array([0.02, -0.01, 0.02])), 0, 0, 0]])
     belief = eqx.tree_at(lambda b: b.mean, belief, mean)
     freedom = jnp.asarray(np.eye(6)[:, [0, 1, 5]])
@@ -429,7 +429,7 @@ def test_a_cost_is_what_its_loss_says(monkeypatch):
 
     decided = jnp.asarray([True, False, True])
     monkeypatch.setattr(tuned_filter, "follow", stub)
-    monkeypatch.setattr(tuned_filter, "started", lambda n, r: Started(starts().belief, decided))
+    monkeypatch.setattr(tuned_filter, "started", lambda n, r: Started(starts().bank, decided))
     for loss, cost, frames in (("likelihood", -3.0, 24), ("score", -5.0 * 9 / 12, 18)):
         of = FilterCost(NAVIGATOR, SPACE, loss)
         batch = of.batch(SPACE.start, drives)
@@ -441,7 +441,7 @@ def test_a_cost_is_what_its_loss_says(monkeypatch):
         np.testing.assert_allclose(mean, cost * 2 * FRAMES / frames)
     error = FilterCost(NAVIGATOR, SPACE, "error")
     np.testing.assert_allclose(error(SPACE.start, item, jnp.zeros(())), 200.0)
-    nobody = SimpleNamespace(belief=starts().belief, chosen=jnp.zeros(3, bool))
+    nobody = SimpleNamespace(bank=starts().bank, chosen=jnp.zeros(3, bool))
     monkeypatch.setattr(tuned_filter, "started", lambda n, r: nobody)
     assert float(error.batch(SPACE.start, drives).frames) == 1
     assert seen[0].selector.max_inflation == seen[0].selector.max_misfit == 1

@@ -33,8 +33,8 @@ def fuse(history: History, stamp_ns: int, number: int, made=told) -> tuple | Non
     assert len(entries) <= KEPT + 1
     numbers = [number_of(entry.told) for entry in entries]
     new = numbers.index(number)
-    moment = (*base.moment, *numbers)
-    history.fused(moment, entries[new], (*base.moment, *numbers[: new + 1]))
+    moment = (*base.belief, *numbers)
+    history.fused(moment, entries[new], (*base.belief, *numbers[: new + 1]))
     return moment
 
 
@@ -60,7 +60,7 @@ def test_events_in_order_are_fused_once():
         assert placed is not None
         base, entries = placed
         assert [number_of(entry.told) for entry in entries] == [number]
-        history.fused((*base.moment, number), entries[0], (*base.moment, number))
+        history.fused((*base.belief, number), entries[0], (*base.belief, number))
         assert history.newest_ns == BEGIN_NS + 10 * MS * number
 
 

@@ -18,7 +18,7 @@ from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.fan import fan
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.map_fit import fit
-from jaxnav.belief.motion import Belief, followed, merged, unstarted
+from jaxnav.belief.motion import Bank, followed, merged, unstarted
 from jaxnav.models.geometry import on_ground
 from jaxnav.navigator import Navigator
 from jaxnav.pose.candidates import Candidates, find_candidates
@@ -362,7 +362,7 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     alive = np.array([True, True, True, True, False, True])
     weights = np.where(alive, rng.uniform(0.1, 1, count), 0.7)
     heir = np.array([0, 0, 2, 0, 2, 2])
-    belief = Belief(
+    belief = Bank(
         jnp.asarray(means), jnp.asarray(covariances), jnp.log(weights), jnp.asarray(alive),
         unstarted(jnp.zeros(n), n, 3, count).rejections, jnp.arange(count),
     )  # fmt: skip
@@ -428,7 +428,7 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
 
 
 def test_nobody_merges_with_itself():
-    motionless = Belief(
+    motionless = Bank(
         jnp.ones((3, 2)), jnp.tile(jnp.eye(2), (3, 1, 1)), jnp.log(jnp.asarray([0.2, 0.3, 0.5])),
         jnp.asarray([True, False, True]), unstarted(jnp.zeros(2), 2, 1, 3).rejections,
         jnp.arange(3),
@@ -492,7 +492,7 @@ def _car(precision: str) -> Navigator:
 def run(nav: Navigator, obs: Observation) -> Seen:
     def step(state, obs):
         state, out = nav.step(state, obs)
-        belief = state.belief
+        belief = state.belief.bank
         return state, Seen(
             pose=out.pose,
             hypothesis=out.hypothesis,
@@ -734,7 +734,7 @@ def test_a_step_has_finite_gradients(precision):
     def started(pose):
         mean = np.append(pose, [0, 0, 0]) + np.outer(off, [0.3, 0.1, 0.3, 0, 0, 0])
         return eqx.tree_at(
-            lambda s: (s.belief.mean, s.belief.covariance, s.belief.initialised),
+            lambda s: (s.belief.bank.mean, s.belief.bank.covariance, s.belief.bank.initialised),
             nav.init(),
             (
                 jnp.asarray(mean),
@@ -751,11 +751,11 @@ def test_a_step_has_finite_gradients(precision):
             lambda n: (n.corner_sigma_px, n.motion.acceleration_density), nav, (sigma_px, density)
         )
         state = eqx.tree_at(
-            lambda s: (s.belief.mean, s.belief.covariance), state, (mean, covariance)
+            lambda s: (s.belief.bank.mean, s.belief.bank.covariance), state, (mean, covariance)
         )
         reading = Observation(corners_px, visible, speed_mps, steering_rad, dt_s)
         state, out = changed.step(state, reading)
-        belief = state.belief
+        belief = state.belief.bank
         told = (belief.mean, belief.covariance, belief.log_weight, out.flip_probability, out.nis)
         return sum(jnp.sum(leaf) for leaf in told)
 
@@ -767,7 +767,7 @@ def test_a_step_has_finite_gradients(precision):
         (started(frontal), frontally),
     ):
         for visible in (obs.visible, jnp.zeros_like(obs.visible)):
-            belief = before.belief
+            belief = before.belief.bank
             floats = (
                 obs.corners_px, obs.speed_mps, obs.dt_s, nav.corner_sigma_px,
                 nav.motion.acceleration_density, belief.mean, belief.covariance,

@@ -25,7 +25,7 @@ from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor
 from tests import worlds
-from tests.helpers.drives import make_report
+from tests.helpers.drives import make_output
 
 FAMILY = "tag36h11"
 WIDTH_PX, HEIGHT_PX = SIZE_PX = (820, 410)
@@ -213,11 +213,13 @@ class Drive:
             vehicle=worlds.qcar(),
             waypoints_m=worlds.WAYPOINTS_M,
         )
-        made = make_report(np.random.default_rng(0))
-        report = eqx.tree_at(lambda r: r.output.covariance, made, 1e-4 * np.eye(6))
-        packed = Layout.of(report).pack(report)
+        made = make_output(np.random.default_rng(0))
+        output = eqx.tree_at(
+            lambda o: (o.pose_covariance, o.velocity_covariance), made, (1e-4 * np.eye(3),) * 2
+        )
+        packed = Layout.of(output).pack(output)
         self.pilot = Pilot(
-            navigator, program=lambda moment, control, *_: (moment, moment, control, packed)
+            navigator, program=lambda belief, control, *_: (belief, belief, control, packed)
         )
         self.now_ns = BEGIN_NS
 

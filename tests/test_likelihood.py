@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 
 from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.estimate import Belief
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.kalman import white_acceleration
 from jaxnav.belief.map_fit import fit
-from jaxnav.belief.motion import Belief
+from jaxnav.belief.motion import Bank
 from jaxnav.models.geometry import OFF_GROUND, T_world_vehicle_from_planar
 from jaxnav.navigator import Navigator
 from jaxnav.pose.observation import Observation, Snapshot, log_sigmas
@@ -39,7 +40,7 @@ def navigator(selector, ground_plane=False, tilt_sigma_rad=TINY, height_sigma_m=
     )
 
 
-def believing(mean, covariance) -> Belief:
+def believing(mean, covariance) -> Bank:
     """One hypothesis that has started."""
     empty = BicycleKalman(CAR).init(1)
     return eqx.tree_at(
@@ -49,23 +50,20 @@ def believing(mean, covariance) -> Belief:
     )
 
 
-def at_rest(pose, P) -> Belief:
+def at_rest(pose, P) -> Bank:
     covariance = jnp.eye(6).at[:3, :3].set(P)
     return believing(jnp.append(jnp.asarray(pose), jnp.zeros(3)), covariance)
 
 
 @jax.jit
-def look(nav: Navigator, belief: Belief, obs: Observation):
+def look(nav: Navigator, belief: Bank, obs: Observation):
     """The log-likelihood, and the belief afterwards."""
     return looked(nav, belief, obs)
 
 
-def looked(nav: Navigator, belief: Belief, obs: Observation):
-    snapshot = nav.snapshot(obs.usable())
-    asks = not isinstance(nav.selector, MultiHypothesis)
-    candidates = nav.find_candidates(snapshot) if asks else nav.no_candidates()
-    estimate = nav.estimate(belief, snapshot, candidates)
-    return estimate.log_likelihood, estimate.belief
+def looked(nav: Navigator, belief: Bank, obs: Observation):
+    after, estimate = nav.sense(Belief.begin(belief), obs)
+    return estimate.log_likelihood, after.bank
 
 
 def seen_from(pose, sigma_px=1.0, seed=0) -> Observation:
@@ -86,7 +84,7 @@ def squared_px2(obs: Observation, poses):
     return jax.lax.map(one, poses, batch_size=4096)
 
 
-def log_integral(obs: Observation, sigma_px, mean, P, about: Belief) -> float:
+def log_integral(obs: Observation, sigma_px, mean, P, about: Bank) -> float:
     """log of the prior times the density of the corners, summed over a grid of (x, y, psi)."""
     center = np.asarray(about.mean[0, :3])
     root = np.linalg.cholesky(np.asarray(about.covariance[0, :3, :3]))

@@ -151,7 +151,7 @@ def test_an_outcome_is_recorded_whole(dtype):
     )
     assert (got.steering_rad, got.throttle) == (outcome.steering_rad, outcome.throttle)
     assert (got.restarts, got.reason, got.digest) == (2, "the loop was away", "d")
-    output, belief = outcome.report.output, outcome.moment.belief
+    output, belief = outcome.output, outcome.belief.bank
     np.testing.assert_array_equal(got.pose, output.pose)
     np.testing.assert_array_equal(got.covariance, output.covariance)
     np.testing.assert_array_equal(got.hypotheses, belief.mean[1:3, :3])
@@ -176,8 +176,8 @@ def test_a_digest_tells_any_two_drives_apart():
     assert digest(outcome) == digest(make_outcome(3))
     changes = {
         "steering_rad": np.nextafter(outcome.steering_rad, 1),
-        "report": eqx.tree_at(lambda r: r.output.pose, outcome.report, replace_fn=_next),
-        "moment": eqx.tree_at(lambda m: m.belief.log_weight, outcome.moment, replace_fn=_next),
+        "output": eqx.tree_at(lambda o: o.pose, outcome.output, replace_fn=_next),
+        "belief": eqx.tree_at(lambda b: b.bank.log_weight, outcome.belief, replace_fn=_next),
     }
     other = {digest(dataclasses.replace(outcome, **{key: changes[key]})) for key in changes}
     assert len(other | {digest(outcome)}) == 4

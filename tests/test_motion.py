@@ -13,7 +13,7 @@ from scipy import stats
 from jaxnav.belief.ambiguity import PoseMeasurement, Selection
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
-from jaxnav.belief.motion import Belief, Motion, restarted_where_broken
+from jaxnav.belief.motion import Bank, Motion, Offer, gated, restarted_where_broken
 from jaxnav.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import in_float32
@@ -22,7 +22,7 @@ from tests.reference import kalman, paper
 WHEELBASE_M = 0.256
 
 
-def chosen(prior: Belief, T_world_vehicle: jaxlie.SE3, covariance, taken) -> Selection:
+def chosen(prior: Bank, T_world_vehicle: jaxlie.SE3, covariance, taken) -> Selection:
     """What a selector says that gives one pose to every hypothesis, or none."""
     count = prior.log_weight.shape[0]
     return Selection(
@@ -58,7 +58,7 @@ def drive_step(motion, belief, pose, covariance, taken, obs):
     """Prediction and update with a planar pose."""
     prior = motion.predict(belief, obs)
     selection = chosen(prior, worlds.planar(*pose), covariance, taken)
-    posterior, nis, _ = motion.update(prior, selection, obs)
+    posterior, nis, *_ = motion.update(prior, selection, obs)
     return prior, posterior, nis
 
 
@@ -68,7 +68,7 @@ def coasted(motion, belief, dt_s):
     return motion.predict(belief, reading(dt_s=dt_s))
 
 
-def started(motion, pose, covariance, speed_mps=0.3, steering_rad=0.1) -> Belief:
+def started(motion, pose, covariance, speed_mps=0.3, steering_rad=0.1) -> Bank:
     obs = reading(speed_mps, steering_rad)
     return drive_step(motion, motion.init(), jnp.asarray(pose), covariance, True, obs)[1]
 
@@ -384,7 +384,7 @@ def test_hypotheses_are_filters_of_their_own(kind):
                 ),
                 kept=prior.initialised & kept,
             )
-            belief, nis, _ = motion.update(prior, selection, reading(0.2, 0.1))
+            belief, nis, *_ = motion.update(prior, selection, reading(0.2, 0.1))
         return belief, nis
 
     kept = jnp.asarray([True, False, True])
@@ -406,7 +406,7 @@ def test_hypotheses_are_filters_of_their_own(kind):
 def first_step(motion, pose, taken):
     """The belief after one look, its NIS, and the poses a selector sees."""
     prior = motion.predict(motion.init(), reading())
-    belief, nis, _ = motion.update(prior, chosen(prior, pose, 1e-4 * jnp.eye(6), taken), reading())
+    belief, nis, *_ = motion.update(prior, chosen(prior, pose, 1e-4 * jnp.eye(6), taken), reading())
     return belief, nis, motion.poses(belief)
 
 
@@ -433,7 +433,7 @@ def test_poses_of_a_car_are_level_and_carry_the_planar_covariance():
     motion = BicycleKalman(worlds.qcar())
     root = np.random.default_rng(2).normal(size=(6, 6))
     P = root @ root.T
-    belief = Belief(
+    belief = Bank(
         jnp.asarray([[0.3, -0.4, 2.0, 0.1, 0.2, 0.3]]),
         jnp.asarray(P[None]),
         jnp.zeros(1),
@@ -462,6 +462,54 @@ def test_broken_hypotheses_start_anew():
     assert np.all(np.isfinite(kept.covariance))
 
 
+@pytest.mark.parametrize(
+    ("nis", "inflation", "taken"), [(20.0, 1.0, True), (22.0, 1.0, False), (22.0, 2.0, True)]
+)
+def test_what_the_gate_accepts_is_told(nis, inflation, taken):
+    """Wider where prediction and corners vary more than they say; counted all the same."""
+    bank = jax.tree.map(lambda leaf: leaf[0], BicycleKalman(worlds.qcar()).init())
+    bank = eqx.tree_at(lambda b: b.initialised, bank, jnp.asarray(True))
+    posterior = bank.mean + 1, bank.covariance
+    offer = Offer(
+        jnp.asarray([np.sqrt(nis), 0, 0]), posterior, posterior, 21.1, jnp.zeros(()), inflation
+    )
+    after, own, accepted = gated(bank, offer, jnp.asarray(True))
+    assert (float(own), bool(accepted)) == (pytest.approx(nis), taken)
+    assert bool(jnp.all(after.mean == bank.mean + taken))
+    assert int(after.rejections.count) == (nis > 21.1)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_a_state_on_the_ground_and_its_covariance(kind):
+    """Pose and velocity as a small time later tells, covariances as samples do."""
+    rng = np.random.default_rng(3)
+    car = BicycleKalman(worlds.qcar())
+    motion = car if kind == "car" else ConstantVelocity(acceleration_density=jnp.zeros(6))
+    if kind == "car":
+        mean = jnp.asarray([0.4, -0.2, 1.1, 0.3, -0.1, 0.5])
+    else:
+        tilted = jaxlie.SE3.exp(jnp.asarray([0.3, -0.4, 0.1, 0.2, -0.3, 0.9]))
+        mean = jnp.append(tilted.wxyz_xyz, jnp.asarray([0.3, -0.1, 0.2, 0.4, -0.2, 0.5]))
+    size = motion.init().covariance.shape[-1]
+    root = 1e-3 * rng.standard_normal((size, size))
+    told = motion.planar(mean, jnp.asarray(root @ root.T))
+    dt_s = 1e-6
+    bank = eqx.tree_at(lambda b: b.mean, motion.init(), mean[None])
+    later = motion.predict(bank, reading(dt_s=dt_s)) if kind == "free" else None
+    moved = mean[:3] + dt_s * mean[3:] if later is None else motion.on_ground(later.mean[0])[0]
+    np.testing.assert_allclose((moved - told.pose) / dt_s, told.velocity, atol=1e-5)
+    errors = jnp.asarray(rng.standard_normal((20_000, size)) @ root.T)
+    poses, velocities = jax.vmap(lambda error: motion.on_ground(motion.moved(mean, error)))(errors)
+    for samples, covariance in (
+        (poses, told.pose_covariance),
+        (velocities, told.velocity_covariance),
+    ):
+        scale = np.sqrt(np.outer(np.diagonal(covariance), np.diagonal(covariance)))
+        np.testing.assert_allclose(
+            np.cov(np.asarray(samples).T) / scale, covariance / scale, atol=0.05
+        )
+
+
 @jax.jit
 def free_step(motion, belief, dt_s, wxyz_xyz, covariance, taken):
     obs = reading(dt_s=dt_s)
@@ -477,7 +525,7 @@ def test_constant_velocity_carries_its_covariance_as_samples_do():
     root = 0.01 * rng.normal(size=(12, 12))
     twist = jnp.asarray([0.4, -0.2, 0.1, 0.3, -0.5, 0.8])
     T = jaxlie.SE3.exp(jnp.asarray(rng.normal(size=6)))
-    belief = Belief(
+    belief = Bank(
         jnp.append(T.wxyz_xyz, twist)[None],
         jnp.asarray((root @ root.T)[None]),
         jnp.zeros(1),

@@ -19,6 +19,7 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator, Output, State
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Observation, Snapshot
+from jaxnav.simulation.regimes import step_by_regime
 from tests import worlds
 from tests.derivatives import check_derivatives, in_float32
 from tests.reference import kalman, paper
@@ -205,7 +206,7 @@ def test_the_first_two_steps_by_hand():
     P[:3, :3] = reference_pose_covariance(nav, truth[0], 0.25) + floor
     P[3:, 3:] = np.diag(np.asarray(motion.initial_velocity_sigma) ** 2)
     x, P, _ = kalman.update(x, P, None, None, SPEED_MPS, STEERING_RAD, *noise)
-    np.testing.assert_allclose(state.belief.mean[0], x, atol=2e-4)
+    np.testing.assert_allclose(state.belief.bank.mean[0], x, atol=2e-4)
     np.testing.assert_allclose(out.covariance, P, rtol=0.02, atol=1e-6)
     assert out.nis == 0
     assert out.flip_probability < 0.5
@@ -221,7 +222,7 @@ def test_the_first_two_steps_by_hand():
     x, P = kalman.predict(x, P, DT_S, np.asarray(motion.acceleration_density))
     R_pose = reference_pose_covariance(nav, truth[1], 0.25) + floor
     x, P, nis = kalman.update(x, P, truth[1], R_pose, SPEED_MPS, STEERING_RAD, *noise)
-    np.testing.assert_allclose(state.belief.mean[0], x, atol=2e-3)
+    np.testing.assert_allclose(state.belief.bank.mean[0], x, atol=2e-3)
     np.testing.assert_allclose(out.covariance, P, rtol=0.05, atol=1e-5)
     np.testing.assert_allclose(out.nis, nis, atol=0.02)
 
@@ -329,8 +330,10 @@ def test_nan_odometry_is_a_step_without_odometry(located):
     for field in ("speed_mps", "steering_rad"):
         broken = eqx.tree_at(lambda o, f=field: getattr(o, f), obs, jnp.asarray(jnp.nan, float))
         actual, _ = step(nav, state, broken)
-        np.testing.assert_array_equal(actual.belief.mean, expected.belief.mean)
-        np.testing.assert_array_equal(actual.belief.covariance, expected.belief.covariance)
+        np.testing.assert_array_equal(actual.belief.bank.mean, expected.belief.bank.mean)
+        np.testing.assert_array_equal(
+            actual.belief.bank.covariance, expected.belief.bank.covariance
+        )
 
 
 def parameters_of(nav: Navigator) -> dict[str, jax.Array]:
@@ -365,7 +368,7 @@ def test_derivatives_of_a_step():
     def outcome(corners_px, speed_mps, steering_rad, dt_s, parameters):
         changed = Observation(corners_px, second.visible, speed_mps, steering_rad, dt_s)
         after, out = tuned(nav, parameters).step(state, changed)
-        return after.belief.mean, after.belief.covariance, out.command
+        return after.belief.bank.mean, after.belief.bank.covariance, out.command
 
     arguments = (second.corners_px, second.speed_mps, second.steering_rad, second.dt_s)
     check_derivatives(outcome, *arguments, parameters_of(nav), step=1e-6, rtol=1e-4, atol=1e-5)
@@ -425,9 +428,9 @@ def test_step_by_regime_is_step():
     nav = navigator(selector=MultiHypothesis(hypotheses=12), max_sightings=2)
     obs = drive(sigma_px=1.0, blind=(STEPS - 2,))
     state, out = scan(nav, nav.init(), obs)
-    by_regime = jax.jit(lambda nav, state, obs: jax.lax.scan(nav.step_by_regime, state, obs))
+    by_regime = jax.jit(lambda nav, state, obs: jax.lax.scan(step_by_regime(nav), state, obs))
     _, same = by_regime(nav, nav.init(), obs)
-    alive = int(np.sum(state.belief.initialised))
+    alive = int(np.sum(state.belief.bank.initialised))
     assert alive < 8
     for name in ("selected", "hypothesis", "decided", "located", "done"):
         np.testing.assert_array_equal(getattr(same, name), getattr(out, name))
@@ -439,22 +442,22 @@ def test_step_by_regime_is_step():
 def test_more_hypotheses_need_no_change_to_step():
     """K = 2 through the same step: the reported pose is that of the heavier one."""
     nav = navigator(selector=EachItsOwn())
-    assert nav.init().belief.mean.shape == (2, 6)
+    assert nav.init().belief.bank.mean.shape == (2, 6)
     state, out = scan(nav, nav.init(), drive(sigma_px=0.3))
-    assert state.belief.mean.shape == (2, 6)
+    assert state.belief.bank.mean.shape == (2, 6)
     assert out.nis.shape == (STEPS,)
-    heavier = int(np.argmax(state.belief.log_weight))
+    heavier = int(np.argmax(state.belief.bank.log_weight))
     assert int(out.hypothesis[-1]) == heavier
-    np.testing.assert_allclose(out.pose[-1], state.belief.mean[heavier, :3], atol=1e-12)
-    share = np.exp(np.asarray(state.belief.log_weight))
-    means = np.asarray(state.belief.mean)
+    np.testing.assert_allclose(out.pose[-1], state.belief.bank.mean[heavier, :3], atol=1e-12)
+    share = np.exp(np.asarray(state.belief.bank.log_weight))
+    means = np.asarray(state.belief.bank.mean)
     apart = means - means[heavier]
     apart[:, 2] = kalman.wrap(apart[:, 2])
-    spread = np.asarray(state.belief.covariance) + np.einsum("id,ie->ide", apart, apart)
+    spread = np.asarray(state.belief.bank.covariance) + np.einsum("id,ie->ide", apart, apart)
     expected = np.einsum("i,ide->de", share / share.sum(), spread)
     np.testing.assert_allclose(out.covariance[-1], expected, atol=1e-12)
-    assert not np.allclose(state.belief.mean[0], state.belief.mean[1], atol=0.01)
-    assert abs(float(state.belief.log_weight[0] - state.belief.log_weight[1])) > 1
+    assert not np.allclose(state.belief.bank.mean[0], state.belief.bank.mean[1], atol=0.01)
+    assert abs(float(state.belief.bank.log_weight[0] - state.belief.bank.log_weight[1])) > 1
 
 
 def test_it_locates_a_hand_held_rig_without_a_route():

@@ -160,7 +160,7 @@ class Driven:
         self.healths = np.array([step.outcome.health for step in self.steps])
         poses = np.array([step.outcome.pose for step in self.steps])
         truth = np.array([planar_in_world(step.truth[:3], origin_m) for step in self.steps])
-        decided = np.array([bool(step.outcome.report.output.decided) for step in self.steps])
+        decided = np.array([bool(step.outcome.output.decided) for step in self.steps])
         assert np.linalg.norm(truth[0, :2] - at) < 1 * MM
         self.errors_m = np.linalg.norm((poses - truth)[:, :2], axis=1)[decided]
         self.poses = poses
@@ -273,7 +273,7 @@ def test_commands_tell_the_world(away, tmp_path, command_process, capsys):
     out = tmp_path / "out"
     assert main(["replay", str(recording), "--out", str(out), "--headless"]) == 0
     rows = np.loadtxt(out / "trajectory.tum")
-    located = [bool(s.outcome.report.output.located) for s in away.steps[:100]]
+    located = [bool(s.outcome.output.located) for s in away.steps[:100]]
     np.testing.assert_allclose(rows[:, 1:3], away.poses[:100][located][:, :2], atol=0.01 * MM)
     final = json.loads((out / "summary.json").read_text())["final_pose"]
     np.testing.assert_allclose(final[:2], away.poses[99, :2], atol=0.01 * MM)

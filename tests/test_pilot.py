@@ -51,19 +51,19 @@ def handled(setup: DriveSetup, inputs: list[Input]) -> tuple[Pilot, list[Outcome
 
 def assert_same_belief(one: Outcome, other: Outcome, atol: float) -> None:
     """Of their moments; a bank's empty slots hold anything."""
-    alive = one.moment.belief.initialised
-    np.testing.assert_array_equal(other.moment.belief.initialised, alive)
+    alive = one.belief.bank.initialised
+    np.testing.assert_array_equal(other.belief.bank.initialised, alive)
     for name in ("mean", "covariance", "log_weight"):
-        before, after = (getattr(o.moment.belief, name)[alive] for o in (one, other))
+        before, after = (getattr(o.belief.bank, name)[alive] for o in (one, other))
         np.testing.assert_allclose(after, before, atol=atol, rtol=0, err_msg=name)
-    assert one.moment.decided == other.moment.decided
+    assert one.belief.decided == other.belief.decided
 
 
 def test_the_car_finds_out_where_it_is_and_drives(steps):
     last = steps[-1]
     assert last.outcome.health == Health.OK
     assert last.outcome.faults == Fault(0)
-    assert np.hypot(*(last.outcome.report.output.pose - last.truth[:3])[:2]) < 0.02
+    assert np.hypot(*(last.outcome.output.pose - last.truth[:3])[:2]) < 0.02
     assert last.truth[3] > 0.1
     assert {step.outcome.restarts for step in steps} == {0}
 
@@ -111,9 +111,9 @@ def test_late_frames_tell_the_same_as_frames_in_time(setup, inputs, delay_ns):
     _, one = handled(setup, [*inputs[:130], end])
     _, other = handled(setup, [*late, end])
     assert {outcome.rejects for outcome in other} == {Reject(0)}
-    assert bool(one[-1].report.output.decided)
+    assert bool(one[-1].output.decided)
     assert_same_belief(one[-1], other[-1], atol=1e-9)
-    np.testing.assert_allclose(one[-1].report.output.pose, other[-1].report.output.pose, atol=1e-9)
+    np.testing.assert_allclose(one[-1].output.pose, other[-1].output.pose, atol=1e-9)
 
 
 def test_what_takes_several_calls_tells_the_same_as_one(setup, inputs, monkeypatch):
@@ -132,7 +132,7 @@ def test_what_takes_several_calls_tells_the_same_as_one(setup, inputs, monkeypat
     assert {outcome.rejects for outcome in other} <= {Reject(0), Reject.INNOVATION_LARGE}
     for a, b in zip(one, other, strict=True):
         for name in ("nis", "selected", "costs", "pose"):
-            first, second = getattr(a.report.output, name), getattr(b.report.output, name)
+            first, second = getattr(a.output, name), getattr(b.output, name)
             np.testing.assert_allclose(first, second, atol=1e-9, rtol=1e-9)
         assert (a.steering_rad, a.throttle) == pytest.approx((b.steering_rad, b.throttle), abs=1e-9)
     assert_same_belief(one[-1], other[-1], atol=1e-9)
@@ -157,19 +157,17 @@ def test_a_tick_changes_nothing_of_what_is_believed(setup, steps, inputs):
     outcomes = outcomes[60:]
     for event, tick, step in zip(outcomes[::3], outcomes[1::3], steps, strict=True):
         for other in (event, tick):
-            same = jax.tree.map(np.array_equal, other.moment, step.outcome.moment)
+            same = jax.tree.map(np.array_equal, other.belief, step.outcome.belief)
             assert all(jax.tree.leaves(same))
-    np.testing.assert_array_equal(outcomes[-1].report.output.pose, outcomes[-3].report.output.pose)
+    np.testing.assert_array_equal(outcomes[-1].output.pose, outcomes[-3].output.pose)
 
 
 def test_while_nothing_comes_the_pose_goes_on(setup, inputs):
     pilot, outcomes = handled(setup, inputs)
     later = pilot.handle(Input(inputs[-1].now_ns + 500 * MS))
-    moved_m = np.hypot(*(later.report.output.pose - outcomes[-1].report.output.pose)[:2])
+    moved_m = np.hypot(*(later.output.pose - outcomes[-1].output.pose)[:2])
     assert 0.05 < moved_m < 1.0
-    assert np.trace(later.report.output.covariance) > np.trace(
-        outcomes[-1].report.output.covariance
-    )
+    assert np.trace(later.output.covariance) > np.trace(outcomes[-1].output.covariance)
     assert Fault.CAMERAS_STALE | Fault.ODOMETRY_STALE in later.faults
     assert later.health == Health.DEGRADED
 
@@ -261,12 +259,12 @@ def test_whatever_the_data_are_the_belief_stays_finite(setup, inputs, change, fa
     assert reject in rejects
     assert Fault.NOT_FINITE not in faults
     for outcome in outcomes:
-        belief = outcome.moment.belief
-        for values in (belief.mean, belief.covariance, outcome.report.output.pose):
+        belief = outcome.belief.bank
+        for values in (belief.mean, belief.covariance, outcome.output.pose):
             assert np.isfinite(values[belief.initialised] if values.ndim > 1 else values).all()
         assert abs(outcome.steering_rad) <= pilot.limits.steering_rad
         assert abs(outcome.throttle) <= pilot.limits.throttle
-    assert bool(outcomes[-1].report.output.located)
+    assert bool(outcomes[-1].output.located)
 
 
 def test_a_loop_that_slept_begins_anew(setup, inputs):
@@ -274,7 +272,7 @@ def test_a_loop_that_slept_begins_anew(setup, inputs):
     woke_ns = inputs[-1].now_ns + 1_500 * MS
     outcome = pilot.handle(Input(woke_ns))
     assert Fault.CLOCK_JUMPED | Fault.RESTARTED in outcome.faults
-    assert not outcome.report.output.located
+    assert not outcome.output.located
     assert outcome.throttle == 0
     assert (outcome.restarts, outcome.restart_reason) == (1, "the loop was away for over a second")
     shift_ns = woke_ns + 10 * MS - inputs[0].now_ns
@@ -284,7 +282,7 @@ def test_a_loop_that_slept_begins_anew(setup, inputs):
             given, lambda part: dataclasses.replace(part, stamp_ns=part.stamp_ns + shift_ns)
         )
         outcome = pilot.handle(dataclasses.replace(moved, now_ns=given.now_ns + shift_ns))
-        located |= bool(outcome.report.output.located)
+        located |= bool(outcome.output.located)
     assert located
     assert outcome.restarts == 1
 
@@ -311,16 +309,16 @@ def test_data_may_come_after_an_hour_of_silence(setup):
     estimator.fuse(told, BEGIN_NS, BEGIN_NS, 0)
     fused = estimator.fuse(told, BEGIN_NS + hour_ns, BEGIN_NS + hour_ns, hour_ns)
     assert (fused.refused, fused.events) == (False, 1)
-    assert np.isfinite(fused.report.output.covariance).all()
+    assert np.isfinite(fused.output.covariance).all()
 
 
 def test_numbers_beyond_float32_are_left_out_by_the_filter():
     """They come as inf, which it does not look at, and nobody is warned again and again."""
     given = []
 
-    def program(moment, control, events, numbers):
+    def program(belief, control, events, numbers):
         given.append(events.unpacked())
-        return moment, moment, control, moment
+        return belief, belief, control, belief
 
     with jax.enable_x64(False):
         estimator = Estimator(make_setup().navigator(), program)
@@ -368,8 +366,8 @@ def test_whatever_comes_in_what_comes_out_is_finite(setup, inputs, told):
     shift_ns = inputs[20].now_ns - BEGIN_NS
     for one in sorted(told, key=lambda one: one.now_ns):
         outcome = pilot.handle(dataclasses.replace(one, now_ns=one.now_ns + shift_ns))
-        assert np.isfinite(outcome.report.output.pose).all()
-        assert np.isfinite(outcome.report.output.covariance).all()
+        assert np.isfinite(outcome.output.pose).all()
+        assert np.isfinite(outcome.output.covariance).all()
         assert Fault.NOT_FINITE not in outcome.faults
         assert abs(outcome.steering_rad) <= pilot.limits.steering_rad
         assert abs(outcome.throttle) <= pilot.limits.throttle
@@ -380,9 +378,7 @@ def test_a_sigma_of_ones_own_stands_for_the_detectors(setup, inputs):
     _, detected = handled(setup, inputs[:20])
     assert [digest(a) == digest(b) for a, b in zip(told, detected, strict=True)] == [True] * 20
     _, rough = handled(dataclasses.replace(setup, corner_sigma_px=3.0), inputs[:20])
-    spread, finer = (
-        np.trace(outcomes[-1].report.output.covariance) for outcomes in (rough, detected)
-    )
+    spread, finer = (np.trace(outcomes[-1].output.covariance) for outcomes in (rough, detected))
     assert spread > 2 * finer
 
 
@@ -395,7 +391,7 @@ def test_cameras_that_look_in_turn_are_fused_each_at_its_time(setup):
     steps = simulated(setup, 2.0, rates=Rates(camera_skew_s=0.004))
     assert {len(step.input.frames) for step in steps} == {0, 1}
     assert steps[-1].outcome.health == Health.OK
-    assert np.hypot(*(steps[-1].outcome.report.output.pose - steps[-1].truth[:3])[:2]) < 0.02
+    assert np.hypot(*(steps[-1].outcome.output.pose - steps[-1].truth[:3])[:2]) < 0.02
 
 
 def test_what_nothing_confirms_is_not_decided_and_its_sigma_says_so(setup):
@@ -411,13 +407,13 @@ def test_what_nothing_confirms_is_not_decided_and_its_sigma_says_so(setup):
 
     steps = simulated(setup, 4.0, change=inject.between(1.5, np.inf, blind))
     last = steps[-1]
-    output = last.outcome.report.output
-    assert bool(last.outcome.moment.decided)
+    output = last.outcome.output
+    assert bool(last.outcome.belief.decided)
     assert not output.decided
     error_m = np.hypot(*(output.pose - last.truth[:3])[:2])
     assert error_m > 0.1
     assert np.sqrt(np.trace(output.covariance[:2, :2])) > error_m / 4
     assert Fault.ODOMETRY_DOUBTFUL in last.outcome.faults
     assert (last.outcome.health, last.outcome.throttle) == (Health.STOP, 0.0)
-    wrong = [step for step in steps if step.outcome.report.output.decided]
-    assert max(np.hypot(*(s.outcome.report.output.pose - s.truth[:3])[:2]) for s in wrong) < 0.2
+    wrong = [step for step in steps if step.outcome.output.decided]
+    assert max(np.hypot(*(s.outcome.output.pose - s.truth[:3])[:2]) for s in wrong) < 0.2

@@ -55,8 +55,6 @@ class Spy:
             ),
         )
 
-    step_by_regime = step
-
 
 def run(navigator, scenario: Scenario, noise_px=0.0, seeds=SEEDS, chunk_frames=15) -> Trace:
     """The whole rollout, leading axes (seeds, frames)."""

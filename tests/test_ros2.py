@@ -199,11 +199,11 @@ VELOCITY = np.array([0.3, 0.4, -0.7])
 
 def outcome_with(**output):
     root = np.random.default_rng(3).standard_normal((6, 6))
-    given = {"pose": POSE, "covariance": root @ root.T, "located": np.asarray(True)} | output
-    report = SimpleNamespace(output=SimpleNamespace(**given), mean=np.concatenate([POSE, VELOCITY]))
+    given = {"pose": POSE, "velocity": VELOCITY, "covariance": root @ root.T}
+    told = SimpleNamespace(**given | {"located": np.asarray(True)} | output)
     now_ns = time.monotonic_ns() - 30_000_000
     flags = Health.OK, Fault(0), Reject(0)
-    return Outcome(now_ns, *flags, -0.25, 0.06, report, None, None, now_ns, 0, "")
+    return Outcome(now_ns, *flags, -0.25, 0.06, told, None, None, now_ns, 0, "")
 
 
 @pytest.fixture
@@ -239,7 +239,7 @@ def test_the_covariance_stands_where_ros_wants_it(bus, publisher):
     numbers = message.pose.covariance
     assert len(numbers) == 36
     assert all(type(number) is float for number in numbers)
-    P = outcome.report.output.covariance
+    P = outcome.output.covariance
     expected = {0: P[0, 0], 1: P[0, 1], 5: P[0, 2], 6: P[1, 0], 7: P[1, 1], 11: P[1, 2]}
     expected |= {30: P[2, 0], 31: P[2, 1], 35: P[2, 2]}
     assert {i: n for i, n in enumerate(numbers) if n} == pytest.approx(expected)
@@ -255,7 +255,7 @@ def test_the_twist_is_in_the_axes_of_the_vehicle(bus, publisher):
     twist = message.twist.twist
     assert (twist.linear.x, twist.linear.y) == pytest.approx((forward.real, forward.imag))
     assert twist.angular.z == VELOCITY[2]
-    P = outcome.report.output.covariance[3:, 3:]
+    P = outcome.output.covariance[3:, 3:]
     drawn = np.random.default_rng(0).multivariate_normal(VELOCITY, P, 200_000)
     turned = (drawn[:, 0] + 1j * drawn[:, 1]) * turn
     sampled = np.cov(np.stack([turned.real, turned.imag, drawn[:, 2]]))

@@ -17,13 +17,13 @@ FLOATS = st.floats() | st.floats(-500, 500) | st.sampled_from([-0.0, 1e308, -1e3
 
 def outcome_of(pose, flip, located, health=Health.OK, throttle=0.0371, steering_rad=-0.1):
     outcome = make_outcome(1)
-    report = eqx.tree_at(
-        lambda r: (r.output.pose, r.output.flip_probability, r.output.located),
-        outcome.report,
+    output = eqx.tree_at(
+        lambda o: (o.pose, o.flip_probability, o.located),
+        outcome.output,
         (np.array(pose), np.array(flip), np.array(located)),
     )
     return dataclasses.replace(
-        outcome, report=report, health=health, throttle=throttle, steering_rad=steering_rad
+        outcome, output=output, health=health, throttle=throttle, steering_rad=steering_rad
     )
 
 

@@ -17,11 +17,12 @@ class Seeing:
         self.support = Support(worlds.qcar(), **how)
         self.now_ns = 10**9
 
-    def frames(self, count, fix=HERE, believed=True, possible=()) -> list[bool]:
+    def frames(self, count, fix=HERE, believed=True, possible=(), agrees=True) -> list[bool]:
         taken = []
         for _ in range(count):
             self.now_ns += 33_000_000
-            taken.append(self.support.corners(believed, self.now_ns, fix, lambda: possible))
+            told = believed, believed and agrees, self.now_ns, fix
+            taken.append(self.support.corners(*told, lambda: possible))
         return taken
 
     def drives(self, way_m: float) -> None:
@@ -50,6 +51,19 @@ def test_one_contradiction_takes_nothing_away_and_many_do():
     assert seeing.frames(1) == [True]
     assert not seeing.support.doubt(contradicted=False).is_doubted
     assert seeing.support.doubt(contradicted=True).is_doubted
+
+
+def test_what_the_filter_accepts_beyond_its_gate_is_a_fix_and_confirms_nothing():
+    """A car that is being located is not stopped for want of a fix; nor does it start on that."""
+    seeing = Seeing()
+    assert not any(seeing.frames(20, agrees=False))
+    assert seeing.support.doubt(contradicted=False).is_doubted
+    seeing.frames(CONFIRMED)
+    assert seeing.frames(20, agrees=False) == [True] * 20
+    seeing.support.restarted()
+    assert not any(seeing.frames(CONFIRMED - 1))
+    assert not any(seeing.frames(1, agrees=False))
+    assert not any(seeing.frames(CONFIRMED - 1))
 
 
 def test_a_relocation_is_slow_until_some_way_was_driven():

@@ -164,7 +164,7 @@ def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
     first = jnp.argmax(estimated(navigator, recorded).decided, axis=1)
     truth = recorded.T_world_vehicle_true[np.arange(len(rows)), first]
     off_rad = jax.vmap(lambda a, b: rotation_error_rad(jaxlie.SE3(a), jaxlie.SE3(b)))(
-        start.belief.mean[:, 0, :7], truth
+        start.bank.mean[:, 0, :7], truth
     )
     assert np.mean(np.rad2deg(off_rad)[np.asarray(start.chosen)] < 10) >= 0.95
 

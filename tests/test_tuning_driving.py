@@ -55,8 +55,6 @@ class Knows(Navigator):
             command=command,
         )
 
-    step_by_regime = step
-
 
 def driver(radius_m=0.15, **gains) -> Navigator:
     values = {"integral_limit_ms": 1.0, "lookahead_m": 1.0, "slows_at_rad": 1.0} | gains

@@ -150,7 +150,7 @@ def test_nobody_waits_and_what_does_not_fit_is_counted(tmp_path, monkeypatch):
 def test_what_can_not_be_drawn_is_left_out(tmp_path):
     view = opened(tmp_path / "drive.rrd", waits=True)
     view.image("front", 1, np.zeros((4, 4, 4, 4)), None)
-    view.show(dataclasses.replace(make_outcome(0), report=None))
+    view.show(dataclasses.replace(make_outcome(0), output=None))
     assert view.dropped == 2
     nowhere = dataclasses.replace(
         Shown.of(make_outcome(1)),

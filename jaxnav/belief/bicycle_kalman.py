@@ -3,11 +3,21 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
-from jaxnav.belief.motion import Belief, Motion, Offer, contradicted, followed, forgotten, unstarted
+from jaxnav.belief.motion import (
+    Bank,
+    Motion,
+    Offer,
+    Planar,
+    contradicted,
+    followed,
+    forgotten,
+    unstarted,
+)
 from jaxnav.models import bicycle
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import (
@@ -56,29 +66,29 @@ class BicycleKalman(Motion):
     max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
     max_rejected_s: float = 7.0  # whether they agree or not
 
-    def init(self, hypotheses: int = 1) -> Belief:
+    def init(self, hypotheses: int = 1) -> Bank:
         """Hypotheses that have seen nothing."""
         return unstarted(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, 3, hypotheses)
 
-    def predict(self, belief: Belief, obs: Observation) -> Belief:
+    def predict(self, bank: Bank, obs: Observation) -> Bank:
         """x = A x, P = A P A' + Q (Eq. 9), then the odometry (Eqs. 10 and 11).
 
         A hypothesis that the gate has contradicted too often or too long is forgotten.
         """
         mean, covariance = jax.vmap(lambda x, P: self._with_odometry(*self._later(x, P, obs), obs))(
-            belief.mean, belief.covariance
+            bank.mean, bank.covariance
         )
-        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
-        return forgotten(predicted, self.lost(belief), obs.dt_s)
+        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, (mean, covariance))
+        return forgotten(predicted, self.lost(bank), obs.dt_s)
 
-    def lost(self, belief: Belief) -> Bool[Array, " K"]:
+    def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Whether the gate has contradicted a hypothesis too often or too long."""
-        return contradicted(belief, self.max_rejections, self.max_rejected_s)
+        return contradicted(bank, self.max_rejections, self.max_rejected_s)
 
-    def poses(self, belief: Belief) -> PoseBelief:
+    def poses(self, bank: Bank) -> PoseBelief:
         """Level on the ground (Eq. 12), as far as `tilt_sigma_rad` and `height_sigma_m` go."""
-        T_world_vehicle = T_world_vehicle_from_planar(belief.mean[:, :3])
-        dtype = belief.mean.dtype
+        T_world_vehicle = T_world_vehicle_from_planar(bank.mean[:, :3])
+        dtype = bank.mean.dtype
         freedom = jnp.asarray(ON_GROUND, dtype)
         tilt = [self.height_sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad]
         nuisance = jnp.asarray(OFF_GROUND, dtype) * jnp.asarray(tilt, dtype)[None]
@@ -88,17 +98,17 @@ class BicycleKalman(Motion):
 
         return PoseBelief(
             T_world_vehicle,
-            jax.vmap(body_covariance)(belief.mean, belief.covariance),
-            belief.log_weight,
-            belief.initialised,
+            jax.vmap(body_covariance)(bank.mean, bank.covariance),
+            bank.log_weight,
+            bank.initialised,
             freedom,
             nuisance,
             self.gate_nis,
         )
 
-    def measure(self, belief: Belief, measured: PoseMeasurement, obs: Observation) -> Offer:
+    def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has chosen a candidate, in 3 dof."""
-        P = belief.covariance
+        P = bank.covariance
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         R = planar_covariance(measured.T_world_vehicle, measured.covariance)
         # Height, roll and pitch were fitted as well, or were not free: then their variances are 0.
@@ -106,26 +116,26 @@ class BicycleKalman(Motion):
         fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
         log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
         R = R + kalman.as_covariance(self.vision_floor)
-        innovation = self.difference(pose, belief.mean[:3])
+        innovation = self.difference(pose, bank.mean[:3])
         correction, posterior, S = kalman.update(P, innovation, jnp.eye(3, 6, dtype=P.dtype), R)
         return Offer(
             kalman.whitened(innovation, S),
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
             first=self._first(pose, R, obs),
-            posterior=(self.moved(belief.mean, correction), posterior),
+            posterior=(self.moved(bank.mean, correction), posterior),
         )
 
-    def follow(self, belief: Belief, measured: PosePosterior, obs: Observation) -> Offer:
+    def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has corrected its pose, in 3 dof."""
         T = measured.T_world_vehicle
         pose = planar_from_T_world_vehicle(T)
-        eye = jnp.eye(6, dtype=belief.mean.dtype)
-        to_body = eye.at[:3, :3].set(_turn(-belief.mean[2]))
+        eye = jnp.eye(6, dtype=bank.mean.dtype)
+        to_body = eye.at[:3, :3].set(_turn(-bank.mean[2]))
         to_world = eye.at[:3, :3].set(_turn(pose[2]))
         correction, P = followed(
-            jnp.where(belief.initialised, sandwich(to_body, belief.covariance), eye),
-            T_world_vehicle_from_planar(belief.mean[:3]),
+            jnp.where(bank.initialised, sandwich(to_body, bank.covariance), eye),
+            T_world_vehicle_from_planar(bank.mean[:3]),
             T,
             measured.covariance,
             jnp.asarray(ON_GROUND, eye.dtype),
@@ -136,7 +146,7 @@ class BicycleKalman(Motion):
             log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
             first=self._first(pose, planar_covariance(T, measured.covariance), obs),
-            posterior=(jnp.append(pose, belief.mean[3:] + correction[3:]), sandwich(to_world, P)),
+            posterior=(jnp.append(pose, bank.mean[3:] + correction[3:]), sandwich(to_world, P)),
         )
 
     def difference(self, mean: Array, base: Array) -> Array:
@@ -148,6 +158,14 @@ class BicycleKalman(Motion):
         """The sum, its heading wrapped."""
         mean = base + error
         return mean.at[2].set(wrap_angle(mean[2]))
+
+    def on_ground(self, mean: Array) -> tuple[Array, Array]:
+        """The two halves of the state."""
+        return mean[:3], mean[3:]
+
+    def planar(self, mean: Array, covariance: Array) -> Planar:
+        """The state itself."""
+        return Planar(mean[:3], covariance[:3, :3], mean[3:], covariance[3:, 3:])
 
     def _first(self, pose: Array, covariance: Array, obs: Observation) -> tuple[Array, Array]:
         """The state of a hypothesis that starts: a pose, at rest as far as the odometry tells."""
@@ -186,6 +204,13 @@ class BicycleKalman(Motion):
         seen = kalman.hide_rows(velocity - mean[3:], H, R, present)
         correction, P, _ = kalman.update(P, *seen)
         return self.moved(mean, correction), P
+
+
+def planar_poses(
+    bank: Bank,
+) -> tuple[Float[Array | np.ndarray, "K 3"], Float[Array | np.ndarray, "K 3 3"]]:
+    """(x_m, y_m, psi_rad) of every hypothesis of a car, and its covariance; or NumPy's of such."""
+    return bank.mean[:, :3], bank.covariance[:, :3, :3]
 
 
 def _turn(angle_rad: Array) -> Array:

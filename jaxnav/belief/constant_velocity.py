@@ -8,9 +8,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
-from jaxnav.belief.motion import Belief, Motion, Offer, contradicted, followed, forgotten, unstarted
-from jaxnav.models.geometry import cayley, inverse_cayley
-from jaxnav.numerics.small_matrices import cholesky, log_det
+from jaxnav.belief.motion import Bank, Motion, Offer, contradicted, followed, forgotten, unstarted
+from jaxnav.models.geometry import (
+    cayley,
+    inverse_cayley,
+    planar_from_T_world_vehicle,
+    rotation_matrix,
+)
+from jaxnav.numerics.small_matrices import applied, cholesky, log_det
 from jaxnav.pose.observation import Observation
 
 
@@ -36,18 +41,18 @@ class ConstantVelocity(Motion):
     max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
     max_rejected_s: float = 7.0  # whether they agree or not
 
-    def init(self, hypotheses: int = 1) -> Belief:
+    def init(self, hypotheses: int = 1) -> Bank:
         """Hypotheses that have seen nothing."""
         mean = jnp.zeros(13, self.acceleration_density.dtype).at[0].set(1)
         return unstarted(mean, 12, 6, hypotheses)
 
-    def predict(self, belief: Belief, obs: Observation) -> Belief:
+    def predict(self, bank: Bank, obs: Observation) -> Bank:
         """T = T exp(twist dt); the error turns with the frame.
 
         Without odometry a prediction is soon worth nothing: past `lost_sigma_m` the next pose
         starts the filter anew. So it does where the gate has contradicted it too often or too long.
         """
-        dtype, dt_s = belief.mean.dtype, jnp.asarray(obs.dt_s, belief.mean.dtype)
+        dtype, dt_s = bank.mean.dtype, jnp.asarray(obs.dt_s, bank.mean.dtype)
         eye, zero = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
 
@@ -60,32 +65,32 @@ class ConstantVelocity(Motion):
                 kalman.predict_covariance(P, F, Q),
             )
 
-        mean, covariance = jax.vmap(one)(belief.mean, belief.covariance)
+        mean, covariance = jax.vmap(one)(bank.mean, bank.covariance)
         variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
-        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), belief, (mean, covariance))
-        wrong = self.lost(belief)
+        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, (mean, covariance))
+        wrong = self.lost(bank)
         lost = wrong | ~(variance_m2 < self.lost_sigma_m**2)
         return forgotten(predicted, lost, dt_s)
 
-    def lost(self, belief: Belief) -> Bool[Array, " K"]:
+    def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Whether the gate has contradicted a hypothesis too often or too long."""
-        return contradicted(belief, self.max_rejections, self.max_rejected_s)
+        return contradicted(bank, self.max_rejections, self.max_rejected_s)
 
-    def poses(self, belief: Belief) -> PoseBelief:
+    def poses(self, bank: Bank) -> PoseBelief:
         """The pose part of the state."""
         return PoseBelief(
-            jaxlie.SE3(belief.mean[:, :7]),
-            belief.covariance[:, :6, :6],
-            belief.log_weight,
-            belief.initialised,
-            jnp.eye(6, dtype=belief.mean.dtype),
-            jnp.zeros((6, 0), belief.mean.dtype),
+            jaxlie.SE3(bank.mean[:, :7]),
+            bank.covariance[:, :6, :6],
+            bank.log_weight,
+            bank.initialised,
+            jnp.eye(6, dtype=bank.mean.dtype),
+            jnp.zeros((6, 0), bank.mean.dtype),
             self.gate_nis,
         )
 
-    def measure(self, belief: Belief, measured: PoseMeasurement, obs: Observation) -> Offer:
+    def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has chosen a candidate, in 6 dof."""
-        mean, P = belief.mean, belief.covariance
+        mean, P = bank.mean, bank.covariance
         wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
         log_volume = log_det(cholesky(measured.covariance)) / 2
         R = measured.covariance + kalman.as_covariance(self.vision_floor)
@@ -99,15 +104,15 @@ class ConstantVelocity(Motion):
             posterior=(self.moved(mean, correction), posterior),
         )
 
-    def follow(self, belief: Belief, measured: PosePosterior, obs: Observation) -> Offer:
+    def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has corrected its pose, in 6 dof."""
         T = measured.T_world_vehicle
         correction, P = followed(
-            belief.covariance,
-            jaxlie.SE3(belief.mean[:7]),
+            bank.covariance,
+            jaxlie.SE3(bank.mean[:7]),
             T,
             measured.covariance,
-            jnp.eye(6, dtype=belief.mean.dtype),
+            jnp.eye(6, dtype=bank.mean.dtype),
         )
         return Offer(
             measured.innovation,
@@ -115,7 +120,7 @@ class ConstantVelocity(Motion):
             log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
             first=self._first(T.wxyz_xyz, measured.covariance),
-            posterior=(jnp.append(T.wxyz_xyz, belief.mean[7:] + correction[6:]), P),
+            posterior=(jnp.append(T.wxyz_xyz, bank.mean[7:] + correction[6:]), P),
         )
 
     def difference(self, mean: Array, base: Array) -> Array:
@@ -127,6 +132,17 @@ class ConstantVelocity(Motion):
         """The pose times cay(xi), the twist plus its error."""
         T = (jaxlie.SE3(base[:7]) @ cayley(error[:6])).normalize()
         return jnp.append(T.wxyz_xyz, base[7:] + error[6:])
+
+    def on_ground(self, mean: Array) -> tuple[Array, Array]:
+        """Of the pose and of the twist, turned into the world: how it moves seen from above."""
+        T_world_vehicle = jaxlie.SE3(mean[:7])
+        R_world_vehicle = rotation_matrix(T_world_vehicle.rotation())
+        v_mps, w_radps = applied(R_world_vehicle, mean[7:10]), applied(R_world_vehicle, mean[10:])
+        # psi is the direction of the x axis, which moves by w x (R e_x).
+        x, y, up = R_world_vehicle[:, 0]
+        level = jnp.maximum(x**2 + y**2, jnp.finfo(mean.dtype).eps)
+        turn_radps = w_radps[2] - up * (x * w_radps[0] + y * w_radps[1]) / level
+        return planar_from_T_world_vehicle(T_world_vehicle), jnp.append(v_mps[:2], turn_radps)
 
     def _first(self, wxyz_xyz: Array, covariance: Array) -> tuple[Array, Array]:
         """The state of a body that starts: a pose, at rest as far as anybody knows."""

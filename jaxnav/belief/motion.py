@@ -1,15 +1,15 @@
-"""Motion models: how the belief moves, and how a pose and the odometry correct it.
+"""Motion models: how a bank of hypotheses moves, and how a pose and the odometry correct it.
 
 All share one interface, so that `step` and the selectors know nothing of the state:
 
-    belief = motion.init(hypotheses)
-    belief = motion.predict(belief, obs)                         # dt, and odometry where there is
-    prior  = motion.poses(belief)                                # what a selector sees
-    belief, nis, log_likelihood = motion.update(belief, selection, obs)
-    covariance = motion.error_covariance(belief, best)           # of the pose that is reported
+    bank = motion.init(hypotheses)
+    bank = motion.predict(bank, obs)                  # dt, and odometry where there is
+    prior = motion.poses(bank)                        # what a selector sees
+    updated = motion.update(bank, selection, obs)
+    covariance = motion.error_covariance(bank, best)  # of the pose that is reported
 
-A belief is a bank of K hypotheses along the leading axis of every leaf. `bicycle_kalman.py` is for
-cars, `constant_velocity.py` for everything else.
+A bank has K hypotheses along the leading axis of every leaf. `bicycle_kalman.py` is for cars,
+`constant_velocity.py` for everything else.
 """
 
 import abc
@@ -52,7 +52,7 @@ class Rejections(eqx.Module):
     waited_s: Float[Array, "*K"]  # since a pose was last offered, however often it was predicted
 
 
-class Belief(eqx.Module):
+class Bank(eqx.Module):
     """K hypotheses: means as the motion model stores them, covariances, weights."""
 
     mean: Float[Array, "*K n"]
@@ -61,6 +61,24 @@ class Belief(eqx.Module):
     initialised: Bool[Array, "*K"]
     rejections: Rejections
     number: Int[Array, "*K"]  # stays with a hypothesis wherever it stands in the bank
+
+
+class Updated(NamedTuple):
+    """A bank after an observation, and how each hypothesis took it."""
+
+    bank: Bank
+    nis: Float[Array, " K"]  # of the pose it was offered; 0 without one, or without a prediction
+    accepted: Bool[Array, " K"]  # the pose was inside the gate, or started it
+    log_likelihood: Float[Array, " K"]  # of the pose given the prediction, up to a constant; or 0
+
+
+class Planar(NamedTuple):
+    """Where a vehicle is on the ground, and how it moves there."""
+
+    pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
+    pose_covariance: Float[Array, "3 3"]
+    velocity: Float[Array, " 3"]  # its derivative
+    velocity_covariance: Float[Array, "3 3"]
 
 
 class Offer(NamedTuple):
@@ -78,27 +96,27 @@ class Motion(eqx.Module):
     """What `Navigator` asks of a motion model, and what all models do alike."""
 
     @abc.abstractmethod
-    def init(self, hypotheses: int = 1) -> Belief:
+    def init(self, hypotheses: int = 1) -> Bank:
         """Hypotheses that have seen nothing."""
 
     @abc.abstractmethod
-    def predict(self, belief: Belief, obs: Observation) -> Belief:
-        """The belief at this observation, before its corners are looked at."""
+    def predict(self, bank: Bank, obs: Observation) -> Bank:
+        """The bank at this observation, before its corners are looked at."""
 
     @abc.abstractmethod
-    def lost(self, belief: Belief) -> Bool[Array, " K"]:
+    def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Hypotheses that the gate has contradicted too often or too long: `predict` drops them."""
 
     @abc.abstractmethod
-    def poses(self, belief: Belief) -> PoseBelief:
+    def poses(self, bank: Bank) -> PoseBelief:
         """What a selector sees of it."""
 
     @abc.abstractmethod
-    def measure(self, belief: Belief, measured: PoseMeasurement, obs: Observation) -> Offer:
+    def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has chosen a candidate."""
 
     @abc.abstractmethod
-    def follow(self, belief: Belief, measured: PosePosterior, obs: Observation) -> Offer:
+    def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has corrected its pose."""
 
     @abc.abstractmethod
@@ -109,50 +127,59 @@ class Motion(eqx.Module):
     def moved(self, base: Float[Array, " n"], error: Float[Array, " d"]) -> Float[Array, " n"]:
         """The mean to which an error state leads."""
 
-    def update(
-        self, belief: Belief, selection: Selection, obs: Observation
-    ) -> tuple[Belief, Float[Array, " K"], Float[Array, " K"]]:
-        """The posterior of every hypothesis (Eqs. 10 and 11), equal ones merged; their NIS, and the
-        log-likelihood of what each was offered given what it predicted, up to a constant.
+    @abc.abstractmethod
+    def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+        """(x_m, y_m, psi_rad) of a mean in the world, and their derivatives."""
+
+    def planar(self, mean: Float[Array, " n"], covariance: Float[Array, "d d"]) -> Planar:
+        """A state on the ground."""
+        P, still = covariance, jnp.zeros(covariance.shape[0], mean.dtype)
+        slopes = jax.jacfwd(lambda error: self.on_ground(self.moved(mean, error)))(still)
+        (pose, velocity), (J_pose, J_velocity) = self.on_ground(mean), slopes
+        return Planar(pose, sandwich(J_pose, P), velocity, sandwich(J_velocity, P))
+
+    def update(self, bank: Bank, selection: Selection, obs: Observation) -> Updated:
+        """The posterior of every hypothesis (Eqs. 10 and 11), equal ones merged.
 
         A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
-        NIS is above the gate. Without a pose, or without a prediction of it, both numbers are 0.
+        NIS is above the gate.
         """
-        belief = eqx.tree_at(
-            lambda b: (b.log_weight, b.initialised), belief, (selection.log_weight, selection.kept)
+        bank = eqx.tree_at(
+            lambda b: (b.log_weight, b.initialised), bank, (selection.log_weight, selection.kept)
         )
         measured = selection.measured
         offer = self.follow if isinstance(measured, PosePosterior) else self.measure
 
-        def one(before: Belief, measured: Any) -> tuple[Belief, Array, Array]:
+        def one(before: Bank, measured: Any) -> Updated:
             offered = offer(before, measured, obs)
-            after, nis = gated(before, offered, measured.taken)
+            after, nis, accepted = gated(before, offered, measured.taken)
             compared = measured.taken & before.initialised
-            return after, nis, jnp.where(compared, offered.log_likelihood, 0)
+            return Updated(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
 
-        belief, nis, log_likelihood = jax.vmap(one)(belief, measured)
-        return merged(belief, selection.heir, self.difference, self.moved), nis, log_likelihood
+        updated: Updated = jax.vmap(one)(bank, measured)
+        bank = merged(updated.bank, selection.heir, self.difference, self.moved)
+        return updated._replace(bank=bank)
 
-    def error_covariance(self, belief: Belief, index: Int[Array, ""]) -> Float[Array, "d d"]:
+    def error_covariance(self, bank: Bank, index: Int[Array, ""]) -> Float[Array, "d d"]:
         """What is to be expected of a hypothesis' error: the spread of the whole bank about it.
 
         Source: Bar-Shalom, Li, Kirubarajan (2001), section 1.4.16 (moments of a mixture).
         """
-        mass = jnp.where(belief.initialised, jnp.exp(belief.log_weight), 0)
+        mass = jnp.where(bank.initialised, jnp.exp(bank.log_weight), 0)
         total = jnp.sum(mass)
         share = jnp.where(total > 0, mass / jnp.where(total > 0, total, 1), 0)
         share = jnp.where(total > 0, share, jnp.arange(mass.shape[0]) == index)
-        apart = jax.vmap(lambda mean: self.difference(mean, belief.mean[index]))(belief.mean)
+        apart = jax.vmap(lambda mean: self.difference(mean, bank.mean[index]))(bank.mean)
         apart = jnp.where((share > 0)[:, None], apart, 0)
         squared = apart[:, :, None] * apart[:, None]
-        return jnp.sum(share[:, None, None] * (belief.covariance + squared), axis=0)
+        return jnp.sum(share[:, None, None] * (bank.covariance + squared), axis=0)
 
 
 def unstarted(
     mean: Float[Array, " n"], error_states: int, pose_states: int, hypotheses: int
-) -> Belief:
+) -> Bank:
     """K hypotheses that have seen nothing."""
-    return Belief(
+    return Bank(
         mean=jnp.tile(mean, (hypotheses, 1)),
         covariance=jnp.tile(jnp.eye(error_states, dtype=mean.dtype), (hypotheses, 1, 1)),
         log_weight=jnp.zeros(hypotheses, mean.dtype),
@@ -167,35 +194,36 @@ def unstarted(
     )
 
 
-def forgotten(belief: Belief, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Belief:
+def forgotten(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Bank:
     """The prediction without the hypotheses that are lost: their next pose starts them anew.
 
     Args:
         dt_s: since the last observation, of whatever kind: for the others time goes on.
     """
-    waited_s = jnp.minimum(belief.rejections.waited_s + dt_s, _PAUSE_S)
-    rejections = dataclasses.replace(belief.rejections, waited_s=waited_s.astype(belief.mean.dtype))
+    waited_s = jnp.minimum(bank.rejections.waited_s + dt_s, _PAUSE_S)
+    rejections = dataclasses.replace(bank.rejections, waited_s=waited_s.astype(bank.mean.dtype))
     return eqx.tree_at(
         lambda b: (b.initialised, b.rejections),
-        belief,
-        (belief.initialised & ~lost, _cleared(rejections, lost)),
+        bank,
+        (bank.initialised & ~lost, _cleared(rejections, lost)),
     )
 
 
 def contradicted(
-    belief: Belief, max_count: int, max_duration_s: Float[Array, ""] | float
+    bank: Bank, max_count: int, max_duration_s: Float[Array, ""] | float
 ) -> Bool[Array, " K"]:
     """Whether so many contradictions in a row agree, or they have lasted so long (R3)."""
-    rejections = belief.rejections
+    rejections = bank.rejections
     return (rejections.count >= max_count) | (rejections.duration_s >= max_duration_s)
 
 
 def gated(
-    belief: Belief,
+    bank: Bank,
     offer: Offer,
     taken: Bool[Array, ""],
-) -> tuple[Belief, Float[Array, ""]]:
-    """One hypothesis that was offered a pose, and its NIS, 0 where there was none to compare.
+) -> tuple[Bank, Float[Array, ""], Bool[Array, ""]]:
+    """One hypothesis that was offered a pose, its NIS, 0 where there was none to compare, and
+    whether the pose was accepted.
 
     It starts with `first`, or takes `posterior` where the gate admits it, or stays as predicted
     (RELIABILITY R1).
@@ -204,19 +232,23 @@ def gated(
         taken: whether there is a pose at all.
     """
     nis = jnp.sum(offer.innovation**2)
-    offered = taken & belief.initialised
-    starts, agrees = taken & ~belief.initialised, offered & (nis <= offer.gate_nis)
+    offered = taken & bank.initialised
+    starts, agrees = taken & ~bank.initialised, offered & (nis <= offer.gate_nis)
     accepted = offered & (nis <= offer.gate_nis * offer.inflation)
-    predicted = (belief.mean, belief.covariance)
+    predicted = (bank.mean, bank.covariance)
     mean, covariance = where(accepted, offer.posterior, where(starts, offer.first, predicted))
-    return Belief(
-        mean,
-        covariance,
-        belief.log_weight,
-        belief.initialised | taken,
-        _cleared(_and_another(belief.rejections, offered, offer.innovation), agrees | starts),
-        belief.number,
-    ), jnp.where(offered, nis, 0)
+    return (
+        Bank(
+            mean,
+            covariance,
+            bank.log_weight,
+            bank.initialised | taken,
+            _cleared(_and_another(bank.rejections, offered, offer.innovation), agrees | starts),
+            bank.number,
+        ),
+        jnp.where(offered, nis, 0),
+        accepted | starts,
+    )
 
 
 def _and_another(
@@ -273,15 +305,15 @@ def followed(
 
 
 def merged(
-    belief: Belief,
+    bank: Bank,
     heir: Int[Array, " K"],
     difference: Callable[[Array, Array], Array],
     moved: Callable[[Array, Array], Array],
-) -> Belief:
+) -> Bank:
     """Hypotheses that share an heir as one, with their common mean and covariance.
 
     Args:
-        belief: after the update, with the weights of that.
+        bank: after the update, with the weights of that.
         heir: index of the hypothesis that takes each one in.
         difference: (mean, from) -> error state (d,).
         moved: (mean, error state) -> mean.
@@ -290,83 +322,86 @@ def merged(
     """
     count = heir.shape[0]
     if count == 1:
-        return belief
-    mass = jnp.where(belief.initialised, jnp.exp(belief.log_weight), 0)
-    member = (heir[None] == jnp.arange(count)[:, None]) & belief.initialised[None]
+        return bank
+    mass = jnp.where(bank.initialised, jnp.exp(bank.log_weight), 0)
+    member = (heir[None] == jnp.arange(count)[:, None]) & bank.initialised[None]
     total = jnp.sum(jnp.where(member, mass[None], 0), axis=1)
     share = jnp.where(member, mass[None] / jnp.where(total > 0, total, 1)[:, None], 0)
     alone = jnp.sum(member, axis=1) <= 1
 
     def common() -> tuple[Array, Array]:
-        apart = jax.vmap(difference)(belief.mean, belief.mean[heir])
+        apart = jax.vmap(difference)(bank.mean, bank.mean[heir])
         shift = product(share, apart)
         spread = apart - shift[heir]
-        second = belief.covariance + spread[:, :, None] * spread[:, None]
+        second = bank.covariance + spread[:, :, None] * spread[:, None]
         covariance = product(share, second.reshape(count, -1)).reshape(second.shape)
-        return jax.vmap(moved)(belief.mean, shift), covariance
+        return jax.vmap(moved)(bank.mean, shift), covariance
 
     # Few frames merge anything.
-    mean, covariance = jax.lax.cond(
-        jnp.all(alone), lambda: (belief.mean, belief.covariance), common
-    )
-    stays = belief.initialised & (heir == jnp.arange(count))
+    mean, covariance = jax.lax.cond(jnp.all(alone), lambda: (bank.mean, bank.covariance), common)
+    stays = bank.initialised & (heir == jnp.arange(count))
     return dataclasses.replace(
-        belief,
-        mean=jnp.where(alone[:, None], belief.mean, mean),
-        covariance=jnp.where(alone[:, None, None], belief.covariance, covariance),
-        log_weight=jnp.where(stays, jnp.log(jnp.where(total > 0, total, 1)), belief.log_weight),
+        bank,
+        mean=jnp.where(alone[:, None], bank.mean, mean),
+        covariance=jnp.where(alone[:, None, None], bank.covariance, covariance),
+        log_weight=jnp.where(stays, jnp.log(jnp.where(total > 0, total, 1)), bank.log_weight),
         initialised=stays,
     )
 
 
-def of_mixture(belief: Belief, log_values: Float[Array, " K"]) -> Float[Array, ""]:
+def heaviest(bank: Bank) -> Int[Array, ""]:
+    """Which hypothesis is the most probable."""
+    return jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
+
+
+def of_mixture(bank: Bank, log_values: Float[Array, " K"]) -> Float[Array, ""]:
     """log sum_k w_k exp(log_value_k) of hypotheses that live; 0 where none does."""
-    lives = belief.initialised
-    log_weight = jnp.where(lives, belief.log_weight, 0)
+    lives = bank.initialised
+    log_weight = jnp.where(lives, bank.log_weight, 0)
     total = jax.nn.logsumexp(log_weight, where=lives)
     value = jax.nn.logsumexp(log_weight + jnp.where(lives, log_values, 0), where=lives)
     any_lives = jnp.any(lives)
     return jnp.where(any_lives, value, 0) - jnp.where(any_lives, total, 0)
 
 
-def leading(belief: Belief, count: int) -> Belief:
+def leading(bank: Bank, count: int) -> Bank:
     """The first hypotheses of a bank."""
-    first: Belief = jax.tree.map(lambda leaf: leaf[:count], belief)
+    first: Bank = jax.tree.map(lambda leaf: leaf[:count], bank)
     return first
 
 
-def followed_by(belief: Belief, empty: Belief) -> Belief:
+def followed_by(first: Bank, empty: Bank) -> Bank:
     """Hypotheses in the first slots of a bank that is empty otherwise."""
-    kept = belief.initialised.shape[0]
-    bank: Belief = jax.tree.map(lambda a, b: jnp.concatenate([a, b[kept:]]), belief, empty)
+    kept = first.initialised.shape[0]
+    bank: Bank = jax.tree.map(lambda a, b: jnp.concatenate([a, b[kept:]]), first, empty)
     return bank
 
 
-def numbered_anew_where_empty(belief: Belief) -> Belief:
+def numbered_anew_where_empty(bank: Bank) -> Bank:
     """The same, slots counted from 0 where no hypothesis lives that goes by another number."""
-    anew = jnp.arange(belief.number.shape[0])
-    number = jnp.where(jnp.any(belief.initialised), belief.number, anew)
-    return dataclasses.replace(belief, number=number)
+    anew = jnp.arange(bank.number.shape[0])
+    number = jnp.where(jnp.any(bank.initialised), bank.number, anew)
+    return dataclasses.replace(bank, number=number)
 
 
-def survivors_first(belief: Belief) -> Belief:
+def survivors_first(bank: Bank) -> Bank:
     """The same bank, hypotheses that live before those that don't, each in their order."""
-    count = belief.initialised.shape[0]
+    count = bank.initialised.shape[0]
     if count == 1:
-        return belief
-    lives = belief.initialised.astype(int)
+        return bank
+    lives = bank.initialised.astype(int)
     place = jnp.where(
-        belief.initialised,
+        bank.initialised,
         jnp.cumsum(lives) - 1,
         jnp.sum(lives) + jnp.cumsum(1 - lives) - 1,
     )
     order = jnp.argmax(place[None] == jnp.arange(count)[:, None], axis=1)
-    sorted_bank: Belief = jax.tree.map(lambda leaf: leaf[order], belief)
+    sorted_bank: Bank = jax.tree.map(lambda leaf: leaf[order], bank)
     return sorted_bank
 
 
-def restarted_where_broken(belief: Belief, start: Belief) -> Belief:
-    """The belief, with `start` in place of hypotheses whose numbers overflowed."""
-    hypotheses = (belief.mean, belief.covariance.reshape(*belief.mean.shape[:1], -1))
+def restarted_where_broken(bank: Bank, start: Bank) -> Bank:
+    """The bank, with `start` in place of hypotheses whose numbers overflowed."""
+    hypotheses = (bank.mean, bank.covariance.reshape(*bank.mean.shape[:1], -1))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(hypotheses, axis=1)), axis=1)
-    return dataclasses.replace(where(finite, belief, start), number=belief.number)
+    return dataclasses.replace(where(finite, bank, start), number=bank.number)

@@ -139,7 +139,7 @@ class CameraDelays:
             self.read(outcome.stamp_ns, *told.odometry)
         if told is not None and told.corners_px is not None:
             self.seen(outcome.stamp_ns, told)
-        output = outcome.report.output
+        output = outcome.output
         if outcome.now_ns >= self._next_ns and bool(output.decided):
             self.at(outcome.now_ns, np.asarray(output.pose, float))
 

@@ -1,7 +1,7 @@
 """The filter as the loop calls it: one compiled call an event, and the history of what was told."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import equinox as eqx
@@ -10,23 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from jaxnav.belief.estimate import Belief, Evidence
 from jaxnav.compiling.packing import Layout, Packed
 from jaxnav.compiling.step import compiled
 from jaxnav.loop.history import Entry, History, Told
-from jaxnav.navigator import Navigator
-from jaxnav.timeline import Corners, Events, Moment, Report, advance, begin
+from jaxnav.navigator import Navigator, Output
+from jaxnav.timeline import Corners, Events, advance
 
 EVENTS = 64  # that one call fuses: 800 ms of odometry at 50 Hz, and of frames at 30 Hz
 
 _NOTHING = Told()
 
-# (moment, control, events, numbers) -> (moment, then, control, report), see `advance_packed`
+# (belief, control, events, numbers) -> (belief, then, control, output), see `advance_packed`
 Program = Callable[..., tuple[Packed, Packed, Packed, Packed]]
 
 
 def advance_packed(
     navigator: Navigator,
-    moment: Packed,
+    belief: Packed,
     control: Packed,
     events: Packed,
     numbers: Int[Array, "4"],
@@ -36,24 +37,24 @@ def advance_packed(
     Args:
         numbers: count, new, now_us, elapsed_us.
     """
-    given = (part.unpacked() for part in (moment, control, events))
+    given = (part.unpacked() for part in (belief, control, events))
     returned = advance(navigator, *given, *numbers)
-    moment, then, control, report = (Layout.of(part).pack(part) for part in returned)
-    return moment, then, control, report
+    belief, then, control, output = (Layout.of(part).pack(part) for part in returned)
+    return belief, then, control, output
 
 
 def _beginning(navigator: Navigator) -> tuple[Packed, Packed]:
-    """Moment and control at the start of a drive."""
-    moment, control = begin(navigator), navigator.init().control
-    return Layout.of(moment).pack(moment), Layout.of(control).pack(control)
+    """Belief and control at the start of a drive."""
+    state = navigator.init()
+    return Layout.of(state.belief).pack(state.belief), Layout.of(state.control).pack(state.control)
 
 
 @dataclass(frozen=True)
 class Fused:
-    """What came of an event. Leaves of `report` and `moment` are NumPy's."""
+    """What came of an event. Leaves of `output` and `belief` are NumPy's."""
 
-    report: Report
-    moment: Moment
+    output: Output
+    belief: Belief
     refused: bool  # older than all that is kept
     events: int  # that were fused, this one and those after it
 
@@ -76,8 +77,8 @@ class Estimator:
     def reset(self) -> None:
         """Forget what was sensed; the route goes on."""
         self._history: History | None = None
-        self._moment = self._first
-        self._moment_ns = 0
+        self._belief = self._first
+        self._belief_ns = 0
 
     def forget_speed(self) -> None:
         """Command as if it had never been known: the last that was told was not true."""
@@ -106,44 +107,48 @@ class Estimator:
                 self._history = History(self._first, stamp_ns)
             placed = self._history.place(stamp_ns, told)
         if placed is None:
-            base_ns = self._moment_ns if self._history is not None else now_ns
-            moment, _, report = self._call(self._moment, [], base_ns, 0, now_ns, elapsed_ns)
-            told_of = moment.fetched().unpacked()
-            return Fused(report.fetched().unpacked(), told_of, told is not None, 0)
+            base_ns = self._belief_ns if self._history is not None else now_ns
+            belief, _, output = self._call(self._belief, [], base_ns, 0, now_ns, elapsed_ns)
+            believed = belief.fetched().unpacked()
+            return Fused(output.fetched().unpacked(), believed, told is not None, 0)
         base, entries = placed
         assert self._history is not None
         new = next(index for index, entry in enumerate(entries) if entry.told is told)
-        moment, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
-        self._moment, self._moment_ns = moment, entries[-1].stamp_ns
-        self._history.fused(moment, entries[new], then)
-        return Fused(known, moment.fetched().unpacked(), False, len(entries))
+        belief, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
+        self._belief, self._belief_ns = belief, entries[-1].stamp_ns
+        self._history.fused(belief, entries[new], then)
+        return Fused(known, belief.fetched().unpacked(), False, len(entries))
 
     def _fused(
         self, base: Entry, entries: list[Entry], new: int, now_ns: int, elapsed_ns: int
-    ) -> tuple[Packed, Packed, Report]:
-        """What is believed after the entries, and after the new one, and the report: in one call
+    ) -> tuple[Packed, Packed, Output]:
+        """What is believed after the entries, and after the new one, and the output: in one call
         nearly always, in several where a frame is late and the cameras are many."""
-        assert base.moment is not None
+        assert base.belief is not None
         rows = [(entry.stamp_ns, entry.told or _NOTHING) for entry in entries]
-        moment, base_ns = base.moment, base.stamp_ns
+        belief, base_ns = base.belief, base.stamp_ns
         if len(rows) <= EVENTS:
-            moment, then, report = self._call(moment, rows, base_ns, new, now_ns, elapsed_ns)
-            return moment, then, report.fetched().unpacked()
+            belief, then, output = self._call(belief, rows, base_ns, new, now_ns, elapsed_ns)
+            return belief, then, output.fetched().unpacked()
         # One less: its place is what `new` means where the new event is of another part.
         size, control = EVENTS - 1, self._control
         for first in range(0, len(rows), size):
             part, holds = rows[first : first + size], first <= new < first + size
             self._control = control  # there is one command
             index = new - first if holds else size
-            moment, after, report = self._call(moment, part, base_ns, index, now_ns, elapsed_ns)
+            belief, after, output = self._call(belief, part, base_ns, index, now_ns, elapsed_ns)
             base_ns = part[-1][0]
             if holds:
-                then, found = after, report
-        return moment, then, _finding(report.fetched().unpacked(), found.fetched().unpacked())
+                then, of_new = after, output
+        return (
+            belief,
+            then,
+            _with_evidence(output.fetched().unpacked(), of_new.fetched().unpacked()),
+        )
 
     def _call(
         self,
-        moment: Packed,
+        belief: Packed,
         rows: Sequence[tuple[int, Told]],
         base_ns: int,
         new: int,
@@ -154,8 +159,8 @@ class Estimator:
         events = self._events(rows, base_ns, seeing)
         now_us, elapsed_us = _us_between(base_ns, now_ns), elapsed_ns // 1000
         numbers = np.array([len(rows), new, _int32(now_us), _int32(elapsed_us)], np.int32)
-        moment, then, self._control, report = self._program(moment, self._control, events, numbers)
-        return moment, then, report
+        belief, then, self._control, output = self._program(belief, self._control, events, numbers)
+        return belief, then, output
 
     def _events(self, rows: Sequence[tuple[int, Told]], base_ns: int, seeing: bool) -> Packed:
         packed, events = self._layouts[seeing].room()
@@ -180,15 +185,14 @@ class Estimator:
                 corners["corner_sigma_px"][index] = told.sigma_px
 
 
-def _finding(report: Report, other: Report) -> Report:
-    """A report with what another one has found in the corners."""
+def _with_evidence(output: Output, of_new: Output) -> Output:
+    """An output with what the corners of another event say."""
 
-    def found(of: Report) -> tuple[Any, ...]:
-        output = of.output
-        return output.candidates, output.costs, output.selected, output.nis
+    def evidence(output: Output) -> list[Any]:
+        return [getattr(output, field.name) for field in fields(Evidence)]
 
-    merged: Report = eqx.tree_at(found, report, found(other))
-    return merged
+    told: Output = eqx.tree_at(evidence, output, evidence(of_new))
+    return told
 
 
 def _layout(navigator: Navigator, seeing: bool) -> Layout:

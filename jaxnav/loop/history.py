@@ -32,25 +32,25 @@ class Told:
 
 @dataclass
 class Entry:
-    """One event; `moment` is what was believed after it, None where that is not true any more."""
+    """One event; `belief` is what was believed after it, None where that is not true any more."""
 
     stamp_ns: int
     told: Told | None  # None: where everything began
-    moment: Packed | None
+    belief: Packed | None
 
 
 class History:
     """The events of one drive."""
 
-    def __init__(self, moment: Packed, begin_ns: int):
+    def __init__(self, belief: Packed, begin_ns: int):
         """With nothing sensed, at some instant."""
-        self._entries = [Entry(begin_ns, None, moment)]
+        self._entries = [Entry(begin_ns, None, belief)]
 
     def place(self, stamp_ns: int, told: Told) -> tuple[Entry, list[Entry]] | None:
         """Take an event in.
 
         Returns:
-            The entry to start from, whose moment is true, and all those after it, which are to be
+            The entry to start from, whose belief is true, and all those after it, which are to be
             fused; None where the event is too old to be placed.
         """
         entries = self._entries
@@ -58,25 +58,25 @@ class History:
         while index > 0 and entries[index - 1].stamp_ns > stamp_ns:
             index -= 1
         base = index - 1
-        while base >= 0 and entries[base].moment is None:
+        while base >= 0 and entries[base].belief is None:
             base -= 1
         if base < 0:
             return None
         entries.insert(index, Entry(stamp_ns, told, None))
         for entry in entries[index:]:
-            entry.moment = None
+            entry.belief = None
         return entries[base], entries[base + 1 :]
 
-    def fused(self, moment: Packed, new: Entry, then: Packed) -> None:
+    def fused(self, belief: Packed, new: Entry, then: Packed) -> None:
         """Keep what is believed, and no more events than may be needed.
 
         Args:
-            moment: what is believed after the newest event.
+            belief: what is believed after the newest event.
             new: the entry that `place` has made; the next late event may start from it.
             then: what was believed after that.
         """
-        new.moment = then
-        self._entries[-1].moment = moment
+        new.belief = then
+        self._entries[-1].belief = belief
         self._thin()
         self._forget()
 
@@ -89,14 +89,14 @@ class History:
                 del self._entries[-2]
 
     def _forget(self) -> None:
-        """All before the last moment that an event as old as may be can start from."""
+        """All before the last belief that an event as old as may be can start from."""
         entries = self._entries
         oldest_ns = entries[-1].stamp_ns - OLD_NS
         base = 0
         for index, entry in enumerate(entries):
             if entry.stamp_ns > oldest_ns:
                 break
-            if entry.moment is not None:
+            if entry.belief is not None:
                 base = index
         del entries[: max(base, len(entries) - KEPT)]
 

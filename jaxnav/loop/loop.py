@@ -141,7 +141,7 @@ class Loop:
                 return "time is over"
             if ending is not None and (why := ending.over) is not None:
                 return why
-            if self._outcome is not None and self._outcome.report.output.done:
+            if self._outcome is not None and self._outcome.output.done:
                 arrived_ns = arrived_ns or now_ns
                 if now_ns - arrived_ns > _STAYS_S * 1e9:
                     return "arrived"
@@ -186,12 +186,12 @@ class Loop:
                 "frame to command", (self._now_ns() - given.frames[0].stamp_ns) / 1e6
             )
         self._outcome = outcome
-        output = outcome.report.output
+        output = outcome.output
         # In one go: who looks for markers reads it at any time.
         self._belief = (
             (
                 np.asarray(output.T_world_vehicle.wxyz_xyz),
-                np.asarray(output.covariance[:3, :3] + self._min_covariance),
+                np.asarray(output.pose_covariance + self._min_covariance),
             )
             if output.decided
             else None

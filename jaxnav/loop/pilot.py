@@ -17,7 +17,8 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxnav.belief.motion import Belief
+from jaxnav.belief.bicycle_kalman import planar_poses
+from jaxnav.belief.estimate import Belief
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.due import due_px
 from jaxnav.loop.estimator import Estimator, Program
@@ -35,8 +36,7 @@ from jaxnav.loop.support import Support
 from jaxnav.loop.way import Place, Way
 from jaxnav.loop.ways import Fix
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
-from jaxnav.navigator import Navigator
-from jaxnav.timeline import Moment, Report
+from jaxnav.navigator import Navigator, Output
 
 SLEPT_NS = 1_000_000_000  # a loop that was away for so long believes what is of another time
 _SEEING_NS = 500_000_000  # for so long after a marker the estimate's speed is worth the odometer's
@@ -60,7 +60,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the pilot makes of an event. Its report and moment count from `origin_m`."""
+    """What the pilot makes of an event. Its output and belief count from `origin_m`."""
 
     now_ns: int
     health: Health
@@ -68,8 +68,8 @@ class Outcome:
     rejects: Reject
     steering_rad: float
     throttle: float
-    report: Report  # NumPy's leaves, as of `moment`
-    moment: Moment
+    output: Output  # NumPy's leaves, as of `belief`
+    belief: Belief
     told: Told | None  # what was fused, and when it was true
     stamp_ns: int
     restarts: int  # so far, and why the last one
@@ -80,53 +80,63 @@ class Outcome:
     @property
     def pose(self) -> np.ndarray:
         """x_m, y_m, psi_rad in the world."""
-        return np.asarray(planar_in_world(self.report.output.pose, self.origin_m))
+        return np.asarray(planar_in_world(self.output.pose, self.origin_m))
 
     @property
     def T_world_vehicle(self) -> np.ndarray:
         """(7,) wxyz_xyz."""
-        wxyz_xyz = self.report.output.T_world_vehicle.wxyz_xyz
-        return np.asarray(poses_in_world(wxyz_xyz, self.origin_m))
+        return np.asarray(poses_in_world(self.output.T_world_vehicle.wxyz_xyz, self.origin_m))
 
 
 class _Known(NamedTuple):
-    """What the pilot looks at in a report."""
+    """What the pilot looks at in an output."""
 
     pose: np.ndarray  # x_m, y_m, psi_rad
-    covariance: np.ndarray
+    pose_covariance: np.ndarray
+    velocity: np.ndarray  # its derivative
+    velocity_covariance: np.ndarray
     located: bool
     decided: bool
-    selected: int
+    accepted: bool
     nis: float
+    gate_nis: float
     steering_rad: float
     throttle: float
-    mean: np.ndarray
 
     @staticmethod
-    def of(report: Report) -> "_Known":
-        told = vars(report)  # an attribute of an equinox module takes a us
-        output = vars(told["output"])
-        command = vars(output["command"])
+    def of(output: Output) -> "_Known":
+        told = vars(output)  # an attribute of an equinox module takes a us
+        command = vars(told["command"])
         return _Known(
-            output["pose"],
-            output["covariance"],
-            bool(output["located"]),
-            bool(output["decided"]),
-            int(output["selected"]),
-            float(output["nis"]),
+            told["pose"],
+            told["pose_covariance"],
+            told["velocity"],
+            told["velocity_covariance"],
+            bool(told["located"]),
+            bool(told["decided"]),
+            bool(told["accepted"]),
+            float(told["nis"]),
+            float(told["gate_nis"]),
             float(command["steering_rad"]),
             float(command["throttle"]),
-            told["mean"],
         )
 
     @property
     def is_finite(self) -> bool:
-        numbers = (*self.pose.tolist(), *self.covariance.ravel().tolist())
-        return all(map(math.isfinite, numbers))
+        arrays = self.pose, self.pose_covariance, self.velocity, self.velocity_covariance
+        return all(math.isfinite(number) for array in arrays for number in array.ravel().tolist())
 
-    def sigma(self, *states: int) -> float:
-        """Of several states together."""
-        return math.sqrt(max(sum(float(self.covariance[state, state]) for state in states), 0.0))
+    @property
+    def position_sigma_m(self) -> float:
+        return _root_of_sum(self.pose_covariance)
+
+    @property
+    def speed_mps(self) -> tuple[float, float]:
+        """Along the course, and its sigma."""
+        heading, (x_mps, y_mps, _) = float(self.pose[2]), self.velocity.tolist()
+        forward_mps = math.cos(heading) * x_mps + math.sin(heading) * y_mps
+        speed_mps = math.copysign(math.hypot(x_mps, y_mps), forward_mps)
+        return speed_mps, _root_of_sum(self.velocity_covariance)
 
 
 class Pilot:
@@ -154,7 +164,6 @@ class Pilot:
         self.limits = Limits.of(navigator.controller.vehicle)
         self._corrections = Corrections.of(navigator.controller.vehicle)
         self._estimator = Estimator(navigator, program)
-        self._gate_nis = float(getattr(navigator.motion, "gate_nis", math.inf))
         self._frames = Frames(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
         self._odometry_stamps = Stamps()
@@ -251,7 +260,7 @@ class Pilot:
     ) -> Outcome:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
         fused = self._estimator.fuse(told, stamp_ns, now_ns, elapsed_ns)
-        known = _Known.of(fused.report)
+        known = _Known.of(fused.output)
         finite = known.is_finite
         if not finite:
             faults |= Fault.NOT_FINITE
@@ -260,7 +269,7 @@ class Pilot:
             rejects |= Reject.TOO_LATE
         if told is not None and told.corners_px is not None and fused.refused:
             self._frames.refused()
-        restarts = self._restarts_before + int(fused.moment.restarts)
+        restarts = self._restarts_before + int(fused.belief.restarts)
         if finite and restarts > self._restarts:
             self._restarts, self._restart_reason = restarts, "contradicted by the corners"
             faults |= Fault.RESTARTED
@@ -269,13 +278,13 @@ class Pilot:
             self._support.restarted()
         outvoted: tuple[int, ...] = ()
         if told is not None and told.corners_px is not None and not fused.refused:
-            outvoted = self._outvoted.count(told, np.asarray(fused.report.outvoted))
+            outvoted = self._outvoted.count(told, np.asarray(fused.output.outvoted))
             if outvoted:
                 faults |= Fault.MARKER_OUTVOTED
-            rejects |= self._judge(known, fused.moment.belief, stamp_ns, now_ns)
+            rejects |= self._judge(known, fused.belief, stamp_ns, now_ns)
         faults |= self._contradictions()
-        report, known = self._honest(fused.report, known)
-        if self._left is not None and report.output.decided:
+        output, known = self._honest(fused.output, known)
+        if self._left is not None and output.decided:
             self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
             self._left = None
         self._known, self._now_ns = known, now_ns
@@ -290,8 +299,8 @@ class Pilot:
             rejects,
             steering_rad,
             throttle,
-            report,
-            fused.moment,
+            output,
+            fused.belief,
             told,
             stamp_ns,
             self._restarts,
@@ -301,26 +310,27 @@ class Pilot:
         )
 
     def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
-        """Whether the corners were believed."""
-        gate, nis = self._gate_nis, known.nis
-        believed = known.selected >= 0 and nis <= gate
-        self._monitor.corners(believed)
-        fix = _fix(known.pose, known.covariance) if known.decided else None
-        alive = zip(belief.mean, belief.covariance, belief.initialised, strict=True)
+        """Whether the corners were accepted, and what they say of the estimate."""
+        agrees = known.accepted and known.nis <= known.gate_nis
+        self._monitor.corners(agrees)
+        fix = _fix(known.pose, known.pose_covariance) if known.decided else None
+        bank = belief.bank
+        alive = zip(*planar_poses(bank), bank.initialised, strict=True)
         support = self._support
         before = support.relocations, support.refused
         if support.corners(
-            believed,
+            known.accepted,
+            agrees,
             now_ns,
             fix,
-            lambda: [_fix(mean, covariance) for mean, covariance, lives in alive if lives],
+            lambda: [_fix(pose, covariance) for pose, covariance, lives in alive if lives],
         ):
             self._fix_ns, self._distance_m = max(stamp_ns, self._fix_ns or 0), 0.0
         if support.relocations > before[0] or support.refused > before[1]:
             self._explain("refused" if support.refused else "relocated")
-        if believed:
-            return Reject.INNOVATION_LARGE if nis > gate / 2 else _NO_REJECT
-        return Reject.INNOVATION
+        if not known.accepted:
+            return Reject.INNOVATION
+        return Reject.INNOVATION_LARGE if known.nis > known.gate_nis / 2 else _NO_REJECT
 
     def _explain(self, what: str) -> None:
         """Add to the reason of the last restart."""
@@ -338,19 +348,20 @@ class Pilot:
             found |= Fault.ODOMETRY_DOUBTFUL
         return found
 
-    def _honest(self, report: Report, known: _Known) -> tuple[Report, _Known]:
+    def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """What is told of an estimate that nothing confirms: not decided, and how far off."""
         doubt = self._support.doubt(self._monitor.contradicted)
         if not (doubt.is_doubted and known.decided):
-            return report, known
-        covariance = known.covariance.copy()
-        covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
-        honest: Report = eqx.tree_at(
-            lambda r: (r.output.decided, r.output.covariance),
-            report,
-            (np.asarray(False), covariance),
+            return output, known
+        covariances = [np.array(output.pose_covariance), np.array(output.covariance)]
+        for covariance in covariances:
+            covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
+        honest: Output = eqx.tree_at(
+            lambda told: (told.decided, told.pose_covariance, told.covariance),
+            output,
+            (np.asarray(False), *covariances),
         )
-        return honest, known._replace(covariance=covariance)
+        return honest, known._replace(pose_covariance=covariances[0])
 
     def _limited(
         self, known: _Known, health: Health, now_ns: int, elapsed_ns: int
@@ -377,7 +388,7 @@ class Pilot:
             fix_age_s=age_s(self._fix_ns),
             odometry_age_s=age_s(self._odometer_ns),
             cameras_age_s=tuple(age_s(stamp_ns) for stamp_ns in self._frames.newest_ns),
-            position_sigma_m=known.sigma(0, 1),
+            position_sigma_m=known.position_sigma_m,
             distance_m=self._distance_m,
             faults=faults,
             restarts=self._restarts_lately(now_ns),
@@ -421,19 +432,19 @@ class Pilot:
     def _speed(self) -> tuple[float, float] | None:
         """Speed along the course and its sigma, m/s, as far as they are known."""
         known = self._known
-        if known is None or not known.decided:
-            return None
-        heading, *velocity = map(float, known.mean[2:5])
-        forward = math.cos(heading) * velocity[0] + math.sin(heading) * velocity[1]
-        speed = math.copysign(math.hypot(*velocity), forward)
-        return speed, known.sigma(3, 4)
+        return None if known is None or not known.decided else known.speed_mps
 
 
 def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
-    """Of a state that begins with x_m, y_m, psi_rad."""
+    """Of x_m, y_m, psi_rad."""
     x_m, y_m, psi_rad = map(float, pose[:3])
-    sigma_m = math.sqrt(max(float(covariance[0, 0] + covariance[1, 1]), 0.0))
-    return Fix(x_m, y_m, psi_rad, sigma_m, math.sqrt(max(float(covariance[2, 2]), 0.0)))
+    sigma_rad = math.sqrt(max(float(covariance[2, 2]), 0.0))
+    return Fix(x_m, y_m, psi_rad, _root_of_sum(covariance), sigma_rad)
+
+
+def _root_of_sum(covariance: np.ndarray) -> float:
+    """Sigma of two coordinates together."""
+    return math.sqrt(max(float(covariance[0, 0]) + float(covariance[1, 1]), 0.0))
 
 
 def _apart(pose: np.ndarray, other: np.ndarray) -> str:

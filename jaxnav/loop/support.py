@@ -1,7 +1,7 @@
 """What an estimate rests on, and so whether to act upon it.
 
     support.drove(reading, heading_rad, gap_s, throttle, seeing)    # with every odometry
-    is_fix = support.corners(believed, now_ns, fix, possible)   # with every frame
+    is_fix = support.corners(accepted, agrees, now_ns, fix, possible)  # with every frame
     support.doubt(contradicted)
 
 The filter can't know that its pose is nonsense: all that it has was fused into it. So a pose is
@@ -99,7 +99,8 @@ class Support:
 
     def corners(
         self,
-        believed: bool,
+        accepted: bool,
+        agrees: bool,
         now_ns: int,
         fix: Fix | None,
         possible: Callable[[], Sequence[Fix]],
@@ -107,16 +108,18 @@ class Support:
         """Take in a frame, and say whether it is a fix.
 
         Args:
-            believed: its corners fit the pose.
+            accepted: the filter has taken it.
+            agrees: with the prediction; what doesn't is accepted where all is less sure than it
+                says, and confirms nothing.
             fix: that pose; None: several are possible.
             possible: these.
         """
         self._ways.glimpse(now_ns)
-        if not believed:
-            if not self.confirmed:
-                self._confirmations = 0
+        if not agrees and not self.confirmed:
+            self._confirmations = 0
+        if not accepted:
             return False
-        self._confirmations += 1
+        self._confirmations += agrees
         if not self.confirmed:
             return False
         slack_m = self._propulsion.off_m

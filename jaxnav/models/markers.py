@@ -13,7 +13,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnav.models.geometry import rotation_matrix
+from jaxnav.models.geometry import rotation_matrix, transform_points
 from jaxnav.models.origin import ZERO, Origin
 
 # How many markers each family has. AprilTag's keep AprilTag's names; ArUco's are OpenCV's, in lower
@@ -63,6 +63,12 @@ class MarkerMap(eqx.Module):
         R = jax.vmap(rotation_matrix)(self.Ts_world_marker.rotation())
         turned = jnp.sum(R[:, None] * corners[:, :, None], axis=3)
         return turned + self.Ts_world_marker.translation()[:, None]
+
+    def nearest_m(self, T_world_vehicle: jaxlie.SE3) -> Float[Array, " 2"]:
+        """The centre of the marker that is nearest on the ground, in the vehicle's axes."""
+        centers_world_m = self.Ts_world_marker.translation()
+        centers_m = transform_points(T_world_vehicle.inverse(), centers_world_m)[:, :2]
+        return centers_m[jnp.argmin(jnp.sum(centers_m**2, axis=1))]
 
     def without_origin(self) -> "MarkerMap":
         """The same numbers, whatever they count from: one compiled program serves all origins."""

@@ -1,6 +1,6 @@
 """Which markers in view to hold a pose against: those that can be markers, and agree.
 
-    found = consistent(snapshot, navigator.find_candidates)
+    found = consistent(snapshot, navigator.find_candidates, navigator.no_candidates())
 
 Four corners at random places fit no pose at all, and a marker that was moved, or a copy of it, fits
 no pose that the others agree on. A belief that takes them in all the same, however little it trusts
@@ -40,12 +40,31 @@ class Consistent(NamedTuple):
     outvoted: Bool[Array, " M"]
 
 
-def consistent(snapshot: Snapshot, find: Callable[[Snapshot], Candidates]) -> Consistent:
+def consistent(
+    snapshot: Snapshot, find: Callable[[Snapshot], Candidates], none: Candidates
+) -> Consistent:
     """What is seen without nonsense and without a marker that the others outvote.
 
     Args:
         find: see `find_candidates`.
+        none: what it returns where nothing is in view: then it is not called.
     """
+
+    def look() -> tuple[Array, Candidates, Array]:
+        found = among_all(snapshot, find)
+        return found.snapshot.seen.visible, found.candidates, found.outvoted
+
+    def nothing() -> tuple[Array, Candidates, Array]:
+        nobody = jnp.zeros(len(snapshot.markers.ids), bool)
+        return jnp.zeros_like(snapshot.seen.visible), none, nobody
+
+    any_seen = jnp.any(snapshot.seen.visible)
+    visible, candidates, outvoted = jax.lax.cond(any_seen, look, nothing)
+    return Consistent(_among(snapshot, visible), candidates, outvoted)
+
+
+def among_all(snapshot: Snapshot, find: Callable[[Snapshot], Candidates]) -> Consistent:
+    """`consistent` that calls `find` whatever is in view."""
     snapshot = _among(snapshot, _can_be_markers(snapshot))
     candidates = find(snapshot)
     nobody = jnp.zeros(len(snapshot.markers.ids), bool)

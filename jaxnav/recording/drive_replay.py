@@ -125,7 +125,7 @@ def first_difference(log: DriveLog, outcomes: Iterable[Outcome]) -> Difference |
 
 
 def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: float) -> str | None:
-    output, away_m = outcome.report.output, opposite(outcome.origin_m)
+    output, away_m = outcome.output, opposite(outcome.origin_m)
     for name, kind in (("health", Health), ("faults", Fault), ("rejects", Reject)):
         before, now = kind(int(getattr(recorded, name)[index])), getattr(outcome, name)
         if before != now:

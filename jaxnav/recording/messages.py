@@ -13,13 +13,15 @@ from typing import Any
 
 import jax
 
-from jaxnav.belief.motion import Belief
+from jaxnav.belief.bicycle_kalman import planar_poses
+from jaxnav.belief.motion import Bank
 from jaxnav.detection.types import Detections
 from jaxnav.files.ranges import RANGES
 from jaxnav.loop.frames import Sighted
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import Origin, inverses_in_world, planar_in_world
+from jaxnav.navigator import Output
 from jaxnav.recording.message_schemas import (
     FRAMES,
     ODOMETRY,
@@ -29,7 +31,6 @@ from jaxnav.recording.message_schemas import (
     SightedMessage,
     TickMessage,
 )
-from jaxnav.timeline import Report
 
 # Beyond, a stamp is none, see `Stamps`; what is recorded of it is not one either.
 _LEAST_NS, _MOST_NS = int(RANGES["stamp_ns"].least), int(RANGES["stamp_ns"].most)
@@ -73,7 +74,7 @@ def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
     """The message of an outcome; see `OutcomeMessage`.
 
     Args:
-        outcome: its report with NumPy leaves.
+        outcome: its output with NumPy leaves.
         digest: of the pilot's state, for who replays the drive.
     """
     message: dict[str, Any] = {
@@ -90,7 +91,7 @@ def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
     }
     if outcome.outvoted:
         message["outvoted"] = list(outcome.outvoted)
-    return message | _reported(outcome.report, outcome.moment.belief, outcome.origin_m)
+    return message | _reported(outcome.output, outcome.belief.bank, outcome.origin_m)
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,8 @@ class _Rows:
         return values
 
 
-def _reported(report: Report, belief: Belief, origin_m: Origin) -> dict[str, Any]:
-    output, alive, valid = report.output, belief.initialised, report.output.candidates.valid
+def _reported(output: Output, bank: Bank, origin_m: Origin) -> dict[str, Any]:
+    alive, valid = bank.initialised, output.candidates.valid
     selected = int(output.selected)
     planar = partial(planar_in_world, origin_m=origin_m)
     inverses = partial(inverses_in_world, origin_m=origin_m)
@@ -123,8 +124,8 @@ def _reported(report: Report, belief: Belief, origin_m: Origin) -> dict[str, Any
         "flip_probability": output.flip_probability,
         "nis": output.nis,
         "hypothesis": output.hypothesis,
-        "hypotheses": _Rows(belief.mean[:, :3], alive, planar),
-        "log_weight": _Rows(belief.log_weight, alive),
+        "hypotheses": _Rows(planar_poses(bank)[0], alive, planar),
+        "log_weight": _Rows(bank.log_weight, alive),
         "Ts_vehicle_world": _Rows(output.candidates.T_vehicle_world.wxyz_xyz, valid, inverses),
         "costs": _Rows(output.costs, valid),
         "selected": sum(valid[:selected].tolist()) if selected >= 0 else -1,
@@ -164,8 +165,8 @@ def _sighted(message: SightedMessage) -> Sighted:
 
 def digest(outcome: Outcome) -> str:
     """Of all that was believed and commanded: two drives with the same digests are the same."""
-    output = outcome.report.output
-    told = (outcome.moment, output.pose, output.covariance, output.command)
+    output = outcome.output
+    told = (outcome.belief, output.pose, output.covariance, output.command)
     state = hashlib.blake2b(digest_size=8)
     for leaf in jax.tree.leaves(told):
         state.update(leaf.tobytes())

@@ -27,6 +27,7 @@ from jaxnav.simulation.drive import PASSED_M
 from jaxnav.simulation.kept import Kept
 from jaxnav.simulation.plant import CarState, move_through, read_odometry
 from jaxnav.simulation.queue import run_lanes
+from jaxnav.simulation.regimes import step_by_regime
 from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.single_frames import directions
 from jaxnav.simulation.world import Spread, World, nominal
@@ -135,7 +136,7 @@ class Rollout(eqx.Module):
     @_jit(compiler_options=COMPILER_OPTIONS)
     def _advance_many(self, worlds: World, keep: Keep) -> tuple[World, tuple[Trace, Any]]:
         """The same for many lanes, each with no more work than it has."""
-        step = self.navigator.step_by_regime
+        step = step_by_regime(self.navigator)
         frame = over_lanes(lambda world: self._kept(world, step, keep))
         worlds, kept = jax.lax.scan(
             lambda w, _: frame(w), lanes_last(worlds), length=self.chunk_frames

@@ -216,7 +216,7 @@ def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
 def _error_m(step: Step) -> float:
     """Of a position that is acted upon; NaN where there is none."""
     outcome = step.outcome
-    if not outcome.report.output.decided or outcome.throttle == 0:
+    if not outcome.output.decided or outcome.throttle == 0:
         return math.nan
     truth = planar_in_world(step.truth[:3], outcome.origin_m)
     return float(np.hypot(*(outcome.pose[:2] - truth[:2])))

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.kalman import nis
-from jaxnav.belief.motion import Belief, Motion
+from jaxnav.belief.motion import Bank, Motion, heaviest
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import (
     T_world_vehicle_from_planar,
@@ -50,7 +50,8 @@ def estimated(navigator: Navigator, recorded: Recorded) -> Estimated:
             obs, used, truth = now
             after, out = local.step(state, obs)
             after = jax.tree.map(lambda a, b: jnp.where(used, a, b), after, state)
-            error = error_of(local.motion, after.belief.mean[out_index(after)], jaxlie.SE3(truth))
+            bank = after.belief.bank
+            error = error_of(local.motion, bank.mean[heaviest(bank)], jaxlie.SE3(truth))
             d = error.shape[0]
             return after, Estimated(
                 out.T_world_vehicle.wxyz_xyz,
@@ -58,10 +59,6 @@ def estimated(navigator: Navigator, recorded: Recorded) -> Estimated:
                 nees(error, out.covariance[:d, :d]),
                 out.decided & out.located & used,
             )
-
-        def out_index(state: State) -> Array:
-            belief = state.belief
-            return jnp.argmax(jnp.where(belief.initialised, belief.log_weight, -jnp.inf))
 
         frames = (recorded.obs, recorded.used, recorded.T_world_vehicle_true)
         return jax.lax.scan(frame, local.init(), frames)[1]
@@ -96,7 +93,7 @@ def position_states(pose_states: int) -> int:
 class Started(eqx.Module):
     """Where each of B sequences begins: one hypothesis, in the valley that was found to be true."""
 
-    belief: Belief
+    bank: Bank
     chosen: Bool[Array, "*B"]  # False: nothing was ever decided, the sequence tells nothing
 
 
@@ -139,24 +136,24 @@ def _carried_back(
 
 
 @eqx.filter_jit
-def _around(navigator: Navigator, T_world_vehicle: Float[Array, "B 7"]) -> Belief:
+def _around(navigator: Navigator, T_world_vehicle: Float[Array, "B 7"]) -> Bank:
     """One hypothesis each, wide about a pose and at rest."""
     motion = navigator.motion
     empty = motion.init(1)
     velocity_sigma = motion.initial_velocity_sigma  # type: ignore[attr-defined]
     sigma = jnp.concatenate([jnp.full_like(velocity_sigma, _CARRIED_SIGMA), velocity_sigma])
 
-    def one(T: Array) -> Belief:
+    def one(T: Array) -> Bank:
         pose = T
         if isinstance(motion, BicycleKalman):
             pose = planar_from_T_world_vehicle(jaxlie.SE3(T))
         mean = jnp.concatenate([pose, jnp.zeros_like(empty.mean[0, pose.shape[0] :])])
-        belief: Belief = eqx.tree_at(
+        belief: Bank = eqx.tree_at(
             lambda b: (b.mean, b.covariance, b.initialised),
             empty,
             (mean[None], jnp.diag(sigma**2)[None], jnp.ones(1, bool)),
         )
         return belief
 
-    beliefs: Belief = jax.vmap(one)(T_world_vehicle)
+    beliefs: Bank = jax.vmap(one)(T_world_vehicle)
     return beliefs

@@ -28,6 +28,7 @@ from jaxnav.navigator import Step
 from jaxnav.parameters import with_parameters
 from jaxnav.simulation.kept import Kept
 from jaxnav.simulation.queue import run_lanes
+from jaxnav.simulation.regimes import step_by_regime
 from jaxnav.simulation.rollout import Rollout, Trace
 from jaxnav.simulation.world import World
 from jaxnav.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss, no_costs
@@ -159,7 +160,7 @@ class ClosedLoop(eqx.Module):
         """The same for many lanes, each with no more work than it has."""
 
         def frame(drive: Sensitive) -> Sensitive:
-            return self._frame(x, space, drive, lambda r: r.navigator.step_by_regime)
+            return self._frame(x, space, drive, lambda r: step_by_regime(r.navigator))
 
         last, _ = jax.lax.scan(
             lambda d, _: (over_lanes(frame)(d), None),

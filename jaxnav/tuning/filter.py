@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.belief.motion import Belief
+from jaxnav.belief.motion import Bank
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import with_parameters
 from jaxnav.tuning.branches import started
@@ -27,7 +27,7 @@ _CM2_PER_M2 = 1e4
 class Item(NamedTuple):
     """One sequence; or many, leaves leading with (B,)."""
 
-    start: Belief
+    start: Bank
     recorded: Recorded
 
 
@@ -67,7 +67,7 @@ class FilterCost(eqx.Module):
         )
         counted = usable.used if self.loss == "likelihood" else usable.judged
         frames = jnp.maximum(jnp.sum(counted), 1).astype(x.dtype)
-        return Batch(Item(start.belief, usable), frames)
+        return Batch(Item(start.bank, usable), frames)
 
     def mean(self, x: Float[Array, " n"], batch: Batch) -> Float[Array, ""]:
         """The mean cost of a frame."""

@@ -1,6 +1,6 @@
 """The filter along a sequence from a start that is chosen: smooth in its noise parameters.
 
-The estimator is the car's, `Navigator.estimate`, frame by frame, with one hypothesis: of the poses
+The estimator is the car's, `Navigator.sense`, frame by frame, with one hypothesis: of the poses
 that a marker admits the other ones are left out, for good (`branches.py` says which). Selectors
 that choose anew in every frame do so, and no gradient flows through that choice.
 """
@@ -14,12 +14,15 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.estimate import Belief
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.kalman import log_likelihood
-from jaxnav.belief.motion import Belief
+from jaxnav.belief.motion import Bank
 from jaxnav.navigator import Navigator
 from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND
-from jaxnav.pose.observation import Observation
+from jaxnav.pose.candidates import Candidates
+from jaxnav.pose.consistency import Consistent
+from jaxnav.pose.observation import Observation, Snapshot
 from jaxnav.tuning.branches import error_of, nees, position_states
 from jaxnav.tuning.recorded import Recorded
 
@@ -47,28 +50,25 @@ def trusting(navigator: Navigator) -> Navigator:
         navigator = eqx.tree_at(
             lambda n: (n.selector.max_inflation, n.selector.max_misfit), navigator, (1.0, 1.0)
         )
-    return navigator
+        return _GoesOn.like(navigator)
+    return _Trusts.like(navigator)
 
 
-def follow(navigator: Navigator, start: Belief, recorded: Recorded) -> Followed:
+def follow(navigator: Navigator, start: Bank, recorded: Recorded) -> Followed:
     """One sequence (no batch axis), frame by frame."""
     local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
-    # A hypothesis that goes on asks no candidate.
-    goes_on = isinstance(navigator.selector, MultiHypothesis)
 
     @functools.partial(jax.checkpoint, policy=KEEP_FOUND)
     def frame(
         belief: Belief, now: tuple[Observation, Array, Array, Array]
     ) -> tuple[Belief, Followed]:
         obs, used, truth, judged = now
-        snapshot = local.snapshot(obs.usable())
-        candidates = local.no_candidates() if goes_on else local.find_candidates(snapshot)
-        estimate = local.estimate(belief, snapshot, candidates)
-        after: Belief = jax.tree.map(lambda a, b: jnp.where(used, a, b), estimate.belief, belief)
-        error = error_of(local.motion, after.mean[0], jaxlie.SE3(truth))
+        after, estimate = local.sense(belief, obs)
+        after = jax.tree.map(lambda a, b: jnp.where(used, a, b), after, belief)
+        error = error_of(local.motion, after.bank.mean[0], jaxlie.SE3(truth))
         d = error.shape[0]
-        P = after.covariance[0, :d, :d]
-        lives, worst = after.initialised[0], jnp.asarray(jnp.inf, P.dtype)
+        P = after.bank.covariance[0, :d, :d]
+        lives, worst = after.bank.initialised[0], jnp.asarray(jnp.inf, P.dtype)
 
         def told(counts: Array, value: Array, otherwise: Array) -> Array:
             return jnp.where(counts, jnp.where(lives, value, otherwise), 0)
@@ -82,4 +82,20 @@ def follow(navigator: Navigator, start: Belief, recorded: Recorded) -> Followed:
         )
 
     frames = (recorded.obs, recorded.used, recorded.T_world_vehicle_true, recorded.judged)
-    return jax.lax.scan(frame, start, frames)[1]
+    return jax.lax.scan(frame, Belief.begin(start), frames)[1]
+
+
+class _Trusts(Navigator):
+    """Takes all corners for those of markers."""
+
+    def look(self, obs: Observation) -> Consistent:
+        snapshot = self.snapshot(obs)
+        nobody = jnp.zeros(len(self.markers.ids), bool)
+        return Consistent(snapshot, self.find_candidates(snapshot), nobody)
+
+
+class _GoesOn(_Trusts):
+    """Looks for no candidate: a hypothesis that goes on asks none."""
+
+    def find_candidates(self, snapshot: Snapshot) -> Candidates:
+        return self.no_candidates()

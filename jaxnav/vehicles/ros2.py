@@ -192,11 +192,11 @@ class RosPublisher:
         """
         speed_mps = outcome.throttle * self._speed_per_throttle_mps
         self._node.publish_drive(self._command, outcome.steering_rad, speed_mps, outcome.now_ns)
-        if not outcome.report.output.located:
+        if not outcome.output.located:
             return
         pose = np.asarray(outcome.pose, float)
-        velocity = np.asarray(outcome.report.mean, float)[3:6]
-        covariance = np.asarray(outcome.report.output.covariance, float)
+        velocity = np.asarray(outcome.output.velocity, float)
+        covariance = np.asarray(outcome.output.covariance, float)
         if all(np.isfinite(part).all() for part in (pose, velocity, covariance)):
             self._publish_odometry(pose, velocity, covariance, outcome.now_ns)
 

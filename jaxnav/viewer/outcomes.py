@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.origin import ZERO, Origin, inverses_in_world, opposite, planar_in_world
@@ -34,8 +35,8 @@ class Shown:
     @staticmethod
     def of(outcome: Outcome) -> "Shown":
         """What the pilot gave."""
-        output, belief = outcome.report.output, outcome.moment.belief
-        alive, valid = np.asarray(belief.initialised), np.asarray(output.candidates.valid)
+        output, bank = outcome.output, outcome.belief.bank
+        alive, valid = np.asarray(bank.initialised), np.asarray(output.candidates.valid)
         selected = int(output.selected)
         return Shown(
             now_ns=outcome.now_ns,
@@ -49,8 +50,8 @@ class Shown:
             located=bool(output.located),
             flip_probability=float(output.flip_probability),
             nis=float(output.nis),
-            hypotheses=np.asarray(belief.mean)[alive, :3],
-            log_weight=np.asarray(belief.log_weight)[alive],
+            hypotheses=np.asarray(planar_poses(bank)[0])[alive],
+            log_weight=np.asarray(bank.log_weight)[alive],
             Ts_vehicle_world=np.asarray(output.candidates.T_vehicle_world.wxyz_xyz)[valid],
             selected=int(valid[:selected].sum()) if selected >= 0 else -1,
         )

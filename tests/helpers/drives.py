@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.belief.motion import Belief, Rejections
+from jaxnav.belief.estimate import Belief
+from jaxnav.belief.motion import Bank, Rejections
 from jaxnav.control import Command
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault, Health, Reject
@@ -18,7 +19,6 @@ from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.navigator import Output
 from jaxnav.pose.candidates import Candidates
 from jaxnav.recording.messages import input_message, outcome_message
-from jaxnav.timeline import Moment, Report
 
 BEGIN_NS = 5_000_000_123
 PERIOD_NS = 10_000_000
@@ -50,7 +50,7 @@ def make_input(index: int) -> Input:
     return Input(now_ns)
 
 
-def make_report(rng: np.random.Generator, dtype: type = float) -> Report:
+def make_output(rng: np.random.Generator, dtype: type = float) -> Output:
     """Two of three candidates valid, the second of these taken."""
 
     def random(*shape: int) -> jax.Array:
@@ -67,21 +67,28 @@ def make_report(rng: np.random.Generator, dtype: type = float) -> Report:
     )
     output = Output(
         pose=random(3),
+        pose_covariance=random(3, 3),
+        velocity=random(3),
+        velocity_covariance=random(3, 3),
         covariance=random(6, 6),
         T_world_vehicle=jaxlie.SE3(random(7)),
         located=jnp.asarray(True),
-        command=Command(random(), random()),
-        done=jnp.asarray(False),
-        candidates=candidates,
-        costs=jnp.asarray(np.array([0.5, np.inf, np.inf], dtype)),
-        selected=jnp.asarray(2),
         hypothesis=jnp.asarray(7),
         flip_probability=random(),
         decided=jnp.asarray(True),
+        candidates=candidates,
+        costs=jnp.asarray(np.array([0.5, np.inf, np.inf], dtype)),
+        selected=jnp.asarray(2),
+        accepted=jnp.asarray(True),
         nis=random(),
+        gate_nis=random(),
+        outvoted=jnp.zeros(1, bool),
+        log_likelihood=random(),
+        command=Command(random(), random()),
+        done=jnp.asarray(False),
         control_log=None,
     )
-    return _as_numpy(Report(output=output, mean=random(8), outvoted=jnp.zeros(1, bool)))
+    return _as_numpy(output)
 
 
 def _poses(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -91,13 +98,13 @@ def _poses(rng: np.random.Generator, count: int) -> np.ndarray:
     return poses
 
 
-def make_moment(rng: np.random.Generator, dtype: type = float) -> Moment:
+def make_belief(rng: np.random.Generator, dtype: type = float) -> Belief:
     """Two of four hypotheses alive."""
 
     def random(*shape: int) -> jax.Array:
         return jnp.asarray(rng.normal(size=shape).astype(dtype))
 
-    belief = Belief(
+    bank = Bank(
         mean=random(4, 8),
         covariance=random(4, 6, 6),
         log_weight=random(4),
@@ -106,13 +113,13 @@ def make_moment(rng: np.random.Generator, dtype: type = float) -> Moment:
         number=jnp.arange(4),
     )
     decided, restarts = jnp.asarray(True), jnp.asarray(1, jnp.int32)
-    return _as_numpy(Moment(belief, decided, random(), restarts))
+    return _as_numpy(Belief(bank, decided, random(), restarts))
 
 
 @functools.cache
-def _told(seed: int, dtype: type) -> tuple[Report, Moment]:
+def _told(seed: int, dtype: type) -> tuple[Output, Belief]:
     rng = np.random.default_rng(seed)
-    return make_report(rng, dtype), make_moment(rng, dtype)
+    return make_output(rng, dtype), make_belief(rng, dtype)
 
 
 def _as_numpy(tree):
@@ -123,7 +130,7 @@ def _as_numpy(tree):
 def make_outcome(index: int, seed: int = 0, dtype: type = float) -> Outcome:
     """What is reported of it depends on the seed alone."""
     now_ns = BEGIN_NS + index * PERIOD_NS
-    report, moment = _told(seed, dtype)
+    output, belief = _told(seed, dtype)
     return Outcome(
         now_ns=now_ns,
         health=Health.DEGRADED,
@@ -131,8 +138,8 @@ def make_outcome(index: int, seed: int = 0, dtype: type = float) -> Outcome:
         rejects=Reject.TOO_LATE,
         steering_rad=0.1 * index,
         throttle=-0.1 / (index + 1),
-        report=report,
-        moment=moment,
+        output=output,
+        belief=belief,
         told=None,
         stamp_ns=now_ns - 3,
         restarts=2,

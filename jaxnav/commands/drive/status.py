@@ -26,7 +26,7 @@ def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen
         latency_ms: from an exposure to its command.
         marker_seen: of late.
     """
-    output, far = outcome.report.output, outcome.origin_m != ZERO
+    output, far = outcome.output, outcome.origin_m != ZERO
     x_m, y_m, psi_rad = (float(value) for value in outcome.pose)
     width = _FAR if far else 6
     places = [_fixed(x_m, width, 2), _fixed(y_m, width, 2), _fixed(math.degrees(psi_rad), 4, 0)]

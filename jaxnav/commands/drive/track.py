@@ -29,7 +29,7 @@ class Row(NamedTuple):
     @staticmethod
     def of(outcome: Outcome) -> "Row":
         """What is kept of it."""
-        output = outcome.report.output
+        output = outcome.output
         return Row(
             outcome.now_ns,
             np.asarray(outcome.pose, float),

@@ -1,0 +1,124 @@
+"""What is carried from one observation to the next, and what is reported of it."""
+
+from dataclasses import fields
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.belief.motion import Bank, Motion, heaviest
+from jaxnav.pose.candidates import Candidates
+
+
+class Belief(eqx.Module):
+    """What is believed after an observation: all that the next one starts from."""
+
+    bank: Bank
+    decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
+    flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
+    restarts: Int[Array, ""]  # how often all that was believed had to be given up, so far
+
+    @staticmethod
+    def begin(bank: Bank) -> "Belief":
+        """Nothing sensed yet."""
+        nothing = jnp.zeros((), bank.mean.dtype)
+        return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32))
+
+    def after(
+        self,
+        bank: Bank,
+        survived: Bool[Array, ""],
+        decided: Bool[Array, ""],
+        flip_probability: Float[Array, ""],
+    ) -> "Belief":
+        """The next one.
+
+        Args:
+            survived: whether any hypothesis outlived its prediction.
+        """
+        given_up = jnp.any(self.bank.initialised) & ~survived
+        flip_probability = flip_probability.astype(self.flip_probability.dtype)
+        return Belief(bank, decided, flip_probability, self.restarts + given_up)
+
+
+class Believed(eqx.Module):
+    """What is reported of a belief: its heaviest hypothesis, and how sure of that it is."""
+
+    pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
+    pose_covariance: Float[Array, "3 3"]
+    velocity: Float[Array, " 3"]  # v_x_mps, v_y_mps, psi_dot_radps in the world
+    velocity_covariance: Float[Array, "3 3"]
+    covariance: Float[Array, "d d"]  # of the state's error: (6, 6) for a car, see the motion model
+    T_world_vehicle: jaxlie.SE3
+    located: Bool[Array, ""]  # False until the first pose was taken
+    hypothesis: Int[Array, ""]  # the one reported; while it survives, it keeps its number
+    flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
+    decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
+
+    @staticmethod
+    def of(motion: Motion, belief: Belief) -> "Believed":
+        """The heaviest hypothesis, its covariance that of the whole bank about it."""
+        bank, best = belief.bank, heaviest(belief.bank)
+        Ts_world_vehicle = motion.poses(bank).T_world_vehicle
+        covariance = motion.error_covariance(bank, best)
+        return Believed(
+            **motion.planar(bank.mean[best], covariance)._asdict(),
+            covariance=covariance,
+            T_world_vehicle=jax.tree.map(lambda leaf: leaf[best], Ts_world_vehicle),
+            located=bank.initialised[best],
+            hypothesis=bank.number[best],
+            flip_probability=belief.flip_probability,
+            decided=belief.decided & bank.initialised[best],
+        )
+
+
+class Evidence(eqx.Module):
+    """What the corners of an observation say."""
+
+    candidates: Candidates
+    costs: Float[Array, " N"]  # of the candidates, in the selector's unit
+    selected: Int[Array, ""]  # the candidate taken, -1: none
+    accepted: Bool[Array, ""]  # the filter has taken the pose
+    nis: Float[Array, ""]  # of the pose taken, 0 where none was
+    gate_nis: Float[Array, ""]  # a larger one contradicts the prediction, accepted or not
+    outvoted: Bool[Array, " M"]  # markers that the others in view contradict
+    # Of the corners given what the whole bank had predicted, up to a constant; 0 at a start.
+    log_likelihood: Float[Array, ""]
+
+    @staticmethod
+    def none(candidates: Candidates, markers: int, dtype: DTypeLike) -> "Evidence":
+        """No marker is in view.
+
+        Args:
+            candidates: none of them valid.
+            markers: how many the map has.
+            dtype: of the belief.
+        """
+        zero = jnp.zeros((), dtype)
+        return Evidence(
+            candidates=candidates,
+            costs=jnp.full_like(candidates.cost, jnp.inf),
+            selected=jnp.asarray(-1),
+            accepted=jnp.asarray(False),
+            nis=zero,
+            gate_nis=zero + jnp.inf,
+            outvoted=jnp.zeros(markers, bool),
+            log_likelihood=zero,
+        )
+
+
+class Estimate(Believed, Evidence):
+    """Everything that is known after one observation."""
+
+    @staticmethod
+    def of(motion: Motion, belief: Belief, evidence: Evidence) -> "Estimate":  # type: ignore[override]
+        """What is believed, and what the corners say."""
+        return Estimate(**vars(Believed.of(motion, belief)), **vars(evidence))
+
+    @property
+    def evidence(self) -> Evidence:
+        """What the corners say, alone."""
+        return Evidence(**{field.name: getattr(self, field.name) for field in fields(Evidence)})
