@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.models.camera import LENS_COEFFICIENTS, LENSES, Camera, stack_cameras
+from jaxnav.models.camera import LENS_COEFFICIENTS, Camera, stack_cameras
+from jaxnav.models.lenses import LENSES
 from tests.derivatives import check_derivatives
 
 # Lens, coefficients, focal length, image size, half angle of view in degrees along the diagonal.
@@ -18,6 +19,13 @@ MODELS = {
     "none": ("none", [], 500.0, (640, 480), 38),
     "radtan": ("radtan", [-0.28, 0.07, 2e-4, -1e-4], 460.0, (752, 480), 44),
     "radtan k3": ("radtan", [0.11, -0.2, 1e-3, 5e-4, 0.09], 600.0, (1280, 720), 50),
+    "rational": (
+        "rational",
+        [0.35, 0.05, 1e-3, 5e-4, 0.01, 0.5, 0.02, 0.005],
+        600.0,
+        (1280, 720),
+        50,
+    ),
     "equidistant": ("equidistant", [0.0] * 4, 319.0, (836, 420), 75),
     "equidistant k": ("equidistant", [-0.013, 0.02, -0.012, 0.002], 319.0, (836, 420), 75),
 }
@@ -99,7 +107,7 @@ def test_lens_finds_the_ray_that_made_a_pixel(name):
     np.testing.assert_allclose(rays, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["none", "radtan", "equidistant k"])
+@pytest.mark.parametrize("name", ["none", "radtan", "rational", "equidistant k"])
 def test_lens_has_true_derivatives(name):
     """Of pixels and rays, with respect to points, pixels and the calibration; also on the axis."""
     camera = build(name)
@@ -114,7 +122,7 @@ def test_lens_has_true_derivatives(name):
     check_derivatives(see, *calibration, jnp.asarray(points), pixels, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["none", "radtan", "equidistant k"])
+@pytest.mark.parametrize("name", ["none", "radtan", "rational", "equidistant k"])
 def test_lens_is_finite_everywhere(name, precision):
     camera = build(name)
     points = jnp.asarray(

@@ -33,6 +33,7 @@ def camera(lens: str, distortion: list[float] | None = None, name: str = "front"
 
 REFUSED = [
     (camera("radtan", [0.1, 0, 0, 0, 0.2]), "kalibr", "front.distortion: has k3, and Kalibr's"),
+    (camera("rational"), "kalibr", "front.lens: is rational, and Kalibr has radtan and"),
     (camera("equidistant"), "photonvision", "front.lens: is equidistant, and PhotonVision knows"),
     (camera("none"), "jaxnav", "is jaxnav's already: nothing to convert"),
     (camera("none"), "wpilib", "holds cameras, and a WPILib layout holds markers"),

@@ -197,7 +197,7 @@ def _without(header: dict, key: str) -> dict:
         ),
         (
             lambda h: h | {"rig": {"cameras": [h["rig"]["cameras"][0] | {"lens": "fish"}]}},
-            "rig.cameras.front.lens: must be 'none', 'radtan' or 'equidistant', got",
+            "rig.cameras.front.lens: must be 'none', 'radtan', 'rational' or 'equidistant'",
         ),
         (
             lambda h: h | {"route": h["route"] | {"start_pose": [1.0]}},

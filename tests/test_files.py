@@ -206,7 +206,10 @@ BAD_CAMERAS = [
     ({"focal_px": [True, 319]}, "cameras.front.focal_px[0]: must be a number, got True"),
     ({"focal_px": None}, "cameras.front.focal_px: must be a list, got None"),
     ({"center_px": [1e300, 1]}, "cameras.front.center_px[0]: must be <= 1e+09, got 1e+300"),
-    ({"lens": "fisheye"}, "cameras.front.lens: must be 'none', 'radtan' or 'equidistant', got"),
+    (
+        {"lens": "fisheye"},
+        "cameras.front.lens: must be 'none', 'radtan', 'rational' or 'equidistant'",
+    ),
     ({"distortion": [1, 2, 3]}, "cameras.front.distortion: must have 4 coefficients"),
     ({"lens": "radtan", "distortion": [1] * 3}, "front.distortion: must have 4 or 5 coefficients"),
     ({"lens": "none", "distortion": [1]}, "front.distortion: must have 0 coefficients"),
@@ -399,6 +402,17 @@ rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
 """
 
 
+def test_a_camchain_may_have_k3(tmp_path):
+    """As TagSLAM's files do, under ROS's name of the lens."""
+    coefficients = [0.1, -0.02, 0.001, 0.002, 0.003]
+    for model in ("radtan", "plumb_bob"):
+        data = yaml.safe_load(KALIBR)
+        data["cam1"] |= {"distortion_model": model, "distortion_coeffs": coefficients}
+        camera = files.load_rig(write(tmp_path, data)).cameras
+        assert camera.lenses[int(camera.lens_index[1])] == "radtan"
+        np.testing.assert_array_equal(camera.distortion[1], [*coefficients, 0, 0, 0])
+
+
 def test_a_camchain_is_chained(tmp_path):
     rig = files.load_rig(write(tmp_path, KALIBR))
     assert rig.names == ("cam0", "cam1")
@@ -426,6 +440,7 @@ def test_a_camchain_is_chained(tmp_path):
             "cam0.distortion_model: must be one of",
         ),
         ("[-0.01, 0, 0.01, 0]", "[-0.01, 0]", "cam0.distortion_coeffs: must have 4 numbers, got 2"),
+        ("0.001, 0.002]", "0]", "cam1.distortion_coeffs: must have 4 or 5 numbers, got 3"),
         ("[470, 471.5,", "[0, 471.5,", "cam0.intrinsics: the focal lengths must be > 0"),
         ("[470, 471.5, ", "[", "cam0.intrinsics: must be fu fv pu pv, got 2 numbers"),
         ("T_cam_imu", "T_imu", "cam0.T_cam_imu: missing"),
@@ -443,7 +458,8 @@ def test_a_bad_camchain_is_named_with_its_key(tmp_path, old, new, expected):
 
 
 def numbers(camera: Any) -> list[float]:
-    return np.concatenate([camera.focal_px, camera.center_px, camera.distortion]).tolist()
+    assert not np.any(camera.distortion[5:])
+    return np.concatenate([camera.focal_px, camera.center_px, camera.distortion[:5]]).tolist()
 
 
 def opencv_file(folder: Path, K: np.ndarray, distortion: list[float]) -> Path:
@@ -506,7 +522,11 @@ def test_a_camera_is_chosen_by_name(tmp_path):
         ("plumb_bob", "mei", "distortion_model: must be one of plumb_bob"),
         ("plumb_bob", "equidistant", "distortion_coefficients.data: must be k1 k2 k3 k4"),
         ("image_width: 640", "", "image_width: missing"),
-        ("cols: 5, data: [0.1,", "cols: 6, data: [0.1, 0.2,", "only k1 k2 p1 p2 k3 are supported"),
+        (
+            "cols: 5, data: [0.1,",
+            "cols: 9, data: [0.1, 0.2, 0.3, 0.4, 0.5,",
+            "has thin prism or tilt coefficients",
+        ),
     ],
 )
 def test_a_bad_camera_info_is_named_with_its_key(tmp_path, old, new, expected):

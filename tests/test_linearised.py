@@ -17,6 +17,7 @@ from tests.derivatives import check_derivatives
 LENSES = {
     "none": (),
     "radtan": (0.1, -0.05, 0.002, -0.003, 0.01),
+    "rational": (0.1, -0.05, 0.002, -0.003, 0.01, 0.2, -0.03, 0.02),
     "equidistant": (-0.02, 0.003, -0.004, 0.001),
 }
 SIDE, AXIS, BEHIND, PLANE = (0.3, -0.2, 1.5), (0.0, 0.0, 2.0), (0.4, 0.3, -1.0), (0.5, 0.2, 0.0)
@@ -80,7 +81,8 @@ rows_of = jax.jit(lambda rig, seen, points: reprojection_rows(rig, seen)(points)
 
 
 @pytest.mark.parametrize(
-    "lenses", [["none"], ["radtan"], ["equidistant"], ["radtan", "equidistant", "none"]]
+    "lenses",
+    [["none"], ["radtan"], ["rational"], ["equidistant"], ["radtan", "equidistant", "none"]],
 )
 @pytest.mark.parametrize("special", [SIDE, AXIS, BEHIND, PLANE])
 def test_residuals_and_slopes_are_those_of_the_projection(lenses, special):

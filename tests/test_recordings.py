@@ -43,6 +43,14 @@ def problem(*args: Any, call: Callable[..., Any] = read_recording) -> str:
 # --- the real recordings --------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("name", ["test_2", "test_21", "test_22", "test_9"])
+def test_every_public_recording_is_read(data_dir, name):
+    """Lenses with k3 too, which test_21 has."""
+    read = read_recording(data_dir / "tagslam" / name)
+    assert read.visible.any()
+    assert read.reference.valid.any()
+
+
 def test_bags_and_arrays_hold_the_same(recording):
     bag, npz = recording
     frames, used, referenced = DECODED[bag.name]

@@ -17,7 +17,7 @@ from jaxnav.files import poses
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.models.rig import CameraRig
 
-Lens = Literal["none", "radtan", "equidistant"]
+Lens = Literal["none", "radtan", "rational", "equidistant"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ from jaxnav.models.camera import Camera
 
 _LENS: dict[str, Lens] = {
     "radtan": "radtan",
+    "plumb_bob": "radtan",  # TagSLAM's, which may have k3
     "equidistant": "equidistant",
     "equi": "equidistant",
     "none": "none",
@@ -84,13 +85,15 @@ class KalibrCamera(ForeignEntry):
 
     @field_validator("distortion_coeffs")
     @classmethod
-    def _four(cls, coefficients: list[float], info: Any) -> list[float]:
+    def _as_many_as_it_has(cls, coefficients: list[float], info: Any) -> list[float]:
         # Kalibr writes four for both lenses; for `none` some tools write zeros.
-        model = info.data.get("distortion_model", "none")
-        if model == "none" and any(coefficients):
+        lens = _LENS[info.data.get("distortion_model", "none")]
+        if lens == "none" and any(coefficients):
             raise ValueError("must be empty for distortion_model none")
-        if model != "none" and len(coefficients) != 4:
-            raise ValueError(f"must have 4 numbers, got {len(coefficients)}")
+        allowed = {"none": [len(coefficients)], "radtan": [4, 5], "equidistant": [4]}[lens]
+        if len(coefficients) not in allowed:
+            expected = " or ".join(map(str, allowed))
+            raise ValueError(f"must have {expected} numbers, got {len(coefficients)}")
         return coefficients
 
     @model_validator(mode="after")
@@ -205,6 +208,11 @@ def camchain_text(cameras: Sequence[CameraFigures]) -> str:
                 Ts[-1] @ poses.matrix(poses.inverse(poses.pose_from_matrix(Ts[-2])))
             ).tolist()
         coefficients = list(camera.distortion)
+        if camera.lens == "rational":
+            raise BadInput(
+                f"{where}.lens",
+                "is rational, and Kalibr has radtan and equidistant: calibrate again with one",
+            )
         if camera.lens == "radtan" and coefficients.pop():
             raise BadInput(
                 f"{where}.distortion",

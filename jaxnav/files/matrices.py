@@ -9,8 +9,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files.figures import CameraFigures, Lens
 from jaxnav.files.ranges import pinhole_problem, problem_of
 from jaxnav.files.validation import Count, ForeignEntry, Number, shown
-
-_COEFFICIENTS = "k1 k2 p1 p2 k3"
+from jaxnav.models.camera import LENS_COEFFICIENTS
 
 
 class MatrixEntry(ForeignEntry):
@@ -53,6 +52,9 @@ def figures_from_matrices(
 
     Raises:
         BadInput: not calibrated, skewed, or a lens with more coefficients than ours.
+
+    Returns:
+        Of the lens `radtan` with more than five coefficients that matter: `rational`.
     """
     where, K = matrix
     if len(K) != 9:
@@ -69,13 +71,15 @@ def figures_from_matrices(
         sizes = "image_width and image_height, or resolution"
         raise BadInput(where, f"{problem} ({sizes})")
     where, coefficients = distortion
-    most = 4 if lens == "equidistant" else 5
+    if lens == "radtan" and any(coefficients[5:]):
+        lens = "rational"
+    most = LENS_COEFFICIENTS[lens]
     if lens == "equidistant" and len(coefficients) != 4:
         raise BadInput(where, f"must be k1 k2 k3 k4 for a fisheye lens, got {len(coefficients)}")
     if any(coefficients[most:]):
         raise BadInput(
-            where, f"only {_COEFFICIENTS} are supported, and a later one is not zero: "
-            "calibrate again with five coefficients (plumb_bob, radtan)",
+            where, "has thin prism or tilt coefficients that are not zero: calibrate again with "
+            "eight (rational) or five (plumb_bob, radtan)",
         )  # fmt: skip
     for index, value in enumerate(coefficients[:most]):
         if problem := problem_of("distortion", value):
@@ -90,5 +94,5 @@ def pinhole_matrix(camera: CameraFigures) -> list[float]:
 
 
 def coefficients(camera: CameraFigures) -> list[float]:
-    """D: k1 k2 p1 p2 k3, or k1 k2 k3 k4 of a fisheye lens; a camera without lens has zeros."""
+    """D: k1 k2 p1 p2 k3 [k4 k5 k6], or k1 k2 k3 k4 of a fisheye lens; zeros without a lens."""
     return list(camera.distortion) if camera.lens != "none" else [0.0] * 5

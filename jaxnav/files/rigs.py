@@ -2,7 +2,7 @@
 
     cameras:
       - name: front
-        lens: equidistant                # none, radtan (k1 k2 p1 p2 [k3]) or equidistant (k1..k4)
+        lens: equidistant                # none, radtan, rational or equidistant, see models/camera
         focal_px: [319.0, 319.0]
         center_px: [401.0, 202.0]        # the centre of the top-left pixel is (0, 0)
         distortion: [0.0, 0.0, 0.0, 0.0] # may be left out: zeros

@@ -18,6 +18,12 @@ _LENS: dict[str, Lens] = {
     "rational_polynomial": "radtan",
     "equidistant": "equidistant",
 }
+_MODEL: dict[Lens, str] = {
+    "none": "plumb_bob",
+    "radtan": "plumb_bob",
+    "rational": "rational_polynomial",
+    "equidistant": "equidistant",
+}
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
@@ -80,7 +86,7 @@ def camera_info_text(camera: CameraFigures) -> str:
         "image_height": camera.image_size_px[1],
         "camera_name": Quoted(camera.name),
         "camera_matrix": _matrix(3, 3, K),
-        "distortion_model": "equidistant" if camera.lens == "equidistant" else "plumb_bob",
+        "distortion_model": _MODEL[camera.lens],
         "distortion_coefficients": _matrix(1, len(D), D),
         "rectification_matrix": _matrix(3, 3, _IDENTITY),
         "projection_matrix": _matrix(3, 4, projection),

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from jaxnav.models.camera import MIN_DEPTH_RATIO
 from jaxnav.models.geometry import rotation_matrix
+from jaxnav.models.lenses import MOST_COEFFICIENTS, image_of
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.observation import Sightings, cameras_of
 
@@ -51,7 +51,7 @@ def reprojection_rows(rig: CameraRig, seen: Sightings) -> Callable[[Float[Array,
 
     def rows(points: Array) -> Rows:
         in_camera = jnp.sum(turn * points[None], axis=1) + shift
-        per_lens = [_LENSES[lens](in_camera, coefficients) for lens in cameras.lenses]
+        per_lens = [image_of(lens, in_camera, coefficients) for lens in cameras.lenses]
         image, slope = per_lens[0]
         for index, (other_image, other_slope) in enumerate(per_lens[1:], start=1):
             image = jnp.where((lens_index == index)[None], other_image, image)
@@ -69,7 +69,7 @@ def pinhole_rows(
     """The same for a camera of focal length 1, in multiples of `unit`, of points it sees."""
 
     def rows(points: Array) -> Rows:
-        image, slope = _pinhole(points, points)
+        image, slope = image_of("none", points, jnp.zeros(MOST_COEFFICIENTS, points.dtype))
         return (image - corners_n.T[..., None]) / unit, slope / unit
 
     return rows
@@ -96,75 +96,3 @@ def turned(half: Float[Array, "3 N"], arms: Float[Array, "3 P N"]) -> Float[Arra
     swing = 2 * crossed(half[:, None], arms)
     per_norm = 1 / (1 + jnp.sum(half**2, axis=0))
     return arms + (swing + crossed(half[:, None], swing)) * per_norm[None, None]
-
-
-def _pinhole(points: Array, coefficients: Array) -> tuple[Array, Array]:
-    del coefficients
-    squared = jnp.sum(points**2, axis=0)
-    nonzero = squared > 0
-    length = jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1)), 0)
-    nearest = MIN_DEPTH_RATIO * jnp.maximum(length, 1e-12)
-    ahead = points[2] > nearest
-    per_depth = 1 / jnp.where(ahead, points[2], nearest)
-    image = points[:2] * per_depth[None]
-    # Of the depth, or of what stands in for it.
-    axis = _axes(jnp.asarray([0.0, 0.0, 1.0], points.dtype), points)
-    clamped = MIN_DEPTH_RATIO * points / jnp.maximum(length, 1e-12)[None]
-    depth_slope = jnp.where(ahead[None], axis, clamped)
-    straight = _axes(jnp.eye(3, 2, dtype=points.dtype), points)
-    return image, (straight - depth_slope[:, None] * image[None]) * per_depth[None, None]
-
-
-def _radtan(points: Array, coefficients: Array) -> tuple[Array, Array]:
-    (x, y), slope = _pinhole(points, coefficients)
-    k1, k2, p1, p2, k3 = coefficients
-    r2 = x**2 + y**2
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bend = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # of radial, per x or y and by r2's own slope
-    image = jnp.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
-            y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
-        ]
-    )
-    mixed = x * y * bend + 2 * p1 * x + 2 * p2 * y
-    along_x = radial + x**2 * bend + 2 * p1 * y + 6 * p2 * x
-    along_y = radial + y**2 * bend + 6 * p1 * y + 2 * p2 * x
-    u_slope, v_slope = slope[:, 0], slope[:, 1]
-    return image, jnp.stack(
-        [
-            along_x[None] * u_slope + mixed[None] * v_slope,
-            mixed[None] * u_slope + along_y[None] * v_slope,
-        ],
-        axis=1,
-    )
-
-
-def _equidistant(points: Array, coefficients: Array) -> tuple[Array, Array]:
-    x, y, z = points
-    k1, k2, k3, k4, _ = coefficients
-    r2, squared = x**2 + y**2, jnp.sum(points**2, axis=0)
-    off_axis = r2 > 1e-14 * z**2
-    per_radius = jax.lax.rsqrt(jnp.where(off_axis, r2, 1))
-    theta = jnp.where(off_axis, jnp.arctan2(jnp.where(off_axis, r2 * per_radius, 1), z), 0)
-    t2 = theta**2
-    gain = 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
-    rise = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))  # of theta * gain
-    # theta / radius, which tends to 1 / z on the axis
-    on_axis = 1 / jnp.where(off_axis | (z <= 0), 1, z)
-    ratio = jnp.where(off_axis, theta * per_radius, on_axis) * gain
-    rise = rise / jnp.where(squared > 0, squared, 1)
-    bend = jnp.where(off_axis, (z * rise - ratio) * per_radius**2, 0)
-    # How the ratio answers, times both coordinates; and how these do.
-    is_depth = _axes(jnp.asarray([False, False, True]), points)
-    slope = jnp.where(is_depth, -rise[None], points * bend[None])[:, None] * points[None, :2]
-    straight = _axes(jnp.eye(3, 2, dtype=points.dtype), points)
-    return points[:2] * ratio[None], slope + straight * ratio[None, None]
-
-
-def _axes(constant: Array, points: Array) -> Array:
-    """A constant for all points."""
-    return constant.reshape(*constant.shape, *(1,) * (points.ndim - 1))
-
-
-_LENSES = {"none": _pinhole, "radtan": _radtan, "equidistant": _equidistant}

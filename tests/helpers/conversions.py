@@ -58,8 +58,9 @@ def written(folder: Path, name: str, text: str) -> Path:
 
 # What holds which lens, of the formats with one camera a file.
 HELD = [
-    *((to, lens) for to in ("ros", "opencv") for lens in ("radtan", "equidistant")),
+    *((to, lens) for to in ("ros", "opencv") for lens in ("radtan", "rational", "equidistant")),
     ("photonvision", "radtan"),
+    ("photonvision", "rational"),
 ]
 
 COEFFICIENTS = st.floats(-10, 10)
@@ -74,6 +75,8 @@ def a_camera(draw, lens: str, name: str = "front", k3: bool = True) -> CameraFig
     coefficients = [draw(COEFFICIENTS) for _ in range(LENS_COEFFICIENTS[lens])]
     if lens == "radtan" and not k3:
         coefficients[4] = 0.0
+    if lens == "rational" and not any(coefficients[5:]):
+        coefficients[5] = 0.5  # or it is radtan
     q = np.array([draw(st.floats(-1, 1)) for _ in range(4)])
     q = q / np.linalg.norm(q) if np.linalg.norm(q) > 0.1 else np.array([1.0, 0, 0, 0])
     T = np.array([*q, *(draw(numbers(-500, 500)) for _ in range(3))])

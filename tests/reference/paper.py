@@ -17,7 +17,7 @@ def project(K, lens, k, point_camera):
     else:
         u, v = x / z, y / z
         if lens == "radtan":
-            k1, k2, p1, p2, k3 = k
+            k1, k2, p1, p2, k3 = k[:5]
             r2 = u * u + v * v
             radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
             u, v = (

@@ -20,6 +20,7 @@ from jaxnav.calibration.lenses.views import BoardViews
 from jaxnav.calibration.rigs.pose_arrays import retracted
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import rotation_matrix, skew, turn_and_shift
+from jaxnav.models.lenses import MOST_COEFFICIENTS
 from jaxnav.numerics.schur import Blocks, SchurLM, SchurState, reduce
 
 # Of the shared unknowns, in their order; zero and fixed beyond what the lens has.
@@ -28,6 +29,7 @@ NAMES = {
     "radtan": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
     "equidistant": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
+FITTED = tuple(NAMES)
 COUNT = 9
 NO_CUT = 1e8  # in sigmas: plain least squares
 _BATCH = 16  # views are padded to a multiple of so many, so that few sizes are compiled
@@ -66,7 +68,8 @@ def free_mask(lens: str, fixed: tuple[str, ...] = ()) -> np.ndarray:
 
 def camera_of(lens: str, parameters: Array) -> Camera:
     """The camera of nine numbers."""
-    return Camera(parameters[:2], parameters[2:4], parameters[4:], jnp.asarray(0), (lens,))
+    coefficients = jnp.pad(parameters[4:], (0, MOST_COEFFICIENTS + 4 - COUNT))
+    return Camera(parameters[:2], parameters[2:4], coefficients, jnp.asarray(0), (lens,))
 
 
 def gathered(views: BoardViews) -> Seen:

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.images import CollectedViews, collect_views
-from jaxnav.calibration.lenses.bundle import camera_of
+from jaxnav.calibration.lenses.bundle import FITTED, camera_of
 from jaxnav.calibration.lenses.fit import LensFit, fit_lens
 from jaxnav.calibration.lenses.intrinsics import (
     FEWEST_VIEWS,
@@ -23,7 +23,7 @@ from jaxnav.calibration.lenses.intrinsics import (
     within_reach,
 )
 from jaxnav.calibration.lenses.screening import screened
-from jaxnav.models.camera import LENSES, Camera
+from jaxnav.models.camera import Camera
 
 _LOOKS = 5
 _STAYS = 0.1  # in sigmas, of every parameter
@@ -73,7 +73,7 @@ def _camera_of_marker(
         if len(views.views) < FEWEST_VIEWS:
             return seen_by
         fits = []
-        for one in LENSES if lens == "auto" else (lens,):
+        for one in FITTED if lens == "auto" else (lens,):
             start = before.parameters if before is not None and before.lens == one else None
             fits.append(fit_lens(views, one, start=start))
         found = within_reach(min(fits, key=lambda fit: fit.sigma_px), tell)

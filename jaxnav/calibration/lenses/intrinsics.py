@@ -21,7 +21,7 @@ from jaxnav.calibration.lenses.screening import screened
 from jaxnav.calibration.lenses.start import lens_start
 from jaxnav.calibration.lenses.views import BoardViews
 from jaxnav.errors import BadInput
-from jaxnav.models.camera import LENSES, Camera
+from jaxnav.models.camera import Camera
 
 FEWEST_VIEWS = 5
 _LEAST_SPREAD_DEG = 5.0  # between two views' normals
@@ -97,7 +97,7 @@ def calibrate_lens(
     """
     good, left_out = screened(views)
     _require_views(good, {**left_out, **gone}, where)
-    lenses = LENSES if lens == "auto" else (lens,)
+    lenses = lens_bundle.FITTED if lens == "auto" else (lens,)
     tell("start")
     starts = {one: lens_start(good, one) for one in lenses}
     rough = min(starts, key=lambda one: starts[one][1])
@@ -106,7 +106,7 @@ def calibrate_lens(
     chosen = informative(good, rough, starts[rough][0], max_views)
     good = replace(good, views=tuple(good.views[i] for i in chosen))
     fits = {}
-    for one in sorted(LENSES, key=lambda one: one not in lenses):
+    for one in sorted(lens_bundle.FITTED, key=lambda one: one not in lenses):
         if one in lenses or len(good.views) >= lens_comparison.FEWEST_VIEWS:
             tell(f"fit {one}")
             start = starts[one][0] if one in starts else None

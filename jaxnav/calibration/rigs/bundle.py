@@ -39,13 +39,13 @@ class Unknowns(eqx.Module):
 
     Shared by all frames are S sixes: the twists of C cameras and of M markers; then, where lenses
     move, of every camera its focal length, centre and first two coefficients, and after these its
-    other coefficients and three that mean nothing.
+    other six.
     """
 
     Ts_world_vehicle: Float[Array, "F 7"]
     Ts_vehicle_camera: Float[Array, "C 7"]
     Ts_world_marker: Float[Array, "M 7"]
-    lenses: Float[Array, "L 9"]  # fx fy cx cy and five coefficients; L = C or 0
+    lenses: Float[Array, "L 12"]  # fx fy cx cy and eight coefficients; L = C or 0
 
     @property
     def sixes(self) -> int:
@@ -54,12 +54,12 @@ class Unknowns(eqx.Module):
         return placed + 2 * self.lenses.shape[0]
 
 
-def lenses_of(cameras: Camera) -> Float[Array, "C 9"]:
+def lenses_of(cameras: Camera) -> Float[Array, "*C 12"]:
     """The figures of lenses as unknowns."""
-    return jnp.concatenate([cameras.focal_px, cameras.center_px, cameras.distortion], axis=1)
+    return jnp.concatenate([cameras.focal_px, cameras.center_px, cameras.distortion], axis=-1)
 
 
-def with_lenses(cameras: Camera, lenses: Float[Array, "*C 9"]) -> Camera:
+def with_lenses(cameras: Camera, lenses: Float[Array, "*C 12"]) -> Camera:
     """The cameras with these figures."""
     focal_px, center_px, distortion = jnp.split(lenses, [2, 4], axis=-1)
     return Camera(focal_px, center_px, distortion, cameras.lens_index, cameras.lenses)
@@ -142,7 +142,7 @@ def moved(poses: Unknowns, own: Float[Array, "F 6"], shared: Float[Array, " R"])
         retracted(poses.Ts_world_vehicle, own),
         retracted(poses.Ts_vehicle_camera, cameras),
         retracted(poses.Ts_world_marker, markers),
-        poses.lenses + jnp.concatenate([lenses, others[:, :3]], axis=1),
+        poses.lenses + jnp.concatenate([lenses, others], axis=1),
     )
 
 
@@ -223,8 +223,8 @@ def _linearised(poses: Unknowns, known: Seen) -> tuple[Array, Array, Array, Arra
     r = (residuals * scale[:, None, None]).reshape(N, 8)
     shared = [J_camera, J_marker]
     if poses.lenses.shape[0]:
-        J_lens = lens_slopes.reshape(N, 8, 9) * scale[:, None, None]
-        shared += [J_lens[..., :6], jnp.pad(J_lens[..., 6:], [(0, 0), (0, 0), (0, 3)])]
+        J_lens = lens_slopes.reshape(N, 8, 12) * scale[:, None, None]
+        shared += [J_lens[..., :6], J_lens[..., 6:]]
     return _loss(distance2), r, J_frame, jnp.stack(shared, axis=1)
 
 
@@ -246,22 +246,19 @@ def _looked_at(
     lenses_move = poses.lenses.shape[0] > 0
     cameras = with_lenses(known.cameras, poses.lenses) if lenses_move else known.cameras
     cameras = jax.tree.map(lambda leaf: leaf[known.camera], cameras)
-    axes = jnp.eye(12, dtype=in_camera.dtype)[: 12 if lenses_move else 3]
 
-    def pixel(camera: Camera, point: Array) -> tuple[Array, Array]:
-        def projected(x: Array) -> Array:
-            return with_lenses(camera, x[3:]).project(x[:3])
+    def pixel(camera: Camera, point: Array) -> tuple[Array, Array, Array]:
+        px, by_point = camera.project_with_slope(point)
+        if not lenses_move:
+            return px, by_point, jnp.zeros((2, 0), px.dtype)
+        by_lens = jax.jacfwd(lambda lens: with_lenses(camera, lens).project(point))
+        return px, by_point, by_lens(lenses_of(camera))
 
-        lens = jnp.concatenate([camera.focal_px, camera.center_px, camera.distortion])
-        push = partial(jax.jvp, projected, (jnp.concatenate([point, lens]),))
-        columns = jax.vmap(lambda axis: push((axis,)))(axes)
-        return columns[0][0], columns[1].T
-
-    px, slopes = jax.vmap(jax.vmap(pixel, in_axes=(None, 0)))(cameras, in_camera)
+    px, *slopes = jax.vmap(jax.vmap(pixel, in_axes=(None, 0)))(cameras, in_camera)
     R_cv = jnp.swapaxes(R_vc, 1, 2)
     R_cm = R_cv @ jnp.swapaxes(R_wv, 1, 2) @ R_wm
     residuals = px - known.corners_px
-    return residuals, (in_camera, in_vehicle), (slopes[..., :3], slopes[..., 3:]), (R_cv, R_cm)
+    return residuals, (in_camera, in_vehicle), (slopes[0], slopes[1]), (R_cv, R_cm)
 
 
 def _distance2(residuals: Float[Array, "N 4 2"], sigma_px: Array) -> Float[Array, " N"]:

@@ -80,12 +80,12 @@ class RigCalibration:
         return self._sixes()[:placed]
 
     def lens_sigmas(self) -> np.ndarray:
-        """(C, 9): of fx fy cx cy in px and of the five coefficients."""
+        """(C, 12): of fx fy cx cy in px and of the eight coefficients."""
         C = len(self.calibrated)
         lenses = self._sixes()[C + len(self.mapped) :]
         if not len(lenses):
-            return np.zeros((C, 9))
-        return np.concatenate([lenses[:C], lenses[C:, :3]], axis=1)
+            return np.zeros((C, 12))
+        return np.concatenate([lenses[:C], lenses[C:]], axis=1)
 
     def _sixes(self) -> np.ndarray:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0)).reshape(-1, 6)

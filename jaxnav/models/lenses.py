@@ -1,0 +1,237 @@
+"""What a lens does to a point, its slope, and its inverse: a new lens is a row of `LENSES`.
+
+Coordinates come first: points (3, ...) in m in the camera frame, images (2, ...) at focal length 1,
+slopes (3, 2, ...) by the three coordinates of the point, per m. Coefficients are in the order of
+OpenCV, one or an array for each that goes with the points; those that a lens has not are left out.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnav.models.geometry import on_last_axis, safe_norm
+
+# Points nearer to the camera's plane than this multiple of their distance are projected as
+# if they lay there: finite and far outside of any image instead of infinite or mirrored.
+MIN_DEPTH_RATIO = 1e-3
+# Where an inverse lens starts: 96 angles from the axis, up to 89 or 180 degrees.
+_TABLE_SIZE = 96
+_NEWTON_STEPS = 4
+_LEAST_DENOMINATOR = 1e-3  # of a rational lens, far outside of what it was fitted to
+
+Image = tuple[Float[Array, "2 ..."], Float[Array, "3 2 ..."]]
+
+
+class Lens(NamedTuple):
+    """One kind of lens."""
+
+    coefficients: tuple[str, ...]
+    image: Callable[[Array, Array], Image]  # of points (3, ...), with the slope
+    bearing: Callable[[Array, Array], Array]  # unit vectors (..., 3) through images (..., 2)
+    least_depth_ratio: float  # depth over distance of the last point that can be seen
+
+
+def _pinhole(points: Array, coefficients: Array) -> Image:
+    del coefficients
+    squared = jnp.sum(points**2, axis=0)
+    nonzero = squared > 0
+    length = jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1)), 0)
+    nearest = MIN_DEPTH_RATIO * jnp.maximum(length, 1e-12)
+    ahead = points[2] > nearest
+    per_depth = 1 / jnp.where(ahead, points[2], nearest)
+    image = points[:2] * per_depth[None]
+    # Of the depth, or of what stands in for it.
+    axis = _axes(jnp.asarray([0.0, 0.0, 1.0], points.dtype), points)
+    clamped = MIN_DEPTH_RATIO * points / jnp.maximum(length, 1e-12)[None]
+    depth_slope = jnp.where(ahead[None], axis, clamped)
+    straight = _axes(jnp.eye(3, 2, dtype=points.dtype), points)
+    return image, (straight - depth_slope[:, None] * image[None]) * per_depth[None, None]
+
+
+def _radtan(points: Array, coefficients: Array) -> Image:
+    image, slope = _pinhole(points, coefficients)
+    bent, (along_x, mixed, along_y) = _bent(image[0], image[1], coefficients)
+    u_slope, v_slope = slope[:, 0], slope[:, 1]
+    return bent, jnp.stack(
+        [
+            along_x[None] * u_slope + mixed[None] * v_slope,
+            mixed[None] * u_slope + along_y[None] * v_slope,
+        ],
+        axis=1,
+    )
+
+
+def _bent(x: Array, y: Array, coefficients: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Where a point of the pinhole's image goes, and du/dx, du/dy = dv/dx, dv/dy.
+
+    Source: Brown (1966); with k4 k5 k6 OpenCV's rational model.
+    """
+    _, _, p1, p2, *_ = coefficients
+    r2 = x**2 + y**2
+    radial, rise = _radial(r2, coefficients)
+    bend = 2 * rise  # of radial, per x or y
+    bent = jnp.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+            y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+        ]
+    )
+    mixed = x * y * bend + 2 * p1 * x + 2 * p2 * y
+    along_x = radial + x**2 * bend + 2 * p1 * y + 6 * p2 * x
+    along_y = radial + y**2 * bend + 6 * p1 * y + 2 * p2 * x
+    return bent, (along_x, mixed, along_y)
+
+
+def _radial(r2: Array, coefficients: Array) -> tuple[Array, Array]:
+    """By how much the radius grows, and the derivative of that by r2."""
+    k1, k2, _, _, k3, *below = coefficients
+
+    def polynomial(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
+        return 1 + r2 * (a + r2 * (b + r2 * c)), a + r2 * (2 * b + 3 * r2 * c)
+
+    value, rise = polynomial(k1, k2, k3)
+    if not below:
+        return value, rise
+    under, under_rise = polynomial(*below)
+    fits = under > _LEAST_DENOMINATOR
+    under = jnp.where(fits, under, _LEAST_DENOMINATOR)
+    ratio = value / under
+    return ratio, (rise - jnp.where(fits, ratio * under_rise, 0)) / under
+
+
+def _equidistant(points: Array, coefficients: Array) -> Image:
+    """Source: Kannala, Brandt (2006)."""
+    x, y, z = points
+    k1, k2, k3, k4 = coefficients
+    r2, squared = x**2 + y**2, jnp.sum(points**2, axis=0)
+    off_axis = r2 > 1e-14 * z**2
+    per_radius = jax.lax.rsqrt(jnp.where(off_axis, r2, 1))
+    theta = jnp.where(off_axis, jnp.arctan2(jnp.where(off_axis, r2 * per_radius, 1), z), 0)
+    t2 = theta**2
+    gain = _equidistant_gain(t2, coefficients)
+    rise = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))  # of theta * gain
+    # theta / radius, which tends to 1 / z on the axis
+    on_axis = 1 / jnp.where(off_axis | (z <= 0), 1, z)
+    ratio = jnp.where(off_axis, theta * per_radius, on_axis) * gain
+    rise = rise / jnp.where(squared > 0, squared, 1)
+    bend = jnp.where(off_axis, (z * rise - ratio) * per_radius**2, 0)
+    # How the ratio answers, times both coordinates; and how these do.
+    is_depth = _axes(jnp.asarray([False, False, True]), points)
+    slope = jnp.where(is_depth, -rise[None], points * bend[None])[:, None] * points[None, :2]
+    straight = _axes(jnp.eye(3, 2, dtype=points.dtype), points)
+    return points[:2] * ratio[None], slope + straight * ratio[None, None]
+
+
+def _equidistant_gain(theta2: Array, coefficients: Array) -> Array:
+    k1, k2, k3, k4 = coefficients
+    return 1 + theta2 * (k1 + theta2 * (k2 + theta2 * (k3 + theta2 * k4)))
+
+
+def _axes(constant: Array, points: Array) -> Array:
+    """A constant for all points."""
+    return constant.reshape(*constant.shape, *(1,) * (points.ndim - 1))
+
+
+def _towards(xy: Array) -> Array:
+    ray = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
+    return ray / jnp.sqrt(jnp.sum(ray**2, axis=-1, keepdims=True))
+
+
+def _pinhole_bearing(xy: Array, coefficients: Array) -> Array:
+    del coefficients
+    return _towards(xy)
+
+
+def _radtan_bearing(xy_bent: Array, coefficients: Array) -> Array:
+    radius_bent = safe_norm(xy_bent)
+    table = np.tan(np.linspace(0, np.deg2rad(89), _TABLE_SIZE))
+    radius = _invert(lambda r: r * _radial(r**2, coefficients)[0], radius_bent, table)
+    safe = jnp.where(radius_bent > 0, radius_bent, 1)
+    start = xy_bent * jnp.where(radius_bent > 0, radius / safe, 1)[..., None]
+
+    def newton(xy: Array) -> Array:
+        # The tangential terms only bend the start a little, so a long step means that there is
+        # no such ray.
+        value, (a, b, d) = _bent(xy[..., 0], xy[..., 1], coefficients)
+        residual_x, residual_y = value - jnp.moveaxis(xy_bent, -1, 0)
+        determinant = a * d - b * b
+        regular = determinant > 1e-6
+        inverse = jnp.where(regular, 1 / jnp.where(regular, determinant, 1), 0)
+        solved = [d * residual_x - b * residual_y, a * residual_y - b * residual_x]
+        step = jnp.stack(solved, axis=-1) * inverse[..., None]
+        reachable = safe_norm(step) < 0.2 * (1 + safe_norm(xy))
+        return jnp.where(reachable[..., None], xy - step, xy)
+
+    xy = start
+    for _ in range(_NEWTON_STEPS):
+        xy = newton(xy)
+    return _towards(newton(jax.lax.stop_gradient(xy)))
+
+
+def _equidistant_bearing(xy_bent: Array, coefficients: Array) -> Array:
+    theta_bent = safe_norm(xy_bent)
+    table = np.linspace(0, np.pi, _TABLE_SIZE)
+    theta = _invert(lambda t: t * _equidistant_gain(t**2, coefficients), theta_bent, table)
+    # sin(theta) / theta_bent, which tends to 1 on the axis
+    off_axis = theta_bent > 1e-7
+    ratio = jnp.where(off_axis, jnp.sin(theta) / jnp.where(off_axis, theta_bent, 1), 1)
+    return jnp.concatenate([xy_bent * ratio[..., None], jnp.cos(theta)[..., None]], axis=-1)
+
+
+def _invert(profile: Callable[[Array], Array], target: Array, table: np.ndarray) -> Array:
+    """The smallest x >= 0 with profile(x) = target: table look-up, then Newton in its cell.
+
+    The table ends where the profile stops rising, which is as far as the lens is one-to-one.
+    The last Newton step alone carries the gradient, and it is the implicit one.
+    """
+    grid = jnp.asarray(table, target.dtype)
+    values = profile(grid)
+    rising = jnp.concatenate([jnp.ones(1, bool), jnp.cumprod(jnp.diff(values) > 0).astype(bool)])
+    last = jnp.sum(rising) - 1
+    reached = on_last_axis(values, target[..., None]) <= target[..., None]
+    below = jnp.sum(on_last_axis(rising, reached) & reached, axis=-1) - 1
+    cell = jnp.clip(below, 0, jnp.maximum(last - 1, 0))
+    low, high = grid[cell], grid[jnp.minimum(cell + 1, last)]
+    value_low, value_high = values[cell], values[jnp.minimum(cell + 1, last)]
+    span = jnp.where(value_high > value_low, value_high - value_low, 1)
+    x = low + (high - low) * jnp.clip((target - value_low) / span, 0, 1)
+
+    def newton(x: Array) -> Array:
+        value, slope = jax.jvp(profile, (x,), (jnp.ones_like(x),))
+        return x - (value - target) / jnp.where(slope > 1e-6, slope, 1)
+
+    for _ in range(_NEWTON_STEPS):
+        x = jnp.clip(newton(x), low, high)
+    x = jax.lax.stop_gradient(x)
+    inside = (target >= value_low) & (target <= value_high)
+    return jnp.where(inside, newton(x), x)
+
+
+_BROWN = ("k1", "k2", "p1", "p2", "k3")
+LENSES = {
+    "none": Lens((), _pinhole, _pinhole_bearing, MIN_DEPTH_RATIO),
+    "radtan": Lens(_BROWN, _radtan, _radtan_bearing, MIN_DEPTH_RATIO),
+    "rational": Lens((*_BROWN, "k4", "k5", "k6"), _radtan, _radtan_bearing, MIN_DEPTH_RATIO),
+    "equidistant": Lens(("k1", "k2", "k3", "k4"), _equidistant, _equidistant_bearing, -0.99),
+}
+MOST_COEFFICIENTS = max(len(lens.coefficients) for lens in LENSES.values())
+
+
+def image_of(
+    lens: str, points: Float[Array, "3 ..."], coefficients: Float[Array, "8 ..."]
+) -> Image:
+    """Where points go in the image at focal length 1, and the slope of that."""
+    kind = LENSES[lens]
+    return kind.image(points, coefficients[: len(kind.coefficients)])
+
+
+def bearing_of(
+    lens: str, xy: Float[Array, "*batch 2"], coefficients: Float[Array, " 8"]
+) -> Float[Array, "*batch 3"]:
+    """Unit vectors through places in the image at focal length 1."""
+    kind = LENSES[lens]
+    return kind.bearing(xy, coefficients[: len(kind.coefficients)])
