@@ -41,8 +41,8 @@ class Fault(enum.IntFlag):
 class Reject(enum.IntFlag):
     """Good data that contradicts the rest."""
 
-    INNOVATION = enum.auto()  # corners: NIS above the gate
-    INNOVATION_LARGE = enum.auto()  # corners: NIS above half of the gate
+    INNOVATION = enum.auto()  # corners: the filter has not accepted them
+    INNOVATION_LARGE = enum.auto()  # accepted, though NIS is above half of the gate
     TOO_LATE = enum.auto()  # older than all that the ring keeps
     ODOMETRY = enum.auto()  # a speed that the vehicle can't have reached
 
