@@ -183,7 +183,7 @@ def test_blocks_are_those_of_the_whole_jacobian(world):
 
 def test_lenses_that_are_off_are_found_where_they_may_move(world):
     rig, Ts_world_marker, views = world
-    shift = np.array([[3.0, 3.0, 2.0, -3.0, 0.01, 0, 0, 0, 0]] * 4)
+    shift = np.array([[3.0, 3.0, 2.0, -3.0, 0.01, *[0] * 7]] * 4)
     off = dataclasses.replace(
         rig, cameras=bundle.with_lenses(rig.cameras, bundle.lenses_of(rig.cameras) + shift)
     )

@@ -107,7 +107,7 @@ def test_lenses_of_other_images(change, level, words):
 
 @pytest.mark.parametrize(("k1", "level"), [(-0.13, "warning"), (-0.6, "error")])
 def test_a_lens_that_folds_within_the_image(k1, level):
-    found = the_problem(lenses(with_lens(distortion=[k1, 0, 0, 0, 0])), level)
+    found = the_problem(lenses(with_lens(distortion=[k1, *[0] * 7])), level)
     assert found.what.startswith("front: the lens model can be inverted up to")
 
 
