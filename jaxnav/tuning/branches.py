@@ -148,12 +148,12 @@ def _around(navigator: Navigator, T_world_vehicle: Float[Array, "B 7"]) -> Bank:
         if isinstance(motion, BicycleKalman):
             pose = planar_from_T_world_vehicle(jaxlie.SE3(T))
         mean = jnp.concatenate([pose, jnp.zeros_like(empty.mean[0, pose.shape[0] :])])
-        belief: Bank = eqx.tree_at(
+        bank: Bank = eqx.tree_at(
             lambda b: (b.mean, b.covariance, b.initialised),
             empty,
             (mean[None], jnp.diag(sigma**2)[None], jnp.ones(1, bool)),
         )
-        return belief
+        return bank
 
-    beliefs: Bank = jax.vmap(one)(T_world_vehicle)
-    return beliefs
+    banks: Bank = jax.vmap(one)(T_world_vehicle)
+    return banks

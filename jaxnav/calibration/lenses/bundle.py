@@ -20,16 +20,12 @@ from jaxnav.calibration.lenses.views import BoardViews
 from jaxnav.calibration.rigs.pose_arrays import retracted
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import rotation_matrix, skew, turn_and_shift
-from jaxnav.models.lenses import MOST_COEFFICIENTS
+from jaxnav.models.lenses import LENSES, MOST_COEFFICIENTS
 from jaxnav.numerics.schur import Blocks, SchurLM, SchurState, reduce
 
 # Of the shared unknowns, in their order; zero and fixed beyond what the lens has.
-NAMES = {
-    "none": ("fx", "fy", "cx", "cy"),
-    "radtan": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
-    "equidistant": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-}
-FITTED = tuple(NAMES)
+FITTED = ("none", "radtan", "equidistant")
+NAMES = {lens: ("fx", "fy", "cx", "cy", *LENSES[lens].coefficients) for lens in FITTED}
 COUNT = 9
 NO_CUT = 1e8  # in sigmas: plain least squares
 _BATCH = 16  # views are padded to a multiple of so many, so that few sizes are compiled
