@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief.ambiguity import Selector
@@ -146,10 +147,11 @@ class Navigator(eqx.Module):
 
     def fuse(self, belief: Belief, seen: Consistent) -> tuple[Belief, Estimate]:
         """The belief after what was seen, or without a marker by prediction and odometry alone."""
+        predicted = self.predict(belief, seen.snapshot.obs)
         belief, evidence = jax.lax.cond(
             jnp.any(seen.snapshot.seen.visible),
-            lambda: self.correct(belief, seen),
-            lambda: self.coast(belief, seen.snapshot.obs),
+            lambda: self.correct(predicted, seen),
+            lambda: self.coast(predicted),
         )
         return belief, Estimate.of(self.motion, belief, evidence)
 
@@ -157,17 +159,21 @@ class Navigator(eqx.Module):
         """The candidate poses, of all in view that can be a marker."""
         return consistent(self.snapshot(obs), self.find_candidates, self.no_candidates())
 
+    def predict(self, belief: Belief, obs: Observation) -> Belief:
+        """What is believed `dt_s` later, with the odometry where there is any."""
+        return belief.predicted(self._sound(self.motion.predict(belief.bank, obs)))
+
     def correct(self, belief: Belief, seen: Consistent) -> tuple[Belief, Evidence]:
-        """Predict, select a candidate for each hypothesis, update."""
+        """Select a candidate for each predicted hypothesis, and update it."""
         motion, obs = self.motion, seen.snapshot.obs
-        prior = numbered_anew_where_empty(motion.predict(belief.bank, obs))
+        prior = numbered_anew_where_empty(belief.bank)
         predicted = motion.poses(prior)
         selection = self.selector(predicted, seen.candidates, seen.snapshot)
         updated = motion.update(prior, selection, obs)
         bank = self._sound(updated.bank)
 
-        survived, best = jnp.any(prior.initialised), heaviest(bank)
-        belief = belief.after(bank, survived, selection.decided, selection.flip_probability)
+        best = heaviest(bank)
+        belief = belief.after(bank, selection.decided, selection.flip_probability)
         evidence = Evidence(
             candidates=seen.candidates,
             costs=selection.costs,
@@ -180,12 +186,11 @@ class Navigator(eqx.Module):
         )
         return belief, evidence
 
-    def coast(self, belief: Belief, obs: Observation) -> tuple[Belief, Evidence]:
-        """Predict, with the odometry where there is any."""
-        bank = self._sound(self.motion.predict(belief.bank, obs))
-        located = jnp.any(bank.initialised)
+    def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
+        """What is predicted is what is believed: nothing is in view."""
+        located = jnp.any(belief.bank.initialised)
         flip_probability = jnp.where(located, belief.flip_probability, 0)
-        belief = belief.after(bank, located, belief.decided & located, flip_probability)
+        belief = belief.after(belief.bank, belief.decided & located, flip_probability)
         return belief, self.no_evidence(belief)
 
     def act(
@@ -199,17 +204,13 @@ class Navigator(eqx.Module):
         command, done, log = None, jnp.asarray(False), None
         if self.controller is not None and control is not None:
             obs, pose = obs.usable(), estimate.pose
-            speed_mps = jnp.where(obs.has_odometry, obs.speed_mps, jnp.nan)
+            told = obs.steering_rad, obs.dt_s, jnp.where(obs.has_odometry, obs.speed_mps, jnp.nan)
+            steering_rad, dt_s, speed_mps = (jnp.asarray(x, pose.dtype) for x in told)
+            nearest_m = self.markers.nearest_m(estimate.T_world_vehicle)
             control, command, done, log = self.controller(
-                control,
-                pose,
-                estimate.located,
-                jnp.asarray(obs.steering_rad, pose.dtype),
-                jnp.asarray(obs.dt_s, pose.dtype),
-                estimate.decided,
-                self.markers.nearest_m(estimate.T_world_vehicle),
-                jnp.asarray(speed_mps, pose.dtype),
-            )
+                control, pose, estimate.located, steering_rad, dt_s, estimate.decided,
+                nearest_m, speed_mps,
+            )  # fmt: skip
         return control, Output(**vars(estimate), command=command, done=done, control_log=log)
 
     def snapshot(self, obs: Observation) -> Snapshot:
@@ -217,9 +218,10 @@ class Navigator(eqx.Module):
         sigmas_px = self.corner_sigma_px, self.model_sigma_px
         return Snapshot.create(self.rig, self.markers, obs, *sigmas_px, self.max_sightings)
 
-    def find_candidates(self, snapshot: Snapshot) -> Candidates:
-        """Both poses of every marker in view, refined."""
-        return find_candidates(snapshot, self.max_candidates, self.max_lm_steps, self.ground_plane)
+    def find_candidates(self, snapshot: Snapshot, own: jaxlie.SE3 | None = None) -> Candidates:
+        """Both poses of every marker in view, refined; see `find_candidates`."""
+        limits = self.max_candidates, self.max_lm_steps
+        return find_candidates(snapshot, *limits, self.ground_plane, own)
 
     def no_candidates(self) -> Candidates:
         """What `find_candidates` returns where nothing is in view."""

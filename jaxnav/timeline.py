@@ -99,7 +99,7 @@ def advance(
 
     def sense(before: Belief, obs: Observation) -> tuple[Belief, Evidence]:
         if events.corners is None:
-            return navigator.coast(before, obs)
+            return navigator.coast(navigator.predict(before, obs))
         after, estimate = navigator.sense(before, obs)
         return after, estimate.evidence
 
@@ -127,7 +127,7 @@ def advance(
     unheard = dataclasses.replace(obs, has_odometry=jnp.asarray(False), dt_s=seconds(age_us))
     present: Belief = jax.lax.cond(
         age_us > FRESH_US,
-        lambda: navigator.coast(belief, unheard.usable())[0],
+        lambda: navigator.coast(navigator.predict(belief, unheard.usable()))[0],
         lambda: belief,
     )
     estimate = Estimate.of(navigator.motion, present, evidence)

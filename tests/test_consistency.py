@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxnav.navigator import Navigator
-from jaxnav.pose.candidates import own_errors_px
+from jaxnav.pose.candidates import both_poses, own_errors_px
 from jaxnav.pose.consistency import consistent
 from jaxnav.pose.observation import Observation
 from tests import worlds
@@ -28,7 +28,7 @@ def told():
     def told(navigator, obs):
         snapshot = navigator.snapshot(obs)
         found = consistent(snapshot, navigator.find_candidates, navigator.no_candidates())
-        return snapshot, found, own_errors_px(snapshot)
+        return snapshot, found, own_errors_px(snapshot, both_poses(snapshot))
 
     return told
 

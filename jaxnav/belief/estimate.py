@@ -1,6 +1,6 @@
 """What is carried from one observation to the next, and what is reported of it."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import equinox as eqx
 import jax
@@ -27,21 +27,17 @@ class Belief(eqx.Module):
         nothing = jnp.zeros((), bank.mean.dtype)
         return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32))
 
-    def after(
-        self,
-        bank: Bank,
-        survived: Bool[Array, ""],
-        decided: Bool[Array, ""],
-        flip_probability: Float[Array, ""],
-    ) -> "Belief":
-        """The next one.
+    def predicted(self, bank: Bank) -> "Belief":
+        """With its hypotheses later on. Where none of them is left, that counts as a restart."""
+        given_up = jnp.any(self.bank.initialised) & ~jnp.any(bank.initialised)
+        return replace(self, bank=bank, restarts=self.restarts + given_up)
 
-        Args:
-            survived: whether any hypothesis outlived its prediction.
-        """
-        given_up = jnp.any(self.bank.initialised) & ~survived
+    def after(
+        self, bank: Bank, decided: Bool[Array, ""], flip_probability: Float[Array, ""]
+    ) -> "Belief":
+        """The next one."""
         flip_probability = flip_probability.astype(self.flip_probability.dtype)
-        return Belief(bank, decided, flip_probability, self.restarts + given_up)
+        return Belief(bank, decided, flip_probability, self.restarts)
 
 
 class Believed(eqx.Module):

@@ -326,7 +326,7 @@ def _normal(
 ) -> tuple[Array, Array, Array]:
     """Normal equations of the views' whitened residuals, and their chi-square, at `_PRIOR`'s p."""
 
-    def residuals(p: Array) -> Array:
+    def residuals(p: Array) -> tuple[Array, Array]:
         speed, steering = (1 + p[6]) * speed_mps, (1 + p[7]) * steering_rad + p[8]
         dt_s = jnp.diff(edges_s, append=edges_s[-1:])
         dt_s = jnp.where(dt_s < _ROOM_S + STRETCH_S, dt_s, 0.0)
@@ -346,22 +346,27 @@ def _normal(
             after_s = time_s - edges_s[at]
             return advance(nodes[at], speed[at], steering[at], after_s, wheelbase_m)
 
-        # From the odometer's own world to the true one.
-        T_vehicle_world = T_world_vehicle_from_planar(along(jnp.zeros_like(p[0]))).inverse()
-        T_world_world = T_world_vehicle_from_planar(p[:3]) @ T_vehicle_world
+        # From the odometer's own world to the true one: at time 0 the pose is p[:3].
+        times = jax.vmap(along)(jnp.append(times_s - p[9], 0.0))
+        turn, moved_m = p[2] - times[-1, 2], times[:-1, :2] - times[-1:, :2]
+        c, s = jnp.cos(turn), jnp.sin(turn)
+        x_m, y_m = c * moved_m[:, 0] - s * moved_m[:, 1], s * moved_m[:, 0] + c * moved_m[:, 1]
+        poses = jnp.stack([p[0] + x_m, p[1] + y_m, times[:-1, 2] + turn], axis=1)
+
         points_world = markers.corners_world_m[marker]
         one = jax.tree.map(lambda leaf: leaf[camera], rig.cameras)
         T_camera_vehicle = jax.tree.map(lambda leaf: leaf[camera], rig.Ts_camera_vehicle)
 
-        def seen(time_s: Array, points: Array) -> Array:
-            T_world_vehicle = T_world_world @ T_world_vehicle_from_planar(along(time_s - p[9]))
-            points = transform_points(T_camera_vehicle @ T_world_vehicle.inverse(), points)
+        def seen(pose: Array, points: Array) -> Array:
+            points = transform_points(T_world_vehicle_from_planar(pose).inverse(), points)
+            points = transform_points(T_camera_vehicle, points)
             return one.project(points + jnp.cross(p[3:6][None], points))
 
-        px = jax.vmap(seen)(times_s, points_world) - corners_px
-        return (px / sigma_px[..., None]).reshape(len(times_s), 8)
+        px = jax.vmap(seen)(poses, points_world) - corners_px
+        r = (px / sigma_px[..., None]).reshape(len(times_s), 8)
+        return r, r
 
-    J, r = jax.jacfwd(residuals)(p), residuals(p)
+    J, r = jax.jacfwd(residuals, has_aux=True)(p)
     chi2 = jnp.sum(r**2, axis=1)
     fine = used & jnp.isfinite(chi2)
     r, J = jnp.where(fine[:, None], r, 0), jnp.where(fine[:, None, None], J, 0)

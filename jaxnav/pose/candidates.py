@@ -20,7 +20,6 @@ from jaxnav.models.geometry import (
     transform_points,
 )
 from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
 from jaxnav.numerics.small_matrices import in_order
 from jaxnav.pose.ippe import ippe_from_rays
 from jaxnav.pose.observation import Sightings, Snapshot, cameras_of
@@ -70,7 +69,11 @@ class Candidates(eqx.Module):
 
 
 def find_candidates(
-    snapshot: Snapshot, max_candidates: int = 4, max_steps: int = 12, ground_plane: bool = False
+    snapshot: Snapshot,
+    max_candidates: int = 4,
+    max_steps: int = 12,
+    ground_plane: bool = False,
+    own: jaxlie.SE3 | None = None,
 ) -> Candidates:
     """Every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
 
@@ -82,9 +85,12 @@ def find_candidates(
         snapshot: what is seen.
         max_steps: bound on the LM steps.
         ground_plane: keep the vehicle level on the ground, z = 0: only (x, y, psi) are refined.
+        own: `both_poses(snapshot)`, of who has them already.
     """
     rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
-    Ts_vehicle_world, owner_visible = _both_poses(rig, markers, seen)
+    own = both_poses(snapshot) if own is None else own
+    Ts_vehicle_world = jaxlie.SE3(own.wxyz_xyz.reshape(-1, 7))
+    owner_visible = jnp.repeat(seen.visible, 2)
     if ground_plane:
         Ts_vehicle_world = jax.vmap(lambda T: on_ground(T.inverse()).inverse())(Ts_vehicle_world)
 
@@ -123,13 +129,15 @@ def find_candidates(
     )
 
 
-def own_errors_px(snapshot: Snapshot) -> Float[Array, " D"]:
+def own_errors_px(snapshot: Snapshot, own: jaxlie.SE3) -> Float[Array, " D"]:
     """How far the corners of each sighting are from those of the better of its own two poses, RMS.
 
     Large where they are not the image of a square at all.
+
+    Args:
+        own: `both_poses(snapshot)`.
     """
     rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
-    Ts_vehicle_world, _ = _both_poses(rig, markers, seen)
 
     def one(
         camera: Camera, T_camera_vehicle: jaxlie.SE3, Ts: jaxlie.SE3, corners: Array, px: Array
@@ -143,17 +151,16 @@ def own_errors_px(snapshot: Snapshot) -> Float[Array, " D"]:
     squared = jax.vmap(one)(
         cameras_of(rig, seen),
         jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index]),
-        jaxlie.SE3(Ts_vehicle_world.wxyz_xyz.reshape(-1, 2, 7)),
+        own,
         markers.corners_world_m[seen.marker_index],
         seen.corners_px,
     )
     return safe_sqrt(squared)
 
 
-def _both_poses(
-    rig: CameraRig, markers: MarkerMap, seen: Sightings
-) -> tuple[jaxlie.SE3, Bool[Array, " twice_D"]]:
-    """Two vehicle poses (2D,) from every sighting by itself, and whether it is visible."""
+def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
+    """`T_vehicle_world` twice, batch axes (D, 2): of every sighting by itself, visible or not."""
+    rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
 
     def one(
         camera: Camera,
@@ -169,14 +176,13 @@ def _both_poses(
             )
         )(Ts_camera_marker)
 
-    Ts_vehicle_world = jax.vmap(one)(
+    return jax.vmap(one)(
         cameras_of(rig, seen),
         jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index]),
         jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[seen.marker_index]),
         markers.size_m[seen.marker_index],
         seen.corners_px,
     )
-    return jaxlie.SE3(Ts_vehicle_world.wxyz_xyz.reshape(-1, 7)), jnp.repeat(seen.visible, 2)
 
 
 def _repeats(

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.numerics.trees import where
-from jaxnav.pose.candidates import Candidates, own_errors_px
+from jaxnav.pose.candidates import Candidates, both_poses, own_errors_px
 from jaxnav.pose.observation import Sightings, Snapshot
 
 # Corners are those of a square in space where they miss the best projection of one by less than so
@@ -31,6 +32,10 @@ _GAIN = 4.0  # by which it must fall without one marker, and without no other as
 LEAST_MARKERS = 3  # two can't outvote each other
 
 
+# `find_candidates` of a snapshot, and of the poses that each sighting has by itself.
+Find = Callable[[Snapshot, jaxlie.SE3], Candidates]
+
+
 class Consistent(NamedTuple):
     """What is left of a snapshot, the candidate poses for that, and which markers are not in it
     because the others outvote them."""
@@ -40,9 +45,19 @@ class Consistent(NamedTuple):
     outvoted: Bool[Array, " M"]
 
 
-def consistent(
-    snapshot: Snapshot, find: Callable[[Snapshot], Candidates], none: Candidates
-) -> Consistent:
+class Kept(NamedTuple):
+    """The same, of the snapshot only what changes: which sightings are visible still."""
+
+    visible: Bool[Array, " D"]
+    candidates: Candidates
+    outvoted: Bool[Array, " M"]
+
+    def of(self, snapshot: Snapshot) -> Consistent:
+        """With the snapshot that it was found in."""
+        return Consistent(_among(snapshot, self.visible), self.candidates, self.outvoted)
+
+
+def consistent(snapshot: Snapshot, find: Find, none: Candidates) -> Consistent:
     """What is seen without nonsense and without a marker that the others outvote.
 
     Args:
@@ -50,27 +65,23 @@ def consistent(
         none: what it returns where nothing is in view: then it is not called.
     """
 
-    def look() -> tuple[Array, Candidates, Array]:
-        found = among_all(snapshot, find)
-        return found.snapshot.seen.visible, found.candidates, found.outvoted
-
-    def nothing() -> tuple[Array, Candidates, Array]:
+    def nothing() -> Kept:
         nobody = jnp.zeros(len(snapshot.markers.ids), bool)
-        return jnp.zeros_like(snapshot.seen.visible), none, nobody
+        return Kept(jnp.zeros_like(snapshot.seen.visible), none, nobody)
 
     any_seen = jnp.any(snapshot.seen.visible)
-    visible, candidates, outvoted = jax.lax.cond(any_seen, look, nothing)
-    return Consistent(_among(snapshot, visible), candidates, outvoted)
+    kept: Kept = jax.lax.cond(any_seen, lambda: among_all(snapshot, find), nothing)
+    return kept.of(snapshot)
 
 
-def among_all(snapshot: Snapshot, find: Callable[[Snapshot], Candidates]) -> Consistent:
+def among_all(snapshot: Snapshot, find: Find) -> Kept:
     """`consistent` that calls `find` whatever is in view."""
-    snapshot = _among(snapshot, _can_be_markers(snapshot))
-    candidates = find(snapshot)
+    own = both_poses(snapshot)
+    snapshot = _among(snapshot, _can_be_markers(snapshot, own))
+    seen, candidates = snapshot.seen, find(snapshot, own)
     nobody = jnp.zeros(len(snapshot.markers.ids), bool)
-    if nobody.shape[0] < LEAST_MARKERS or snapshot.seen.visible.shape[0] < LEAST_MARKERS:
-        return Consistent(snapshot, candidates, nobody)
-    seen = snapshot.seen
+    if nobody.shape[0] < LEAST_MARKERS or seen.visible.shape[0] < LEAST_MARKERS:
+        return Kept(seen.visible, candidates, nobody)
     in_view = jnp.sum(_in_view(seen, nobody.shape[0]))
     all_of_them = _excess(candidates, seen)
 
@@ -78,7 +89,7 @@ def among_all(snapshot: Snapshot, find: Callable[[Snapshot], Candidates]) -> Con
         # One slot of each marker stands for it; slots of the same marker come to the same.
         def without(marker: Array) -> tuple[Array, Candidates]:
             rest = _among(snapshot, seen.marker_index != marker)
-            found = find(rest)
+            found = find(rest, own)
             return _excess(found, rest.seen), found
 
         excess, found = jax.vmap(without)(seen.marker_index)
@@ -99,12 +110,12 @@ def among_all(snapshot: Snapshot, find: Callable[[Snapshot], Candidates]) -> Con
         lambda: (jnp.ones_like(seen.visible), candidates),
     )
     outvoted = _in_view(_among(snapshot, ~kept).seen, nobody.shape[0])
-    return Consistent(_among(snapshot, kept), candidates, outvoted)
+    return Kept(seen.visible & kept, candidates, outvoted)
 
 
-def _can_be_markers(snapshot: Snapshot) -> Bool[Array, " D"]:
+def _can_be_markers(snapshot: Snapshot, own: jaxlie.SE3) -> Bool[Array, " D"]:
     seen = snapshot.seen
-    errors_px = own_errors_px(snapshot)
+    errors_px = own_errors_px(snapshot, own)
     sides_px = jnp.linalg.norm(seen.corners_px - jnp.roll(seen.corners_px, 1, axis=1), axis=2)
     bound_px = jnp.maximum(
         _MISFIT_SIGMAS * jnp.mean(seen.sigma_px, axis=1),

@@ -7,17 +7,14 @@ where many lanes run side by side, each in its own branch (see `lanes`).
 import dataclasses
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.motion import followed_by, leading, survivors_first
 from jaxnav.navigator import Navigator, Step
-from jaxnav.pose.candidates import Candidates
-from jaxnav.pose.consistency import Consistent, among_all
+from jaxnav.pose.consistency import Consistent, Kept, among_all
 from jaxnav.pose.observation import Observation
 
 # Slots of the banks that are kept compiled beside the whole one: nine frames of ten need a single
@@ -38,21 +35,19 @@ class _ByRegime(Navigator):
         snapshot = self.snapshot(obs)
         slots = snapshot.seen.visible.shape[0]
         if slots == 1:
-            return among_all(snapshot, self.find_candidates)
+            return among_all(snapshot, self.find_candidates).of(snapshot)
 
-        def several() -> tuple[Array, Candidates, Array]:
-            seen = among_all(snapshot, self.find_candidates)
-            return seen.snapshot.seen.visible, seen.candidates, seen.outvoted
-
-        def one() -> tuple[Array, Candidates, Array]:
-            seen = among_all(snapshot.largest(1), self.find_candidates)
-            visible = jnp.zeros(slots, bool).at[0].set(seen.snapshot.seen.visible[0])
+        def one() -> Kept:
+            kept = among_all(snapshot.largest(1), self.find_candidates)
+            visible = jnp.zeros(slots, bool).at[0].set(kept.visible[0])
             count = min(self.max_candidates, 2 * slots)
-            return visible, seen.candidates.padded(count), seen.outvoted
+            return Kept(visible, kept.candidates.padded(count), kept.outvoted)
 
         any_further = jnp.any(snapshot.seen.visible[1:])
-        visible, *found = jax.lax.cond(any_further, several, one)
-        return Consistent(eqx.tree_at(lambda s: s.seen.visible, snapshot, visible), *found)
+        kept: Kept = jax.lax.cond(
+            any_further, lambda: among_all(snapshot, self.find_candidates), one
+        )
+        return kept.of(snapshot)
 
     def fuse(self, belief: Belief, seen: Consistent) -> tuple[Belief, Estimate]:
         bank, count = belief.bank, belief.bank.initialised.shape[0]
@@ -63,9 +58,8 @@ class _ByRegime(Navigator):
         def within(size: int, sees: bool) -> Callable[[Belief], tuple[Belief, Estimate]]:
             def fuse(belief: Belief) -> tuple[Belief, Estimate]:
                 few = dataclasses.replace(belief, bank=leading(belief.bank, size))
-                after, evidence = (
-                    self.correct(few, seen) if sees else self.coast(few, seen.snapshot.obs)
-                )
+                predicted = self.predict(few, seen.snapshot.obs)
+                after, evidence = self.correct(predicted, seen) if sees else self.coast(predicted)
                 estimate = Estimate.of(self.motion, after, evidence)
                 whole = followed_by(survivors_first(after.bank), empty)
                 return dataclasses.replace(after, bank=whole), estimate

@@ -97,5 +97,5 @@ class _Trusts(Navigator):
 class _GoesOn(_Trusts):
     """Looks for no candidate: a hypothesis that goes on asks none."""
 
-    def find_candidates(self, snapshot: Snapshot) -> Candidates:
+    def find_candidates(self, snapshot: Snapshot, own: jaxlie.SE3 | None = None) -> Candidates:
         return self.no_candidates()
