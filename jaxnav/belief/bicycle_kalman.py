@@ -44,7 +44,7 @@ class BicycleKalman(Motion):
     * Q and the odometry's noise are given in the vehicle's axes, since wheels slip along and across
       themselves: numbers learned on one course hold on another.
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
-      floor, since errors of successive frames are correlated (RELIABILITY R8).
+      floor, since errors of successive frames are correlated.
     """
 
     vehicle: Vehicle
@@ -62,7 +62,7 @@ class BicycleKalman(Motion):
     )  # before the first odometry, m/s m/s rad/s
     tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
     height_sigma_m: float = 0.002
-    gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 % (RELIABILITY R1); inf: no gate
+    gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 %; inf: no gate
     max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
     max_rejected_s: float = 7.0  # whether they agree or not
 

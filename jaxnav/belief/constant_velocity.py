@@ -37,7 +37,7 @@ class ConstantVelocity(Motion):
         default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
     )  # m/s and rad/s
     lost_sigma_m: float = 0.5  # a prediction less certain than this is forgotten
-    gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 % (RELIABILITY R1); inf: no gate
+    gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 %; inf: no gate
     max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
     max_rejected_s: float = 7.0  # whether they agree or not
 

@@ -48,7 +48,7 @@ class MultiHypothesis(eqx.Module):
 
     hypotheses: int = eqx.field(static=True, default=24)  # >= 5
     max_steps: int = eqx.field(static=True, default=6)
-    floor_m: float = 0.0001  # of what successive frames get wrong alike (RELIABILITY R8)
+    floor_m: float = 0.0001  # what successive frames get wrong alike
     floor_rad: float = 0.0001
     merge_distance: float = 0.6  # Mahalanobis, between two means that become one
     linear_rad: float = float(np.deg2rad(3.0))  # an angle, and as much of the range

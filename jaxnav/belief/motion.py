@@ -38,13 +38,13 @@ from jaxnav.numerics.small_matrices import (
 from jaxnav.numerics.trees import where
 from jaxnav.pose.observation import Observation
 
-# A pause without any pose contradicts nothing: of it no more than this counts (RELIABILITY R4's
-# flag for a marker that is missing).
+# A pause without any pose contradicts nothing: at most this much of it counts, which is when
+# a missing marker is flagged (docs/promises.md, Missing data).
 _PAUSE_S = 1.0
 
 
 class Rejections(eqx.Module):
-    """Measured poses in a row that contradict the prediction (RELIABILITY R1 to R3)."""
+    """Measured poses in a row that contradict the prediction (docs/design.md, Restart)."""
 
     count: Int[Array, "*K"]  # of the last ones, which agree with each other
     last: Float[Array, "*K m"]  # whitened innovation of the last one
@@ -212,7 +212,7 @@ def forgotten(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | floa
 def contradicted(
     bank: Bank, max_count: int, max_duration_s: Float[Array, ""] | float
 ) -> Bool[Array, " K"]:
-    """Whether so many contradictions in a row agree, or they have lasted so long (R3)."""
+    """Whether so many contradictions in a row agree, or they have lasted so long."""
     rejections = bank.rejections
     return (rejections.count >= max_count) | (rejections.duration_s >= max_duration_s)
 
@@ -225,8 +225,9 @@ def gated(
     """One hypothesis that was offered a pose, its NIS, 0 where there was none to compare, and
     whether the pose was accepted.
 
-    It starts with `first`, or takes `posterior` where the gate admits it, or stays as predicted
-    (RELIABILITY R1).
+    It starts with `first`, or takes `posterior` where the gate admits it, or stays as predicted.
+
+    See docs/design.md, Gate.
 
     Args:
         taken: whether there is a pose at all.

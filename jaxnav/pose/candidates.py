@@ -78,14 +78,15 @@ def find_candidates(
     """Every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
 
     One camera that sees one marker gives two; two cameras on one marker give up to four, which
-    the refinement usually draws together into two (DESIGN 3.4). With many markers the
-    `max_candidates` that explain all corners best are refined.
+    the refinement usually draws together into two (see docs/design.md, Candidates). With many
+    markers the `max_candidates` poses that explain all corners best are refined.
 
     Args:
         snapshot: what is seen.
+        max_candidates: N, how many poses are refined and returned at most.
         max_steps: bound on the LM steps.
         ground_plane: keep the vehicle level on the ground, z = 0: only (x, y, psi) are refined.
-        own: `both_poses(snapshot)`, of who has them already.
+        own: the result of `both_poses(snapshot)`, where the caller has it already.
     """
     rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
     own = both_poses(snapshot) if own is None else own
