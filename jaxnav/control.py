@@ -13,7 +13,7 @@ from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
 
 
 class Command(eqx.Module):
-    """What is sent to the vehicle, inside its limits."""
+    """Steering and throttle for the vehicle, inside its limits."""
 
     steering_rad: Float[Array, ""]
     throttle: Float[Array, ""]  # the driver's unit
@@ -25,48 +25,56 @@ class ControlLog(eqx.Module):
     distance_m: Float[Array, ""]  # L_d
     alpha_rad: Float[Array, ""]
     sideslip_rad: Float[Array, ""]  # beta
-    integral_ms: Float[Array, ""]  # of L_d over time, m s
+    integral_ms: Float[Array, ""]  # integral of L_d over time, m s
 
 
 class ControlState(eqx.Module):
-    """What the controller remembers."""
+    """The state that the controller carries from one command to the next."""
 
     waypoint_index: Int[Array, ""]  # W once the last one is reached
     integral_ms: Float[Array, ""]
-    explored_s: Float[Array, ""]  # how long it has been looking around since it was last sure
-    side: Float[Array, ""]  # to which side of the line of sight it does: 1 left, -1 right, 0 none
+    explored_s: Float[Array, ""]  # duration of the exploration since the pose was last decided
+    side: Float[Array, ""]  # of the line of sight, where it explores: 1 left, -1 right, 0 none
 
 
 class Exploration(eqx.Module):
-    """How a car moves that does not know yet which of several poses it has.
+    """Motion of a car while several poses are possible.
 
-    Slowly, on a course at `angle_rad` to the line of sight, to the side it points to already: that
-    is where the poses and their mirror images drift apart. Whichever pose is the true one, the
-    car gets nearer to the marker and so stays inside the circle around it that it stood on, and
-    the ground between the two is open, since the marker is seen. After `duration_s`, or nearer than
-    `min_range_m`, it stands still until it knows.
+    The car drives slowly at `angle_rad` to the line of sight, to the side it points to already:
+    motion across the line of sight separates the poses from their mirror images. Whichever pose is
+    the true one, the car gets nearer to the marker and stays inside the circle around it on which
+    it stood; the ground between the two is open, since the marker is seen. After `duration_s`, or
+    nearer than `min_range_m`, the car stands until the pose is decided.
     """
 
     speed_mps: float = 0.5
-    settle_s: float = 0.1  # how soon it is at that speed: the throttle leads where the car lags
+    settle_s: float = 0.1  # time constant to that speed; the throttle leads the motor's lag
     angle_rad: float = float(np.deg2rad(60.0))
-    reach_m: float = 0.4  # how sharply it turns onto that course
+    reach_m: float = 0.4  # distance of the point on that course at which it steers
     min_range_m: float = 0.7
     duration_s: float = 12.0
 
 
 class Controller(eqx.Module):
-    """Ackermann arc to the waypoint, PI throttle on the distance to it.
+    """Ackermann steering on an arc to the waypoint, and PI throttle on the distance to it.
 
-    Two numbers that the paper does not have change nothing at their default, infinity:
-    `lookahead_m` and `slows_at_rad`.
+        alpha = atan2(Y_d - y, X_d - x) - psi - beta                               (Eq. 17)
+        steering = atan(2 l sin(alpha) / (L_d cos(beta)))                          (Eq. 18)
+        throttle = p1 L_d + p2 integral of L_d dt                                  (Eq. 19)
 
-    The paper's sum of distances (Eq. 19) never decreases: here it is an integral over time, held
-    inside `integral_limit_ms`, and starts anew at every waypoint. After the last waypoint the
-    throttle is zero, and so it is before the first pose and where the pose is no number. From a
-    waypoint inside the smallest circle the car can drive, which it would orbit, it drives straight
-    on until it can be reached. While the pose is undecided the car explores instead, and no
-    waypoint counts as reached.
+    with the waypoint (X_d, Y_d) and its distance L_d, m, the pose (x, y, psi), the sideslip beta of
+    the measured steering angle, and the wheelbase l.
+
+    The paper's sum of distances never decreases. Here it is an integral over time, limited to
+    `integral_limit_ms` and reset at every waypoint. The throttle is zero after the last waypoint,
+    before the first pose, and where the pose is not finite. A car would orbit a waypoint inside the
+    smallest circle it can drive: it drives straight on until it can reach the waypoint. While the
+    pose is undecided the car explores instead, and no waypoint counts as reached.
+
+    The paper lacks `lookahead_m` and `slows_at_rad`; at their default, infinity, they have no
+    effect.
+
+    Source: Liu, Schofield, Shan (2023), Eqs. 16-19; see docs/design.md, Steering and throttle.
     """
 
     waypoints_m: Float[Array, "W 2"]
@@ -75,14 +83,14 @@ class Controller(eqx.Module):
     proportional_per_m: Float[Array, ""]  # p1, throttle per metre
     integral_per_ms: Float[Array, ""]  # p2, throttle per metre second
     integral_limit_ms: Float[Array, ""]
-    # From afar it steers as towards a point no farther than this; inf: towards the waypoint.
+    # Steers as towards a point at L_d / (1 + L_d / lookahead_m); inf: at the waypoint.
     lookahead_m: Float[Array, ""] | float = np.inf
-    # The throttle is half of it where the waypoint lies so far off the course; inf: nowhere.
+    # The throttle is halved where |alpha| is this large; inf: never.
     slows_at_rad: Float[Array, ""] | float = np.inf
     exploration: Exploration = Exploration()
 
     def init(self) -> ControlState:
-        """At the first waypoint, nothing summed up."""
+        """The state at the first waypoint, with a zero integral."""
         zero = jnp.zeros_like(self.waypoint_radius_m)
         return ControlState(jnp.asarray(0), zero, zero, zero)
 
@@ -97,17 +105,18 @@ class Controller(eqx.Module):
         to_marker_m: Float[Array, " 2"] | None = None,
         speed_mps: Float[Array, ""] | float = np.nan,
     ) -> tuple[ControlState, Command, Bool[Array, ""], ControlLog]:
-        """One command.
+        """One command, towards the next waypoint if the present one is reached.
 
         Args:
+            state: after the previous command.
             pose: (x_m, y_m, psi_rad) of the vehicle in the world.
-            located: whether the pose means anything yet.
-            steering_rad: measured steering angle, for the sideslip; 0 stands in for no number.
-            dt_s: time since the previous call; 0 stands in for no positive number.
+            located: whether a pose has been estimated yet.
+            steering_rad: measured steering angle, for the sideslip; a NaN is taken as 0.
+            dt_s: time since the previous call; taken as 0 where it is not positive and finite.
             decided: whether the pose may be acted upon.
-            to_marker_m: the nearest marker, seen from the vehicle in its own axes: alike under all
-                poses that are still possible. Needed where `decided` may be False.
-            speed_mps: measured speed, which exploring controls; no number: it drives open-loop.
+            to_marker_m: (2,) position of the nearest marker in vehicle axes, which is the same
+                under all poses that are still possible. Needed where `decided` may be False.
+            speed_mps: measured speed, which exploration controls; NaN: it drives open-loop.
 
         Returns:
             The next state, the command, whether the last waypoint is reached, and the log.
@@ -175,7 +184,7 @@ class Controller(eqx.Module):
         speed_mps: Float[Array, ""] | float,
         dt_s: Float[Array, ""],
     ) -> tuple[ControlState, Command]:
-        """The command of a car that is not sure of its pose."""
+        """The command while the pose is undecided; see `Exploration`."""
         zero = jnp.zeros_like(beta_rad)
         if to_marker_m is None:
             return state, Command(zero, zero)
@@ -200,15 +209,16 @@ class Controller(eqx.Module):
         ), Command(steering, jnp.where(goes, throttle, 0))
 
     def short_of(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
-        """How far it is to where a waypoint counts as reached, m; negative beyond."""
+        """Distance to the circle inside which a waypoint counts as reached, m; negative inside."""
         waypoint_m = self.waypoints_m[jnp.minimum(index, self.waypoints_m.shape[0] - 1)]
         return safe_norm(waypoint_m - pose[:2]) - self.waypoint_radius_m
 
     def _orbited(
         self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""]
     ) -> Bool[Array, ""]:
-        """Whether the waypoint lies so deep inside the smallest circle the car can drive that it
-        would go round it for ever. Straight on, it leaves the circle.
+        """Whether the waypoint lies so deep inside the smallest circle that the car would orbit it.
+
+        Driving straight on takes the waypoint out of the circle.
         """
         limit = self.vehicle.steering_limit_rad
         radius_m = 1 / curvature_per_m(limit, self.vehicle.wheelbase_m)

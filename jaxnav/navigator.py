@@ -1,5 +1,7 @@
 """Algorithm 1: from corners, odometry and a route to a command. Read this first.
 
+The way of the data and the decisions behind it are in docs/design.md.
+
 Source: Liu, Schofield, Shan (2023), Algorithm 1.
 """
 
@@ -34,14 +36,14 @@ from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
 
 
 class State(eqx.Module):
-    """Everything `step` carries from one observation to the next."""
+    """The state that `step` carries from one observation to the next."""
 
     belief: Belief
     control: ControlState | None  # None without a route
 
 
 class Output(Estimate):
-    """Everything `step` knows after one observation."""
+    """The estimate after one observation, with the command that follows from it."""
 
     command: Command | None
     done: Bool[Array, ""]  # the last waypoint is reached
@@ -49,13 +51,19 @@ class Output(Estimate):
 
 
 class Navigator(eqx.Module):
-    """A rig that finds its way by markers. Immutable; `init` and `step` are pure.
+    """Algorithm 1 for one rig in one map of markers. Immutable; `init` and `step` are pure.
 
-    With a vehicle and waypoints it drives; without, it only localises (give it the motion model
-    of the body then, `ConstantVelocity()` by default).
+        state = navigator.init()
+        state, output = navigator.step(state, obs)
 
-    Waypoints, states and outputs count from `markers.origin_m`, zero unless the map is far from it:
-    `Route.relative_to` leads there, `planar_in_world` and `poses_in_world` lead back.
+    With a vehicle and waypoints it commands the vehicle. Without them it only localises, with the
+    motion model of the body, `ConstantVelocity()` by default.
+
+    Coordinates of waypoints, states and outputs count from `markers.origin_m`, which is zero unless
+    the map is far from it. `Route.relative_to` converts waypoints, `planar_in_world` and
+    `poses_in_world` convert outputs (see docs/design.md, Far origins).
+
+    Source: Liu, Schofield, Shan (2023), Algorithm 1.
     """
 
     rig: CameraRig
@@ -124,29 +132,42 @@ class Navigator(eqx.Module):
 
     @classmethod
     def like(cls, navigator: "Navigator") -> "Navigator":
-        """The same navigator, of a class that overrides some of its methods."""
+        """An instance of this class, which may override methods, with the fields of another."""
         other = object.__new__(cls)
         for name, part in vars(navigator).items():
             object.__setattr__(other, name, part)
         return other
 
     def init(self) -> State:
-        """Nothing seen yet, at the first waypoint."""
+        """The state before the first observation, at the first waypoint."""
         belief = Belief.begin(self.motion.init(self.selector.hypotheses))
         return State(belief, None if self.controller is None else self.controller.init())
 
     def step(self, state: State, obs: Observation) -> tuple[State, Output]:
-        """One pass of Algorithm 1: sense, then act."""
+        """One pass of Algorithm 1: sense, then act.
+
+        Args:
+            state: after the previous observation, or `init()`.
+            obs: corners (C, M, 4, 2), odometry, and the time since the previous observation.
+
+        Returns:
+            The state after this observation, and the estimate with the command.
+        """
         belief, estimate = self.sense(state.belief, obs)
         control, output = self.act(state.control, estimate, obs)
         return State(belief, control), output
 
     def sense(self, belief: Belief, obs: Observation) -> tuple[Belief, Estimate]:
-        """What is believed after an observation, and what is known of it."""
+        """Fuse an observation: the next belief, and the estimate that is reported of it."""
         return self.fuse(belief, self.look(obs.usable()))
 
     def fuse(self, belief: Belief, seen: Consistent) -> tuple[Belief, Estimate]:
-        """The belief after what was seen, or without a marker by prediction and odometry alone."""
+        """Predict a belief, then correct it by the markers in view, if there are any.
+
+        Args:
+            belief: after the previous observation.
+            seen: candidates of this observation, from `look`.
+        """
         predicted = self.predict(belief, seen.snapshot.obs)
         belief, evidence = jax.lax.cond(
             jnp.any(seen.snapshot.seen.visible),
@@ -156,15 +177,20 @@ class Navigator(eqx.Module):
         return belief, Estimate.of(self.motion, belief, evidence)
 
     def look(self, obs: Observation) -> Consistent:
-        """The candidate poses, of all in view that can be a marker."""
+        """The candidate poses of an observation, without sightings that can be no marker."""
         return consistent(self.snapshot(obs), self.find_candidates, self.no_candidates())
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
-        """What is believed `dt_s` later, with the odometry where there is any."""
+        """The belief `obs.dt_s` later (Eq. 9), with the odometry fused where there is any."""
         return belief.predicted(self._sound(self.motion.predict(belief.bank, obs)))
 
     def correct(self, belief: Belief, seen: Consistent) -> tuple[Belief, Evidence]:
-        """Select a candidate for each predicted hypothesis, and update it."""
+        """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11).
+
+        Args:
+            belief: predicted.
+            seen: candidates of this observation, from `look`.
+        """
         motion, obs = self.motion, seen.snapshot.obs
         prior = numbered_anew_where_empty(belief.bank)
         predicted = motion.poses(prior)
@@ -187,7 +213,7 @@ class Navigator(eqx.Module):
         return belief, evidence
 
     def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
-        """What is predicted is what is believed: nothing is in view."""
+        """The predicted belief as the next one, where no marker is in view."""
         located = jnp.any(belief.bank.initialised)
         flip_probability = jnp.where(located, belief.flip_probability, 0)
         belief = belief.after(belief.bank, belief.decided & located, flip_probability)
@@ -196,10 +222,12 @@ class Navigator(eqx.Module):
     def act(
         self, control: ControlState | None, estimate: Estimate, obs: Observation
     ) -> tuple[ControlState | None, Output]:
-        """What to do at the pose that is believed.
+        """The command at the estimated pose (Eqs. 16-19).
 
         Args:
-            obs: of it speed, steering angle and `dt_s`, the time since the last command, are used.
+            control: the controller's state, None without a route.
+            estimate: from `sense`.
+            obs: its speed, steering angle and `dt_s`, the time since the last command, are used.
         """
         command, done, log = None, jnp.asarray(False), None
         if self.controller is not None and control is not None:
@@ -214,22 +242,22 @@ class Navigator(eqx.Module):
         return control, Output(**vars(estimate), command=command, done=done, control_log=log)
 
     def snapshot(self, obs: Observation) -> Snapshot:
-        """The observation, together with rig and map."""
+        """The observation with its rig and map, and its largest sightings."""
         sigmas_px = self.corner_sigma_px, self.model_sigma_px
         return Snapshot.create(self.rig, self.markers, obs, *sigmas_px, self.max_sightings)
 
     def find_candidates(self, snapshot: Snapshot, own: jaxlie.SE3 | None = None) -> Candidates:
-        """Both poses of every marker in view, refined; see `find_candidates`."""
+        """Both poses of every sighting, refined; see `jaxnav.pose.candidates.find_candidates`."""
         limits = self.max_candidates, self.max_lm_steps
         return find_candidates(snapshot, *limits, self.ground_plane, own)
 
     def no_candidates(self) -> Candidates:
-        """What `find_candidates` returns where nothing is in view."""
+        """Candidates as many as `find_candidates` returns, none of them valid."""
         count = min(self.max_candidates, 2 * slots(self.rig, self.markers, self.max_sightings))
         return Candidates.none(count, self.rig.cameras.focal_px.dtype)
 
     def no_evidence(self, belief: Belief) -> Evidence:
-        """By an observation without a marker."""
+        """The evidence of an observation without a marker."""
         return Evidence.none(self.no_candidates(), len(self.markers.ids), belief.bank.mean.dtype)
 
     def _sound(self, bank: Bank) -> Bank:
@@ -244,5 +272,5 @@ Step = Callable[[State, Observation], tuple[State, Output]]
 
 @jax.jit
 def jitted_step(navigator: Navigator, state: State, obs: Observation) -> tuple[State, Output]:
-    """`navigator.step`, one program for all navigators of a structure."""
+    """`navigator.step`, compiled once for all navigators with the same tree structure."""
     return navigator.step(state, obs)

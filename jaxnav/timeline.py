@@ -1,15 +1,13 @@
-"""What a car senses, each thing at its own time: fused where it belongs, however late it comes.
+"""Fusion of events at their own times, also where they arrive late or out of order.
 
-Cameras look when they look, the odometer has a rate of its own, and a frame is as old as its
-detection took. Whoever calls keeps the last events and what was believed after some of them (see
-`loop.history`); a late event is fused from the belief before it, and all that came after
-it once more, in one call:
+Cameras and odometer have rates of their own, and a frame is as old as its detection took. The
+caller keeps the last events, and the beliefs after some of them (see `loop.history`). A late event
+is fused from the belief before it, and the events after it are fused once more, in one call:
 
     belief, then, control, output = advance(navigator, belief, control, events, count, new, ...)
 
-In order, which is most of the time, that is one event and one turn of the loop. Where cameras look
-more often than their frames take to come, every frame is late: what was believed right after the
-one before, `then`, is where the next one starts.
+Events in order, the usual case, take one turn of the loop. Where a camera's period is shorter than
+its delay every frame is late: the belief right after a frame, `then`, is where the next one starts.
 
 Source: Larsen, Andersen, Ravn, Poulsen (1998), "Incorporation of time delayed measurements in a
 discrete-time Kalman filter", section 2 (the filter recalculated through the delay).
@@ -27,12 +25,12 @@ from jaxnav.control import ControlState
 from jaxnav.navigator import Navigator, Output
 from jaxnav.pose.observation import Observation
 
-# A pose is predicted to the present where its last event is older: at 1 m/s that is 1 mm.
+# A pose whose last event is older is predicted to the present: 1 mm at 1 m/s.
 FRESH_US = 1000
 
 
 class Corners(eqx.Module):
-    """What C cameras show of M markers in N readings."""
+    """Corners of M markers in C cameras, in N readings."""
 
     corners_px: Float[Array, "N C M 4 2"]
     visible: Bool[Array, "N C M"]
@@ -42,20 +40,22 @@ class Corners(eqx.Module):
 class Events(eqx.Module):
     """N readings in the order of their stamps: odometry, the corners of some cameras, or both."""
 
-    stamps_us: Int[Array, " N"]  # int32, since the moment that they are fused from
-    speed_mps: Float[Array, " N"]  # the last known where there is no odometry, NaN: never known
+    stamps_us: Int[Array, " N"]  # int32, time since the belief from which they are fused
+    speed_mps: Float[Array, " N"]  # the last reading where there is no odometry; NaN: none yet
     steering_rad: Float[Array, " N"]
     has_odometry: Bool[Array, " N"]
-    # None where none of them has any: a program without cameras, a third of the time of the other.
+    # None where no event has corners: that program takes a third of the time of the other.
     corners: Corners | None
 
     def at(
         self, index: Int[Array, ""], dt_s: Float[Array, ""], lanes: tuple[int, int]
     ) -> Observation:
-        """One of them, as `step` takes it.
+        """One event as an `Observation`.
 
         Args:
-            lanes: how many cameras and markers there are.
+            index: which event.
+            dt_s: time since the previous event.
+            lanes: (C, M), how many cameras and markers there are.
         """
         seen = self.corners
         return Observation(
@@ -79,21 +79,22 @@ def advance(
     now_us: Int[Array, ""],
     elapsed_us: Int[Array, ""],
 ) -> tuple[Belief, Belief, ControlState | None, Output]:
-    """Fuse events, and say where the vehicle is now and what it should do.
+    """Fuse events, predict to the present, and compute a command.
 
     Args:
-        belief: before the first of them.
-        control: of the last command.
-        events: the new one, and those around it that are to be fused, once more or with it.
-        count: how many of them there are; the rest of the N is not looked at.
-        new: which of them is the new one.
-        now_us: int32, since `belief`: the time for which pose and command are meant.
-        elapsed_us: int32, since the last command.
+        navigator: senses and acts.
+        belief: before the first event.
+        control: the controller's state after the last command, None without a route.
+        events: N slots, the first `count` of which are fused, in the order of their stamps: the
+            new event, and those around it that have to be fused once more.
+        count: how many events there are; the other slots are not read.
+        new: index of the new event.
+        now_us: int32, time since `belief` for which pose and command are meant.
+        elapsed_us: int32, time since the last command.
 
     Returns:
-        What is believed after the last event, what was after the new one, the controller's state,
-        and what is known: pose and command of the present, and what the corners of the new
-        event say.
+        The belief after the last event, the belief after the new event, the controller's state,
+        and the output: pose and command at `now_us`, with the evidence of the new event.
     """
     lanes = len(navigator.rig), len(navigator.markers.ids)
 

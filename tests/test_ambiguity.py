@@ -509,7 +509,7 @@ def ambiguous():
 
 def test_the_unit_of_length_decides(ambiguous):
     """In centimetres the prediction outweighs the image's error, in metres it hardly counts and
-    the rule is the lowest reprojection error (DESIGN 3.1)."""
+    the rule is the lowest reprojection error (docs/design.md, Units of the cost)."""
     margin, *arguments = ambiguous
     assert margin > 0.3
     prior = belief(worlds.planar(TRUTH[0] + 0.05, TRUTH[1] - 0.05, TRUTH[2] + 0.05))
@@ -524,7 +524,7 @@ def test_the_unit_of_length_decides(ambiguous):
 
 
 def test_a_misled_prediction_misleads_the_paper_s_rule(ambiguous):
-    """DESIGN 3.7: near the mirror pose the rule defends it."""
+    """Near the mirror pose the rule defends it (docs/design.md, Ambiguity)."""
     _, candidates, snapshot = ambiguous
     mirror = jaxlie.SE3(candidates.T_vehicle_world.wxyz_xyz[0]).inverse()
     assert int(select(PaperCost(), belief(mirror), candidates, snapshot).selected) == 0

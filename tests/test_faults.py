@@ -1,4 +1,4 @@
-"""The fault matrix: every fault comes to what it must (RELIABILITY)."""
+"""The fault matrix: every fault comes to what docs/promises.md says of it."""
 
 import dataclasses
 from collections.abc import Iterator

@@ -119,7 +119,10 @@ def killer(dtype) -> tuple[jnp.ndarray, float]:
 
 
 def test_the_known_killer(precision):
-    """A nearly frontal half turn 10 m away, on which OpenCV 5.0 fails in float32 (DESIGN 3.5)."""
+    """A nearly frontal half turn 10 m away, on which OpenCV 5.0 fails in float32.
+
+    See docs/design.md, Half turns.
+    """
     corners, size_m = killer(precision)
     pair = jax.jit(ippe_square)(corners, size_m)
     R = np.asarray(pair.T_camera_marker.rotation().as_matrix(), float)

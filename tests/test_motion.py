@@ -315,7 +315,7 @@ def test_ten_rejections_in_a_row_start_it_anew(kind):
 
 @pytest.mark.parametrize("kind", ["car", "free"])
 def test_rejections_that_contradict_each_other_start_nothing(kind):
-    """A reflection here, then there (RELIABILITY R3): only after a while it starts anew."""
+    """A reflection here, then there (docs/design.md, Restart): only later it starts anew."""
     patience = 30  # steps of 0.02 s
     motion, step = outlier_steps(kind, max_rejected_s=0.02 * patience - 0.001)
     belief = motion.init()

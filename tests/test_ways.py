@@ -95,7 +95,7 @@ def test_a_pose_within_the_way_is_in_reach_whatever_has_slipped(share, seconds):
 def test_a_pose_beyond_the_way_is_out_of_reach(by_m, turn_rad, out):
     drive = Drive(0.4)
     drive.seconds(1)
-    drive.seconds(0.34, looks=False)  # R3's ten frames
+    drive.seconds(0.34, looks=False)  # the ten frames of a restart
     assert drive.ways.out_of_reach(drive.fix(by_m, turn_rad)) == out
     assert not drive.ways.out_of_reach(drive.fix(by_m, turn_rad), slack_m=1.0)
 

@@ -1,1 +1,1 @@
-"""Which candidate to take, and what is believed after it."""
+"""Choice of a candidate, and the filter that takes it."""

@@ -1,12 +1,12 @@
-"""Which candidate is the true pose: the selectors that choose one, frame by frame.
+"""Selectors: rules that choose the true pose among the candidates of one frame.
 
 A selector is called as
 
     selection = selector(prior, candidates, snapshot)
 
-and says what each of the filter's K hypotheses takes as its measured pose. It sees the prediction
-as poses with covariances, whatever motion model made it, so car and hand-held rig share every
-selector. The selectors here keep K = 1 and take one candidate or none; `MultiHypothesis`, in
+and returns the pose that each of the filter's K hypotheses takes as measured. It is given the
+prediction as poses with covariances, whatever motion model made it, so car and hand-held rig share
+every selector. The selectors here keep K = 1 and take one candidate or none; `MultiHypothesis`, in
 `hypotheses.py`, carries K > 1 and postpones the choice.
 """
 
@@ -40,46 +40,46 @@ class PoseBelief(eqx.Module):
     log_weight: Float[Array, " K"]
     initialised: Bool[Array, " K"]  # False before the first pose
     freedom: Float[Array, "6 d"]  # the directions of xi in which the vehicle can move
-    # What no filter follows, times its sigma: a car rolls, pitches and bounces a little, and its
-    # cameras point a little elsewhere than the calibration says. xi = nuisance @ N(0, 1).
+    # Directions of xi that the filter does not estimate, times their sigma: xi = nuisance @ N(0,1):
+    # a car rolls, pitches and bounces, and its cameras deviate from their calibration.
     nuisance: Float[Array, "6 t"]
-    # Measured poses farther from the prediction than this, as NIS, the filter keeps out.
+    # The filter rejects measured poses whose NIS exceeds this.
     gate_nis: Float[Array, ""] | float
 
 
 class PoseMeasurement(eqx.Module):
-    """What each hypothesis takes as measured. Lanes that take nothing hold finite numbers."""
+    """The pose that each hypothesis takes as measured; finite numbers where `taken` is False."""
 
     T_world_vehicle: jaxlie.SE3  # batch axis (K,)
     covariance: Float[Array, "*K 6 6"]  # of xi in T_world_vehicle * exp(xi)
-    log_misfit: Float[Array, "*K"]  # how probable what is left of the corners is, up to a constant
+    log_misfit: Float[Array, "*K"]  # log p(residuals at the pose), up to a constant
     taken: Bool[Array, "*K"]
 
 
 class PosePosterior(eqx.Module):
-    """What each hypothesis believes after it has looked at the corners itself.
+    """The corrected pose of each hypothesis: prediction and corners fused by the selector.
 
-    For selectors that weigh prediction and corners together: the filter follows, and corrects the
-    rest of its state. Lanes that have taken nothing hold finite numbers.
+    The filter adopts it and corrects the rest of its state by regression (`motion.followed`).
+    Lanes where `taken` is False hold finite numbers.
     """
 
     T_world_vehicle: jaxlie.SE3  # batch axis (K,)
     covariance: Float[Array, "*K 6 6"]  # of xi in T_world_vehicle * exp(xi)
     innovation: Float[Array, "*K d"]  # of the corners, whitened: its square is the NIS
-    # What the covariance was multiplied with: so much more contradiction the gate lets pass. It is
-    # counted all the same.
+    # Factor on the covariance. The gate admits a NIS up to inflation * gate_nis; above gate_nis it
+    # is counted as a rejection all the same.
     inflation: Float[Array, "*K"]
     log_likelihood: Float[Array, "*K"]  # of the corners given the prediction, up to a constant
     taken: Bool[Array, "*K"]
 
 
 class Selection(eqx.Module):
-    """What a selector decided."""
+    """The decision of a selector about K hypotheses and N candidates."""
 
     measured: PoseMeasurement | PosePosterior
     kept: Bool[Array, " K"]  # False: this hypothesis is given up, or starts anew from `measured`
     log_weight: Float[Array, " K"]  # after this observation
-    heir: Int[Array, " K"]  # the hypothesis that takes this one in; its own index where it stays
+    heir: Int[Array, " K"]  # the hypothesis into which this one merges; its own index: none
     costs: Float[Array, " N"]  # of the candidates, in the selector's unit; inf where invalid
     selected: Int[Array, ""]  # candidate of the reported hypothesis, -1: none
     flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
@@ -88,11 +88,11 @@ class Selection(eqx.Module):
 
 @runtime_checkable
 class Selector(Protocol):
-    """The signature all selectors share."""
+    """The signature that all selectors share."""
 
     @property
     def hypotheses(self) -> int:
-        """K, the number of hypotheses it keeps."""
+        """K, the number of hypotheses that the selector keeps."""
         ...
 
     def __call__(
@@ -101,10 +101,10 @@ class Selector(Protocol):
 
 
 class LowestReprojection(eqx.Module):
-    """The candidate with the lower e1: the paper's Method A, what AprilTag does.
+    """Selects the candidate with the lowest e1 (px^2): the paper's Method A, and AprilTag's rule.
 
-    Needs no prediction, and so can't be misled by one. It can't tell poses apart whose e1 differ
-    by less than the noise: weak perspective, motion blur.
+    It needs no prediction and can't be misled by one. It can't distinguish poses whose e1 differ by
+    less than the noise does, as under weak perspective or motion blur.
 
     Source: Liu, Schofield, Shan (2023), section III; Olson (2011).
     """
@@ -116,10 +116,10 @@ class LowestReprojection(eqx.Module):
 
 
 class RatioTest(eqx.Module):
-    """The candidate with the lower e1, where the other's is clearly higher; else none.
+    """Selects the candidate with the lowest e1 where sqrt(e1 / e1 of the second) <= max_ratio.
 
-    Trades coverage for correctness: from far away, or face to face with the marker, it gives
-    no pose at all, and a wrong pose with a clearly lower error still passes.
+    It trades coverage for correctness: from far away, or face to face with the marker, it selects
+    none, and a wrong pose with a clearly lower error still passes.
 
     Source: Munoz-Salinas et al. (2018), "Mapping and localization from planar markers", section
     4.2; PhotonVision's "pose ambiguity" is the same ratio.
@@ -136,10 +136,10 @@ class RatioTest(eqx.Module):
 
 
 class ObjectSpace(eqx.Module):
-    """The candidate with the lower e2: the nearer one to the filter's prediction, in space.
+    """Selects the candidate with the lowest e2 (m^2): the nearest to the filter's prediction.
 
-    Before the first pose the lower e1. It defends whatever the filter believes, whether or not the
-    image speaks against it: a wrong start is never repaired.
+    Before the first pose it selects the lowest e1. It keeps to whatever the filter believes, also
+    where the image contradicts it, so it does not repair a wrong start.
 
     Source: Wu et al., as cited by Liu, Schofield, Shan (2023), Eq. 14.
     """
@@ -153,11 +153,12 @@ class ObjectSpace(eqx.Module):
 
 
 class PaperCost(eqx.Module):
-    """The candidate with the lower e = e1 + e2 against the filter's prediction.
+    """Selects the candidate with the lowest e = e1 + e2 / length_unit_m^2: the paper's rule.
 
-    e1 in pixel^2 and e2 in squared lengths are added as they are, so the unit of length weighs
-    one against the other; the paper worked in centimetres. Before the first pose e is e1 alone: a
-    wrong start is followed by a prediction near the wrong pose, and the rule defends it.
+    e1 is in px^2 and e2, against the filter's prediction, in squared lengths. They are added
+    unscaled, so the unit of length is a weight; the paper worked in centimetres (see
+    docs/design.md, Units of the cost). Before the first pose e is e1 alone: a wrong start is
+    followed by a prediction near the wrong pose, and the rule keeps to it.
 
     Source: Liu, Schofield, Shan (2023), Eqs. 13-15.
     """
@@ -172,11 +173,13 @@ class PaperCost(eqx.Module):
 
 
 class Mahalanobis(eqx.Module):
-    """The candidate that image and prediction together make the most probable.
+    """Selects the candidate that image and prediction together make the most probable.
 
-    Both errors are whitened, e1 by the corners' sigma and the distance to the prediction by the
-    covariances of both, so no unit has to be chosen. It decides in every frame, for good: a wrong
-    start is defended as the paper's rule defends it, only with better weights.
+        cost = |r|^2 / sigma^2 - log |C| + |xi|^2_S + log |S|,    S = P + C,
+
+    with the residuals r, the candidate's covariance C (6, 6), the predicted one P (6, 6), and the
+    displacement xi (6,) between candidate and prediction. No unit has to be chosen. It decides in
+    every frame, for good: like the paper's rule it keeps to a wrong start.
 
     Source: Bar-Shalom, Li (1995), "Multitarget-multisensor tracking", nearest neighbour
     with normalised distance; MacKay (2003), chapter 27, for the volume of a minimum.
@@ -205,13 +208,13 @@ class Mahalanobis(eqx.Module):
 
 
 class OrientationGiven(eqx.Module):
-    """The candidate that agrees with another sensor: a heading, or the markers' normals.
+    """Selects the candidate that agrees with another sensor: a heading, or the markers' normals.
 
     The observation brings them, each with its sigma: `heading_rad` from a compass or a gyro that
     was aligned before (MegaTag2), `normals_camera` from an RGB-D camera (Jin et al.) or from
-    lenticular markers (Tanaka et al.). Adds their whitened squared error to that of the corners.
-    Where the observation brings neither it is the lower whitened e1, as wide as its minimum is;
-    it believes the sensor without asking whether it can be right.
+    lenticular markers (Tanaka et al.). Their whitened squared error is added to the cost of the
+    corners, |r|^2 / sigma^2 - log |C| with the candidate's covariance C (6, 6); without a reading
+    that alone is the cost. The sensor is believed without a check of its plausibility.
 
     Source: Jin, Matikainen, Srinivasa (2017), "Sensor fusion for fiducial tags"; Tanaka et
     al. (2014), "Solution to pose ambiguity of visual markers using moire patterns"; Limelight's
@@ -236,7 +239,7 @@ class OrientationGiven(eqx.Module):
 
 
 class Oracle(eqx.Module):
-    """The candidate nearest to the truth in angle. For studies: the best any selector could do."""
+    """Selects the candidate nearest to the truth in angle, which bounds all other selectors."""
 
     hypotheses: ClassVar[int] = 1
 
@@ -258,7 +261,7 @@ def _cheapest(
     doubts: Float[Array, " N"] | None = None,
     accepted: Bool[Array, ""] | bool = True,
 ) -> Selection:
-    """The cheapest valid candidate for a single hypothesis, if it is `accepted`.
+    """The selection of the cheapest valid candidate for a single hypothesis, if `accepted`.
 
     Args:
         doubts: probability of each candidate to be the wrong one; by default what this image
@@ -290,7 +293,7 @@ def _cheapest(
 
 
 def _doubt(valid: Bool[Array, " N"], costs: Float[Array, " N"]) -> Float[Array, " N"]:
-    """Probability of each candidate to be wrong, when exp(-cost / 2) is how probable it is."""
+    """Probability of each candidate to be wrong, where exp(-cost / 2) is its likelihood."""
     best = jnp.min(jnp.where(valid, costs, jnp.inf))
     excess = jnp.where(valid, costs - best, 0)
     likelihood = jnp.where(valid, jnp.exp(-excess / 2), 0)
@@ -299,7 +302,7 @@ def _doubt(valid: Bool[Array, " N"], costs: Float[Array, " N"]) -> Float[Array, 
 
 
 def _log_determinants(covariances: Float[Array, "N 6 6"]) -> Float[Array, " N"]:
-    """Of covariances whose entries may differ by many orders of magnitude."""
+    """log |C| of covariances whose entries may differ by many orders of magnitude."""
 
     def one(covariance: Array) -> Array:
         sigma = jnp.sqrt(jnp.diagonal(covariance))
@@ -321,7 +324,7 @@ def _object_space_m2(
 
 
 def _normals_error(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, ""]:
-    """Squared angles between the markers' normals and the measured ones, in sigmas."""
+    """Sum of squared angles between the markers' normals and the measured ones, in sigmas^2."""
     obs, rig = snapshot.obs, snapshot.rig
     assert obs.normals_camera is not None
     matrices = jax.vmap(rotation_matrix)

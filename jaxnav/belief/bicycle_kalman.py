@@ -35,16 +35,21 @@ from jaxnav.pose.observation import Observation
 class BicycleKalman(Motion):
     """The paper's six-state filter for a car: x, y, psi, v_x, v_y, psi_dot in the world.
 
-    The state moves at constant velocity (Eq. 9); the pose of the chosen candidate measures the
-    first half, odometer and steering the second. Two things the paper leaves open:
+        x = A x,  P = A P A' + Q,    A = [I, dt I; 0, I]                               (Eq. 9)
+        K = P H' (H P H' + R)^-1,  x += K (z - H x)                            (Eqs. 10, 11)
+
+    The pose of the chosen candidate measures the first half of the state, odometer and steering the
+    second. The paper leaves open (see docs/design.md, Odometry and the headings before it):
 
     * The odometry's v (cos(beta + psi), sin(beta + psi)) depends on the state's own heading. Its
       innovation uses the predicted psi, and H carries the derivative, so a correction of
       the heading turns the velocity along and the drift of the position corrects the heading.
     * Q and the odometry's noise are given in the vehicle's axes, since wheels slip along and across
-      themselves: numbers learned on one course hold on another.
+      themselves: numbers learned on one course are valid on another.
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
-      floor, since errors of successive frames are correlated (RELIABILITY R8).
+      floor, since errors of successive frames are correlated.
+
+    Source: Liu, Schofield, Shan (2023), Eqs. 8-11.
     """
 
     vehicle: Vehicle
@@ -62,12 +67,12 @@ class BicycleKalman(Motion):
     )  # before the first odometry, m/s m/s rad/s
     tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
     height_sigma_m: float = 0.002
-    gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 % (RELIABILITY R1); inf: no gate
-    max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
-    max_rejected_s: float = 7.0  # whether they agree or not
+    gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 %; inf: no gate
+    max_rejections: int = eqx.field(static=True, default=10)  # in a row that agree: forgotten
+    max_rejected_s: float = 7.0  # of rejections, whether they agree or not: forgotten
 
     def init(self, hypotheses: int = 1) -> Bank:
-        """Hypotheses that have seen nothing."""
+        """A bank of K hypotheses before the first pose."""
         return unstarted(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, 3, hypotheses)
 
     def predict(self, bank: Bank, obs: Observation) -> Bank:
@@ -86,7 +91,7 @@ class BicycleKalman(Motion):
         return contradicted(bank, self.max_rejections, self.max_rejected_s)
 
     def poses(self, bank: Bank) -> PoseBelief:
-        """Level on the ground (Eq. 12), as far as `tilt_sigma_rad` and `height_sigma_m` go."""
+        """Poses level on the ground (Eq. 12); height, roll and pitch are nuisances with a sigma."""
         T_world_vehicle = T_world_vehicle_from_planar(bank.mean[:, :3])
         dtype = bank.mean.dtype
         freedom = jnp.asarray(ON_GROUND, dtype)
@@ -150,25 +155,25 @@ class BicycleKalman(Motion):
         )
 
     def difference(self, mean: Array, base: Array) -> Array:
-        """Of the states, the heading's wrapped."""
+        """mean - base, (6,), with the heading wrapped."""
         apart = mean - base
         return apart.at[2].set(wrap_angle(apart[2]))
 
     def moved(self, base: Array, error: Array) -> Array:
-        """The sum, its heading wrapped."""
+        """base + error, (6,), with the heading wrapped."""
         mean = base + error
         return mean.at[2].set(wrap_angle(mean[2]))
 
     def on_ground(self, mean: Array) -> tuple[Array, Array]:
-        """The two halves of the state."""
+        """The two halves of the state: pose and velocity, (3,) each."""
         return mean[:3], mean[3:]
 
     def planar(self, mean: Array, covariance: Array) -> Planar:
-        """The state itself."""
+        """Pose and velocity as they stand in the state, which is planar."""
         return Planar(mean[:3], covariance[:3, :3], mean[3:], covariance[3:, 3:])
 
     def _first(self, pose: Array, covariance: Array, obs: Observation) -> tuple[Array, Array]:
-        """The state of a hypothesis that starts: a pose, at rest as far as the odometry tells."""
+        """Mean and covariance of a hypothesis that starts at a pose, moving as measured."""
         zero = jnp.zeros((3, 3), pose.dtype)
         velocity = jnp.diag(self.initial_velocity_sigma**2)
         return self._with_odometry(
@@ -209,12 +214,12 @@ class BicycleKalman(Motion):
 def planar_poses(
     bank: Bank,
 ) -> tuple[Float[Array | np.ndarray, "K 3"], Float[Array | np.ndarray, "K 3 3"]]:
-    """(x_m, y_m, psi_rad) of every hypothesis of a car, and its covariance; or NumPy's of such."""
+    """(x_m, y_m, psi_rad) of every hypothesis of a car, and its covariance, of JAX or NumPy."""
     return bank.mean[:, :3], bank.covariance[:, :3, :3]
 
 
 def _turn(angle_rad: Array) -> Array:
-    """(x, y, psi) turned about z."""
+    """Rotation (3, 3) of (x, y, psi) about z."""
     c, s, zero, one = jnp.cos(angle_rad), jnp.sin(angle_rad), angle_rad * 0, angle_rad * 0 + 1
     rows = ([c, -s, zero], [s, c, zero], [zero, zero, one])
     return jnp.stack([jnp.stack(row) for row in rows])

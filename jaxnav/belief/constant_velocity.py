@@ -23,8 +23,10 @@ class ConstantVelocity(Motion):
     """A body that moves freely: pose on SE(3) and body twist, for hand-held and aerial rigs.
 
     The mean is (wxyz, xyz) of T_world_vehicle followed by the twist (m/s, rad/s) in vehicle axes;
-    the 12 error states are xi in `T_world_vehicle * cay(xi)` and the twist's own error. There is no
-    odometry. Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
+    the 12 error states are xi in `T_world_vehicle * cay(xi)` and the error of the twist. Odometry
+    is not used.
+
+    Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
     """
 
     acceleration_density: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
@@ -36,21 +38,21 @@ class ConstantVelocity(Motion):
     initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
     )  # m/s and rad/s
-    lost_sigma_m: float = 0.5  # a prediction less certain than this is forgotten
-    gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 % (RELIABILITY R1); inf: no gate
-    max_rejections: int = eqx.field(static=True, default=10)  # that agree with each other
-    max_rejected_s: float = 7.0  # whether they agree or not
+    lost_sigma_m: float = 0.5  # a hypothesis whose position is less certain is forgotten
+    gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 %; inf: no gate
+    max_rejections: int = eqx.field(static=True, default=10)  # in a row that agree: forgotten
+    max_rejected_s: float = 7.0  # of rejections, whether they agree or not: forgotten
 
     def init(self, hypotheses: int = 1) -> Bank:
-        """Hypotheses that have seen nothing."""
+        """A bank of K hypotheses before the first pose."""
         mean = jnp.zeros(13, self.acceleration_density.dtype).at[0].set(1)
         return unstarted(mean, 12, 6, hypotheses)
 
     def predict(self, bank: Bank, obs: Observation) -> Bank:
-        """T = T exp(twist dt); the error turns with the frame.
+        """T = T exp(twist dt), P = F P F' + Q with F = [Ad(exp(-twist dt)), dt I; 0, I].
 
-        Without odometry a prediction is soon worth nothing: past `lost_sigma_m` the next pose
-        starts the filter anew. So it does where the gate has contradicted it too often or too long.
+        A hypothesis is forgotten, and started anew by its next pose, where the sigma of its
+        position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
         """
         dtype, dt_s = bank.mean.dtype, jnp.asarray(obs.dt_s, bank.mean.dtype)
         eye, zero = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
@@ -77,7 +79,7 @@ class ConstantVelocity(Motion):
         return contradicted(bank, self.max_rejections, self.max_rejected_s)
 
     def poses(self, bank: Bank) -> PoseBelief:
-        """The pose part of the state."""
+        """The pose part of the state: free in six directions, without nuisances."""
         return PoseBelief(
             jaxlie.SE3(bank.mean[:, :7]),
             bank.covariance[:, :6, :6],
@@ -124,17 +126,17 @@ class ConstantVelocity(Motion):
         )
 
     def difference(self, mean: Array, base: Array) -> Array:
-        """(xi, twist): from the pose `base`, in its axes."""
+        """(xi, difference of the twists), (12,): mean = base * cay(xi), in the axes of `base`."""
         T_base_other = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
         return jnp.append(inverse_cayley(T_base_other), mean[7:] - base[7:])
 
     def moved(self, base: Array, error: Array) -> Array:
-        """The pose times cay(xi), the twist plus its error."""
+        """The mean (13,) at an error (12,): base * cay(xi), and the twist plus its error."""
         T = (jaxlie.SE3(base[:7]) @ cayley(error[:6])).normalize()
         return jnp.append(T.wxyz_xyz, base[7:] + error[6:])
 
     def on_ground(self, mean: Array) -> tuple[Array, Array]:
-        """Of the pose and of the twist, turned into the world: how it moves seen from above."""
+        """(x, y, psi) and (v_x, v_y, psi_dot) in the world: pose and motion seen from above."""
         T_world_vehicle = jaxlie.SE3(mean[:7])
         R_world_vehicle = rotation_matrix(T_world_vehicle.rotation())
         v_mps, w_radps = applied(R_world_vehicle, mean[7:10]), applied(R_world_vehicle, mean[10:])
@@ -145,7 +147,7 @@ class ConstantVelocity(Motion):
         return planar_from_T_world_vehicle(T_world_vehicle), jnp.append(v_mps[:2], turn_radps)
 
     def _first(self, wxyz_xyz: Array, covariance: Array) -> tuple[Array, Array]:
-        """The state of a body that starts: a pose, at rest as far as anybody knows."""
+        """Mean and covariance of a hypothesis that starts at a pose, with an unknown velocity."""
         zero = jnp.zeros((6, 6), wxyz_xyz.dtype)
         velocity = jnp.diag(self.initial_velocity_sigma**2)
         P = jnp.block([[covariance, zero], [zero, velocity]])

@@ -1,4 +1,4 @@
-"""What is carried from one observation to the next, and what is reported of it."""
+"""`Belief`, the filter's state between observations, and `Estimate`, what is reported of it."""
 
 from dataclasses import fields, replace
 
@@ -14,34 +14,34 @@ from jaxnav.pose.candidates import Candidates
 
 
 class Belief(eqx.Module):
-    """What is believed after an observation: all that the next one starts from."""
+    """The filter's state after an observation: all that the next one starts from."""
 
     bank: Bank
     decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
     flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
-    restarts: Int[Array, ""]  # how often all that was believed had to be given up, so far
+    restarts: Int[Array, ""]  # how often all hypotheses were forgotten so far
 
     @staticmethod
     def begin(bank: Bank) -> "Belief":
-        """Nothing sensed yet."""
+        """The belief before the first observation, with an empty bank."""
         nothing = jnp.zeros((), bank.mean.dtype)
         return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32))
 
     def predicted(self, bank: Bank) -> "Belief":
-        """With its hypotheses later on. Where none of them is left, that counts as a restart."""
+        """The belief with its bank predicted; a restart is counted where no hypothesis is left."""
         given_up = jnp.any(self.bank.initialised) & ~jnp.any(bank.initialised)
         return replace(self, bank=bank, restarts=self.restarts + given_up)
 
     def after(
         self, bank: Bank, decided: Bool[Array, ""], flip_probability: Float[Array, ""]
     ) -> "Belief":
-        """The next one."""
+        """The belief after an observation, which keeps the number of restarts."""
         flip_probability = flip_probability.astype(self.flip_probability.dtype)
         return Belief(bank, decided, flip_probability, self.restarts)
 
 
 class Believed(eqx.Module):
-    """What is reported of a belief: its heaviest hypothesis, and how sure of that it is."""
+    """The reported part of a belief: pose and covariance of its heaviest hypothesis."""
 
     pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
     pose_covariance: Float[Array, "3 3"]
@@ -50,13 +50,13 @@ class Believed(eqx.Module):
     covariance: Float[Array, "d d"]  # of the state's error: (6, 6) for a car, see the motion model
     T_world_vehicle: jaxlie.SE3
     located: Bool[Array, ""]  # False until the first pose was taken
-    hypothesis: Int[Array, ""]  # the one reported; while it survives, it keeps its number
+    hypothesis: Int[Array, ""]  # number of the reported one, kept while it survives
     flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
     decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
 
     @staticmethod
     def of(motion: Motion, belief: Belief) -> "Believed":
-        """The heaviest hypothesis, its covariance that of the whole bank about it."""
+        """The heaviest hypothesis; its covariance is the bank's second moment about its mean."""
         bank, best = belief.bank, heaviest(belief.bank)
         Ts_world_vehicle = motion.poses(bank).T_world_vehicle
         covariance = motion.error_covariance(bank, best)
@@ -72,21 +72,21 @@ class Believed(eqx.Module):
 
 
 class Evidence(eqx.Module):
-    """What the corners of an observation say."""
+    """Candidates, costs and gate of one observation's corners."""
 
     candidates: Candidates
     costs: Float[Array, " N"]  # of the candidates, in the selector's unit
-    selected: Int[Array, ""]  # the candidate taken, -1: none
+    selected: Int[Array, ""]  # index of the candidate taken, -1: none
     accepted: Bool[Array, ""]  # the filter has taken the pose
-    nis: Float[Array, ""]  # of the pose taken, 0 where none was
+    nis: Float[Array, ""]  # of the pose taken, 0 where there was none
     gate_nis: Float[Array, ""]  # a larger one contradicts the prediction, accepted or not
     outvoted: Bool[Array, " M"]  # markers that the others in view contradict
-    # Of the corners given what the whole bank had predicted, up to a constant; 0 at a start.
+    # log p(corners | prediction of the whole bank), up to a constant; 0 at a start.
     log_likelihood: Float[Array, ""]
 
     @staticmethod
     def none(candidates: Candidates, markers: int, dtype: DTypeLike) -> "Evidence":
-        """No marker is in view.
+        """The evidence of an observation without a marker in view.
 
         Args:
             candidates: none of them valid.
@@ -107,14 +107,14 @@ class Evidence(eqx.Module):
 
 
 class Estimate(Believed, Evidence):
-    """Everything that is known after one observation."""
+    """All that is known after one observation: the belief's report and the corners' evidence."""
 
     @staticmethod
     def of(motion: Motion, belief: Belief, evidence: Evidence) -> "Estimate":  # type: ignore[override]
-        """What is believed, and what the corners say."""
+        """The estimate of a belief and of the evidence that led to it."""
         return Estimate(**vars(Believed.of(motion, belief)), **vars(evidence))
 
     @property
     def evidence(self) -> Evidence:
-        """What the corners say, alone."""
+        """The fields of `Evidence` alone."""
         return Evidence(**{field.name: getattr(self, field.name) for field in fields(Evidence)})

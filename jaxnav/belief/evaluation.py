@@ -1,4 +1,4 @@
-"""Estimates held against the truth: which branch was taken, and how far off it was."""
+"""Comparison of estimates with the truth: the branch that was taken, and position errors."""
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ OUTLIER_DEG = 10.0
 
 
 class Branch(eqx.Module):
-    """What the truth says of one choice. A frame is at most one of `wrong` and `outlier`."""
+    """Verdict on one choice of a candidate. At most one of `wrong` and `outlier` is True."""
 
     judged: Bool[Array, ""]  # a candidate was taken
     wrong: Bool[Array, ""]  # another candidate is closer to the truth in angle
@@ -24,7 +24,13 @@ class Branch(eqx.Module):
 def judge_branch(
     candidates: Candidates, selected: Int[Array, ""], T_world_vehicle_true: jaxlie.SE3
 ) -> Branch:
-    """Whether the selected candidate is the one nearest to the truth in angle."""
+    """Whether the selected candidate is the one nearest to the truth in angle.
+
+    Args:
+        candidates: N poses of one observation.
+        selected: index of the candidate that was taken, -1: none.
+        T_world_vehicle_true: the true pose.
+    """
     angles_rad = jax.vmap(
         lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T_world_vehicle_true)
     )(candidates.T_vehicle_world)

@@ -1,7 +1,7 @@
-"""How a bank of hypotheses starts: as a fan over the directions a marker may be seen from.
+"""The first hypotheses of a bank: a fan over the directions a marker may be seen from.
 
-Range and bearing of a marker are measured well, so one candidate tells them; the viewing direction
-is what is left open.
+A single candidate gives range and bearing of the marker well; only the viewing direction is open.
+See docs/design.md, Cold start.
 """
 
 import jax
@@ -16,21 +16,27 @@ from jaxnav.numerics.small_matrices import product, sandwich
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Snapshot
 
-CANDIDATES = 3  # at most so many stand beside the fan
-_FAN_RAD = float(np.deg2rad(80.0))  # from the marker's normal
-_RANGE_SIGMA = 0.1  # how well a fan starts: of the range
+CANDIDATES = 3  # largest number of candidates beside the fan
+_FAN_RAD = float(np.deg2rad(80.0))  # largest viewing angle, from the marker's normal
+_RANGE_SIGMA = 0.1  # sigma of the start, as a share of the range
 _BEARING_SIGMA_RAD = 0.1
-_CANDIDATE_LOG_WEIGHT = -5.0  # of a candidate beside the fan
+_CANDIDATE_LOG_WEIGHT = -5.0  # of a candidate, where a member of the fan has 0
 
 
 def fan(
     prior: PoseBelief, candidates: Candidates, snapshot: Snapshot, hypotheses: int
 ) -> PoseBelief:
-    """All viewing directions that range and bearing leave open, and the candidates.
+    """K hypotheses: the best candidate turned about the marker, then up to three candidates.
 
-    A car turns about the vertical through the marker; a free body in two angles. The candidates
-    weigh little: they are there for markers that are not upright, of which no other member
-    of a car's fan explains the corners.
+    The fan of a car turns about the vertical through the marker's centre, that of a free body in
+    two angles. The candidates weigh little; they serve markers that do not hang upright, whose
+    corners no member of a car's fan explains.
+
+    Args:
+        prior: an empty bank: its `freedom` says whether the vehicle is a car.
+        candidates: the first is turned about the largest marker in view.
+        snapshot: what is seen.
+        hypotheses: K.
     """
     slots = min(candidates.valid.shape[0], CANDIDATES)
     count = hypotheses - slots
@@ -149,7 +155,7 @@ def _shortest_turn(direction: Float[Array, " 3"]) -> jaxlie.SO3:
 
 
 def normalised(log_weight: Float[Array, " K"]) -> Float[Array, " K"]:
-    """Weights that sum to 1; all as they are where none is finite."""
+    """Log-weights shifted so that the weights sum to 1; unchanged where none is finite."""
     highest = jnp.max(log_weight)
     any_finite = jnp.isfinite(highest)
     shifted = jnp.where(any_finite, log_weight - jnp.where(any_finite, highest, 0), 0)

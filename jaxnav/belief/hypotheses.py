@@ -35,28 +35,38 @@ from jaxnav.pose.observation import Snapshot
 
 
 class MultiHypothesis(eqx.Module):
-    """Every pose that explains what was seen so far, weighed; the heaviest is reported.
+    """A selector that keeps K weighted hypotheses of the vehicle's pose and reports the heaviest.
 
-    `flip_probability` is the mass farther than `far_rad` from the reported pose, its own tails
-    included. The bank calls itself decided when hypotheses of less than `decided_mass` lie that
-    far off and the orientation is known to `decided_sigma_rad`; until then the car explores (see
-    `control.py`).
+    Each hypothesis k minimises e(T) = |r(T)|^2 / sigma^2 + |xi|^2_P next to its prediction, and its
+    weight is multiplied with Laplace's evidence at the minimum:
 
-    It can't decide while nothing moves and the image is silent, and it takes the corner errors of
-    different frames for independent: tell it the sigma of their sum, calibration included.
+        log w_k += -e(T_k) / 2 - log |A + I| / 2,
+
+    where A is J'J of the corners in units of the prediction's sigma.
+
+    `flip_probability` is the mass farther than `far_rad` from the reported pose, with the tails of
+    every hypothesis. The bank is `decided` when hypotheses farther off than `far_rad` weigh less
+    than `decided_mass` and the orientation is known to `decided_sigma_rad`; until then the car
+    explores (see `control.Exploration` and docs/design.md, Ambiguity).
+
+    The bank can't decide while the vehicle stands and both poses fit the image equally well. It
+    takes the corner errors of different frames for independent: the corners' sigma has to include
+    what calibration leaves.
+
+    Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27.
     """
 
     hypotheses: int = eqx.field(static=True, default=24)  # >= 5
     max_steps: int = eqx.field(static=True, default=6)
-    floor_m: float = 0.0001  # of what successive frames get wrong alike (RELIABILITY R8)
+    floor_m: float = 0.0001  # sigma of the error that successive frames share
     floor_rad: float = 0.0001
     merge_distance: float = 0.6  # Mahalanobis, between two means that become one
-    linear_rad: float = float(np.deg2rad(3.0))  # an angle, and as much of the range
-    forget_log_weight: float = -20.0  # lighter ones are dropped
-    outlier_log_evidence: float = -12.0  # what a single frame can say against a hypothesis
-    max_inflation: float = 10.0  # of a covariance, where prediction and corners disagree
-    max_misfit: float = np.inf  # times a corner's sigma, where no pose explains the corners
-    gate: float = 30.0  # whitened squared distance to the corners' own minimum; above: an outlier
+    linear_rad: float = float(np.deg2rad(3.0))  # means this close merge; times the range for shifts
+    forget_log_weight: float = -20.0  # lighter hypotheses are dropped
+    outlier_log_evidence: float = -12.0  # bounds what one frame subtracts from a log-weight
+    max_inflation: float = 10.0  # largest factor on covariances where all hypotheses misfit
+    max_misfit: float = np.inf  # largest factor on the corners' sigma where no pose fits them
+    gate: float = 30.0  # excess cost over the best candidate; above it the frame is an outlier
     far_rad: float = float(np.deg2rad(20.0))
     decided_mass: float = 3e-5
     decided_sigma_rad: float = float(np.deg2rad(12.0))
@@ -67,15 +77,24 @@ class MultiHypothesis(eqx.Module):
             raise ValueError(f"hypotheses must be at least {least}: a fan and the candidates")
 
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
-        """Weigh the hypotheses by the corners, and say what pose each has measured."""
+        """Correct the pose of each hypothesis by the corners, and weigh it by its evidence.
+
+        Args:
+            prior: K predicted hypotheses; a fan replaces them where none is initialised.
+            candidates: N poses of this observation.
+            snapshot: the observation with its rig and map.
+
+        Returns:
+            A `PosePosterior` for each hypothesis, with weights, heirs and `decided`.
+        """
         any_seen = jnp.any(snapshot.seen.visible)
         snapshot = self._trusted(snapshot, candidates)
         starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
         count, bank = prior.log_weight.shape[0], prior
-        if count == self.hypotheses:  # else whoever left the rest away knows that none starts
+        if count == self.hypotheses:  # a bank is cut only where none of its hypotheses starts
             bank = _started(starts, prior, candidates, snapshot)
         floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
-        # All slots take as many steps as the slowest: empty ones do what the heaviest does.
+        # All slots take as many steps as the slowest, so an empty slot repeats the heaviest one.
         heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
         does_as = jnp.where(bank.initialised, jnp.arange(count), heaviest)
         starts_at = _at(_poses(bank), does_as)
@@ -89,7 +108,7 @@ class MultiHypothesis(eqx.Module):
         log_weight = normalised(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
         alive = alive & (log_weight > self.forget_log_weight)
 
-        # What the gate keeps out moves nothing: such a hypothesis is where it was predicted.
+        # A hypothesis whose pose the gate rejects stays where it was predicted.
         passes = starts | (_nis(posteriors) <= prior.gate_nis * inflation)
         after = where(passes, _poses(posteriors), _poses(bank))
         best = jnp.argmax(log_weight)
@@ -125,10 +144,10 @@ class MultiHypothesis(eqx.Module):
         )
 
     def _trusted(self, snapshot: Snapshot, candidates: Candidates) -> Snapshot:
-        """The corners, trusted no more than their own misfit allows.
+        """The snapshot with the corners' sigma raised where no pose explains the corners.
 
-        Where not even the best pose explains them within three sigmas of chi-square, their sigma is
-        larger than they say: a blurred, bent or half hidden marker.
+        Where the cost of the best candidate exceeds its chi-square by three sigmas, the sigma is
+        multiplied so that it does not: the marker is blurred, bent or half hidden.
         """
         seen = snapshot.seen
         misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
@@ -140,10 +159,11 @@ class MultiHypothesis(eqx.Module):
     def _inflation(
         self, fits: Fit, alive: Bool[Array, " K"], starts: Array, freedom: int
     ) -> Float[Array, ""]:
-        """By how much more than they say predictions and corners vary.
+        """Factor, at least 1, by which the covariances of prediction and corners are too small.
 
-        Where they contradict each other even in the hypothesis where they do least, all are wrong
-        alike: wheels slip, a stamp is late, a camera has turned.
+        It is the least NIS of the hypotheses over three sigmas of its chi-square. Where even that
+        one is contradicted, all hypotheses share one error: wheels slip, a stamp is late, a camera
+        has turned.
         """
         least = jnp.min(jnp.where(alive, _nis(fits.posterior), jnp.inf))
         known = jnp.isfinite(least) & ~starts
@@ -158,7 +178,7 @@ class MultiHypothesis(eqx.Module):
         candidates: Candidates,
         starts: Array,
     ) -> Float[Array, " K"]:
-        """What this frame adds to the log-weights, bounded; nothing where it fits none of them."""
+        """Bounded change of each log-weight by this frame; zeros where it fits no hypothesis."""
         forgiven = jnp.where(alive, _nis(fits.posterior), 0) * (1 - 1 / inflation) / 2
         log_evidence = fits.log_evidence + forgiven
         best = jnp.max(jnp.where(alive, log_evidence, -jnp.inf))
@@ -176,10 +196,11 @@ class MultiHypothesis(eqx.Module):
         freedom: Array,
         snapshot: Snapshot,
     ) -> Int[Array, " K"]:
-        """Who takes in whom: the heaviest of those close enough to be one Gaussian.
+        """Index of the hypothesis into which each one is merged; its own index where it stays.
 
-        Close is a fraction of the receiver's own sigma, or of an angle so small that the corners
-        are linear in it.
+        A hypothesis merges into the heaviest of those that are close: within `merge_distance`
+        sigmas of the receiver, where the sigma includes `linear_rad`, an angle so small that the
+        corners are linear in it.
         """
         count = log_weight.shape[0]
         T = poses.T_world_vehicle
@@ -205,7 +226,7 @@ class MultiHypothesis(eqx.Module):
         close = close & alive[:, None] & alive[None]
         rank = ranks(jnp.where(alive, log_weight, -jnp.inf))
         heavier = rank[:, None] < rank[None]
-        # A receiver is taken in by nobody itself.
+        # A hypothesis that receives others is not merged itself.
         takes = close & heavier
         takes = takes & ~jnp.any(takes, axis=0)[:, None]
         best_rank = jnp.where(takes, rank[:, None], count)
@@ -215,7 +236,7 @@ class MultiHypothesis(eqx.Module):
 def _started(
     starts: Bool[Array, ""], prior: PoseBelief, candidates: Candidates, snapshot: Snapshot
 ) -> PoseBelief:
-    """The prediction, or a fan where nothing has been seen before: computed only then."""
+    """The prediction, or a new fan where no hypothesis is initialised; computed only there."""
 
     def changing(bank: PoseBelief) -> tuple[Any, ...]:
         return bank.T_world_vehicle.wxyz_xyz, bank.covariance, bank.log_weight, bank.initialised
@@ -241,7 +262,7 @@ def _inflated(posteriors: PosePosterior, inflation: Float[Array, ""]) -> PosePos
 
 
 def _excess(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:
-    """Of a sum of squares over three sigmas of its chi-square; 1 below.
+    """Ratio of a sum of squares to its chi-square's mean plus three sigmas; 1 below it.
 
     Source: Birge (1932), "The calculation of errors by the method of least squares".
     """
@@ -263,7 +284,11 @@ def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:
 
 
 def _apart(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, " 6"]:
-    """Shift in the first pose's axes, and turn (rad, to second order), from it to the other."""
+    """(shift in the axes of `base`, m; turn, rad to second order) from `base` to `other`.
+
+    Args:
+        base, other: poses (wxyz, xyz).
+    """
     (w, v), (w_other, v_other) = (base[0], base[1:4]), (other[0], other[1:4])
     cosine = w * w_other + jnp.sum(v * v_other)
     sine = w * v_other - w_other * v - jnp.cross(v, v_other)
@@ -276,7 +301,7 @@ def _beyond(
     apart_rad: Float[Array, " K"],
     sigma_rad: Float[Array, " K"],
 ) -> Float[Array, " K"]:
-    """Probability that an angle with that mean and sigma is farther from 0 than a limit."""
+    """Probability that |N(apart_rad, sigma_rad^2)| exceeds a limit, for each hypothesis."""
     scale = np.sqrt(2) * jnp.maximum(sigma_rad, 1e-6)
     below, above = (limit_rad - apart_rad) / scale, (limit_rad + apart_rad) / scale
     return (jax.scipy.special.erfc(below) + jax.scipy.special.erfc(above)) / 2

@@ -1,4 +1,4 @@
-"""The linear Kalman filter: predict and update, nothing about vehicles.
+"""The linear Kalman filter: predict and update, independent of any vehicle.
 
 Source: Liu, Schofield, Shan (2023), Eqs. 8-11; the covariance update in the form of Bucy and
 Joseph (1968), since Eq. 11's (I - K H) P loses positive definiteness in float32.
@@ -34,12 +34,17 @@ def update(
     H: Float[Array, "m n"],
     R: Float[Array, "m m"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, "m m"]]:
-    """Correction of the mean, posterior covariance, and innovation covariance S = H P H' + R.
+    """One update of a linear Kalman filter, in Joseph's form.
+
+        S = H P H' + R,  K = P H' S^-1,  P = (I - K H) P (I - K H)' + K R K'
+
+    Returns:
+        Correction K @ innovation (n,) of the mean, posterior covariance (n, n), and S (m, m).
 
     A measurement that is missing is a zero row of H with a zero innovation and a unit variance,
     uncorrelated with the rest: it changes nothing (see `hide_rows`).
 
-    Source: Eqs. 10 and 11; P = (I - K H) P (I - K H)' + K R K'.
+    Source: Liu, Schofield, Shan (2023), Eqs. 10 and 11; Bucy, Joseph (1968).
     """
     HP = product(H, P)
     S = symmetrise(product(HP, H.T) + R)
@@ -55,29 +60,29 @@ def hide_rows(
     R: Float[Array, "m m"],
     present: Float[Array, " m"],
 ) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, "m m"]]:
-    """The measurement with the rows that are not `present` (0 or 1) made ineffective."""
+    """(innovation, H, R) with the rows where `present` is 0 made ineffective; 1 keeps a row."""
     kept = present[:, None] * present[None, :]
     return present * innovation, present[:, None] * H, kept * R + jnp.diag(1 - present)
 
 
 def whitened(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, " m"]:
-    """The innovation in units of its own sigma."""
+    """L^-1 innovation with S = L L': uncorrelated entries of variance 1."""
     return solve_lower(cholesky(S), innovation)
 
 
 def nis(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
-    """Normalised innovation squared, chi-square with m degrees of freedom."""
+    """Normalised innovation squared, innovation' S^-1 innovation: chi-square with m dof."""
     return jnp.sum(whitened(innovation, S) ** 2)
 
 
 def log_likelihood(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
-    """log N(innovation; 0, S) but for its constant, -m log(2 pi) / 2."""
+    """log N(innovation; 0, S) without its constant, -m log(2 pi) / 2."""
     factor = cholesky(S)
     return -(jnp.sum(solve_lower(factor, innovation) ** 2) + log_det(factor)) / 2
 
 
 def floored(posterior: Float[Array, "n n"], prior: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A covariance kept positive definite next to the prior's largest variance."""
+    """The posterior plus a floor, 1e-12 of the prior's largest variance, on its diagonal."""
     floor = _RELATIVE_FLOOR * jnp.max(jnp.diagonal(prior))
     return posterior + floor * jnp.eye(prior.shape[0], dtype=prior.dtype)
 
@@ -88,19 +93,21 @@ def symmetrise(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def as_covariance(sigma: Float[Array, " d"] | Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """The covariance that stands for itself, or of which standard deviations are given."""
+    """diag(sigma^2) of standard deviations (d,); a covariance (d, d) is returned as it is."""
     return jnp.diag(sigma**2) if sigma.ndim == 1 else sigma
 
 
 def as_matrix(density: Float[Array, " d"] | Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """The matrix itself, or the one with that diagonal."""
+    """diag(density) of a vector (d,); a matrix (d, d) is returned as it is."""
     return jnp.diag(density) if density.ndim == 1 else density
 
 
 def white_acceleration(
     density: Float[Array, " d"] | Float[Array, "d d"], dt_s: Float[Array, ""] | float
 ) -> Float[Array, "2*d 2*d"]:
-    """Q of a position-velocity state driven by white acceleration.
+    """Q of a position-velocity state driven by white acceleration of density D:
+
+        Q = [D dt^3 / 3, D dt^2 / 2; D dt^2 / 2, D dt].
 
     Args:
         density: power spectral density, (m/s^2)^2/Hz or (rad/s^2)^2/Hz: of each axis, or a matrix.

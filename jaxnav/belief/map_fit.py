@@ -1,9 +1,10 @@
-"""The update of hypotheses: the minimum of the paper's e next to its prediction.
+"""The pose of each hypothesis at the minimum of the paper's e next to its prediction.
 
     e(T) = |r(T)|^2 / sigma^2 + |xi|^2_P,      T = T_prior cay(xi),
 
-minimised over the directions in which the vehicle can move, instead of compared at two poses; with
-Laplace's evidence for the prediction, which weighs it.
+minimised over the directions in which the vehicle can move, instead of compared at two poses.
+Laplace's evidence at the minimum weighs the hypothesis. r are the residuals of the corners, P is
+the covariance of the prediction.
 
 Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27.
 """
@@ -39,7 +40,7 @@ from jaxnav.pose.observation import Snapshot, log_sigmas
 
 
 class Fit(eqx.Module):
-    """The minimum of e next to a prediction."""
+    """The minimum of e next to each of K predictions."""
 
     posterior: PosePosterior
     cost: Float[Array, "*K"]  # |r|^2 / sigma^2 at the minimum
@@ -57,10 +58,16 @@ def fit(
 ) -> Fit:
     """Minimise e over u, in units of the prediction's own sigma: xi = freedom L u, P = L L'.
 
+        e(u) = |r(T_prior cay(freedom L u))|^2 / sigma^2 + |u|^2
+
     Args:
-        T_world_prior: K predictions.
-        floor: standard deviations (m, rad) of what successive frames get wrong alike, which no
-            number of frames averages out.
+        T_world_prior: K poses at which the search starts, the predictions.
+        covariance: (K, 6, 6) of the predictions.
+        prior: gives `freedom` (6, d) and `nuisance` (6, t).
+        snapshot: what is seen.
+        floor: (6,) standard deviations (m, rad) of the error that successive frames share, which
+            no number of frames averages out.
+        max_steps: bound on the LM steps.
 
     Returns:
         K minima, along the leading axis of every leaf.
@@ -116,8 +123,13 @@ def _linearised(
     nuisance: Float[Array, "6 t"],
     snapshot: Snapshot,
 ) -> tuple[Callable[[Float[Array, "d K"]], tuple[Array, NormalEquations]], Float[Array, " K"]]:
-    """The whitened residuals (m, K) of u (d, K) in the nuisance that suits them best, with their
-    normal equations, and the logarithm of how much of its prior the corners leave the nuisance."""
+    """The whitened residuals as a function of u, with the nuisance eliminated.
+
+    Returns:
+        A function that maps u (d, K) to residuals (m, K), at the nuisance that minimises them, and
+        their normal equations; and -log |J_t J_t' + I| / 2 (K,), the share of the nuisance's prior
+        that the corners leave.
+    """
     rows = reprojection_rows(snapshot.rig, snapshot.seen)
     corners_world = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
     T_prior_world = T_world_prior.inverse()
@@ -166,13 +178,13 @@ def _linearised(
 
 
 def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
-    """What cay adds to a shift: it turns while it shifts."""
+    """cay(xi) shifts by more than `shift`, since it turns meanwhile: the difference, (3, ...)."""
     swing = crossed(half, shift)
     return (swing + crossed(half, swing)) / (1 + jnp.sum(half**2, axis=0))[None]
 
 
 def _answers(slope: Float[Array, "3 2 P K"], points: Float[Array, "3 P K"]) -> Array:
-    """How residuals answer to a shift and a turn of all corners about the origin, (6, 2 P, K)."""
+    """Derivative (6, 2 P, K) of residuals by a shift and a turn of all corners about the origin."""
     answers = jnp.concatenate([slope, crossed(points[:, None], slope)])
     return answers.reshape(6, -1, answers.shape[-1])
 
@@ -191,12 +203,17 @@ def _fused(
     freedom: Float[Array, "6 d"],
     floor: Float[Array, " 6"],
 ) -> Fit:
-    """Prediction and corners at one minimum: posterior and evidence."""
+    """Posterior and evidence of one hypothesis at its minimum u.
+
+    With A = J'J of the corners in units of the prediction's sigma, N the floor in the same units,
+    and R = A^-1 + N, the posterior covariance is R (I + R)^-1, the evidence
+    -(|r|^2 + |u|^2) / 2 - log |A + I| / 2.
+    """
     dtype = u.dtype
     eye = jnp.eye(u.shape[0], dtype=dtype)
     log_evidence = -(cost + jnp.sum(u**2)) / 2 - log_det(cholesky(information + eye)) / 2
 
-    # What the corners say by themselves: u_alone, with covariance R; fused with the prediction.
+    # The minimum of the corners alone, u_alone with covariance R, is fused with the prediction.
     ridge = jnp.sqrt(jnp.finfo(dtype).eps)
     alone = cholesky(information + ridge * eye)
     u_alone = u - cho_solve(alone, gradient)
@@ -207,7 +224,7 @@ def _fused(
     contradiction = solve_lower(sigma, u_alone)
     u_fused = solve_upper(sigma, contradiction)
     C = _between(information + ridge * eye, N)
-    # The corners given the prediction: what fits to no pose, and the pose that fits best.
+    # log p(corners | prediction): the misfit at the best pose, and that pose's distance.
     misfit = cost - jnp.sum(gradient * (u - u_alone))
     log_likelihood = (
         log_scale - (misfit + log_det(alone) + jnp.sum(contradiction**2) + log_det(sigma)) / 2

@@ -1,10 +1,10 @@
 """Motion models: how a bank of hypotheses moves, and how a pose and the odometry correct it.
 
-All share one interface, so that `step` and the selectors know nothing of the state:
+They share one interface, so that `step` and the selectors do not depend on the state:
 
     bank = motion.init(hypotheses)
-    bank = motion.predict(bank, obs)                  # dt, and odometry where there is
-    prior = motion.poses(bank)                        # what a selector sees
+    bank = motion.predict(bank, obs)                  # by dt_s, then the odometry, if any
+    prior = motion.poses(bank)                        # poses and covariances, for a selector
     updated = motion.update(bank, selection, obs)
     covariance = motion.error_covariance(bank, best)  # of the pose that is reported
 
@@ -38,18 +38,18 @@ from jaxnav.numerics.small_matrices import (
 from jaxnav.numerics.trees import where
 from jaxnav.pose.observation import Observation
 
-# A pause without any pose contradicts nothing: of it no more than this counts (RELIABILITY R4's
-# flag for a marker that is missing).
+# A pause without any pose contradicts nothing: at most this much of it counts, the time after which
+# a missing marker is flagged (docs/promises.md, Missing data).
 _PAUSE_S = 1.0
 
 
 class Rejections(eqx.Module):
-    """Measured poses in a row that contradict the prediction (RELIABILITY R1 to R3)."""
+    """Measured poses in a row that contradict the prediction (docs/design.md, Restart)."""
 
-    count: Int[Array, "*K"]  # of the last ones, which agree with each other
-    last: Float[Array, "*K m"]  # whitened innovation of the last one
-    duration_s: Float[Array, "*K"]  # of all of them, those that were taken nevertheless included
-    waited_s: Float[Array, "*K"]  # since a pose was last offered, however often it was predicted
+    count: Int[Array, "*K"]  # how many of the last rejections agree with each other
+    last: Float[Array, "*K m"]  # whitened innovation of the last rejection
+    duration_s: Float[Array, "*K"]  # of the row, with poses taken by an inflated gate
+    waited_s: Float[Array, "*K"]  # time since a pose was last offered, over all predictions
 
 
 class Bank(eqx.Module):
@@ -60,40 +60,40 @@ class Bank(eqx.Module):
     log_weight: Float[Array, "*K"]
     initialised: Bool[Array, "*K"]
     rejections: Rejections
-    number: Int[Array, "*K"]  # stays with a hypothesis wherever it stands in the bank
+    number: Int[Array, "*K"]  # identity of a hypothesis, kept when it changes its slot
 
 
 class Updated(NamedTuple):
-    """A bank after an observation, and how each hypothesis took it."""
+    """A bank after an observation, and the outcome of the gate for each hypothesis."""
 
     bank: Bank
-    nis: Float[Array, " K"]  # of the pose it was offered; 0 without one, or without a prediction
-    accepted: Bool[Array, " K"]  # the pose was inside the gate, or started it
+    nis: Float[Array, " K"]  # of the offered pose; 0 without a pose or a prediction
+    accepted: Bool[Array, " K"]  # the pose was inside the gate, or started the hypothesis
     log_likelihood: Float[Array, " K"]  # of the pose given the prediction, up to a constant; or 0
 
 
 class Planar(NamedTuple):
-    """Where a vehicle is on the ground, and how it moves there."""
+    """Planar pose and velocity of a vehicle, with their covariances."""
 
     pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
     pose_covariance: Float[Array, "3 3"]
-    velocity: Float[Array, " 3"]  # its derivative
+    velocity: Float[Array, " 3"]  # v_x_mps, v_y_mps, psi_dot_radps in the world
     velocity_covariance: Float[Array, "3 3"]
 
 
 class Offer(NamedTuple):
-    """What a pose would make of one hypothesis."""
+    """One hypothesis as a measured pose would start or correct it, for `gated` to choose from."""
 
     innovation: Float[Array, " m"]  # of the pose, whitened
-    first: tuple[Array, Array]  # mean and covariance, if it starts here
-    posterior: tuple[Array, Array]  # mean and covariance, if it takes the pose
+    first: tuple[Array, Array]  # mean and covariance where the pose starts the hypothesis
+    posterior: tuple[Array, Array]  # mean and covariance where the hypothesis takes the pose
     gate_nis: Float[Array, ""] | float  # a larger NIS is a contradiction, and counted
     log_likelihood: Float[Array, ""]  # of what was measured given the prediction
-    inflation: Float[Array, ""] | float = 1.0  # times the gate, NIS is kept out
+    inflation: Float[Array, ""] | float = 1.0  # a NIS above inflation * gate_nis is not fused
 
 
 class Motion(eqx.Module):
-    """What `Navigator` asks of a motion model, and what all models do alike."""
+    """Base class of the motion models: the abstract methods differ, the others are shared."""
 
     @abc.abstractmethod
     def init(self, hypotheses: int = 1) -> Bank:
@@ -109,7 +109,7 @@ class Motion(eqx.Module):
 
     @abc.abstractmethod
     def poses(self, bank: Bank) -> PoseBelief:
-        """What a selector sees of it."""
+        """Poses, covariances and weights of the hypotheses, for a selector."""
 
     @abc.abstractmethod
     def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
@@ -132,17 +132,27 @@ class Motion(eqx.Module):
         """(x_m, y_m, psi_rad) of a mean in the world, and their derivatives."""
 
     def planar(self, mean: Float[Array, " n"], covariance: Float[Array, "d d"]) -> Planar:
-        """A state on the ground."""
+        """Pose and velocity on the ground: J P J' with the Jacobians of `on_ground`.
+
+        Args:
+            mean: (n,) as the model stores it.
+            covariance: (d, d) of the error state.
+        """
         P, still = covariance, jnp.zeros(covariance.shape[0], mean.dtype)
         slopes = jax.jacfwd(lambda error: self.on_ground(self.moved(mean, error)))(still)
         (pose, velocity), (J_pose, J_velocity) = self.on_ground(mean), slopes
         return Planar(pose, sandwich(J_pose, P), velocity, sandwich(J_velocity, P))
 
     def update(self, bank: Bank, selection: Selection, obs: Observation) -> Updated:
-        """The posterior of every hypothesis (Eqs. 10 and 11), equal ones merged.
+        """The posterior of every hypothesis (Eqs. 10 and 11), with those of one heir merged.
 
-        A measured pose starts a hypothesis that has not been, and is otherwise kept out where its
-        NIS is above the gate.
+        A measured pose starts a hypothesis that is not initialised. Otherwise it is fused where its
+        NIS is inside the gate, and counted as a rejection where it is not.
+
+        Args:
+            bank: predicted.
+            selection: what each hypothesis takes as measured, its weight and its heir.
+            obs: the observation; its odometry gives a hypothesis that starts its velocity.
         """
         bank = eqx.tree_at(
             lambda b: (b.log_weight, b.initialised), bank, (selection.log_weight, selection.kept)
@@ -161,7 +171,9 @@ class Motion(eqx.Module):
         return updated._replace(bank=bank)
 
     def error_covariance(self, bank: Bank, index: Int[Array, ""]) -> Float[Array, "d d"]:
-        """What is to be expected of a hypothesis' error: the spread of the whole bank about it.
+        """Expected squared error of one hypothesis: the second moment of the bank about its mean.
+
+            sum_k w_k (P_k + d_k d_k'),    d_k = difference(mean_k, mean_index).
 
         Source: Bar-Shalom, Li, Kirubarajan (2001), section 1.4.16 (moments of a mixture).
         """
@@ -195,10 +207,10 @@ def unstarted(
 
 
 def forgotten(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Bank:
-    """The prediction without the hypotheses that are lost: their next pose starts them anew.
+    """The bank with the hypotheses that are `lost` no longer initialised: a pose starts them anew.
 
     Args:
-        dt_s: since the last observation, of whatever kind: for the others time goes on.
+        dt_s: time since the last observation of any kind, added to `waited_s` of the others.
     """
     waited_s = jnp.minimum(bank.rejections.waited_s + dt_s, _PAUSE_S)
     rejections = dataclasses.replace(bank.rejections, waited_s=waited_s.astype(bank.mean.dtype))
@@ -212,7 +224,7 @@ def forgotten(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | floa
 def contradicted(
     bank: Bank, max_count: int, max_duration_s: Float[Array, ""] | float
 ) -> Bool[Array, " K"]:
-    """Whether so many contradictions in a row agree, or they have lasted so long (R3)."""
+    """Whether `max_count` rejections in a row agree, or they have lasted `max_duration_s`."""
     rejections = bank.rejections
     return (rejections.count >= max_count) | (rejections.duration_s >= max_duration_s)
 
@@ -222,13 +234,17 @@ def gated(
     offer: Offer,
     taken: Bool[Array, ""],
 ) -> tuple[Bank, Float[Array, ""], Bool[Array, ""]]:
-    """One hypothesis that was offered a pose, its NIS, 0 where there was none to compare, and
-    whether the pose was accepted.
+    """One hypothesis after the gate, the NIS of its pose, and whether the pose was accepted.
 
-    It starts with `first`, or takes `posterior` where the gate admits it, or stays as predicted
-    (RELIABILITY R1).
+    The hypothesis becomes `first` where it is not initialised, `posterior` where
+    NIS = |innovation|^2 <= gate_nis * inflation, and stays as predicted otherwise. The NIS is 0
+    where there was nothing to compare.
+
+    See docs/design.md, Gate.
 
     Args:
+        bank: a bank without its leading axis.
+        offer: what the pose makes of it.
         taken: whether there is a pose at all.
     """
     nis = jnp.sum(offer.innovation**2)
@@ -254,7 +270,7 @@ def gated(
 def _and_another(
     rejections: Rejections, rejected: Bool[Array, ""], innovation: Array
 ) -> Rejections:
-    """One more, which agrees with the last one if it lies within 60 degrees of its direction."""
+    """Count a rejection; it agrees with the last one if they lie within 60 degrees."""
     both = jnp.sum(innovation**2) * jnp.sum(rejections.last**2)
     along = jnp.sum(innovation * rejections.last)
     agrees = (along > 0) & (along**2 > both / 4)
@@ -277,14 +293,24 @@ def followed(
     covariance: Array,
     freedom: Float[Array, "6 d"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The whole state after its pose was corrected: the regression of the rest on the pose.
+    """The whole state after its pose was corrected: the rest follows by regression on the pose.
+
+    With the pose error xi (d entries), the rest v, and the gain G = P_vx P_xx^-1:
+
+        v += G xi,    P_vx = G B C,    P_vv = P_vv - G P_xv + G B C B' G',
+
+    where C is the covariance of the corrected pose, and B carries its error to the prediction.
 
     Args:
-        P: of the predicted state, its first d entries the pose error xi = freedom' cay^-1(...).
-        covariance: (6, 6) of the corrected pose, at the corrected pose.
+        P: (n, n) of the predicted state, whose first d entries are
+            xi = freedom' cay^-1(T_world_prior^-1 T_world_vehicle).
+        T_world_prior: the predicted pose.
+        T_world_vehicle: the corrected pose.
+        covariance: (6, 6) of the corrected pose, in its own axes.
+        freedom: (6, d), the directions in which the vehicle can move.
 
     Returns:
-        Correction of the state (the pose's own entries included), and covariance after it.
+        Correction (n,) of the state, the pose's d entries included, and the covariance after it.
     """
     d = freedom.shape[1]
     away = inverse_cayley(T_world_prior.inverse() @ T_world_vehicle)
@@ -310,11 +336,11 @@ def merged(
     difference: Callable[[Array, Array], Array],
     moved: Callable[[Array, Array], Array],
 ) -> Bank:
-    """Hypotheses that share an heir as one, with their common mean and covariance.
+    """The bank with hypotheses of one heir replaced by one Gaussian of the same two moments.
 
     Args:
-        bank: after the update, with the weights of that.
-        heir: index of the hypothesis that takes each one in.
+        bank: after the update, with the weights after it.
+        heir: index of the hypothesis into which each one is merged.
         difference: (mean, from) -> error state (d,).
         moved: (mean, error state) -> mean.
 
@@ -350,12 +376,12 @@ def merged(
 
 
 def heaviest(bank: Bank) -> Int[Array, ""]:
-    """Which hypothesis is the most probable."""
+    """Index of the most probable hypothesis."""
     return jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
 
 
 def of_mixture(bank: Bank, log_values: Float[Array, " K"]) -> Float[Array, ""]:
-    """log sum_k w_k exp(log_value_k) of hypotheses that live; 0 where none does."""
+    """log (sum_k w_k exp(log_value_k) / sum_k w_k) over initialised hypotheses; 0 without any."""
     lives = bank.initialised
     log_weight = jnp.where(lives, bank.log_weight, 0)
     total = jax.nn.logsumexp(log_weight, where=lives)
@@ -365,27 +391,27 @@ def of_mixture(bank: Bank, log_values: Float[Array, " K"]) -> Float[Array, ""]:
 
 
 def leading(bank: Bank, count: int) -> Bank:
-    """The first hypotheses of a bank."""
+    """The bank cut to its first `count` hypotheses."""
     first: Bank = jax.tree.map(lambda leaf: leaf[:count], bank)
     return first
 
 
 def followed_by(first: Bank, empty: Bank) -> Bank:
-    """Hypotheses in the first slots of a bank that is empty otherwise."""
+    """The bank `empty` with its first slots replaced by the hypotheses of `first`."""
     kept = first.initialised.shape[0]
     bank: Bank = jax.tree.map(lambda a, b: jnp.concatenate([a, b[kept:]]), first, empty)
     return bank
 
 
 def numbered_anew_where_empty(bank: Bank) -> Bank:
-    """The same, slots counted from 0 where no hypothesis lives that goes by another number."""
+    """The bank with numbers 0 to K - 1 where no hypothesis is initialised; else unchanged."""
     anew = jnp.arange(bank.number.shape[0])
     number = jnp.where(jnp.any(bank.initialised), bank.number, anew)
     return dataclasses.replace(bank, number=number)
 
 
 def survivors_first(bank: Bank) -> Bank:
-    """The same bank, hypotheses that live before those that don't, each in their order."""
+    """The bank sorted: initialised hypotheses first, each group in its old order."""
     count = bank.initialised.shape[0]
     if count == 1:
         return bank
@@ -401,7 +427,7 @@ def survivors_first(bank: Bank) -> Bank:
 
 
 def restarted_where_broken(bank: Bank, start: Bank) -> Bank:
-    """The bank, with `start` in place of hypotheses whose numbers overflowed."""
+    """The bank with `start` in place of hypotheses whose mean or covariance is not finite."""
     hypotheses = (bank.mean, bank.covariance.reshape(*bank.mean.shape[:1], -1))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(hypotheses, axis=1)), axis=1)
     return dataclasses.replace(where(finite, bank, start), number=bank.number)

@@ -4,7 +4,7 @@ import enum
 
 
 class Fault(enum.IntFlag):
-    """Data or machinery that failed (RELIABILITY R6: apart from what was merely disbelieved)."""
+    """Data or machinery that failed; sound data that is merely disbelieved is a `Reject`."""
 
     CAMERA_STALE = enum.auto()  # one or several gave no frame in time
     CAMERAS_STALE = enum.auto()  # all of them
@@ -48,7 +48,7 @@ class Reject(enum.IntFlag):
 
 
 class Health(enum.IntEnum):
-    """From waiting to driving to standing (RELIABILITY R13); the larger the worse, from OK on."""
+    """From waiting to driving to standing; the larger the worse, from OK on."""
 
     INIT = 0  # nothing is known yet
     ALIGNED = 1  # located, but several poses are possible: it explores

@@ -1,4 +1,4 @@
-"""The only way to the vehicle, and the dog that watches it (RELIABILITY R5 and R10).
+"""The only way to the vehicle, and the dog that watches it; see docs/promises.md, It stops.
 
     guard = Guard(vehicle, limits)
     guard.arm()

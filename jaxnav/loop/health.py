@@ -1,4 +1,7 @@
-"""How well the vehicle is, and how fast it may go (RELIABILITY R4 and R13)."""
+"""How well the vehicle is, and how fast it may go.
+
+See docs/promises.md, It knows what it does not know.
+"""
 
 from dataclasses import dataclass, field
 
@@ -63,7 +66,7 @@ class Senses:
     distance_m: float  # driven since corners were last believed
     faults: Fault  # that are seen elsewhere
     restarts: int = 0  # in the last RESTARTS_S
-    confirmed: bool = True  # by corners, more than once (R2)
+    confirmed: bool = True  # by corners, more than once (see `support`)
     refused: bool = False  # what is located is not where it may be
 
 

@@ -1,4 +1,4 @@
-"""What a command may be, whatever was computed (RELIABILITY R10)."""
+"""What a command may be, whatever was computed."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@
     outcome = pilot.handle(Input(now_ns, odometry=reading))
     outcome = pilot.handle(Input(now_ns, frames=sighted))
 
-The same events give the same outcomes: what is recorded can be replayed bit for bit (RELIABILITY
-R11). Every event is one call of one compiled program.
+The same events give the same outcomes: what is recorded can be replayed bit for bit. Every event is
+one call of one compiled program.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Which stamps to believe (RELIABILITY R9): integer nanoseconds of the monotonic clock."""
+"""Which stamps to believe: integer nanoseconds of the monotonic clock."""
 
 from dataclasses import dataclass, field
 

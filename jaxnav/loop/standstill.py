@@ -42,8 +42,8 @@ _SLOW_NS = 100_000_000  # after it has stopped: frames may be late, whatever the
 _MOVES, _MOVES_NS = 3, 300_000_000  # so often and so long: no single push, no marker that is moved
 _PAUSE_NS = 1_000_000_000  # between two moves of one motion
 
-# Without a marker and without odometry it stops after 1 s (RELIABILITY R4): nothing tells where it
-# goes then either. A motor takes less to start, and what is meant to go less far stands.
+# Without a marker and without odometry it stops after 1 s (see `health`): nothing tells
+# where it goes then either. A motor takes less to start, and what is meant to go less far stands.
 _PULLS_NS, _PULLS_M = 1_000_000_000, 0.2
 _MAX_GAP_NS = 200_000_000  # without a command the watchdog stops it then, and cameras are stale
 _GOES_MPS, _GOES_SHARE = 0.05, 0.25  # five sigmas of the odometer; of the speed that is pulled for

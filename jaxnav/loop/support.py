@@ -5,7 +5,7 @@
     support.doubt(contradicted)
 
 The filter can't know that its pose is nonsense: all that it has was fused into it. So a pose is
-taken for what it says only after CONFIRMED frames in a row have fitted it (R2), and no longer than
+taken for what it says only after CONFIRMED frames in a row have fitted it, and no longer than
 corners, or odometer and throttle, don't contradict it. After a restart it is held against the way
 that the wheels have gone since the last fix: a copy of the marker elsewhere looks like the marker.
 """
@@ -17,9 +17,9 @@ from jaxnav.loop.propulsion import Propulsion
 from jaxnav.loop.ways import Fix, Ways
 from jaxnav.models.bicycle import Vehicle
 
-CONFIRMED = 2  # frames in a row, with the first: R2's never on a single one
+CONFIRMED = 2  # frames in a row, with the first: never a single one
 # Driven slowly after a relocation, for a person to look at the car: about five seconds at half of
-# its speed in a room, and R4 gives no more to a car that sees nothing.
+# its speed in a room, and a car that sees nothing gets no more (see `health`).
 SLOW_M = 1.0
 # Every further restart on that way asks for twice as many frames, up to three seconds' of a camera.
 _MOST_CONFIRMED = 96

@@ -9,7 +9,7 @@ Place = tuple[float, float, float]  # x_m, y_m, psi_rad
 
 _KEPT_NS = 1_500_000_000  # more than the oldest frame that is taken, see `stamps`
 _PAUSE_NS = 250_000_000  # without a reading: then nobody knows how far it went
-_AHEAD_NS = 100_000_000  # beyond the newest reading: so long it is not stale (RELIABILITY R4)
+_AHEAD_NS = 100_000_000  # beyond the newest reading: so long it is not stale
 
 
 @dataclass

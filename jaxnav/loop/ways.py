@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 # What corners get wrong themselves while the car goes round a marker, with cameras off by 1 deg or
-# 2 %. It is also how near R3 wants a kidnapped car to come.
+# 2 %. It is also how near a car that was carried off must come.
 DRIFT_M = 0.1
 # What wheels and their calibration get wrong, as where `Odometer` believes a sensor again.
 DRIFT_SHARE = 0.1
@@ -35,7 +35,7 @@ _EVERY_NS = 200_000_000
 _AGREES_NS = 1_000_000_000
 _AGREES_M = 0.02
 _GAP_NS = 500_000_000  # unseen for longer, dead reckoning has errors of its own
-_SILENT_S = 0.1  # an odometer that was stale (R4) has told of no way
+_SILENT_S = 0.1  # an odometer that was stale has told of no way
 _SIGMAS = 3.0
 
 

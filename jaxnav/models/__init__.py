@@ -1,1 +1,1 @@
-"""What there is: cameras, rigs, markers, cars, and the frames that they are in."""
+"""Models of cameras, rigs, markers and cars, and the frames they are in."""

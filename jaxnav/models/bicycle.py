@@ -12,7 +12,7 @@ from jaxnav.models.geometry import safe_sinc
 
 
 class Vehicle(eqx.Module):
-    """What the estimator, the controller and the simulated car know of one vehicle."""
+    """Parameters of one vehicle, for the estimator, the controller and the simulated car."""
 
     wheelbase_m: Float[Array, ""]
     steering_limit_rad: Float[Array, ""]  # |steering| never exceeds it
@@ -20,8 +20,8 @@ class Vehicle(eqx.Module):
     throttle_limit: Float[Array, ""]  # in the driver's unit (QCar: PWM duty)
     speed_per_throttle_mps: Float[Array, ""]  # steady-state speed at throttle 1
     speed_time_constant_s: Float[Array, ""]  # first-order lag from throttle to speed
-    # What its sensors tell, against the truth; the core knows the truth alone, see
-    # `jaxnav.loop.corrections`.
+    # Calibration of its sensors. `jaxnav.loop.corrections` applies it; the core reads corrected
+    # values only.
     speed_scale: float = eqx.field(static=True, default=1.0)  # true speed per speed read
     steering_gain: float = eqx.field(static=True, default=1.0)  # true angle per angle read
     steering_offset_rad: float = eqx.field(static=True, default=0.0)  # true angle where 0 is read
@@ -56,12 +56,18 @@ class Vehicle(eqx.Module):
 
 
 def sideslip_rad(steering_rad: Float[Array, ""]) -> Float[Array, ""]:
-    """Angle of the velocity in the vehicle frame: beta = atan(tan(steering) / 2) (Eq. 4)."""
+    """Sideslip beta, rad, the angle of the velocity in the vehicle frame (Eq. 4).
+
+    beta = atan(tan(steering) / 2)
+    """
     return jnp.arctan(jnp.tan(steering_rad) / 2)
 
 
 def curvature_per_m(steering_rad: Float[Array, ""], wheelbase_m: Float[Array, ""]) -> Array:
-    """1 / R_r = cos(beta) tan(steering) / l (Eq. 5), finite when driving straight."""
+    """Curvature of the path, 1/m: 1 / R_r = cos(beta) tan(steering) / l (Eq. 5).
+
+    It is finite when driving straight; l is the wheelbase.
+    """
     return jnp.cos(sideslip_rad(steering_rad)) * jnp.tan(steering_rad) / wheelbase_m
 
 
@@ -71,7 +77,10 @@ def velocity_world(
     psi_rad: Float[Array, ""],
     wheelbase_m: Float[Array, ""],
 ) -> Float[Array, " 3"]:
-    """(v_x m/s, v_y m/s, psi_dot rad/s) in the world at heading psi (Eqs. 6 and 7)."""
+    """(v_x m/s, v_y m/s, psi_dot rad/s) in the world at heading psi (Eqs. 6 and 7).
+
+    v_x = v cos(psi + beta),  v_y = v sin(psi + beta),  psi_dot = v / R_r
+    """
     course_rad = psi_rad + sideslip_rad(steering_rad)
     return speed_mps * jnp.stack(
         [
@@ -89,7 +98,7 @@ def advance(
     dt_s: Float[Array, ""],
     wheelbase_m: Float[Array, ""],
 ) -> Float[Array, " 3"]:
-    """(x_m, y_m, psi_rad) after dt at constant speed and steering: exactly along the arc.
+    """(x_m, y_m, psi_rad) after dt at constant speed and steering, exactly along the arc.
 
     The chord of an arc that turns by a has the direction of its middle and the length
     s sin(a/2) / (a/2).

@@ -24,13 +24,13 @@ LENS_COEFFICIENTS = {name: len(lens.coefficients) for name, lens in LENSES.items
 class Camera(eqx.Module):
     """Intrinsic parameters of one camera, or of several with a leading axis.
 
-    Several cameras share one `lenses` tuple; each says with `lens_index` which one is its own,
-    so a rig may mix lenses and costs nothing extra when it does not.
+    Several cameras share one `lenses` tuple; `lens_index` selects the lens of each, so a rig may
+    mix lenses. A rig of one lens costs nothing extra.
     """
 
     focal_px: Float[Array, "*batch 2"]  # fx fy
     center_px: Float[Array, "*batch 2"]  # cx cy
-    distortion: Float[Array, "*batch 8"]  # as the lens counts them, zero-padded
+    distortion: Float[Array, "*batch 8"]  # in the order of the lens, zero-padded
     lens_index: Int[Array, "*batch"]
     lenses: tuple[str, ...] = eqx.field(static=True)
 
@@ -70,17 +70,19 @@ class Camera(eqx.Module):
 
     @property
     def K(self) -> Float[Array, "*batch 3 3"]:
-        """The pinhole matrix."""
+        """The pinhole matrix [fx, 0, cx; 0, fy, cy; 0, 0, 1], px."""
         (fx, fy), (cx, cy) = jnp.moveaxis(self.focal_px, -1, 0), jnp.moveaxis(self.center_px, -1, 0)
         zero, one = jnp.zeros_like(fx), jnp.ones_like(fx)
         rows = [[fx, zero, cx], [zero, fy, cy], [zero, zero, one]]
         return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
     def project(self, points_camera: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
-        """Pixels of points in the camera frame (m). Of one camera; vmap over several.
+        """Pixels of points in the camera frame, m, for one camera; vmap over several.
 
-        Finite everywhere. Behind a camera without an equidistant lens the result is a far-away
-        pixel on the right side of the image; `in_front` tells whether it means anything.
+            u = f * lens(p) + c                                                      (Eq. 1)
+
+        The result is finite everywhere. Behind a camera without an equidistant lens it is a
+        far-away pixel in the direction of the point; `in_front` tells which points can be seen.
 
         Source: Liu, Schofield, Shan (2023), Eq. 1; lenses as in the module's docstring.
         """
@@ -95,7 +97,7 @@ class Camera(eqx.Module):
     def project_with_slope(
         self, points_camera: Float[Array, "*batch 3"]
     ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch 2 3"]]:
-        """`project`, and its derivative by the point, px per m."""
+        """`project`, and its derivative (..., 2, 3) by the point, px per m."""
         points = jnp.moveaxis(points_camera, -1, 0)
         images, slopes = zip(
             *(image_of(lens, points, self.distortion) for lens in self.lenses), strict=True
@@ -108,10 +110,10 @@ class Camera(eqx.Module):
         return image * focal_px + center_px, slope * focal_px[..., None]
 
     def unproject(self, pixels: Float[Array, "*batch 2"]) -> Float[Array, "*batch 3"]:
-        """Unit vectors in the camera frame through the given pixels. Of one camera.
+        """Unit vectors in the camera frame through the given pixels, for one camera.
 
-        Converges wherever the lens is one-to-one, starting at the axis; a pixel that no ray
-        reaches gets the outermost ray in its direction (project it to notice). The
+        It converges wherever the lens is one-to-one, starting at the axis; a pixel that no ray
+        reaches gets the outermost ray in its direction, whose projection differs from it. The
         derivative is that of the exact inverse.
         """
         focal_px, center_px = (
@@ -121,7 +123,7 @@ class Camera(eqx.Module):
         return self._select([bearing_of(lens, normalised, self.distortion) for lens in self.lenses])
 
     def in_front(self, points_camera: Float[Array, "*batch 3"]) -> Array:
-        """Whether a point can be seen through this lens at all, (*batch) bool."""
+        """Whether a point lies in front of the lens, where it can be seen at all, (*batch) bool."""
         depth_ratio = points_camera[..., 2] / jnp.maximum(safe_norm(points_camera), 1e-12)
         return self._select([depth_ratio > LENSES[lens].least_depth_ratio for lens in self.lenses])
 
@@ -132,7 +134,7 @@ class Camera(eqx.Module):
 
 
 def stack_cameras(cameras: Sequence[Camera]) -> Camera:
-    """Cameras with a leading axis, sharing the set of lenses that occur."""
+    """Cameras stacked along a leading axis, with one tuple of all their lenses."""
     lenses = tuple(sorted({lens for camera in cameras for lens in camera.lenses}))
     return Camera(
         focal_px=jnp.stack([camera.focal_px for camera in cameras]),

@@ -1,4 +1,4 @@
-"""How other tools count corners and turn frames, against ours: written down here and nowhere else.
+"""Corner orders and frames of other tools, against ours: written down here and nowhere else.
 
 Ours: corners go top-left, top-right, bottom-right, bottom-left as a reader sees them, which is the
 order of OpenCV's aruco; the centre of the top-left pixel is (0, 0), as OpenCV counts; the marker is

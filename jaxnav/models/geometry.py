@@ -13,15 +13,15 @@ from jaxtyping import Array, Float, Shaped
 
 from jaxnav.numerics.small_matrices import applied, product, sandwich
 
-# Of xi, and of what else is ordered (translation, rotation): on level ground a vehicle shifts along
-# its x and y and turns about its z.
+# Columns of the identity for vectors ordered (translation, rotation), such as xi: on level ground a
+# vehicle shifts along its x and y and turns about its z.
 ON_GROUND = np.eye(6)[:, [0, 1, 5]]
 OFF_GROUND = np.eye(6)[:, [2, 3, 4]]
 _SKEW = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 1, 0).reshape(9, 3)
 
 
 def wrap_angle(angle_rad: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """The same angle in [-pi, pi).
+    """The angle wrapped to [-pi, pi).
 
     Units: rad in, rad out. The derivative is 1 everywhere.
     """
@@ -60,8 +60,8 @@ def cayley(xi: Float[Array, " 6"]) -> jaxlie.SE3:
     """The rigid motion (1 - X / 2)^-1 (1 + X / 2), where X is the 4 x 4 matrix of a twist xi.
 
     exp(xi) up to third order, and like it a motion about a fixed screw axis, with cay(-xi) the
-    inverse of cay(xi); but rational: no series, no 0 / 0. Here it parametrises whatever is next to
-    a pose.
+    inverse of cay(xi); but rational: no series, no 0 / 0. Here it parametrises poses next to a
+    given one.
 
     Source: Selig (2007), "Cayley maps for SE(3)".
     """
@@ -104,7 +104,10 @@ def inverse_cayley_jacobian(xi: Float[Array, " 6"]) -> Float[Array, "6 6"]:
 
 
 def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "3 3"]:
-    """The matrix of a unit quaternion: a fifth of the operations of jaxlie's, which normalises."""
+    """The matrix (3, 3) of a unit quaternion, in a fifth of the operations of jaxlie's.
+
+    jaxlie normalises the quaternion first.
+    """
     w, v = rotation.wxyz[0], rotation.wxyz[1:]
     outer = v[:, None] * v[None]
     eye = jnp.eye(3, dtype=v.dtype)
@@ -169,8 +172,8 @@ def safe_atan2(y: Float[Array, "*batch"], x: Float[Array, "*batch"]) -> Float[Ar
 def safe_sinc(angle_rad: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """sin(a) / a, with derivatives as exact as the value at any angle.
 
-    Those of the quotient, cos(a) / a - sin(a) / a^2, lose all digits next to 0, and become NaN
-    where a^2 underflows: below 0.5 rad it is the series.
+    The derivative of the quotient, cos(a) / a - sin(a) / a^2, loses all digits next to 0 and
+    becomes NaN where a^2 underflows: below 0.5 rad the series is used.
     """
     small = jnp.abs(angle_rad) < 0.5
     squared = jnp.where(small, angle_rad, 0) ** 2
@@ -190,8 +193,8 @@ def rotation_error_rad(T_a_b: jaxlie.SE3, T_a_c: jaxlie.SE3) -> Float[Array, ""]
 def rotation_from_matrix(R: Float[Array, "3 3"]) -> jaxlie.SO3:
     """The rotation nearest in direction to a nearly orthonormal matrix, at any angle.
 
-    Of the four ways to read a quaternion off a matrix the one with the largest divisor is
-    taken, so half turns are exact and every gradient is finite.
+    There are four formulas for the quaternion of a matrix. The one with the largest divisor is
+    used, so half turns are exact and every gradient is finite.
 
     Source: Shepperd (1978), "Quaternion from rotation matrix".
     """
@@ -215,7 +218,7 @@ def rotation_from_matrix(R: Float[Array, "3 3"]) -> jaxlie.SO3:
 def transform_points(
     T_a_b: jaxlie.SE3, points_b: Float[Array, "*batch 3"]
 ) -> Float[Array, "*batch 3"]:
-    """Points in frame a of one transform applied to a whole array of points in frame b."""
+    """p_a = T_a_b @ p_b for an array of points, (*batch, 3)."""
     return turn_and_shift(rotation_matrix(T_a_b.rotation()), T_a_b.translation(), points_b)
 
 
@@ -228,5 +231,5 @@ def turn_and_shift(
 
 
 def on_last_axis(vector: Shaped[Array, " n"], like: Shaped[Array, "*batch m"]) -> Array:
-    """A vector with leading axes of length 1, to meet another array along its last axis."""
+    """A vector with leading axes of length 1, which broadcasts along the last axis of `like`."""
     return vector.reshape((1,) * (like.ndim - 1) + vector.shape)

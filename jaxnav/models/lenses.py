@@ -1,8 +1,8 @@
-"""What a lens does to a point, its slope, and its inverse: a new lens is a row of `LENSES`.
+"""Projection through a lens, its slope, and its inverse: a new lens is a row of `LENSES`.
 
 Coordinates come first: points (3, ...) in m in the camera frame, images (2, ...) at focal length 1,
 slopes (3, 2, ...) by the three coordinates of the point, per m. Coefficients are in the order of
-OpenCV, one or an array for each that goes with the points; those that a lens has not are left out.
+OpenCV, one or an array for each that broadcasts with the points; a lens gets only its own.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ def _pinhole(points: Array, coefficients: Array) -> Image:
     ahead = points[2] > nearest
     per_depth = 1 / jnp.where(ahead, points[2], nearest)
     image = points[:2] * per_depth[None]
-    # Of the depth, or of what stands in for it.
+    # The slope of the depth, or of the bound that replaces it.
     axis = _axes(jnp.asarray([0.0, 0.0, 1.0], points.dtype), points)
     clamped = MIN_DEPTH_RATIO * points / jnp.maximum(length, 1e-12)[None]
     depth_slope = jnp.where(ahead[None], axis, clamped)
@@ -66,7 +66,7 @@ def _radtan(points: Array, coefficients: Array) -> Image:
 
 
 def _bent(x: Array, y: Array, coefficients: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Where a point of the pinhole's image goes, and du/dx, du/dy = dv/dx, dv/dy.
+    """Distorted image (u, v) of a pinhole's image (x, y), and du/dx, du/dy = dv/dx, dv/dy.
 
     Source: Brown (1966); with k4 k5 k6 OpenCV's rational model.
     """
@@ -87,7 +87,7 @@ def _bent(x: Array, y: Array, coefficients: Array) -> tuple[Array, tuple[Array, 
 
 
 def _radial(r2: Array, coefficients: Array) -> tuple[Array, Array]:
-    """By how much the radius grows, and the derivative of that by r2."""
+    """Factor on the radius, and its derivative by r2, the squared radius."""
     k1, k2, _, _, k3, *below = coefficients
 
     def polynomial(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
@@ -104,7 +104,10 @@ def _radial(r2: Array, coefficients: Array) -> tuple[Array, Array]:
 
 
 def _equidistant(points: Array, coefficients: Array) -> Image:
-    """Source: Kannala, Brandt (2006)."""
+    """theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) along (x, y), with its slope.
+
+    Source: Kannala, Brandt (2006).
+    """
     x, y, z = points
     k1, k2, k3, k4 = coefficients
     r2, squared = x**2 + y**2, jnp.sum(points**2, axis=0)
@@ -119,7 +122,7 @@ def _equidistant(points: Array, coefficients: Array) -> Image:
     ratio = jnp.where(off_axis, theta * per_radius, on_axis) * gain
     rise = rise / jnp.where(squared > 0, squared, 1)
     bend = jnp.where(off_axis, (z * rise - ratio) * per_radius**2, 0)
-    # How the ratio answers, times both coordinates; and how these do.
+    # The slope of the ratio times both coordinates, then the ratio times their slopes.
     is_depth = _axes(jnp.asarray([False, False, True]), points)
     slope = jnp.where(is_depth, -rise[None], points * bend[None])[:, None] * points[None, :2]
     straight = _axes(jnp.eye(3, 2, dtype=points.dtype), points)
@@ -132,7 +135,7 @@ def _equidistant_gain(theta2: Array, coefficients: Array) -> Array:
 
 
 def _axes(constant: Array, points: Array) -> Array:
-    """A constant for all points."""
+    """A constant with trailing axes of length 1, which broadcasts over all points."""
     return constant.reshape(*constant.shape, *(1,) * (points.ndim - 1))
 
 
@@ -154,8 +157,8 @@ def _radtan_bearing(xy_bent: Array, coefficients: Array) -> Array:
     start = xy_bent * jnp.where(radius_bent > 0, radius / safe, 1)[..., None]
 
     def newton(xy: Array) -> Array:
-        # The tangential terms only bend the start a little, so a long step means that there is
-        # no such ray.
+        # The tangential terms move the start by little, so a long step means that there is no
+        # such ray.
         value, (a, b, d) = _bent(xy[..., 0], xy[..., 1], coefficients)
         residual_x, residual_y = value - jnp.moveaxis(xy_bent, -1, 0)
         determinant = a * d - b * b
@@ -224,7 +227,7 @@ MOST_COEFFICIENTS = max(len(lens.coefficients) for lens in LENSES.values())
 def image_of(
     lens: str, points: Float[Array, "3 ..."], coefficients: Float[Array, "8 ..."]
 ) -> Image:
-    """Where points go in the image at focal length 1, and the slope of that."""
+    """Images (2, ...) at focal length 1 of points (3, ...), and their slopes (3, 2, ...)."""
     kind = LENSES[lens]
     return kind.image(points, coefficients[: len(kind.coefficients)])
 
@@ -232,6 +235,6 @@ def image_of(
 def bearing_of(
     lens: str, xy: Float[Array, "*batch 2"], coefficients: Float[Array, " 8"]
 ) -> Float[Array, "*batch 3"]:
-    """Unit vectors through places in the image at focal length 1."""
+    """Unit vectors (..., 3) in the camera frame through images (..., 2) at focal length 1."""
     kind = LENSES[lens]
     return kind.bearing(xy, coefficients[: len(kind.coefficients)])

@@ -46,7 +46,7 @@ def opencv_dictionary_name(family: str) -> str:
 class MarkerMap(eqx.Module):
     """M markers: identity, size and pose. The order of the map is the order of every M axis.
 
-    What is called the world here and in all that computes with the map counts from `origin_m`, a
+    Coordinates in the world, here and in all that computes with the map, count from `origin_m`, a
     place of the files' world near the markers; see `jaxnav.models.origin`.
     """
 
@@ -58,24 +58,24 @@ class MarkerMap(eqx.Module):
 
     @property
     def corners_world_m(self) -> Float[Array, "M 4 3"]:
-        """All corners in the world, m."""
+        """Corners (M, 4, 3) of all markers in the world, m."""
         corners = corners_marker_m(self.size_m)
         R = jax.vmap(rotation_matrix)(self.Ts_world_marker.rotation())
         turned = jnp.sum(R[:, None] * corners[:, :, None], axis=3)
         return turned + self.Ts_world_marker.translation()[:, None]
 
     def nearest_m(self, T_world_vehicle: jaxlie.SE3) -> Float[Array, " 2"]:
-        """The centre of the marker that is nearest on the ground, in the vehicle's axes."""
+        """(x, y), m, in vehicle axes, of the centre of the marker that is nearest on the ground."""
         centers_world_m = self.Ts_world_marker.translation()
         centers_m = transform_points(T_world_vehicle.inverse(), centers_world_m)[:, :2]
         return centers_m[jnp.argmin(jnp.sum(centers_m**2, axis=1))]
 
     def without_origin(self) -> "MarkerMap":
-        """The same numbers, whatever they count from: one compiled program serves all origins."""
+        """The map with the same numbers and `origin_m` zero, so all origins share a program."""
         return self if self.origin_m == ZERO else dataclasses.replace(self, origin_m=ZERO)
 
     def index(self, marker_id: int, family: str) -> int | None:
-        """Where a marker stands in the map, None where it is not in it."""
+        """Index of a marker along the M axis, None if the map lacks it."""
         for index, key in enumerate(zip(self.ids, self.families, strict=True)):
             if key == (marker_id, family):
                 return index

@@ -1,15 +1,15 @@
 """Coordinates near zero for maps that are far from it, so that float32 holds them.
 
-float32 has 7 digits: 1 km from zero they end at 0.06 mm, 100 km away at 8 mm, at 5 000 km (UTM)
-at half a metre. So a `MarkerMap` counts from its `origin_m`, a round place near its markers, and
-with it all that computes: waypoints, beliefs, outputs, simulated cars. Files and people count from
-the world's zero in float64, and what goes from one to the other passes through here:
+float32 has 7 digits: it resolves 0.06 mm at 1 km from zero, 8 mm at 100 km, half a metre at
+5 000 km (UTM). So coordinates of a `MarkerMap`, and of waypoints, beliefs, outputs and simulated
+cars, count from its `origin_m`, a round place near its markers. Files and people count from the
+world's zero in float64. The functions here convert one to the other:
 
     route = route.relative_to(markers.origin_m)                  # on the way in
     x_m, y_m, psi_rad = planar_in_world(out.pose, markers.origin_m)   # on the way out
 
 The axes are the same, and so are angles, velocities and covariances. At the zero origin, that of
-every map within `NEAR_M`, nothing changes, not a bit.
+every map within `NEAR_M`, values are returned as they are.
 """
 
 from typing import Any
@@ -19,16 +19,16 @@ import numpy as np
 Origin = tuple[float, float, float]  # x_m, y_m, z_m in the world
 
 ZERO: Origin = (0.0, 0.0, 0.0)
-# float32's spacing there, 0.06 mm, is a thirtieth of what the best drives are off by.
+# float32's spacing there, 0.06 mm, is a thirtieth of the position error of the best drives.
 NEAR_M = 1000.0
-# Round for a person who reads it, and near: what is left is below 50 m and a map's own size.
+# Round for a reader, and near: coordinates then stay below 50 m plus the map's own size.
 GRID_M = 100.0
 
 
 def origin_near(positions_m: np.ndarray) -> Origin:
     """The origin for places (N, 3): on each axis zero within `NEAR_M`, else a multiple of `GRID_M`.
 
-    What lies on the ground of a car (z = 0 of its coordinates) is thus at the origin's z.
+    A car's ground, z = 0 of its coordinates, is thus at the origin's z.
     """
     middle_m = np.mean(np.asarray(positions_m, float), axis=0)
     rounded_m = GRID_M * np.round(middle_m / GRID_M)
@@ -55,16 +55,16 @@ def poses_in_world(Ts_map_body: Any, origin_m: Origin) -> Any:
 
 
 def inverses_in_world(Ts_body_map: Any, origin_m: Origin) -> Any:
-    """What maps a map's coordinates to a body's, (..., 7), for the world's coordinates, float64.
+    """Poses `T_body_map` (..., 7), wxyz_xyz, converted to `T_body_world`, float64.
 
-    The quaternions are normalised to float64's last digit: their lever is as long as the origin
-    is far.
+    The quaternions are normalised to float64's last digit, since the distance of the origin
+    multiplies their error.
     """
     if origin_m == ZERO:
         return Ts_body_map
     Ts = np.array(Ts_body_map, float)
     Ts[..., :4] /= np.linalg.norm(Ts[..., :4], axis=-1, keepdims=True)
-    # Body from map, times minus the origin: what is rotated is p + 2 q x (q x p + w p).
+    # The translation less the rotated origin; q = (w, q) rotates p to p + 2 q x (q x p + w p).
     w, q = Ts[..., :1], Ts[..., 1:4]
     origin = np.broadcast_to(np.array(origin_m), q.shape)
     Ts[..., 4:] -= origin + 2 * np.cross(q, np.cross(q, origin) + w * origin)
@@ -72,7 +72,7 @@ def inverses_in_world(Ts_body_map: Any, origin_m: Origin) -> Any:
 
 
 def opposite(origin_m: Origin) -> Origin:
-    """The origin that leads back: from the world's coordinates to the map's."""
+    """The origin for the inverse conversion, from the world's coordinates to the map's."""
     x_m, y_m, z_m = origin_m
     return (-x_m, -y_m, -z_m) if origin_m != ZERO else ZERO
 

@@ -1,4 +1,4 @@
-"""Speed and steering from the twist of a body, without ROS, OpenCV or JAX: plug-ins read it too."""
+"""Speed and steering from the twist of a body, without ROS, OpenCV or JAX, for plug-ins."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ STANDSTILL_MPS = 0.02  # below it noise in the yaw rate makes any steering angle
 
 @dataclass
 class TwistReader:
-    """Speed along the course and steering of a bicycle, twist after twist.
+    """Converts the twists of a body to speed along the course and steering of a bicycle.
 
     With v the speed along the course, l the wheelbase and beta = atan(tan(steering) / 2), the
     velocity along the vehicle's own x axis is v cos(beta), the same wherever on that axis
@@ -20,7 +20,7 @@ class TwistReader:
 
     Attributes:
         wheelbase_m: of the bicycle.
-        steering_limit_rad: a faster turn is noise, or slip, and not more steering.
+        steering_limit_rad: bound on the result; a faster turn is noise or slip.
     """
 
     wheelbase_m: float

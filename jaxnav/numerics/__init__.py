@@ -1,1 +1,1 @@
-"""Small matrices, trees and least squares."""
+"""Linear algebra of small matrices, trees of arrays, and least squares."""

@@ -1,9 +1,9 @@
 """A Levenberg-Marquardt step for a handful of unknowns, as a solver that optimistix runs.
 
-optimistix keeps its loop, its bound on the steps, its result codes and its implicit adjoint; this
-class only says what a step is. Against `optimistix.LevenbergMarquardt` it forms J'J once a
-step, and it stops when no step can lower the cost any more instead of when y and every residual
-stand still. `benchmarks/bench_pair.py`: 1.6 times as fast at equal steps; compilation takes half
+optimistix provides the loop, the bound on the steps and the result codes; this class defines a
+step. Unlike `optimistix.LevenbergMarquardt` it forms J'J once a step, and it stops when no step can
+lower the cost any more, not when y and every residual stop changing.
+`benchmarks/bench_pair.py`: 1.6 times as fast at equal steps; compilation takes half
 the time, and float32 works in a process that has float64 enabled.
 """
 
@@ -20,32 +20,32 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxnav.numerics.small_matrices import solve_positive
 
 _FOUND = "found"
-# For the gradient of many steps, `jax.checkpoint(step, policy=KEEP_FOUND)`: of a step it keeps no
-# more than its carry and what each search has found, and searches nothing twice.
+# For the gradient of many steps, `jax.checkpoint(step, policy=KEEP_FOUND)`: it stores the carry of
+# a step and the minima of its searches, so the backward pass repeats no search.
 KEEP_FOUND = jax.checkpoint_policies.save_only_these_names(_FOUND)
 
 
 def found(tree: PyTree) -> PyTree:
-    """The arrays of a tree, as what a search has found."""
+    """The tree with its arrays named as the result of a search, which `KEEP_FOUND` stores."""
     return jax.tree.map(
         lambda leaf: checkpoint_name(leaf, _FOUND) if eqx.is_array(leaf) else leaf, tree
     )
 
 
 class NormalEquations(eqx.Module):
-    """What a step needs to know of N problems besides their cost."""
+    """J'J and J'r of N problems with n unknowns each."""
 
     information: Float[Array, "n n N"]  # J'J
     gradient: Float[Array, "n N"]  # J'r
 
 
 class LMState(eqx.Module):
-    """What is known at the accepted points, and the damping to try next."""
+    """Cost and normal equations at the accepted points, and the damping to try next."""
 
     cost: Float[Array, " N"]  # sum of squares
     normal: NormalEquations
-    damping: Float[Array, " N"]  # 0: none yet
-    growth: Float[Array, " N"]
+    damping: Float[Array, " N"]  # lambda; 0: none yet
+    growth: Float[Array, " N"]  # factor on lambda after a step that is not accepted
     steps: Int[Array, " N"]
     first: Bool[Array, ""]
     done: Bool[Array, " N"]
@@ -54,13 +54,16 @@ class LMState(eqx.Module):
 class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt on dense normal equations with Nielsen's damping, N problems at once.
 
-    The function maps unknowns (n, N) to residuals (m, N), every problem by itself, and returns
-    their `NormalEquations` as `aux`. The solver ends when all problems have; one that has ended
-    stays where it is. `solution.state` says which have, and after how many steps.
+        (J'J + lambda I) move = -J'r
 
-    Unknowns are scaled so that lambda * I suits them all, and few: J'J squares the condition
-    number. A step is accepted when it lowers the cost. The search ends when the model promises to
-    lower the cost by less than `rtol * cost + atol`.
+    The function maps unknowns (n, N) to residuals (m, N), problem by problem, and returns their
+    `NormalEquations` as `aux`. A step is accepted where it lowers the cost |r|^2. A problem is done
+    where the model promises to lower its cost by less than `rtol * cost + atol`; it then stays
+    where it is, and the solver ends when all are done. `solution.state` holds `done` and `steps` of
+    each problem.
+
+    The unknowns should be scaled alike, since lambda * I damps them all, and few, since J'J squares
+    the condition number.
 
     Source: Madsen, Nielsen, Tingleff (2004), "Methods for non-linear least squares problems",
     Algorithm 3.16.
@@ -81,7 +84,7 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         aux_struct: PyTree,
         tags: frozenset[object],
     ) -> LMState:
-        """Nothing known: the first step stays at y and looks around."""
+        """The state before the first step, which stays at y and evaluates the function there."""
         lanes = jnp.zeros(y.shape[1], y.dtype)
         return LMState(
             cost=lanes + jnp.inf,
@@ -102,7 +105,7 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         state: LMState,
         tags: frozenset[object],
     ) -> tuple[Array, LMState, PyTree]:
-        """Try one damped step of every problem and learn from it."""
+        """Try one damped step of every problem, accept it where the cost falls, adapt lambda."""
         information, gradient = state.normal.information, state.normal.gradient
         diagonal = jnp.stack([information[i, i] for i in range(y.shape[0])])
         largest = jnp.max(diagonal, axis=0)
@@ -147,7 +150,7 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         state: LMState,
         tags: frozenset[object],
     ) -> tuple[Array, optx.RESULTS]:
-        """Whether no step of any problem is worth taking."""
+        """Whether all problems are done."""
         return jnp.all(state.done), cast(optx.RESULTS, optx.RESULTS.successful)
 
     def postprocess(
@@ -168,9 +171,10 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
 class ImplicitGradient(optx.AbstractAdjoint):
     """Derivatives of N minima (n, N) by the implicit function theorem: dy = -H^-1 d(gradient).
 
-    What `optimistix.ImplicitAdjoint` computes, less its check of the linear solve, which calls
-    the host and raises there, and with the gradient that the function gives as `aux`:
-    differentiated once less. Where the Hessian is not positive definite the derivative is zero.
+    H is the Hessian of the cost, (n, n) for each problem. The result is that of
+    `optimistix.ImplicitAdjoint`, without its check of the linear solve, which calls the host and
+    raises there. The gradient comes from the function's `aux`, so it is differentiated once less.
+    Where the Hessian is not positive definite the derivative is zero.
     """
 
     def apply(
@@ -180,7 +184,7 @@ class ImplicitGradient(optx.AbstractAdjoint):
         inputs: PyTree,
         tags: frozenset[object],
     ) -> PyTree:
-        """The minimum and what the solver says of it; only the minimum has derivatives."""
+        """The minimum and the solver's other results; only the minimum has derivatives."""
         fixed = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, inputs
         )
@@ -198,7 +202,7 @@ def _gradient(y: Array, _: PyTree, inputs: PyTree) -> Array:
 def moving_with(
     root: Array, inputs: PyTree, *, gradient: Callable[..., Array], residual: PyTree
 ) -> Array:
-    """The root, where gradient(root, residual, inputs) = 0 whatever the inputs."""
+    """The root of gradient(root, residual, inputs) = 0, with its derivative by `inputs`."""
     return root
 
 
@@ -212,7 +216,7 @@ def _moving_with_jvp(
     _, t_gradient = jax.jvp(
         lambda v: gradient(root, residual, eqx.combine(v, constant)), (varying,), (t_inputs,)
     )
-    # No problem depends on another: one direction for all of them yields a column of every Hessian.
+    # Problems are independent: one direction for all of them yields a column of every Hessian.
     _, push_forward = jax.linearize(lambda y: gradient(y, residual, inputs), root)
     n, lanes = root.shape
     directions = jnp.broadcast_to(jnp.eye(n, dtype=root.dtype)[:, :, None], (n, n, lanes))

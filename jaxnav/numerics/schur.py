@@ -1,8 +1,8 @@
 """Levenberg-Marquardt for many small blocks of unknowns and a few shared ones, run by optimistix.
 
-A pose a frame is a block of six that meets nobody but the shared unknowns: cameras, markers,
-lenses. Blocks are eliminated one by one, what is left is a dense system of the shared unknowns
-alone, and cost and memory grow in proportion to the number of frames.
+The pose of a frame is a block of six unknowns, coupled only with the shared ones: cameras, markers,
+lenses. The blocks are eliminated one by one, which leaves a dense system of the shared unknowns.
+Cost and memory grow in proportion to the number of frames.
 
 Source: Brown (1958), "A solution to the general problem of multiple station analytical
 stereotriangulation"; Triggs, McLauchlan, Hartley, Fitzgibbon (2000), "Bundle adjustment: a modern
@@ -22,7 +22,7 @@ from jaxnav.numerics.small_matrices import cholesky, solve_lower, solve_upper
 
 
 class Blocks(eqx.Module):
-    """J'J and J'r of F blocks of n unknowns and R shared ones, both weighed."""
+    """Weighted J'J and J'r of F blocks of n unknowns and of R shared unknowns."""
 
     own: Float[Array, "F n n"]
     cross: Float[Array, "F n R"]
@@ -32,7 +32,12 @@ class Blocks(eqx.Module):
 
 
 class Reduced(eqx.Module):
-    """What is left when all blocks are eliminated."""
+    """The system of the shared unknowns after all blocks were eliminated.
+
+        (S - sum_f C_f' B_f^-1 C_f) dx = -(g - sum_f C_f' B_f^-1 g_f)
+
+    with B `own`, C `cross`, S `shared`, g_f `own_gradient` and g `shared_gradient` of `Blocks`.
+    """
 
     system: Float[Array, "R R"]  # the shared unknowns' information; identity where one is fixed
     gradient: Float[Array, " R"]
@@ -41,14 +46,15 @@ class Reduced(eqx.Module):
     own: Float[Array, "F n"]  # factor^-1 own_gradient
 
     def back(self, shared: Float[Array, " R"]) -> Float[Array, "F n"]:
-        """How the blocks move with a move of the shared unknowns."""
+        """The move (F, n) of the blocks that belongs to a move (R,) of the shared unknowns."""
         return jax.vmap(solve_upper)(self.factor, -self.own - self.carried @ shared)
 
 
 def reduce(blocks: Blocks, free: Bool[Array, " R"], damping: Float[Array, ""]) -> Reduced:
-    """Eliminate the blocks.
+    """Eliminate the blocks by Schur's complement.
 
     Args:
+        blocks: normal equations of all unknowns.
         free: which shared unknowns may move.
         damping: lambda of (J'J + lambda diag(J'J)).
     """
@@ -70,7 +76,7 @@ def reduce(blocks: Blocks, free: Bool[Array, " R"], damping: Float[Array, ""]) -
 
 
 def _damped(A: Float[Array, "*batch n n"], damping: Array) -> Array:
-    """With the diagonal raised; a parameter that nobody sees gets a one."""
+    """A + damping * diag(A); a diagonal entry of 0, an unobserved parameter, becomes 1."""
     diagonal = jnp.diagonal(A, axis1=-2, axis2=-1)
     raised = jnp.where(diagonal > 0, damping * diagonal, 1)
     eye = jnp.eye(A.shape[-1], dtype=A.dtype).reshape((1,) * (A.ndim - 2) + (A.shape[-1],) * 2)
@@ -78,7 +84,7 @@ def _damped(A: Float[Array, "*batch n n"], damping: Array) -> Array:
 
 
 class SchurState(eqx.Module):
-    """What is known at the accepted point, and the damping to try next."""
+    """Cost and normal equations at the accepted point, and the damping to try next."""
 
     cost: Float[Array, ""]
     blocks: Blocks
@@ -89,11 +95,13 @@ class SchurState(eqx.Module):
 
 
 class SchurLM(optx.AbstractLeastSquaresSolver):
-    """A step of Levenberg-Marquardt that eliminates blocks of unknowns.
+    """Levenberg-Marquardt that eliminates blocks of unknowns.
 
-    The function maps y, any pytree, to residuals, and returns their `Blocks` as `aux`; `retract`
-    says what a move (blocks (F, n), shared (R,)) makes of y. The search ends when the model
-    promises to lower the cost by less than `rtol * cost + atol`.
+        (J'J + lambda diag(J'J)) move = -J'r
+
+    The function maps y, any pytree, to residuals, and returns their `Blocks` as `aux`;
+    `retract(y, own, shared)` moves y by the blocks' move (F, n) and the shared one (R,). The search
+    ends when the model promises to lower the cost by less than `rtol * cost + atol`.
     """
 
     rtol: float
@@ -113,7 +121,7 @@ class SchurLM(optx.AbstractLeastSquaresSolver):
         aux_struct: PyTree,
         tags: frozenset[object],
     ) -> SchurState:
-        """Look around."""
+        """The state at y: cost and normal equations there."""
         residual, blocks = fn(y, args)
         dtype = residual.dtype
         return SchurState(
@@ -134,7 +142,7 @@ class SchurLM(optx.AbstractLeastSquaresSolver):
         state: SchurState,
         tags: frozenset[object],
     ) -> tuple[PyTree, SchurState, PyTree]:
-        """Try one damped step and learn from it."""
+        """Try one damped step, accept it where the cost falls, and adapt lambda."""
         blocks, damping = state.blocks, state.damping
         reduced = reduce(blocks, self.free, damping)
         factor = jax.scipy.linalg.cho_factor(reduced.system, lower=True)
@@ -182,7 +190,7 @@ class SchurLM(optx.AbstractLeastSquaresSolver):
         state: SchurState,
         tags: frozenset[object],
     ) -> tuple[Array, optx.RESULTS]:
-        """Whether no step is worth taking."""
+        """Whether the model promises no further gain."""
         return state.done, cast(optx.RESULTS, optx.RESULTS.successful)
 
     def postprocess(

@@ -1,9 +1,9 @@
-"""Linear algebra for a handful of unknowns, unrolled: no LAPACK call, nothing to wait for.
+"""Linear algebra for a handful of unknowns, unrolled, without calls of LAPACK.
 
 Under vmap every scalar below is an array over the batch, so thousands of 3 x 3 systems are solved
 side by side in vector registers. XLA's batched LAPACK calls on the CPU cost several times more,
-and with some thousand matrices inside a scan they have been seen to wait for each other for
-ever (jaxlib 0.10, two cores).
+and with some thousand matrices inside a scan they have been seen to deadlock (jaxlib 0.10, two
+cores).
 """
 
 import jax
@@ -12,26 +12,26 @@ from jaxtyping import Array, Float, Int
 
 
 def product(A: Float[Array, "n k"], B: Float[Array, "k m"]) -> Float[Array, "n m"]:
-    """A B as a sum over an axis.
+    """The matrix product A B, (n, m), as a sum over an axis.
 
-    XLA's batched calls take ten times as long, and a chain of additions it computes anew for every
-    product that the result enters.
+    XLA's batched calls take ten times as long, and XLA computes a chain of additions anew for every
+    product that uses the result.
     """
     return jnp.sum(A[:, :, None] * B[None], axis=1)
 
 
 def applied(A: Float[Array, "n k"], x: Float[Array, " k"]) -> Float[Array, " n"]:
-    """A x, likewise."""
+    """The product A x, (n,), as a sum over an axis."""
     return jnp.sum(A * x[None], axis=1)
 
 
 def gram(J: Float[Array, "n m ..."]) -> Float[Array, "n n ..."]:
-    """J J', for all lanes."""
+    """J J', (n, n), for all lanes along the trailing axes."""
     return jnp.sum(J[:, None] * J[None], axis=2)
 
 
 def sandwich(A: Float[Array, "n k"], P: Float[Array, "k k"]) -> Float[Array, "n n"]:
-    """A P A'."""
+    """The congruence A P A', (n, n)."""
     return product(product(A, P), A.T)
 
 
@@ -58,7 +58,7 @@ def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def solve_lower(L: Float[Array, "n n"], b: Array) -> Array:
-    """L^-1 b, for a lower L."""
+    """L^-1 b, for a lower triangular L; b is (n,) or (n, m)."""
     inverse = 1 / jnp.diagonal(L)
     x: list[Array] = []
     for i in range(L.shape[0]):
@@ -70,7 +70,7 @@ def solve_lower(L: Float[Array, "n n"], b: Array) -> Array:
 
 
 def solve_upper(L: Float[Array, "n n"], b: Array) -> Array:
-    """L'^-1 b, for a lower L."""
+    """L'^-1 b, for a lower triangular L; b is (n,) or (n, m)."""
     n = L.shape[0]
     inverse = 1 / jnp.diagonal(L)
     x: list[Array] = [b[0]] * n
@@ -95,10 +95,10 @@ def log_det(L: Float[Array, "n n"]) -> Float[Array, ""]:
 def solve_positive(
     A: Float[Array, "n n ..."], b: Float[Array, "n ..."], ridge: Float[Array, "..."] | float = 0
 ) -> Array:
-    """(A + ridge I)^-1 b, if that is positive definite; NaN if not. Every entry by itself, for all
-    lanes.
+    """(A + ridge I)^-1 b for all lanes along the trailing axes; NaN if not positive definite.
 
-    As matrices, each column of the factor would be computed anew for every entry that asks for it.
+    Every entry is an array of its own: in matrices XLA would compute each column of the factor anew
+    for every entry that uses it.
 
     Source: Golub, Van Loan (2013), algorithm 4.2.1.
     """
@@ -129,7 +129,7 @@ def solve_positive(
 def eliminated(A: Float[Array, "n n"], B: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """A^-1 B for a positive definite A; NaN or inf where a pivot is 0.
 
-    For more unknowns than are worth unrolling, one kernel each.
+    For more unknowns than are worth unrolling: a loop with one kernel for each pivot.
 
     Source: Golub, Van Loan (2013), section 4.2: elimination without pivoting, Gauss and Jordan's.
     """
@@ -144,9 +144,9 @@ def eliminated(A: Float[Array, "n n"], B: Float[Array, "n m"]) -> Float[Array, "
 
 
 def ranks(values: Float[Array, " n"]) -> Int[Array, " n"]:
-    """The place of each of a handful of values from the highest down, equal ones in their order.
+    """Rank of each value, 0 for the highest; equal values rank in their order.
 
-    What `argsort(argsort(-values))` says, without a call of XLA's sort.
+    Equals `argsort(argsort(-values))`, without a call of XLA's sort.
     """
     index = jnp.arange(values.shape[0])
     earlier = index[None] < index[:, None]
@@ -155,5 +155,5 @@ def ranks(values: Float[Array, " n"]) -> Int[Array, " n"]:
 
 
 def in_order(values: Float[Array, " n"], count: int) -> Int[Array, " count"]:
-    """The indices of the `count` highest of a handful of values, the highest first."""
+    """Indices of the `count` highest values, the highest first."""
     return jnp.argmax(ranks(values)[None] == jnp.arange(count)[:, None], axis=1)

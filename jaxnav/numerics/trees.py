@@ -1,4 +1,4 @@
-"""Choice between whole states."""
+"""`where` for trees of arrays."""
 
 from typing import Any, TypeVar
 

@@ -1,4 +1,4 @@
-"""All vehicle poses that one observation admits: both IPPE poses of every sighting, refined.
+"""Candidate poses of the vehicle: both IPPE poses of every sighting, refined and merged.
 
 Source: Liu, Schofield, Shan (2023), Algorithm 1, "get both possible poses using the IPPE method
 and Eq. 3".
@@ -26,7 +26,7 @@ from jaxnav.pose.observation import Sightings, Snapshot, cameras_of
 from jaxnav.pose.refine import refine_sightings
 from jaxnav.pose.residuals import reprojection_residuals
 
-# Two local minima this close are one: 1.1 degrees, and as much of the distance to the markers.
+# Two local minima this close are merged: 1.1 degrees, and 0.02 of the distance to the marker.
 _SAME_POSE_RAD = 0.02
 
 
@@ -47,7 +47,7 @@ class Candidates(eqx.Module):
 
     @staticmethod
     def none(count: int, dtype: DTypeLike) -> "Candidates":
-        """So many lanes, none of them valid."""
+        """`count` lanes, none of them valid."""
         zeros = jnp.zeros(count, dtype)
         return Candidates(
             T_vehicle_world=jaxlie.SE3(jnp.zeros((count, 7), dtype).at[:, 0].set(1)),
@@ -60,7 +60,7 @@ class Candidates(eqx.Module):
         )
 
     def padded(self, count: int) -> "Candidates":
-        """So many lanes; those that are added are not valid."""
+        """The candidates with lanes appended up to `count`, which are not valid."""
         kept = self.valid.shape[0]
         more = jax.tree.map(
             lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:1], count - kept, axis=0)]), self
@@ -78,14 +78,15 @@ def find_candidates(
     """Every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
 
     One camera that sees one marker gives two; two cameras on one marker give up to four, which
-    the refinement usually draws together into two (DESIGN 3.4). With many markers the
-    `max_candidates` that explain all corners best are refined.
+    the refinement usually draws together into two (see docs/design.md, Candidates). With many
+    markers the `max_candidates` poses that explain all corners best are refined.
 
     Args:
         snapshot: what is seen.
+        max_candidates: N, how many poses are refined and returned at most.
         max_steps: bound on the LM steps.
         ground_plane: keep the vehicle level on the ground, z = 0: only (x, y, psi) are refined.
-        own: `both_poses(snapshot)`, of who has them already.
+        own: the result of `both_poses(snapshot)`, where the caller has it already.
     """
     rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
     own = both_poses(snapshot) if own is None else own
@@ -130,11 +131,12 @@ def find_candidates(
 
 
 def own_errors_px(snapshot: Snapshot, own: jaxlie.SE3) -> Float[Array, " D"]:
-    """How far the corners of each sighting are from those of the better of its own two poses, RMS.
+    """RMS distance (D,), px, of each sighting's corners to the better of its own two poses.
 
-    Large where they are not the image of a square at all.
+    It is large where the corners are not the image of a square.
 
     Args:
+        snapshot: what is seen.
         own: `both_poses(snapshot)`.
     """
     rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
@@ -159,7 +161,10 @@ def own_errors_px(snapshot: Snapshot, own: jaxlie.SE3) -> Float[Array, " D"]:
 
 
 def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
-    """`T_vehicle_world` twice, batch axes (D, 2): of every sighting by itself, visible or not."""
+    """Both IPPE poses `T_vehicle_world` of every sighting by itself, batch axes (D, 2).
+
+    Sightings that are not visible give finite poses without a meaning.
+    """
     rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
 
     def one(
@@ -188,7 +193,7 @@ def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
 def _repeats(
     T_vehicle_world: jaxlie.SE3, seen: Sightings, markers: MarkerMap, valid: Bool[Array, " N"]
 ) -> Bool[Array, " N"]:
-    """Whether an earlier valid lane holds the same pose, as the markers in view tell."""
+    """Whether an earlier valid lane holds the same pose, within `_SAME_POSE_RAD`."""
     first_seen = seen.marker_index[jnp.argmax(seen.visible)]
     center_world = markers.Ts_world_marker.translation()[first_seen]
     centers_vehicle = jax.vmap(lambda T: transform_points(T, center_world))(T_vehicle_world)

@@ -1,10 +1,9 @@
-"""Which markers in view to hold a pose against: those that can be markers, and agree.
+"""Rejection of sightings that are not squares, and of a marker that the others contradict.
 
     found = consistent(snapshot, navigator.find_candidates, navigator.no_candidates())
 
-Four corners at random places fit no pose at all, and a marker that was moved, or a copy of it, fits
-no pose that the others agree on. A belief that takes them in all the same, however little it trusts
-them, goes astray.
+Four corners at random places fit no pose, and a marker that was moved, or a copy of it, fits no
+pose on which the others agree. Fusing them leads the estimate astray, however large their sigma is.
 """
 
 from collections.abc import Callable
@@ -37,8 +36,7 @@ Find = Callable[[Snapshot, jaxlie.SE3], Candidates]
 
 
 class Consistent(NamedTuple):
-    """What is left of a snapshot, the candidate poses for that, and which markers are not in it
-    because the others outvote them."""
+    """A snapshot without inconsistent sightings, its candidates, and the markers outvoted."""
 
     snapshot: Snapshot
     candidates: Candidates
@@ -46,23 +44,27 @@ class Consistent(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """The same, of the snapshot only what changes: which sightings are visible still."""
+    """The parts of `Consistent` that depend on the rejection: visibility, not the snapshot."""
 
     visible: Bool[Array, " D"]
     candidates: Candidates
     outvoted: Bool[Array, " M"]
 
     def of(self, snapshot: Snapshot) -> Consistent:
-        """With the snapshot that it was found in."""
+        """`Consistent` for the snapshot in which this was found."""
         return Consistent(_among(snapshot, self.visible), self.candidates, self.outvoted)
 
 
 def consistent(snapshot: Snapshot, find: Find, none: Candidates) -> Consistent:
-    """What is seen without nonsense and without a marker that the others outvote.
+    """The snapshot without sightings that are not squares and without an outvoted marker.
+
+    With three markers and more in view, the one without which the joint misfit falls below a
+    bound, by a factor that no other marker reaches, is outvoted.
 
     Args:
-        find: see `find_candidates`.
-        none: what it returns where nothing is in view: then it is not called.
+        snapshot: what is seen.
+        find: maps a snapshot, and `both_poses` of it, to `Candidates`; see `find_candidates`.
+        none: the result without a marker in view, where `find` is not called.
     """
 
     def nothing() -> Kept:
@@ -75,7 +77,7 @@ def consistent(snapshot: Snapshot, find: Find, none: Candidates) -> Consistent:
 
 
 def among_all(snapshot: Snapshot, find: Find) -> Kept:
-    """`consistent` that calls `find` whatever is in view."""
+    """As `consistent`, but calls `find` also where no marker is in view."""
     own = both_poses(snapshot)
     snapshot = _among(snapshot, _can_be_markers(snapshot, own))
     seen, candidates = snapshot.seen, find(snapshot, own)
@@ -134,7 +136,7 @@ def _in_view(seen: Sightings, markers: int) -> Bool[Array, " M"]:
 
 
 def _excess(candidates: Candidates, seen: Sightings) -> Float[Array, ""]:
-    """The misfit of the best pose over three sigmas of its chi-square."""
+    """Cost of the best candidate over the mean plus three sigmas of its chi-square."""
     misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
     freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
     return misfit / (freedom + 3 * jnp.sqrt(2 * freedom))

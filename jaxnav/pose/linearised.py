@@ -3,8 +3,8 @@
 A minimisation asks for both at every step, and for so few unknowns differentiation costs more than
 the residuals. Coordinates come first, then corners, and the poses, which all are treated alike,
 last: that is the axis that runs through vector registers. Sums of three or six products are
-written as sums over an axis, which XLA computes once and keeps, where it would repeat a chain of
-additions for everyone who asks for the result.
+written as sums over an axis, which XLA computes once and keeps; it would repeat a chain of
+additions in every consumer of the result.
 """
 
 from collections.abc import Callable
@@ -19,15 +19,15 @@ from jaxnav.models.lenses import MOST_COEFFICIENTS, image_of
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.observation import Sightings, cameras_of
 
-# Residuals (2, P, N) of P corners under N poses, in units of their sigma, and how they answer to a
-# shift of the corners, (3, 2, P, N), per m.
+# Residuals (2, P, N) of P corners under N poses, in units of their sigma, and their derivative by
+# a shift of the corners, (3, 2, P, N), per m.
 Rows = tuple[Float[Array, "2 P N"], Float[Array, "3 2 P N"]]
 
 
 def reprojection_rows(rig: CameraRig, seen: Sightings) -> Callable[[Float[Array, "3 P N"]], Rows]:
     """Projected minus observed corners over sigma, zero in hidden lanes, and their derivatives.
 
-    What does not depend on the pose is done once, before anything is minimised.
+    The parts that do not depend on the pose are computed here, once.
 
     Returns:
         A function of each sighting's own corners in the vehicle frame, P = 4 D of them, m.
@@ -66,7 +66,15 @@ def reprojection_rows(rig: CameraRig, seen: Sightings) -> Callable[[Float[Array,
 def pinhole_rows(
     corners_n: Float[Array, "P 2"], unit: Float[Array, ""]
 ) -> Callable[[Float[Array, "3 P N"]], Rows]:
-    """The same for a camera of focal length 1, in multiples of `unit`, of points it sees."""
+    """As `reprojection_rows` for a camera of focal length 1, in multiples of `unit`.
+
+    Args:
+        corners_n: (P, 2) observed corners, normalised image coordinates.
+        unit: in which residuals are counted.
+
+    Returns:
+        A function of the corners in the camera frame.
+    """
 
     def rows(points: Array) -> Rows:
         image, slope = image_of("none", points, jnp.zeros(MOST_COEFFICIENTS, points.dtype))
@@ -78,7 +86,11 @@ def pinhole_rows(
 def wrench(
     rows: Rows, points: Float[Array, "3 P N"]
 ) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
-    """Force and torque about the origin: J'r of a shift and a turn of all points, without J."""
+    """J'r of a shift and a turn of all points about the origin, computed without forming J.
+
+    Returns:
+        sum of slope * residual (3, N), the force, and its moment (3, N), the torque.
+    """
     residual, slope = rows
     force = jnp.sum(slope * residual[None], axis=1)
     return jnp.sum(force, axis=1), jnp.sum(crossed(points, force), axis=1)

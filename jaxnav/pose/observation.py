@@ -1,4 +1,4 @@
-"""What the vehicle senses at one instant, and its compact form for the solvers."""
+"""`Observation`, one reading of all sensors, and `Snapshot`, its compact form for the solvers."""
 
 import dataclasses
 
@@ -13,9 +13,9 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.numerics.small_matrices import in_order
 
-# What lens calibration and rolling shutter leave in a corner, beside its own scatter.
+# Sigma of the error of lens calibration and rolling shutter in a corner, beside its own scatter.
 MODEL_SIGMA_PX = 0.15
-# Beyond these a reading is an error of the sensor, or of its unit.
+# A reading beyond these is an error of the sensor or of its unit.
 _MAX_SPEED_MPS = 1e3
 _MAX_DT_S = 1e4
 # Up to here comparing every lane with every other is faster than a sort.
@@ -25,8 +25,8 @@ _FEW_LANES = 32
 class Observation(eqx.Module):
     """One synchronous reading of cameras, odometer and steering sensor.
 
-    Lanes that are not visible hold any finite numbers. What no sensor can mean is left out, see
-    `usable`.
+    Axes: C cameras of the rig, M markers of the map. Lanes that are not visible hold any finite
+    numbers. `usable` removes readings that no vehicle can have.
     """
 
     corners_px: Float[Array, "C M 4 2"]  # raw pixels, M in the order of the map
@@ -36,7 +36,7 @@ class Observation(eqx.Module):
     dt_s: Float[Array, ""] | float = 0.0  # since the previous observation
     corner_sigma_px: Float[Array, "C M 4"] | None = None  # None: the estimator's own figure
     has_odometry: Bool[Array, ""] | bool = True  # False: speed and steering are not known
-    # What another sensor knows, for `OrientationGiven`; a NaN is no reading.
+    # Readings of another sensor, for `OrientationGiven`; a NaN is no reading.
     heading_rad: Float[Array, ""] | None = None  # psi in the world
     heading_sigma_rad: Float[Array, ""] | float = 0.02
     normals_camera: Float[Array, "C M 3"] | None = None  # unit normal of each marker
@@ -44,7 +44,7 @@ class Observation(eqx.Module):
     T_world_vehicle_true: jaxlie.SE3 | None = None  # simulations only, for `Oracle`
 
     def usable(self) -> "Observation":
-        """The same with everything finite that a filter looks at.
+        """The observation with all readings finite that a filter uses.
 
         A lane with a non-finite corner is not visible; without a speed and a steering angle that
         a vehicle can have there is no odometry; a `dt_s` that is no positive time is 0.
@@ -133,13 +133,13 @@ def sightings(
 
 
 def slots(rig: CameraRig, markers: MarkerMap, max_sightings: int | None) -> int:
-    """How many sightings are used, the largest: by default two of every marker, 16 at most."""
+    """D, the number of largest sightings used: by default two for each marker, at most 16."""
     count = len(markers.ids)
     return min(max_sightings or min(2 * count, 16), len(rig) * count)
 
 
 class Snapshot(eqx.Module):
-    """One observation by a rig in a map: all that a pose can be held against."""
+    """One observation with its rig and map: all that a pose is compared with."""
 
     rig: CameraRig
     markers: MarkerMap
@@ -155,12 +155,15 @@ class Snapshot(eqx.Module):
         model_sigma_px: Float[Array, ""] | float = MODEL_SIGMA_PX,
         max_sightings: int | None = None,
     ) -> "Snapshot":
-        """An observation together with what it is an observation of.
+        """The snapshot of an observation: its largest sightings with the sigma of their corners.
 
         Args:
-            corner_sigma_px: for observations that bring no sigma of their own.
-            model_sigma_px: what lens calibration and rolling shutter leave in a corner, added
-                in quadrature to the sigma that an observation brings.
+            rig: C cameras.
+            markers: M markers.
+            obs: the observation.
+            corner_sigma_px: of observations that bring no sigma of their own.
+            model_sigma_px: sigma of lens calibration and rolling shutter in a corner, added in
+                quadrature to the sigma that an observation brings.
             max_sightings: see `slots`.
         """
         sigma_px = corner_sigma_px
@@ -171,13 +174,13 @@ class Snapshot(eqx.Module):
         return Snapshot(rig, markers, obs, seen)
 
     def largest(self, count: int) -> "Snapshot":
-        """The same with the first sightings alone."""
+        """The snapshot with its first `count` sightings, which are the largest."""
         seen = jax.tree.map(lambda leaf: leaf[:count], self.seen)
         return dataclasses.replace(self, seen=seen)
 
 
 def log_sigmas(seen: Sightings) -> Float[Array, ""]:
-    """The sum over all visible coordinates: what a likelihood pays for doubting them."""
+    """Sum of log(sigma) over all visible coordinates, for the likelihood of the corners."""
     return 2 * jnp.sum(jnp.where(seen.visible[:, None], jnp.log(seen.sigma_px), 0))
 
 

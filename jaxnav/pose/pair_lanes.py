@@ -1,17 +1,17 @@
 """Both poses of many markers at once: `ippe_square` and `solve_marker` with every scalar an array.
 
-A lane is one pose of one marker. Lanes never wait for each other: one that has converged stands
-still, and after a few steps the few that have not are gathered and go on alone. A lane's result
+A lane is one pose of one marker. Lanes do not wait for each other: one that has converged stays,
+and after a few steps the few that have not are gathered and refined alone. A lane's result
 depends neither on its neighbours nor on how many there are.
 
 Unknowns are the marker's turn about its own centre, the image of that centre, and half a side over
 depth; the marker's size only scales the result. Corners are taken relative to their mean, which
 keeps float32's digits for small markers.
 
-Two things about XLA on a CPU are heeded throughout. It computes a value anew in every kernel that
-uses it, unless that value is a quotient or a root: so what is used often ends in one. And arrays
-that lie a multiple of 4096 bytes apart push each other out of the first-level cache: so blocks have
-odd lengths. `benchmarks/README-pose.md` has the figures.
+Two properties of XLA on a CPU shape the code. It computes a value anew in every kernel that uses
+it, unless that value is a quotient or a root: so values that are used often end in one. And arrays
+a multiple of 4096 bytes apart evict each other from the first-level cache: so blocks have odd
+lengths. `benchmarks/README-pose.md` has the figures.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ from jaxnav.pose.ippe import PosePair
 
 _SIGNS = [(int(a), int(b)) for a, b, _ in CORNER_SIGNS]
 _FIRST_STEPS = 2  # for all lanes; most need no more
-_ROUNDS, _FIRST_ROUND = 5, 4  # of the lanes that are left: 4, 8, 16, 32, 64 further steps
+_ROUNDS, _FIRST_ROUND = 5, 4  # lanes not done get 4, 8, 16, 32, 64 further steps
 
 Lane = Float[Array, "*lanes"]
 
@@ -40,7 +40,7 @@ class Marks(NamedTuple):
     x: tuple[Lane, ...]  # four corners
     y: tuple[Lane, ...]
     mean: tuple[Lane, Lane]
-    unit: Lane  # what residuals are measured in: about half a side in the image
+    unit: Lane  # in which residuals are counted: about half a side in the image
     usable: Bool[Array, "*lanes"]
 
 
@@ -53,7 +53,7 @@ class Poses(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What Levenberg-Marquardt knows of every lane."""
+    """The state of Levenberg-Marquardt in every lane."""
 
     cost: Lane  # sum of squares in units; inf where a corner is behind the camera
     damping: Lane
@@ -67,7 +67,7 @@ class _State(eqx.Module):
 
 
 def marks(corners_n: Float[Array, "4 2 *lanes"]) -> Marks:
-    """Corners of every lane, from the corners with the lanes last."""
+    """The `Marks` of corners (4, 2, *lanes), with zeros for those that are not finite."""
     usable = jnp.all(jnp.isfinite(corners_n), axis=(0, 1))
     corners = jnp.where(usable[None, None], corners_n, 0)
     x, y = (tuple(corners[i, k] for i in range(4)) for k in (0, 1))
@@ -79,7 +79,7 @@ def marks(corners_n: Float[Array, "4 2 *lanes"]) -> Marks:
 
 
 def closed_form(seen: Marks) -> tuple[Poses, Poses]:
-    """Both poses of every lane's marker. Source: see `ippe_square`, whose lines these are."""
+    """Both poses of every lane's marker. Source: see `ippe_square`, of which this is a copy."""
     x, y, (mean_x, mean_y), dtype = seen.x, seen.y, seen.mean, seen.unit.dtype
     # The homography at the centre.
     across, along, twist = (
@@ -332,7 +332,7 @@ class LaneLM(optx.AbstractLeastSquaresSolver):
         aux_struct: PyTree,
         tags: frozenset[object],
     ) -> _State:
-        """Go on from where an earlier search stopped."""
+        """The trace of an earlier search, with which this one continues."""
         return _State(options["trace"], options["steps"])
 
     def step(
@@ -351,7 +351,7 @@ class LaneLM(optx.AbstractLeastSquaresSolver):
         promised = sum(m * (damping * m - g) for m, g in zip(move, gradient, strict=True))
         trial = _moved(y, move)
         trial_cost = _cost(trial, args)
-        # Farther than four times as far at once leads to where nothing pulls back.
+        # A step beyond four times the distance ends where the cost is flat.
         accept = (trial_cost < cost) & (move[2] > -0.75) & ~done
         gained = (cost - trial_cost) / jnp.where(promised > 0, promised, 1)
         least = jnp.finfo(cost.dtype).eps
@@ -379,7 +379,7 @@ class LaneLM(optx.AbstractLeastSquaresSolver):
         state: _State,
         tags: frozenset[object],
     ) -> tuple[Array, optx.RESULTS]:
-        """Whether all lanes are done, or as many steps were taken as may be."""
+        """Whether all lanes are done, or no step is left."""
         over = jnp.all(state.trace.done) | (state.left <= 0)
         return over, cast(optx.RESULTS, optx.RESULTS.successful)
 
@@ -401,7 +401,7 @@ class LaneLM(optx.AbstractLeastSquaresSolver):
 def _improve(
     pose: Poses, seen: Marks, trace: Trace, steps: Int[Array, ""] | int
 ) -> tuple[Poses, Trace]:
-    """At most so many steps of Levenberg-Marquardt in every lane."""
+    """At most `steps` steps of Levenberg-Marquardt in every lane."""
     # A share of the cost and, in hundredths of the marker's spread, as for a single marker.
     tolerance = 1e-12 if seen.unit.dtype == jnp.float64 else 1e-6
     solution: optx.Solution = optx.least_squares(
@@ -417,7 +417,7 @@ def _improve(
 
 
 def _begun(start: Poses, seen: Marks) -> tuple[Poses, Trace]:
-    """A start that is finite and in front of the camera, and what is known of it."""
+    """A start that is finite and in front of the camera, and its trace."""
     finite = seen.usable
     for number in jax.tree.leaves(start):
         finite = finite & jnp.isfinite(number)
@@ -463,7 +463,7 @@ def _in_blocks(corners_n: Float[Array, "B 4 2"], lanes: int) -> Float[Array, "bl
 
 
 def _block_lanes(batch: int, on_cpu: int, elsewhere: int) -> int:
-    """How many lanes are handled together: as many as the cache holds, or the accelerator likes."""
+    """Number of lanes in a block, a multiple of 16: bounded by the cache or the accelerator."""
     most = on_cpu if jax.default_backend() == "cpu" else elsewhere
     return min(most, -(-batch // 16) * 16)
 
@@ -485,8 +485,8 @@ def ippe_squares(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) -
 def solve_pairs(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) -> PosePair:
     """Both poses of every marker, each at its local minimum: (B, 4, 2) and (B,) give (B, 2).
 
-    What `solve_marker` does, lane by lane, without derivatives. Corners that are not finite give
-    NaN, corners that form no square's image finite but meaningless poses.
+    Computes the result of `solve_marker` lane by lane, without derivatives. Corners that are not
+    finite give NaN, corners that form no square's image finite but meaningless poses.
     """
     batch = corners_n.shape[0]
     if batch == 0:
@@ -509,7 +509,7 @@ def solve_pairs(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) ->
 
 
 def _finished(pose: Poses, seen: Marks, trace: Trace) -> tuple[Poses, Trace]:
-    """The lanes that are not done, gathered into blocks of their own and taken to the end.
+    """Gather the lanes that are not done into blocks of their own, and refine them to the end.
 
     Args:
         pose, trace: (blocks, 2, lanes).

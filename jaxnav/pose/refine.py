@@ -35,13 +35,13 @@ from jaxnav.pose.linearised import Rows, crossed, pinhole_rows, reprojection_row
 from jaxnav.pose.observation import Sightings, sightings
 from jaxnav.pose.pair_lanes import solve_pairs
 
-# An angle is known to about a radian, and a distance to about itself, before any corner is
-# looked at. Bounds the covariance where the corners say nothing.
+# Prior sigma of an angle, rad, and of a distance, as a share of itself. It bounds the covariance
+# in directions that the corners do not determine.
 _PRIOR_SIGMA = 1.0
 
 
 class RefinedPose(eqx.Module):
-    """Result of one refinement.
+    """A pose at a local minimum of e1, with its covariance from J'J there.
 
     A lane whose numbers overflowed has an infinite cost, is not `converged`, and holds the start
     and an identity covariance.
@@ -49,7 +49,7 @@ class RefinedPose(eqx.Module):
 
     T_vehicle_world: jaxlie.SE3
     cost: Float[Array, "*N"]  # sum of (residual / sigma)^2
-    e1_px2: Float[Array, "*N"]  # the paper's: as if every sigma were 1 px
+    e1_px2: Float[Array, "*N"]  # the paper's, Eq. 3: every sigma is 1 px
     covariance: Float[Array, "*N 6 6"]  # of xi in T_world_vehicle * exp(xi): vehicle axes, (m, rad)
     steps: Int[Array, "*N"]
     converged: Bool[Array, "*N"]
@@ -64,14 +64,20 @@ def refine_pose(
     corner_sigma_px: Float[Array, "*sigma"] | float = 1.0,
     max_steps: int = 100,
 ) -> RefinedPose:
-    """The local minimum of e1 next to a pose: all cameras, all markers, all corners at once.
+    """The local minimum of e1 (Eq. 3) next to a pose, over all cameras, markers and corners.
+
+    Corners are weighed by 1 / sigma^2. The covariance is (J'J)^-1 of the whitened residuals.
 
     Args:
+        rig: C cameras.
+        markers: M markers.
         corners_px: (C, M, 4, 2) raw pixels.
         visible: (C, M).
         T_vehicle_world: where to start.
         corner_sigma_px: standard deviation of a corner coordinate, a number or (C, M, 4).
         max_steps: bound on the LM steps; a lane that needs more is not `converged`.
+
+    Source: Liu, Schofield, Shan (2023), Eq. 3 and below.
     """
     seen = sightings(rig, markers, corners_px, visible, corner_sigma_px)
     start = jaxlie.SE3(T_vehicle_world.wxyz_xyz[None])
@@ -90,10 +96,17 @@ def refine_sightings(
 ) -> RefinedPose:
     """`refine_pose` from N poses, on sightings that have been gathered already.
 
-    All take as many steps as the slowest; those that are not `wanted` take none.
+    All lanes take as many steps as the slowest; those that are not `wanted` take none.
 
-    With `ground_plane` a level start stays level on the ground: the vehicle's x, y and heading
-    alone are refined, and the covariance is that of these three.
+    Args:
+        rig: C cameras.
+        markers: M markers.
+        seen: D sightings.
+        Ts_vehicle_world: N poses at which to start.
+        max_steps: bound on the LM steps.
+        ground_plane: a level start stays level on the ground: only the vehicle's x, y and heading
+            are refined, and the covariance is that of these three.
+        wanted: (N,), which lanes to refine; None: all.
     """
     rows = reprojection_rows(rig, seen)
     any_visible = jnp.any(seen.visible)
@@ -166,7 +179,7 @@ class _Chart(eqx.Module):
             return residual.reshape(-1, residual.shape[-1]), NormalEquations(gram(J), gradient)
 
         def in_chart(about: Array, half: Array) -> Array:
-            """Answers to a turn from here on, as answers to a change of `half`."""
+            """Derivatives by a turn from here on, converted to derivatives by `half`."""
             return (about + crossed(about, half)) / (1 + jnp.sum(half**2, axis=0))[None]
 
         return at
@@ -201,7 +214,7 @@ def _minimise(
     constrained: Bool[Array, " N"],
     max_steps: int,
 ) -> tuple[jaxlie.SE3, LMState]:
-    """LM from the chart's poses: where each ends, and how.
+    """Minimise by LM from the chart's poses: the poses found, and the solver's state.
 
     Gradients are those of the implicit function at the minimum: right only where `done`, and
     independent of the start.
@@ -210,14 +223,14 @@ def _minimise(
     n, dtype = free.shape[1], chart.pivot.dtype
 
     def fn(y: Array, args: None) -> tuple[Any, NormalEquations]:
-        # Without a visible corner there is nothing to gain: nothing moves.
+        # Without a visible corner the residuals are zero, and the pose stays.
         residual, normal = linearised(y)
         return jnp.where(constrained[None], residual, 0), NormalEquations(
             jnp.where(constrained[None, None], normal.information, 0),
             jnp.where(constrained[None], normal.gradient, 0),
         )
 
-    tolerance = 1e-12 if dtype == jnp.float64 else 1e-6  # of the cost, what is left to gain
+    tolerance = 1e-12 if dtype == jnp.float64 else 1e-6  # gain left, as a share of the cost
     solution: optx.Solution = optx.least_squares(
         fn,
         NormalEquationsLM(rtol=tolerance, atol=tolerance),
@@ -249,9 +262,9 @@ def _body_covariance(pivot: Array, scale: Array, information: Array, free: Array
 def solve_marker(
     corners_n: Float[Array, "4 2"], size_m: Float[Array, ""] | float, max_steps: int = 100
 ) -> PosePair:
-    """Both poses of one marker in one camera, each refined to its local minimum by LM.
+    """Both poses of one marker in one camera, each refined by LM to its minimum of e1.
 
-    Args and result as `ippe_square`; `reprojection_error` is the refined one.
+    Arguments and result are those of `ippe_square`; `reprojection_error` is the refined one.
     """
     corners_n = jnp.asarray(corners_n)
     start = ippe_square(corners_n, size_m)
@@ -265,7 +278,7 @@ def solve_marker(
 
 
 class _SingleMarker(eqx.Module):
-    """What one camera sees of one marker, and how it fits to N poses of it."""
+    """Corners of one marker in one camera, with their residuals at N poses of it."""
 
     corners_n: Float[Array, "4 2"]
     size_m: Float[Array, ""]
@@ -312,7 +325,7 @@ def _solve_pairs(corners_n: Array, size_m: Array) -> PosePair:
 def _solve_pairs_jvp(
     primals: tuple[Array, Array], tangents: tuple[Array, Array]
 ) -> tuple[PosePair, PosePair]:
-    """By the implicit function theorem, as the derivatives of `solve_marker`."""
+    """Derivatives by the implicit function theorem, as those of `solve_marker`."""
     pair = _solve_pairs(*primals)
     wxyz_xyz = pair.T_camera_marker.wxyz_xyz
     _, (t_poses, t_errors) = jax.jvp(
@@ -324,7 +337,7 @@ def _solve_pairs_jvp(
 def _at_minima(
     wxyz_xyz: Float[Array, "2 7"], corners_n: Array, size_m: Array
 ) -> tuple[Array, Array]:
-    """Refined poses and their errors, which move with the corners and the size as minima do."""
+    """Refined poses and their errors, with the derivatives of minima by corners and size."""
     T = jaxlie.SE3(jax.lax.stop_gradient(wxyz_xyz))
     marker = _SingleMarker(corners_n, size_m)
     here = jnp.zeros((6, 2), wxyz_xyz.dtype)

@@ -22,10 +22,11 @@ def reprojection_residuals(
 ) -> Callable[[Float[Array, "M 4 3"]], Float[Array, "D 4 2"]]:
     """Projected minus observed corners in pixels, zero in hidden lanes.
 
-    What does not depend on the pose is done once, before anything is minimised.
+    The parts that do not depend on the pose are computed here, once.
 
     Args:
-        seen: the sightings.
+        rig: C cameras.
+        seen: D sightings.
 
     Returns:
         A function of the corners of all markers of the map, in the vehicle frame, m.
@@ -57,9 +58,20 @@ def e1(
     visible: Bool[Array, "C M"],
     T_vehicle_world: jaxlie.SE3,
 ) -> Float[Array, ""]:
-    """Image-space error: squared distances of all visible corners, pixel^2 (Eq. 3).
+    """Image-space error, pixel^2 (Eq. 3): squared distances of all visible corners.
+
+        e1(T_vw) = sum_ij |u_ij - project_j(T_jv T_vw p_i)|^2
 
     Pixels are raw: the lens is part of the projection.
+
+    Args:
+        rig: C cameras j, with T_jv = `Ts_camera_vehicle`.
+        markers: M markers, whose corners p_i are in the world.
+        corners_px: u_ij, (C, M, 4, 2).
+        visible: (C, M).
+        T_vehicle_world: T_vw.
+
+    Source: Liu, Schofield, Shan (2023), Eq. 3.
     """
     seen = sightings(rig, markers, corners_px, visible)
     corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
@@ -72,10 +84,20 @@ def e2(
     T_vehicle_world: jaxlie.SE3,
     T_vehicle_world_prior: jaxlie.SE3,
 ) -> Float[Array, ""]:
-    """Object-space error: squared distances, in the vehicle frame, between the corners under a
-    pose and under the filter's prediction, m^2, summed over the markers in view (Eq. 14).
+    """Object-space error, m^2 (Eq. 14): squared distances of the corners to their prediction.
 
-    A marker seen by two cameras counts once.
+        e2(T_vw) = sum_i |T_vw p_i - T_w p_i|^2
+
+    in the vehicle frame, over the corners p_i of the markers in view. A marker seen by two cameras
+    counts once.
+
+    Args:
+        markers: M markers.
+        visible: (C, M).
+        T_vehicle_world: T_vw.
+        T_vehicle_world_prior: T_w, the filter's prediction.
+
+    Source: Liu, Schofield, Shan (2023), Eq. 14.
     """
     corners = markers.corners_world_m
     gap = transform_points(T_vehicle_world, corners) - transform_points(

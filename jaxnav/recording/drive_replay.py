@@ -5,7 +5,7 @@
     difference = first_difference(log, replay_drive(log.inputs, setup, folder))
 
 On the machine and with the versions that it was recorded with every bit is the same, elsewhere
-every number but for rounding (RELIABILITY R11).
+every number but for rounding (docs/promises.md, Replay).
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The fault matrix: what can go wrong on a drive, and what must come of it (RELIABILITY).
+"""The fault matrix: what can go wrong on a drive, and what must come of it.
 
     for row in matrix():
         print(line(run_trial(row, trial)))
@@ -35,7 +35,7 @@ from jaxnav.vehicles.world import World
 
 BEGIN_S, END_S = 2.5, 4.0  # of most faults
 ALL_CAMERAS = range(4)  # of the rig that is driven with
-SETTLE_S = 2.0  # after a fault: then the position must be right again (R3)
+SETTLE_S = 2.0  # after a fault: then the position must be right again
 WAYPOINTS_M = (
     (1.3, 0.0), (0.3, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5),
     (0.5, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5), (0.5, 0.2),
@@ -63,7 +63,7 @@ class Row:
     """One fault, and what is asked of a drive with it.
 
     Attributes:
-        name: as RELIABILITY calls it.
+        name: as `jaxnav faults` prints it.
         change: what happens to the data on their way, made anew for each drive.
         happens: what happens to the world, the same.
         faults, rejects: one of these at least must be seen while it lasts; none: nothing is asked.

@@ -1,4 +1,4 @@
-"""The rows of the fault matrix (RELIABILITY), and what each must come to."""
+"""The rows of the fault matrix, and what each must come to."""
 
 import dataclasses
 from collections.abc import Callable

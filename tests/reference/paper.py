@@ -86,7 +86,10 @@ def drive(pose, speed_mps, steering_rad, duration_s, wheelbase_m, steps=2000):
 
 
 def steering(pose, waypoint_m, steering_measured_rad, wheelbase_m):
-    """Eqs. 4, 17, 18, the arctan of a ratio read as atan2 (DESIGN 3.2): (angle, L_d, alpha)."""
+    """Eqs. 4, 17, 18, the arctan of a ratio read as atan2: (angle, L_d, alpha).
+
+    See docs/design.md, Steering and throttle.
+    """
     beta = np.arctan(0.5 * np.tan(steering_measured_rad))
     dx, dy = waypoint_m[0] - pose[0], waypoint_m[1] - pose[1]
     distance = np.sqrt(dx**2 + dy**2)
