@@ -1,6 +1,7 @@
 """Kinds of values that several commands are told, and what is asked of them."""
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -32,12 +33,44 @@ Scenario = Literal[
 StudyKind = Literal["ambiguity", "drive"]
 CornerBackend = Literal["aruco", "apriltag"]
 Switch = tyro.conf.FlagCreatePairsOff[bool]
-QCarFile = Annotated[
-    Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: the QCar's)")
+
+
+def _file(told: str | None = None, without: str = "(default: the QCar's)") -> object:
+    return tyro.conf.arg(metavar="FILE", help_behavior_hint=without, help=told)
+
+
+QCarFile = Annotated[Path | None, _file()]
+OptionalFile = Annotated[Path | None, _file(without="(optional)")]
+OptionalName = Annotated[
+    str | None, tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)")
 ]
-OptionalFile = Annotated[
-    Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")
+KeyValues = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
 ]
+
+# These bring their help along.
+QCarRig = Annotated[Path | None, _file("Cameras: a rig file or a Kalibr camchain.")]
+QCarMarkers = Annotated[Path | None, _file("Marker map.")]
+QCarVehicle = Annotated[Path | None, _file("Vehicle parameters and limits.")]
+QCarBicycle = Annotated[Path | None, _file("Bicycle parameters and limits.")]
+Believed = Annotated[
+    Selector, tyro.conf.arg(help="Which of the two poses of a marker is believed.")
+]
+Detector = Annotated[
+    CornerBackend,
+    tyro.conf.arg(help="Marker detector. apriltag needs the extra of that name."),
+]
+Float64 = Annotated[Switch, tyro.conf.arg(help="Estimate in double precision.")]
+ResultsFolder = Annotated[Path, tyro.conf.arg(metavar="DIR", help="Folder for the results.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Headless:
+    """What every command is told that shows how far it is."""
+
+    headless: Switch = False
+    """No progress bar."""
 
 
 def require(condition: bool, flag: str, problem: str) -> None:

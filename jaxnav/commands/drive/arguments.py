@@ -7,9 +7,19 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxnav.commands.kinds import (
+    Believed,
     CornerBackend,
+    Detector,
+    Float64,
+    Headless,
+    KeyValues,
     OptionalFile,
+    OptionalName,
     QCarFile,
+    QCarMarkers,
+    QCarRig,
+    QCarVehicle,
+    ResultsFolder,
     Selector,
     Switch,
     require,
@@ -44,25 +54,17 @@ class Run:
         ),
     ] = None
     """Installed cameras (sim, qcar, opencv, replay and those of plug-ins), or MODULE:NAME."""
-    option: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
-    ] = ()
+    option: KeyValues = ()
     """What the vehicle and the cameras are told, e.g. images=true for sim."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle_file: QCarFile = None
-    """Vehicle parameters and limits."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle_file: QCarVehicle = None
     route: QCarFile = None
     """Waypoints, and where a simulated car starts."""
     params: OptionalFile = None
     """Tuned parameters of filter and controller."""
-    selector: Selector = "multi-hypothesis"
-    """Which of the two poses of a marker is believed."""
-    corner_backend: CornerBackend = "aruco"
-    """Marker detector. apriltag needs the extra of that name."""
+    selector: Believed = "multi-hypothesis"
+    corner_backend: Detector = "aruco"
     relocate: bool = True
     """Drive on, slowly at first, where the corners say that the car is where its wheels can't have
     brought it: somebody carried it there, or shows it a copy of the marker. Without: stop."""
@@ -83,8 +85,7 @@ class Run:
     """Between two readings of the odometer, s."""
     timeout_s: float = 0.2
     """So long after the last sign of life of any thread the vehicle has been stopped, s."""
-    float64: Switch = False
-    """Estimate in double precision."""
+    float64: Float64 = False
     seed: int = 0
     """Of a simulated vehicle."""
     headless: Switch = False
@@ -110,7 +111,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Faults:
+class Faults(Headless):
     """Drive the simulated car with every fault of the fault matrix, and print what came of it.
 
     Cameras, stamps, odometry, calibration, the world and the loop fail in some fifty ways, one at a
@@ -119,24 +120,16 @@ class Faults:
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()
     """Faults whose names hold one of these."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle_file: QCarFile = None
-    """Vehicle parameters and limits."""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
-        None
-    )
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle_file: QCarVehicle = None
+    json: OptionalFile = None
     """Write the table into this file too."""
-    float64: Switch = False
-    """Estimate in double precision."""
-    headless: Switch = False
-    """No progress bar."""
+    float64: Float64 = False
 
 
 @dataclass(frozen=True)
-class Replay:
+class Replay(Headless):
     """Drive a recorded drive again, or localise a recorded camera rig in every frame.
 
     A drive is a .mcap of `jaxnav`, or a ROS bag with --topics, --rig, --markers-file, --vehicle and
@@ -187,10 +180,7 @@ class Replay:
         tyro.conf.arg(metavar="N", constructor=int, help_behavior_hint="(default: all)"),
     ] = None
     """Stop after N frames, of a drive after N inputs."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
-    """Folder for the results."""
-    headless: Switch = False
-    """No progress bar."""
+    out: ResultsFolder = Path("out")
 
     def __post_init__(self) -> None:
         if self.limit is not None:
@@ -200,7 +190,7 @@ class Replay:
 
 
 @dataclass(frozen=True)
-class View:
+class View(Headless):
     """Look at a recorded drive in Rerun: map, cameras, candidates, health, over time.
 
     Opens a window, or writes an .rrd file to --out. Needs the extra `viz`.
@@ -208,12 +198,8 @@ class View:
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
     """Recorded drive (.mcap)."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
-        None
-    )
+    out: OptionalFile = None
     """Write this file (.rrd) instead of opening a window."""
-    headless: Switch = False
-    """No progress bar."""
 
 
 @dataclass(frozen=True)
@@ -230,15 +216,11 @@ class Locate:
     """Calibration: a rig file, a Kalibr camchain or a ROS camera_info YAML."""
     marker_size_m: Annotated[float, tyro.conf.arg(metavar="S")]
     """Side of the black square, m."""
-    camera_name: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
-    ] = None
+    camera_name: OptionalName = None
     """Which camera of the file took it, where the file holds several."""
     family: str = "tag36h11"
     """Marker family."""
-    corner_backend: CornerBackend = "aruco"
-    """Marker detector. apriltag needs the extra of that name."""
+    corner_backend: Detector = "aruco"
     json: Switch = False
     """Print JSON instead of a table."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="PNG", help_behavior_hint="(optional)")] = (

@@ -6,11 +6,11 @@ from typing import Annotated
 
 import tyro
 
-from jaxnav.commands.kinds import Selector, StudyKind, Switch, require
+from jaxnav.commands.kinds import Headless, ResultsFolder, Selector, StudyKind, require
 
 
 @dataclass(frozen=True)
-class Study:
+class Study(Headless):
     """Run a Monte-Carlo study: a labelled grid of parameters, many trials in every cell.
 
     `ambiguity` studies single frames, `drive` closed-loop drives. CONFIG is a YAML file, or the
@@ -45,8 +45,6 @@ class Study:
         ),
     ] = None
     """How many trials are run and written at a time. Changes no result."""
-    headless: Switch = False
-    """No progress bar."""
 
     def __post_init__(self) -> None:
         if self.chunk_trials is not None:
@@ -58,7 +56,7 @@ class Study:
 
 
 @dataclass(frozen=True)
-class Plot:
+class Plot(Headless):
     """Draw a study or a recorded drive.
 
     Of a study: flip-rate maps, curves with their intervals, reliability diagrams, and summary.json
@@ -70,12 +68,10 @@ class Plot:
     """What `jaxnav study` wrote, or a recorded drive (.mcap)."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
     """Folder for the pictures."""
-    headless: Switch = False
-    """No progress bar."""
 
 
 @dataclass(frozen=True)
-class Reliability:
+class Reliability(Headless):
     """Draw whether flip probabilities mean what they say: when it says 10 %, are 10 % flipped?
 
     Without RECORDING, on random views of one marker (sides of 10 to 100 px, 0 to 60 degrees, corner
@@ -94,10 +90,7 @@ class Reliability:
     """How many random views."""
     seed: int = 0
     """Of the random views."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
-    """Folder for the results."""
-    headless: Switch = False
-    """No progress bar."""
+    out: ResultsFolder = Path("out")
 
     def __post_init__(self) -> None:
         require(self.frames >= 1, "--frames", f"must be at least 1, got {self.frames}")

@@ -7,11 +7,14 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxnav.commands.kinds import (
+    Believed,
+    Headless,
     OptionalFile,
-    QCarFile,
+    QCarBicycle,
+    QCarMarkers,
+    QCarRig,
+    ResultsFolder,
     Scenario,
-    Selector,
-    Switch,
     require,
     require_finite,
     require_within,
@@ -21,7 +24,7 @@ _Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME", help_behavior_
 
 
 @dataclass(frozen=True)
-class TuneFilter:
+class TuneFilter(Headless):
     """Learn the filter's noise, Q and R, from recordings or from simulated drives.
 
     By default it asks no truth: it makes the corners of every frame as likely as can be, given all
@@ -68,20 +71,13 @@ class TuneFilter:
     """Those that are to be whole matrices."""
     params: OptionalFile = None
     """Where to start: a file of parameters."""
-    selector: Selector = "multi-hypothesis"
-    """Which of the two poses of a marker is believed."""
+    selector: Believed = "multi-hypothesis"
     steps: int = 150
     """At most so many evaluations."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle: QCarFile = None
-    """Bicycle parameters and limits."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("tuned")
-    """Folder for the results."""
-    headless: Switch = False
-    """No progress bar."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle: QCarBicycle = None
+    out: ResultsFolder = Path("tuned")
 
     def __post_init__(self) -> None:
         for flag, count in (
@@ -101,7 +97,7 @@ class TuneFilter:
 
 
 @dataclass(frozen=True)
-class TuneController:
+class TuneController(Headless):
     """Learn the controller's gains from simulated drives.
 
     The loss of a drive is a weighed sum of the time to the last waypoint, the distance from the
@@ -141,22 +137,15 @@ class TuneController:
     """Parameters to learn; by default p1, p2, its bound, look-ahead and slowing down in turns."""
     params: OptionalFile = None
     """Where to start: a file of parameters."""
-    selector: Selector = "multi-hypothesis"
-    """Which of the two poses of a marker is believed."""
+    selector: Believed = "multi-hypothesis"
     steps: int = 40
     """At most so many."""
     learning_rate: float = 0.25
     """Of Adam, at the first step; a tenth of it at the last."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle: QCarFile = None
-    """Bicycle parameters and limits."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("tuned")
-    """Folder for the results."""
-    headless: Switch = False
-    """No progress bar."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle: QCarBicycle = None
+    out: ResultsFolder = Path("tuned")
 
     def __post_init__(self) -> None:
         for flag, count in (
