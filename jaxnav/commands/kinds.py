@@ -35,25 +35,37 @@ CornerBackend = Literal["aruco", "apriltag"]
 Switch = tyro.conf.FlagCreatePairsOff[bool]
 
 
-def _file(told: str | None = None, without: str = "(default: the QCar's)") -> object:
-    return tyro.conf.arg(metavar="FILE", help_behavior_hint=without, help=told)
+def optional(
+    metavar: str,
+    without: str = "(optional)",
+    constructor: type | None = None,
+    told: str | None = None,
+) -> object:
+    """How help shows an option that may be left out.
+
+    Args:
+        without: what is then.
+        constructor: of the value, where the word None is none.
+        told: the help, where the field has none of its own.
+    """
+    return tyro.conf.arg(
+        metavar=metavar, help_behavior_hint=without, constructor=constructor, help=told
+    )
 
 
-QCarFile = Annotated[Path | None, _file()]
-OptionalFile = Annotated[Path | None, _file(without="(optional)")]
-OptionalName = Annotated[
-    str | None, tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)")
-]
+_QCAR = "FILE", "(default: the QCar's)", None
+QCarFile = Annotated[Path | None, optional(*_QCAR)]
+OptionalFile = Annotated[Path | None, optional("FILE")]
+OptionalName = Annotated[str | None, optional("NAME", constructor=str)]
 KeyValues = Annotated[
-    tyro.conf.UseAppendAction[tuple[str, ...]],
-    tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
+    tyro.conf.UseAppendAction[tuple[str, ...]], optional("KEY=VALUE", "(repeatable)")
 ]
 
 # These bring their help along.
-QCarRig = Annotated[Path | None, _file("Cameras: a rig file or a Kalibr camchain.")]
-QCarMarkers = Annotated[Path | None, _file("Marker map.")]
-QCarVehicle = Annotated[Path | None, _file("Vehicle parameters and limits.")]
-QCarBicycle = Annotated[Path | None, _file("Bicycle parameters and limits.")]
+QCarRig = Annotated[Path | None, optional(*_QCAR, "Cameras: a rig file or a Kalibr camchain.")]
+QCarMarkers = Annotated[Path | None, optional(*_QCAR, "Marker map.")]
+QCarVehicle = Annotated[Path | None, optional(*_QCAR, "Vehicle parameters and limits.")]
+QCarBicycle = Annotated[Path | None, optional(*_QCAR, "Bicycle parameters and limits.")]
 Believed = Annotated[
     Selector, tyro.conf.arg(help="Which of the two poses of a marker is believed.")
 ]

@@ -14,6 +14,7 @@ from jaxnav.commands.kinds import (
     QCarMarkers,
     QCarRig,
     QCarVehicle,
+    optional,
     require,
 )
 
@@ -39,13 +40,10 @@ class Doctor:
     option: KeyValues = ()
     """What the plug-ins are told."""
     frame: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(metavar="CAMERA=IMAGE", help_behavior_hint="(repeatable)"),
+        tyro.conf.UseAppendAction[tuple[str, ...]], optional("CAMERA=IMAGE", "(repeatable)")
     ] = ()
     """A picture by one of the rig's cameras, the car standing anywhere with a marker in view."""
-    drive: Annotated[
-        Path | None, tyro.conf.arg(metavar="FILE.mcap", help_behavior_hint="(optional)")
-    ] = None
+    drive: Annotated[Path | None, optional("FILE.mcap")] = None
     """A recorded drive with eights, or stops and starts: are the cameras later than they say?"""
     json: OptionalFile = None
     """Write all findings into this file too."""

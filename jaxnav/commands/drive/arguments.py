@@ -22,6 +22,7 @@ from jaxnav.commands.kinds import (
     ResultsFolder,
     Selector,
     Switch,
+    optional,
     require,
     require_finite,
     require_within,
@@ -47,12 +48,7 @@ class Run:
 
     vehicle: str = "sim"
     """An installed vehicle (sim, qcar, ros2, replay and those of plug-ins), or MODULE:NAME."""
-    cameras: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="NAME", constructor=str, help_behavior_hint="(default: as --vehicle)"
-        ),
-    ] = None
+    cameras: Annotated[str | None, optional("NAME", "(default: as --vehicle)", str)] = None
     """Installed cameras (sim, qcar, opencv, replay and those of plug-ins), or MODULE:NAME."""
     option: KeyValues = ()
     """What the vehicle and the cameras are told, e.g. images=true for sim."""
@@ -68,18 +64,13 @@ class Run:
     relocate: bool = True
     """Drive on, slowly at first, where the corners say that the car is where its wheels can't have
     brought it: somebody carried it there, or shows it a copy of the marker. Without: stop."""
-    record: Annotated[
-        Path | None, tyro.conf.arg(metavar="MCAP", help_behavior_hint="(optional)")
-    ] = None
+    record: Annotated[Path | None, optional("MCAP")] = None
     """Record the drive into this file."""
     record_images: Switch = False
     """Record the cameras' images too, as JPEG."""
     view: Switch = False
     """Open Rerun and look on. Needs the extra viz."""
-    duration_s: Annotated[
-        float | None,
-        tyro.conf.arg(metavar="S", help_behavior_hint="(default: until the last waypoint)"),
-    ] = None
+    duration_s: Annotated[float | None, optional("S", "(default: until the last waypoint)")] = None
     """End after this time, s."""
     period_s: float = 0.02
     """Between two readings of the odometer, s."""
@@ -171,14 +162,10 @@ class Replay(Headless):
     ] = None
     """Which of the two poses of a marker is believed."""
     corner_sigma_px: Annotated[
-        float | None,
-        tyro.conf.arg(metavar="PX", help_behavior_hint="(default: as the recording tells)"),
+        float | None, optional("PX", "(default: as the recording tells)")
     ] = None
     """Standard deviation of a corner coordinate."""
-    limit: Annotated[
-        int | None,
-        tyro.conf.arg(metavar="N", constructor=int, help_behavior_hint="(default: all)"),
-    ] = None
+    limit: Annotated[int | None, optional("N", "(default: all)", int)] = None
     """Stop after N frames, of a drive after N inputs."""
     out: ResultsFolder = Path("out")
 
@@ -223,9 +210,7 @@ class Locate:
     corner_backend: Detector = "aruco"
     json: Switch = False
     """Print JSON instead of a table."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="PNG", help_behavior_hint="(optional)")] = (
-        None
-    )
+    out: Annotated[Path | None, optional("PNG")] = None
     """Draw the markers and both poses into this file."""
 
     def __post_init__(self) -> None:

@@ -19,6 +19,7 @@ from jaxnav.commands.kinds import (
     Selector,
     SimulatedSelector,
     Switch,
+    optional,
     require,
     require_finite,
     require_within,
@@ -86,9 +87,7 @@ class Simulate(Headless):
     """Which pose is believed; several names, or `all`."""
     corner_noise_px: tuple[float, ...] = (1.0,)
     """Standard deviation of the corners, one or several."""
-    told_noise_px: Annotated[
-        float | None, tyro.conf.arg(metavar="PX", help_behavior_hint="(default: the truth)")
-    ] = None
+    told_noise_px: Annotated[float | None, optional("PX", "(default: the truth)")] = None
     """What the navigator is told of it."""
     seeds: int = 100
     """How many drives."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxnav.commands.kinds import Headless, ResultsFolder, Selector, StudyKind, require
+from jaxnav.commands.kinds import Headless, ResultsFolder, Selector, StudyKind, optional, require
 
 
 @dataclass(frozen=True)
@@ -23,27 +23,15 @@ class Study(Headless):
     """What a trial is."""
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
     """YAML file with `trials`, `axes` and what is fixed; or a name; or `list`."""
-    out: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="STORE", help_behavior_hint="(default: out/CONFIG.zarr)"),
-    ] = None
+    out: Annotated[Path | None, optional("STORE", "(default: out/CONFIG.zarr)")] = None
     """Where the result goes, or goes on."""
-    workers: Annotated[
-        int | None,
-        tyro.conf.arg(metavar="N", constructor=int, help_behavior_hint="(default: this process)"),
-    ] = None
+    workers: Annotated[int | None, optional("N", "(default: this process)", int)] = None
     """Start so many Dask workers on this machine."""
-    scheduler: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="ADDRESS", constructor=str, help_behavior_hint="(optional)"),
-    ] = None
+    scheduler: Annotated[str | None, optional("ADDRESS", constructor=str)] = None
     """Run on the Dask cluster with its scheduler there, e.g. tcp://127.0.0.1:8786."""
-    chunk_trials: Annotated[
-        int | None,
-        tyro.conf.arg(
-            metavar="N", constructor=int, help_behavior_hint="(default: 65536, or 256 drives)"
-        ),
-    ] = None
+    chunk_trials: Annotated[int | None, optional("N", "(default: 65536, or 256 drives)", int)] = (
+        None
+    )
     """How many trials are run and written at a time. Changes no result."""
 
     def __post_init__(self) -> None:
@@ -79,10 +67,7 @@ class Reliability(Headless):
     every marker by itself. Written to --out: reliability.png and summary.json.
     """
 
-    recording: Annotated[
-        tyro.conf.Positional[Path | None],
-        tyro.conf.arg(metavar="RECORDING", help_behavior_hint="(optional)"),
-    ] = None
+    recording: Annotated[tyro.conf.Positional[Path | None], optional("RECORDING")] = None
     """Folder, ROS 1 bag (.bag, .bag.bz2) or .npz."""
     selector: Selector = "multi-hypothesis"
     """Whose probabilities, on a recording."""

@@ -15,12 +15,13 @@ from jaxnav.commands.kinds import (
     QCarRig,
     ResultsFolder,
     Scenario,
+    optional,
     require,
     require_finite,
     require_within,
 )
 
-_Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
+_Names = Annotated[tuple[str, ...], optional("NAME", "")]
 
 
 @dataclass(frozen=True)
@@ -39,13 +40,10 @@ class TuneFilter(Headless):
     """
 
     recordings: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]],
-        tyro.conf.arg(metavar="RECORDING", help_behavior_hint="(default: simulated drives)"),
+        tyro.conf.Positional[tuple[Path, ...]], optional("RECORDING", "(default: simulated drives)")
     ] = ()
     """Drives (.mcap), or rigs: folders of TagSLAM, .npz, ROS 1 bags with --rig and --markers."""
-    test: Annotated[
-        tuple[Path, ...], tyro.conf.arg(metavar="RECORDING", help_behavior_hint="(optional)")
-    ] = ()
+    test: Annotated[tuple[Path, ...], optional("RECORDING")] = ()
     """Recordings to hold the result against, whole."""
     part: tuple[float, float] = (0.0, 1.0)
     """What part of every recording is learned from; the rest is held against the result."""

@@ -13,6 +13,7 @@ from jaxnav.commands.kinds import (
     OptionalFile,
     ResultsFolder,
     Switch,
+    optional,
     require,
     require_finite,
     require_within,
@@ -21,12 +22,7 @@ from jaxnav.commands.kinds import (
 CalibrationFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision", "wpilib"]
 WPILibFamily = Literal["tag16h5", "tag25h9", "tag36h11"]
 
-_OPTIONAL = "(optional)"
 _NAMED = re.compile(r"([A-Za-z_][\w.\-]{0,99})=(.+)")
-
-
-def _default(hint: str, metavar: str) -> object:
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {hint})")
 
 
 @dataclass(frozen=True)
@@ -46,17 +42,27 @@ class CalibrateBoard:
     """The paper, or its width and height in mm, as in 600x400."""
     landscape: Switch = False
     """The paper's longer side lies."""
-    columns: Annotated[int | None, _default("as the target and the paper suggest", "INT")] = None
+    columns: Annotated[
+        int | None, optional("INT", "(default: as the target and the paper suggest)")
+    ] = None
     """Squares or tags side by side."""
-    rows: Annotated[int | None, _default("as the target and the paper suggest", "INT")] = None
+    rows: Annotated[
+        int | None, optional("INT", "(default: as the target and the paper suggest)")
+    ] = None
     """Squares or tags one above the other."""
-    size_mm: Annotated[float | None, _default("the largest round size that fits", "FLOAT")] = None
+    size_mm: Annotated[
+        float | None, optional("FLOAT", "(default: the largest round size that fits)")
+    ] = None
     """Side of a square, or of the black outline of a tag or marker."""
-    marker_mm: Annotated[float | None, _default("a cell of white around it", "FLOAT")] = None
+    marker_mm: Annotated[
+        float | None, optional("FLOAT", "(default: a cell of white around it)")
+    ] = None
     """Of a charuco board, the side of its markers."""
     spacing: float = 0.3
     """Of an aprilgrid, the gap between tags in sides of a tag: Kalibr's tagSpacing."""
-    family: Annotated[str | None, _default("4x4 for charuco, else tag36h11", "NAME")] = None
+    family: Annotated[str | None, optional("NAME", "(default: 4x4 for charuco, else tag36h11)")] = (
+        None
+    )
     """Of the markers: tag36h11, 4x4_50, 6x6_250, ..."""
     first_id: int = 0
     """Of the markers, which are numbered on from there."""
@@ -108,10 +114,7 @@ class CalibrateIntrinsics(Headless):
     jaxnav locate take; report.json with every parameter's sigma; report.png.
     """
 
-    sources: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="SOURCE", help_behavior_hint="(required)"),
-    ]
+    sources: Annotated[tyro.conf.Positional[tuple[str, ...]], optional("SOURCE", "(required)")]
     """Images, folders of images, videos. Of several cameras at once: front=DIR left=DIR ..."""
     board: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """The board: board.yaml of `jaxnav calibrate board`, or Kalibr's."""
@@ -167,14 +170,9 @@ class CalibrateConvert:
     out: Annotated[Path, tyro.conf.arg(metavar="FILE|DIR")]
     """The file (.json of photonvision and wpilib, else .yaml); of several cameras, where each has
     one of its own, their folder."""
-    camera_name: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=_OPTIONAL)
-    ] = None
+    camera_name: Annotated[str | None, optional("NAME")] = None
     """Which camera, where SOURCE has several; what to call it, where SOURCE has one."""
-    position_m: Annotated[
-        tuple[float, float, float] | None,
-        tyro.conf.arg(metavar="X Y Z", help_behavior_hint=_OPTIONAL),
-    ] = None
+    position_m: Annotated[tuple[float, float, float] | None, optional("X Y Z")] = None
     """Where the camera is on the vehicle, if SOURCE does not say so: forward, left, up."""
     yaw_deg: float = 0.0
     """With --position-m: 0 looks forward, 90 to the left."""
@@ -182,22 +180,14 @@ class CalibrateConvert:
     """With --position-m: positive looks up."""
     roll_deg: float = 0.0
     """With --position-m: positive is clockwise as seen from behind the camera."""
-    marker_size_m: Annotated[
-        float | None,
-        tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: FIRST's, 0.1651)"),
-    ] = None
+    marker_size_m: Annotated[float | None, optional("FLOAT", "(default: FIRST's, 0.1651)")] = None
     """Side of the black square of every tag in a WPILib layout, which does not tell."""
     family: Annotated[
-        WPILibFamily | None,
-        tyro.conf.arg(
-            metavar="{tag16h5,tag25h9,tag36h11}",
-            help_behavior_hint="(default: FIRST's, tag36h11)",
-        ),
+        WPILibFamily | None, optional("{tag16h5,tag25h9,tag36h11}", "(default: FIRST's, tag36h11)")
     ] = None
     """Of the tags in a WPILib layout, which does not tell."""
     field_size_m: Annotated[
-        tuple[float, float] | None,
-        tyro.conf.arg(metavar="LENGTH WIDTH", help_behavior_hint="(default: what the map spans)"),
+        tuple[float, float] | None, optional("LENGTH WIDTH", "(default: what the map spans)")
     ] = None
     """Of the field in a WPILib layout to be written."""
 

@@ -13,6 +13,7 @@ from jaxnav.commands.kinds import (
     QCarFile,
     ResultsFolder,
     Switch,
+    optional,
     require,
     require_finite,
     require_within,
@@ -38,9 +39,7 @@ Family = Annotated[str, tyro.conf.arg(help="Marker family, where the recording d
 OdometryParameter = Literal[
     "speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "camera_delay_s"
 ]
-_RecordedFile = Annotated[
-    Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: the recording's)")
-]
+_RecordedFile = Annotated[Path | None, optional("FILE", "(default: the recording's)")]
 
 
 def _require_recordings(recordings: tuple[Path, ...]) -> None:
@@ -165,9 +164,7 @@ class CalibrateOdometry(Headless):
     """Who finds the markers in a ROS bag's images."""
     fix: Annotated[tuple[OdometryParameter, ...], tyro.conf.arg(help_behavior_hint="")] = ()
     """What is not looked for: it stays as it is in --vehicle."""
-    wheelbase_sigma_m: Annotated[
-        float | None, tyro.conf.arg(metavar="M", help_behavior_hint="(optional)")
-    ] = None
+    wheelbase_sigma_m: Annotated[float | None, optional("M")] = None
     """How well the wheelbase in --vehicle was measured; by default nothing is known of it."""
     out: ResultsFolder = Path("calibrated")
 
