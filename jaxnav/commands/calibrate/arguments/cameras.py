@@ -23,6 +23,7 @@ CalibrationFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision",
 WPILibFamily = Literal["tag16h5", "tag25h9", "tag36h11"]
 
 _NAMED = re.compile(r"([A-Za-z_][\w.\-]{0,99})=(.+)")
+_Count = Annotated[int | None, optional("INT", "(default: as the target and the paper suggest)")]
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,9 @@ class CalibrateBoard:
     """The paper, or its width and height in mm, as in 600x400."""
     landscape: Switch = False
     """The paper's longer side lies."""
-    columns: Annotated[
-        int | None, optional("INT", "(default: as the target and the paper suggest)")
-    ] = None
+    columns: _Count = None
     """Squares or tags side by side."""
-    rows: Annotated[
-        int | None, optional("INT", "(default: as the target and the paper suggest)")
-    ] = None
+    rows: _Count = None
     """Squares or tags one above the other."""
     size_mm: Annotated[
         float | None, optional("FLOAT", "(default: the largest round size that fits)")
@@ -114,7 +111,10 @@ class CalibrateIntrinsics(Headless):
     jaxnav locate take; report.json with every parameter's sigma; report.png.
     """
 
-    sources: Annotated[tyro.conf.Positional[tuple[str, ...]], optional("SOURCE", "(required)")]
+    sources: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.arg(metavar="SOURCE", help_behavior_hint="(required)"),
+    ]
     """Images, folders of images, videos. Of several cameras at once: front=DIR left=DIR ..."""
     board: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """The board: board.yaml of `jaxnav calibrate board`, or Kalibr's."""
