@@ -16,9 +16,8 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, TextIO, cast
 
-from jaxnav.commands.terminal import nothing_hidden
 from jaxnav.errors import EXIT_BAD_INPUT as EXIT_BAD_INPUT
 from jaxnav.errors import EXIT_INTERRUPTED as EXIT_INTERRUPTED
 from jaxnav.errors import BadInput, visible
@@ -130,6 +129,34 @@ def _dispatch(args: list[str], *signals: Signals) -> int:
         package, extra = _OF_EXTRAS[missing.name]
         raise UsageError(f"needs {package}: pip install 'jaxnav[{extra}]'") from None
     return code
+
+
+class _Shown:
+    """A stream that writes out what a terminal would obey, line feeds apart, and what it can't
+    show. All else is the stream's own."""
+
+    def __init__(self, stream: Any):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        shown = "\n".join(visible(line) for line in text.split("\n"))
+        encoding = getattr(self._stream, "encoding", None) or "utf-8"
+        self._stream.write(shown.encode(encoding, "backslashreplace").decode(encoding))
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def nothing_hidden() -> Iterator[None]:
+    """While the block runs, whatever is printed to the standard output is made visible."""
+    before = sys.stdout
+    sys.stdout = cast(TextIO, _Shown(before))
+    try:
+        yield
+    finally:
+        sys.stdout = before
 
 
 def _parse(args: list[str]) -> Any:

@@ -8,9 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxnav.calibration.boards.images import source_files
-from jaxnav.cli import main
+from jaxnav.cli import main, nothing_hidden
 from jaxnav.commands.pictures import save_figure
-from jaxnav.commands.terminal import nothing_hidden
 from jaxnav.errors import BadInput, visible
 from jaxnav.files.images import decoded_image
 from jaxnav.vehicles.opencv_cameras import _device

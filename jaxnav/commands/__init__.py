@@ -8,7 +8,7 @@ import dataclasses
 import importlib
 from collections.abc import Iterator
 from functools import cache
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Union, cast
 
 _REPORT = ("report.png", "report.json")
 _MAP = ("markers.yaml", "trajectory.tum", *_REPORT)
@@ -38,10 +38,12 @@ class Registered:
 
     @property
     def kind(self) -> type:
-        """The dataclass of its arguments."""
+        """The dataclass of its arguments; what it shares with others comes last, in help too."""
         module, _, name = self.arguments.partition(":")
-        kind: type = getattr(importlib.import_module(f"{__name__}.{module}"), name)
-        return kind
+        kind: Any = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+        named = (name for one in kind.__mro__ for name in vars(one).get("__annotations__", ()))
+        kind.__dataclass_fields__ = {name: kind.__dataclass_fields__[name] for name in named}
+        return cast(type, kind)
 
 
 COMMANDS = {
@@ -77,31 +79,33 @@ COMMANDS = {
         "tune.arguments:TuneController", "tune.controller", in_folder=_TUNED
     ),
     "calibrate board": Registered(
-        "calibrate.arguments.boards:CalibrateBoard",
+        "calibrate.arguments.cameras:CalibrateBoard",
         "calibrate.board",
         in_folder=("board.pdf", "board.png", "board.yaml", "report.json"),
     ),
     "calibrate intrinsics": Registered(
-        "calibrate.arguments.intrinsics:CalibrateIntrinsics",
+        "calibrate.arguments.cameras:CalibrateIntrinsics",
         "calibrate.intrinsics",
         in_folder=("camera.yaml", *_REPORT),
     ),
     "calibrate rig": Registered(
-        "calibrate.arguments.rig:CalibrateRig", "calibrate.rig", in_folder=("rig.yaml", *_MAP)
+        "calibrate.arguments.recordings:CalibrateRig",
+        "calibrate.rig",
+        in_folder=("rig.yaml", *_MAP),
     ),
     "calibrate markers": Registered(
-        "calibrate.arguments.markers:CalibrateMarkers", "calibrate.markers", in_folder=_MAP
+        "calibrate.arguments.recordings:CalibrateMarkers", "calibrate.markers", in_folder=_MAP
     ),
     "calibrate check": Registered(
-        "calibrate.arguments.check:CalibrateCheck", "calibrate.check", in_folder=_MAP
+        "calibrate.arguments.recordings:CalibrateCheck", "calibrate.check", in_folder=_MAP
     ),
     "calibrate odometry": Registered(
-        "calibrate.arguments.odometry:CalibrateOdometry",
+        "calibrate.arguments.recordings:CalibrateOdometry",
         "calibrate.odometry",
         in_folder=("vehicle.yaml", *_REPORT),
     ),
     "calibrate convert": Registered(
-        "calibrate.arguments.convert:CalibrateConvert", "calibrate.convert"
+        "calibrate.arguments.cameras:CalibrateConvert", "calibrate.convert"
     ),
 }
 GROUPS = {

@@ -1,6 +1,7 @@
 """Kinds of values that several commands are told, and what is asked of them."""
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -32,12 +33,56 @@ Scenario = Literal[
 StudyKind = Literal["ambiguity", "drive"]
 CornerBackend = Literal["aruco", "apriltag"]
 Switch = tyro.conf.FlagCreatePairsOff[bool]
-QCarFile = Annotated[
-    Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: the QCar's)")
+
+
+def optional(
+    metavar: str,
+    without: str = "(optional)",
+    constructor: type | None = None,
+    told: str | None = None,
+) -> object:
+    """How help shows an option that may be left out.
+
+    Args:
+        without: what is then.
+        constructor: of the value, where the word None is none.
+        told: the help, where the field has none of its own.
+    """
+    return tyro.conf.arg(
+        metavar=metavar, help_behavior_hint=without, constructor=constructor, help=told
+    )
+
+
+_QCAR = "FILE", "(default: the QCar's)", None
+QCarFile = Annotated[Path | None, optional(*_QCAR)]
+OptionalFile = Annotated[Path | None, optional("FILE")]
+OptionalName = Annotated[str | None, optional("NAME", constructor=str)]
+KeyValues = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]], optional("KEY=VALUE", "(repeatable)")
 ]
-OptionalFile = Annotated[
-    Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")
+
+# These bring their help along.
+QCarRig = Annotated[Path | None, optional(*_QCAR, "Cameras: a rig file or a Kalibr camchain.")]
+QCarMarkers = Annotated[Path | None, optional(*_QCAR, "Marker map.")]
+QCarVehicle = Annotated[Path | None, optional(*_QCAR, "Vehicle parameters and limits.")]
+QCarBicycle = Annotated[Path | None, optional(*_QCAR, "Bicycle parameters and limits.")]
+Believed = Annotated[
+    Selector, tyro.conf.arg(help="Which of the two poses of a marker is believed.")
 ]
+Detector = Annotated[
+    CornerBackend,
+    tyro.conf.arg(help="Marker detector. apriltag needs the extra of that name."),
+]
+Float64 = Annotated[Switch, tyro.conf.arg(help="Estimate in double precision.")]
+ResultsFolder = Annotated[Path, tyro.conf.arg(metavar="DIR", help="Folder for the results.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Headless:
+    """What every command is told that shows how far it is."""
+
+    headless: Switch = False
+    """No progress bar."""
 
 
 def require(condition: bool, flag: str, problem: str) -> None:

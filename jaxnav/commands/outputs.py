@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.commands import COMMANDS, registered
-from jaxnav.commands.calibrate.arguments.intrinsics import CalibrateIntrinsics
+from jaxnav.commands.calibrate.arguments.cameras import CalibrateIntrinsics
 
 _OUTPUTS = {"out", "json", "record"}  # fields that are no inputs
 

@@ -106,22 +106,29 @@ class Ros2Reader(_Ros2Reader):
             yield one
 
 
-def checked_message(kind: str, raw: bytes) -> bytes:
-    """A message's bytes, if it is not too long to be taken apart."""
-    if kind not in _IMAGES and len(raw) > limits.MESSAGE_BYTES:
-        raise ValueError(f"a message of {len(raw)} bytes")
-    return raw
-
-
-def typestore(connections: Collection[Connection], known: dict[str, str]) -> Any:
-    """The types of some connections.
+def messages(
+    reader: Ros1Reader | Ros2Reader, connections: Collection[Connection], known: dict[str, str]
+) -> Iterator[tuple[Connection, int, Any]]:
+    """The messages of some connections with the times, in ns, at which they were received.
 
     Args:
         known: definitions of types that a bag may use without one.
 
     Raises:
-        Exception: of rosbags, or that a definition is too long or declares too much.
+        Exception: of rosbags, or that a definition or a message is too long or declares too much.
     """
+    types = typestore(connections, known)
+    is_ros1 = isinstance(reader, Ros1Reader)
+    deserialize = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
+    for connection, received_ns, raw in reader.messages(connections) if connections else ():
+        kind = connection.msgtype
+        if kind not in _IMAGES and len(raw) > limits.MESSAGE_BYTES:
+            raise ValueError(f"a message of {len(raw)} bytes")
+        yield connection, received_ns, deserialize(raw, kind)
+
+
+def typestore(connections: Collection[Connection], known: dict[str, str]) -> Any:
+    """The types of some connections; the rest as in `messages`."""
     undefined = {c.msgtype for c in connections if c.msgdef.format is MessageDefinitionFormat.NONE}
     types = get_typestore(Stores.ROS2_HUMBLE if undefined else Stores.EMPTY)
     for kind in undefined - types.fielddefs.keys():

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.datasets.bag_readers import Ros1Reader, checked_message, typestore
+from jaxnav.datasets.bag_readers import Ros1Reader, messages
 from jaxnav.datasets.recording import Rows
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
@@ -91,10 +91,7 @@ def _read(path: Path) -> Bag:
         bag.topics = {connection.topic: connection.msgtype for connection in reader.connections}
         kinds = (DETECTIONS_TYPE, *_TF_TYPES)
         wanted = [c for c in reader.connections if c.msgtype in kinds]
-        types = typestore(wanted, {})
-        for connection, _, raw in reader.messages(connections=wanted) if wanted else ():
-            kind = connection.msgtype
-            message = types.deserialize_ros1(checked_message(kind, raw), kind)
+        for connection, _, message in messages(reader, wanted, {}):
             if connection.msgtype == DETECTIONS_TYPE:
                 _add_detections(bag.detections.setdefault(connection.topic, Detections()), message)
             else:

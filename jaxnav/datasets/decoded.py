@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.datasets.recording import Recording, Rows, assemble
+from jaxnav.datasets.recording import Found, Rows
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import to_se3
@@ -38,8 +38,8 @@ _REFERENCE_KEYS: dict[str, tuple[tuple[str | int, ...], str]] = {
 }
 
 
-def read_decoded(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -> Recording:
-    """Read an .npz; see `read_recording`. The reference may be missing.
+def read_decoded(path: Path, rig: CameraRig | None) -> Found:
+    """Read an .npz. The reference may be missing.
 
     The file does not hold the sizes of the images: they are taken as twice the principal point,
     or larger where a corner lies further out.
@@ -49,29 +49,18 @@ def read_decoded(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -
     """
     stored = _checked(path)
     rows, rig = _rows(path, stored, rig)
-    reference = None
-    if "rig_stamp" in stored:
-        matrices = zip(stored["rig_stamp"], stored["T_map_rig"], strict=True)
-        reference = {
-            int(stamp): _pose(path, f"T_map_rig[{index}]", T)
-            for index, (stamp, T) in enumerate(matrices)
-        }
-    return assemble(
-        path.stem if path.stem != "decoded" else path.resolve().parent.name,
-        rows,
-        rig,
-        markers or _markers(path, stored),
-        reference,
-    )
+    name = path.stem if path.stem != "decoded" else path.resolve().parent.name
+    return Found(name, rows, rig, lambda: _markers(path, stored), lambda: _reference(path, stored))
 
 
-def decoded_rows(path: Path, rig: CameraRig | None) -> tuple[Rows, CameraRig]:
-    """All detections of an .npz, and the cameras that made them.
-
-    Raises:
-        BadInput: one line naming file and key.
-    """
-    return _rows(path, _checked(path), rig)
+def _reference(path: Path, stored: dict[str, np.ndarray]) -> dict[int, np.ndarray] | None:
+    if "rig_stamp" not in stored:
+        return None
+    matrices = zip(stored["rig_stamp"], stored["T_map_rig"], strict=True)
+    return {
+        int(stamp): _pose(path, f"T_map_rig[{index}]", T)
+        for index, (stamp, T) in enumerate(matrices)
+    }
 
 
 def _checked(path: Path) -> dict[str, np.ndarray]:

@@ -13,6 +13,7 @@ Conventions of the recordings that exist, as found in their data:
   the two is false, and missing a sighting costs less than believing a false one.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -117,6 +118,22 @@ class Rows:
     ids: Int[np.ndarray, " N"]
     corners_px: Float[np.ndarray, "N 4 2"]  # BL BR TR TL
     frame_stamps_ns: Int[np.ndarray, " F"]  # of all frames, those without a detection as well
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a file holds: detections and cameras; the rest for who asks for it.
+
+    Attributes:
+        markers: the map. Raises BadInput where there is none, or a broken one.
+        reference: stamp in ns -> (7,) wxyz xyz of the vehicle in the world, if the file tells.
+    """
+
+    name: str
+    rows: Rows
+    rig: CameraRig
+    markers: Callable[[], MarkerMap]
+    reference: Callable[[], dict[int, np.ndarray] | None] = lambda: None
 
 
 def assemble(

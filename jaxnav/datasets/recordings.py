@@ -1,10 +1,11 @@
 """Reading recordings: a TagSLAM folder, a single ROS 1 bag with a rig and a marker map, an .npz."""
 
 from pathlib import Path
+from typing import NoReturn
 
 from jaxnav.datasets import bags
 from jaxnav.datasets.decoded import read_decoded
-from jaxnav.datasets.recording import Recording, Reference, Rows, assemble
+from jaxnav.datasets.recording import Found, Recording, Reference, assemble
 from jaxnav.datasets.tagslam import read_tagslam
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
@@ -27,36 +28,46 @@ def read_recording(
         BadInput: one line naming the file and what is wrong in it, or the flag that is missing.
     """
     path = Path(path)
-    if path.is_dir():
-        return read_tagslam(path, rig, markers)
-    if not path.exists():
-        raise BadInput(path, "there is no such file or folder")
-    if path.suffix == ".npz":
-        return read_decoded(path, rig, markers)
-    if bags.is_bag(path):
-        return _read_single_bag(path, rig, markers)
-    raise BadInput(path, "is no recording: expected a folder, a .bag, a .bag.bz2 or an .npz")
+    if rig is not None and markers is None and bags.is_bag(path) and path.is_file():
+        _no_markers(path)  # before all of it is read
+    found = find(path, rig)
+    reference = found.reference()
+    return assemble(found.name, found.rows, found.rig, markers or found.markers(), reference)
 
 
-def _read_single_bag(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -> Recording:
-    if rig is not None and markers is None:
-        raise BadInput("--markers-file", f"missing: {path} does not say where its markers are")
-    rows, rig = bag_rows(path, rig)
-    assert markers is not None  # the rig is asked for first
-    return assemble(path.name, rows, rig, markers)
+def find(path: Path, rig: CameraRig | None, also: str = "") -> Found:
+    """All detections of a recording, whatever map they are of.
 
-
-def bag_rows(path: Path, rig: CameraRig | None) -> tuple[Rows, CameraRig]:
-    """All detections of a single bag by the cameras of a rig, which are called like its topics.
+    Args:
+        also: what else the caller reads, for the message about what nobody does.
 
     Raises:
         BadInput: one line naming the file, or the flag that is missing.
     """
+    if path.is_dir():
+        return read_tagslam(path, rig)
+    if not path.exists():
+        raise BadInput(path, "there is no such file or folder")
+    if path.suffix == ".npz":
+        return read_decoded(path, rig)
+    if bags.is_bag(path):
+        return _read_single_bag(path, rig)
+    problem = f"is no recording: expected {also}a folder, a .bag, a .bag.bz2 or an .npz"
+    raise BadInput(path, problem)
+
+
+def _read_single_bag(path: Path, rig: CameraRig | None) -> Found:
+    """A bag with detections by the cameras of a rig, which are called like its topics."""
     if rig is None:
         raise BadInput("--rig", f"missing: {path} alone does not say what its cameras are")
     bag = bags.read_bag(path)
     topics = [_topic_of(path, bag, name) for name in rig.names]
-    return bags.rows_of_topics([bag.detections[t] for t in topics]), rig
+    rows = bags.rows_of_topics([bag.detections[t] for t in topics])
+    return Found(path.name, rows, rig, lambda: _no_markers(path))
+
+
+def _no_markers(path: Path) -> NoReturn:
+    raise BadInput("--markers-file", f"missing: {path} does not say where its markers are")
 
 
 def _topic_of(path: Path, bag: bags.Bag, camera: str) -> str:

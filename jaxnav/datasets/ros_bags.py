@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.datasets import bags
-from jaxnav.datasets.bag_readers import Ros1Reader, Ros2Reader, checked_message, typestore
+from jaxnav.datasets.bag_readers import Ros1Reader, Ros2Reader, messages
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import problem_of
 
@@ -101,17 +101,12 @@ def _read(
         with reader_class(plain) as reader:
             chosen = choose({c.topic: c.msgtype for c in reader.connections})
             connections = [c for c in reader.connections if c.topic in chosen]
-            types = typestore(connections, _DEFINITIONS)
-            is_ros1 = reader_class is Ros1Reader
-            deserialize = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-            for connection, received_ns, raw in reader.messages(connections=connections):
-                kind = connection.msgtype
+            for connection, received_ns, message in messages(reader, connections, _DEFINITIONS):
                 if not isinstance(received_ns, int):
                     raise ValueError(f"a message of {connection.topic} has no time")
                 if problem := problem_of("stamp_ns", received_ns):
                     raise ValueError(f"the time of a message of {connection.topic} {problem}")
-                message = deserialize(checked_message(kind, raw), kind)
-                yield Received(connection.topic, kind, received_ns, message)
+                yield Received(connection.topic, connection.msgtype, received_ns, message)
     except BadInput:
         raise
     except Exception as error:

@@ -6,11 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnav.datasets import bags
-from jaxnav.datasets.decoded import decoded_rows
 from jaxnav.datasets.recording import TO_OURS, Rows
-from jaxnav.datasets.recordings import bag_rows
-from jaxnav.datasets.tagslam import tagslam_rows
+from jaxnav.datasets.recordings import find
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
 from jaxnav.loop.interfaces import Odometry
@@ -58,18 +55,10 @@ def read_sightings(path: str | Path, rig: CameraRig | None = None) -> Sightings:
         BadInput: one line naming the file and what is wrong in it, or the flag that is missing.
     """
     path = Path(path)
-    if path.is_dir():
-        return _of_rows(*tagslam_rows(path, rig))
-    if not path.exists():
-        raise BadInput(path, "there is no such file or folder")
-    if path.suffix == ".mcap":
+    if path.suffix == ".mcap" and path.exists() and not path.is_dir():
         return _of_drive(path, rig)
-    if path.suffix == ".npz":
-        return _of_rows(*decoded_rows(path, rig))
-    if bags.is_bag(path):
-        return _of_rows(*bag_rows(path, rig))
-    problem = "is no recording: expected a .mcap, a folder, a .bag, a .bag.bz2 or an .npz"
-    raise BadInput(path, problem)
+    found = find(path, rig, also="a .mcap, ")
+    return _of_rows(found.rows, found.rig)
 
 
 def _of_rows(rows: Rows, rig: CameraRig) -> Sightings:

@@ -8,13 +8,13 @@ camera_poses.yaml  poses of the cameras on the rig, where there is no /tf
 
 import re
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
 from jaxnav.datasets import bags
-from jaxnav.datasets.recording import Recording, Rows, assemble
+from jaxnav.datasets.recording import Found
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import to_se3
@@ -80,40 +80,12 @@ class CameraPoseEntry(ForeignEntry):
     pose: PoseEntry
 
 
-def read_tagslam(path: Path, rig: CameraRig | None, markers: MarkerMap | None) -> Recording:
-    """Read a TagSLAM folder; see `read_recording`.
+def read_tagslam(path: Path, rig: CameraRig | None) -> Found:
+    """Read a TagSLAM folder.
 
     Raises:
         BadInput: one line naming file and key.
     """
-    found = _read(path, rig)
-    markers = markers or _markers(path, found.edges)
-    reference = {
-        stamp: _canonical(pose)
-        for (_, child), stamped in found.edges.items() if child == found.body
-        for stamp, pose in stamped.items()
-    }  # fmt: skip
-    return assemble(path.name, found.rows, found.rig, markers, reference or None)
-
-
-def tagslam_rows(path: Path, rig: CameraRig | None) -> tuple[Rows, CameraRig]:
-    """All detections of a TagSLAM folder, and the cameras that made them.
-
-    Raises:
-        BadInput: one line naming file and key.
-    """
-    found = _read(path, rig)
-    return found.rows, found.rig
-
-
-class _Found(NamedTuple):
-    rows: Rows
-    rig: CameraRig
-    edges: "Edges"
-    body: str
-
-
-def _read(path: Path, rig: CameraRig | None) -> _Found:
     files = [file for file in sorted(path.iterdir()) if bags.is_bag(file)]
     names = {file.name for file in files}
     files = [file for file in files if file.name.removesuffix(".bz2") not in names - {file.name}]
@@ -130,10 +102,21 @@ def _read(path: Path, rig: CameraRig | None) -> _Found:
     if len(rig) != len(chain):
         problem = f"has {len(rig)} cameras, but {path / 'cameras.yaml'} has {len(chain)}"
         raise BadInput("--rig", problem)
-    return _Found(rows, rig, edges, body)
+    return Found(
+        path.name, rows, rig, lambda: _markers(path, edges), lambda: _reference(edges, body)
+    )
 
 
 Edges = dict[tuple[str, str], dict[int, tuple[float, ...]]]
+
+
+def _reference(edges: Edges, body: str) -> dict[int, np.ndarray] | None:
+    reference = {
+        stamp: _canonical(pose)
+        for (_, child), stamped in edges.items() if child == body
+        for stamp, pose in stamped.items()
+    }  # fmt: skip
+    return reference or None
 
 
 def _detections(

@@ -9,7 +9,7 @@ from jaxnav import __version__
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.pages import PAPERS_MM, check_fit, largest
 from jaxnav.calibration.boards.sheets import sheet_of
-from jaxnav.commands.calibrate.arguments.boards import CalibrateBoard
+from jaxnav.commands.calibrate.arguments.cameras import CalibrateBoard
 from jaxnav.commands.calibrate.boards import write_board
 from jaxnav.commands.process import configure_jax
 from jaxnav.detection import marker_cells

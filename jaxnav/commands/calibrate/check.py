@@ -8,7 +8,7 @@ from jaxnav.calibration.rigs.calibrate import calibrate_rig
 from jaxnav.calibration.rigs.linking import inverted
 from jaxnav.calibration.rigs.marker_check import Check, Verdict, checked
 from jaxnav.calibration.rigs.vehicle_frame import moved_world
-from jaxnav.commands.calibrate.arguments.check import CalibrateCheck as Arguments
+from jaxnav.commands.calibrate.arguments.recordings import CalibrateCheck as Arguments
 from jaxnav.commands.calibrate.data import RigData, gathered
 from jaxnav.commands.calibrate.report import provenance, summary, write_files
 from jaxnav.commands.pictures import save_figure

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxnav.calibration.rigs.calibrate import calibrate_rig
 from jaxnav.calibration.rigs.linking import inverted
-from jaxnav.commands.calibrate.arguments.markers import CalibrateMarkers as Arguments
+from jaxnav.commands.calibrate.arguments.recordings import CalibrateMarkers as Arguments
 from jaxnav.commands.calibrate.data import gathered
 from jaxnav.commands.calibrate.rig import publish, refuse_wrong_sizes
 from jaxnav.commands.process import configure_jax

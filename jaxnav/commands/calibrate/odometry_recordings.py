@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.calibration.odometry.drive import Drive
-from jaxnav.commands.calibrate.arguments.odometry import CalibrateOdometry as Arguments
+from jaxnav.commands.calibrate.arguments.recordings import CalibrateOdometry as Arguments
 from jaxnav.commands.reading import read_shown
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.detection import Detections

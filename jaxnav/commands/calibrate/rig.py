@@ -9,7 +9,7 @@ from jaxnav.calibration.rigs.driven_frame import driven_frame
 from jaxnav.calibration.rigs.linking import inverted
 from jaxnav.calibration.rigs.marker_check import sizes_m
 from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven, moved_to_places
-from jaxnav.commands.calibrate.arguments.rig import CalibrateRig as Arguments
+from jaxnav.commands.calibrate.arguments.recordings import CalibrateRig as Arguments
 from jaxnav.commands.calibrate.data import RigData, gathered
 from jaxnav.commands.calibrate.report import (
     found_markers,

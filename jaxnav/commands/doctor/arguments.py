@@ -7,7 +7,14 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
+    KeyValues,
+    OptionalFile,
+    OptionalName,
     QCarFile,
+    QCarMarkers,
+    QCarRig,
+    QCarVehicle,
+    optional,
     require,
 )
 
@@ -21,41 +28,24 @@ class Doctor:
     driven. Exit code 0: no error; 1: an error was found; 2: a file or a flag is not understood.
     """
 
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle_file: QCarFile = None
-    """Vehicle parameters and limits."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle_file: QCarVehicle = None
     route: QCarFile = None
     """Start and waypoints."""
-    vehicle: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
-    ] = None
+    vehicle: OptionalName = None
     """Vehicle plug-in to open and read: an installed name or module:name."""
-    cameras: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
-    ] = None
+    cameras: OptionalName = None
     """Camera plug-in to open and read: an installed name or module:name."""
-    option: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
-    ] = ()
+    option: KeyValues = ()
     """What the plug-ins are told."""
     frame: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(metavar="CAMERA=IMAGE", help_behavior_hint="(repeatable)"),
+        tyro.conf.UseAppendAction[tuple[str, ...]], optional("CAMERA=IMAGE", "(repeatable)")
     ] = ()
     """A picture by one of the rig's cameras, the car standing anywhere with a marker in view."""
-    drive: Annotated[
-        Path | None, tyro.conf.arg(metavar="FILE.mcap", help_behavior_hint="(optional)")
-    ] = None
+    drive: Annotated[Path | None, optional("FILE.mcap")] = None
     """A recorded drive with eights, or stops and starts: are the cameras later than they say?"""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
-        None
-    )
+    json: OptionalFile = None
     """Write all findings into this file too."""
 
     def __post_init__(self) -> None:

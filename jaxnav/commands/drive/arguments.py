@@ -7,11 +7,22 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxnav.commands.kinds import (
+    Believed,
     CornerBackend,
+    Detector,
+    Float64,
+    Headless,
+    KeyValues,
     OptionalFile,
+    OptionalName,
     QCarFile,
+    QCarMarkers,
+    QCarRig,
+    QCarVehicle,
+    ResultsFolder,
     Selector,
     Switch,
+    optional,
     require,
     require_finite,
     require_within,
@@ -37,54 +48,35 @@ class Run:
 
     vehicle: str = "sim"
     """An installed vehicle (sim, qcar, ros2, replay and those of plug-ins), or MODULE:NAME."""
-    cameras: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="NAME", constructor=str, help_behavior_hint="(default: as --vehicle)"
-        ),
-    ] = None
+    cameras: Annotated[str | None, optional("NAME", "(default: as --vehicle)", str)] = None
     """Installed cameras (sim, qcar, opencv, replay and those of plug-ins), or MODULE:NAME."""
-    option: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
-    ] = ()
+    option: KeyValues = ()
     """What the vehicle and the cameras are told, e.g. images=true for sim."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle_file: QCarFile = None
-    """Vehicle parameters and limits."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle_file: QCarVehicle = None
     route: QCarFile = None
     """Waypoints, and where a simulated car starts."""
     params: OptionalFile = None
     """Tuned parameters of filter and controller."""
-    selector: Selector = "multi-hypothesis"
-    """Which of the two poses of a marker is believed."""
-    corner_backend: CornerBackend = "aruco"
-    """Marker detector. apriltag needs the extra of that name."""
+    selector: Believed = "multi-hypothesis"
+    corner_backend: Detector = "aruco"
     relocate: bool = True
     """Drive on, slowly at first, where the corners say that the car is where its wheels can't have
     brought it: somebody carried it there, or shows it a copy of the marker. Without: stop."""
-    record: Annotated[
-        Path | None, tyro.conf.arg(metavar="MCAP", help_behavior_hint="(optional)")
-    ] = None
+    record: Annotated[Path | None, optional("MCAP")] = None
     """Record the drive into this file."""
     record_images: Switch = False
     """Record the cameras' images too, as JPEG."""
     view: Switch = False
     """Open Rerun and look on. Needs the extra viz."""
-    duration_s: Annotated[
-        float | None,
-        tyro.conf.arg(metavar="S", help_behavior_hint="(default: until the last waypoint)"),
-    ] = None
+    duration_s: Annotated[float | None, optional("S", "(default: until the last waypoint)")] = None
     """End after this time, s."""
     period_s: float = 0.02
     """Between two readings of the odometer, s."""
     timeout_s: float = 0.2
     """So long after the last sign of life of any thread the vehicle has been stopped, s."""
-    float64: Switch = False
-    """Estimate in double precision."""
+    float64: Float64 = False
     seed: int = 0
     """Of a simulated vehicle."""
     headless: Switch = False
@@ -110,7 +102,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Faults:
+class Faults(Headless):
     """Drive the simulated car with every fault of the fault matrix, and print what came of it.
 
     Cameras, stamps, odometry, calibration, the world and the loop fail in some fifty ways, one at a
@@ -119,24 +111,16 @@ class Faults:
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()
     """Faults whose names hold one of these."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle_file: QCarFile = None
-    """Vehicle parameters and limits."""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
-        None
-    )
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle_file: QCarVehicle = None
+    json: OptionalFile = None
     """Write the table into this file too."""
-    float64: Switch = False
-    """Estimate in double precision."""
-    headless: Switch = False
-    """No progress bar."""
+    float64: Float64 = False
 
 
 @dataclass(frozen=True)
-class Replay:
+class Replay(Headless):
     """Drive a recorded drive again, or localise a recorded camera rig in every frame.
 
     A drive is a .mcap of `jaxnav`, or a ROS bag with --topics, --rig, --markers-file, --vehicle and
@@ -178,19 +162,12 @@ class Replay:
     ] = None
     """Which of the two poses of a marker is believed."""
     corner_sigma_px: Annotated[
-        float | None,
-        tyro.conf.arg(metavar="PX", help_behavior_hint="(default: as the recording tells)"),
+        float | None, optional("PX", "(default: as the recording tells)")
     ] = None
     """Standard deviation of a corner coordinate."""
-    limit: Annotated[
-        int | None,
-        tyro.conf.arg(metavar="N", constructor=int, help_behavior_hint="(default: all)"),
-    ] = None
+    limit: Annotated[int | None, optional("N", "(default: all)", int)] = None
     """Stop after N frames, of a drive after N inputs."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
-    """Folder for the results."""
-    headless: Switch = False
-    """No progress bar."""
+    out: ResultsFolder = Path("out")
 
     def __post_init__(self) -> None:
         if self.limit is not None:
@@ -200,7 +177,7 @@ class Replay:
 
 
 @dataclass(frozen=True)
-class View:
+class View(Headless):
     """Look at a recorded drive in Rerun: map, cameras, candidates, health, over time.
 
     Opens a window, or writes an .rrd file to --out. Needs the extra `viz`.
@@ -208,12 +185,8 @@ class View:
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
     """Recorded drive (.mcap)."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
-        None
-    )
+    out: OptionalFile = None
     """Write this file (.rrd) instead of opening a window."""
-    headless: Switch = False
-    """No progress bar."""
 
 
 @dataclass(frozen=True)
@@ -230,20 +203,14 @@ class Locate:
     """Calibration: a rig file, a Kalibr camchain or a ROS camera_info YAML."""
     marker_size_m: Annotated[float, tyro.conf.arg(metavar="S")]
     """Side of the black square, m."""
-    camera_name: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="NAME", constructor=str, help_behavior_hint="(optional)"),
-    ] = None
+    camera_name: OptionalName = None
     """Which camera of the file took it, where the file holds several."""
     family: str = "tag36h11"
     """Marker family."""
-    corner_backend: CornerBackend = "aruco"
-    """Marker detector. apriltag needs the extra of that name."""
+    corner_backend: Detector = "aruco"
     json: Switch = False
     """Print JSON instead of a table."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="PNG", help_behavior_hint="(optional)")] = (
-        None
-    )
+    out: Annotated[Path | None, optional("PNG")] = None
     """Draw the markers and both poses into this file."""
 
     def __post_init__(self) -> None:

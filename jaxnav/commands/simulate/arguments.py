@@ -7,13 +7,19 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
-    CornerBackend,
+    Detector,
+    Headless,
     OptionalFile,
+    QCarBicycle,
     QCarFile,
+    QCarMarkers,
+    QCarRig,
+    QCarVehicle,
     Scenario,
     Selector,
     SimulatedSelector,
     Switch,
+    optional,
     require,
     require_finite,
     require_within,
@@ -21,7 +27,7 @@ from jaxnav.commands.kinds import (
 
 
 @dataclass(frozen=True)
-class Demo:
+class Demo(Headless):
     """Drive the paper's experiment: a simulated car, four rendered cameras, one marker.
 
     The car is driven by the method of --selector alone; Method A (the pose of lowest reprojection
@@ -37,12 +43,9 @@ class Demo:
     """Folder for the report."""
     selector: Selector = "multi-hypothesis"
     """Which of the two poses of a marker the driving method believes."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle: QCarFile = None
-    """Vehicle parameters and limits."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle: QCarVehicle = None
     route: QCarFile = None
     """Start and waypoints."""
     params: OptionalFile = None
@@ -55,12 +58,9 @@ class Demo:
     """Spoil the detected corners by this much (standard deviation, px)."""
     rolling_shutter: bool = True
     """Expose the rows of an image one after the other."""
-    corner_backend: CornerBackend = "aruco"
-    """Marker detector. apriltag needs the extra of that name."""
+    corner_backend: Detector = "aruco"
     duration_s: float = 30.0
     """Give up when the car has not arrived after this simulated time, s."""
-    headless: Switch = False
-    """No progress bar."""
 
     def __post_init__(self) -> None:
         require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
@@ -71,7 +71,7 @@ class Demo:
 
 
 @dataclass(frozen=True)
-class Simulate:
+class Simulate(Headless):
     """Drive many seeds at corner level, without images, and count what became of them.
 
     Prints a table, one row for each selector and noise level. A drive succeeds when the true car
@@ -87,30 +87,21 @@ class Simulate:
     """Which pose is believed; several names, or `all`."""
     corner_noise_px: tuple[float, ...] = (1.0,)
     """Standard deviation of the corners, one or several."""
-    told_noise_px: Annotated[
-        float | None, tyro.conf.arg(metavar="PX", help_behavior_hint="(default: the truth)")
-    ] = None
+    told_noise_px: Annotated[float | None, optional("PX", "(default: the truth)")] = None
     """What the navigator is told of it."""
     seeds: int = 100
     """How many drives."""
     seed: int = 0
     """The first seed."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle: QCarFile = None
-    """Bicycle parameters and limits."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle: QCarBicycle = None
     params: OptionalFile = None
     """Tuned parameters, before what the scenario tells; --told-noise-px goes before both."""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(optional)")] = (
-        None
-    )
+    json: OptionalFile = None
     """Write all numbers, each with its 95 % interval, into this file after every row."""
     resume: Switch = False
     """Keep the rows that --json holds already."""
-    headless: Switch = False
-    """No progress bar."""
 
     def __post_init__(self) -> None:
         require(self.seeds >= 1, "--seeds", f"must be at least 1, got {self.seeds}")

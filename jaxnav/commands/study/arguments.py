@@ -6,11 +6,11 @@ from typing import Annotated
 
 import tyro
 
-from jaxnav.commands.kinds import Selector, StudyKind, Switch, require
+from jaxnav.commands.kinds import Headless, ResultsFolder, Selector, StudyKind, optional, require
 
 
 @dataclass(frozen=True)
-class Study:
+class Study(Headless):
     """Run a Monte-Carlo study: a labelled grid of parameters, many trials in every cell.
 
     `ambiguity` studies single frames, `drive` closed-loop drives. CONFIG is a YAML file, or the
@@ -23,30 +23,16 @@ class Study:
     """What a trial is."""
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
     """YAML file with `trials`, `axes` and what is fixed; or a name; or `list`."""
-    out: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="STORE", help_behavior_hint="(default: out/CONFIG.zarr)"),
-    ] = None
+    out: Annotated[Path | None, optional("STORE", "(default: out/CONFIG.zarr)")] = None
     """Where the result goes, or goes on."""
-    workers: Annotated[
-        int | None,
-        tyro.conf.arg(metavar="N", constructor=int, help_behavior_hint="(default: this process)"),
-    ] = None
+    workers: Annotated[int | None, optional("N", "(default: this process)", int)] = None
     """Start so many Dask workers on this machine."""
-    scheduler: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="ADDRESS", constructor=str, help_behavior_hint="(optional)"),
-    ] = None
+    scheduler: Annotated[str | None, optional("ADDRESS", constructor=str)] = None
     """Run on the Dask cluster with its scheduler there, e.g. tcp://127.0.0.1:8786."""
-    chunk_trials: Annotated[
-        int | None,
-        tyro.conf.arg(
-            metavar="N", constructor=int, help_behavior_hint="(default: 65536, or 256 drives)"
-        ),
-    ] = None
+    chunk_trials: Annotated[int | None, optional("N", "(default: 65536, or 256 drives)", int)] = (
+        None
+    )
     """How many trials are run and written at a time. Changes no result."""
-    headless: Switch = False
-    """No progress bar."""
 
     def __post_init__(self) -> None:
         if self.chunk_trials is not None:
@@ -58,7 +44,7 @@ class Study:
 
 
 @dataclass(frozen=True)
-class Plot:
+class Plot(Headless):
     """Draw a study or a recorded drive.
 
     Of a study: flip-rate maps, curves with their intervals, reliability diagrams, and summary.json
@@ -70,12 +56,10 @@ class Plot:
     """What `jaxnav study` wrote, or a recorded drive (.mcap)."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
     """Folder for the pictures."""
-    headless: Switch = False
-    """No progress bar."""
 
 
 @dataclass(frozen=True)
-class Reliability:
+class Reliability(Headless):
     """Draw whether flip probabilities mean what they say: when it says 10 %, are 10 % flipped?
 
     Without RECORDING, on random views of one marker (sides of 10 to 100 px, 0 to 60 degrees, corner
@@ -83,10 +67,7 @@ class Reliability:
     every marker by itself. Written to --out: reliability.png and summary.json.
     """
 
-    recording: Annotated[
-        tyro.conf.Positional[Path | None],
-        tyro.conf.arg(metavar="RECORDING", help_behavior_hint="(optional)"),
-    ] = None
+    recording: Annotated[tyro.conf.Positional[Path | None], optional("RECORDING")] = None
     """Folder, ROS 1 bag (.bag, .bag.bz2) or .npz."""
     selector: Selector = "multi-hypothesis"
     """Whose probabilities, on a recording."""
@@ -94,10 +75,7 @@ class Reliability:
     """How many random views."""
     seed: int = 0
     """Of the random views."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
-    """Folder for the results."""
-    headless: Switch = False
-    """No progress bar."""
+    out: ResultsFolder = Path("out")
 
     def __post_init__(self) -> None:
         require(self.frames >= 1, "--frames", f"must be at least 1, got {self.frames}")

@@ -7,21 +7,25 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxnav.commands.kinds import (
+    Believed,
+    Headless,
     OptionalFile,
-    QCarFile,
+    QCarBicycle,
+    QCarMarkers,
+    QCarRig,
+    ResultsFolder,
     Scenario,
-    Selector,
-    Switch,
+    optional,
     require,
     require_finite,
     require_within,
 )
 
-_Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
+_Names = Annotated[tuple[str, ...], optional("NAME", "")]
 
 
 @dataclass(frozen=True)
-class TuneFilter:
+class TuneFilter(Headless):
     """Learn the filter's noise, Q and R, from recordings or from simulated drives.
 
     By default it asks no truth: it makes the corners of every frame as likely as can be, given all
@@ -36,13 +40,10 @@ class TuneFilter:
     """
 
     recordings: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]],
-        tyro.conf.arg(metavar="RECORDING", help_behavior_hint="(default: simulated drives)"),
+        tyro.conf.Positional[tuple[Path, ...]], optional("RECORDING", "(default: simulated drives)")
     ] = ()
     """Drives (.mcap), or rigs: folders of TagSLAM, .npz, ROS 1 bags with --rig and --markers."""
-    test: Annotated[
-        tuple[Path, ...], tyro.conf.arg(metavar="RECORDING", help_behavior_hint="(optional)")
-    ] = ()
+    test: Annotated[tuple[Path, ...], optional("RECORDING")] = ()
     """Recordings to hold the result against, whole."""
     part: tuple[float, float] = (0.0, 1.0)
     """What part of every recording is learned from; the rest is held against the result."""
@@ -68,20 +69,13 @@ class TuneFilter:
     """Those that are to be whole matrices."""
     params: OptionalFile = None
     """Where to start: a file of parameters."""
-    selector: Selector = "multi-hypothesis"
-    """Which of the two poses of a marker is believed."""
+    selector: Believed = "multi-hypothesis"
     steps: int = 150
     """At most so many evaluations."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle: QCarFile = None
-    """Bicycle parameters and limits."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("tuned")
-    """Folder for the results."""
-    headless: Switch = False
-    """No progress bar."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle: QCarBicycle = None
+    out: ResultsFolder = Path("tuned")
 
     def __post_init__(self) -> None:
         for flag, count in (
@@ -101,7 +95,7 @@ class TuneFilter:
 
 
 @dataclass(frozen=True)
-class TuneController:
+class TuneController(Headless):
     """Learn the controller's gains from simulated drives.
 
     The loss of a drive is a weighed sum of the time to the last waypoint, the distance from the
@@ -141,22 +135,15 @@ class TuneController:
     """Parameters to learn; by default p1, p2, its bound, look-ahead and slowing down in turns."""
     params: OptionalFile = None
     """Where to start: a file of parameters."""
-    selector: Selector = "multi-hypothesis"
-    """Which of the two poses of a marker is believed."""
+    selector: Believed = "multi-hypothesis"
     steps: int = 40
     """At most so many."""
     learning_rate: float = 0.25
     """Of Adam, at the first step; a tenth of it at the last."""
-    rig: QCarFile = None
-    """Cameras: a rig file or a Kalibr camchain."""
-    markers: QCarFile = None
-    """Marker map."""
-    vehicle: QCarFile = None
-    """Bicycle parameters and limits."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("tuned")
-    """Folder for the results."""
-    headless: Switch = False
-    """No progress bar."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle: QCarBicycle = None
+    out: ResultsFolder = Path("tuned")
 
     def __post_init__(self) -> None:
         for flag, count in (
