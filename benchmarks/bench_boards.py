@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import jax
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -21,6 +20,7 @@ from jaxnav.calibration.boards import detection as board_detection
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.saddles import fit_saddles
 from jaxnav.calibration.boards.sheets import sheet_of
+from jaxnav.configuration import configure
 from jaxnav.detection.families import dictionary
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.simulation.boards import BoardRenderer, facing_pose
@@ -145,7 +145,7 @@ def rows_of(board: Board, camera, size: tuple[int, int]) -> list[str]:
 
 def main() -> None:
     cv2.setNumThreads(1)
-    jax.config.update("jax_enable_x64", True)
+    configure(float64=True)
     rig = load_rig(calib_dir() / "qcar" / "rig.yaml")
     camera, size = rig.camera(0), rig.image_sizes_px[0]
     begun_s = time.monotonic()

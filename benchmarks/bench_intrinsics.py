@@ -22,7 +22,7 @@ from jaxnav.calibration.lenses.fit import LensFit, fit_lens
 from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.calibration.lenses.start import board_poses, opencv_calibration
 from jaxnav.calibration.lenses.views import BoardViews
-from jaxnav.commands.process import configure_jax
+from jaxnav.configuration import configure
 from jaxnav.models.camera import Camera
 
 TRIALS, ROUNDS, VIEWS, SIGMA_PX = 100, 15, 40, 0.1
@@ -207,7 +207,7 @@ def scaling() -> None:
 
 
 if __name__ == "__main__":
-    configure_jax(float64=True)
+    configure(float64=True)
     for title, each in CASES.items():
         print(f"\n## {title}")
         consistency(each)

@@ -19,9 +19,9 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy, as the command does
 
-from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.configuration import configure, step_folder
 
-configure_jax(float64=False, threads=1)
+configure(float64=False, threads=1)
 
 import cv2  # noqa: E402
 import jax  # noqa: E402

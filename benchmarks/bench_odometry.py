@@ -10,12 +10,12 @@ import math
 import time
 from collections.abc import Callable
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
 from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
 from jaxnav.calibration.odometry.model import NAMES
+from jaxnav.configuration import configure
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.simulation.statistics import anees_band
@@ -41,7 +41,7 @@ MIDDLE = np.array([1.0, 1.0, 0.0, 0.256, 0.02])
 
 def main() -> None:
     """Print the tables that are asked for."""
-    jax.config.update("jax_enable_x64", True)
+    configure(float64=True)
     sections: dict[str, Callable[[], None]] = {"trials": trials_table, "drives": drives_table}
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sections", nargs="*", help=", ".join(sections))

@@ -27,7 +27,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from jaxnav.commands.process import configure_jax
+from jaxnav.configuration import configure
 from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.pose import refine
 from jaxnav.pose.ippe import PosePair, ippe_square
@@ -217,7 +217,7 @@ def peak_mib() -> float:
 @pytest.fixture(scope="module")
 def corners() -> np.ndarray:
     """One batch for all."""
-    configure_jax(float64=False)
+    configure(float64=False)
     return markers(BATCH, 0.3)
 
 
@@ -253,7 +253,7 @@ def test_general(benchmark: BenchmarkFixture, corners: np.ndarray, name: str) ->
 
 def main() -> None:
     """Print the tables."""
-    configure_jax(float64=False)
+    configure(float64=False)
     many = markers(BATCH, 0.3)
     few, some = many[:OPENCV_LANES], many[:GENERAL_LANES]
     before = peak_mib()

@@ -39,9 +39,9 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--frames", type=int, default=None)
     args = parser.parse_args()
-    from jaxnav.commands.process import configure_jax
+    from jaxnav.configuration import configure
 
-    configure_jax(float64=True)
+    configure(float64=True)
     if args.section == "trials":
         trials(args.trials, args.frames or 300)
     elif args.section == "branches":

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from jaxnav.belief.selectors import make_selector
-from jaxnav.commands.process import configure_jax
+from jaxnav.configuration import configure
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.rollout import Rollout
@@ -68,7 +68,7 @@ def start(drives: Rollout, chunks: int = 1) -> float:
 
 def main() -> None:
     """Print the table."""
-    configure_jax(float64=False)
+    configure(float64=False)
     jax.config.update("jax_enable_compilation_cache", False)
     many = int(sys.argv[sys.argv.index("--seeds") + 1]) if "--seeds" in sys.argv else MANY
     print(

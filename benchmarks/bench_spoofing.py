@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.configuration import configure, step_folder
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.loop.flags import Fault, Health, names
 from jaxnav.recording.drive_setup import DriveSetup
@@ -102,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=3)
     args = parser.parse_args()
-    configure_jax(float64=False, threads=1)
+    configure(float64=False, threads=1)
     qcar = calib_dir() / "qcar"
     rig, markers = load_rig(qcar / "rig.yaml"), load_markers(qcar / "markers.yaml")
     vehicle = load_vehicle(qcar / "vehicle.yaml")

@@ -17,9 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.configuration import configure, step_folder
 
-configure_jax(float64=False, threads=1)  # before the first array, as the commands do
+configure(float64=False, threads=1)  # before the first array, as the commands do
 
 import cv2  # noqa: E402
 import equinox as eqx  # noqa: E402

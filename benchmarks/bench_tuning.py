@@ -255,10 +255,10 @@ def _print_cost(
 
 def _filter_loss(seeds: int) -> tuple[Any, Any, Any]:
     """The likelihood of drives, Q ten times too large and R ten times too small."""
-    from jaxnav.commands.process import configure_jax
     from jaxnav.commands.tune.arguments import TuneFilter
+    from jaxnav.configuration import configure
 
-    configure_jax(float64=False)
+    configure(float64=False)
     import jax.numpy as jnp
 
     from jaxnav.commands.tune.data import read_data

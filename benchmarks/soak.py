@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.commands.process import configure_jax
+from jaxnav.configuration import configure
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.loop.estimator import advance_packed
 from jaxnav.loop.flags import Fault, Health
@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("--events", type=int, default=1_000_000)
     parser.add_argument("--float64", action="store_true")
     args = parser.parse_args()
-    configure_jax(float64=args.float64, threads=1)
+    configure(float64=args.float64, threads=1)
     qcar = calib_dir() / "qcar"
     rig, markers = load_rig(qcar / "rig.yaml"), load_markers(qcar / "markers.yaml")
     vehicle = load_vehicle(qcar / "vehicle.yaml")

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from jaxnav.belief.bicycle_kalman import BicycleKalman as BicycleKalman
     from jaxnav.belief.constant_velocity import ConstantVelocity as ConstantVelocity
     from jaxnav.belief.hypotheses import MultiHypothesis as MultiHypothesis
+    from jaxnav.configuration import configure as configure
     from jaxnav.errors import BadInput as BadInput
     from jaxnav.files import load_camera as load_camera
     from jaxnav.files import load_markers as load_markers
@@ -69,6 +70,7 @@ _MODULE_OF = {
     "PosePair": "pose.ippe",
     "RatioTest": "belief.ambiguity",
     "Vehicle": "models.bicycle",
+    "configure": "configuration",
     "e1": "pose.residuals",
     "e2": "pose.residuals",
     "ippe_square": "pose.ippe",

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxnav import cli
-from jaxnav.commands import COMMANDS, names, process
+from jaxnav import cli, configuration
+from jaxnav.commands import COMMANDS, names
 from jaxnav.commands.drive.arguments import Locate, Replay
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.errors import BadInput
@@ -299,11 +299,11 @@ def test_a_cache_folder_that_others_can_write_to_is_done_without(tmp_path, varia
 def test_cache_folders_that_could_be_somebody_elses_are_refused(tmp_path, capsys) -> None:
     """The same for JAX's cache and for kept executables, and for what lies in the folder."""
     good = tmp_path / "good"
-    assert process._private(good) == good
+    assert configuration._private(good) == good
     (good / "entry-cache").write_bytes(b"")
     good.chmod(0o755)
-    process._private.cache_clear()
-    assert process._private(good) == good
+    configuration._private.cache_clear()
+    assert configuration._private(good) == good
     (good / "entry-cache").chmod(0o666)
     (tmp_path / "link").symlink_to(good)
     refused = [tmp_path / "link", tmp_path / "link" / "steps", good]
@@ -314,14 +314,14 @@ def test_cache_folders_that_could_be_somebody_elses_are_refused(tmp_path, capsys
     (tmp_path / "planted").mkdir()
     (tmp_path / "planted" / "entry-cache").symlink_to(good / "entry-cache")
     refused.append(tmp_path / "planted")
-    process._private.cache_clear()
+    configuration._private.cache_clear()
     for folder in refused:
-        assert process._private(folder) is None
-        assert process._private(folder) is None  # and is said once
+        assert configuration._private(folder) is None
+        assert configuration._private(folder) is None  # and is said once
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == len(refused)
     assert all(line.startswith("compiled code is not kept: ") for line in lines)
-    assert process.cache_refused() in lines[-1]
+    assert configuration.cache_refused() in lines[-1]
 
 
 def test_the_users_own_flags_for_xla_are_kept(tmp_path) -> None:

@@ -62,14 +62,16 @@ def test_nothing_heavy_is_loaded(statement: str) -> None:
 
 def test_importing_every_module_leaves_jax_as_it_was() -> None:
     _python(
-        "import jax, pkgutil, importlib, jaxlie, equinox, optimistix, lineax\n"
+        "import jax, pkgutil, importlib, jaxlie, equinox, optimistix\n"
         "before = dict(jax.config.values)\n"
         "import jaxnav\n"
         "names = [m.name for m in pkgutil.walk_packages(jaxnav.__path__, 'jaxnav.')]\n"
         "assert 'jaxnav.navigator' in names, names\n"
         "for name in names: importlib.import_module(name)\n"
         "changed = {k: v for k, v in jax.config.values.items() if before.get(k) != v}\n"
-        "assert not changed, changed"
+        "assert not changed, changed\n"
+        "from jax._src import xla_bridge\n"
+        "assert not xla_bridge.backends_are_initialized()"  # or `configure` would come too late
     )
 
 

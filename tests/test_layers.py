@@ -34,7 +34,7 @@ LAYERS = {
         "vehicles",
     },
     "pictures": {"plots", "viewer"},
-    "shell": {"cli", "commands"},
+    "shell": {"cli", "commands", "configuration"},
 }
 ORDER = list(LAYERS)
 LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
@@ -54,6 +54,7 @@ SIDE_BY_SIDE = {
     "tuning": {"simulation"},
     "viewer": {"plots"},
     "cli": {"commands"},
+    "commands": {"configuration"},
 }
 MAY_IMPORT_LANES = {"simulation", "tuning"}
 MOST_NODES, MOST_ARROWS, LONGEST_CHAIN = 30, 170, 14
@@ -61,7 +62,7 @@ MOST_NODES, MOST_ARROWS, LONGEST_CHAIN = 30, 170, 14
 ERRORS = "errors"
 PUBLIC_NAMES = "__init__"
 
-CORE_MAY_IMPORT = {"jax", "jaxlie", "equinox", "optimistix", "lineax", "jaxtyping", "numpy"} | {
+CORE_MAY_IMPORT = {"jax", "jaxlie", "equinox", "optimistix", "jaxtyping", "numpy"} | {
     "__future__",
     "abc",
     "collections",
