@@ -10,6 +10,7 @@ Nothing is configured on import. `docs/guide/performance.md` has what it buys.
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import warnings
@@ -146,7 +147,10 @@ def _taken(flags: dict[str, str]) -> bool:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         timeout=_PROBE_S,
+        start_new_session=True,  # a Ctrl-C is meant for us, and says nothing of flags
     )
+    if run.returncode < 0 and run.returncode != -signal.SIGABRT:  # killed, by want of memory say
+        raise subprocess.SubprocessError(f"ended by signal {-run.returncode}")
     return run.returncode == 0
 
 

@@ -3,6 +3,8 @@
 Source: Liu, Schofield, Shan (2023), Eqs. 16-19.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -88,6 +90,26 @@ class Controller(eqx.Module):
     # The throttle is halved where |alpha| is this large; inf: never.
     slows_at_rad: Float[Array, ""] | float = np.inf
     exploration: Exploration = Exploration()
+
+    @classmethod
+    def along(
+        cls,
+        waypoints_m: Sequence[Sequence[float]] | Float[Array, "W 2"],
+        vehicle: Vehicle | None,
+        **numbers: float,
+    ) -> "Controller":
+        """A controller of plain numbers, by the names of its fields.
+
+        Raises:
+            ValueError: no vehicle, or waypoints of the wrong shape.
+        """
+        waypoints = jnp.asarray(waypoints_m, float)
+        if vehicle is None:
+            raise ValueError("waypoints_m needs a vehicle to drive")
+        if waypoints.ndim != 2 or waypoints.shape[1] != 2:
+            raise ValueError(f"waypoints_m must be (W, 2), got {waypoints.shape}")
+        arrays = {name: jnp.asarray(number, float) for name, number in numbers.items()}
+        return cls(waypoints_m=waypoints, vehicle=vehicle, **arrays)
 
     def init(self) -> ControlState:
         """The state at the first waypoint, with a zero integral."""

@@ -62,8 +62,6 @@ class Navigator(eqx.Module):
     Coordinates of waypoints, states and outputs count from `markers.origin_m`, which is zero unless
     the map is far from it. `Route.relative_to` converts waypoints, `planar_in_world` and
     `poses_in_world` convert outputs (see docs/design.md, Far origins).
-
-    Source: Liu, Schofield, Shan (2023), Algorithm 1.
     """
 
     rig: CameraRig
@@ -105,24 +103,14 @@ class Navigator(eqx.Module):
         self.rig = rig
         self.markers = markers
         self.selector = selector or MultiHypothesis()
-        if motion is None:
-            motion = ConstantVelocity() if vehicle is None else BicycleKalman(vehicle)
-        self.motion = motion
+        self.motion = motion or (BicycleKalman(vehicle) if vehicle else ConstantVelocity())
         self.controller = None
         if len(waypoints_m) > 0:
-            waypoints = jnp.asarray(waypoints_m, float)
-            if vehicle is None:
-                raise ValueError("waypoints_m needs a vehicle to drive")
-            if waypoints.ndim != 2 or waypoints.shape[1] != 2:
-                raise ValueError(f"waypoints_m must be (W, 2), got {waypoints.shape}")
-            self.controller = Controller(
-                waypoints_m=waypoints,
-                waypoint_radius_m=jnp.asarray(waypoint_radius_m, float),
-                vehicle=vehicle,
-                proportional_per_m=jnp.asarray(proportional_per_m, float),
-                integral_per_ms=jnp.asarray(integral_per_ms, float),
-                integral_limit_ms=jnp.asarray(integral_limit_ms, float),
-            )
+            self.controller = Controller.along(
+                waypoints_m, vehicle, waypoint_radius_m=waypoint_radius_m,
+                proportional_per_m=proportional_per_m, integral_per_ms=integral_per_ms,
+                integral_limit_ms=integral_limit_ms,
+            )  # fmt: skip
         self.corner_sigma_px = jnp.asarray(corner_sigma_px, float)
         self.model_sigma_px = jnp.asarray(model_sigma_px, float)
         self.max_sightings = max_sightings
@@ -149,9 +137,6 @@ class Navigator(eqx.Module):
         Args:
             state: after the previous observation, or `init()`.
             obs: corners (C, M, 4, 2), odometry, and the time since the previous observation.
-
-        Returns:
-            The state after this observation, and the estimate with the command.
         """
         belief, estimate = self.sense(state.belief, obs)
         control, output = self.act(state.control, estimate, obs)
@@ -162,12 +147,7 @@ class Navigator(eqx.Module):
         return self.fuse(belief, self.look(obs.usable()))
 
     def fuse(self, belief: Belief, seen: Consistent) -> tuple[Belief, Estimate]:
-        """Predict a belief, then correct it by the markers in view, if there are any.
-
-        Args:
-            belief: after the previous observation.
-            seen: candidates of this observation, from `look`.
-        """
+        """Predict a belief, then correct it by the markers in view, if there are any."""
         predicted = self.predict(belief, seen.snapshot.obs)
         belief, evidence = jax.lax.cond(
             jnp.any(seen.snapshot.seen.visible),
@@ -185,12 +165,7 @@ class Navigator(eqx.Module):
         return belief.predicted(self._sound(self.motion.predict(belief.bank, obs)))
 
     def correct(self, belief: Belief, seen: Consistent) -> tuple[Belief, Evidence]:
-        """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11).
-
-        Args:
-            belief: predicted.
-            seen: candidates of this observation, from `look`.
-        """
+        """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
         motion, obs = self.motion, seen.snapshot.obs
         prior = numbered_anew_where_empty(belief.bank)
         predicted = motion.poses(prior)
@@ -225,8 +200,6 @@ class Navigator(eqx.Module):
         """The command at the estimated pose (Eqs. 16-19).
 
         Args:
-            control: the controller's state, None without a route.
-            estimate: from `sense`.
             obs: its speed, steering angle and `dt_s`, the time since the last command, are used.
         """
         command, done, log = None, jnp.asarray(False), None
