@@ -68,4 +68,5 @@ def main(frames: int = 20, h: float = 1e-2) -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)  # a finite difference loses half of the digits
     main()
