@@ -21,10 +21,17 @@ if TYPE_CHECKING:
     from jaxnav.belief.ambiguity import OrientationGiven as OrientationGiven
     from jaxnav.belief.ambiguity import PaperCost as PaperCost
     from jaxnav.belief.ambiguity import RatioTest as RatioTest
+    from jaxnav.belief.ambiguity import Selection as Selection
+    from jaxnav.belief.ambiguity import Selector as Selector
     from jaxnav.belief.bicycle_kalman import BicycleKalman as BicycleKalman
     from jaxnav.belief.constant_velocity import ConstantVelocity as ConstantVelocity
+    from jaxnav.belief.estimate import Belief as Belief
+    from jaxnav.belief.estimate import Estimate as Estimate
     from jaxnav.belief.hypotheses import MultiHypothesis as MultiHypothesis
+    from jaxnav.belief.motion import Motion as Motion
     from jaxnav.configuration import configure as configure
+    from jaxnav.control import Command as Command
+    from jaxnav.control import Controller as Controller
     from jaxnav.errors import BadInput as BadInput
     from jaxnav.files import load_camera as load_camera
     from jaxnav.files import load_markers as load_markers
@@ -40,8 +47,12 @@ if TYPE_CHECKING:
     from jaxnav.models.rig import CameraRig as CameraRig
     from jaxnav.navigator import Navigator as Navigator
     from jaxnav.navigator import Observation as Observation
+    from jaxnav.navigator import Output as Output
+    from jaxnav.navigator import State as State
+    from jaxnav.pose.candidates import Candidates as Candidates
     from jaxnav.pose.ippe import PosePair as PosePair
     from jaxnav.pose.ippe import ippe_square as ippe_square
+    from jaxnav.pose.observation import Snapshot as Snapshot
     from jaxnav.pose.refine import refine_pose as refine_pose
     from jaxnav.pose.refine import solve_marker as solve_marker
     from jaxnav.pose.refine import solve_markers as solve_markers
@@ -53,22 +64,33 @@ if TYPE_CHECKING:
 # The imports above tell the same to type checkers; a test holds the two together.
 _MODULE_OF = {
     "BadInput": "errors",
+    "Belief": "belief.estimate",
     "BicycleKalman": "belief.bicycle_kalman",
     "Camera": "models.camera",
     "CameraRig": "models.rig",
+    "Candidates": "pose.candidates",
+    "Command": "control",
     "ConstantVelocity": "belief.constant_velocity",
+    "Controller": "control",
+    "Estimate": "belief.estimate",
     "LowestReprojection": "belief.ambiguity",
     "Mahalanobis": "belief.ambiguity",
     "MarkerMap": "models.markers",
+    "Motion": "belief.motion",
     "MultiHypothesis": "belief.hypotheses",
     "Navigator": "navigator",
     "ObjectSpace": "belief.ambiguity",
     "Observation": "navigator",
     "Oracle": "belief.ambiguity",
     "OrientationGiven": "belief.ambiguity",
+    "Output": "navigator",
     "PaperCost": "belief.ambiguity",
     "PosePair": "pose.ippe",
     "RatioTest": "belief.ambiguity",
+    "Selection": "belief.ambiguity",
+    "Selector": "belief.ambiguity",
+    "Snapshot": "pose.observation",
+    "State": "navigator",
     "Vehicle": "models.bicycle",
     "configure": "configuration",
     "e1": "pose.residuals",

@@ -4,6 +4,7 @@ Source: Liu, Schofield, Shan (2023), Eqs. 16-19.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -108,7 +109,7 @@ class Controller(eqx.Module):
             raise ValueError("waypoints_m needs a vehicle to drive")
         if waypoints.ndim != 2 or waypoints.shape[1] != 2:
             raise ValueError(f"waypoints_m must be (W, 2), got {waypoints.shape}")
-        arrays = {name: jnp.asarray(number, float) for name, number in numbers.items()}
+        arrays: dict[str, Any] = {k: jnp.asarray(number, float) for k, number in numbers.items()}
         return cls(waypoints_m=waypoints, vehicle=vehicle, **arrays)
 
     def init(self) -> ControlState:

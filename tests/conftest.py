@@ -49,7 +49,7 @@ install_import_hook(CORE, "beartype.beartype")
 
 # A file is one worker's: what takes minutes must not come last.
 LONG = """test_navigator test_hypotheses test_replay test_ambiguity test_demo test_rollout
-    test_study_kinds test_detection""".split()
+    test_study_kinds test_detection test_examples""".split()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
