@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format benchmark fuzz clean
+.PHONY: help demo test lint format benchmark fuzz docs clean
 
 help:
 	@echo "make demo       the main job: a simulated drive, its report in demo/"
@@ -19,6 +19,7 @@ help:
 	@echo "make format     let ruff rewrite what it can"
 	@echo "make benchmark  timings against OpenCV and NumPy"
 	@echo "make fuzz       damaged files against every loader and command, an hour: MINUTES=5 SEED=1"
+	@echo "make docs       the site, in site/: guide, API, notebooks; a warning is an error"
 	@echo "make clean      remove .venv and everything that was generated"
 
 demo: $(VENV)/.installed
@@ -43,8 +44,11 @@ benchmark: $(VENV)/.installed-dev
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES) --seed $(SEED) --workers $(WORKERS)
 
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) build dist demo out .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks
+	rm -rf $(VENV) build dist demo out site .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is written when its step has succeeded, so a failed installation is tried again.
@@ -64,4 +68,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/.created
 $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(VENV)/.created
 	@echo "installing jaxnav and its test extras into $(VENV)"
 	@$(PIP_INSTALL) -e '.[dev]'
+	@touch $(VENV)/.installed $@
+
+$(VENV)/.installed-docs: pyproject.toml constraints.txt | $(VENV)/.created
+	@echo "installing jaxnav and what builds its site into $(VENV)"
+	@$(PIP_INSTALL) -e '.[docs]'
 	@touch $(VENV)/.installed $@
