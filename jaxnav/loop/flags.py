@@ -1,10 +1,10 @@
-"""What can be wrong, and how well the vehicle is: words for records, screens and tests."""
+"""The faults, rejections and health states of a drive, named for records, screens and tests."""
 
 import enum
 
 
 class Fault(enum.IntFlag):
-    """Data or machinery that failed; sound data that is merely disbelieved is a `Reject`."""
+    """Data or hardware that failed; sound data that the filter does not believe are a `Reject`."""
 
     CAMERA_STALE = enum.auto()  # one or several gave no frame in time
     CAMERAS_STALE = enum.auto()  # all of them
@@ -48,7 +48,7 @@ class Reject(enum.IntFlag):
 
 
 class Health(enum.IntEnum):
-    """From waiting to driving to standing; the larger the worse, from OK on."""
+    """The vehicle's health, from waiting to driving to standing; from OK on, larger is worse."""
 
     INIT = 0  # nothing is known yet
     ALIGNED = 1  # located, but several poses are possible: it explores
@@ -59,5 +59,5 @@ class Health(enum.IntEnum):
 
 
 def names(flags: enum.IntFlag) -> list[str]:
-    """Of the flags that are up."""
+    """The names of the flags that are set."""
     return [flag.name or "" for flag in type(flags) if flag in flags]

@@ -15,7 +15,7 @@ from jaxnav.loop.limits import Limits
 from jaxnav.loop.plugins import missing_members
 from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, started
 
-_READ_S = 0.05  # "without waiting longer than some milliseconds"
+_READ_S = 0.05  # "may wait for some milliseconds at most"
 _STOP_S = 0.5
 _PATIENCE_S = 3.0  # until the first readings must have come
 _READINGS = 20
