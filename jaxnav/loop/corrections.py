@@ -73,7 +73,7 @@ class Corrections:
         return speed_mps / self.speed_scale, angle_rad
 
     def frame(self, seen: Sighted) -> Sighted:
-        """A frame with its stamp corrected to the odometer's."""
+        """A frame with its stamp corrected to the odometer's clock."""
         late_ns = self.frame_late_ns
         return replace(seen, stamp_ns=seen.stamp_ns - late_ns) if late_ns else seen
 

@@ -3,7 +3,7 @@
     with Signals() as signals:
         signals.check()                  # between the steps of a start: raises `Interrupted`
         signals.hold()                   # before a vehicle is opened
-        signals.on_signal(stop)          # called by a thread of ours, whatever the main thread does
+        signals.on_signal(stop)          # called by a separate thread, also if the main one is busy
 
 Python's own handler raises KeyboardInterrupt wherever the interpreter happens to be, also inside a
 library's callback, which swallows it. This handler raises nothing and loses no signal.
@@ -103,7 +103,7 @@ class Signals:
     def on_signal(self, tell: Callable[[str], None]) -> None:
         """Call a function with the signal's name when one comes, at once if one has come already.
 
-        A thread of ours calls it, also while the main thread is inside a library.
+        A thread of its own calls it, also while the main thread is inside a library.
         """
         with self._lock:
             self._told.append(tell)

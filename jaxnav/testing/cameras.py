@@ -108,7 +108,7 @@ def _check_frames(camera: Any, reader: Worker, size_px: tuple[int, int]) -> None
 
 
 def _timeouts(end_s: float) -> Iterator[float]:
-    """Yield timeouts until a time; some are too short for any camera."""
+    """Yield timeouts until `end_s`; some are too short for any camera."""
     while time.monotonic() < end_s:
         yield from (0.0, 0.2, 0.001, 1.0)
 

@@ -66,13 +66,13 @@ class Row:
         name: as `jaxnav faults` prints it.
         change: makes the change to the data on their way, anew for each drive.
         happens: makes the change to the world, anew for each drive.
-        faults, rejects: at least one must be seen during the fault; none: no requirement.
-        at_least, at_most: bounds of the worst health during the fault.
+        faults, rejects: one at least must be seen by SETTLE_S after its end; none: no requirement.
+        at_least, at_most: bounds of the worst health in the same time.
         error_m: largest error of a decided position during the fault and SETTLE_S after.
         error_after_m: largest error after that.
         begins_s, ends_s: of the fault; inf: it lasts.
         drive_s: duration of the whole drive.
-        telling: how the navigator's rig and markers differ from the true ones.
+        telling: how the navigator's rig differs from the true one, see `told_rig`.
         markers: makes the drive's markers from the trial's.
         relocate: see `Pilot`.
         well: the worst health at which the car has recovered.
