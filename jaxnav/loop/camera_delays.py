@@ -56,9 +56,9 @@ _LEAST_SIGMA_S = 0.001
 # A view counts in full up to the 99.9th percentile of chi-square with 8 degrees of freedom.
 _FULL_WEIGHT = 26.1
 _STEPS = 15
-_DONE = 5e-3  # of a prior sigma: after such a step the next one would change nothing
-# Of x, y (m), psi (rad) at the start, the camera's turn about its axes (rad), the odometer's speed
-# and steering gain (shares), the steering's zero (rad), and the delay (s).
+_DONE = 5e-3  # share of the prior sigma: after a smaller step the next one would change nothing
+# Sigmas of x, y (m), psi (rad) at the start, the camera's rotation about its axes (rad), the
+# odometer's speed and steering gain (shares), the steering's zero (rad), and the delay (s).
 _PRIOR = np.array([1.0, 1.0, 0.5, 0.03, 0.03, 0.03, 0.15, 0.15, 0.03, 0.3])
 _DELAY = len(_PRIOR) - 1
 # Readings scatter, and the position error that they cause stays in the views that follow. It is
@@ -275,7 +275,7 @@ def _stretch(
 ) -> Stretch:
     """A stretch in arrays of fixed size; a reading holds from midway after the one before."""
     readings = _thinned(readings, _READINGS)
-    # A row for each marker of each instant.
+    # One row for each marker at each instant.
     rows = [(view.stamp_ns, *row) for view in views for row in zip(*view[2:], strict=True)]
     stamps_ns, marker, corners_px, sigmas_px = zip(*_thinned(rows, _VIEWS), strict=True)
     stamps_s = np.array([(stamp_ns - begin_ns) / 1e9 for stamp_ns, _, _ in readings])

@@ -13,7 +13,7 @@ from jaxnav.loop.history import Told
 from jaxnav.loop.stamps import Stamps
 from jaxnav.models.markers import MarkerMap
 
-FROZEN_AFTER = 3  # frames with the very same corners, or pictures
+FROZEN_AFTER = 3  # frames in a row with exactly the same corners or picture
 _NO_FAULT = Fault(0)
 _MOST_PX = RANGES["corner_px"].most  # beyond, a corner is as good as infinite
 _NONE = Detections.concatenate([])
@@ -55,7 +55,7 @@ class Frames:
         self._newest_before_ns = list(self.newest_ns)
         self._markers, self._corner_sigma_px = markers, corner_sigma_px
         self._stamps = [Stamps() for _ in range(cameras)]
-        self._corners: list[tuple[bytes, int]] = [(b"", 0)] * cameras  # and how often the same
+        self._corners: list[tuple[bytes, int]] = [(b"", 0)] * cameras  # last, and its repetitions
 
     def refused(self) -> None:
         """Treat the last frames, which came too late for the filter, as if they had not come."""

@@ -136,7 +136,7 @@ class _Capture:
             width_px, height_px = self._size_px
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, width_px)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height_px)
-            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # what waits in a queue is old
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # pictures in a queue are old
         self._capture = capture
 
     def _check(self, image: np.ndarray) -> None:

@@ -71,7 +71,7 @@ class RosVehicle:
         self._steering_rad = 0.0
         self._written_ns: int | None = None
         self._closed = False
-        self._writing = threading.Lock()  # so that nothing follows the zero of a `stop`
+        self._writing = threading.Lock()  # so that no command follows the zero speed of a `stop`
         self._stops = 0
         self._node = Node("jaxnav_vehicle")
         self._publisher = self._node.publisher(AckermannDriveStamped, command_topic)
