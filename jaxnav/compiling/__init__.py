@@ -1,1 +1,1 @@
-"""Programs that are compiled once on a machine, and kept."""
+"""Compile programs once on a machine, and keep their executables."""

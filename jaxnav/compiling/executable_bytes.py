@@ -1,7 +1,7 @@
-"""A compiled program as bytes, and back: XLA's own for the machine code, JSON for the rest.
+"""Convert a compiled program to bytes and back: XLA's format for machine code, JSON for the rest.
 
-To read it runs no Python that the bytes name: no pickle. The machine code is run as it is found,
-so it is trusted all the same.
+Reading executes no Python code that the bytes name: there is no pickle. The machine code is run
+without a check, so it must be trusted all the same.
 """
 
 import dataclasses
@@ -16,26 +16,26 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-_CHECKSUM_BYTES = 32  # at the beginning, of what follows
-_LENGTH = struct.Struct("<Q")  # of the JSON, then it, then the machine code
-_OURS = ("jaxnav", "jaxlie")  # whose classes a tree may consist of
+_CHECKSUM_BYTES = 32  # at the beginning: the checksum of all that follows
+_LENGTH = struct.Struct("<Q")  # then the length of the JSON, the JSON, and the machine code
+_OURS = ("jaxnav", "jaxlie")  # packages whose classes a tree may contain
 
 Run = Callable[[list[Any]], list[Any]]
 
 
 class NotStorableError(ValueError):
-    """A program, or what it returns, can't be told in bytes."""
+    """A program, or the tree that it returns, can't be converted to bytes."""
 
 
 def to_bytes(compiled: Any, returned: Any) -> bytes:
-    """What `from_bytes` reads.
+    """Convert a compiled program to the bytes that `from_bytes` reads.
 
     Args:
-        compiled: of JAX; takes a list of arrays and returns one.
-        returned: a tree with those arrays as leaves, or anything in their place.
+        compiled: JAX's compiled program; takes a list of arrays and returns one.
+        returned: a tree with the returned arrays, or anything in their place, as leaves.
 
     Raises:
-        NotStorableError: it is more than arrays in and arrays out, its backend can't store it, or
+        NotStorableError: it does more than to map arrays to arrays, its backend can't store it, or
             the tree has classes that are not jaxnav's own.
     """
     held = getattr(compiled._executable, "_unloaded_executable", None)
@@ -64,16 +64,16 @@ def to_bytes(compiled: Any, returned: Any) -> bytes:
 
 
 def from_bytes(raw: bytes, inputs: list[Any]) -> tuple[Run, Any]:
-    """The program, ready to be called, and the structure of what it returns.
+    """Load a program; return it, ready to be called, and the structure of the tree it returns.
 
     Args:
         inputs: shapes and types of the arrays that it takes.
 
     Raises:
-        Exception: of any kind, where the bytes are damaged, or of another JAX or machine.
+        Exception: of any kind, where the bytes are damaged or from another JAX or machine.
     """
     content = raw[_CHECKSUM_BYTES:]
-    # Machine code that was damaged may do anything: it must not even be looked at.
+    # Damaged machine code may do anything: it must not even be parsed.
     if _checksum(content) != raw[:_CHECKSUM_BYTES]:
         raise ValueError("damaged")
     (length,) = _LENGTH.unpack_from(content)
@@ -112,14 +112,14 @@ def from_bytes(raw: bytes, inputs: list[Any]) -> tuple[Run, Any]:
 
 @cache
 def _small_program() -> Any:
-    """As JAX holds any program: what is loaded differs from it in signature and machine code."""
+    """A template of JAX's form of a program; a loaded one replaces signature and machine code."""
     scalar = jax.ShapeDtypeStruct((), jnp.float32)
     compiled = jax.jit(lambda leaves: [leaf + 1 for leaf in leaves]).lower([scalar]).compile()
     return compiled._executable._unloaded_executable  # type: ignore[attr-defined]
 
 
 def _plain(value: Any) -> Any:
-    """A tree, its fields and what stands for its leaves, as JSON can say it."""
+    """Convert a tree, with its fields and the placeholders of its leaves, to JSON values."""
     kind = type(value)
     if value is None or kind in (bool, int, float, str):
         return value
@@ -132,12 +132,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [name, *map(_plain, value)]
     fields = (field.name for field in dataclasses.fields(value))
-    # Of a module of Equinox not all need be there.
+    # An Equinox module need not have all of its fields.
     return [name, {field: _plain(getattr(value, field)) for field in fields if _has(value, field)}]
 
 
 def _tree(plain: Any) -> Any:
-    """What `_plain` was told. No class is asked to make itself: its fields are put in place."""
+    """The inverse of `_plain`. It calls no constructor, but sets the fields of each object."""
     if not isinstance(plain, list):
         return plain
     name, *content = plain
@@ -160,7 +160,7 @@ def _tree(plain: Any) -> Any:
 
 
 def _class(name: str) -> Any:
-    """A class that this process knows already, by `module:name`."""
+    """Find a class by `module:name` among the modules already imported."""
     module, _, qualified = name.partition(":")
     found: Any = sys.modules.get(module)
     if module.partition(".")[0] in _OURS:

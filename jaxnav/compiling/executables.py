@@ -1,12 +1,12 @@
-"""Compiled programs that outlive their process: what a car calls is compiled once on a machine.
+"""Keep compiled programs in files, so that each is compiled only once on a machine.
 
 JAX's own cache spares a later process the compiler, but tracing and lowering take longer than
-loading what was made of them. So the executable itself is kept.
+loading an executable. So the executable itself is kept.
 
     @kept
     def project(camera, points): ...
 
-    keep_in(folder)  # a command's to say; without it `kept` is `jax.jit`
+    keep_in(folder)  # called by a command; without it `kept` is `jax.jit`
 """
 
 import hashlib
@@ -28,10 +28,10 @@ import numpy as np
 from jaxnav.compiling.executable_bytes import NotStorableError, Run, from_bytes, to_bytes
 from jaxnav.files.private import NotPrivateError, PrivateFolder
 
-_KEPT = 64  # executables, of some MB each: the last ones used
+_KEPT = 64  # the last used executables, some MB each, are kept
 _NAME = re.compile(r"[0-9a-f]{64}\.step")
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
-# All of the package but what only calls what is compiled, or draws what came of it.
+# Folders of the package that only call compiled programs or draw their results.
 _WITHOUT = (
     "calibration", "commands", "datasets", "plots", "studies", "testing", "tuning", "viewer",
 )  # fmt: skip
@@ -41,18 +41,18 @@ _folders: list[Path] = []  # the last one counts
 
 
 def keep_in(folder: Path | None) -> None:
-    """Load and keep what is `kept` in a folder from now on; None: nowhere.
+    """Load and keep the executables of `kept` functions in a folder from now on; None: nowhere.
 
     Args:
-        folder: made when it is missing. Executables are run as they are found: where anybody else
-            may write to it, or to what leads there, nothing is loaded and nothing is kept, see
+        folder: made if it is missing. Executables are run without a check: if anybody else may
+            write to it, or to anything on its path, nothing is loaded and nothing is kept, see
             `PrivateFolder`.
     """
     _folders[:] = [] if folder is None else [folder]
 
 
 class kept:
-    """`jax.jit` of one of jaxnav's own functions, of arrays and trees of arrays."""
+    """`jax.jit` of one of jaxnav's own functions of arrays and trees, with a kept executable."""
 
     def __init__(self, function: Callable[..., Any]):
         self.jitted = jax.jit(function)
@@ -72,7 +72,7 @@ class kept:
 
 
 def program(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -> tuple[Run, Any]:
-    """An executable of the leaves of what a function is told, and the structure of what it returns.
+    """The executable of a function on its arguments' leaves, and the structure of its result.
 
     Loaded if another process has kept it, else compiled and kept.
     """
@@ -82,7 +82,7 @@ def program(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -
 
 
 def is_kept(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -> bool:
-    """Whether `program` finds what it looks for."""
+    """Whether `program` finds the executable in the folder."""
     given, inputs = _asked(told)
     with suppress(OSError, NotPrivateError), PrivateFolder(folder) as files:
         return files.holds(_file(_name(function, given), inputs))
@@ -91,8 +91,8 @@ def is_kept(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -
 
 @cache
 def sources_digest(package: Path, without: tuple[str, ...]) -> str:
-    """Of a package's sources, but for those of some folders, as they are when a process first asks:
-    between two releases a version does not change."""
+    """The digest of a package's sources, some folders left out, as of the first call in a process:
+    between two releases the version does not change."""
     digest = hashlib.blake2b(digest_size=8)
     for source in sorted(package.rglob("*.py")):
         name = source.relative_to(package)
@@ -120,11 +120,11 @@ def _compiled(
         seen.append(returned)
         return jax.tree.leaves(returned)
 
-    # By a name that JAX's own cache has never met: what it loads runs, but lacks its kernels once
-    # stored again.
+    # A name that JAX's own cache has never seen: a program loaded from it runs, but lacks its
+    # kernels once it is stored again.
     flat.__name__ = f"step_{time.time_ns()}"
     run = jax.jit(flat).lower(inputs).compile()
-    # Functions of other libraries, LAPACK's say, are not there for what was loaded.
+    # A loaded program does not find functions of other libraries, such as LAPACK's.
     if "custom_call_target" not in (run.as_text() or ""):
         with suppress(NotStorableError):
             _keep(folder, name, to_bytes(run, seen[0]))
@@ -137,15 +137,15 @@ def _loaded(folder: Path, name: str, inputs: list[Any]) -> tuple[Run, Any] | Non
             raw = files.read(name)
         run, structure = from_bytes(raw, inputs)
         blank = [np.zeros(like.shape, like.dtype) for like in inputs]
-        jax.block_until_ready(run(blank))  # what does not run here shows now
-    except Exception:  # none yet, none for this machine, or somebody else's: it is made anew
+        jax.block_until_ready(run(blank))  # a program that does not run here fails now
+    except Exception:  # none yet, none for this machine, or a foreign one: it is compiled anew
         return None
     return run, structure
 
 
 def _keep(folder: Path, name: str, raw: bytes) -> None:
-    """All of it or nothing, and of older ones no more than `_KEPT`."""
-    # A full, a foreign or an unsafe disk: the program is there all the same.
+    """Write an executable completely or not at all, and keep only the `_KEPT` last used ones."""
+    # A full, foreign or unsafe disk is ignored: the program is in memory all the same.
     with suppress(OSError, NotPrivateError), PrivateFolder(folder, make=True) as files:
         files.write(name, raw)
         ours = [name for name in files.names_by_use() if _NAME.fullmatch(name)]
@@ -154,7 +154,7 @@ def _keep(folder: Path, name: str, raw: bytes) -> None:
 
 
 def _file(structures: str, leaves: list[Any]) -> str:
-    """A name of all that the executable depends on."""
+    """The file name of an executable: a hash of all on which it depends."""
     device = jax.devices()[0]
     depends_on = [
         structures,

@@ -1,4 +1,4 @@
-"""Trees of arrays as two vectors: what enters or leaves a compiled call costs some us an array.
+"""Pack trees of arrays into two vectors, since each array passed to a compiled call costs some us.
 
 packed = Layout.of(tree).pack(tree)
 tree = packed.unpacked()
@@ -16,7 +16,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Place:
-    """Where a leaf of a tree is."""
+    """The place of a tree's leaf in one of the vectors."""
 
     begin: int
     shape: tuple[int, ...]
@@ -25,13 +25,13 @@ class Place:
 
     @property
     def end(self) -> int:
-        """Where the next one begins."""
+        """The index where the next leaf begins."""
         return self.begin + math.prod(self.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A tree with places for leaves. Equal where structure, shapes and types are."""
+    """A tree with places as leaves. Layouts are equal if structure, shapes and types are."""
 
     places: Any
     precision: str
@@ -39,7 +39,7 @@ class Layout:
 
     @staticmethod
     def of(tree: Any) -> "Layout":
-        """Of floats of one precision, integers that int32 holds, and truth values."""
+        """The layout of a tree of floats of one precision, integers in int32's range, and bools."""
         leaves, structure = jax.tree.flatten(tree)
         places, ends, precision = [], [0, 0], "float32"
         for leaf in leaves:
@@ -50,7 +50,7 @@ class Layout:
         return Layout(jax.tree.unflatten(structure, places), precision, f"{structure} {places}")
 
     def pack(self, tree: Any) -> "Packed":
-        """A tree of this layout."""
+        """Pack a tree of this layout."""
         floats, integers = [jnp.zeros(0, self.precision)], [jnp.zeros(0, jnp.int32)]
         places = jax.tree.leaves(self.places)
         for leaf, place in zip(jax.tree.leaves(tree), places, strict=True):
@@ -59,14 +59,14 @@ class Layout:
         return Packed(jnp.concatenate(floats), jnp.concatenate(integers), self)
 
     def unpack(self, floats: Any, integers: Any) -> Any:
-        """The tree."""
+        """The tree of packed vectors."""
         leaves = self._views(floats, integers)
         for index, dtype in self._casts:
             leaves[index] = leaves[index].astype(dtype)
         return jax.tree.unflatten(self._structure, leaves)
 
     def room(self) -> tuple["Packed", Any]:
-        """Zeros of NumPy's, and a tree of views to write to; truth values are integers there."""
+        """Vectors of NumPy zeros, and a tree of writable views of them, with bools as integers."""
         integers, floats = self._sizes
         packed = Packed(np.zeros(floats, self.precision), np.zeros(integers, np.int32), self)
         views = self._views(packed.floats, packed.integers)
@@ -81,7 +81,7 @@ class Layout:
 
     @cached_property
     def _slices(self) -> list[tuple[slice, tuple[int, ...] | None, bool]]:
-        """Where each leaf is, and its shape, None of a vector's: each array made takes a us."""
+        """The slice and shape of each leaf; None for a vector, since each reshape takes 1 us."""
         return [
             (slice(at.begin, at.end), None if len(at.shape) == 1 else at.shape, at.is_float)
             for at in jax.tree.leaves(self.places)
@@ -89,14 +89,14 @@ class Layout:
 
     @cached_property
     def _casts(self) -> list[tuple[int, np.dtype]]:
-        """Which leaves are no int32, and what they are."""
+        """The indices and types of the leaves that are neither floats nor int32."""
         places = list(enumerate(jax.tree.leaves(self.places)))
         others = [(index, at) for index, at in places if not at.is_float and at.dtype != "int32"]
         return [(index, np.dtype(at.dtype)) for index, at in others]
 
     @cached_property
     def _sizes(self) -> tuple[int, int]:
-        """How many integers and floats there are."""
+        """The numbers of integers and of floats."""
         places = jax.tree.leaves(self.places)
         integers, floats = (
             max((at.end for at in places if at.is_float is kind), default=0)
@@ -122,16 +122,16 @@ class Layout:
 )
 @dataclass(frozen=True)
 class Packed:
-    """All numbers of a tree; of JAX's arrays, or of NumPy's."""
+    """The numbers of a tree in two vectors, JAX's or NumPy's."""
 
     floats: Any  # (n,)
     integers: Any  # (m,) int32
     layout: Layout
 
     def unpacked(self) -> Any:
-        """The tree."""
+        """The tree of these numbers."""
         return self.layout.unpack(self.floats, self.integers)
 
     def fetched(self) -> "Packed":
-        """The same, of NumPy's arrays."""
+        """The same numbers in NumPy arrays."""
         return Packed(np.asarray(self.floats), np.asarray(self.integers), self.layout)

@@ -1,4 +1,4 @@
-"""What a car calls of a navigator, compiled once on a machine: `Navigator.step`, and others."""
+"""Compile a navigator's functions once on a machine: `Navigator.step`, and others."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -37,18 +37,18 @@ def compiled(
     call to call.
 
     Args:
-        function: of a navigator and of further trees of arrays; one of jaxnav's own.
-        folder: of executables, see `keep_in`. Without one, and where the navigator has parts that
-            are not jaxnav's own, nothing is kept.
+        function: one of jaxnav's own, of a navigator and of further trees of arrays.
+        folder: folder of executables, see `keep_in`. Without one, or if the navigator has parts
+            that are not jaxnav's own, nothing is kept.
 
     Returns:
-        The function of the further trees.
+        The function of the further trees, with the navigator bound.
     """
     navigator = bare(navigator)
     if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
         return partial(_jitted(function), navigator)
     numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
-    ready: dict[Any, tuple[Any, Any]] = {}  # a program for each set of fields that are there
+    ready: dict[Any, tuple[Any, Any]] = {}  # a program for each structure of the arguments
 
     def call(*told: Any) -> Any:
         leaves, given = jax.tree.flatten(told)
@@ -68,8 +68,8 @@ def is_compiled(
 
 
 def bare(navigator: Navigator) -> Navigator:
-    """Without what its vehicle's sensors are off by and what its map counts from: those numbers
-    are static, no leaves, and nothing is computed with them."""
+    """The navigator without its vehicle's sensor corrections and its map's origin: these numbers
+    are static fields, not leaves, and nothing is computed with them."""
 
     def without(part: Any) -> Any:
         if isinstance(part, MarkerMap):
@@ -91,7 +91,7 @@ def bare(navigator: Navigator) -> Navigator:
 
 @cache
 def _jitted(function: Callable[..., Any]) -> Callable[..., Any]:
-    """One program for all navigators of a structure."""
+    """`jax.jit(function)`, cached: one program for all navigators of a structure."""
     return jax.jit(function)
 
 
@@ -100,7 +100,7 @@ def _is_ours(part: Any) -> bool:
 
 
 def _parts(module: Any) -> Iterator[Any]:
-    """A module and all that it consists of."""
+    """Yield a module and all modules inside it."""
     yield module
     parts = jax.tree.leaves(
         list(vars(module).values()) if isinstance(module, eqx.Module) else [],

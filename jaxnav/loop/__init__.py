@@ -1,1 +1,1 @@
-"""What drives: from what the sensors say to what the car is told."""
+"""The driving loop: from sensor data to the car's commands."""

@@ -1,19 +1,19 @@
-"""How much later than its stamps say each camera is, from a few seconds of driving.
+"""Estimate how late each camera's images are against their stamps, from a few seconds of driving.
 
     delays = CameraDelays(rig, markers, vehicle)
-    delays.take(outcome)                 # every one of a pilot: some microseconds
-    while delays.due:                    # where nobody waits: tens of milliseconds
+    delays.take(outcome)                 # every outcome of a pilot: some microseconds
+    while delays.due:                    # in a thread that may wait: tens of milliseconds
         delays.solve()
-    delays.found                         # one `Delay` a camera
+    delays.found                         # one `Delay` per camera
 
-The car drives a stretch of `STRETCH_S` as its odometer says; the corners that a camera sees on it
-lie where the car was a delay before their stamps. Little else is believed: unknown are, beside the
-delay, where the stretch began, how far the odometer's speed, steering gain and zero are off, and
-how the camera is turned, each with a prior as wide as a car needs that was never calibrated. So
-wheels that slip and cameras that hang askew don't pass for a delay; what does is that the image
-moves later than the wheels. While speed and steering stay as they are nothing tells, and sigma
-says so. `jaxnav calibrate odometry` finds one delay for all cameras ten times as exactly, from a
-drive of a minute.
+The odometer gives the car's motion over a stretch of `STRETCH_S`; the corners that a camera sees
+on it fit the pose that the car had one delay before their stamps. Beside the delay these are
+unknown: the start pose of the stretch, the errors of the odometer's speed, steering gain and zero,
+and the camera's rotation, each with a prior wide enough for a car that was never calibrated. So
+slipping wheels and misaligned cameras don't pass for a delay; an image that moves later than the
+wheels does. While speed and steering are constant the data tell nothing, and sigma says so.
+`jaxnav calibrate odometry` finds one delay for all cameras ten times as exactly, from a drive of a
+minute.
 """
 
 import math
@@ -35,12 +35,12 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.observation import MODEL_SIGMA_PX
 
-STRETCH_S = 2.0  # longer ones tell more, and believe the odometer for longer
-# What a long exposure or a driver's jitter does to stamps, and the filter takes without harm: the
-# scenario `blur`.
+STRETCH_S = 2.0  # longer ones tell more, but rely on the odometer for longer
+# An error of stamps that a long exposure or a driver's jitter causes, and that does the filter no
+# harm: the scenario `blur`.
 HARMLESS_S = 0.02
 SURE_SIGMAS = 3.0
-KNOWN_S = 0.008  # sigma, from which on a delay counts as known
+KNOWN_S = 0.008  # the largest sigma of a delay that counts as known
 
 _READINGS, _VIEWS = 160, 96  # of a stretch, at most: 70 Hz for 2.3 s; more are thinned out
 _LEAST_VIEWS = 12
@@ -48,32 +48,32 @@ _LEAST_MPS = 0.05  # a car that stands tells nothing
 _ROOM_S = 0.25  # of readings on either side of a stretch: as long as a delay may be
 _STRETCH_NS, _ROOM_NS = int(STRETCH_S * 1e9), int(_ROOM_S * 1e9)
 _LIMIT_S = 0.2
-_TELLS_S = 0.05  # sigma, beyond which a stretch tells nothing that would count
+_TELLS_S = 0.05  # a stretch whose sigma is above this is left out
 _WAITING = 8  # stretches that may wait to be solved
-_EAGER = 20  # stretches of cameras, after which one every now and then will do
+_EAGER = 20  # stretches of cameras, after which one every 10 s is enough
 _LATER_NS = 10_000_000_000
 _LEAST_SIGMA_S = 0.001
 # A view counts in full up to the 99.9th percentile of chi-square with 8 degrees of freedom.
 _FULL_WEIGHT = 26.1
 _STEPS = 15
-_DONE = 5e-3  # of a prior sigma: after such a step the next one would change nothing
-# Of x, y (m), psi (rad) at the start, the camera's turn about its axes (rad), the odometer's speed
-# and steering gain (shares), the steering's zero (rad), and the delay (s).
+_DONE = 5e-3  # share of the prior sigma: after a smaller step the next one would change nothing
+# Sigmas of x, y (m), psi (rad) at the start, the camera's rotation about its axes (rad), the
+# odometer's speed and steering gain (shares), the steering's zero (rad), and the delay (s).
 _PRIOR = np.array([1.0, 1.0, 0.5, 0.03, 0.03, 0.03, 0.15, 0.15, 0.03, 0.3])
 _DELAY = len(_PRIOR) - 1
-# Readings scatter, and what they carry the car off by stays with the views that follow: beside the
-# corners' own error, and in sigmas of a stretch. So that estimates scatter as their sigmas say
-# (`benchmarks/bench_delays.py`).
+# Readings scatter, and the position error that they cause stays in the views that follow. It is
+# added to the corners' own error, and inflates the sigma of a stretch, so that estimates scatter as
+# their sigmas say (`benchmarks/bench_delays.py`).
 _SCATTER_PX, _INFLATION = 0.6, 1.5
 
 
 class Delay(NamedTuple):
-    """One camera's, s: how much earlier than its stamps say, corrected ones, its images were taken.
+    """The delay of one camera, s: how much earlier than their corrected stamps images were taken.
 
     Attributes:
         delay_s: NaN where nothing is known.
         sigma_s: inf where nothing is known.
-        stretches: how many tell.
+        stretches: how many were used.
     """
 
     delay_s: float
@@ -82,21 +82,21 @@ class Delay(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Whether the drive told enough."""
+        """Whether the data were enough for a small sigma."""
         return self.sigma_s <= KNOWN_S
 
     @property
     def late(self) -> bool:
-        """Whether it is surely more than is harmless, to either side."""
+        """Whether the delay, positive or negative, is surely larger than a harmless one."""
         return self.known and abs(self.delay_s) - SURE_SIGMAS * self.sigma_s > HARMLESS_S
 
 
 class Stretch(NamedTuple):
-    """What one camera saw on a stretch, and how the car went; times in s since its beginning."""
+    """One camera's views and the odometry of a stretch; times in s since its beginning."""
 
     camera: int
     start_pose: Float[np.ndarray, " 3"]
-    edges_s: Float[np.ndarray, " K"]  # from when on each reading holds
+    edges_s: Float[np.ndarray, " K"]  # time from which each reading holds
     speed_mps: Float[np.ndarray, " K"]
     steering_rad: Float[np.ndarray, " K"]
     times_s: Float[np.ndarray, " V"]
@@ -107,7 +107,7 @@ class Stretch(NamedTuple):
 
 
 class _View(NamedTuple):
-    """Markers seen at one instant, a row each."""
+    """The markers seen at one instant, one row each."""
 
     stamp_ns: int
     camera: Int[np.ndarray, " N"]
@@ -117,23 +117,23 @@ class _View(NamedTuple):
 
 
 class CameraDelays:
-    """The delays of a rig on one drive. `take` for one thread, `solve` for one, any other."""
+    """The delays of a rig on one drive. One thread calls `take`, one may call `solve`."""
 
     def __init__(self, rig: CameraRig, markers: MarkerMap, vehicle: Vehicle):
-        """What the drive is driven with. What the vehicle's description corrects is corrected."""
+        """Take the drive's rig, map and vehicle. Delays come beside the vehicle's corrections."""
         self._world = rig, markers.without_origin(), vehicle.wheelbase_m
         self._dtype = np.asarray(vehicle.wheelbase_m).dtype
-        # Nothing here grows: half a minute at 30 Hz, and a third of one at 50 Hz.
+        # Bounded memory: half a minute at 30 Hz, and a third of a minute at 50 Hz.
         self._readings: deque[tuple[int, float, float]] = deque(maxlen=1024)
         self._views: deque[_View] = deque(maxlen=1024)
         self._open: deque[tuple[int, np.ndarray]] = deque(maxlen=_WAITING)  # begin, pose there
         self._next_ns = 0
-        # Of every camera: sums of information, information * delay, information * delay^2.
+        # For every camera: sums of information, information * delay, information * delay^2.
         self._sums = np.zeros((len(rig), 3))
         self._counts = np.zeros(len(rig), int)
 
     def take(self, outcome: Outcome) -> None:
-        """Remember what a pilot was told, and where it believes to be."""
+        """Keep the data of an outcome and its estimated pose."""
         told = outcome.told
         if told is not None and told.odometry is not None:
             self.read(outcome.stamp_ns, *told.odometry)
@@ -144,12 +144,12 @@ class CameraDelays:
             self.at(outcome.now_ns, np.asarray(output.pose, float))
 
     def read(self, stamp_ns: int, speed_mps: float, steering_rad: float) -> None:
-        """A reading, corrected; one that is older than the last is left out."""
+        """Keep a corrected reading; one that is not newer than the last is left out."""
         if not self._readings or stamp_ns > self._readings[-1][0]:
             self._readings.append((stamp_ns, speed_mps, steering_rad))
 
     def seen(self, stamp_ns: int, told: Told) -> None:
-        """Corners, their stamp corrected."""
+        """Keep corners and their corrected stamp."""
         assert told.corners_px is not None
         assert told.visible is not None
         assert told.sigma_px is not None
@@ -158,7 +158,7 @@ class CameraDelays:
         self._views.append(_View(stamp_ns, camera, marker, corners_px, sigma_px))
 
     def at(self, now_ns: int, pose: np.ndarray) -> None:
-        """Where the car is, about: a stretch begins if it is time for one."""
+        """Begin a stretch at the car's approximate pose, if it is time for one."""
         if now_ns >= self._next_ns:
             self._open.append((now_ns, pose))
             eager = self._counts.sum() < _EAGER
@@ -166,22 +166,22 @@ class CameraDelays:
 
     @property
     def due(self) -> bool:
-        """Whether a stretch is over and not solved."""
+        """Whether a stretch is over and not yet solved."""
         if not (self._open and self._readings):
             return False
         return self._readings[-1][0] > self._open[0][0] + _STRETCH_NS + _ROOM_NS
 
     def warm_up(self) -> None:
-        """Compile, or load what was compiled."""
+        """Compile the program, or load it."""
         one = _View(10**9, np.zeros(1, int), np.zeros(1, int), np.zeros((1, 4, 2)), np.ones((1, 4)))
         readings = [(k * 10**8, 0.1, 0.0) for k in range(30)]
         self._equations(_stretch(0, 0, np.zeros(3), readings, [one], self._dtype), 0 * _PRIOR)
 
     def solve(self) -> None:
-        """The oldest stretch that is over, camera by camera."""
+        """Solve the oldest finished stretch, camera by camera."""
         begin_ns, pose = self._open.popleft()
         end_ns = begin_ns + _STRETCH_NS
-        # Copied in one go: whoever drives may add to them meanwhile.
+        # Copied at once: the driving thread may add to them meanwhile.
         readings = [r for r in self._readings.copy() if r[0] - begin_ns >= -_ROOM_NS]
         readings = [r for r in readings if r[0] <= end_ns + _ROOM_NS]
         views = [view for view in self._views.copy() if begin_ns <= view.stamp_ns < end_ns]
@@ -200,21 +200,21 @@ class CameraDelays:
 
     @property
     def found(self) -> list[Delay]:
-        """So far, of each camera."""
+        """The delay of each camera so far."""
         return list(map(_of_stretches, self._sums, self._counts))
 
     @property
     def together(self) -> Delay:
-        """So far, of all cameras as if they had one."""
+        """The common delay of all cameras so far."""
         return _of_stretches(self._sums.sum(axis=0), self._counts.sum())
 
     @property
     def late(self) -> bool:
-        """Whether some are surely later, or earlier, than is harmless."""
+        """Whether a camera, or all together, are surely later or earlier than is harmless."""
         return self.together.late or any(one.late for one in self.found)
 
     def _solved(self, stretch: Stretch) -> tuple[float, float]:
-        """Delay in s and its information in 1/s^2, 0 where it can't be told."""
+        """The delay in s and its information in 1/s^2, 0 where it can't be determined."""
         p = np.zeros(len(_PRIOR))
         p[:3] = stretch.start_pose
         start = p.copy()
@@ -234,7 +234,7 @@ class CameraDelays:
         variance = np.linalg.inv(A)[_DELAY, _DELAY]
         if not variance > 0 or abs(p[_DELAY]) >= _LIMIT_S:
             return 0.0, 0.0
-        # What the stretch alone tells, without the prior: stretches are added up.
+        # The information of the stretch alone, without the prior: stretches are added up.
         information = 1 / variance - 1 / _PRIOR[_DELAY] ** 2
         if not information > 1 / _TELLS_S**2:
             return 0.0, 0.0
@@ -255,7 +255,7 @@ def _of_camera(view: _View, camera: int) -> _View | None:
 
 
 def _of_stretches(sums: np.ndarray, count: int) -> Delay:
-    """Of several stretches; where they contradict each other sigma is as large as that."""
+    """The mean delay of several stretches; sigma grows where they contradict each other."""
     information, first, second = sums
     if not information > 0:
         return Delay(math.nan, math.inf, 0)
@@ -273,9 +273,9 @@ def _stretch(
     views: Sequence[_View],
     dtype: np.dtype,
 ) -> Stretch:
-    """In arrays of one size: readings hold from midway after the one before."""
+    """A stretch in arrays of fixed size; a reading holds from midway after the one before."""
     readings = _thinned(readings, _READINGS)
-    # A row for each marker of each instant.
+    # One row for each marker at each instant.
     rows = [(view.stamp_ns, *row) for view in views for row in zip(*view[2:], strict=True)]
     stamps_ns, marker, corners_px, sigmas_px = zip(*_thinned(rows, _VIEWS), strict=True)
     stamps_s = np.array([(stamp_ns - begin_ns) / 1e9 for stamp_ns, _, _ in readings])
@@ -290,7 +290,7 @@ def _stretch(
     return Stretch(
         camera,
         start_pose,
-        # What pads begins after all that is asked for.
+        # Padding begins after every time that is used.
         np.concatenate([edges_s, np.full(rest, 1e3)]).astype(dtype),
         padded([speed_mps for _, speed_mps, _ in readings], rest),
         padded([steering_rad for _, _, steering_rad in readings], rest),
@@ -303,7 +303,7 @@ def _stretch(
 
 
 def _thinned(rows: Sequence[Any], most: int) -> list[Any]:
-    """Evenly, as many as there is room for."""
+    """At most this many of the rows, evenly spaced."""
     which = np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))
     return [rows[index] for index in which]
 
@@ -331,7 +331,7 @@ def _normal(
         dt_s = jnp.diff(edges_s, append=edges_s[-1:])
         dt_s = jnp.where(dt_s < _ROOM_S + STRETCH_S, dt_s, 0.0)
 
-        # Where each reading begins to hold: sums, which cost a tenth of one step after the other.
+        # The pose where each reading begins to hold: sums cost a tenth of steps in sequence.
         zero = jnp.zeros_like(p[:3])
         dx, dy, dpsi = jax.vmap(advance, in_axes=(None, 0, 0, 0, None))(
             zero, speed, steering, dt_s, wheelbase_m
@@ -341,12 +341,12 @@ def _normal(
         nodes = jnp.stack([jnp.cumsum(dx) - dx, jnp.cumsum(dy) - dy, psi], axis=1)
 
         def along(time_s: Array) -> Array:
-            """The pose by the odometer, from where the readings begin."""
+            """The pose by odometry, relative to the start of the readings."""
             at = jnp.clip(jnp.searchsorted(edges_s, time_s, side="right") - 1, 0, None)
             after_s = time_s - edges_s[at]
             return advance(nodes[at], speed[at], steering[at], after_s, wheelbase_m)
 
-        # From the odometer's own world to the true one: at time 0 the pose is p[:3].
+        # From the odometer's frame to the world: at time 0 the pose is p[:3].
         times = jax.vmap(along)(jnp.append(times_s - p[9], 0.0))
         turn, moved_m = p[2] - times[-1, 2], times[:-1, :2] - times[-1:, :2]
         c, s = jnp.cos(turn), jnp.sin(turn)
@@ -370,7 +370,7 @@ def _normal(
     chi2 = jnp.sum(r**2, axis=1)
     fine = used & jnp.isfinite(chi2)
     r, J = jnp.where(fine[:, None], r, 0), jnp.where(fine[:, None, None], J, 0)
-    # As Cauchy's where it is far off.
+    # Cauchy's loss for large residuals.
     excess = jnp.maximum(chi2 / _FULL_WEIGHT, 1.0)
     weight = jnp.where(fine, 1 / excess, 0.0)
     rho = jnp.where(excess > 1, _FULL_WEIGHT * (1 + jnp.log(excess)), chi2)

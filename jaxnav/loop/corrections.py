@@ -1,8 +1,8 @@
-"""Between what the sensors of a calibrated vehicle say and what is true.
+"""Convert between the sensor values of a calibrated vehicle and the true ones.
 
-Readings are corrected where they enter the pilot, commands where they leave the guard, so that
-recordings hold what the sensors said, and everything inside is in true units. A vehicle that was
-not calibrated changes nothing, not a bit.
+Readings are corrected where they enter the pilot, commands where they leave the guard. So
+recordings hold the raw sensor values, and everything inside is in true units. Without a calibration
+every value stays the same, bit for bit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # the guard's process corrects without JAX and OpenCV
 
 @dataclass(frozen=True)
 class Corrections:
-    """Of one vehicle; see there."""
+    """The corrections of one vehicle; see `Vehicle` in `models.bicycle`."""
 
     speed_scale: float = 1.0
     steering_gain: float = 1.0
@@ -30,7 +30,7 @@ class Corrections:
 
     @staticmethod
     def of(vehicle: Vehicle) -> Corrections:
-        """Those of its description."""
+        """The corrections in a vehicle's description."""
         return Corrections(
             vehicle.speed_scale,
             vehicle.steering_gain,
@@ -39,15 +39,15 @@ class Corrections:
             float(vehicle.steering_limit_rad),
         )
 
-    # Whoever is late is moved back, never the other ahead: no stamp lies in the future.
+    # The late sensor is moved back, never the other one ahead: no stamp lies in the future.
     @cached_property
     def frame_late_ns(self) -> int:
-        """What is taken from the stamps of frames."""
+        """The delay subtracted from the stamps of frames."""
         return round(max(self.camera_delay_s, 0.0) * 1e9)
 
     @cached_property
     def reading_late_ns(self) -> int:
-        """What is taken from the stamps of readings."""
+        """The delay subtracted from the stamps of readings."""
         return round(max(-self.camera_delay_s, 0.0) * 1e9)
 
     @cached_property
@@ -55,7 +55,7 @@ class Corrections:
         return (self.speed_scale, self.steering_gain, self.steering_offset_rad) == (1, 1, 0)
 
     def reading(self, read: Odometry) -> Odometry:
-        """What was true when a reading was taken."""
+        """A reading in true units, its stamp corrected."""
         if self._is_neutral and not self.reading_late_ns:
             return read
         return replace(
@@ -66,26 +66,26 @@ class Corrections:
         )
 
     def read(self, speed_mps: float, steering_rad: float) -> tuple[float, float]:
-        """What the sensors say of a true speed and steering: the inverse of `reading`."""
+        """The sensor values of a true speed and steering angle: the inverse of `reading`."""
         if self._is_neutral:
             return speed_mps, steering_rad
         angle_rad = (steering_rad - self.steering_offset_rad) / self.steering_gain
         return speed_mps / self.speed_scale, angle_rad
 
     def frame(self, seen: Sighted) -> Sighted:
-        """A frame with its stamp on the odometer's clock."""
+        """A frame with its stamp corrected to the odometer's clock."""
         late_ns = self.frame_late_ns
         return replace(seen, stamp_ns=seen.stamp_ns - late_ns) if late_ns else seen
 
     def servo_rad(self, steering_rad: float) -> float:
-        """What the servo is told so that the wheels stand at an angle, as far as it can turn."""
+        """The servo angle that turns the wheels to an angle, within the servo's limit."""
         if self._is_neutral:
             return steering_rad
         told_rad = self.read(0.0, steering_rad)[1]
         return min(max(told_rad, -self.steering_limit_rad), self.steering_limit_rad)
 
     def true_rad(self, servo_rad: float) -> float:
-        """Where the wheels stand when the servo is told so: the inverse of `servo_rad`."""
+        """The angle of the wheels at a servo angle: the inverse of `servo_rad`."""
         if self._is_neutral:
             return servo_rad
         return self.steering_gain * servo_rad + self.steering_offset_rad

@@ -1,4 +1,4 @@
-"""Which way corners should have gone in the images, where the vehicle went some way."""
+"""Predict how corners move in the images when the vehicle moves."""
 
 import math
 
@@ -15,9 +15,9 @@ def due_px(
     """Corners before and after a motion, (C, M, 4, 2) each; None where the pose is not known.
 
     Args:
-        pose: (x_m, y_m, psi_rad) after it, as believed. That it is not exact matters little: shifts
-            differ by as much as the distance to the marker does.
-        motion: (x_m, y_m, psi_rad) in the vehicle's axes before it.
+        pose: estimated (x_m, y_m, psi_rad) after the motion. Its error matters little: the relative
+            error of a shift is that of the distance to the marker.
+        motion: (x_m, y_m, psi_rad) in the vehicle's axes before the motion.
     """
     if pose is None:
         return None
@@ -33,7 +33,7 @@ def due_px(
 
 
 def _quads_px(navigator: Navigator, place: Place) -> np.ndarray:
-    """Corners as seen from a place, by the program that says where to look for them."""
+    """Corners as seen from a place, (C, M, 4, 2), by the program that predicts search regions."""
     (x_m, y_m, psi_rad), dtype = place, np.asarray(navigator.corner_sigma_px).dtype
     wxyz_xyz = np.array([math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0], dtype)
     found = expected(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))

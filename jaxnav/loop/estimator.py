@@ -1,4 +1,4 @@
-"""The filter as the loop calls it: one compiled call an event, and the history of what was told."""
+"""Run the filter for the loop: one compiled call per event, with a history of recent events."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -17,7 +17,7 @@ from jaxnav.loop.history import Entry, History, Told
 from jaxnav.navigator import Navigator, Output
 from jaxnav.timeline import Corners, Events, advance
 
-EVENTS = 64  # that one call fuses: 800 ms of odometry at 50 Hz, and of frames at 30 Hz
+EVENTS = 64  # fused by one call: 800 ms of odometry at 50 Hz and of frames at 30 Hz
 
 _NOTHING = Told()
 
@@ -32,7 +32,7 @@ def advance_packed(
     events: Packed,
     numbers: Int[Array, "4"],
 ) -> tuple[Packed, Packed, Packed, Packed]:
-    """`advance`, whose arguments and results are few vectors.
+    """`advance` with its arguments and results packed into a few vectors.
 
     Args:
         numbers: count, new, now_us, elapsed_us.
@@ -44,44 +44,44 @@ def advance_packed(
 
 
 def _beginning(navigator: Navigator) -> tuple[Packed, Packed]:
-    """Belief and control at the start of a drive."""
+    """The belief and control state at the start of a drive."""
     state = navigator.init()
     return Layout.of(state.belief).pack(state.belief), Layout.of(state.control).pack(state.control)
 
 
 @dataclass(frozen=True)
 class Fused:
-    """What came of an event. Leaves of `output` and `belief` are NumPy's."""
+    """The result of one event. The leaves of `output` and `belief` are NumPy arrays."""
 
     output: Output
     belief: Belief
-    refused: bool  # older than all that is kept
-    events: int  # that were fused, this one and those after it
+    refused: bool  # the event is older than all that is kept
+    events: int  # number of events fused: this one and those after it
 
 
 class Estimator:
-    """One drive. The same calls give the same bits."""
+    """The estimator of one drive. The same calls give the same bits."""
 
     def __init__(self, navigator: Navigator, program: Program | None = None):
         """Args:
-        navigator: what to run.
-        program: `advance_packed` of the navigator, compiled; by default by `jax.jit`, see
+        navigator: the navigator to run.
+        program: compiled `advance_packed` of the navigator; by default compiled by `jax.jit`, see
             `compiled`.
         """
         self._program = program or compiled(advance_packed, navigator, None)
         self._first, self._control = compiled(_beginning, navigator, None)()
         self._layouts = {seeing: _layout(navigator, seeing) for seeing in (False, True)}
-        self._odometry = (np.nan, np.nan)  # speed_mps, steering_rad: the last
+        self._odometry = (np.nan, np.nan)  # the last speed_mps, steering_rad
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was sensed; the route goes on."""
+        """Forget all sensor data; keep the progress on the route."""
         self._history: History | None = None
         self._belief = self._first
         self._belief_ns = 0
 
     def forget_speed(self) -> None:
-        """Command as if it had never been known: the last that was told was not true."""
+        """Command as if the speed had never been known: the last reading was wrong."""
         self._odometry = (np.nan, self._odometry[1])
 
     def warm_up(self) -> None:
@@ -91,13 +91,13 @@ class Estimator:
             self._program(self._first, self._control, self._events([], 0, seeing), numbers)
 
     def fuse(self, told: Told | None, stamp_ns: int, now_ns: int, elapsed_ns: int) -> Fused:
-        """Take an event in, or none.
+        """Fuse an event, or only predict to the present.
 
         Args:
-            told: None to look at the clock only.
-            stamp_ns: when it was true.
-            now_ns: for which the pose and the command are meant.
-            elapsed_ns: since the last command.
+            told: the event's data; None to predict only.
+            stamp_ns: timestamp of the event.
+            now_ns: time of the returned pose and command.
+            elapsed_ns: time since the last command.
         """
         if told is not None and told.odometry is not None:
             self._odometry = told.odometry
@@ -122,15 +122,15 @@ class Estimator:
     def _fused(
         self, base: Entry, entries: list[Entry], new: int, now_ns: int, elapsed_ns: int
     ) -> tuple[Packed, Packed, Output]:
-        """What is believed after the entries, and after the new one, and the output: in one call
-        nearly always, in several where a frame is late and the cameras are many."""
+        """The belief after all entries, the belief after the new one, and the output. Takes one
+        call nearly always, several where a frame is late and the cameras are many."""
         assert base.belief is not None
         rows = [(entry.stamp_ns, entry.told or _NOTHING) for entry in entries]
         belief, base_ns = base.belief, base.stamp_ns
         if len(rows) <= EVENTS:
             belief, then, output = self._call(belief, rows, base_ns, new, now_ns, elapsed_ns)
             return belief, then, output.fetched().unpacked()
-        # One less: its place is what `new` means where the new event is of another part.
+        # One less: the free place is the value of `new` where the new event is in another part.
         size, control = EVENTS - 1, self._control
         for first in range(0, len(rows), size):
             part, holds = rows[first : first + size], first <= new < first + size
@@ -164,13 +164,13 @@ class Estimator:
 
     def _events(self, rows: Sequence[tuple[int, Told]], base_ns: int, seeing: bool) -> Packed:
         packed, events = self._layouts[seeing].room()
-        # What float32 can't hold is infinite, and so left out by the filter.
+        # Numbers that float32 can't hold become infinite, and the filter leaves them out.
         with np.errstate(over="ignore"):
             self._fill(events, rows, base_ns)
         return packed
 
     def _fill(self, events: Events, rows: Sequence[tuple[int, Told]], base_ns: int) -> None:
-        into = vars(events)  # an attribute of an equinox module takes a us
+        into = vars(events)  # reading an attribute of an equinox module takes 1 us
         speed_mps, steering_rad = into["speed_mps"], into["steering_rad"]
         speed_mps[:], steering_rad[:] = self._odometry
         for index, (stamp_ns, told) in enumerate(rows):
@@ -186,7 +186,7 @@ class Estimator:
 
 
 def _with_evidence(output: Output, of_new: Output) -> Output:
-    """An output with what the corners of another event say."""
+    """An output with the evidence fields of another one."""
 
     def evidence(output: Output) -> list[Any]:
         return [getattr(output, field.name) for field in fields(Evidence)]
@@ -196,7 +196,7 @@ def _with_evidence(output: Output, of_new: Output) -> Output:
 
 
 def _layout(navigator: Navigator, seeing: bool) -> Layout:
-    """Of `EVENTS`, with room for corners or without."""
+    """The layout of `EVENTS` events, with or without room for corners."""
     lanes = EVENTS, len(navigator.rig), len(navigator.markers.ids)
     dtype = navigator.corner_sigma_px.dtype
 
@@ -218,10 +218,10 @@ def _layout(navigator: Navigator, seeing: bool) -> Layout:
 
 
 def _us_between(earlier_ns: int, later_ns: int) -> int:
-    """So that times add up, whichever events they are measured from."""
+    """Time difference, us, of rounded times: differences add up, whatever event they start at."""
     return later_ns // 1000 - earlier_ns // 1000
 
 
 def _int32(number: int) -> int:
-    """Inside of what it can be: half an hour, in us, within which nothing came."""
+    """Clamp to [0, 2^31 - 1]: as us that is over half an hour, in which nothing came."""
     return min(max(number, 0), 2**31 - 1)

@@ -1,8 +1,8 @@
-"""Where each marker should appear from the present belief, so that a detector can look there first.
+"""Predict where each marker appears from the present belief, so a detector can look there first.
 
     quads_px, visible, radius_px = expected(rig, markers, T_world_vehicle, covariance)
 
-A corner is looked for in the circle of that radius around its place in `quads_px`.
+A corner is searched in the circle of that radius around its place in `quads_px`.
 """
 
 from typing import NamedTuple
@@ -24,19 +24,19 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
 SIGMAS = 3.0
-# The corner's own noise, and how far a corner moves while the exposure lasts.
+# The corner's own noise, and its motion during the exposure.
 MARGIN_PX = 4.0
-_SPENT = 1e-6  # of a variance is rounding
+_SPENT = 1e-6  # a remainder below this share of a variance is rounding
 
 
 class Expected(NamedTuple):
-    """What C cameras should see of M markers.
+    """The predicted views of M markers in C cameras.
 
     Attributes:
         quads_px: corners from the mean pose, TL TR BR BL.
         visible: the marker may be seen: printed side towards the camera, and every corner in front
             of it and in the image, or outside of it by no more than the radius.
-        radius_px: how far a corner may be from its place.
+        radius_px: the largest distance of a corner from its place.
     """
 
     quads_px: Float[Array, "C M 4 2"]
@@ -52,15 +52,15 @@ def expected(
     covariance: Float[Array, "3 3"],
     margin_px: Float[Array, ""] | float = MARGIN_PX,
 ) -> Expected:
-    """Where each marker should appear.
+    """Predict where each marker appears.
 
     With vectors a_k whose sum of a_k a_k' is the pose's covariance, and u(x) a corner,
 
         radius = sqrt(sum over k of max |u(x +- 3 a_k) - u(x)|^2) + margin.
 
-    Where u is straight that is 3 sqrt(trace) of the corner's covariance, beyond which a Gaussian
-    lies in at most 0.27 % of all cases. Moving the pose instead of taking a derivative keeps it
-    close to that where u bends.
+    Where u is linear that is 3 sqrt(trace) of the corner's covariance, beyond which a Gaussian
+    lies in at most 0.27 % of all cases. Moving the pose instead of taking a derivative keeps the
+    radius close to that where u is curved.
 
     Args:
         T_world_vehicle: wxyz xyz, the mean.
@@ -69,7 +69,7 @@ def expected(
     """
     mean = jaxlie.SE3(T_world_vehicle)
     offsets = SIGMAS * _axes(covariance)
-    # Half a turn further the vehicle would look where it looked before.
+    # Half a turn further the cameras would see the same markers again.
     limit = jnp.asarray([jnp.inf, jnp.inf, jnp.pi / 2], offsets.dtype)
     offsets = jnp.clip(offsets, -limit[None], limit[None])
 
@@ -87,8 +87,8 @@ def expected(
 
 
 def _axes(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Rows a_k: Cholesky's columns, none where a variance is spent. No call of LAPACK, which a
-    program that is loaded from a disk does not find."""
+    """Rows a_k: the columns of Cholesky's factor, zero where no variance is left. LAPACK is not
+    called, since a program loaded from disk does not find it."""
     rows: list[Array] = []
     for k in range(3):
         rest = covariance[k] - sum((row[k] * row for row in rows), jnp.zeros_like(covariance[k]))

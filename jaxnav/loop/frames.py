@@ -1,4 +1,4 @@
-"""From frames to what they tell: which to use, and what is wrong with the others."""
+"""Select the frames to fuse, and report what is wrong with the others."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,25 +13,25 @@ from jaxnav.loop.history import Told
 from jaxnav.loop.stamps import Stamps
 from jaxnav.models.markers import MarkerMap
 
-FROZEN_AFTER = 3  # frames with the very same corners, or pictures
+FROZEN_AFTER = 3  # frames in a row with exactly the same corners or picture
 _NO_FAULT = Fault(0)
 _MOST_PX = RANGES["corner_px"].most  # beyond, a corner is as good as infinite
 _NONE = Detections.concatenate([])
 
-# Whether a camera shows what it should not see any more: camera, stamp_ns, now_ns, corners_px
+# Whether a camera shows an old picture. Arguments: camera, stamp_ns, now_ns, corners_px
 # (M, 4, 2), visible (M,), their sigma_px; see `Standstill.frozen`.
 Frozen = Callable[[int, int, int, np.ndarray, np.ndarray, float], bool]
 
 
 @dataclass(frozen=True)
 class Sighted:
-    """What one camera's frame shows.
+    """The detections in one camera's frame.
 
     Attributes:
         camera: index in the rig.
-        stamp_ns: as the camera says.
+        stamp_ns: the camera's own timestamp.
         detections: None where the frame could not be used.
-        faults: of the frame, found by whoever looked at its pixels.
+        faults: faults of the frame, found by the search of its pixels.
     """
 
     camera: int
@@ -44,7 +44,7 @@ class Frames:
     """The frames of a drive, camera by camera.
 
     Attributes:
-        newest_ns: when each camera last gave a frame that could be used, None: never.
+        newest_ns: time of each camera's last usable frame, None: never.
     """
 
     def __init__(self, cameras: int, markers: MarkerMap, corner_sigma_px: float | None = None):
@@ -55,19 +55,19 @@ class Frames:
         self._newest_before_ns = list(self.newest_ns)
         self._markers, self._corner_sigma_px = markers, corner_sigma_px
         self._stamps = [Stamps() for _ in range(cameras)]
-        self._corners: list[tuple[bytes, int]] = [(b"", 0)] * cameras  # and how often the same
+        self._corners: list[tuple[bytes, int]] = [(b"", 0)] * cameras  # last, and its repetitions
 
     def refused(self) -> None:
-        """What was told last came too late for the filter: it is as if it had not come."""
+        """Treat the last frames, which came too late for the filter, as if they had not come."""
         self.newest_ns = list(self._newest_before_ns)
 
     def told(
         self, frames: Sequence[Sighted], now_ns: int, frozen: Frozen | None = None
     ) -> tuple[Told | None, int, Fault]:
-        """What frames tell, when it was true, and what is wrong with them.
+        """The data of frames, their stamp, and the faults found in them.
 
         Args:
-            frozen: asked of each camera that shows markers; None: nobody knows.
+            frozen: called for each camera that shows markers; None: not checked.
         """
         self._newest_before_ns = list(self.newest_ns)
         if not frames:
@@ -116,7 +116,7 @@ class Frames:
     def _leave_out_frozen(
         self, seen: Observed, stamps_ns: dict[int, int], now_ns: int, frozen: Frozen | None
     ) -> tuple[int | None, bool]:
-        """When what is left was true, and whether a camera was left out."""
+        """Hide frozen cameras; return the stamp of the others, and whether one was hidden."""
         taken_ns, left_out = None, False
         for camera, stamp_ns in stamps_ns.items():
             shown, corners_px = seen.visible[camera], seen.corners_px[camera]
@@ -131,7 +131,7 @@ class Frames:
         return taken_ns, left_out
 
     def _frozen(self, camera: int, detections: Detections) -> bool:
-        """Whether a camera shows the very same corners once too often."""
+        """Whether a camera has shown exactly the same corners FROZEN_AFTER times in a row."""
         shown = detections.corners_px.tobytes() if len(detections) else b""
         last, times = self._corners[camera]
         repeats = shown and shown == last and np.isfinite(detections.corners_px).all()
@@ -141,11 +141,11 @@ class Frames:
 
 
 def _are_finite(corners_px: np.ndarray, sigma_px: np.ndarray) -> bool:
-    """Whether all are numbers that a vehicle can have; those of NaN compare as none."""
+    """Whether corners and sigmas are finite and in range; NaN fails every comparison."""
     near = np.abs(corners_px).max() <= _MOST_PX
     return bool(near and sigma_px.min() > 0 and sigma_px.max() < np.inf)
 
 
 def _hide(seen: Observed, lane: tuple[int, ...]) -> None:
-    """Make it one that shows nothing."""
+    """Make a lane of the observation empty."""
     seen.visible[lane], seen.corners_px[lane], seen.sigma_px[lane] = False, 0, 1

@@ -1,18 +1,18 @@
-"""The only way to the vehicle, and the dog that watches it; see docs/promises.md, It stops.
+"""The watchdog through which all commands reach the vehicle; see docs/promises.md, It stops.
 
     guard = Guard(vehicle, limits)
     guard.arm()
     guard.write(steering_rad, throttle)     # again and again, or it stops the vehicle
     guard.close()
 
-A thread of its own, the monotonic clock, and nothing of JAX. It stops the vehicle when no fresh
-command came for a while, when a watched thread hangs, on a command that is no number, and when it
-is told to. It says stop until the vehicle has heard it, and once more after anything that might
-have undone it. Once it has stopped it does not arm again: whoever wants to drive on starts anew.
+It has its own thread, uses the monotonic clock, and imports no JAX. It stops the vehicle when no
+fresh command came in time, when a watched thread hangs, on a command that is not a number, and when
+told to. It repeats the stop until the vehicle has heard it, and again after anything that might
+have undone it. Once tripped it does not arm again: to drive on, start a new drive.
 
 A thread can't act while C code of the same process holds the interpreter, nor once the process is
-gone: vehicles that can be moved have a guard in a process of its own (see `guard_process`), and the
-one here beside it.
+gone: vehicles that can be moved have a guard in a process of its own (see `guard_process`) as well
+as this one.
 """
 
 import atexit
@@ -27,14 +27,14 @@ from jaxnav.loop.interfaces import Vehicle
 from jaxnav.loop.limits import Limits
 
 TIMEOUT_S = 0.2
-_LOOK_S = 0.02  # between two looks of the dog
-_LOCK_S = 0.02  # so long it waits for a thread that is inside the driver
-_AGAIN_S = 0.1  # between two stops of a vehicle that has heard the first one
-HEARD_WITHIN_S = 10.0  # so long `close` goes on with a vehicle that does not hear
+_LOOK_S = 0.02  # period of the watchdog
+_LOCK_S = 0.02  # time that `trip` waits for a thread inside the driver
+_AGAIN_S = 0.1  # time between two stops of a vehicle that has heard the first one
+HEARD_WITHIN_S = 10.0  # time for which `close` repeats the stop to a vehicle that does not hear it
 
 
 class Guard:
-    """For any thread. `write` is called by one."""
+    """The watchdog of one vehicle. Thread-safe, but only one thread may call `write`."""
 
     def __init__(
         self,
@@ -44,11 +44,11 @@ class Guard:
         now_ns: Callable[[], int] = time.monotonic_ns,
         corrections: Corrections | None = None,
     ):
-        """Disarmed: nothing but zero throttle gets through.
+        """Start disarmed: only zero throttle gets through.
 
         Args:
-            corrections: what the servo is told for a true angle; by default the angle.
-            timeout_s: from the last sign of life until the vehicle has been stopped.
+            corrections: convert true angles to servo angles; by default they are the same.
+            timeout_s: time from the last sign of life until the vehicle has been stopped.
         """
         self._vehicle, self._limits, self._now_ns = vehicle, limits, now_ns
         self._corrections = corrections or Corrections()
@@ -58,36 +58,36 @@ class Guard:
         self._reason: str | None = None
         self._tripped = threading.Event()
         self._closed = threading.Event()
-        self._beats: dict[str, int] = {}  # when each watched thread was last alive
+        self._beats: dict[str, int] = {}  # time of each watched thread's last sign of life
         self._steering_rad, self._written_ns = 0.0, now_ns()
         self._deadline_ns = self._written_ns
         self._unheard: str | None = None  # why the last stop did not reach the vehicle
-        self._stopped_s = 0.0  # when the last one did
+        self._stopped_s = 0.0  # time of the last stop that did
         self._thread = threading.Thread(target=self._watch, name="jaxnav-guard", daemon=True)
         self._thread.start()
         atexit.register(self._at_exit)
 
     @property
     def tripped(self) -> bool:
-        """Whether the vehicle was stopped for good."""
+        """Whether the guard has stopped the vehicle for good."""
         return self._tripped.is_set()
 
     @property
     def reason(self) -> str | None:
-        """Why."""
+        """Why the guard has tripped; None: it has not."""
         return self._reason
 
     @property
     def unheard(self) -> str | None:
-        """Why the vehicle has not heard that it should stop; None: it has, or was not told."""
+        """Why the last stop did not reach the vehicle; None: it did, or there was none."""
         return self._unheard
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Sleep, and wake when it trips: whether it has."""
+        """Wait until the guard trips or the time is over; return whether it has tripped."""
         return self._tripped.wait(timeout_s)
 
     def arm(self) -> None:
-        """From now on commands get through, and must come."""
+        """Let commands through from now on, and require them to come in time."""
         with self._lock:
             now_ns = self._now_ns()
             self._written_ns = now_ns
@@ -96,22 +96,22 @@ class Guard:
             self._armed = not self.tripped
 
     def beat(self, name: str) -> None:
-        """A sign of life of a thread, which is watched from its first one on."""
+        """Note a sign of life of a thread; the first one begins its watch."""
         self._beats[name] = self._now_ns()
 
     def leave(self, name: str) -> None:
-        """A thread ends as it should: it is watched no more."""
+        """Stop watching a thread that ends normally."""
         self._beats.pop(name, None)
 
     def write(self, steering_rad: float, throttle: float, deadline_ns: int | None = None) -> bool:
-        """A command, inside the limits whatever it says.
+        """Write a command to the vehicle, clamped to the limits.
 
         Args:
-            deadline_ns: by when the next one must have come; by default the guard's own time from
-                now. A command whose own deadline is over is not obeyed.
+            deadline_ns: time by which the next command must come; by default now plus the guard's
+                timeout. A command whose own deadline is over is not obeyed.
 
         Returns:
-            Whether the vehicle took it. A driver that can't write now gets the next one.
+            Whether the vehicle took the command. A driver that fails to write gets the next one.
         """
         if not (math.isfinite(steering_rad) and math.isfinite(throttle)):
             self.trip(f"the command was no number: {steering_rad}, {throttle}")
@@ -131,15 +131,15 @@ class Guard:
             except OSError:
                 return False
             finally:
-                if self.tripped:  # meanwhile: what was written last must not be a throttle
+                if self.tripped:  # during the write: the last thing written must not be a throttle
                     self._stop()
             self._steering_rad, self._written_ns = steering_rad, now_ns
             self._deadline_ns = now_ns + self._timeout_ns if deadline_ns is None else deadline_ns
             return True
 
     def trip(self, reason: str) -> None:
-        """Stop the vehicle, now and for good. From any thread."""
-        # A thread that hangs inside the driver holds the lock: then without it.
+        """Stop the vehicle, now and for good. May be called from any thread."""
+        # A thread that hangs inside the driver holds the lock: then stop without it.
         held = self._lock.acquire(timeout=_LOCK_S)
         try:
             if self._reason is None:
@@ -152,11 +152,11 @@ class Guard:
                 self._lock.release()
 
     def close(self, heard_within_s: float = HEARD_WITHIN_S) -> None:
-        """Stop and let go of the vehicle. Any number of times.
+        """Stop and release the vehicle. May be called any number of times.
 
         Args:
-            heard_within_s: so long it goes on saying stop to a vehicle that does not hear; then
-                `unheard` says why.
+            heard_within_s: time for which the stop is repeated to a vehicle that does not hear it;
+                then `unheard` says why.
         """
         if self._closed.is_set():
             return
@@ -171,14 +171,14 @@ class Guard:
         atexit.unregister(self._at_exit)
         with suppress(Exception):
             self._vehicle.close()
-        with suppress(Exception):  # once more, for a driver that let go without a word
+        with suppress(Exception):  # once more, for a driver that closes without stopping
             self._vehicle.stop()
 
     def _watch(self) -> None:
         while not self._closed.wait(self._until_next_look_s()):
             try:
                 self._look()
-            except Exception as error:  # a dog that dies unseen watches nothing
+            except Exception as error:  # a watchdog that dies silently watches nothing
                 self.trip(f"the guard failed: {type(error).__name__}: {error}")
 
     def _until_next_look_s(self) -> float:
@@ -201,10 +201,10 @@ class Guard:
                 self.trip(f"{name} hangs for {(now_ns - beat_ns) / 1e9:.2f} s")
 
     def _stop(self) -> None:
-        """Say it once; `_look` and `close` say it again until it is heard."""
+        """Tell the vehicle to stop once; `_look` and `close` repeat it until it is heard."""
         try:
             self._vehicle.stop()
-        except Exception as error:  # whatever it is, there is nothing else to do but try again
+        except Exception as error:  # whatever it is, all that can be done is to try again
             self._unheard = f"{type(error).__name__}: {error}"
         else:
             self._unheard, self._stopped_s = None, time.monotonic()

@@ -1,15 +1,15 @@
-"""The process that owns the vehicle: it stops it, whatever becomes of the one that computes.
+"""The process that owns the vehicle and stops it, whatever happens to the computing process.
 
-    python -m jaxnav.loop.guard_process COMMANDS READINGS     # two descriptors of sockets
+    python -m jaxnav.loop.guard_process COMMANDS READINGS     # file descriptors of two sockets
 
-`moved_vehicle` starts it and talks to it. It holds no JAX and no OpenCV, is up in a fifth of a
-second, and runs the `Guard` with its limits and corrections beside the plug-in. Each command says
-by when the next one must have come, on the clock that all processes of a machine share: one that
-comes too late is not obeyed, and where none comes in time the vehicle is stopped. So it is at once
-where the other process ends, which closes its sockets, however it ends.
+`moved_vehicle` starts it and talks to it. It imports no JAX and no OpenCV, is up in a fifth of a
+second, and runs the plug-in behind a `Guard` with its limits and corrections. Each command carries
+the deadline of the next one, on the clock that all processes of a machine share: a command that
+comes too late is not obeyed, and when none comes in time the vehicle is stopped. It is stopped at
+once when the computing process ends, however it ends, since that closes the sockets.
 
-On the first socket JSON and commands come in and events go out; on the second a byte asks for a
-reading. All are in frames, see `Link`.
+On the first socket JSON and commands come in and events go out; on the second a byte requests a
+reading. All of these are framed, see `Link`.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from jaxnav.loop.priority import NICE, lower_nice
 COMMAND = struct.Struct("<cQqdd")  # kind, sequence, deadline_ns, steering_rad, throttle
 READING = struct.Struct("<cqdd?")  # kind, stamp_ns, speed_mps, steering_rad, valid
 KIND_COMMAND, KIND_TEXT, KIND_READING, KIND_FAILED = b"c", b"t", b"r", b"f"
-HEARD_WITHIN_S = 600.0  # an orphan says stop for so long to a vehicle that does not hear
-_HEAVY = ("jax", "cv2")  # what the guard's process must do without
-_PRIORITY = 20  # of the real-time class: above what computes, below the kernel's own threads
+HEARD_WITHIN_S = 600.0  # an orphan repeats the stop for this long to a vehicle that does not hear
+_HEAVY = ("jax", "cv2")  # modules that the guard's process must not import
+_PRIORITY = 20  # in the real-time class: above the computing process, below the kernel's threads
 _LARGEST = 2**24
 
 
 class Link:
-    """Frames over a stream socket: four bytes of length, then the content."""
+    """Messages over a stream socket, each a frame: four bytes of length, then the content."""
 
     def __init__(self, end: socket.socket):
         self.socket = end
@@ -55,19 +55,19 @@ class Link:
         self._frames: list[bytes] = []
 
     def send(self, content: bytes) -> None:
-        """All of it, or OSError."""
+        """Send one frame completely, or raise OSError."""
         self.socket.sendall(struct.pack("<I", len(content)) + content)
 
     def tell(self, **said: Any) -> None:
-        """A mapping as JSON."""
+        """Send a mapping as JSON."""
         self.send(KIND_TEXT + json.dumps(said).encode())
 
     def receive(self) -> list[bytes]:
-        """Whole frames that have come, none perhaps; waits for some bytes where none had.
+        """The complete frames received, possibly none; waits for bytes if no frame is ready.
 
         Raises:
             EOFError: the other end is closed.
-            OSError: the socket's time is over, or it broke.
+            OSError: the socket timed out or broke.
         """
         frames, self._frames = self._frames, []
         if frames:
@@ -87,7 +87,7 @@ class Link:
         return frames
 
     def mapping(self) -> dict[str, Any]:
-        """The next one, waited for."""
+        """Wait for the next mapping and return it."""
         while not (frames := self.receive()):
             pass
         self._frames = frames[1:]
@@ -96,11 +96,11 @@ class Link:
 
 
 class CanNotMoveError(Exception):
-    """A vehicle that needs the process that computes, and why."""
+    """A vehicle needs the computing process; the message says why."""
 
 
 class _Missing:
-    """Rig and markers, which the guard's process does not know."""
+    """Placeholder for rig or markers, which the guard's process does not have."""
 
     def __init__(self, name: str):
         self._name = name
@@ -110,13 +110,13 @@ class _Missing:
 
 
 def main(commands: int, readings: int) -> None:
-    """Serve until the vehicle may be let go of."""
+    """Serve until the vehicle can be released."""
     for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTOU", "SIGPIPE"):
-        signal.signal(getattr(signal, name), signal.SIG_IGN)  # the other process hears them
+        signal.signal(getattr(signal, name), signal.SIG_IGN)  # the computing process handles them
     told = os.pipe()
     os.set_blocking(told[1], False)
     signal.set_wakeup_fd(told[1], warn_on_full_buffer=False)
-    signal.signal(signal.SIGTERM, lambda number, frame: None)  # of a machine that shuts down
+    signal.signal(signal.SIGTERM, lambda number, frame: None)  # sent when the machine shuts down
     link = Link(socket.socket(fileno=commands))
     asked = Link(socket.socket(fileno=readings))
     with suppress(EOFError, OSError):
@@ -135,7 +135,7 @@ def main(commands: int, readings: int) -> None:
         if order.get("only_stop"):
             _stop_for_good(vehicle, order)
             return
-        priority = _preferred()  # of this thread, and of the guard's, which it begins
+        priority = _preferred()  # of this thread, and of the guard's thread, which it starts
         guard = Guard(
             vehicle,
             Limits(**order["limits"]),
@@ -153,7 +153,7 @@ def main(commands: int, readings: int) -> None:
 
 
 class _Server:
-    """What comes in, until there is nothing left to do."""
+    """The server of both sockets, until it is told to close."""
 
     def __init__(self, vehicle: Vehicle, guard: Guard, link: Link, asked: Link, signals: int):
         self._vehicle, self._guard = vehicle, guard
@@ -161,7 +161,7 @@ class _Server:
         self._sequence = 0
 
     def serve(self) -> None:
-        """Commands before readings: these may take a driver's time."""
+        """Serve commands before readings, since a reading may take as long as the driver does."""
         look = select.poll()
         for descriptor in (self._link.socket, self._asked.socket, self._signals):
             look.register(descriptor, select.POLLIN)
@@ -182,7 +182,7 @@ class _Server:
             self._guard.trip("the process that computes is gone")
 
     def _obey(self, frame: bytes) -> bool:
-        """Whether there is more to come."""
+        """Execute a frame; return False if it says to close."""
         if frame[:1] != KIND_COMMAND:
             said = json.loads(frame[1:])
             if "stop" in said:
@@ -191,7 +191,7 @@ class _Server:
         _, sequence, deadline_ns, steering_rad, throttle = COMMAND.unpack(frame)
         if sequence > self._sequence:
             if not self._sequence:
-                self._guard.arm()  # the first command: from now on they must come
+                self._guard.arm()  # the first command: from now on commands must come in time
             self._sequence = sequence
             self._guard.write(steering_rad, throttle, deadline_ns)
         return True
@@ -205,14 +205,14 @@ class _Server:
             )
         except OSError as error:
             return KIND_FAILED + str(error).encode()[:1000]
-        except Exception as error:  # it can't be known what it means: the vehicle stops
+        except Exception as error:  # its meaning is unknown: the vehicle stops
             self._guard.trip(f"the vehicle: {type(error).__name__}: {error}")
             return KIND_FAILED + f"{type(error).__name__}: {error}".encode()[:1000]
         return numbers + (over or "").encode()
 
 
 def _report(guard: Guard, link: Link) -> None:
-    """Say at once that it tripped: by a thread, for the other one may hang in the driver."""
+    """Report a trip at once: in a thread, since the main one may hang in the driver."""
     guard.wait()
     with suppress(OSError):
         link.tell(tripped=guard.reason)
@@ -238,17 +238,17 @@ def _opened(factory: Any, order: dict[str, Any]) -> Vehicle:
 
 
 def _stop_for_good(vehicle: Vehicle, order: dict[str, Any]) -> None:
-    """Of a guard whose forerunner has died."""
+    """Stop and close the vehicle of a guard's process that has died."""
     guard = Guard(vehicle, Limits(**order["limits"]), order["timeout_s"])
     guard.close(HEARD_WITHIN_S)
 
 
 def _preferred() -> str:
-    """Have the kernel run this process first and keep its memory, as far as it may."""
-    with suppress(OSError):  # the last that is ended where memory runs out
+    """Raise the process's priority and lock its memory where permitted; describe the priority."""
+    with suppress(OSError):  # killed last when memory runs out
         Path("/proc/self/oom_score_adj").write_text("-900")
     with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mlockall(1)  # what is there now: MCL_CURRENT
+        ctypes.CDLL(None).mlockall(1)  # MCL_CURRENT: the pages mapped now
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
         return "real-time priority"
@@ -256,6 +256,6 @@ def _preferred() -> str:
 
 
 if __name__ == "__main__":
-    with FreeOutput():  # a driver that prints of its troubles must not wait for a reader
+    with FreeOutput():  # a driver that prints errors must not wait for a reader
         main(int(sys.argv[1]), int(sys.argv[2]))
-    os._exit(0)  # the vehicle is let go of: what else a plug-in has loaded needs no end
+    os._exit(0)  # the vehicle is released: what else a plug-in has loaded needs no cleanup

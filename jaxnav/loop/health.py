@@ -1,4 +1,4 @@
-"""How well the vehicle is, and how fast it may go.
+"""Decide the health of the vehicle, and with it how fast the vehicle may go.
 
 See docs/promises.md, It knows what it does not know.
 """
@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 from jaxnav.loop.flags import Fault, Health
 
-# From bad to better only after so many good looks in a row. What merely contradicts counts up with
-# every contradiction and down with every agreement, and is bad at ten (ArduPilot's EKF check).
+# A better state needs this many good looks in a row. Corners count up with every contradiction and
+# down with every agreement, and are bad at ten (ArduPilot's EKF check).
 LOOKS = 10
 _OFTEN = 10
-# A vehicle that is carried off restarts once, or twice where it takes the mirror pose first. Who
-# restarts more often than that believes something new every other second, and stands, until it is
-# so long ago. It is no trip of the watchdog: the drive goes on by itself.
+# A vehicle that is carried off restarts once, or twice where it takes the mirror pose first. One
+# that restarts more often within RESTARTS_S has no stable belief, and stands until those restarts
+# are older. That does not trip the watchdog: the drive goes on by itself.
 MOST_RESTARTS, RESTARTS_S = 3, 10.0
 
 SPEED_FACTOR = {
@@ -41,7 +41,7 @@ _SLOW = (
 
 @dataclass(frozen=True)
 class Timeouts:
-    """When missing data count, and when they count as too much."""
+    """The limits beyond which missing data lower the health."""
 
     camera_stale_s: float = 0.2  # PX4
     odometry_stale_s: float = 0.1  # PX4
@@ -55,24 +55,24 @@ class Timeouts:
 
 @dataclass(frozen=True)
 class Senses:
-    """What is known of the data at one instant. Ages in s, inf: never."""
+    """The state of the data at one instant. Ages in s, inf: never."""
 
     located: bool
     decided: bool
-    fix_age_s: float  # since corners were last believed
+    fix_age_s: float  # time since the last fix
     odometry_age_s: float
     cameras_age_s: tuple[float, ...]
     position_sigma_m: float
-    distance_m: float  # driven since corners were last believed
-    faults: Fault  # that are seen elsewhere
+    distance_m: float  # driven since the last fix
+    faults: Fault  # found elsewhere
     restarts: int = 0  # in the last RESTARTS_S
     confirmed: bool = True  # by corners, more than once (see `support`)
-    refused: bool = False  # what is located is not where it may be
+    refused: bool = False  # the pose is out of reach and not accepted (see `support`)
 
 
 @dataclass
 class Monitor:
-    """The health of the vehicle from one look to the next."""
+    """The monitor of the vehicle's health, updated look by look."""
 
     timeouts: Timeouts = field(default_factory=Timeouts)
     health: Health = Health.INIT
@@ -80,7 +80,7 @@ class Monitor:
     _doubts: int = 0
 
     def look(self, senses: Senses) -> tuple[Health, Fault]:
-        """The health now, and what is wrong. Call it at a steady rate."""
+        """Update the health; return it with the faults. Call it at a steady rate."""
         missing = self._missing(senses)
         faults = senses.faults | missing if missing else senses.faults
         wanted = self._wanted(senses, faults)
@@ -94,11 +94,11 @@ class Monitor:
 
     @property
     def contradicted(self) -> bool:
-        """Whether corners contradict what is believed more often than not."""
+        """Whether corners contradict the estimate more often than not."""
         return self._doubts >= _OFTEN
 
     def corners(self, believed: bool) -> None:
-        """Count a frame's corners that were believed, or not."""
+        """Count a frame whose corners were believed, or were not."""
         self._doubts = max(self._doubts - 1, 0) if believed else min(self._doubts + 1, 2 * _OFTEN)
 
     def _missing(self, senses: Senses) -> Fault:

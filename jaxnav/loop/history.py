@@ -1,9 +1,9 @@
-"""The last events in the order of their stamps, and what was believed after them.
+"""Keep the last events in the order of their stamps, with the beliefs after them.
 
-What was believed is kept where it is still true: a late event undoes what had been believed since,
-and the next event starts from what was believed before. All that `Stamps` lets in has its place,
-whatever the rates: events are kept for `OLD_NS`. Readings of an odometer that come faster than
-`THIN_NS` are fused as they come, but of those only so many are kept to be fused once more.
+A late event invalidates the beliefs of all later events, and fusion starts again from the last
+belief before it. Every event that `Stamps` lets in has a place, whatever the rates: events are
+kept for `OLD_NS`. Readings of an odometer that come faster than `THIN_NS` are fused as they come,
+but only a part of them is kept to be fused again.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from jaxnav.compiling.packing import Packed
 from jaxnav.loop.stamps import OLD_NS
 
 # At 100 Hz every reading is kept, at higher rates about that many: at 1 m/s a car moves 8 mm
-# meanwhile, and where it brakes with 3 m/s^2 its speed changes by 2 %.
+# in this time, and braking at 3 m/s^2 changes its speed by 2 %.
 THIN_NS = 8_000_000
-# Bounded, whatever is told: 800 ms of the odometer and of cameras that look 400 times a second.
+# Bounded for any input: 800 ms of the odometer and of cameras that look 400 times a second.
 KEPT = 420
 
 
 @dataclass(frozen=True)
 class Told:
-    """What an event says: odometry, corners of some cameras, or both."""
+    """The data of an event: odometry, corners of some cameras, or both."""
 
     odometry: tuple[float, float] | None = None  # speed_mps, steering_rad
     corners_px: np.ndarray | None = None  # (C, M, 4, 2), finite
@@ -32,25 +32,25 @@ class Told:
 
 @dataclass
 class Entry:
-    """One event; `belief` is what was believed after it, None where that is not true any more."""
+    """One event and the belief after it, None where a late event has invalidated it."""
 
     stamp_ns: int
-    told: Told | None  # None: where everything began
+    told: Told | None  # None: the beginning
     belief: Packed | None
 
 
 class History:
-    """The events of one drive."""
+    """The recent events of one drive."""
 
     def __init__(self, belief: Packed, begin_ns: int):
-        """With nothing sensed, at some instant."""
+        """Begin with a belief at some instant, before any event."""
         self._entries = [Entry(begin_ns, None, belief)]
 
     def place(self, stamp_ns: int, told: Told) -> tuple[Entry, list[Entry]] | None:
-        """Take an event in.
+        """Insert an event.
 
         Returns:
-            The entry to start from, whose belief is true, and all those after it, which are to be
+            The entry to start from, whose belief is valid, and all entries after it, which must be
             fused; None where the event is too old to be placed.
         """
         entries = self._entries
@@ -68,12 +68,12 @@ class History:
         return entries[base], entries[base + 1 :]
 
     def fused(self, belief: Packed, new: Entry, then: Packed) -> None:
-        """Keep what is believed, and no more events than may be needed.
+        """Keep the new beliefs, and drop events that are no longer needed.
 
         Args:
-            belief: what is believed after the newest event.
+            belief: after the newest event.
             new: the entry that `place` has made; the next late event may start from it.
-            then: what was believed after that.
+            then: the belief after the new entry.
         """
         new.belief = then
         self._entries[-1].belief = belief
@@ -81,7 +81,7 @@ class History:
         self._forget()
 
     def _thin(self) -> None:
-        """Leave out the reading before the newest where it follows another one too soon."""
+        """Drop the reading before the newest if it follows its predecessor too soon."""
         last = self._entries[-3:]
         if len(last) == 3 and all(entry.told and entry.told.corners_px is None for entry in last):
             before, middle, _ = last
@@ -89,7 +89,7 @@ class History:
                 del self._entries[-2]
 
     def _forget(self) -> None:
-        """All before the last belief that an event as old as may be can start from."""
+        """Drop all entries before the belief from which the oldest allowed event can start."""
         entries = self._entries
         oldest_ns = entries[-1].stamp_ns - OLD_NS
         base = 0
@@ -102,5 +102,5 @@ class History:
 
     @property
     def newest_ns(self) -> int:
-        """Stamp of the newest event."""
+        """The stamp of the newest event."""
         return self._entries[-1].stamp_ns

@@ -1,4 +1,4 @@
-"""What a vehicle and a camera are to the loop: write these, and any car drives.
+"""The interfaces of a vehicle and of a camera: implement these to drive any car.
 
 A plug-in is a factory, found by an entry point of the group `jaxnav.vehicles` or
 `jaxnav.cameras`, or as `module:name`:
@@ -6,15 +6,15 @@ A plug-in is a factory, found by an entry point of the group `jaxnav.vehicles` o
     def open_vehicle(setup: Setup) -> Vehicle
     def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]   # one for each of the rig
 
-`jaxnav.testing.check_vehicle` and `check_cameras` say whether it keeps its promises. A vehicle may
-also be `Ending`, and its factory may have `HasOwnFiles` or `SharesProcess`.
+`jaxnav.testing.check_vehicle` and `check_cameras` test whether a plug-in keeps these promises. A
+vehicle may also be `Ending`, and its factory may be `HasOwnFiles` or `SharesProcess`.
 
-`jaxnav run` opens a vehicle in the process of its guard, which outlives whatever happens to the one
-that computes (see `guard_process`). There `setup.vehicle` is plain numbers, `setup.rig` and
-`setup.markers` are missing, and the vehicle that `open_cameras` gets only passes its calls on. A
-vehicle whose module imports JAX or OpenCV, that looks at rig or markers, or says `SharesProcess`,
-stays in the process that computes, watched by a thread. The guard runs at real-time priority where
-it may: a `read` that waits must sleep, not spin.
+`jaxnav run` opens a vehicle in the process of its guard, which survives any end of the computing
+process (see `guard_process`). There `setup.vehicle` is plain numbers, `setup.rig` and
+`setup.markers` are missing, and the vehicle that `open_cameras` gets only forwards its calls. A
+vehicle whose module imports JAX or OpenCV, that reads rig or markers, or that is `SharesProcess`,
+stays in the computing process, watched by a thread. The guard runs at real-time priority where
+that is permitted: a `read` that waits must sleep, not spin.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # plug-ins import this file in the guard's process, which has
 
 @dataclass(frozen=True)
 class Setup:
-    """What a plug-in is told when it is opened."""
+    """The arguments that a plug-in gets when it is opened."""
 
     rig: CameraRig
     markers: MarkerMap
@@ -50,10 +50,10 @@ class Odometry:
     """One reading of wheel odometer and steering sensor.
 
     Attributes:
-        stamp_ns: when it was measured, `time.monotonic_ns()` of this machine.
+        stamp_ns: time of measurement, `time.monotonic_ns()` of this machine.
         speed_mps: along the vehicle's course, negative backwards.
         steering_rad: angle of the front wheels, positive to the left.
-        valid: False where the driver itself knows that it could not read.
+        valid: False where the driver knows that it could not read.
     """
 
     stamp_ns: int
@@ -64,12 +64,12 @@ class Odometry:
 
 @dataclass(frozen=True)
 class Frame:
-    """What one camera saw at one instant: an image, or the markers that it found itself.
+    """One camera's data of one instant: an image, or the markers that the camera detected itself.
 
     Attributes:
         stamp_ns: middle of the exposure, `time.monotonic_ns()` of this machine.
         image: (H, W) or (H, W, 3) in BGR order, uint8.
-        detections: of a camera that detects by itself; the image is then only shown and recorded.
+        detections: from a camera that detects markers itself; its image is only shown and recorded.
     """
 
     stamp_ns: int
@@ -83,42 +83,42 @@ class Vehicle(Protocol):
 
     @property
     def timeout_s(self) -> float:
-        """After this time without a `write` the vehicle stops by itself; inf: it does not."""
+        """Time without a `write` after which the vehicle stops by itself; inf: it does not."""
         ...
 
     def read(self) -> Odometry:
-        """The latest reading, without waiting longer than some milliseconds.
+        """The latest reading; may wait for some milliseconds at most.
 
         Raises:
-            OSError: it can't be read now; the loop goes on without it and asks again.
+            OSError: no reading is possible now; the loop goes on without it and asks again.
         """
         ...
 
     def write(self, steering_rad: float, throttle: float) -> None:
-        """Steer and drive, throttle in the driver's unit, until the next call.
+        """Apply steering and throttle (in the driver's unit) until the next call.
 
         Raises:
-            OSError: it can't be written now; the loop tries again at the next tick.
+            OSError: no command is possible now; the loop tries again at the next tick.
         """
         ...
 
     def stop(self) -> None:
-        """Zero throttle, now. From any thread, also while another is inside `read` or `write`, any
-        number of times, also after `close`."""
+        """Set zero throttle now. May be called from any thread, also while another is inside `read`
+        or `write`, any number of times, also after `close`."""
         ...
 
     def close(self) -> None:
-        """Stop and let go of the hardware. Any number of times."""
+        """Stop and release the hardware. May be called any number of times."""
         ...
 
 
 @runtime_checkable
 class Ending(Protocol):
-    """What a vehicle may have beside: its drive can be over by itself, as a recording's is."""
+    """Optional part of a vehicle whose drive can end by itself, as a recording's does."""
 
     @property
     def over(self) -> str | None:
-        """Why there is nothing more to drive, which ends the loop in good order; None: there is."""
+        """Why the drive is over, which ends the loop in good order; None while it goes on."""
         ...
 
 
@@ -128,19 +128,19 @@ class Camera(Protocol):
 
     @property
     def name(self) -> str:
-        """As the rig calls it."""
+        """The camera's name in the rig."""
         ...
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next frame, never the same twice; None where there is none within the time.
+        """The next frame, never the same twice; None if none comes within the timeout.
 
         Raises:
-            OSError: it can't be read now; the loop waits a little and asks again.
+            OSError: no frame can be read now; the loop waits a little and asks again.
         """
         ...
 
     def close(self) -> None:
-        """Let go of the hardware; a `read` that waits returns. Any number of times."""
+        """Release the hardware; a waiting `read` returns. May be called any number of times."""
         ...
 
 
@@ -150,14 +150,14 @@ OpenCameras = Callable[[Setup, Vehicle], Sequence[Camera]]
 
 @runtime_checkable
 class SharesProcess(Protocol):
-    """What the factory of a vehicle may have beside: its cameras, say, need the vehicle itself."""
+    """Optional part of a vehicle's factory: its cameras, for example, need the vehicle itself."""
 
-    shares_process: bool  # True: it is opened in the process that computes
+    shares_process: bool  # True: the vehicle is opened in the computing process
 
 
 @dataclass(frozen=True)
 class OwnFiles:
-    """What a vehicle brings with it."""
+    """The rig, markers, parameters and route that a vehicle brings with it."""
 
     rig: CameraRig
     markers: MarkerMap
@@ -167,13 +167,13 @@ class OwnFiles:
 
 @runtime_checkable
 class HasOwnFiles(Protocol):
-    """What the factory of a vehicle, a class perhaps, may have beside: where no flag names a file,
-    the vehicle's own is taken."""
+    """Optional part of a vehicle's factory, which may be a class: the vehicle's own file is used
+    where no flag names one."""
 
     def own_files(self, options: Mapping[str, str]) -> OwnFiles:
-        """Called before anything is opened, in the precision of the drive.
+        """The vehicle's own files. Called before anything is opened, in the drive's precision.
 
         Raises:
-            BadInput: an option is wrong, or what it names.
+            BadInput: an option, or the file that it names, is wrong.
         """
         ...

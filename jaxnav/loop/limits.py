@@ -1,4 +1,4 @@
-"""What a command may be, whatever was computed."""
+"""Clamp commands to the limits of the vehicle, whatever was computed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # the guard's process knows a vehicle's numbers without JAX
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one vehicle."""
+    """The limits of one vehicle's commands."""
 
     steering_rad: float
     steering_rate_radps: float
@@ -20,7 +20,7 @@ class Limits:
 
     @staticmethod
     def of(vehicle: Vehicle) -> Limits:
-        """Those of its description."""
+        """The limits in a vehicle's description."""
         return Limits(
             float(vehicle.steering_limit_rad),
             float(vehicle.steering_rate_limit_radps),
@@ -32,11 +32,11 @@ class Limits:
     ) -> tuple[float, float]:
         """Steering and throttle inside the limits.
 
-        No number is no throttle, and the steering stays where it is.
+        A command that is not finite gives zero throttle; such steering keeps its last value.
 
         Args:
-            last_steering_rad: what was commanded before.
-            elapsed_s: since then; 0 stands in for no positive number.
+            last_steering_rad: the steering angle commanded before.
+            elapsed_s: time since then; 0 replaces a value that is not positive and finite.
         """
         last = _clamped(last_steering_rad, self.steering_rad, 0.0)
         steering = _clamped(steering_rad, self.steering_rad, last)

@@ -1,9 +1,9 @@
-"""The loop on the vehicle: the sensors tell the pilot, the pilot tells the guard.
+"""The loop on the vehicle: it feeds sensor data to the pilot and commands to the guard.
 
     loop = Loop(pilot, guard, vehicle, eyes)
     loop.run()
 
-One thread: it reads the odometer at a steady rate, takes what the cameras' threads have seen, and
+One thread reads the odometer at a steady rate, takes the sightings of the cameras' threads, and
 writes a command after each. Nothing here waits for a disk or a screen.
 """
 
@@ -25,31 +25,31 @@ from jaxnav.loop.priority import before_siblings
 from jaxnav.loop.seeing import Eyes, Region, groups
 
 _THREAD = "the loop"
-_STAYS_S = 0.5  # at the last waypoint, before the drive is over
-# Hypotheses are searched for where the reported one is: regions are not narrower than this.
+_STAYS_S = 0.5  # the drive ends this long after the last waypoint is reached
+# Markers are searched for at the reported hypothesis: regions are not narrower than this.
 _MIN_COVARIANCE = np.diag([0.01**2, 0.01**2, np.deg2rad(0.5) ** 2])
 
 
 class Observer(Protocol):
-    """Who looks on: a recorder, a view, a status line. Neither waits nor raises."""
+    """An observer of the loop: a recorder, a view, a status line. It neither waits nor raises."""
 
     def handled(self, given: Input, outcome: Outcome) -> None:
-        """The pilot has made something of an input."""
+        """Take an input that the pilot has handled, and its outcome."""
         ...
 
     def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
-        """A camera's frame was looked at."""
+        """Take a camera's frame after the search for markers, and the markers found."""
         ...
 
     @property
     def faults(self) -> Fault:
-        """What it can't do any more."""
+        """The faults of the observer."""
         ...
 
 
 @dataclass
 class Statistics:
-    """How long things took, ms: histograms with logarithmic bins, so that nothing grows."""
+    """Histograms of durations, ms, in logarithmic bins: their memory does not grow."""
 
     edges_ms: np.ndarray = field(default_factory=lambda: np.geomspace(0.01, 10_000, 241))
     counts: dict[str, np.ndarray] = field(default_factory=dict)
@@ -57,13 +57,13 @@ class Statistics:
     handled: int = 0
 
     def add(self, name: str, duration_ms: float) -> None:
-        """Count one."""
+        """Count one duration."""
         if name not in self.counts:
             self.counts[name] = np.zeros(len(self.edges_ms) + 1, np.int64)
         self.counts[name][int(np.searchsorted(self.edges_ms, duration_ms))] += 1
 
     def quantile_ms(self, name: str, share: float) -> float:
-        """Below which so large a share lies, to 6 %; NaN where nothing was counted."""
+        """The duration below which this share of them lies, to 6 %; NaN if none was counted."""
         counts = self.counts.get(name)
         if counts is None or not counts.sum():
             return float("nan")
@@ -72,10 +72,10 @@ class Statistics:
 
 
 class Loop:
-    """One drive.
+    """The loop of one drive.
 
     Attributes:
-        stopped: whether it was the guard that ended it.
+        stopped: whether the guard ended the drive.
     """
 
     def __init__(
@@ -89,10 +89,10 @@ class Loop:
         now_ns: Callable[[], int] = time.monotonic_ns,
     ):
         """Args:
-        pilot: warmed up.
-        guard: of the vehicle; armed when the loop runs.
+        pilot: must be warmed up.
+        guard: of the vehicle; `run` arms it.
         eyes: not started yet.
-        period_s: between two readings of the odometer.
+        period_s: time between two readings of the odometer.
         """
         self.pilot, self.guard, self.statistics = pilot, guard, Statistics()
         self.stopped = False
@@ -101,23 +101,23 @@ class Loop:
         self._now_ns = now_ns
         self._outcome: Outcome | None = None
         self._odometry_ns: int | None = None
-        self._blank: tuple[Sighted, ...] = ()  # frames that show nothing and wait for the next tick
+        self._blank: tuple[Sighted, ...] = ()  # frames without markers, kept for the next tick
         self._belief: tuple[np.ndarray, np.ndarray] | None = None
         self._expectation: tuple[tuple[np.ndarray, np.ndarray], Expected] | None = None  # of it
         dtype = np.asarray(pilot.navigator.corner_sigma_px).dtype
         self._min_covariance = _MIN_COVARIANCE.astype(dtype)
-        # Compiled now: whoever looks for markers is watched.
+        # Compiled now: the threads that look for markers are watched.
         self._expected(np.array([1, 0, 0, 0, 0, 0, 0], dtype), self._min_covariance)
 
     def run(self, duration_s: float = float("inf")) -> str:
-        """Drive until the last waypoint, the guard's word, or the end of the time or the vehicle.
+        """Drive until the last waypoint, a trip of the guard, the time limit or the vehicle's end.
 
         Returns:
-            Why it ended: "arrived", "time is over", what an `Ending` vehicle or the guard says.
+            Why it ended: "arrived", "time is over", or the reason of an `Ending` vehicle or guard.
         """
         self._eyes.expected = self._region
         self._eyes.start()
-        with before_siblings():  # a late image is one image less, a late command ends the drive
+        with before_siblings():  # a late image costs one image, a late command ends the drive
             return self._driven(duration_s)
 
     def _driven(self, duration_s: float) -> str:
@@ -164,7 +164,7 @@ class Loop:
         self._handle(Input(self._now_ns(), reading, frames, faults))
 
     def _sighted(self) -> list[tuple[Sighted, ...]]:
-        """What shows markers; the rest waits for the next tick."""
+        """The frames that show markers, in groups; the other frames wait for the next tick."""
         seen = self._eyes.take()
         for one in seen:
             for observer in self._observers:
@@ -187,7 +187,7 @@ class Loop:
             )
         self._outcome = outcome
         output = outcome.output
-        # In one go: who looks for markers reads it at any time.
+        # One assignment: the threads that look for markers read it at any time.
         self._belief = (
             (
                 np.asarray(output.T_world_vehicle.wxyz_xyz),
@@ -206,7 +206,7 @@ class Loop:
         return faults
 
     def _region(self, camera: int) -> Region | None:
-        """Where a camera should see markers. Called by the threads that look for them."""
+        """The region where a camera should see markers. Called by the threads that search."""
         belief = self._belief
         if belief is None:
             return None

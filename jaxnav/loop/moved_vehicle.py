@@ -1,8 +1,8 @@
-"""A vehicle that lives in its guard's process, as the loop sees it: like any other.
+"""Run a vehicle in its guard's process, and give the loop a `Vehicle` that talks to it.
 
-guarding = GuardProcess("qcar")                  # starts; beside other work
+guarding = GuardProcess("qcar")                  # starts in parallel to other work
 vehicle = guarding.open(setup, timeout_s)        # None: it can't be moved, `stays` says why
-vehicle.watch(guard.trip)                        # told when it was stopped there, or is dead
+vehicle.watch(guard.trip)                        # called when it was stopped there, or is dead
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from jaxnav.loop.interfaces import Odometry, Setup
 from jaxnav.loop.limits import Limits
 
 _MODULE = "jaxnav.loop.guard_process"
-_READ_S = 0.02  # so long a reading is waited for: a tick of the loop
-_DEAF_S = 1.0  # without an answer: then the process hangs, and another one stops the vehicle
-_CLOSES_S = 15.0  # longer than its guard says stop to a vehicle that answers now and then
-_LATEST_S = 0.03  # the guard looks every 20 ms: its deadline is so much before the time's end
+_READ_S = 0.02  # timeout of a reading: a tick of the loop
+_DEAF_S = 1.0  # no answer for this long: the process hangs, and another one stops the vehicle
+_CLOSES_S = 15.0  # longer than its guard repeats the stop to a vehicle that answers now and then
+_LATEST_S = 0.03  # the guard looks every 20 ms: its deadline is this much before the timeout
 
 
 class GuardProcess:
-    """The process, from its start until it has a vehicle or is not needed.
+    """A guard's process, from its start until it has a vehicle or is not needed.
 
     Attributes:
-        stays: why the vehicle can't be moved; None: it can, or nobody knows yet.
+        stays: why the vehicle can't be moved; None: it can, or that is not known yet.
     """
 
     def __init__(self, name: str):
-        """Start it.
+        """Start the process.
 
         Args:
-            name: of the vehicle, as `plugins.find` takes it.
+            name: name of the vehicle, as `plugins.find` takes it.
 
         Raises:
             OSError: the machine has no room for another process.
@@ -60,14 +60,14 @@ class GuardProcess:
         self.stays: str | None = None
         self._opens = False
         ours, theirs = zip(socket.socketpair(), socket.socketpair(), strict=True)
-        # OpenBLAS would take memory for a thread a core, all of which would be locked.
+        # OpenBLAS would allocate memory for a thread per core, and all of it would be locked.
         environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
         self.process = subprocess.Popen(
             [sys.executable, "-m", _MODULE, *(str(end.fileno()) for end in theirs)],
             pass_fds=[end.fileno() for end in theirs],
             stdin=subprocess.DEVNULL,
             env=environment | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            start_new_session=True,  # what a terminal sends is for the process that computes
+            start_new_session=True,  # signals from a terminal are for the computing process
         )
         for end in theirs:
             end.close()
@@ -79,12 +79,12 @@ class GuardProcess:
         """Wait until the plug-in is imported there, or is known to stay here.
 
         Args:
-            check: called while it waits; may raise.
+            check: called during the wait; may raise.
 
         Raises:
             BadInput: the process has ended.
         """
-        if "bad" in (answer := self._answer(check)):  # who found it here can drive it here
+        if "bad" in (answer := self._answer(check)):  # the caller found it here, so it runs here
             self.stays = f"there {answer['bad']}"
 
     def open(
@@ -97,8 +97,8 @@ class GuardProcess:
         """Open the vehicle there; None: it can't be moved after all, see `stays`.
 
         Args:
-            timeout_s: from the last command until the vehicle has been stopped.
-            check: called while it waits; may raise.
+            timeout_s: time from the last command until the vehicle has been stopped.
+            check: called during the wait; may raise.
 
         Raises:
             BadInput: as `plugins.open_vehicle`.
@@ -130,9 +130,9 @@ class GuardProcess:
         return MovedVehicle(self, answer["opened"], answer["priority"], timeout_s)
 
     def rescue(self) -> bool:
-        """Once this process is dead: let another one open the vehicle and stop it; whether it has.
+        """After this process's death, open and stop the vehicle in another one; whether it worked.
 
-        Waits until it has.
+        Waits until that has ended.
         """
         another = GuardProcess(self.name)
         try:
@@ -146,7 +146,7 @@ class GuardProcess:
             another.end()
 
     def end(self) -> None:
-        """Let go of it: it stops its vehicle, if it has one, and ends by itself."""
+        """Release the process: it stops its vehicle, if it has one, and ends by itself."""
         if not self._opens:
             self.process.kill()
         for link in (self.commands, self.readings):
@@ -168,7 +168,7 @@ class GuardProcess:
 
 
 class MovedVehicle:
-    """A `Vehicle`. Commands are sent and not waited for; a reading is asked for."""
+    """A `Vehicle` in another process. It sends commands without waiting, and requests readings."""
 
     def __init__(
         self, guarding: GuardProcess, own_timeout_s: float, priority: str, timeout_s: float
@@ -178,7 +178,7 @@ class MovedVehicle:
         self._timeout_ns = int((timeout_s - _LATEST_S) * 1e9)
         self._sequence = 0
         self._over: str | None = None
-        self._asked_s: float | None = None  # since when a reading is waited for
+        self._asked_s: float | None = None  # when the pending reading was requested
         self._closing = self._closed = False
         self._dead: str | None = None
         self._unheard: str | None = None
@@ -189,7 +189,7 @@ class MovedVehicle:
 
     @property
     def pid(self) -> int:
-        """Of its process."""
+        """The id of the guard's process."""
         return self._guarding.process.pid
 
     @property
@@ -199,7 +199,7 @@ class MovedVehicle:
 
     @property
     def over(self) -> str | None:
-        """See `Ending`: what the vehicle said with its last reading."""
+        """See `Ending`; as sent with the vehicle's last reading."""
         return self._over
 
     def watch(self, told: Callable[[str], None]) -> None:
@@ -211,7 +211,7 @@ class MovedVehicle:
         """See `Vehicle`.
 
         Raises:
-            OSError: no answer within a tick, or the plug-in's own.
+            OSError: no answer within a tick, or the plug-in's own error.
         """
         link = self._guarding.readings
         now_s = time.monotonic()
@@ -219,7 +219,7 @@ class MovedVehicle:
             link.send(b"?")
             self._asked_s = now_s
         elif now_s - self._asked_s > _DEAF_S:
-            self._guarding.process.kill()  # whereupon `_listen` hears of its end
+            self._guarding.process.kill()  # `_listen` then notices its end
             raise OSError("the guard's process does not answer")
         try:
             answer = link.receive()
@@ -253,7 +253,7 @@ class MovedVehicle:
         )
 
     def stop(self) -> None:
-        """See `Vehicle`: the guard there trips, and says stop until the vehicle hears it.
+        """See `Vehicle`: the guard there trips, and repeats the stop until the vehicle hears it.
 
         Raises:
             OSError: the process is dead, and no other one has stopped the vehicle yet.
@@ -262,11 +262,11 @@ class MovedVehicle:
             return
         if self._dead:
             raise OSError(self._dead)
-        with suppress(OSError):  # it is ending: then it stops the vehicle without being told
+        with suppress(OSError):  # the process is ending: it stops the vehicle by itself
             self._guarding.commands.tell(stop="told to stop")
 
     def close(self) -> None:
-        """See `Vehicle`. Waits until the vehicle has heard that it should stop."""
+        """See `Vehicle`. Waits until the vehicle has heard the stop."""
         if self._closed:  # or stopped by another process, after this one's death
             self._guarding.end()
             return
@@ -281,13 +281,13 @@ class MovedVehicle:
 
     @property
     def unheard(self) -> str | None:
-        """What a person must know once it is closed: why the vehicle may not have stopped."""
+        """For a person, after `close`: why the vehicle may not have stopped; None: it has."""
         if self._guarding.process.poll() is None:
             return "the guard's process still tells it to stop"
         return self._unheard
 
     def _listen(self) -> None:
-        """Of a thread: what the guard there says, and whether it lives."""
+        """Receive the events of the guard there and notice its end. Runs in a thread."""
         link = self._guarding.commands
         try:
             while True:
@@ -311,7 +311,7 @@ class MovedVehicle:
 
 
 def ending(process: subprocess.Popen[bytes]) -> str:
-    """How a process ended, in words."""
+    """How a process ended, as text."""
     code = process.poll()
     if code is None:
         return "closed its connection"

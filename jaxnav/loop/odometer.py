@@ -1,4 +1,4 @@
-"""Which odometry to believe: a wheel can't do everything that its sensor says."""
+"""Decide which odometry to believe: a wheel can't do everything that its sensor says."""
 
 import math
 from collections import deque
@@ -10,19 +10,19 @@ from jaxnav.models.bicycle import Vehicle
 
 _MARGIN_MPS = 0.05  # beside what the vehicle can reach
 _SIGMAS = 2.0
-_AGREE_MPS = 0.2  # two refused readings that tell the same
-_AGREEING = 10  # of them in a row are believed where no camera knows better
-_DISTRUSTED = 5  # refusals in a row: then a speed that fits does not suffice, the way must too
+_AGREE_MPS = 0.2  # largest difference of two refused readings that agree
+_AGREEING = 10  # this many of them in a row are believed where no camera knows better
+_DISTRUSTED = 5  # after so many refusals in a row a fitting speed is not enough, the way must fit
 _PATH_NS = 1_000_000_000
-_PATH_M, _PATH_SHARE = 0.02, 0.1  # how well
-_STUCK_AFTER = 25  # readings, none different from the one before, of a vehicle that moves
-_PULLED_MPS = 0.1  # a change that any encoder shows
+_PATH_M, _PATH_SHARE = 0.02, 0.1  # how well the way must fit
+_STUCK_AFTER = 25  # identical readings of a moving vehicle
+_PULLED_MPS = 0.1  # a change of speed that any encoder shows
 _MAX_GAP_NS = 1_000_000_000
 
 
 @dataclass
 class Odometer:
-    """Readings in a row. Physically impossible ones are refused."""
+    """The judge of an odometer's readings: it refuses physically impossible ones."""
 
     max_mps: float
     speed_per_throttle_mps: float
@@ -33,15 +33,15 @@ class Odometer:
     _raw_ns: int = 0
     _repeated: int = 0
     _same_speed: int = 0
-    _pulled_mps: float = 0.0  # after what the motor was told
-    _pulled_range_mps: tuple[float, float] = (0.0, 0.0)  # since the speed that is read changed
+    _pulled_mps: float = 0.0  # speed expected from the throttle commands
+    _pulled_range_mps: tuple[float, float] = (0.0, 0.0)  # since the measured speed changed
     _refused_mps: float = 0.0
     _refusals: int = 0
     _path: deque[tuple[int, float, float]] = field(default_factory=deque)  # see _agrees
 
     @staticmethod
     def of(vehicle: Vehicle) -> "Odometer":
-        """For a vehicle: how fast it may be, and how soon."""
+        """The judge for a vehicle, with its top speed and its time constant."""
         speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
         return Odometer(
             float(vehicle.throttle_limit) * speed_per_throttle_mps,
@@ -59,13 +59,13 @@ class Odometer:
         throttle: float,
         contradicted: bool = False,
     ) -> tuple[bool, Fault]:
-        """Whether to fuse a reading, and what is wrong with the sensor.
+        """Whether to fuse a reading, and the faults of the sensor.
 
         Args:
-            believed: the estimate's speed and its sigma, m/s, where there is one.
-            seeing: cameras tell the speed too, so that odometry which insists is not believed.
+            believed: the estimate's speed and its sigma, m/s; None: not known.
+            seeing: cameras tell the speed too, so persistent impossible readings stay refused.
             throttle: last commanded.
-            contradicted: corners move, and have done so for a while, where it says it stands.
+            contradicted: corners have moved for a while, but the reading says that the car stands.
         """
         if self._stuck(speed_mps, steering_rad, stamp_ns, throttle) or contradicted:
             return False, Fault.ODOMETRY_STUCK
@@ -104,7 +104,7 @@ class Odometer:
                 return True
             reference = self.last[0]
         gap_s = min(max(stamp_ns - self._last_ns, 0), _MAX_GAP_NS) / 1e9
-        # The throttle pulls towards a speed of its own, brakes and friction towards none.
+        # The throttle pulls towards a speed of its own, brakes and friction towards zero.
         done = 1 - math.exp(-gap_s / self.time_constant_s)
         targets = (reference, throttle * self.speed_per_throttle_mps, 0.0)
         reached = [reference + done * (target - reference) for target in targets]
@@ -114,9 +114,9 @@ class Odometer:
     def _agrees(
         self, speed_mps: float, stamp_ns: int, believed: tuple[float, float] | None
     ) -> bool:
-        """Whether a sensor that was refused has gone the way that the cameras saw, for a while.
+        """Whether the way by a refused sensor has agreed with the cameras' way for a while.
 
-        Speeds that cameras tell are rough, ways are not.
+        Cameras measure speeds roughly, but ways well.
         """
         if believed is None:
             self._path.clear()
@@ -132,8 +132,8 @@ class Odometer:
         return long_enough and abs(off_m) < _PATH_M + _PATH_SHARE * way_m
 
     def _stuck(self, speed_mps: float, steering_rad: float, stamp_ns: int, throttle: float) -> bool:
-        """Whether a sensor tells the same too often: all of it, or a speed that the motor was told
-        to change meanwhile (who has no sensor for the steering gives what was commanded)."""
+        """Whether readings repeat too often: all of it, or only the speed although the throttle has
+        changed it meanwhile (a driver without a steering sensor reports the commanded angle)."""
         gap_s = min(max(stamp_ns - self._raw_ns, 0), _MAX_GAP_NS) / 1e9
         done = 1 - math.exp(-gap_s / self.time_constant_s)
         self._pulled_mps += done * (throttle * self.speed_per_throttle_mps - self._pulled_mps)

@@ -1,11 +1,11 @@
-"""stdout and stderr that can't hold up or end a drive, whoever reads them, or nobody.
+"""Decouple stdout and stderr from their reader, so that they can't hold up or end a drive.
 
     with FreeOutput():
         print("...")      # never waits; nothing is raised where the terminal is stuck, full or gone
 
-Everything that this process writes to the two descriptors, libraries in C and drivers too, goes
-through a pipe to a thread that takes it at once, and from there to where it was meant for, as far
-as that takes it.
+All output of this process to the two descriptors, also by C libraries and drivers, goes through a
+pipe to a thread that reads it at once. A second thread writes it to its destination, as far as that
+accepts it.
 """
 
 import os
@@ -15,12 +15,12 @@ import threading
 from contextlib import suppress
 from types import TracebackType
 
-_WAITING = 1000  # pieces of at most 64 KiB: what does not fit is left out
-_PATIENCE_S = 1.0  # for what was written last, at the end
+_WAITING = 1000  # pieces of at most 64 KiB in the queue: what does not fit is left out
+_PATIENCE_S = 1.0  # time at the end to write what is still in the queue
 
 
 class FreeOutput:
-    """From entering to leaving."""
+    """Context manager: inside it, writing to stdout and stderr never waits."""
 
     def __enter__(self) -> "FreeOutput":
         self._pumps = [_Pump(1), _Pump(2)]
@@ -40,7 +40,7 @@ class FreeOutput:
 
 
 class _Pump:
-    """One descriptor."""
+    """The pipe and the two threads of one descriptor."""
 
     def __init__(self, descriptor: int):
         self._descriptor, self._meant_for = descriptor, os.dup(descriptor)
@@ -53,7 +53,7 @@ class _Pump:
         threading.Thread(target=self._write, daemon=True).start()
 
     def close(self) -> None:
-        """Give the descriptor back, after what waits is written or nobody takes it."""
+        """Restore the descriptor, and wait until the queue is written, for a limited time."""
         os.dup2(self._meant_for, self._descriptor)
         self._written.wait(_PATIENCE_S)
 
@@ -74,7 +74,7 @@ class _Pump:
 
 
 def fill_descriptors() -> None:
-    """Where stdin, stdout or stderr was closed: let no file opened later be taken for it."""
+    """Open closed standard streams on /dev/null, so that no later file takes their descriptors."""
     if None not in (sys.stdin, sys.stdout, sys.stderr):
         return
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:

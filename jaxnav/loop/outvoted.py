@@ -1,4 +1,4 @@
-"""Markers that the others have outvoted: not believed when they are alone in view."""
+"""Remember markers that the others have outvoted, and hide them when too few are in view."""
 
 import dataclasses
 
@@ -7,24 +7,24 @@ import numpy as np
 from jaxnav.loop.history import Told
 from jaxnav.pose.consistency import LEAST_MARKERS
 
-_OFTEN = 10  # frames more in which the others contradicted it than frames in which they did not
+_OFTEN = 10  # frames with a contradiction by the others minus frames without one
 
 
 class Outvoted:
-    """Of one drive, marker by marker. Only frames that show enough markers to vote count."""
+    """The votes against each marker in one drive. Only frames with enough markers to vote count."""
 
     def __init__(self, ids: tuple[int, ...]):
         """Args:
-        ids: of the map's markers, in its order.
+        ids: ids of the map's markers, in its order.
         """
         self._ids = ids
         self._times = np.zeros(len(ids), int)
 
     def count(self, told: Told, outvoted: np.ndarray) -> tuple[int, ...]:
-        """Take in what came of a frame, and say which markers were outvoted in it.
+        """Count the votes of a frame; return the ids of the markers outvoted in it.
 
         Args:
-            outvoted: (M,).
+            outvoted: (M,), which markers the filter found to be outvoted.
         """
         if len(self._ids) < LEAST_MARKERS or told.visible is None:
             return ()
@@ -36,7 +36,7 @@ class Outvoted:
         return self._named(outvoted)
 
     def without(self, told: Told) -> tuple[Told | None, tuple[int, ...]]:
-        """What is told without those that must not stand alone, and which these are."""
+        """The data without markers that were often outvoted, if too few can vote, and their ids."""
         if len(self._ids) < LEAST_MARKERS or told.visible is None:
             return told, ()
         in_view = told.visible.any(axis=0)

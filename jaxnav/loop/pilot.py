@@ -1,11 +1,11 @@
-"""From events to commands: the deterministic half of the loop, without a clock, a thread or a file.
+"""Turn events into commands: the deterministic half of the loop, with no clock, thread or file.
 
     pilot = Pilot(navigator)
     outcome = pilot.handle(Input(now_ns, odometry=reading))
     outcome = pilot.handle(Input(now_ns, frames=sighted))
 
-The same events give the same outcomes: what is recorded can be replayed bit for bit. Every event is
-one call of one compiled program.
+The same events give the same outcomes, so a recorded drive can be replayed bit for bit. Every event
+is one call of one compiled program.
 """
 
 import math
@@ -38,18 +38,18 @@ from jaxnav.loop.ways import Fix
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.navigator import Navigator, Output
 
-SLEPT_NS = 1_000_000_000  # a loop that was away for so long believes what is of another time
-_SEEING_NS = 500_000_000  # for so long after a marker the estimate's speed is worth the odometer's
+SLEPT_NS = 1_000_000_000  # after a pause this long in the loop, its belief is out of date
+_SEEING_NS = 500_000_000  # this long after a fix, the estimate's speed is as good as the odometer's
 _NO_FAULT, _NO_REJECT = Fault(0), Reject(0)
 
 
 @dataclass(frozen=True)
 class Input:
-    """What reaches the pilot at one instant: odometry, frames, both, or neither (a tick).
+    """The data that reach the pilot at one instant: odometry, frames, both, or neither (a tick).
 
     Attributes:
-        frames: of different cameras. Those that show markers were captured together.
-        faults: found by whoever brings it.
+        frames: from different cameras. Frames that show markers were captured together.
+        faults: found by the caller.
     """
 
     now_ns: int
@@ -60,7 +60,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the pilot makes of an event. Its output and belief count from `origin_m`."""
+    """The pilot's result for one event. Coordinates of output and belief count from `origin_m`."""
 
     now_ns: int
     health: Health
@@ -68,32 +68,32 @@ class Outcome:
     rejects: Reject
     steering_rad: float
     throttle: float
-    output: Output  # NumPy's leaves, as of `belief`
+    output: Output  # its leaves, and those of `belief`, are NumPy arrays
     belief: Belief
-    told: Told | None  # what was fused, and when it was true
+    told: Told | None  # the data that were fused, and their timestamp
     stamp_ns: int
-    restarts: int  # so far, and why the last one
+    restarts: int  # so far, and the reason of the last one
     restart_reason: str
-    outvoted: tuple[int, ...] = ()  # ids of markers that were left out, since others contradict
+    outvoted: tuple[int, ...] = ()  # ids of markers left out because others contradict them
     origin_m: Origin = ZERO  # see `MarkerMap`
 
     @property
     def pose(self) -> np.ndarray:
-        """x_m, y_m, psi_rad in the world."""
+        """The pose in the world: (3,) x_m, y_m, psi_rad."""
         return np.asarray(planar_in_world(self.output.pose, self.origin_m))
 
     @property
     def T_world_vehicle(self) -> np.ndarray:
-        """(7,) wxyz_xyz."""
+        """The pose of the vehicle in the world: (7,) wxyz_xyz."""
         return np.asarray(poses_in_world(self.output.T_world_vehicle.wxyz_xyz, self.origin_m))
 
 
 class _Known(NamedTuple):
-    """What the pilot looks at in an output."""
+    """The fields of an output that the pilot uses."""
 
     pose: np.ndarray  # x_m, y_m, psi_rad
     pose_covariance: np.ndarray
-    velocity: np.ndarray  # its derivative
+    velocity: np.ndarray  # derivative of the pose
     velocity_covariance: np.ndarray
     located: bool
     decided: bool
@@ -105,7 +105,7 @@ class _Known(NamedTuple):
 
     @staticmethod
     def of(output: Output) -> "_Known":
-        told = vars(output)  # an attribute of an equinox module takes a us
+        told = vars(output)  # reading an attribute of an equinox module takes 1 us
         command = vars(told["command"])
         return _Known(
             told["pose"],
@@ -132,7 +132,7 @@ class _Known(NamedTuple):
 
     @property
     def speed_mps(self) -> tuple[float, float]:
-        """Along the course, and its sigma."""
+        """The speed along the course and its sigma, m/s."""
         heading, (x_mps, y_mps, _) = float(self.pose[2]), self.velocity.tolist()
         forward_mps = math.cos(heading) * x_mps + math.sin(heading) * y_mps
         speed_mps = math.copysign(math.hypot(x_mps, y_mps), forward_mps)
@@ -140,7 +140,7 @@ class _Known(NamedTuple):
 
 
 class Pilot:
-    """One drive. Not for several threads."""
+    """The pilot of one drive. Not thread-safe."""
 
     def __init__(
         self,
@@ -152,8 +152,8 @@ class Pilot:
     ):
         """Args:
         navigator: with a vehicle and waypoints.
-        timeouts: see there.
-        program: `advance_packed` of the navigator, compiled; by default by `jax.jit`.
+        timeouts: see `Timeouts`.
+        program: compiled `advance_packed` of the navigator; by default compiled by `jax.jit`.
         corner_sigma_px: of every corner along one axis; by default as each detection says.
         relocate: whether to drive on from a pose that no slip explains, slowly at first; else stop.
         """
@@ -176,7 +176,7 @@ class Pilot:
         self._frozen = partial(self._standstill.frozen, due=self._due_px)
         self._support = Support(navigator.controller.vehicle, relocate)
         self._outvoted = Outvoted(navigator.markers.ids)
-        self._hidden: tuple[int, ...] = ()  # of the last frames
+        self._hidden: tuple[int, ...] = ()  # marker ids left out of the last frames
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
         self._distance_m = 0.0
@@ -185,18 +185,18 @@ class Pilot:
         self._known: _Known | None = None
         self._restarts = self._restarts_before = 0
         self._restart_reason = ""
-        self._restarts_ns: deque[int] = deque()  # the last ones
-        self._left: _Known | None = None  # what was believed before a restart
+        self._restarts_ns: deque[int] = deque()  # times of the recent restarts
+        self._left: _Known | None = None  # the estimate before a restart
         self._command = (0.0, 0.0)
         self._commanded_ns: int | None = None
 
     def warm_up(self) -> None:
-        """Compile, and leave no trace of it."""
+        """Compile the programs without changing the pilot's state."""
         self._estimator.warm_up()
         due_px(self.navigator, np.zeros(3), (0.0, 0.0, 0.0))
 
     def handle(self, given: Input) -> Outcome:
-        """Fuse what came in, frames first. `now_ns` is never less than that of the input before."""
+        """Fuse an input, frames first. `now_ns` must not be less than in the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
         frames = [self._corrections.frame(frame) for frame in given.frames]
         told, stamp_ns, seen_faults = self._frames.told(frames, now_ns, self._frozen)
@@ -310,7 +310,7 @@ class Pilot:
         )
 
     def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
-        """Whether the corners were accepted, and what they say of the estimate."""
+        """Use the corners to confirm or doubt the estimate; return their `Reject` flags."""
         agrees = known.accepted and known.nis <= known.gate_nis
         self._monitor.corners(agrees)
         fix = _fix(known.pose, known.pose_covariance) if known.decided else None
@@ -333,12 +333,12 @@ class Pilot:
         return Reject.INNOVATION_LARGE if known.nis > known.gate_nis / 2 else _NO_REJECT
 
     def _explain(self, what: str) -> None:
-        """Add to the reason of the last restart."""
+        """Append a note to the reason of the last restart."""
         parts = [self._restart_reason, f"{what}: no slip explains the way there"]
         self._restart_reason = "; ".join(part for part in parts if part)
 
     def _contradictions(self) -> Fault:
-        """What speaks against where the estimate says that the vehicle is."""
+        """The faults that contradict the estimated pose."""
         support, found = self._support, _NO_FAULT
         if support.relocated:
             found |= Fault.RELOCATED
@@ -349,7 +349,7 @@ class Pilot:
         return found
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
-        """What is told of an estimate that nothing confirms: not decided, and how far off."""
+        """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""
         doubt = self._support.doubt(self._monitor.contradicted)
         if not (doubt.is_doubted and known.decided):
             return output, known
@@ -407,7 +407,7 @@ class Pilot:
         return due_px(self.navigator, known.pose if known and known.located else None, motion)
 
     def _slept(self, now_ns: int) -> Fault:
-        """Whether the loop was away so long that what it believes is of another time."""
+        """Start anew if the loop paused for so long that its belief is out of date."""
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
         if self._now_ns is None or abs(now_ns - self._now_ns) <= SLEPT_NS:
             return _NO_FAULT
@@ -426,29 +426,29 @@ class Pilot:
         self._left = self._known
 
     def _seeing(self, now_ns: int) -> bool:
-        """Whether corners tell of late how fast the vehicle is."""
+        """Whether recent corners tell how fast the vehicle is."""
         return self._fix_ns is not None and now_ns - self._fix_ns < _SEEING_NS
 
     def _speed(self) -> tuple[float, float] | None:
-        """Speed along the course and its sigma, m/s, as far as they are known."""
+        """Speed along the course and its sigma, m/s; None where the pose is not decided."""
         known = self._known
         return None if known is None or not known.decided else known.speed_mps
 
 
 def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
-    """Of x_m, y_m, psi_rad."""
+    """The fix of a pose (x_m, y_m, psi_rad) and its covariance."""
     x_m, y_m, psi_rad = map(float, pose[:3])
     sigma_rad = math.sqrt(max(float(covariance[2, 2]), 0.0))
     return Fix(x_m, y_m, psi_rad, _root_of_sum(covariance), sigma_rad)
 
 
 def _root_of_sum(covariance: np.ndarray) -> float:
-    """Sigma of two coordinates together."""
+    """Sigma of the first two coordinates together."""
     return math.sqrt(max(float(covariance[0, 0]) + float(covariance[1, 1]), 0.0))
 
 
 def _apart(pose: np.ndarray, other: np.ndarray) -> str:
-    """How far the other one is, in words."""
+    """The distance and turn from a pose to another, as text."""
     x_m, y_m, psi_rad = other - pose
     psi_deg = math.degrees(math.remainder(float(psi_rad), math.tau))
     return f"{math.hypot(x_m, y_m):.2f} m and {psi_deg:.0f} deg"

@@ -1,9 +1,9 @@
-"""Vehicles and cameras by name: what is installed, or `module:name` of anybody's.
+"""Find and open vehicles and cameras by name: an installed entry point, or any `module:name`.
 
     vehicle = open_vehicle("qcar", setup)
     cameras = open_cameras("my_cameras:open_cameras", setup, vehicle)
 
-Whatever is wrong with a plug-in is one line for a person.
+Every problem of a plug-in is reported in one line for a person.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from jaxnav.loop.interfaces import Camera, Setup, Vehicle
 VEHICLES = "jaxnav.vehicles"
 CAMERAS = "jaxnav.cameras"
 
-# Modules that no package registry has, and who brings them.
+# Modules that no package registry has, and where they come from.
 _COMES_WITH = {
     "pal": "it comes with Quanser's software for the QCar: put its folder on PYTHONPATH",
     "quanser": "it comes with Quanser's software for the QCar, for that car's own Python",
@@ -29,12 +29,12 @@ _COMES_WITH = {
 
 
 def vehicle_names() -> list[str]:
-    """Of the vehicles that are installed."""
+    """The names of the installed vehicles."""
     return sorted(_installed(VEHICLES))
 
 
 def camera_names() -> list[str]:
-    """Of the camera drivers that are installed."""
+    """The names of the installed camera drivers."""
     return sorted(_installed(CAMERAS))
 
 
@@ -42,17 +42,17 @@ def open_vehicle(name: str, setup: Setup) -> Vehicle:
     """Open a vehicle.
 
     Args:
-        name: of an entry point, or `module:name`.
+        name: name of an entry point, or `module:name`.
 
     Raises:
-        BadInput: there is none of that name, it can't be imported or opened, or what it gives is
-            not a vehicle.
+        BadInput: there is none of that name, it can't be imported or opened, or it does not return
+            a vehicle.
     """
     return opened_vehicle(name, find("--vehicle", VEHICLES, name), setup)
 
 
 def opened_vehicle(name: str, factory: Callable[..., Any], setup: Setup) -> Vehicle:
-    """`open_vehicle` of a factory that was found before."""
+    """Like `open_vehicle`, with a factory that was found before."""
     flag = "--vehicle"
     vehicle: Vehicle = _opened(flag, name, factory, setup)
     if lacking := missing_members(vehicle, Vehicle):
@@ -65,11 +65,11 @@ def open_cameras(name: str, setup: Setup, vehicle: Vehicle) -> tuple[Camera, ...
     """Open the cameras of the rig, in its order.
 
     Args:
-        name: of an entry point, or `module:name`.
+        name: name of an entry point, or `module:name`.
 
     Raises:
-        BadInput: there is none of that name, it can't be imported or opened, or what it gives are
-            not the rig's cameras.
+        BadInput: there is none of that name, it can't be imported or opened, or it does not return
+            the rig's cameras.
     """
     flag = "--cameras"
     found = _opened(flag, name, find(flag, CAMERAS, name), setup, vehicle)
@@ -84,12 +84,12 @@ def open_cameras(name: str, setup: Setup, vehicle: Vehicle) -> tuple[Camera, ...
 
 
 def find(flag: str, group: str, name: str) -> Callable[..., Any]:
-    """The factory of a plug-in.
+    """Find the factory of a plug-in.
 
     Args:
-        flag: for the message.
-        group: of entry points.
-        name: of one of them, or `module:name`.
+        flag: command-line flag that the message names.
+        group: group of entry points.
+        name: name of one of them, or `module:name`.
 
     Raises:
         BadInput: there is none of that name, or it can't be imported or called.
@@ -114,7 +114,7 @@ def find(flag: str, group: str, name: str) -> Callable[..., Any]:
 
 
 def missing_members(opened: object, protocol: type) -> list[str]:
-    """What a protocol asks for and an object does not have, methods with their brackets."""
+    """The members of a protocol that an object lacks, methods with brackets."""
     asked = {name: value for name, value in vars(protocol).items() if not name.startswith("_")}
     lacking = []
     for name, value in asked.items():
@@ -136,14 +136,14 @@ def _imported(flag: str, name: str, module: str) -> Any:
     except ImportError as error:
         raise _not_importable(flag, name, error) from error
     except Exception as error:
-        # A plug-in is anybody's code: on import it may do, and so raise, anything.
+        # A plug-in is foreign code: its import may raise anything.
         raise BadInput(flag, f"{name}: importing {module} failed: {_said(error)}") from error
 
 
 def _opened(flag: str, name: str, factory: Callable[..., Any], *args: object) -> Any:
     try:
         return factory(*args)
-    except ImportError as error:  # drivers are imported when they are needed
+    except ImportError as error:  # a factory may import its driver
         raise _not_importable(flag, name, error) from error
     except OSError as error:
         raise BadInput(flag, f"{name} could not be opened: {_said(error)}") from error
@@ -168,7 +168,7 @@ def _wrong_with(cameras: tuple[Any, ...], names: tuple[str, ...]) -> str:
 
 
 def _close(things: Sequence[Any]) -> None:
-    """Let go of what was opened and will not be used."""
+    """Close what was opened and will not be used."""
     for thing in things:
         if callable(getattr(thing, "close", None)):
             with contextlib.suppress(OSError):

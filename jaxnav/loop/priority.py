@@ -1,8 +1,8 @@
-"""A process that runs before what else the computer has to do, and a thread before its siblings.
+"""Raise the priority of a process above others, and of a thread above its siblings.
 
-A nice value counts among the processes of one terminal only, where the kernel groups them so
-(sched(7), autogroups): what another terminal runs gets as much time as all of this one. So the
-group's value is lowered as well.
+Where the kernel groups processes by terminal (sched(7), autogroups), a nice value counts only
+within one group: another terminal gets as much time as all of this one. So the group's value is
+lowered as well.
 """
 
 import os
@@ -17,10 +17,10 @@ _GROUP = Path("/proc/self/autogroup")  # "/autogroup-42 nice 0"
 
 @contextmanager
 def before_others() -> Iterator[None]:
-    """Meanwhile this process comes first, as far as it may. Then its terminal is as it was; after
-    a kill -9 its other programs go on before others.
+    """Raise this process's priority inside the block, where permitted, then restore its terminal's;
+    after a kill -9 the terminal's other programs keep the raised priority.
 
-    Threads have the priority of the one that began them: those of XLA begin with the first array.
+    A thread inherits the priority of its creator: XLA's threads start with the first array.
     """
     lower_nice(NICE)
     before = _group_nice()
@@ -36,8 +36,8 @@ def before_others() -> Iterator[None]:
 
 @contextmanager
 def before_siblings() -> Iterator[None]:
-    """Meanwhile the calling thread comes before the others of its process that run already."""
-    if sys.platform != "linux":  # a nice value is the process's, and its siblings have it as well
+    """Raise the calling thread's priority above the process's running threads inside the block."""
+    if sys.platform != "linux":  # a nice value is that of the whole process, siblings included
         yield
         return
     before = os.getpriority(os.PRIO_PROCESS, 0)
@@ -51,7 +51,7 @@ def before_siblings() -> Iterator[None]:
 
 
 def lower_nice(nice: int) -> bool:
-    """Give the calling thread a nice value, if that may be."""
+    """Set the nice value of the calling thread; return whether that was permitted."""
     with suppress(OSError):  # PermissionError: it may not be raised here
         os.setpriority(os.PRIO_PROCESS, 0, nice)
         return True
@@ -59,7 +59,7 @@ def lower_nice(nice: int) -> bool:
 
 
 def _group_nice() -> int | None:
-    """None where the kernel has no such groups."""
+    """The nice value of the group; None where the kernel has no such groups."""
     try:
         return int(_GROUP.read_text().rpartition(" ")[2])
     except (OSError, ValueError):

@@ -1,11 +1,11 @@
-"""The odometer held against the throttle: all that can contradict it where no marker is in view.
+"""Compare the odometer with the throttle, the only check of it while no marker is in view.
 
     propulsion.look(speed_mps, throttle, gap_s, seeing, disputed)
     propulsion.doubtful, propulsion.off_m
 
-Nominal parameters of a vehicle, a battery that runs low, a slope: the throttle tells the speed
-within a factor of two, and when within another. What the odometer says beyond that, without a
-marker, is as likely wrong as right: the car may be blocked, or its encoder dead.
+With nominal parameters, a low battery or a slope, the throttle tells the speed within a factor of
+two, and the time constant within another. Without a marker, a reading outside of that is as likely
+wrong as right: the car may be blocked, or its encoder dead.
 """
 
 import math
@@ -14,18 +14,18 @@ from dataclasses import dataclass
 from jaxnav.models.bicycle import Vehicle
 
 _FACTOR = 2.0  # of speed and of time constant, see above
-_MARGIN_MPS = 0.05  # below it a motor may well not turn at all, and `Odometer` allows as much
-DOUBT_M = 0.05  # parted so far, nothing is decided any more: what a fault-free drive may err by
-_UNTRUE = 10  # readings more that contradict than agree, markers in view: then the throttle lies
+_MARGIN_MPS = 0.05  # below it a motor may not turn at all, and `Odometer` allows as much
+DOUBT_M = 0.05  # beyond it nothing is decided any more: the error allowed in a fault-free drive
+_UNTRUE = 10  # excess of contradicting readings with markers in view: then the throttle is wrong
 
 
 @dataclass
 class Propulsion:
-    """What the throttle should come to, and how far the odometer is from it.
+    """The speed range expected from the throttle, and the odometer's deviation from it.
 
     Attributes:
-        off_m: way between the odometer's and the throttle's since the last `confirmed`, as far as
-            they contradict each other.
+        off_m: difference of the ways by odometer and by throttle since the last `confirmed`, summed
+            while they contradict each other.
     """
 
     speed_per_throttle_mps: float
@@ -38,27 +38,27 @@ class Propulsion:
 
     @staticmethod
     def of(vehicle: Vehicle) -> "Propulsion":
-        """For a vehicle."""
+        """The comparison for a vehicle, before any reading."""
         return Propulsion(
             float(vehicle.speed_per_throttle_mps), float(vehicle.speed_time_constant_s)
         )
 
     @property
     def doubtful(self) -> bool:
-        """Whether the odometer is contradicted, and nothing has confirmed it since."""
+        """Whether the throttle contradicts the odometer, and nothing has confirmed it since."""
         return self.off_m > DOUBT_M
 
     def look(
         self, speed_mps: float, throttle: float, gap_s: float, seeing: bool, disputed: bool
     ) -> None:
-        """A reading that was believed.
+        """Take a reading that was believed.
 
         Args:
             throttle: commanded since the reading before.
-            gap_s: since then.
+            gap_s: time since then.
             seeing: corners tell the way too.
-            disputed: another one than the odometer. Where they agree it is the throttle that is
-                wrong: the car is carried, towed or replayed, or other than its file says.
+            disputed: the corners' way differs from the odometer's. Where the two agree, the
+                throttle is wrong: the car is carried, towed, replayed, or not as in its file.
         """
         target = throttle * self.speed_per_throttle_mps
         slow = 1 - math.exp(-gap_s / (_FACTOR * self.time_constant_s))
@@ -79,5 +79,5 @@ class Propulsion:
             self.off_m += abs(speed_mps - self._nominal_mps) * gap_s
 
     def confirmed(self) -> None:
-        """Corners tell where the car is."""
+        """Forget the deviation, since corners tell where the car is."""
         self.off_m = 0.0

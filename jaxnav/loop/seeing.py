@@ -1,7 +1,7 @@
-"""From cameras to sightings: a thread for each camera, and some that look for markers.
+"""Read the cameras, one thread each, and search their frames for markers in further threads.
 
-A camera's thread hands over its latest frame, older ones are dropped. Who looks for markers takes
-them camera by camera, searches first where the filter expects the markers, and the whole
+A camera's thread hands over its latest frame; older ones are dropped. The searching threads take
+frames camera by camera. They search first where the filter expects the markers, and the whole
 image now and then, and whenever nothing was found where it should be.
 """
 
@@ -20,10 +20,10 @@ from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import Camera, Frame
 from jaxnav.models.camera import Camera as CameraModel
 
-_READ_S = 0.05  # a camera's thread is back at least so often
+_READ_S = 0.05  # longest wait of a camera's thread
 _RETRY_S = 0.05
-_MIN_SPREAD = 2.0  # grey levels: below, an image shows nothing at all
-_SAMPLE = 16  # every so-manieth row and column of an image is looked at
+_MIN_SPREAD = 2.0  # grey levels: an image with less spread shows nothing at all
+_SAMPLE = 16  # step between the rows and columns whose spread is taken
 
 WHOLE_EVERY = 10  # frames of a camera
 
@@ -32,7 +32,7 @@ _NONE = Detections.concatenate([])
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame, and what was found in it."""
+    """A frame and the detections in it."""
 
     sighted: Sighted
     frame: Frame
@@ -41,14 +41,14 @@ class Seen:
 
 @dataclass(frozen=True)
 class Region:
-    """Where markers should be in an image: (K, 4, 2) corners, and how far off each may be, (K,)."""
+    """The expected places of K markers in an image: corners (K, 4, 2) and search radii (K,)."""
 
     quads_px: np.ndarray
     radius_px: np.ndarray
 
 
 class Search:
-    """Markers in the frames of one camera. For one thread at a time."""
+    """The search for markers in one camera's frames. For one thread at a time."""
 
     def __init__(
         self,
@@ -64,16 +64,16 @@ class Search:
         self._camera, self._size_px, self._model = camera, size_px, model
         self._detectors = list(detectors)
         self._since_whole = camera  # so that cameras take turns
-        self._picture, self._pictures = b"", 0  # the last, and how often the same
+        self._picture, self._pictures = b"", 0  # the last picture, and how often it repeated
 
     def warm_up(self) -> None:
-        """Look at a picture of a marker, so that the first frame takes no longer than others."""
+        """Search a picture of a marker, so that the first frame takes no longer than others."""
         width, height = self._size_px
         image = np.full((height, width), 200, np.uint8)
         side = max(min(16 * (min(width, height) // 32), 64), 1)
         for detector in self._detectors:
             printed = (255 * marker_cells(detector.family, 0)).astype(np.uint8)
-            # In a picture that is too small for a marker there is nothing but its beginning.
+            # A picture that is too small for a marker shows only its upper left part.
             picture = cv2.resize(printed, (side, side), interpolation=cv2.INTER_NEAREST)
             image[8 : 8 + side, 8 : 8 + side] = picture[: height - 8, : width - 8]
         corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -82,10 +82,10 @@ class Search:
         self._everywhere(image, region)
 
     def look(self, frame: Frame, region: Region | None) -> Sighted:
-        """What a frame shows.
+        """Search a frame for markers.
 
         Args:
-            region: where markers should be, nowhere perhaps; None where nobody knows.
+            region: where markers should be, possibly nowhere; None where that is not known.
         """
         if frame.detections is not None:
             return Sighted(self._camera, frame.stamp_ns, frame.detections)
@@ -106,8 +106,8 @@ class Search:
         return Sighted(self._camera, frame.stamp_ns, found)
 
     def _repeats(self, image: np.ndarray) -> bool:
-        """Whether a picture is the same once too often. No sensor is without noise; bytes are
-        compared, since 20 us of that see more than any digest of the same time."""
+        """Whether a picture has come FROZEN_AFTER times in a row: every sensor has noise. Bytes are
+        compared, which takes 20 us and sees more than any digest of the same time."""
         picture = image.tobytes()
         self._pictures = self._pictures + 1 if picture == self._picture else 1
         self._picture = picture
@@ -129,7 +129,7 @@ class Search:
 
 
 def image_fault(image: np.ndarray | None, size_px: tuple[int, int]) -> Fault:
-    """What is wrong with an image, before anything is looked for in it."""
+    """The fault of an image that can't be searched; `Fault(0)` if it can."""
     if image is None or not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         return Fault.FRAME_UNUSABLE
     if image.ndim not in (2, 3) or image.shape[1::-1] != tuple(size_px):
@@ -141,7 +141,7 @@ def image_fault(image: np.ndarray | None, size_px: tuple[int, int]) -> Fault:
 
 
 class Eyes:
-    """All cameras of a rig, and the threads behind them."""
+    """The cameras of a rig, with the threads that read and search them."""
 
     def __init__(
         self,
@@ -152,8 +152,8 @@ class Eyes:
     ):
         """Args:
         searches: one for each camera.
-        guard: told of every sign of life, and of what breaks.
-        workers: threads that look for markers.
+        guard: gets the threads' signs of life, and trips on their errors.
+        workers: number of threads that search for markers.
         """
         self._cameras, self._searches, self._guard = list(cameras), list(searches), guard
         self._woken = threading.Condition()
@@ -163,8 +163,8 @@ class Eyes:
         self._waiting = threading.Condition()
         self._seen: list[Seen] = []
         self._over = threading.Event()
-        self.dropped = 0  # frames that gave way to newer ones
-        self.errors = [0] * len(cameras)  # reads that failed
+        self.dropped = 0  # frames replaced by newer ones before a search
+        self.errors = [0] * len(cameras)  # failed reads
         self.expected: Callable[[int], Region | None] = lambda camera: None
         names = [f"camera {camera.name}" for camera in cameras]
         self._threads = [
@@ -176,25 +176,25 @@ class Eyes:
         ]
 
     def start(self) -> None:
-        """Open the eyes."""
+        """Start the threads."""
         self._searches[0].warm_up()
         for thread in self._threads:
             thread.start()
 
     def take(self) -> list[Seen]:
-        """What was seen since the last time, in the order of the stamps."""
+        """The frames searched since the last call, in the order of their stamps."""
         with self._woken:
             seen, self._seen = self._seen, []
         return sorted(seen, key=lambda one: one.sighted.stamp_ns)
 
     def wait(self, timeout_s: float) -> None:
-        """Until something was seen, or the time is over."""
+        """Wait until a frame was searched, or the time is over."""
         with self._woken:
             if not self._seen and timeout_s > 0:
                 self._woken.wait(timeout_s)
 
     def close(self) -> None:
-        """End the threads, as far as they can be, and close the cameras."""
+        """End the threads, except any that hang, and close the cameras."""
         self._over.set()
         with self._waiting:
             self._waiting.notify_all()
@@ -223,7 +223,7 @@ class Eyes:
                         self.dropped += self._frames[index] is not None
                         self._frames[index] = frame
                         self._waiting.notify()
-        except Exception as error:  # it can't be known what it means: the vehicle stops
+        except Exception as error:  # its meaning is unknown: the vehicle stops
             self._guard.trip(f"{name}: {_told(error)}")
         finally:
             self._guard.leave(name)
@@ -237,7 +237,7 @@ class Eyes:
                     continue
                 index, frame = taken
                 try:
-                    # A camera that detects by itself needs not be told where to look.
+                    # A camera that detects markers itself needs no region.
                     region = self.expected(index) if frame.detections is None else None
                     sighted = self._searches[index].look(frame, region)
                 finally:
@@ -252,7 +252,7 @@ class Eyes:
             self._guard.leave(name)
 
     def _next(self) -> tuple[int, Frame] | None:
-        """A frame to look at: of the camera whose turn it is."""
+        """The camera whose turn it is, and its frame; None: none came in time."""
         with self._waiting:
             for attempt in (0, 1):
                 for offset in range(len(self._frames)):
@@ -272,8 +272,8 @@ def _told(error: Exception) -> str:
 
 
 def groups(seen: Sequence[Seen]) -> tuple[list[tuple[Sighted, ...]], tuple[Sighted, ...]]:
-    """Sightings as the pilot takes them: those that show something, of one instant together, and
-    those that show nothing, which need no call of their own."""
+    """Group sightings for the pilot: those with markers, one group per instant, and those without,
+    which need no call of their own."""
     by_stamp: dict[int, list[Sighted]] = {}
     empty: list[Sighted] = []
     for one in seen:

@@ -1,12 +1,12 @@
-"""Signals that end a drive: noted the moment they come, looked at before anything goes on.
+"""Catch the signals that end a drive: note each one at once, act on it at the next step.
 
     with Signals() as signals:
         signals.check()                  # between the steps of a start: raises `Interrupted`
         signals.hold()                   # before a vehicle is opened
-        signals.on_signal(stop)          # called by a thread of ours, whatever the main thread does
+        signals.on_signal(stop)          # called by a separate thread, also if the main one is busy
 
-Python's own handler raises KeyboardInterrupt wherever the interpreter happens to be, inside a
-callback of a library as well, which swallows it. Ours raises nothing and forgets nothing.
+Python's own handler raises KeyboardInterrupt wherever the interpreter happens to be, also inside a
+library's callback, which swallows it. This handler raises nothing and loses no signal.
 """
 
 import os
@@ -17,17 +17,17 @@ from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import Any
 
-# All that a person, a shell, a closed terminal or a supervisor may send, and that would end or
-# suspend a process which does not handle it. Ctrl-Z ends a drive: a car is not left half-way.
+# The signals of a person, a shell, a closed terminal or a supervisor that would end or suspend a
+# process without a handler. Ctrl-Z ends a drive: a car is not left half-way.
 _NAMES = "SIGINT SIGTERM SIGHUP SIGQUIT SIGTSTP SIGUSR1 SIGUSR2 SIGALRM SIGVTALRM SIGPROF SIGXCPU"
-_BY_HAND = ("SIGINT", "SIGTERM", "SIGQUIT", "SIGTSTP")  # ours, whoever else handles them
+_BY_HAND = ("SIGINT", "SIGTERM", "SIGQUIT", "SIGTSTP")  # taken over from any other handler
 _LEAVES_S = 1.0  # after a signal, while nothing moves and the main thread compiles or imports
-_ENDS_S = 60.0  # after a signal, while a vehicle is open: longer than all that closes it may take
+_ENDS_S = 60.0  # after a signal, while a vehicle is open: longer than closing it may take
 EXIT = 128  # plus the signal's number, as shells report it
 
 
 class Interrupted(BaseException):
-    """A signal came: what was begun is given up. No `except Exception` takes it for a fault."""
+    """A signal came: abandon what was begun. `except Exception` does not catch it."""
 
     def __init__(self, number: int):
         BaseException.__init__(self, signal.Signals(number).name)
@@ -35,16 +35,16 @@ class Interrupted(BaseException):
 
 
 class Signals:
-    """The signals of this process from now on. Outside the main thread: none, all else works.
+    """The handler of this process's signals. Outside the main thread it catches none.
 
     Attributes:
-        number: the first one that came.
+        number: number of the first signal that came; None: none has.
     """
 
     def __init__(self) -> None:
         self.number: int | None = None
         self._held = self._over = False
-        self._seen = threading.Event()  # by the main thread, which ends what it does
+        self._seen = threading.Event()  # set when the main thread has noticed the signal
         self._came = threading.Event()
         self._closed = threading.Event()
         self._told: list[Callable[[str], None]] = []
@@ -60,7 +60,7 @@ class Signals:
             if number is None:
                 continue
             now = signal.getsignal(number)
-            # `nohup` has SIGHUP ignored on purpose; a plug-in may have use for others.
+            # `nohup` ignores SIGHUP on purpose; a plug-in may use other signals itself.
             if name in _BY_HAND or now is signal.SIG_DFL:
                 self._before[number] = signal.signal(number, self._note)
         # A program in the background may write to its terminal, which would suspend it.
@@ -73,16 +73,16 @@ class Signals:
 
     @property
     def name(self) -> str | None:
-        """Of the first one that came."""
+        """The name of the first signal that came."""
         return None if self.number is None else signal.Signals(self.number).name
 
     @property
     def exit_code(self) -> int | None:
-        """What a process that was ended by a signal returns; None: it was not."""
+        """The exit code of a process that a signal has ended; None: no signal came."""
         return None if self.number is None else EXIT + self.number
 
     def check(self) -> None:
-        """Go on, or not. For the main thread, at every step.
+        """Raise if a signal came. The main thread calls it at every step.
 
         Raises:
             Interrupted: a signal came.
@@ -92,7 +92,7 @@ class Signals:
             raise Interrupted(self.number)
 
     def hold(self) -> None:
-        """From now on something is open that must be closed: no signal ends the process at once.
+        """Declare that something is open and must be closed: no signal ends the process at once.
 
         Raises:
             Interrupted: a signal came.
@@ -101,9 +101,9 @@ class Signals:
         self.check()
 
     def on_signal(self, tell: Callable[[str], None]) -> None:
-        """Call this with the signal's name when one comes, at once where one has come already.
+        """Call a function with the signal's name when one comes, at once if one has come already.
 
-        Called by a thread of ours: also while the main thread is inside a library.
+        A thread of its own calls it, also while the main thread is inside a library.
         """
         with self._lock:
             self._told.append(tell)
@@ -112,12 +112,12 @@ class Signals:
             tell(name)
 
     def ignore(self) -> None:
-        """All is closed and the process ends: what comes now does not change how."""
+        """Ignore further signals: all is closed and the process ends."""
         for number in self._before:
             signal.signal(number, signal.SIG_IGN)
 
     def close(self) -> None:
-        """Give the handlers back."""
+        """Restore the handlers."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -127,7 +127,7 @@ class Signals:
             signal.signal(number, handler)
         if self._pipe is not None:
             signal.set_wakeup_fd(-1)
-            os.close(self._pipe[1])  # whereupon the thread reads the end, and closes the other
+            os.close(self._pipe[1])  # the thread then reads the end, and closes the other one
 
     def __enter__(self) -> "Signals":
         return self
@@ -145,7 +145,7 @@ class Signals:
             self.number = number
 
     def _read(self) -> None:
-        """The thread that hears of signals although the main thread does not run Python now."""
+        """Receive signals in a thread, also while the main thread runs no Python code."""
         assert self._pipe is not None
         while True:
             with suppress(OSError):
@@ -163,11 +163,11 @@ class Signals:
         with self._lock:
             told = list(self._told)
         for tell in told:
-            with suppress(Exception):  # one that fails must not keep the others from hearing it
+            with suppress(Exception):  # one that fails must not keep the others from being called
                 tell(self.name or "")
 
     def _leave(self) -> None:
-        """End a process whose main thread does not: it may compile, or hang in a driver."""
+        """End the process if its main thread does not: it may compile, or hang in a driver."""
         self._came.wait()
         if not self._seen.wait(_LEAVES_S) and not self._held:
             self._exit()

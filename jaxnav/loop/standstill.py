@@ -1,18 +1,18 @@
-"""Who stands still while others move: a frozen camera, a stuck odometer, a vehicle that is held.
+"""Detect what stands still while others move: a frozen camera, a stuck odometer, a held vehicle.
 
     corners rest, the odometer goes             the camera shows an old picture
     corners move, the odometer rests            the odometer is stuck
     neither moves, and the throttle pulls       both are, or the vehicle is held
 
-A camera is judged by the share of its due that it shows: with d the shifts of the corners that the
-odometer's way makes due, and s those that are seen,
+A camera is judged by the share of the expected shift that it shows: with d the shifts of corners
+due by the odometer's way, and s the shifts seen,
 
-    share = <s, d> / <d, d>,      sigma of it = sqrt(2) sigma_px / |d|.
+    share = <s, d> / <d, d>,      its sigma = sqrt(2) sigma_px / |d|.
 
-A marker far ahead on the axis of motion has no due, and so raises no alarm; neither does a vehicle
-that stands. In the third case nothing tells where it goes: it may be blind, held fast, or without
-power. Whether it can go again is not tried, for it might go blind: it stays so until something
-moves, a vehicle that is pushed say. Senses that tell nothing are stale, and others' concern.
+A marker far ahead on the axis of motion has no expected shift, so it raises no alarm; neither does
+a vehicle that stands. In the third case nothing tells where it goes: it may be blind, held fast, or
+without power. The vehicle does not try to go again, since it might go blind: the fault lasts until
+something moves, for example when someone pushes it. Missing data are stale, and handled elsewhere.
 """
 
 import math
@@ -23,50 +23,50 @@ import numpy as np
 
 from jaxnav.loop.way import Place, Way, between
 
-# The corners due by a motion (x_m, y_m, psi_rad, in the vehicle's earlier axes): places before and
-# after it, (C, M, 4, 2) each; None: it is not known where the vehicle is.
+# The corners before and after a motion (x_m, y_m, psi_rad, in the vehicle's earlier axes),
+# (C, M, 4, 2) each; None: the pose of the vehicle is not known.
 Due = Callable[[Place], tuple[np.ndarray, np.ndarray] | None]
 
-_MOVED_PX, _MOVED_SIGMAS = 1.0, 6.0  # more than noise makes of any of the corners of some markers
-_MIN_SIGMA_PX = 0.05  # detectors promise less, models of lenses do not keep it
-# A camera that looks 100 ms late, which nobody has told, hides 5 cm at 0.5 m/s, half of this.
+_MOVED_PX, _MOVED_SIGMAS = 1.0, 6.0  # more than noise moves any corner of some markers
+_MIN_SIGMA_PX = 0.05  # detectors report less, but lens models are not that accurate
+# A camera with an unknown delay of 100 ms hides 5 cm at 0.5 m/s, half of this.
 _WAY_M = 0.1
 _SHARE, _SHARE_SIGMAS = 0.5, 3.0
 _FROZEN_AFTER = 3  # such frames in a row
-# Corners that rest are compared for so long: 0.1 m in 5 s are twice the odometry's sigma in the
-# filter, which is that of a reading, not of all of them.
+# Resting corners are compared for this long: 0.1 m in 5 s are twice the odometry's sigma in the
+# filter, which is the sigma of one reading, not of all of them.
 _REST_NS = 5_000_000_000
 
-_RESTS_MPS = 0.02  # an odometer that stands says less: twice the same sigma
-_SLOW_NS = 100_000_000  # after it has stopped: frames may be late, whatever they say
-_MOVES, _MOVES_NS = 3, 300_000_000  # so often and so long: no single push, no marker that is moved
-_PAUSE_NS = 1_000_000_000  # between two moves of one motion
+_RESTS_MPS = 0.02  # the odometer of a standing car reads less: twice the same sigma
+_SLOW_NS = 100_000_000  # after the car has stopped: frames may be late, whatever their stamps say
+_MOVES, _MOVES_NS = 3, 300_000_000  # this often and long: no single push, no marker that is moved
+_PAUSE_NS = 1_000_000_000  # longest time between two moves of one motion
 
-# Without a marker and without odometry it stops after 1 s (see `health`): nothing tells
-# where it goes then either. A motor takes less to start, and what is meant to go less far stands.
+# Without a marker and without odometry the vehicle stops after 1 s (see `health`): nothing tells
+# where it goes here either. A motor starts sooner, and a shorter commanded way counts as standing.
 _PULLS_NS, _PULLS_M = 1_000_000_000, 0.2
-_MAX_GAP_NS = 200_000_000  # without a command the watchdog stops it then, and cameras are stale
-_GOES_MPS, _GOES_SHARE = 0.05, 0.25  # five sigmas of the odometer; of the speed that is pulled for
+_MAX_GAP_NS = 200_000_000  # without a command this long the watchdog stops it; cameras are stale
+_GOES_MPS, _GOES_SHARE = 0.05, 0.25  # five sigmas of the odometer; share of the expected speed
 
 
 @dataclass
 class _Rest:
-    """Corners of one camera that have not moved since."""
+    """Reference corners of one camera, which have not moved since their stamp."""
 
     corners_px: np.ndarray  # (M, 4, 2)
     visible: np.ndarray  # (M,)
     stamp_ns: int
     place: Place | None  # by the odometer
     way: int  # number of the way that the place is on
-    moves: int = 0  # that led here one after the other
-    moving_ns: int = 0  # since when
-    doubts: int = 0  # frames in a row that show less than their due
+    moves: int = 0  # number of successive moves that led here
+    moving_ns: int = 0  # stamp of the beginning of these moves
+    doubts: int = 0  # frames in a row that show too small a shift
     frozen: bool = False
 
 
 @dataclass
 class Standstill:
-    """Of one drive.
+    """The detector of one drive for what stands still while others move.
 
     Attributes:
         nothing_moves: the throttle pulls, and neither wheels nor corners move.
@@ -77,17 +77,17 @@ class Standstill:
     time_constant_s: float
     nothing_moves: bool = False
     _rests: dict[int, _Rest] = field(default_factory=dict)
-    _quiet_ns: int | None = None  # since when the odometer says that it stands
+    _quiet_ns: int | None = None  # stamp of the reading since which the odometer says it stands
     _told_ns: int = 0  # stamp of the last reading, believed or not
     _contradicted_ns: int | None = None  # stamp of the last corners that moved meanwhile
     _pulled_mps: float = 0.0
-    _pulled_m: float = 0.0  # since something moved
-    _moved_ns: int | None = None  # when that was
+    _pulled_m: float = 0.0  # expected way since something moved
+    _moved_ns: int | None = None  # time when something moved
     _commanded_ns: int | None = None
-    _claimed_ns: int | None = None  # when a sense last told anything
+    _claimed_ns: int | None = None  # time of the last data from any sensor
 
     def read(self, stamp_ns: int, now_ns: int, speed_mps: float) -> bool:
-        """A reading, whatever is thought of it: whether corners move while it says it stands."""
+        """Take any reading; return whether corners move while the odometer says it stands."""
         self._claimed_ns = now_ns
         self._told_ns = max(stamp_ns, self._told_ns)
         if abs(speed_mps) >= _RESTS_MPS:
@@ -98,7 +98,7 @@ class Standstill:
         return since_ns is not None and stamp_ns - since_ns < _PAUSE_NS
 
     def went(self, stamp_ns: int, now_ns: int, speed_mps: float, steering_rad: float) -> None:
-        """A reading that is believed, and is not always the same."""
+        """Take a reading that is believed and not stuck."""
         self.way.go(stamp_ns, speed_mps, steering_rad)
         goes_mps = _GOES_MPS
         if not self.nothing_moves:
@@ -107,7 +107,7 @@ class Standstill:
             self._moves(now_ns)
 
     def commanded(self, throttle: float, now_ns: int) -> None:
-        """What the motor is told now: how fast the vehicle should be after what it was told."""
+        """Take a throttle command, and update the speed and way expected from all commands."""
         before_ns = now_ns if self._commanded_ns is None else self._commanded_ns
         self._commanded_ns = now_ns
         gap_s = min(max(now_ns - before_ns, 0), _MAX_GAP_NS) / 1e9
@@ -131,12 +131,12 @@ class Standstill:
         sigma_px: float,
         due: Due,
     ) -> bool:
-        """Whether a camera shows what it should not see any more.
+        """Whether a camera shows an old picture: its corners rest while the odometer goes.
 
         Args:
             corners_px: (M, 4, 2), finite where a marker is visible, (M,).
-            sigma_px: of the least certain.
-            due: asked where corners rest while the odometer goes.
+            sigma_px: sigma of the least certain corner.
+            due: called where corners rest while the odometer goes.
         """
         rest = self._rests.get(camera)
         both = None if rest is None else rest.visible & visible
@@ -144,13 +144,13 @@ class Standstill:
             self._rests[camera] = self._rest(corners_px, visible, stamp_ns)
             return False
         sigma_px = max(sigma_px, _MIN_SIGMA_PX)
-        with np.errstate(over="ignore"):  # whatever a camera says
+        with np.errstate(over="ignore"):  # corners may have any value
             seen_px = corners_px[both] - rest.corners_px[both]
         moved_px, noise_px = np.abs(seen_px).max(), max(_MOVED_PX, _MOVED_SIGMAS * sigma_px)
         if moved_px > noise_px:
             moved = self._moved(rest, self._rest(corners_px, visible, stamp_ns))
             self._rests[camera] = moved
-            # Where it stands for long, noise goes far once in a while, but not three times as far.
+            # In a long standstill noise rarely exceeds this bound, but not three times the bound.
             if moved.moves > 1 or moved_px > 3 * noise_px or not self.nothing_moves:
                 self._moves(now_ns)
             return False
@@ -176,7 +176,7 @@ class Standstill:
         return _Rest(corners_px, visible, stamp_ns, self.way.at(stamp_ns), self.way.number)
 
     def _moved(self, before: _Rest, now: _Rest) -> _Rest:
-        """Corners that have moved: for how long already, and whether the odometer knows of it."""
+        """Count a move of the corners, and note a contradiction if the odometer says it stands."""
         goes_on = 0 < now.stamp_ns - before.stamp_ns < _PAUSE_NS and before.moves > 0
         now.moves = before.moves + 1 if goes_on else 1
         now.moving_ns = before.moving_ns if goes_on else before.stamp_ns
@@ -192,7 +192,7 @@ class Standstill:
 
 
 def _withheld(due_px: np.ndarray, seen_px: np.ndarray, sigma_px: float) -> bool:
-    """Whether surely less than half is seen of the shifts that are due."""
+    """Whether surely less than half of the expected shifts is seen."""
     with np.errstate(over="ignore", invalid="ignore"):
         squared_px2, along_px2 = float(np.sum(due_px**2)), float(np.sum(seen_px * due_px))
     if not 0 < squared_px2 < math.inf:

@@ -1,13 +1,13 @@
-"""What an estimate rests on, and so whether to act upon it.
+"""Check what supports an estimate, and so decide whether to act on it.
 
     support.drove(reading, heading_rad, gap_s, throttle, seeing)    # with every odometry
     is_fix = support.corners(accepted, agrees, now_ns, fix, possible)  # with every frame
     support.doubt(contradicted)
 
-The filter can't know that its pose is nonsense: all that it has was fused into it. So a pose is
-taken for what it says only after CONFIRMED frames in a row have fitted it, and no longer than
-corners, or odometer and throttle, don't contradict it. After a restart it is held against the way
-that the wheels have gone since the last fix: a copy of the marker elsewhere looks like the marker.
+The filter can't know that its pose is wrong: all data were fused into it. So a pose is trusted only
+after CONFIRMED frames in a row have fitted it, and only until corners, or odometer and throttle,
+contradict it. After a restart the pose is compared with the way of the wheels since the last fix: a
+copy of the marker elsewhere looks like the marker.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,27 +17,27 @@ from jaxnav.loop.propulsion import Propulsion
 from jaxnav.loop.ways import Fix, Ways
 from jaxnav.models.bicycle import Vehicle
 
-CONFIRMED = 2  # frames in a row, with the first: never a single one
-# Driven slowly after a relocation, for a person to look at the car: about five seconds at half of
-# its speed in a room, and a car that sees nothing gets no more (see `health`).
+CONFIRMED = 2  # frames in a row, with the first: a single one never confirms
+# Way driven slowly after a relocation, so that a person can look at the car: about five seconds at
+# half of its speed in a room, and a car that sees nothing gets no more (see `health`).
 SLOW_M = 1.0
-# Every further restart on that way asks for twice as many frames, up to three seconds' of a camera.
+# Every further restart on that way needs twice as many frames, up to three seconds of a camera's.
 _MOST_CONFIRMED = 96
 
 
 class Doubt(NamedTuple):
-    """Why an estimate is not to be acted upon, and how far off it may be beside its sigma."""
+    """Whether to doubt an estimate, and its possible error beside its sigma."""
 
     is_doubted: bool
     off_m: float
 
 
 class Support:
-    """Of one drive's estimate.
+    """The support of one drive's estimate.
 
     Attributes:
-        refused: the pose is out of reach and must not be (`relocate` is False).
-        relocations: so far.
+        refused: the pose is out of reach, which is not allowed (`relocate` is False).
+        relocations: number of relocations so far.
     """
 
     def __init__(self, vehicle: Vehicle, relocate: bool = True):
@@ -55,17 +55,17 @@ class Support:
 
     @property
     def confirmed(self) -> bool:
-        """Whether so many frames in a row have fitted the pose."""
+        """Whether enough frames in a row have fitted the pose."""
         return self._confirmations >= self._needed
 
     @property
     def relocated(self) -> bool:
-        """Whether it was where no slip can have brought it, a short way ago, or still is."""
+        """Whether no slip explains the pose now, or one less than SLOW_M ago."""
         return self.refused or self._ways.way_m < self._slow_until_m
 
     @property
     def disputed(self) -> bool:
-        """Whether corners and odometer tell of different ways."""
+        """Whether the ways by corners and by odometer differ."""
         return self._ways.disputed
 
     @property
@@ -82,17 +82,17 @@ class Support:
         throttle: float,
         seeing: bool,
     ) -> None:
-        """A reading of the odometer that was believed; see `Ways` and `Propulsion`."""
+        """Take a reading of the odometer that was believed; see `Ways` and `Propulsion`."""
         self._ways.drove(speed_mps, steering_rad, heading_rad, gap_s)
         self._propulsion.look(speed_mps, throttle, gap_s, seeing, self._ways.disputed)
 
     def restarted(self) -> None:
-        """All that was believed was given up; what was confirmed tells where it can be now."""
+        """The filter has restarted: confirm the pose anew, and check it against the last fix."""
         self._needed = min(2 * self._needed, _MOST_CONFIRMED) if self.relocated else CONFIRMED
         self._confirmations, self._restarted = 0, True
 
     def begin_anew(self) -> None:
-        """The same, and anything may have happened meanwhile."""
+        """Start anew and forget the last fix: anything may have happened meanwhile."""
         self._confirmations, self._needed = 0, CONFIRMED
         self._restarted = self.refused = False
         self._ways.forget()
@@ -105,14 +105,14 @@ class Support:
         fix: Fix | None,
         possible: Callable[[], Sequence[Fix]],
     ) -> bool:
-        """Take in a frame, and say whether it is a fix.
+        """Take a frame; return whether it gives a fix.
 
         Args:
-            accepted: the filter has taken it.
-            agrees: with the prediction; what doesn't is accepted where all is less sure than it
-                says, and confirms nothing.
-            fix: that pose; None: several are possible.
-            possible: these.
+            accepted: the filter has taken the frame.
+            agrees: it agrees with the prediction. A frame that does not may still be accepted, with
+                larger sigmas, but confirms nothing.
+            fix: the estimated pose; None: several poses are possible.
+            possible: returns these poses.
         """
         self._ways.glimpse(now_ns)
         if not agrees and not self.confirmed:
@@ -140,10 +140,10 @@ class Support:
         return True
 
     def doubt(self, contradicted: bool) -> Doubt:
-        """Whether to act upon the estimate.
+        """The doubt about the estimate.
 
         Args:
-            contradicted: by the corners, more often than not.
+            contradicted: the corners contradict it more often than not.
         """
         off_m = self._propulsion.off_m if self.odometry_doubtful else 0.0
         if contradicted or self.refused:

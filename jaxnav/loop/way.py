@@ -1,4 +1,4 @@
-"""Where an odometer says that the vehicle went, of the last seconds, whatever else is believed."""
+"""Keep the vehicle's way of the last 1.5 s by odometry alone, whatever the estimate."""
 
 import math
 from bisect import bisect_right
@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 Place = tuple[float, float, float]  # x_m, y_m, psi_rad
 
-_KEPT_NS = 1_500_000_000  # more than the oldest frame that is taken, see `stamps`
-_PAUSE_NS = 250_000_000  # without a reading: then nobody knows how far it went
-_AHEAD_NS = 100_000_000  # beyond the newest reading: so long it is not stale
+_KEPT_NS = 1_500_000_000  # more than the age of the oldest frame that is taken, see `stamps`
+_PAUSE_NS = 250_000_000  # without a reading for this long the way is unknown
+_AHEAD_NS = 100_000_000  # the newest reading is extrapolated for this long: it is not stale yet
 
 
 @dataclass
@@ -17,13 +17,13 @@ class Way:
     """Dead reckoning in a frame of its own."""
 
     wheelbase_m: float
-    number: int = 0  # of the way: places on different ones can't be compared
+    number: int = 0  # of the way: places on different ways can't be compared
     _track: deque[tuple[int, Place]] = field(default_factory=deque)
     _speed_mps: float = 0.0
     _steering_rad: float = 0.0
 
     def go(self, stamp_ns: int, speed_mps: float, steering_rad: float) -> None:
-        """A reading. One that comes late is left out, after a pause a new way begins."""
+        """Take a reading; a late one is left out, and after a pause a new way begins."""
         if self._track and not 0 < stamp_ns - self._track[-1][0] <= _PAUSE_NS:
             if stamp_ns <= self._track[-1][0]:
                 return
@@ -36,7 +36,7 @@ class Way:
             self._track.popleft()
 
     def at(self, stamp_ns: int) -> Place | None:
-        """Where it was then; None: nobody knows."""
+        """The place at a time, interpolated; None: not known."""
         track = self._track
         if not track or not track[0][0] <= stamp_ns <= track[-1][0] + _AHEAD_NS:
             return None
@@ -49,7 +49,7 @@ class Way:
         return x_m, y_m, psi_rad
 
     def _beyond(self, stamp_ns: int) -> Place:
-        """So long after the newest reading, as fast as it says (see `bicycle.velocity_world`)."""
+        """The place extrapolated from the newest reading (see `bicycle.velocity_world`)."""
         before_ns, (x_m, y_m, psi_rad) = self._track[-1]
         tangent = math.tan(self._steering_rad)
         beta_rad = math.atan(tangent / 2)
@@ -64,7 +64,7 @@ class Way:
 
 
 def between(place: Place, other: Place) -> Place:
-    """Where the other place is, seen from the first in its own axes."""
+    """The other place relative to the first, in the first one's axes."""
     x_m, y_m = other[0] - place[0], other[1] - place[1]
     c, s = math.cos(place[2]), math.sin(place[2])
     return c * x_m + s * y_m, c * y_m - s * x_m, other[2] - place[2]

@@ -1,4 +1,4 @@
-"""The way that corners tell of, held against the way that the wheels have gone.
+"""Compare the vehicle's way by the corners with its way by the odometer.
 
     ways.drove(speed_mps, steering_rad, heading_rad, gap_s)    # with every odometry
     ways.glimpse(now_ns)                                       # with every frame that shows markers
@@ -6,15 +6,15 @@
     ways.out_of_reach(fix)                                     # before that
 
 A marker that is carried along, or a copy of it elsewhere, fits its own corners as well as the true
-one does. What it can't imitate is the odometer: the car has not gone where the corners say. Two
-measures, since a slow drag hides in what wheels slip and a leap does not:
+one does. It can't imitate the odometer: the car has not gone where the corners say. There are two
+measures, since a slow drag is hidden by wheel slip and a leap is not:
 
-    disputed       over some seconds the two ways part by more than DRIFT_M + DRIFT_SHARE of the way
+    disputed       over some seconds the two ways differ by more than DRIFT_M + DRIFT_SHARE * way
     out of reach   a pose farther from the last one than the wheels have turned, or turned farther
                    than they can have turned it
 
-What neither can see: a copy carried slower than DRIFT_SHARE of the car's own speed, or by less than
-the two margins; and one that was there from the beginning.
+Neither detects a copy carried slower than DRIFT_SHARE of the car's own speed or by less than the
+two margins, or one that was there from the beginning.
 """
 
 import math
@@ -22,25 +22,25 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-# What corners get wrong themselves while the car goes round a marker, with cameras off by 1 deg or
+# Error of the corners themselves while the car goes round a marker, with cameras off by 1 deg or
 # 2 %. It is also how near a car that was carried off must come.
 DRIFT_M = 0.1
-# What wheels and their calibration get wrong, as where `Odometer` believes a sensor again.
+# Error of wheels and their calibration, as where `Odometer` believes a sensor again.
 DRIFT_SHARE = 0.1
-REACH_RAD = math.radians(20.0)  # from there on `MultiHypothesis` calls it another branch
-_WINDOW_NS = 8_000_000_000  # 0.1 m in it is 1.25 cm/s, of a car that stands
+REACH_RAD = math.radians(20.0)  # from this angle on `MultiHypothesis` calls it another branch
+_WINDOW_NS = 8_000_000_000  # for a standing car, 0.1 m in this time is 1.25 cm/s
 _EVERY_NS = 200_000_000
-# They agree again when, over a second, they part by no more than this (see `Odometer._agrees`) and
-# half of DRIFT_SHARE.
+# The ways agree again when, over a second, they differ by no more than this (see
+# `Odometer._agrees`) plus half of DRIFT_SHARE.
 _AGREES_NS = 1_000_000_000
 _AGREES_M = 0.02
-_GAP_NS = 500_000_000  # unseen for longer, dead reckoning has errors of its own
-_SILENT_S = 0.1  # an odometer that was stale has told of no way
+_GAP_NS = 500_000_000  # after longer gaps without corners dead reckoning has errors of its own
+_SILENT_S = 0.1  # a longer gap between readings leaves the way unknown
 _SIGMAS = 3.0
 
 
 class Fix(NamedTuple):
-    """A pose in the world that the corners tell, and its sigmas."""
+    """A pose in the world measured by the corners, and its sigmas."""
 
     x_m: float
     y_m: float
@@ -52,7 +52,7 @@ class Fix(NamedTuple):
 class _Anchor(NamedTuple):
     now_ns: int
     fix: Fix
-    x_m: float  # of the fix beside the way by odometry
+    x_m: float  # of the fix, minus the place by odometry
     y_m: float
     way_m: float
     turned_rad: float
@@ -60,19 +60,19 @@ class _Anchor(NamedTuple):
 
 @dataclass
 class Ways:
-    """Both ways of one drive.
+    """The ways of one drive by corners and by odometer.
 
     Attributes:
         wheelbase_m: of the vehicle.
-        disputed: the two part.
-        way_m: by odometry, forwards or backwards, since the drive began.
+        disputed: the two ways differ.
+        way_m: length by odometry, forwards or backwards, since the drive began.
     """
 
     wheelbase_m: float
     disputed: bool = False
     way_m: float = 0.0
-    _turned_rad: float = 0.0  # whichever way
-    _x_m: float = 0.0  # by odometry, along the heading that was believed
+    _turned_rad: float = 0.0  # sum of turns in both directions
+    _x_m: float = 0.0  # by odometry, along the estimated heading
     _y_m: float = 0.0
     _seen_ns: int = 0
     _last: _Anchor | None = None
@@ -81,11 +81,11 @@ class Ways:
     def drove(
         self, speed_mps: float, steering_rad: float, heading_rad: float, gap_s: float
     ) -> None:
-        """What the odometer tells of the last moment.
+        """Take a reading of the odometer.
 
         Args:
-            heading_rad: as it is believed, so that a steering sensor's offset does not add up.
-            gap_s: since the reading before.
+            heading_rad: the estimated heading, so that a steering sensor's offset does not add up.
+            gap_s: time since the reading before.
         """
         if gap_s > _SILENT_S:
             self._window.clear()
@@ -100,13 +100,13 @@ class Ways:
         self._turned_rad += abs(step_m * math.sin(beta_rad)) * 2 / self.wheelbase_m
 
     def glimpse(self, now_ns: int) -> None:
-        """Corners were seen, believed or not."""
+        """Note that corners were seen, believed or not."""
         if not 0 <= now_ns - self._seen_ns <= _GAP_NS:
             self._window.clear()
         self._seen_ns = now_ns
 
     def look(self, now_ns: int, fix: Fix) -> None:
-        """Compare where the corners say that the car is with the way that it went."""
+        """Compare a pose measured by the corners with the way by odometry."""
         here = _Anchor(
             now_ns, fix, fix.x_m - self._x_m, fix.y_m - self._y_m, self.way_m, self._turned_rad
         )
@@ -131,10 +131,10 @@ class Ways:
     def out_of_reach(self, fix: Fix, slack_m: float = 0.0) -> bool:
         """Whether no slip explains how the car came from the last pose to this one.
 
-        Wheels that spin or slide leave it anywhere within the way that they have turned.
+        With spinning or sliding wheels the car is anywhere within the way that they have turned.
 
         Args:
-            slack_m: by which the way may be longer than the odometer says.
+            slack_m: the way may be this much longer than the odometer says.
         """
         if self._last is None:
             return False
@@ -142,7 +142,7 @@ class Ways:
         way_m, turned_rad = self.way_m - self._last.way_m, self._turned_rad - self._last.turned_rad
         off_m = math.hypot(fix.x_m - before.x_m, fix.y_m - before.y_m)
         off_rad = abs(math.remainder(fix.psi_rad - before.psi_rad, math.tau))
-        # Sliding about one axle, a car turns by the way over the wheelbase.
+        # Sliding about one axle, a car turns by way / wheelbase.
         sliding_rad = (way_m + slack_m) / self.wheelbase_m
         return off_m > DRIFT_M + way_m + slack_m + _SIGMAS * (
             before.sigma_m + fix.sigma_m
@@ -152,11 +152,11 @@ class Ways:
 
     @property
     def since_fix_m(self) -> float:
-        """Way by odometry since the last pose."""
+        """The way by odometry since the last pose, m."""
         return 0.0 if self._last is None else self.way_m - self._last.way_m
 
     def forget(self) -> None:
-        """The last pose tells nothing of the next one."""
+        """Forget the last pose: it tells nothing about the next one."""
         self._last, self.disputed = None, False
         self._window.clear()
 

@@ -1,1 +1,1 @@
-"""Our own drives: recorded, read back and replayed."""
+"""Record jaxnav's drives, read them back and replay them."""

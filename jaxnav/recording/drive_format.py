@@ -1,8 +1,8 @@
-"""JSON that gives every number back bit for bit (and a NaN as a NaN), as recorded drives hold it.
+"""Encode recorded messages as JSON that gives every number back bit for bit, and a NaN as a NaN.
 
-Foxglove knows fields that are a number, a text, an object, or a list of such: no lists of lists,
-and no "number or text". So arrays are one list, row by row, and a field with something that is not
-finite, for which JSON has no number, stands beside the others with words in its place:
+Foxglove knows fields that are a number, a text, an object, or a list of these: no lists of lists,
+and no "number or text". So an array is one list, row by row, and a field with a value that is not
+finite, for which JSON has no number, stands apart from the others with words for such values:
 
     {"nis": 0.5, "not_finite": {"costs": [1.5, "inf"]}}
 """
@@ -28,11 +28,11 @@ _WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
 def encode(message: dict[str, Any]) -> bytes:
-    """A message as JSON.
+    """Encode a message as JSON.
 
     Args:
-        message: of plain values, arrays, flags (written as the list of their names) and enums
-            (as their name).
+        message: plain values, arrays, flags (written as the list of their names) and enums (as
+            their name).
 
     Raises:
         TypeError: a value of another kind.
@@ -42,10 +42,10 @@ def encode(message: dict[str, Any]) -> bytes:
 
 
 def decode(raw: bytes) -> dict[str, Any]:
-    """What `encode` wrote, of plain values.
+    """Decode what `encode` wrote into plain values.
 
     Raises:
-        ValueError: not such JSON.
+        ValueError: the bytes are not such JSON.
     """
     try:
         message = from_json(raw, allow_inf_nan=False, cache_strings="keys")
@@ -59,17 +59,17 @@ def decode(raw: bytes) -> dict[str, Any]:
 
 
 def header_metadata(header: dict[str, Any]) -> dict[str, str]:
-    """The header of a drive as MCAP's metadata, which lie outside of its protected chunks."""
+    """The header of a drive as MCAP metadata, with a CRC, since no chunk's CRC covers it."""
     text = encode(header).decode()
     checksum = f"{zlib.crc32(text.encode()):08x}"
     return {"format_version": str(FORMAT_VERSION), "header": text, "crc32": checksum}
 
 
 def header_of(metadata: dict[str, str], path: Path) -> dict[str, Any]:
-    """The header from what `header_metadata` made of it.
+    """The header of a drive from MCAP metadata made by `header_metadata`.
 
     Raises:
-        BadInput: a newer format, or damaged.
+        BadInput: the header has a newer format, or is damaged.
     """
     version = metadata.get("format_version", "")
     if not (version.isascii() and version.isdecimal() and len(version) < 10):
@@ -138,7 +138,7 @@ def _merged_below(value: Any) -> Any:
 
 
 def _decode_slowly(raw: bytes) -> Any:
-    """By Python's own reader: takes other encodings as well, and says what is wrong where."""
+    """Decode by Python's own reader: it takes other encodings too, and says where an error is."""
     try:
         return _merged_below(_PYTHON.decode(raw.decode(json.detect_encoding(raw), "surrogatepass")))
     except RecursionError:

@@ -1,4 +1,4 @@
-"""A recorded drive, read back: what reached the pilot, what it made of it, what the cameras saw."""
+"""Read a recorded drive: the pilot's inputs, its outcomes, and the cameras' images."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -29,10 +29,10 @@ from jaxnav.recording.messages import input_of
 
 @dataclass(frozen=True)
 class Outcomes:
-    """N outcomes, a row each. NaN, none of them or -1 where there was no report.
+    """N outcomes, one row each. NaN, an empty array or -1 where there was no report.
 
     Attributes:
-        now_ns: (N,), when.
+        now_ns: (N,), time of each outcome.
         times_s: (N,), since the first.
         health, faults, rejects: (N,), values of `Health`, `Fault` and `Reject`.
         steering_rad, throttle: (N,), what was commanded, within the limits.
@@ -41,10 +41,10 @@ class Outcomes:
         located, decided, done: (N,) bool.
         flip_probability, nis: (N,).
         hypothesis, restarts: (N,) int.
-        hypotheses, log_weight: N arrays, (K, 3) and (K,), of those alive.
+        hypotheses, log_weight: N arrays, (K, 3) and (K,), of the hypotheses alive.
         Ts_vehicle_world, costs: N arrays, (M, 7) wxyz_xyz and (M,), of the candidates.
-        selected: (N,) int, which of them.
-        reasons, digests: N texts: why it last started anew, and of the pilot's state.
+        selected: (N,) int, index of the selected candidate.
+        reasons, digests: N texts: reason of the last restart, digest of the pilot's state.
     """
 
     now_ns: np.ndarray
@@ -74,7 +74,7 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class RecordedImage:
-    """A JPEG and its camera's stamp."""
+    """A JPEG image with its camera's timestamp."""
 
     topic: str
     stamp_ns: int
@@ -86,10 +86,10 @@ class DriveLog:
     """A recorded drive.
 
     Attributes:
-        header: as it was given to the recorder.
+        header: as given to the recorder.
         inputs: in the order in which the pilot handled them.
-        missing: topic -> how many of its messages were left out, as far as one can tell.
-        truncated: the recording was not brought to its end; what was, is here.
+        missing: topic -> number of its messages that were left out, as far as one can tell.
+        truncated: the recording was cut off; what was written before is here.
     """
 
     path: Path
@@ -100,10 +100,10 @@ class DriveLog:
     truncated: bool
 
     def images(self, topic: str | None = None) -> Iterator[RecordedImage]:
-        """The images, read from the file one by one: of a topic or, by default, of all.
+        """Read the images from the file one by one, of one topic or, by default, of all.
 
         Raises:
-            BadInput: one that is damaged.
+            BadInput: an image is damaged.
         """
         for record in McapMessages(self.path):
             if isinstance(record, Recorded) and record.schema == IMAGE_SCHEMA:
@@ -113,10 +113,10 @@ class DriveLog:
 
 
 def read_drive(path: str | Path, told: Callable[[int], object] = lambda size: None) -> DriveLog:
-    """Read what `Recorder` wrote, to its end or as far as it goes.
+    """Read a file of `Recorder`, to its end or as far as it goes.
 
     Args:
-        told: how many bytes of the file were read, piece by piece; for a progress bar.
+        told: called with the size in bytes of each piece that was read; for a progress bar.
 
     Raises:
         BadInput: one line naming file and topic: not such a file, of a newer format, or damaged.
@@ -128,7 +128,7 @@ def read_drive(path: str | Path, told: Callable[[int], object] = lambda size: No
 def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
     header: dict[str, Any] | None = None
     inputs: list[Input] = []
-    # Not as messages: one takes four times the memory of what it says.
+    # Values, not message objects: those take four times the memory.
     told: dict[str, list[Any]] = {name: [] for name in OutcomeMessage.model_fields}
     detections = 0
     gaps = _Gaps()
@@ -161,7 +161,7 @@ def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """Without the search for cycles, a tenth of the time: a drive's messages have none."""
+    """Turn off the search for cycles, a tenth of the time: a drive's messages have none."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -173,7 +173,7 @@ def _uncollected() -> Iterator[None]:
 
 @dataclass
 class _Gaps:
-    """What the sequence numbers tell."""
+    """Counts of missing messages by gaps in the sequence numbers."""
 
     missing: dict[str, int] = field(default_factory=dict)
     _last: dict[str, int] = field(default_factory=dict)

@@ -1,11 +1,11 @@
-"""A recorded drive driven again: the same inputs, and where what comes of them differs.
+"""Replay a recorded drive: run its inputs again, and find where the outcomes differ.
 
     log = read_drive(path)
     setup = DriveSetup.of_header(log.header, path)
     difference = first_difference(log, replay_drive(log.inputs, setup, folder))
 
-On the machine and with the versions that it was recorded with every bit is the same, elsewhere
-every number but for rounding (docs/promises.md, Replay).
+On the machine and with the versions of the recording every bit is the same, elsewhere every number
+up to rounding (docs/promises.md, Replay).
 """
 
 import dataclasses
@@ -28,19 +28,19 @@ from jaxnav.recording.drive_log import DriveLog, Outcomes
 from jaxnav.recording.drive_setup import DriveSetup, made_here
 from jaxnav.recording.messages import digest
 
-# As rounding differs between machines, relative to values above 1.
+# Rounding differences between machines, relative to values above 1.
 TOLERANCE_FLOAT64, TOLERANCE_FLOAT32 = 1e-9, 1e-3
-_MAGNIFIED = 1e3  # a NIS is in units of sigma, which is a millimetre
+_MAGNIFIED = 1e3  # NIS is in units of sigma, which is a millimetre
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Where a replay first differs from what was recorded.
+    """The first difference between a replay and its recording.
 
     Attributes:
-        index: of the outcome in the recording.
-        time_s: since the first.
-        what: which value, and by how much.
+        index: index of the outcome in the recording.
+        time_s: time since the first outcome.
+        what: the value that differs, and by how much.
     """
 
     index: int
@@ -49,10 +49,10 @@ class Difference:
 
 
 def check_inputs(inputs: Iterable[Input], setup: DriveSetup, where: Path) -> None:
-    """Whether inputs can be of a rig.
+    """Check that the inputs fit the rig.
 
     Raises:
-        BadInput: a frame is of a camera that the rig does not have, or the clock runs backwards.
+        BadInput: a frame is from a camera that the rig does not have, or the clock runs backwards.
     """
     before_ns = 0
     for index, given in enumerate(inputs):
@@ -68,10 +68,10 @@ def check_inputs(inputs: Iterable[Input], setup: DriveSetup, where: Path) -> Non
 def replay_drive(
     inputs: Sequence[Input], setup: DriveSetup, folder: Path | None
 ) -> Iterator[Outcome]:
-    """What a pilot at its beginning makes of recorded inputs, one after the other.
+    """The outcomes of a new pilot for recorded inputs, one after the other.
 
     Args:
-        folder: of executables, see `compiled`.
+        folder: folder of executables, see `compiled`.
     """
     pilot = setup.pilot(folder)
     for given in inputs:
@@ -79,15 +79,15 @@ def replay_drive(
 
 
 class Comparison:
-    """Outcomes of a replay held against those of the recording, one after the other.
+    """A comparison of a replay's outcomes with the recorded ones, one after the other.
 
-    Bit for bit where the drive was recorded by what runs now, else within the tolerance of its
-    precision. Outcomes that the recording has lost are passed over.
+    Bit for bit where the drive was recorded by this machine and these versions, else within the
+    tolerance of its precision. Outcomes that the recording has lost are skipped.
 
     Attributes:
         bit_for_bit: whether bits are compared.
-        compared: how many outcomes were.
-        first: where they first differ; None: nowhere yet.
+        compared: number of outcomes compared.
+        first: the first difference; None: none yet.
     """
 
     def __init__(self, log: DriveLog):
@@ -117,7 +117,7 @@ class Comparison:
 
 
 def first_difference(log: DriveLog, outcomes: Iterable[Outcome]) -> Difference | None:
-    """The first recorded outcome that a replay does not come to; None: there is none."""
+    """The first difference between a replay's outcomes and the recorded ones; None: none."""
     comparison = Comparison(log)
     for outcome in outcomes:
         comparison.look(outcome)
@@ -149,7 +149,7 @@ def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: flo
         before, bound = getattr(recorded, name)[index], tolerance
         if name == "nis":
             bound *= _MAGNIFIED
-        if name == "pose":  # by the numbers that were computed with, less what was rounded since
+        if name == "pose":  # in the coordinates of the computation, less the rounding since then
             value, before = (planar_in_world(pose, away_m) for pose in (value, before))
             bound += float(np.spacing(max(map(abs, away_m)))) if tolerance else 0.0
         off = _off(np.asarray(value, float), np.asarray(before, float))
@@ -159,7 +159,7 @@ def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: flo
 
 
 def _off(now: np.ndarray, before: np.ndarray) -> float:
-    """The largest difference, relative to values above 1; NaN is as good as NaN."""
+    """The largest difference, relative to values above 1; NaN equals NaN."""
     if now.shape != before.shape:
         return np.inf
     off = np.abs(now - before) / np.maximum(np.abs(before), 1.0)
@@ -174,18 +174,18 @@ def _words(flags: Any) -> str:
 def inputs_from_images(
     log: DriveLog, setup: DriveSetup, corner_backend: str
 ) -> tuple[list[Input], int]:
-    """The inputs with what is found now in the recorded images, in the recorded order.
+    """The recorded inputs in their order, with new detections from the recorded images.
 
-    A frame whose image was not recorded stays as it was, and so does one that was not usable.
+    A frame without a recorded image, or one that was not usable, stays as it was.
 
     Args:
         corner_backend: see `make_detector`.
 
     Returns:
-        The inputs, and how many frames were searched anew.
+        The inputs, and the number of frames that were searched anew.
 
     Raises:
-        BadInput: no image of a camera is there, or one has a wrong size; as `make_detector`.
+        BadInput: there is no camera's image, or one has a wrong size; as `make_detector`.
     """
     search, found = ImageSearch(setup.rig, setup.markers, corner_backend), {}
     camera_of = {f"/camera/{name}": index for index, name in enumerate(setup.rig.names)}

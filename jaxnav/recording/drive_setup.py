@@ -1,4 +1,4 @@
-"""What a drive is driven with: all that a replay must know to come to the same bits.
+"""The setup of a drive: all that a replay needs to compute the same bits.
 
     setup = DriveSetup(rig, markers, vehicle, route)
     pilot = setup.pilot(folder)
@@ -7,7 +7,7 @@
     log = read_drive(path)
     setup = DriveSetup.of_header(log.header, path)
 
-The header is plain JSON and holds rig, markers, vehicle and parameters as their files do.
+The header is plain JSON and holds rig, markers, vehicle and parameters in the form of their files.
 """
 
 import hashlib
@@ -52,19 +52,19 @@ from jaxnav.navigator import Navigator
 from jaxnav.recording.message_fields import Flag
 
 SETUP_VERSION = 1
-# What the bits of a drive don't depend on.
+# Folders of sources on which the bits of a drive don't depend.
 _WITHOUT = (
     "calibration", "commands", "datasets", "lanes", "plots", "simulation", "studies",
     "testing", "tuning", "vehicles", "viewer",
 )  # fmt: skip
-# The others need what only a simulation has: another sensor, the truth.
+# The other selectors need what only a simulation has: another sensor, the truth.
 PILOT_SELECTORS = tuple(name for name in SELECTORS if name not in ("orientation-given", "oracle"))
 
 _Limit = Annotated[float, Field(strict=True, ge=0)]  # also inf: never
 
 
 class RouteEntry(Entry):
-    """See `Route`."""
+    """A route in the header; see `Route`."""
 
     waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
     waypoint_radius_m: Radius
@@ -78,7 +78,7 @@ class RouteEntry(Entry):
         return start_pose
 
     def route(self) -> Route:
-        """The route."""
+        """The `Route` of this entry."""
         x_m, y_m, psi_rad = self.start_pose
         waypoints_m = tuple((x, y) for x, y in self.waypoints_m)
         return Route(waypoints_m, self.waypoint_radius_m, (x_m, y_m, psi_rad))
@@ -94,7 +94,7 @@ class SetupEntry(Entry):
     setup_version: Annotated[int, Field(strict=True)]
     rig: RigFile
     markers: MarkerFile
-    origin_m: Point | None = None  # that the map counts from; maps near zero have none
+    origin_m: Point | None = None  # origin of the map's coordinates; maps near zero have none
     vehicle: VehicleFile
     route: RouteEntry
     selector: Text
@@ -106,7 +106,7 @@ class SetupEntry(Entry):
     made_by: dict[str, str]
 
     def origin(self) -> Origin:
-        """What the map counted from when it was recorded."""
+        """The origin of the map's coordinates in the recording."""
         if self.origin_m is None:
             return ZERO
         x_m, y_m, z_m = self.origin_m
@@ -123,12 +123,12 @@ class SetupEntry(Entry):
 
 @dataclass(frozen=True, eq=False)
 class DriveSetup:
-    """What a drive is driven with.
+    """The setup of a drive.
 
     Attributes:
-        markers: what is driven with counts from their `origin_m`, the route from zero.
+        markers: coordinates of the pilot count from their `origin_m`, those of `route` from zero.
         selector: one of `PILOT_SELECTORS`.
-        corner_sigma_px: of every corner along one axis; None: as whoever detects it says.
+        corner_sigma_px: of every corner along one axis; None: as each detection says.
         float64: precision of the process, in which rig, markers and vehicle are made too.
         parameters: name -> number or nested lists, in place of the navigator's own; see
             `with_params`.
@@ -147,10 +147,10 @@ class DriveSetup:
     relocate: bool = True
 
     def with_params(self, params: Params) -> "DriveSetup":
-        """The setup with these parameters, and none of those that it had.
+        """The setup with these parameters in place of all that it had.
 
         Raises:
-            BadInput: a parameter that does not fit the navigator; names file and key.
+            BadInput: a parameter does not fit the navigator; names file and key.
         """
         apply_params(replace(self, parameters={}).navigator(), params)
         return replace(self, parameters=params.plain())
@@ -161,7 +161,7 @@ class DriveSetup:
         return self.route.relative_to(self.markers.origin_m)
 
     def navigator(self) -> Navigator:
-        """What the pilot runs."""
+        """The navigator that the pilot runs."""
         navigator = Navigator(
             rig=self.rig,
             markers=self.markers,
@@ -176,14 +176,14 @@ class DriveSetup:
         """A pilot at the beginning of a drive.
 
         Args:
-            folder: of executables, see `compiled`.
+            folder: folder of executables, see `compiled`.
         """
         navigator = self.navigator()
         program = compiled(advance_packed, navigator, folder)
         return Pilot(navigator, self.timeouts, program, self.corner_sigma_px, self.relocate)
 
     def header(self) -> dict[str, Any]:
-        """All of it, every number bit for bit, and what this process is."""
+        """The setup with every number bit for bit, and a description of this process."""
         header = {
             "setup_version": SETUP_VERSION,
             "rig": rig_data(self.rig),
@@ -196,7 +196,7 @@ class DriveSetup:
             "float64": self.float64,
             "made_by": this_process(),
         }
-        # Without them any version of the program reads it.
+        # A header without these fields can be read by any version of the program.
         if self.parameters:
             header["parameters"] = dict(self.parameters)
         if self.markers.origin_m != ZERO:
@@ -205,13 +205,13 @@ class DriveSetup:
 
     @staticmethod
     def of_header(header: dict[str, Any], where: Path) -> "DriveSetup":
-        """What `header` was made of. The process must have its precision, see `needs_float64`.
+        """The setup of a `header`. The process must have its precision, see `needs_float64`.
 
         Args:
-            where: the file that the header is of.
+            where: the file of the header.
 
         Raises:
-            BadInput: one line naming file and key; also where it is of a newer kind.
+            BadInput: one line naming file and key; also where the header has a newer version.
         """
         entry = _checked(header, where)
         setup = DriveSetup(
@@ -231,7 +231,7 @@ class DriveSetup:
 
 
 def needs_float64(header: dict[str, Any], where: Path) -> bool:
-    """The precision of a recorded drive, without making an array.
+    """Whether a recorded drive needs float64; makes no array.
 
     Raises:
         BadInput: as `DriveSetup.of_header`.
@@ -240,12 +240,12 @@ def needs_float64(header: dict[str, Any], where: Path) -> bool:
 
 
 def made_here(header: dict[str, Any]) -> bool:
-    """Whether a drive was recorded by what runs now, so that a replay has the same bits."""
+    """Whether this machine and these versions recorded a drive, so a replay has the same bits."""
     return bool(header.get("made_by") == this_process())
 
 
 def this_process() -> dict[str, str]:
-    """All that the bits of a result depend on beside the setup."""
+    """All on which the bits of a result depend beside the setup: versions, machine, settings."""
     libraries = ("jaxnav", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax", "numpy")
     return {name: version(name) for name in libraries} | {
         "opencv": str(cv2.__version__),

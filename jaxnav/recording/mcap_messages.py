@@ -1,7 +1,7 @@
-"""An MCAP file from its beginning as far as it goes, whatever bytes it holds.
+"""Read the messages of an MCAP file from its beginning as far as possible, whatever its bytes.
 
-A file that is cut off, as a program that was killed leaves it, is read up to the cut. Sizes are
-bounded, and checksums are compared where there are any.
+A truncated file, as a killed program leaves it, is read up to its end. Sizes are bounded, and
+checksums are compared where there are any.
 """
 
 import struct
@@ -36,13 +36,13 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log and publish time
 
 
 def profile_of(path: Path) -> str | None:
-    """What the header of an MCAP file says it is; None: it can't be read, or is none."""
+    """The profile in the header of an MCAP file; None: it can't be read, or is not MCAP."""
     try:
         with path.open("rb") as file:
             head = file.read(100)
     except (OSError, ValueError):  # ValueError: a NUL in the name
         return None
-    # After the magic a record of the type 1, its length in 8 bytes, that of the profile in 4.
+    # After the magic: a record of type 1, its length in 8 bytes, the profile's length in 4.
     if not head.startswith(_MAGIC + b"\x01") or len(head) < 21:
         return None
     size = int.from_bytes(head[17:21], "little")
@@ -50,7 +50,7 @@ def profile_of(path: Path) -> str | None:
 
 
 class Recorded(NamedTuple):
-    """One message as the file has it."""
+    """One message as it is in the file."""
 
     topic: str
     schema: str  # its name, "" for none
@@ -61,17 +61,17 @@ class Recorded(NamedTuple):
 
 
 class McapMessages:
-    """To be iterated once: metadata and messages in the order of the file.
+    """An iterable, for one pass, of metadata and messages in the order of the file.
 
-    Iterating raises BadInput where the file can't be read, is no MCAP file, or is damaged.
+    Iterating raises BadInput where the file can't be read, is not an MCAP file, or is damaged.
 
     Attributes:
-        truncated: whether the file had an end, once all was read.
+        truncated: after the last item, whether the file lacks its end.
     """
 
     def __init__(self, path: Path, told: Callable[[int], object] = lambda size: None):
         """Args:
-        told: how many bytes were read, piece by piece.
+        told: called with the size in bytes of each piece that was read.
         """
         self.path = path
         self.truncated = True
@@ -138,14 +138,14 @@ class McapMessages:
 
 
 class _Reader(StreamReader):
-    """MCAP's, without the index of a chunk's messages: two numbers for each, to leap to a time."""
+    """MCAP's reader without the index of a chunk's messages, which serves only to seek a time."""
 
     def _read_record(self, opcode: int, length: int) -> McapRecord | None:
         return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
 
 
 class _CutOff(Exception):
-    """The file ends here."""
+    """The file ends before the bytes that were requested."""
 
     def __init__(self, begun: bool):
         Exception.__init__(self)
@@ -153,7 +153,7 @@ class _CutOff(Exception):
 
 
 class _Bounded:
-    """A file that gives all that is asked for, or says that it is cut off."""
+    """A file whose `read` returns all requested bytes, or raises `_CutOff`."""
 
     def __init__(self, file: IO[bytes], told: Callable[[int], object]):
         self._file, self._told, self._begun = file, told, False
@@ -170,7 +170,7 @@ class _Bounded:
 
 
 def _opened(chunk: Chunk, budget: Budget) -> Iterator[McapRecord]:
-    """The records of a chunk, one after the other: a million of them need no memory."""
+    """Yield the records of a chunk one by one, so that a million of them need no memory."""
     if chunk.compression not in ("", "zstd"):
         raise ValueError(f"compressed by {chunk.compression[:20]!r}, only zstd is read")
     if chunk.uncompressed_size > limits.CHUNK_BYTES:

@@ -1,4 +1,4 @@
-"""Kinds of fields of the messages of a recorded drive: how each is read, and its JSON schema."""
+"""Field types of the messages of a recorded drive: how each is read, and its JSON schema."""
 
 import base64
 import binascii
@@ -15,23 +15,23 @@ from pydantic_core import core_schema
 from jaxnav.files.ranges import RANGES
 from jaxnav.loop.flags import Fault
 
-# What JSON schema calls a value -> what checks it, and its dtype.
+# JSON schema's name of a type -> the check of its values, and their dtype.
 _ITEMS: dict[str, tuple[core_schema.CoreSchema, type]] = {
     "number": (core_schema.float_schema(strict=True), float),
     "integer": (core_schema.int_schema(strict=True, ge=-(2**63), lt=2**63), int),
     "boolean": (core_schema.bool_schema(strict=True), bool),
 }
-_MOST_KNOWN = 1000  # lists of words that are not read again
+_MOST_KNOWN = 1000  # lists of words whose flags are cached
 _MOST_SIDES = 32  # of a covariance: a state has 6 to 9 numbers
 
 
 @dataclass(frozen=True)
 class Array:
-    """A list as an array, row by row.
+    """A field that reads a flat list as an array, row by row.
 
     Attributes:
-        items: their type in JSON schema's word.
-        shape: its first axis may be -1, of any length.
+        items: type of the values, as JSON schema names it.
+        shape: shape of the array; its first axis may be -1, of any length.
     """
 
     items: str
@@ -62,7 +62,7 @@ class Array:
 
 @dataclass(frozen=True)
 class Words:
-    """Flags as the list of their names, or an enum as its name."""
+    """A field that reads flags from the list of their names, or an enum from its name."""
 
     kind: type[enum.Enum]
 
@@ -109,10 +109,10 @@ def _bytes(value: Any) -> bytes:
 
 
 def square(array: np.ndarray) -> np.ndarray:
-    """The matrix of these values.
+    """The square matrix of these values.
 
     Raises:
-        ValueError: their number is no square.
+        ValueError: their number is not a square, or the matrix is too large.
     """
     side = math.isqrt(array.size)
     if side**2 != array.size or side > _MOST_SIDES:

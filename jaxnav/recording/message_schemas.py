@@ -1,4 +1,4 @@
-"""What each message of a recorded drive holds: one model gives its JSON schema and its check.
+"""The messages of a recorded drive: one model of each gives its JSON schema and its check.
 
     topic       schema              one for
     /odometry   jaxnav.Odometry     a reading of the odometer, as it was read
@@ -39,7 +39,7 @@ IMAGE_SCHEMA = "foxglove.CompressedImage"
 
 
 class SightedMessage(Entry):
-    """See `Sighted`; N detections. None of them where the frame was not usable."""
+    """A `Sighted` with N detections; N = 0 where the frame was not usable."""
 
     camera: Count
     stamp_ns: Stamp
@@ -64,7 +64,7 @@ class SightedMessage(Entry):
 
 
 class OdometryMessage(Entry):
-    """See `Odometry`, and of `Input` what it has beside it: frames that showed nothing."""
+    """An `Input` with `Odometry`, and with the frames that showed nothing."""
 
     now_ns: Now
     stamp_ns: Stamp
@@ -76,7 +76,7 @@ class OdometryMessage(Entry):
 
 
 class FramesMessage(Entry):
-    """Frames that were handled together."""
+    """An `Input` of frames that were handled together."""
 
     now_ns: Now
     frames: Annotated[list[SightedMessage], Field(min_length=1)]
@@ -84,22 +84,22 @@ class FramesMessage(Entry):
 
 
 class TickMessage(Entry):
-    """Nothing came."""
+    """An `Input` without data."""
 
     now_ns: Now
     faults: Faults
 
 
 class OutcomeMessage(Entry):
-    """See `Outcome` and its report, without which all from `pose` on is missing. All poses are in
-    the world.
+    """An `Outcome` and its report; without a report all fields from `pose` on are missing. All
+    poses are in the world.
 
     Attributes:
         covariance: (d, d).
-        hypotheses: (K, 3), x_m y_m psi_rad of those that are alive.
-        Ts_vehicle_world: (N, 7), wxyz_xyz of the candidates that are valid.
+        hypotheses: (K, 3), x_m y_m psi_rad of the hypotheses alive.
+        Ts_vehicle_world: (N, 7), wxyz_xyz of the valid candidates.
         selected: index into these, -1: none.
-        digest: of the pilot's state, for who replays; "" where none was taken.
+        digest: of the pilot's state, to compare a replay with; "" where none was taken.
         outvoted: ids of markers that were left out; older drives have none.
     """
 
@@ -152,14 +152,14 @@ REPORTED = [
 
 
 class TimeMessage(Entry):
-    """Foxglove's time."""
+    """A time as Foxglove has it."""
 
     sec: Count
     nsec: Annotated[int, Field(strict=True, ge=0, lt=10**9)]
 
 
 class ImageMessage(Entry):
-    """Foxglove's compressed image."""
+    """A compressed image as Foxglove has it."""
 
     timestamp: TimeMessage
     frame_id: Word
@@ -179,8 +179,8 @@ MESSAGES: dict[str, tuple[str, type[AnyMessage]]] = {
 
 
 def json_schema(model: type[BaseModel]) -> bytes:
-    """The JSON schema of a model's messages as `encode` writes them, in what Foxglove reads of it:
-    every type is one word, nothing refers to another place."""
+    """The JSON schema of a model's messages as `encode` writes them, in the form that Foxglove
+    reads: every type is one word, and there are no references."""
     schema = model.model_json_schema()
     return json.dumps(_simple(schema, schema.get("$defs", {}))).encode()
 

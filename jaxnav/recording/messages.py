@@ -1,7 +1,7 @@
-"""Inputs and outcomes of the pilot as messages of a recorded drive, and inputs back from them.
+"""Convert the pilot's inputs and outcomes to messages of a recorded drive, and inputs back.
 
-What is made here is cheap: arrays are handed on as they are, and become JSON where they are
-written. So they must not be changed afterwards.
+This is cheap: arrays are passed on as they are, and the recorder's thread makes them JSON. So they
+must not be changed afterwards.
 """
 
 import hashlib
@@ -32,13 +32,13 @@ from jaxnav.recording.message_schemas import (
     TickMessage,
 )
 
-# Beyond, a stamp is none, see `Stamps`; what is recorded of it is not one either.
+# `Stamps` refuses a stamp outside of this range; it refuses the clamped one in the recording too.
 _LEAST_NS, _MOST_NS = int(RANGES["stamp_ns"].least), int(RANGES["stamp_ns"].most)
 _NONE = Detections.concatenate([])
 
 
 def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
-    """Topic, stamp in ns and message of an input: what `Recorder.put` takes."""
+    """The topic, stamp in ns and message of an input: the arguments of `Recorder.put`."""
     message: dict[str, Any] = {"now_ns": given.now_ns, "faults": given.faults}
     if given.frames:
         message["frames"] = [_sighted_message(frame) for frame in given.frames]
@@ -56,7 +56,7 @@ def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
 
 
 def input_of(message: OdometryMessage | FramesMessage | TickMessage) -> Input:
-    """The input that a message was made of."""
+    """The input of a message."""
     match message:
         case OdometryMessage():
             reading = Odometry(
@@ -74,8 +74,8 @@ def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
     """The message of an outcome; see `OutcomeMessage`.
 
     Args:
-        outcome: its output with NumPy leaves.
-        digest: of the pilot's state, for who replays the drive.
+        outcome: with NumPy leaves in its output.
+        digest: digest of the pilot's state, to compare a replay with.
     """
     message: dict[str, Any] = {
         "now_ns": outcome.now_ns,
@@ -96,7 +96,7 @@ def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Rows of an array in one list, taken by whoever writes them, not by the driving thread."""
+    """Rows of an array as one list, made by the thread that writes them, not by the driving one."""
 
     array: Any
     which: Any = ...
@@ -164,7 +164,7 @@ def _sighted(message: SightedMessage) -> Sighted:
 
 
 def digest(outcome: Outcome) -> str:
-    """Of all that was believed and commanded: two drives with the same digests are the same."""
+    """The digest of an outcome's belief and command: drives with the same digests are the same."""
     output = outcome.output
     told = (outcome.belief, output.pose, output.covariance, output.command)
     state = hashlib.blake2b(digest_size=8)

@@ -1,7 +1,7 @@
-"""What a recorded pilot reported, without the numbers that nobody can draw.
+"""Remove numbers from recorded outcomes that are too large to draw.
 
 A pilot that diverged, or a file that somebody edited, holds poses of 1e308. A recording keeps them,
-for it tells what happened; a picture, and a difference in metres, have no room for them.
+since it tells what happened; a plot, or a difference in metres, can't show them.
 """
 
 from dataclasses import replace
@@ -16,9 +16,9 @@ _UNIT = 1e-3  # a quaternion's length may be off by this
 
 
 def plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
-    """The outcomes with NaN for numbers that are not within reason, and how many had one.
+    """The outcomes with NaN for implausible numbers, and the number of outcomes that had one.
 
-    An outcome without a pose is not located; an alternative that is nowhere is left out.
+    An outcome without a plausible pose is not located; such hypotheses and candidates are left out.
     """
     posed = _all(is_within("pose", outcomes.pose))
     commanded = np.stack([outcomes.steering_rad, outcomes.throttle], axis=1)
@@ -50,7 +50,7 @@ def plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
 
 
 def left_out(count: int) -> str:
-    """What a person is told of them."""
+    """The message to a person about outcomes with implausible numbers."""
     return f"left out: what {count} outcomes report that is not finite, or out of this world"
 
 
@@ -74,7 +74,7 @@ _Rows = tuple[np.ndarray, ...]
 
 
 def _paired(rows: _Rows, others: _Rows) -> tuple[_Rows, _Rows]:
-    """Rows that belong together, without those that have no counterpart."""
+    """Both tuples of arrays, each pair cut to its common number of rows."""
     counts = [min(len(a), len(b)) for a, b in zip(rows, others, strict=True)]
     return (
         tuple(row[:count] for row, count in zip(rows, counts, strict=True)),
@@ -87,5 +87,5 @@ def _kept(rows: _Rows, which: list[np.ndarray]) -> _Rows:
 
 
 def _moved(selected: int, kept: np.ndarray) -> int:
-    """The index of what is selected among those that are kept, -1 where it is not."""
+    """The index of the selected row among the kept ones, -1 if it is not kept."""
     return int(kept[:selected].sum()) if 0 <= selected < len(kept) and kept[selected] else -1

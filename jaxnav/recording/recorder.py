@@ -1,4 +1,4 @@
-"""Drives recorded while they are driven, without ever holding up the driving.
+"""Record a drive to a file without ever holding up the drive.
 
     recorder = Recorder(path, header)
     recorder.put(*input_message(given))
@@ -6,7 +6,7 @@
     recorder.image("/camera/front", stamp_ns, pixels)
     recorder.close()
 
-The file is MCAP, its messages JSON (see `message_schemas`). Whatever ends the program, the file can
+The file is MCAP with JSON messages (see `message_schemas`). However the program ends, the file can
 be read up to the last half second.
 """
 
@@ -30,9 +30,9 @@ from jaxnav.errors import BadInput
 from jaxnav.recording.drive_format import HEADER, PROFILE, encode, header_metadata
 from jaxnav.recording.message_schemas import IMAGE_SCHEMA, MESSAGES, ImageMessage, json_schema
 
-IDLE_S = 0.02  # between looks at an empty queue
-FLUSH_S = 0.25  # at the latest so long after it was put, a message is the operating system's
-SYNC_S = 1.0  # and so often the disk's
+IDLE_S = 0.02  # period of looks at an empty queue
+FLUSH_S = 0.25  # the longest time until a message is handed to the operating system
+SYNC_S = 1.0  # period of writing to the disk
 JPEG_QUALITY = 85
 _MAX_TIME_NS = 2**64 - 1
 
@@ -48,10 +48,10 @@ class _Item:
 
 
 class Recorder:
-    """A file and a thread that writes it. `put` and `image` are for any thread.
+    """A file and a thread that writes it. Any thread may call `put` and `image`.
 
-    What does not fit into the queue is left out and counted; a gap in the sequence numbers of its
-    topic tells where. Images give way first.
+    Messages that do not fit into the queue are dropped and counted; a gap in the sequence numbers
+    of their topic shows where. Images are dropped first.
     """
 
     def __init__(
@@ -64,14 +64,14 @@ class Recorder:
         """Open the file and write the header.
 
         Args:
-            path: a file that is there is replaced once there is something to record.
-            header: rig, markers, vehicle, route, settings, versions: what JSON and arrays can say.
+            path: an existing file is replaced once there is something to record.
+            header: rig, markers, vehicle, route, settings, versions: values that `encode` takes.
             queue_messages: how many may wait, images among them: some seconds of a drive.
-            queue_images: how many images may wait, for they are large.
+            queue_images: how many images may wait; fewer, since they are large.
 
         Raises:
             BadInput: the file can't be written.
-            TypeError, ValueError: the header is not such.
+            TypeError, ValueError: `encode` does not take the header.
         """
         self.path = Path(path)
         metadata = header_metadata(header)
@@ -88,7 +88,7 @@ class Recorder:
             raise BadInput(self.path, f"can't be written: {_reason(error)}") from None
         self._queue_messages, self._queue_images = queue_messages, queue_images
         self._queue: deque[_Item] = deque()
-        self._lock = threading.RLock()  # a signal's handler may close while the same thread puts
+        self._lock = threading.RLock()  # a signal handler may call `close` during a `put`
         self._closing = threading.Event()
         self._images = self._dropped = self._written = 0
         self._failed: str | None = None
@@ -101,25 +101,25 @@ class Recorder:
 
     @property
     def dropped(self) -> int:
-        """Messages and images that were left out so far."""
+        """Number of messages and images dropped so far."""
         return self._dropped
 
     @property
     def failed(self) -> str | None:
-        """Why nothing is recorded any more, None while it is."""
+        """Why recording has ended early; None: it has not."""
         return self._failed
 
     @property
     def written(self) -> int:
-        """Messages and images that were written so far."""
+        """Number of messages and images written so far."""
         return self._written
 
     def put(self, topic: str, stamp_ns: int, message: dict[str, Any]) -> None:
         """Record a message. Never waits, never raises.
 
         Args:
-            stamp_ns: when it was true. Its `now_ns`, where it has one, is when it was handled.
-            message: what `encode` takes; not to be changed afterwards.
+            stamp_ns: its timestamp. Its `now_ns`, if it has one, is the time of handling.
+            message: as `encode` takes it; must not be changed afterwards.
         """
         self._offer(topic, stamp_ns, message.get("now_ns", stamp_ns), message, is_image=False)
 
@@ -128,16 +128,16 @@ class Recorder:
 
         Args:
             topic: its last part is the camera's name.
-            image: a JPEG, or (H, W) or (H, W, 3) BGR pixels, not to be changed afterwards.
+            image: a JPEG, or (H, W) or (H, W, 3) BGR pixels; must not be changed afterwards.
         """
         self._offer(topic, stamp_ns, stamp_ns, image, is_image=True)
 
     def close(self, timeout_s: float = 5.0, keep_empty: bool = True) -> None:
-        """Write what waits and the summary. Any number of times; a disk that does not answer
-        within the time is left alone, and `failed` says so.
+        """Write the queue and the summary. May be called any number of times. If the disk does not
+        answer within the timeout, `close` returns all the same, and `failed` says so.
 
         Args:
-            keep_empty: leave a file also where nothing was recorded, if there is none yet.
+            keep_empty: leave a file even if nothing was recorded, unless there is one already.
         """
         with self._lock:
             self._keeps_empty = keep_empty
@@ -174,7 +174,7 @@ class Recorder:
                 item = self._taken()
                 if item is not None:
                     self._write(item)
-                    time.sleep(0)  # the driving thread may have the interpreter first
+                    time.sleep(0)  # lets the driving thread have the interpreter
                 elif self._closing.wait(IDLE_S) and not self._queue:
                     break
                 self._flush_in_time()
@@ -182,7 +182,7 @@ class Recorder:
             self._file.sync()
             if self._keeps_empty:
                 self._file.take_place(only_where_free=True)
-        except Exception as error:  # of a disk, or of whatever: the vehicle drives on
+        except Exception as error:  # from the disk or anything else: the vehicle drives on
             self._fail(error)
         with suppress(OSError):
             self._file.leave()
@@ -204,7 +204,7 @@ class Recorder:
 
     def _new_channel(self, item: _Item) -> int:
         schema = (IMAGE_SCHEMA, ImageMessage) if item.is_image else MESSAGES.get(item.topic)
-        schema_id = 0  # none: a topic of somebody else
+        schema_id = 0  # no schema: a topic that is not jaxnav's
         if schema is not None:
             text = json_schema(schema[1])
             schema_id = self._writer.register_schema(schema[0], "jsonschema", text)
@@ -227,10 +227,10 @@ class Recorder:
 
 
 class _File:
-    """What MCAP's writer needs of a file. It holds nothing back: what is written is written.
+    """An unbuffered file with the methods that MCAP's writer needs.
 
-    Until `take_place` it lies beside the path under a name of its own, so that a recording of
-    another day is lost to nothing but a new one. What is no file, a pipe, is written to directly.
+    Until `take_place` it lies beside the path under a name of its own, so that only a new recording
+    replaces an old one. A path that is not a file, such as a pipe, is written to directly.
     """
 
     def __init__(self, path: Path):
@@ -240,13 +240,13 @@ class _File:
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
             if path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-            self._path = path.resolve()  # of a link what it leads to
+            self._path = path.resolve()  # the target of a link
             self._beside = self._path.with_name(f".{path.name}-{secrets.token_hex(4)}.part")
         self._file = self._beside.open("wb", buffering=0)
         self._position = 0
 
     def take_place(self, only_where_free: bool = False) -> None:
-        """Become the file of the path, if it is not yet."""
+        """Move the file to its path, if it is not there yet."""
         if self._beside != self._path and not (only_where_free and self._path.exists()):
             self._beside.replace(self._path)
             self._beside = self._path
@@ -262,17 +262,17 @@ class _File:
         return self._position
 
     def flush(self) -> None:
-        """There is nothing to flush."""
+        """Do nothing: the file is unbuffered."""
 
     def sync(self) -> None:
         try:
             os.fsync(self._file.fileno())
         except OSError as error:
-            if error.errno != errno.EINVAL:  # of a pipe, which is no disk
+            if error.errno != errno.EINVAL:  # a pipe, which can't be synced
                 raise
 
     def leave(self) -> None:
-        """Close it, and leave nothing behind that did not become the path's."""
+        """Close the file, and delete it if it was not moved to its path."""
         self._file.close()
         if self._beside != self._path:
             self._beside.unlink(missing_ok=True)
@@ -295,7 +295,7 @@ def _image_message(item: _Item) -> dict[str, Any]:
 
 
 def _time(stamp_ns: int) -> int:
-    """As MCAP can say it."""
+    """Clamp a time to MCAP's range."""
     return min(max(int(stamp_ns), 0), _MAX_TIME_NS)
 
 

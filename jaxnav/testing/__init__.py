@@ -1,9 +1,9 @@
-"""Whether a plug-in keeps the promises of `jaxnav.loop.interfaces`. Call it from pytest:
+"""Test whether a plug-in keeps the promises of `jaxnav.loop.interfaces`. Call it from pytest:
 
     def test_my_car():
         check_vehicle(open_vehicle, setup)
 
-It really drives: lift the car off the ground, its wheels turn at full throttle for a moment.
+The test really drives: lift the car off the ground, its wheels turn at full throttle for a moment.
 """
 
 from jaxnav.testing.cameras import check_cameras

@@ -1,4 +1,4 @@
-"""Calls of code that may hang, raise anything, or live in another time."""
+"""Call code that may hang, raise anything, or give stamps of another clock."""
 
 import time
 from collections.abc import Callable
@@ -7,21 +7,21 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Any
 
-HANGS_S = 5.0  # no call of a plug-in takes so long
-_OLD_NS = 1_000_000_000  # a stamp older than this is of another clock
+HANGS_S = 5.0  # a call of a plug-in that takes longer hangs
+_OLD_NS = 1_000_000_000  # a stamp older than this is from another clock
 
 Finish = Callable[[str, float], Any]
 
 
 class Worker:
-    """One thread, as the loop has one for each part of a plug-in. What hangs in it is found."""
+    """A thread, as the loop has for each part of a plug-in. It detects calls that hang."""
 
     def __init__(self) -> None:
         self._tasks: SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = SimpleQueue()
         Thread(target=self._run, name="jaxnav check", daemon=True).start()
 
     def begin(self, function: Callable[[], Any]) -> Finish:
-        """Begin now, wait later: (what it is, for the message; how long, s) -> its result."""
+        """Begin a call; the returned function (name of the call, timeout, s) awaits its result."""
         future: Future[Any] = Future()
         self._tasks.put((function, future))
 
@@ -40,10 +40,10 @@ class Worker:
         return finish
 
     def call(self, what: str, function: Callable[[], Any]) -> tuple[Any, OSError | None]:
-        """(result, None) or (None, the OSError), which is allowed.
+        """Call a function; return (result, None), or (None, error) for an allowed OSError.
 
         Raises:
-            AssertionError: it hangs, or raises anything else.
+            AssertionError: the call hangs, or raises anything else.
         """
         try:
             return self.begin(function)(what, HANGS_S), None
@@ -51,7 +51,7 @@ class Worker:
             return None, error
 
     def close(self) -> None:
-        """Let the thread end."""
+        """End the thread after its last call."""
         self._tasks.put(None)
 
     def _run(self) -> None:
@@ -64,7 +64,7 @@ class Worker:
 
 
 def started(function: Callable[[], Any]) -> Finish:
-    """Begin it in a thread that is for nothing else; see `Worker.begin`."""
+    """Begin a call in a thread of its own; see `Worker.begin`."""
     worker = Worker()
     finish = worker.begin(function)
     worker.close()
@@ -72,7 +72,7 @@ def started(function: Callable[[], Any]) -> Finish:
 
 
 def check_stamp(what: str, stamp_ns: object) -> None:
-    """Whether it is of this machine's monotonic clock, and of just now.
+    """Check that a stamp is from this machine's monotonic clock, and recent.
 
     Raises:
         AssertionError: it is not.

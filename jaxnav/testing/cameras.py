@@ -1,4 +1,4 @@
-"""The promises of the cameras, one by one."""
+"""Check the promises of cameras one by one."""
 
 import contextlib
 import math
@@ -15,19 +15,19 @@ from jaxnav.loop.interfaces import Camera, Frame, Odometry, OpenCameras, Setup, 
 from jaxnav.loop.plugins import missing_members
 from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, started
 
-_PATIENCE_S = 3.0  # until the first frames must have come
+_PATIENCE_S = 3.0  # time within which the first frames must come
 _FRAMES = 5
-_LATE_S = 0.2  # that a camera may need beyond its time
+_LATE_S = 0.2  # time that a camera may need beyond its timeout
 
 
 def check_cameras(factory: OpenCameras, setup: Setup, vehicle: Vehicle | None = None) -> None:
     """Open the cameras, read each in a thread of its own, and close them.
 
     Args:
-        vehicle: what the factory is given; by default one that stands still.
+        vehicle: passed to the factory; by default one that stands still.
 
     Raises:
-        AssertionError: a sentence that says which promise is broken.
+        AssertionError: its message says which promise is broken.
     """
     cameras = factory(setup, vehicle or Parked())
     assert isinstance(cameras, Sequence), "the factory gives no sequence of cameras"
@@ -47,12 +47,12 @@ def check_cameras(factory: OpenCameras, setup: Setup, vehicle: Vehicle | None = 
             look(f"the check of the camera {name}", 10 * HANGS_S)
     finally:
         for camera in cameras:
-            with contextlib.suppress(Exception):  # or it would hide what was found
+            with contextlib.suppress(Exception):  # an error here would hide the one found
                 started(camera.close)("close()", HANGS_S)
 
 
 class Parked:
-    """A vehicle that stands, for cameras that ask for one."""
+    """A vehicle that stands still, for cameras that need one."""
 
     timeout_s = math.inf
 
@@ -70,7 +70,7 @@ class Parked:
 
 
 def _check_camera(camera: Any, size_px: tuple[int, int]) -> None:
-    """Read it in one thread, close it from another."""
+    """Read a camera in one thread, and close it from another."""
     reader = Worker()
     try:
         _check_frames(camera, reader, size_px)
@@ -80,7 +80,7 @@ def _check_camera(camera: Any, size_px: tuple[int, int]) -> None:
 
 
 def _check_frames(camera: Any, reader: Worker, size_px: tuple[int, int]) -> None:
-    """The first frames, and that later ones leave them as they are."""
+    """Check the first frames, and that later reads do not change them."""
     frames: list[tuple[Frame, np.ndarray | None]] = []
     failure = None
     begin_s = time.monotonic()
@@ -108,7 +108,7 @@ def _check_frames(camera: Any, reader: Worker, size_px: tuple[int, int]) -> None
 
 
 def _timeouts(end_s: float) -> Iterator[float]:
-    """Some so short that no camera has a picture by then."""
+    """Yield timeouts until `end_s`; some are too short for any camera."""
     while time.monotonic() < end_s:
         yield from (0.0, 0.2, 0.001, 1.0)
 
@@ -142,7 +142,7 @@ def _check_frame(frame: object, name: str, size_px: tuple[int, int]) -> None:
 
 
 def _check_closing(camera: Any, reader: Worker) -> None:
-    """While a `read` waits."""
+    """Check `close` while a `read` waits, a second `close`, and a `read` after it."""
     closed = threading.Event()
 
     def read_on() -> None:

@@ -1,10 +1,10 @@
-"""The fault matrix: what can go wrong on a drive, and what must come of it.
+"""Run the fault matrix: the faults that can occur on a drive, and the required results.
 
     for row in matrix():
         print(line(run_trial(row, trial)))
 
-All at corner level: drives of the simulated car through a loop of waypoints, in lockstep. What a
-fault does to images is tried where frames are looked at, threads and signals where the loop is.
+All faults act on corners, in lockstep drives of the simulated car through a loop of waypoints.
+Faults of images are tested with the search of frames, threads and signals with the loop.
 """
 
 import dataclasses
@@ -34,8 +34,8 @@ from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates, Step, drive
 from jaxnav.vehicles.world import World
 
 BEGIN_S, END_S = 2.5, 4.0  # of most faults
-ALL_CAMERAS = range(4)  # of the rig that is driven with
-SETTLE_S = 2.0  # after a fault: then the position must be right again
+ALL_CAMERAS = range(4)  # of the trial's rig
+SETTLE_S = 2.0  # this long after a fault the position must be right again
 WAYPOINTS_M = (
     (1.3, 0.0), (0.3, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5),
     (0.5, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5), (0.5, 0.2),
@@ -46,7 +46,7 @@ Happens = Callable[[int, World], None]
 
 
 def lasting(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
-    """A change while most faults last."""
+    """Make a change that lasts from BEGIN_S to `end_s`."""
     return lambda: between(BEGIN_S, end_s, change())
 
 
@@ -60,23 +60,23 @@ def _nothing_happens() -> Happens:
 
 @dataclass(frozen=True)
 class Row:
-    """One fault, and what is asked of a drive with it.
+    """One fault, and the requirements on a drive with it.
 
     Attributes:
         name: as `jaxnav faults` prints it.
-        change: what happens to the data on their way, made anew for each drive.
-        happens: what happens to the world, the same.
-        faults, rejects: one of these at least must be seen while it lasts; none: nothing is asked.
-        at_least, at_most: the worst health that it costs lies between these.
-        error_m: largest error of a decided position while it lasts and SETTLE_S after.
-        error_after_m: the largest thereafter.
+        change: makes the change to the data on their way, anew for each drive.
+        happens: makes the change to the world, anew for each drive.
+        faults, rejects: one at least must be seen by SETTLE_S after its end; none: no requirement.
+        at_least, at_most: bounds of the worst health in the same time.
+        error_m: largest error of a decided position during the fault and SETTLE_S after.
+        error_after_m: largest error after that.
         begins_s, ends_s: of the fault; inf: it lasts.
-        drive_s: of the whole drive.
-        telling: how the navigator's rig and markers differ from the true ones.
-        markers: where there are others than the trial's: made of these.
+        drive_s: duration of the whole drive.
+        telling: how the navigator's rig differs from the true one, see `told_rig`.
+        markers: makes the drive's markers from the trial's.
         relocate: see `Pilot`.
-        well: the health at which the car has recovered.
-        shift_m: so far from the trial's world the map and the route are written down.
+        well: the worst health at which the car has recovered.
+        shift_m: offset of the files' coordinates of map and route from the trial's world.
     """
 
     name: str
@@ -101,7 +101,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Result:
-    """What came of it."""
+    """The result of a drive with a fault."""
 
     row: Row
     faults: Fault
@@ -109,14 +109,14 @@ class Result:
     worst: Health
     error_m: float
     error_after_m: float
-    recovered_s: float  # after the end until it was well for good; inf: never, or it lasts
+    recovered_s: float  # from the fault's end to lasting health; inf: never, or the fault lasts
     restarts: int
     broken: tuple[str, ...]  # promises that were not kept
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The car that the faults happen to."""
+    """The car and world in which the faults are tried."""
 
     rig: CameraRig
     markers: MarkerMap
@@ -127,7 +127,7 @@ class Trial:
 
 
 def run_trial(row: Row, trial: Trial) -> Result:
-    """A drive with the fault in it."""
+    """Drive with a row's fault, and judge the drive."""
     trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
     markers, route = written_down(trial, row.shift_m)
     navigator = Navigator(
@@ -148,9 +148,9 @@ def run_trial(row: Row, trial: Trial) -> Result:
 
 
 def written_down(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
-    """Map and route as a drive has them when their files count from elsewhere.
+    """The map and route of a drive whose files have a shifted origin.
 
-    What the trial counts from is that of its map.
+    The trial's own coordinates count from the origin of its map.
     """
     if shift_m == ZERO:
         return trial.markers, Route(WAYPOINTS_M, _RADIUS_M, trial.start_pose)
@@ -163,7 +163,7 @@ def written_down(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
 
 
 def told_rig(rig: CameraRig, telling: str) -> CameraRig:
-    """What the navigator is told of the cameras: their calibration, or a wrong one."""
+    """The rig that the navigator gets: the true calibration, or a wrong one."""
     Ts = rig.Ts_camera_vehicle
     if telling == "focal":
         return eqx.tree_at(lambda r: r.cameras.focal_px, rig, 1.02 * rig.cameras.focal_px)
@@ -180,7 +180,7 @@ def told_rig(rig: CameraRig, telling: str) -> CameraRig:
 
 
 def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
-    """What a drive shows, held against what is asked."""
+    """Compare a drive with the requirements of its row."""
     times_s = np.array([(step.input.now_ns - BEGIN_NS) / 1e9 for step in steps])
     outcomes = [step.outcome for step in steps]
     healths = np.array([outcome.health for outcome in outcomes])
@@ -214,7 +214,7 @@ def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
 
 
 def _error_m(step: Step) -> float:
-    """Of a position that is acted upon; NaN where there is none."""
+    """The error, m, of a decided position while the car drives; NaN otherwise."""
     outcome = step.outcome
     if not outcome.output.decided or outcome.throttle == 0:
         return math.nan
@@ -255,7 +255,7 @@ HEADER = (
 
 
 def line(result: Result) -> str:
-    """A row of the table."""
+    """A result as a row of the table."""
     seen = ", ".join([*names(result.faults), *names(result.rejects)]).lower() or "-"
     recovered = "-" if math.isinf(result.recovered_s) else f"{result.recovered_s:.2f}"
     kept = "; ".join(result.broken) or "yes"

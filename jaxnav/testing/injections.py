@@ -1,4 +1,4 @@
-"""What can happen to data on their way to the pilot: pieces of which faults are made."""
+"""Change data on their way to the pilot: the parts from which faults are made."""
 
 import dataclasses
 import math
@@ -12,22 +12,22 @@ from jaxnav.loop.frames import Sighted
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Input
 
-EditFrame = Callable[[Sighted], Sighted | None]  # None: it never comes
+EditFrame = Callable[[Sighted], Sighted | None]  # None: the frame is lost
 EditOdometry = Callable[[Odometry], Odometry | None]
 
 
 def seconds(given: Input) -> float:
-    """Since the drive began."""
+    """The time of an input since the drive began, s."""
     return (given.now_ns - BEGIN_NS) / 1e9
 
 
 def between(begin_s: float, end_s: float, change: Change) -> Change:
-    """A change for a while."""
+    """Apply a change from `begin_s` to `end_s`."""
     return lambda given: change(given) if begin_s <= seconds(given) < end_s else [given]
 
 
 def frames(edit: EditFrame) -> Change:
-    """Every camera's frame edited."""
+    """Edit the frames of all cameras."""
 
     def change(given: Input) -> list[Input]:
         if not given.frames:
@@ -39,7 +39,7 @@ def frames(edit: EditFrame) -> Change:
 
 
 def odometry(edit: EditOdometry) -> Change:
-    """Every reading edited."""
+    """Edit all readings of the odometer."""
 
     def change(given: Input) -> list[Input]:
         if given.odometry is None:
@@ -51,7 +51,7 @@ def odometry(edit: EditOdometry) -> Change:
 
 
 def detections(edit: Callable[[Detections], Detections]) -> EditFrame:
-    """What a frame shows, edited."""
+    """Edit the detections of frames."""
     return lambda frame: (
         frame
         if frame.detections is None
@@ -60,36 +60,36 @@ def detections(edit: Callable[[Detections], Detections]) -> EditFrame:
 
 
 def corners(edit: Callable[[np.ndarray], np.ndarray]) -> EditFrame:
-    """Corners (N, 4, 2) edited."""
+    """Edit the corners (N, 4, 2) of frames."""
     return detections(lambda found: dataclasses.replace(found, corners_px=edit(found.corners_px)))
 
 
 def stamps(edit: Callable[[int], int]) -> EditFrame:
-    """The stamps of frames edited."""
+    """Edit the stamps of frames."""
     return lambda frame: dataclasses.replace(frame, stamp_ns=edit(frame.stamp_ns))
 
 
 def nothing_seen(frame: Sighted) -> Sighted:
-    """A frame that shows no marker: a tunnel, a black or a white image."""
+    """Make a frame show no marker: a tunnel, a black or a white image."""
     return dataclasses.replace(frame, detections=Detections.concatenate([]))
 
 
 def unusable(frame: Sighted) -> Sighted:
-    """No image, or one of a wrong size."""
+    """Make a frame unusable: no image, or one of a wrong size."""
     return dataclasses.replace(frame, detections=None, faults=Fault.FRAME_UNUSABLE)
 
 
 def gone(_: object) -> None:
-    """It never comes."""
+    """Lose a frame or a reading."""
 
 
 def only_camera(camera: int, edit: EditFrame) -> EditFrame:
-    """One camera's frames alone edited."""
+    """Edit the frames of one camera only."""
     return lambda frame: edit(frame) if frame.camera == camera else frame
 
 
 def late(delay_s: float, every: int = 1) -> Change:
-    """Frames that come later than others: every so-manieth."""
+    """Delay every n-th input with frames, n = `every`."""
     count = 0
 
     def change(given: Input) -> list[Input]:
@@ -104,7 +104,7 @@ def late(delay_s: float, every: int = 1) -> Change:
 
 
 def stalled(begin_s: float, stall_s: float) -> Change:
-    """A loop that does nothing for a while, and then has to do all that came meanwhile."""
+    """Stall the loop for a while; it then gets all inputs of that time at once."""
     end_ns = BEGIN_NS + int((begin_s + stall_s) * 1e9)
 
     def change(given: Input) -> list[Input]:
@@ -115,10 +115,10 @@ def stalled(begin_s: float, stall_s: float) -> Change:
 
 
 def frozen(cameras: Iterable[int], jitter_px: float, seed: int = 0) -> EditFrame:
-    """Cameras whose pictures stay the same under new stamps.
+    """Freeze the pictures of cameras under new stamps.
 
     Args:
-        jitter_px: the largest error of a corner that is found anew in the same picture.
+        jitter_px: largest difference of a corner detected again in the same picture.
     """
     kept: dict[int, Detections] = {}
     of, rng = set(cameras), np.random.default_rng(seed)
@@ -138,12 +138,12 @@ def frozen(cameras: Iterable[int], jitter_px: float, seed: int = 0) -> EditFrame
 
 
 def speed(edit: Callable[[float], float]) -> EditOdometry:
-    """What the wheels say, edited; the steering goes on."""
+    """Edit the measured speed, not the steering."""
     return lambda reading: dataclasses.replace(reading, speed_mps=edit(reading.speed_mps))
 
 
 def constant() -> Callable[[float], float]:
-    """The first value for ever."""
+    """Repeat the first value for ever."""
     first: list[float] = []
 
     def edit(value: float) -> float:
@@ -154,12 +154,12 @@ def constant() -> Callable[[float], float]:
 
 
 def both(change: Change, other: Change) -> Change:
-    """Two changes one after the other."""
+    """Apply two changes, one after the other."""
     return lambda given: [done for one in change(given) for done in other(one)]
 
 
 def repeated() -> EditOdometry:
-    """A driver that gives its old values again, under new stamps."""
+    """Repeat the first reading under new stamps."""
     last: list[Odometry] = []
 
     def edit(reading: Odometry) -> Odometry:
@@ -170,7 +170,7 @@ def repeated() -> EditOdometry:
 
 
 def with_values(values: Iterable[float]) -> EditOdometry:
-    """Speed and steering that are no numbers, one kind after the other."""
+    """Replace speed or steering, in turns, by these values, which are no numbers."""
     kinds = list(values)
     count = 0
 

@@ -1,6 +1,6 @@
-"""A drive of the simulated car as fast as the machine can: the loop, event by event, no threads.
+"""Drive the simulated car event by event, without threads, as fast as the machine can.
 
-What reaches the pilot may be changed on its way: that is how faults are tried.
+Data may be changed on their way to the pilot: that is how faults are tried.
 """
 
 import dataclasses
@@ -22,24 +22,24 @@ BEGIN_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Rates:
-    """When things happen."""
+    """The periods and delays of the sensors."""
 
     odometry_period_s: float = 0.02
     frame_period_s: float = 1 / 30
     frame_delay_s: float = 0.03  # from the exposure until its corners are known
-    camera_skew_s: float = 0.0  # by which each camera looks later than the one before
+    camera_skew_s: float = 0.0  # delay of each camera after the one before
 
 
 @dataclass(frozen=True)
 class Step:
-    """One event, what the pilot made of it, and the truth: x_m y_m psi_rad speed steering."""
+    """One event, the pilot's outcome, and the truth: x_m y_m psi_rad speed steering."""
 
     input: Input
     outcome: Outcome
     truth: np.ndarray
 
 
-# What came in at its time -> what reaches the pilot instead, each at its own time, not before.
+# An input -> the inputs that reach the pilot instead, each at its own time, not before.
 Change = Callable[[Input], list[Input]]
 
 
@@ -52,12 +52,12 @@ def drive(
     happens: Callable[[int, World], None] = lambda now_ns, world: None,
     delays: CameraDelays | None = None,
 ) -> Iterator[Step]:
-    """Drive, an event at a time, until the time is over.
+    """Drive event by event until the time is over.
 
     Args:
-        change: what happens to an input on its way.
-        delays: who watches the cameras' stamps, if anybody does.
-        happens: to the world, called with the time before each input is made.
+        change: changes an input on its way.
+        delays: estimates the cameras' delays; None: not estimated.
+        happens: changes the world; called with the time before each input is made.
     """
     rates = rates or Rates()
     end_ns = BEGIN_NS + int(duration_s * 1e9)
@@ -87,7 +87,7 @@ def drive(
 def _inputs(
     world: World, rates: Rates, end_ns: int, happens: Callable[[int, World], None]
 ) -> Iterator[tuple[int, Callable[[], Input]]]:
-    """When the next input is there, and how it is made: in their order."""
+    """Yield the time of each input and the function that makes it, in order of time."""
     odometry_ns = int(rates.odometry_period_s * 1e9)
     frame_ns, delay_ns = int(rates.frame_period_s * 1e9), int(rates.frame_delay_s * 1e9)
     cameras = len(world.rig)

@@ -1,4 +1,4 @@
-"""The rows of the fault matrix, and what each must come to."""
+"""The rows of the fault matrix, with the requirements of each."""
 
 import dataclasses
 from collections.abc import Callable
@@ -25,7 +25,7 @@ _BLIND_S = (0.2, 1.0, 5.0, 20.0)
 
 
 def matrix() -> list[Row]:
-    """All rows."""
+    """All rows of the matrix."""
     return [
         Row("none"),
         *_cameras(),
@@ -233,7 +233,7 @@ def _odometry() -> list[Row]:
         return inject.odometry(edit)
 
     def wrapped(reading: Odometry) -> Odometry:
-        # Of 2^32 counts, each 1 / 15 000 m, in 20 ms.
+        # The wrap of 2^32 counts, each 1 / 15 000 m, in 20 ms.
         return dataclasses.replace(reading, speed_mps=reading.speed_mps - 2**32 / 15e3 / 0.02)
 
     def invalid(reading: Odometry) -> Odometry:
@@ -368,7 +368,7 @@ def _nonsense() -> list[Row]:
         return inject.frames(inject.corners(lambda c: rng.uniform([0, 0], [820, 410], c.shape)))
 
     def blind(by: float) -> Callable[[], Change]:
-        """Without a marker, the odometer telling so much of the speed."""
+        """Hide all markers, and scale the measured speed."""
 
         def edit(reading: Odometry) -> Odometry:
             return dataclasses.replace(reading, speed_mps=by * reading.speed_mps)
@@ -423,7 +423,7 @@ def _spoofed() -> list[Row]:
     lasting: dict[str, Any] = {"ends_s": _LATEST, "drive_s": 8.0, "at_most": Health.STOP}
     relocated = lasting | {"faults": Fault.RELOCATED, "at_least": _SLOW}
     return [
-        # What one marker tells can't be told from the truth: that it is slow, and said, is asked.
+        # A copy of the only marker can't be told from it: a slow and reported reaction is required.
         Row("a copy 1 m away instead", happens=moved, error_m=1.1, **relocated),
         Row("a larger copy instead", happens=larger, error_m=1.1, **relocated),
         Row(
@@ -441,7 +441,7 @@ def _spoofed() -> list[Row]:
             error_m=0.6,
             **lasting,
         ),
-        # Restart follows restart, and none of them is confirmed: it stands.
+        # Restart follows restart, and none of them is confirmed: the car stands.
         Row(
             "a copy dragged at 0.5 m/s",
             happens=dragged(0.5),
@@ -454,7 +454,7 @@ def _spoofed() -> list[Row]:
 
 def _outvoted() -> list[Row]:
     def three(markers: MarkerMap) -> MarkerMap:
-        """The marker, and one on either side."""
+        """The marker, with one more on either side."""
         Ts = np.repeat(np.asarray(markers.Ts_world_marker.wxyz_xyz)[:1], 3, axis=0)
         Ts[:, 4] += np.array([0.0, -0.5, 0.5], Ts.dtype)
         return MarkerMap(
@@ -477,7 +477,7 @@ def _outvoted() -> list[Row]:
 
 
 def _far_origins() -> list[Row]:
-    """Nothing is wrong, but that float32 ends at half a metre or a metre where the map is."""
+    """Maps so far away that float32 resolves only 0.5 m or 1 m there; nothing else is wrong."""
     return [
         Row("map 10 000 km from the origin", shift_m=(1e7, -1e7, 0.0)),
         Row("map at UTM coordinates", shift_m=(448_251.37, 5_411_932.81, 0.0)),
@@ -485,8 +485,8 @@ def _far_origins() -> list[Row]:
 
 
 def _late_stamps() -> list[Row]:
-    """Frames that were taken earlier than they say, and no clock shows it: it is told, and what it
-    does to the estimate meanwhile is not promised."""
+    """Frames taken earlier than their stamps, which no clock shows: this must be reported, but the
+    estimate's error meanwhile is not limited."""
     late_s = 0.05
     return [
         Row(

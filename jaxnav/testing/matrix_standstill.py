@@ -1,4 +1,4 @@
-"""Rows of the fault matrix: what stands still while others move, and what depends on the rates."""
+"""Rows of the fault matrix where something stands still while others move, or rates matter."""
 
 import dataclasses
 import itertools
@@ -15,12 +15,12 @@ from jaxnav.vehicles.world import World
 
 _LATEST = np.inf  # to the end of the drive
 _SLOW = Health.DEGRADED
-# By which a look near where a marker is expected and one at the whole picture differ at most.
+# Largest difference of a corner between a search near its expected place and one everywhere.
 _JITTER_PX = 0.01
 
 
 def standstill() -> list[Row]:
-    """What stands still while others move."""
+    """Rows in which something stands still while others move."""
 
     def still(cameras: range) -> Callable[[], Change]:
         return lambda: inject.frames(inject.frozen(cameras, _JITTER_PX))
@@ -96,7 +96,7 @@ def standstill() -> list[Row]:
             at_most=Health.STOP,
             error_m=0.8,
             ends_s=BEGIN_S + 4.0,
-            # It has gone on unseen, farther than the frozen odometer explains: RELOCATED, and slow.
+            # The car has gone farther than the frozen odometer explains: RELOCATED, and slow.
             well=Health.DEGRADED,
             drive_s=BEGIN_S + 7.0,
         ),
@@ -113,7 +113,7 @@ def standstill() -> list[Row]:
 
 
 def rates() -> list[Row]:
-    """What depends on how often things come."""
+    """Rows that depend on the rates of sensors or of restarts."""
 
     def to_and_fro() -> Happens:
         turn_ns = iter(itertools.count(BEGIN_NS + int(BEGIN_S * 1e9), 700_000_000))

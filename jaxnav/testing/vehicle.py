@@ -1,4 +1,4 @@
-"""The promises of a vehicle, one by one."""
+"""Check the promises of a vehicle one by one."""
 
 import contextlib
 import math
@@ -15,9 +15,9 @@ from jaxnav.loop.limits import Limits
 from jaxnav.loop.plugins import missing_members
 from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, started
 
-_READ_S = 0.05  # "without waiting longer than some milliseconds"
+_READ_S = 0.05  # "may wait for some milliseconds at most"
 _STOP_S = 0.5
-_PATIENCE_S = 3.0  # until the first readings must have come
+_PATIENCE_S = 3.0  # time within which the first readings must come
 _READINGS = 20
 _BUSY_S = 0.3
 
@@ -28,10 +28,10 @@ def check_vehicle(
     """Open a vehicle, read it, drive it, stop it and close it.
 
     Args:
-        throttle_of: what the vehicle's motor was last told, where something knows.
+        throttle_of: returns the last throttle of the vehicle's motor; None: not known.
 
     Raises:
-        AssertionError: a sentence that says which promise is broken.
+        AssertionError: its message says which promise is broken.
     """
     vehicle = factory(setup)
     lacking = missing_members(vehicle, Vehicle)
@@ -44,31 +44,31 @@ def check_vehicle(
         check.stops()
         check.closed()
     finally:
-        with contextlib.suppress(Exception):  # or it would hide what was found
+        with contextlib.suppress(Exception):  # an error here would hide the one found
             started(vehicle.close)("close()", HANGS_S)
         check.end()
 
 
 class _Check:
-    """One vehicle: read and written by one thread, stopped by another."""
+    """The checks of one vehicle, which one thread reads and writes, and another stops."""
 
     def __init__(self, vehicle: Any, limits: Limits, throttle_of: Callable[[Any], float] | None):
         self._vehicle, self._limits, self._throttle_of = vehicle, limits, throttle_of
         self._driver, self._watchdog = Worker(), Worker()
 
     def end(self) -> None:
-        """Let the threads end."""
+        """End the threads."""
         self._driver.close()
         self._watchdog.close()
 
     def timeout(self) -> None:
-        """It is a positive number."""
+        """Check that `timeout_s` is a positive number."""
         timeout_s = self._vehicle.timeout_s
         assert isinstance(timeout_s, int | float), f"timeout_s is no number but {timeout_s!r}"
         assert timeout_s > 0, f"timeout_s must be positive, or inf, not {timeout_s}"
 
     def readings(self) -> None:
-        """Of a vehicle at rest that is read faster than any driver measures."""
+        """Check the readings at rest, read faster than any driver measures."""
         readings: list[Odometry] = []
         slow, failure = 0, None
         begin_s = time.monotonic()
@@ -83,7 +83,7 @@ class _Check:
                 break
             time.sleep(0.005)
         assert readings, f"read() raised OSError for {_PATIENCE_S:g} s: {failure}"
-        # A machine may be busy for a moment; a driver that waits does so every time.
+        # A busy machine delays a few reads; a driver that waits delays every one.
         assert slow <= 2, f"read() took longer than {_READ_S:g} s, {slow} times"
         stamps = [reading.stamp_ns for reading in readings]
         assert stamps == sorted(stamps), "the stamps of read() go back in time"
@@ -91,7 +91,7 @@ class _Check:
         assert any(reading.valid for reading in readings), "no reading of read() was valid"
 
     def writes(self) -> None:
-        """At rest, then at the limits, in steps of a loop."""
+        """Check commands at rest, then at the limits, each followed by a read as in a loop."""
         steps = [(0, 0), (1, 0), (-1, 0), (0.5, 0.5), (0, 1), (0, -1), (0, 0)]
         try:
             for steering, throttle in steps:
@@ -102,7 +102,7 @@ class _Check:
             self._stop()
 
     def stops(self) -> None:
-        """While another thread drives, and that nothing follows."""
+        """Check `stop` while another thread drives, and that no command follows it."""
         done = threading.Event()
 
         def drive() -> None:
@@ -133,7 +133,7 @@ class _Check:
             self._stands("when it is read after stop()")
 
     def closed(self) -> None:
-        """While it drives; and all that may be called afterwards."""
+        """Check `close` while the vehicle drives, and all calls that are allowed afterwards."""
         self._write(0, 1)
         for what in ("close()", "a second close()"):
             self._watchdog.begin(self._vehicle.close)(what, HANGS_S)
@@ -149,7 +149,7 @@ class _Check:
         self._driver.call(f"read(){when}", self._vehicle.read)
 
     def _write(self, steering: float, throttle: float, when: str = "") -> None:
-        """In shares of the limits."""
+        """Write a command, given in shares of the limits."""
         command = steering * self._limits.steering_rad, throttle * self._limits.throttle
         self._driver.call(f"write{command}{when}", partial(self._vehicle.write, *command))
 

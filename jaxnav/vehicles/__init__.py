@@ -1,1 +1,1 @@
-"""Vehicles and cameras that come with jaxnav: plug-ins like anybody's, see `loop.interfaces`."""
+"""The vehicles and cameras of jaxnav: plug-ins like any other, see `loop.interfaces`."""

@@ -1,6 +1,6 @@
-"""A camera whose driver may block: a thread of its own asks it, and `read` never waits too long.
+"""Read a camera whose driver may block in a thread of its own, so that `read` keeps its timeout.
 
-Who reads slowly gets the newest picture, not the oldest.
+A slow reader gets the newest picture, not the oldest.
 """
 
 import contextlib
@@ -10,12 +10,12 @@ from collections.abc import Callable
 
 from jaxnav.loop.interfaces import Frame
 
-_PATIENCE_S = 0.5  # what `close` grants a driver that hangs, before it leaves the thread behind
+_PATIENCE_S = 0.5  # time that `close` waits for a hanging driver, before it abandons the thread
 _RETRY_S = 0.25  # after an error
 
 
 class Grabber:
-    """A `Camera`, made of two functions of a driver that only one thread may call."""
+    """A `Camera` made of two functions of a driver, which only one thread calls."""
 
     def __init__(
         self,
@@ -24,14 +24,14 @@ class Grabber:
         release: Callable[[], None],
         pause_s: float = 0.0,
     ):
-        """Start to grab.
+        """Start to grab frames.
 
         Args:
-            name: as the rig calls it.
-            grab: the next frame, whose image is the caller's to keep; None: there is no new
-                one. May block, and raise OSError.
-            release: lets go of the hardware; called once, after the last `grab`.
-            pause_s: after each None.
+            name: the camera's name in the rig.
+            grab: returns the next frame, whose image the caller may keep, or None if there is no
+                new one. May block, and raise OSError.
+            release: releases the hardware; called once, after the last `grab`.
+            pause_s: pause after each None.
         """
         self._name, self._grab, self._release, self._pause_s = name, grab, release, pause_s
         self._changed = threading.Condition()
@@ -43,11 +43,11 @@ class Grabber:
 
     @property
     def name(self) -> str:
-        """As the rig calls it."""
+        """The camera's name in the rig."""
         return self._name
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The newest frame that was not read yet; None where there is none within the time.
+        """The newest frame that was not read yet; None if none comes within the timeout.
 
         Raises:
             OSError: the driver failed, or the camera is closed.
@@ -69,7 +69,7 @@ class Grabber:
                 self._changed.wait(left_s)
 
     def close(self) -> None:
-        """Let go of the hardware; a `read` that waits returns. Any number of times."""
+        """Release the hardware; a waiting `read` returns. May be called any number of times."""
         with self._changed:
             self._closing.set()
             self._changed.notify_all()
@@ -83,7 +83,7 @@ class Grabber:
             except OSError as error:
                 failure, pause_s = error, _RETRY_S
             except Exception as error:
-                # Drivers raise what they like; a thread that died of it would say nothing.
+                # Drivers raise any exception; a thread that died of one would not report it.
                 failure, pause_s = OSError(f"{type(error).__name__}: {error}"), _RETRY_S
             with self._changed:
                 self._frame = self._frame if frame is None else frame
@@ -91,5 +91,5 @@ class Grabber:
                 self._changed.notify_all()
             if frame is None:
                 self._closing.wait(pause_s)
-        with contextlib.suppress(Exception):  # nobody is left who could do anything about it
+        with contextlib.suppress(Exception):  # nothing could be done about it
             self._release()

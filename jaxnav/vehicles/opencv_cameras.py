@@ -1,4 +1,4 @@
-"""Cameras by OpenCV's VideoCapture: USB and CSI cameras, and video files in their place.
+"""Read cameras with OpenCV's VideoCapture: USB and CSI cameras, or video files in their place.
 
 Options: `source.<camera>` for each camera of the rig, which is one of
 
@@ -6,7 +6,7 @@ Options: `source.<camera>` for each camera of the rig, which is one of
     drive.avi                              a video file, played once at its own frame rate
     nvarguscamerasrc sensor-id=0 ! ... ! appsink drop=true max-buffers=1      GStreamer
 
-and `latency_ms`, from the middle of the exposure until the picture is there.
+and `latency_ms`, from the middle of the exposure until the picture is received.
 """
 
 import re
@@ -26,7 +26,7 @@ _DEFAULT_RATE_HZ = 30.0  # of a file that does not say
 
 
 def open_cameras(setup: Setup, vehicle: Vehicle) -> list[Camera]:
-    """One for each camera of the rig.
+    """Open one source for each camera of the rig.
 
     Raises:
         BadInput: a source is missing, can't be opened, or gives images of another size.
@@ -56,13 +56,13 @@ def open_cameras(setup: Setup, vehicle: Vehicle) -> list[Camera]:
 
 
 class _Capture:
-    """A source that is opened once more when it has failed, unless it is a file."""
+    """A source of pictures, which is reopened after a failure unless it is a file."""
 
     def __init__(self, where: str, source: str, size_px: tuple[int, int], delay_ns: int):
-        """Open it, and look at a picture.
+        """Open the source and check one picture.
 
         Raises:
-            BadInput: it can't be opened, gives none, or one of another size.
+            BadInput: it can't be opened, gives no picture, or one of another size.
         """
         self._source, self._size_px, self._delay_ns = source, size_px, delay_ns
         device = _device(source)
@@ -95,10 +95,10 @@ class _Capture:
             self._open()  # from its beginning
 
     def grab(self) -> Frame:
-        """The next picture; waits for it.
+        """Wait for the next picture.
 
         Raises:
-            OSError: unplugged, at the end of its file, or of another size.
+            OSError: it is unplugged, at the end of its file, or gives a picture of another size.
         """
         if self._capture is None:
             self._open()
@@ -118,7 +118,7 @@ class _Capture:
         return Frame(now_ns - self._delay_ns, np.asarray(image))
 
     def release(self) -> None:
-        """Let go of it."""
+        """Release the source."""
         if self._capture is not None:
             self._capture.release()
         self._capture = None
@@ -136,7 +136,7 @@ class _Capture:
             width_px, height_px = self._size_px
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, width_px)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height_px)
-            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # what waits in a queue is old
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # pictures in a queue are old
         self._capture = capture
 
     def _check(self, image: np.ndarray) -> None:
@@ -149,7 +149,7 @@ class _Capture:
 
 
 def _device(source: str) -> int | None:
-    """The number of a V4L2 device; OpenCV opens them by that alone."""
+    """The number of a V4L2 device, which OpenCV needs to open it."""
     if re.fullmatch("[0-9]{1,6}", source):
         return int(source)
     if not source.startswith("/dev/"):

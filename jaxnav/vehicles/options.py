@@ -1,4 +1,4 @@
-"""What `--option KEY=VALUE` may hold, and how a person hears that it doesn't."""
+"""Parse the values of `--option KEY=VALUE`, and report wrong ones to a person."""
 
 import math
 from collections.abc import Mapping

@@ -1,12 +1,12 @@
-"""The Quanser QCar, through its maker's `pal.products.qcar`.
+"""Drive the Quanser QCar through its maker's `pal.products.qcar`.
 
-Options of the car: `read_mode`, 0 (the sensors are asked at every read) or 1 (they are taken from
+Options of the car: `read_mode`, 0 (every read samples the sensors) or 1 (every read takes them from
 the board's queue, which it fills at `frequency`, Hz: for a loop that reads as often, since
 otherwise the queue, and so the odometry, is up to two seconds old). Of the cameras: `frame_rate`,
 Hz, and `latency_ms`. The rig's cameras are called front, right, rear (or back) and left.
 
-The maker's driver prints the errors of the hardware and goes on with what it read last. So data
-that stand still are taken for what they are: the noise of a gyroscope never repeats.
+The maker's driver prints hardware errors and goes on with the values that it read last. So values
+that do not change are taken for an error: the noise of a gyroscope never repeats.
 """
 
 import math
@@ -25,9 +25,9 @@ from jaxnav.vehicles.servo import Servo
 
 THROTTLE_LIMIT = 0.3  # PWM duty, the maker's own limit
 STEERING_LIMIT_RAD = 0.6  # the maker's own limit
-_LOCK_PATIENCE_S = 0.03  # three times what a read takes at the lowest frequency
-_FROZEN_READS = 5  # without any change, and for
-_FROZEN_NS = 50_000_000  # so long, which a slow gyroscope needs for a new value
+_LOCK_PATIENCE_S = 0.03  # three times the duration of a read at the lowest frequency
+_FROZEN_READS = 5  # reads without any change, and
+_FROZEN_NS = 50_000_000  # their duration: a slow gyroscope needs it for a new value
 _FIRST_DATA_S = 2.0
 _FRAME_POLL_S = 0.002
 
@@ -35,7 +35,7 @@ _CAMERAS = {"front": "Front", "right": "Right", "rear": "Back", "back": "Back", 
 
 
 def open_vehicle(setup: Setup) -> Vehicle:
-    """The car.
+    """Open the car.
 
     Raises:
         ImportError: the maker's software is not there.
@@ -56,7 +56,7 @@ def open_vehicle(setup: Setup) -> Vehicle:
 
 
 def open_cameras(setup: Setup, vehicle: Vehicle) -> list[Camera]:
-    """The four CSI cameras, or those of them that the rig has.
+    """Open the four CSI cameras, or those of them that the rig has.
 
     Raises:
         ImportError: the maker's software is not there.
@@ -93,13 +93,13 @@ def _maker(flag: str) -> Any:
     except ImportError:
         raise
     except Exception as error:
-        # It asks for the login name and the kind of car on import, and fails where there is none.
+        # On import it reads the login name and the type of car, and fails where there is none.
         raise BadInput(flag, f"pal.products.qcar: {type(error).__name__}: {error}") from error
     return maker
 
 
 class QCarVehicle:
-    """A `Vehicle`. The steering angle is not measured: it is what the servo must have reached."""
+    """A QCar as a `Vehicle`. Its steering angle is not measured, but computed by a servo model."""
 
     timeout_s = math.inf  # the board keeps the last command
 
@@ -125,7 +125,7 @@ class QCarVehicle:
         self._changes = self._repeats = 0
 
     def gives_data(self, within_s: float) -> bool:
-        """Whether the sensors say anything new within this time."""
+        """Whether the sensors give new values within this time."""
         deadline_s = time.monotonic() + within_s
         while time.monotonic() < deadline_s:
             try:
@@ -137,7 +137,7 @@ class QCarVehicle:
         return False
 
     def read(self) -> Odometry:
-        """The latest reading; not valid where the sensors stand still.
+        """The latest reading; not valid if the sensor values do not change.
 
         Raises:
             OSError: the driver failed, or the car is closed.
@@ -149,7 +149,7 @@ class QCarVehicle:
             return Odometry(now_ns, speed_mps, self._servo.angle_at(now_ns), valid=not frozen)
 
     def write(self, steering_rad: float, throttle: float) -> None:
-        """Steer and drive, inside the limits whatever is asked for.
+        """Apply a command, clamped to the limits.
 
         Raises:
             OSError: the driver failed, or the car is closed.
@@ -166,7 +166,7 @@ class QCarVehicle:
             self._exchange(stops)
 
     def stop(self) -> None:
-        """Zero throttle, now, also while the driver hangs in another thread.
+        """Set zero throttle now, also while the driver hangs in another thread.
 
         Raises:
             OSError: the driver failed.
@@ -175,7 +175,7 @@ class QCarVehicle:
         self._throttle = 0.0
         if self._closed:
             return
-        # Better two threads in the driver than a car that drives on.
+        # Two threads in the driver are better than a car that drives on.
         free = self._driver.acquire(timeout=_LOCK_PATIENCE_S)
         try:
             # Once more, for a `write` that took the lock after it was counted first.
@@ -186,7 +186,7 @@ class QCarVehicle:
                 self._driver.release()
 
     def close(self) -> None:
-        """Stop and let go of the board. Any number of times."""
+        """Stop and release the board. May be called any number of times."""
         if self._closed:
             return
         try:
@@ -201,16 +201,16 @@ class QCarVehicle:
                     self._driver.release()
 
     def _exchange(self, stops: int) -> float:
-        """Send the command, take the sensors: the speed, m/s. Only with the lock.
+        """Send the command and read the sensors; return the speed, m/s. Needs the lock.
 
         Args:
-            stops: how many there were when the lock was taken.
+            stops: number of stops when the lock was taken.
         """
         if self._closed:
             raise OSError("the QCar is closed")
         self._ask("read_write_std", self._throttle, self._steering_rad)
         if self._stops != stops:
-            # A stop did not wait for this call, whose throttle may have reached the motor last.
+            # A stop did not wait for this call: its throttle may have reached the motor after it.
             self._throttle = 0.0
             self._ask("write", 0.0, self._steering_rad)
         sensed = [self._sensor(name) for name in ("motorTach", "motorEncoder", "gyroscope")]
@@ -234,13 +234,13 @@ class QCarVehicle:
         try:
             getattr(self._car, method)(*values)
         except Exception as error:
-            # The driver of a board that was not opened fails somewhere, with anything.
+            # The driver of a board that was not opened may raise anything.
             raise OSError(f"the QCar's driver: {type(error).__name__}: {error}") from error
 
 
 def _csi_camera(name: str, camera: Any, delay_ns: int) -> Grabber:
-    """A camera of the maker's, which says by nothing but its picture that it has a new one."""
-    last = np.zeros_like(camera.imageData)  # what its buffer holds at first
+    """A camera of the maker's; only a changed picture shows that there is a new one."""
+    last = np.zeros_like(camera.imageData)  # the initial content of its buffer
 
     def grab() -> Frame | None:
         fresh = camera.read()

@@ -1,7 +1,7 @@
-"""Images of the simulated car's cameras, rendered by a process of their own.
+"""Render the images of the simulated car's cameras in a process of their own.
 
-Rendering takes more of a core than a car's computer has to spare, and holds the interpreter while
-it does: beside the loop that would be a fault that no real camera brings.
+Rendering takes more of a core than a car's computer has to spare, and holds the interpreter
+meanwhile: in the loop's process that would be a fault that no real camera causes.
 """
 
 import multiprocessing
@@ -13,20 +13,20 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
 EXPOSURE_S = 0.005
-_SPREAD_S = 0.02  # before and after a stamp: what the track covers
+_SPREAD_S = 0.02  # the track covers this time before and after a stamp
 _POSES = 9
 
 
 def track_times_s() -> np.ndarray:
-    """Instants around a stamp at which the poses of a track are asked for, s."""
+    """The instants of a track's poses relative to the stamp, s."""
     return np.linspace(-_SPREAD_S, _SPREAD_S, _POSES)
 
 
 class RenderingProcess:
-    """Renders one set of images after the other. For one thread."""
+    """A process that renders one set of images after the other. For one thread."""
 
     def __init__(self, rig: CameraRig, markers: MarkerMap, seed: int):
-        """Started when this returns; the first images cost what they cost."""
+        """Start the process and wait until it has rendered a first set of images."""
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(
@@ -37,7 +37,7 @@ class RenderingProcess:
         self.render(np.tile([0.0, 0.0, 0.0], (_POSES, 1)))
 
     def render(self, poses: np.ndarray) -> list[np.ndarray]:
-        """What every camera sees.
+        """Render the image of every camera.
 
         Args:
             poses: (x_m, y_m, psi_rad) at `track_times_s`, (9, 3).
@@ -53,7 +53,7 @@ class RenderingProcess:
         return images
 
     def close(self) -> None:
-        """End the process. Any number of times."""
+        """End the process. May be called any number of times."""
         self._connection.close()
         self._process.terminate()
         self._process.join(2.0)

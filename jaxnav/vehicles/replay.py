@@ -1,12 +1,12 @@
-"""A recorded drive as a vehicle, in real time: nothing moves, all comes once more as it came.
+"""Replay a recorded drive as a vehicle in real time: nothing moves, all data come as they came.
 
 jaxnav run --vehicle replay --option drive=drive.mcap       # detections as recorded
     --option images=true                                    # the recorded images
 
-What was handed over at an instant of the recording is handed over so long after the first look at
-it, as old as it was then; its stamps are moved into the present. Readings and frames that were
-invalid are so again, and a reading that failed fails. The whole drive is held in memory, with its
-JPEGs where they are asked for.
+The clock of the recording starts when it is first read; data arrive at their recorded times, with
+their recorded ages, and their stamps are shifted into the present. Readings and frames that were
+invalid are invalid again, and a read that failed fails. The whole drive is held in memory, with
+its JPEGs if `images` is true.
 """
 
 import contextlib
@@ -30,16 +30,16 @@ from jaxnav.recording.drive_replay import check_inputs
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.vehicles.options import choice
 
-_WAITS_NS = 50_000_000  # so long a reading waits its turn when several came between two looks
-_LINGERS_NS = 50_000_000  # after the last input, until whoever looks for markers is done with it
+_WAITS_NS = 50_000_000  # longest wait of a reading when several came between two looks
+_LINGERS_NS = 50_000_000  # time after the last input for the search of its markers
 
 
 class Clock:
-    """What time it is in a recording, which begins when it is first asked. For several threads."""
+    """The clock of a recording, which starts when it is first read. Thread-safe."""
 
     def __init__(self, begin_ns: int):
         """Args:
-        begin_ns: of the recording, on its own clock.
+        begin_ns: begin of the recording, on its own clock.
         """
         self._begin_ns = begin_ns
         self._shift_ns: int | None = None
@@ -47,16 +47,16 @@ class Clock:
 
     @property
     def is_running(self) -> bool:
-        """Whether it was asked."""
+        """Whether the clock has started."""
         return self._shift_ns is not None
 
     def recorded_ns(self) -> int:
-        """Now, on the recording's clock."""
+        """The present time on the recording's clock."""
         shift_ns = self._shift()
         return time.monotonic_ns() - shift_ns
 
     def present_ns(self, stamp_ns: int) -> int:
-        """A stamp of the recording on the clock of today; one that never was one stays wrong."""
+        """A recorded stamp on the present clock; a stamp that is not positive stays as it is."""
         return stamp_ns + self._shift() if stamp_ns > 0 else stamp_ns
 
     def _shift(self) -> int:
@@ -67,30 +67,30 @@ class Clock:
 
 
 class ReplayVehicle:
-    """The car of a recording: it is read as it was read then, and whatever it is told is counted.
+    """The car of a recording: reads give the recorded readings, commands are only counted.
 
     Attributes:
         recorded: the recording.
-        camera_names: of its cameras, in the order of its rig.
-        clock: of all that is read from it.
-        writes: how many commands it was told.
-        throttle: the last one's; 0 once it was stopped.
+        camera_names: names of its cameras, in the order of its rig.
+        clock: the clock of the vehicle and its cameras.
+        writes: number of commands written.
+        throttle: throttle of the last command; 0 after a stop.
     """
 
-    shares_process = True  # its cameras have its clock
+    shares_process = True  # its cameras share its clock
 
     def __init__(self, setup: Setup):
         """Options: drive, the recording; images (false).
 
         Raises:
-            BadInput: the recording is missing, none, empty or damaged, or an option is wrong.
+            BadInput: the file is missing, no recording, empty or damaged, or an option is wrong.
         """
         self.recorded, own = _recorded(setup.options)
         self.camera_names = own.rig.names
         self.clock = Clock(self.recorded.inputs[0].now_ns)
         self.writes, self.throttle = 0, 0.0
         self._end_ns = self.recorded.inputs[-1].now_ns + _LINGERS_NS
-        # When each look at the vehicle was, and what it gave; None: it failed.
+        # The time of each read of the vehicle, and its reading; None: the read failed.
         self._readings = [
             (given.now_ns, given.odometry)
             for given in self.recorded.inputs
@@ -102,27 +102,27 @@ class ReplayVehicle:
 
     @staticmethod
     def own_files(options: Mapping[str, str]) -> OwnFiles:
-        """See `HasOwnFiles`: those that the drive was recorded with."""
+        """See `HasOwnFiles`: the files with which the drive was recorded."""
         _, own = _recorded(options)
         return OwnFiles(own.rig, own.markers, own.vehicle, own.route)
 
     @property
     def timeout_s(self) -> float:
-        """See `Vehicle`. It stands, whatever it is told; any time is true."""
+        """See `Vehicle`. The car stands whatever the command, so any time is true."""
         return 0.2
 
     @property
     def over(self) -> str | None:
-        """See `Ending`. Whoever asks does not look: the recording does not begin by it."""
+        """See `Ending`. Asking for it does not start the recording."""
         is_over = self.clock.is_running and self.clock.recorded_ns() > self._end_ns
         return "the recording is over" if is_over else None
 
     def read(self) -> Odometry:
-        """See `Vehicle`. Those that came since the last look come one by one, if not too late; at
-        the end the last one comes again and again.
+        """See `Vehicle`. Readings since the last call come one by one, if not too late; at the end
+        the last one repeats.
 
         Raises:
-            OSError: it could not be read then, or not yet; it is closed.
+            OSError: the recorded read failed, there is no reading yet, or the vehicle is closed.
         """
         now_ns = self.clock.recorded_ns()
         while self._next < len(self._readings) and self._readings[self._next][0] <= now_ns:
@@ -141,7 +141,7 @@ class ReplayVehicle:
         )
 
     def write(self, steering_rad: float, throttle: float) -> None:
-        """See `Vehicle`. It goes nowhere."""
+        """See `Vehicle`. The command moves nothing."""
         if self._closed:
             raise OSError("the vehicle is closed")
         self.writes, self.throttle = self.writes + 1, throttle
@@ -167,8 +167,8 @@ class ReplayCamera:
         jpegs: Mapping[int, bytes],
     ):
         """Args:
-        frames: when they were handled, ns of the recording, in that order.
-        jpegs: stamp of the recording in ns -> what is to be shown in place of detections.
+        frames: (time of handling in ns of the recording, frame), in the order of time.
+        jpegs: recorded stamp in ns -> the image to show in place of detections.
         """
         self._name, self._clock = name, clock
         self._frames, self._jpegs = frames, jpegs
@@ -200,9 +200,9 @@ class ReplayCamera:
 
 
 def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
-    """The recording's cameras, by their names in the rig.
+    """Open the recording's cameras, by their names in the rig.
 
-    Options: images (false): show the recorded images, in which markers are then looked for.
+    Options: images (false): show the recorded images, which are then searched for markers.
 
     Raises:
         BadInput: another vehicle; a camera that was not recorded; images that are missing, can't be
@@ -228,7 +228,7 @@ def _shows_images(options: Mapping[str, str]) -> bool:
 
 
 def _recorded(options: Mapping[str, str]) -> tuple[DriveLog, DriveSetup]:
-    """The recording, and with what it was driven; in the precision of this process."""
+    """The recording and its setup, in the precision of this process."""
     if not options.get("drive"):
         raise BadInput("--option drive", "missing: the recorded drive (.mcap)")
     path, written_ns = Path(options["drive"]), 0
@@ -248,12 +248,12 @@ def _recorded(options: Mapping[str, str]) -> tuple[DriveLog, DriveSetup]:
 
 @lru_cache(maxsize=1)
 def _read(path: Path, written_ns: int) -> DriveLog:
-    """Once for its files and once for its drive."""
+    """Read a drive, or take it from the cache: it is needed for its files and for its data."""
     return read_drive(path)
 
 
 def _jpegs(log: DriveLog, rig: CameraRig) -> dict[str, dict[int, bytes]]:
-    """For each camera of a rig, its images by their stamps."""
+    """The JPEGs of each camera of a rig, by their stamps."""
     found: dict[str, dict[int, bytes]] = {name: {} for name in rig.names}
     for image in log.images():
         name = image.topic.removeprefix("/camera/")

@@ -1,10 +1,10 @@
-"""ROS 2: a vehicle behind topics, and a publisher of what the pilot believes and commands.
+"""Connect to ROS 2: a vehicle behind topics, and a publisher of the pilot's pose and command.
 
 Options of the vehicle: `odometry_topic` (/odom) and its `odometry_type` (odometry:
 nav_msgs/Odometry, or ackermann: ackermann_msgs/AckermannDriveStamped), `command_topic` (/drive,
 AckermannDriveStamped: the speed is throttle * speed_per_throttle_mps).
 
-ROS itself is not needed to install jaxnav; it is imported when something here is opened.
+ROS is not needed to install jaxnav; it is imported when something here is opened.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
     from jaxnav.loop.pilot import Outcome
     from jaxnav.models.bicycle import Vehicle as VehicleModel
 
-_LOCK_PATIENCE_S = 0.03  # for a message that another thread publishes; then past it
+_LOCK_PATIENCE_S = 0.03  # a `stop` waits this long for a message that another thread publishes
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y, rotation about z among the six of a ROS covariance
 
 
 def open_vehicle(setup: Setup) -> Vehicle:
-    """The vehicle behind the topics.
+    """Open the vehicle behind the topics.
 
     Raises:
         ImportError: ROS 2 or one of its message packages is not there.
@@ -48,14 +48,14 @@ def open_vehicle(setup: Setup) -> Vehicle:
 
 
 class RosVehicle:
-    """A `Vehicle`. It is as good as its last message: an old one keeps its old stamp."""
+    """A vehicle behind ROS topics. A read gives the last message, with that message's stamp."""
 
-    timeout_s = math.inf  # what listens to the topic may stop by itself, but does not say so
+    timeout_s = math.inf  # a subscriber may stop by itself, but does not say so
 
     def __init__(
         self, vehicle: VehicleModel, odometry_topic: str, odometry_type: str, command_topic: str
     ):
-        """Listen.
+        """Subscribe to the odometry.
 
         Args:
             odometry_type: odometry or ackermann.
@@ -71,7 +71,7 @@ class RosVehicle:
         self._steering_rad = 0.0
         self._written_ns: int | None = None
         self._closed = False
-        self._writing = threading.Lock()  # so that nothing follows the zero of a `stop`
+        self._writing = threading.Lock()  # so that no command follows the zero speed of a `stop`
         self._stops = 0
         self._node = Node("jaxnav_vehicle")
         self._publisher = self._node.publisher(AckermannDriveStamped, command_topic)
@@ -93,7 +93,7 @@ class RosVehicle:
         return self._reading
 
     def write(self, steering_rad: float, throttle: float) -> None:
-        """Publish a command, inside the limits whatever is asked for.
+        """Publish a command, clamped to the limits.
 
         Raises:
             OSError: it could not be published, or the vehicle is closed.
@@ -111,7 +111,7 @@ class RosVehicle:
             try:
                 self._command(throttle, now_ns)
             finally:
-                if self._stops != stops:  # it did not wait for this one, which hung
+                if self._stops != stops:  # a stop did not wait for this command, which hung
                     self._command(0.0, time.monotonic_ns())
 
     def stop(self) -> None:
@@ -130,7 +130,7 @@ class RosVehicle:
                 self._writing.release()
 
     def close(self) -> None:
-        """Stop and leave ROS. Any number of times."""
+        """Stop and leave ROS. May be called any number of times."""
         if self._closed:
             return
         try:
@@ -157,7 +157,7 @@ class RosVehicle:
 
 
 class RosPublisher:
-    """Publishes every outcome of a pilot: the pose with its covariance, and the command."""
+    """A publisher of every outcome of a pilot: the pose with its covariance, and the command."""
 
     def __init__(
         self,
@@ -168,8 +168,8 @@ class RosPublisher:
         vehicle_frame: str = "base_link",
     ):
         """Args:
-        world_frame: of the poses.
-        vehicle_frame: midway between the axles, x forward.
+        world_frame: name of the poses' frame.
+        vehicle_frame: name of the frame midway between the axles, x forward.
 
         Raises:
             ImportError: ROS 2 or one of its message packages is not there.
@@ -185,7 +185,7 @@ class RosPublisher:
         self._command = self._node.publisher(AckermannDriveStamped, command_topic)
 
     def publish(self, outcome: Outcome) -> None:
-        """The command, and the pose where it is known.
+        """Publish the command, and the pose where it is known.
 
         Raises:
             OSError: it could not be published.
@@ -201,7 +201,7 @@ class RosPublisher:
             self._publish_odometry(pose, velocity, covariance, outcome.now_ns)
 
     def close(self) -> None:
-        """Leave ROS. Any number of times."""
+        """Leave ROS. May be called any number of times."""
         self._node.close()
 
     def _publish_odometry(
@@ -209,7 +209,7 @@ class RosPublisher:
     ) -> None:
         """Args:
         pose: x_m, y_m, psi_rad in the world.
-        velocity: its derivative.
+        velocity: derivative of the pose.
         covariance: (6, 6) of both.
         """
         message = self._odometry_type()

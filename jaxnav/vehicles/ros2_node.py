@@ -1,4 +1,4 @@
-"""A node of ROS 2 with a context of its own: the signals of the process stay with the loop."""
+"""Run a ROS 2 node in a context of its own, so that the process's signals stay with the loop."""
 
 import threading
 import time
@@ -11,7 +11,7 @@ _OLDEST_NS = 1_000_000_000  # a message that claims to be older was stamped by a
 
 
 class Node:
-    """Topics, and time on the monotonic clock. `close` it."""
+    """A node with topics, and with times on the monotonic clock. It must be closed."""
 
     def __init__(self, name: str):
         """Enter ROS.
@@ -34,11 +34,11 @@ class Node:
         self._thread: threading.Thread | None = None
 
     def publisher(self, message_type: type, topic: str) -> Any:
-        """Something that `publish` takes."""
+        """A publisher on a topic, for `publish`."""
         return self._node.create_publisher(message_type, topic, _QUEUE)
 
     def listen(self, message_type: type, topic: str, take: Callable[[Any], None]) -> None:
-        """Hand every message to a function, in a thread of the node."""
+        """Pass every message of a topic to a function, in a thread of the node."""
         from rclpy.qos import qos_profile_sensor_data  # reliable publishers suit it too
 
         self._node.create_subscription(message_type, topic, take, qos_profile_sensor_data)
@@ -54,7 +54,7 @@ class Node:
         try:
             publisher.publish(message)
         except Exception as error:
-            # rclpy has exceptions of its own for a context that is gone.
+            # rclpy raises exceptions of its own for a context that is gone.
             raise OSError(f"ROS: {type(error).__name__}: {error}") from error
 
     def publish_drive(
@@ -72,17 +72,17 @@ class Node:
         self.publish(publisher, message)
 
     def stamp(self, monotonic_ns: int) -> Any:
-        """The stamp of an instant of the monotonic clock, on the clock of ROS."""
+        """Convert a time of the monotonic clock to a ROS stamp."""
         age_ns = time.monotonic_ns() - monotonic_ns
         return self._Time(nanoseconds=max(self._now_ns() - age_ns, 0)).to_msg()
 
     def monotonic_ns(self, stamp: Any) -> int:
-        """When a message was stamped. One without a stamp, or of another clock: now."""
+        """Convert a ROS stamp to the monotonic clock; a missing or foreign one gives now."""
         age_ns = self._now_ns() - (int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec))
         return time.monotonic_ns() - (age_ns if 0 <= age_ns <= _OLDEST_NS else 0)
 
     def close(self) -> None:
-        """Leave ROS. Any number of times."""
+        """Leave ROS. May be called any number of times."""
         if self._closing.is_set():
             return
         self._closing.set()

@@ -1,6 +1,6 @@
-"""The simulated car in real time: a vehicle and cameras like any other's.
+"""Run the simulated car in real time: a vehicle and cameras like any other.
 
-jaxnav run --vehicle sim                           # cameras that find their markers themselves
+jaxnav run --vehicle sim                           # cameras that detect markers themselves
 jaxnav run --vehicle sim --option images=true      # rendered images
 """
 
@@ -17,17 +17,17 @@ from jaxnav.vehicles.options import choice, number
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
 from jaxnav.vehicles.world import World, WorldSettings
 
-_LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are there
+_LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are known
 
 
 class SimVehicle:
-    """The car of a `World`, which stops by itself when it hears nothing.
+    """The car of a `World`, which stops by itself without commands.
 
-    Its odometer, its servo and its stamps are off as the vehicle's description says.
+    Its odometer, servo and stamps have the errors in the vehicle's description.
     """
 
     def __init__(self, world: World):
-        """For the cameras the world is there to look at."""
+        """Take the world, which the cameras look at too."""
         self.world = world
         self._corrections = Corrections.of(world.vehicle)
         self._closed = False
@@ -63,7 +63,7 @@ class SimVehicle:
 
 
 class _Shutter:
-    """When the cameras look, all at once, and what they see: made by a thread, once for all."""
+    """A thread that makes the frames of all cameras, all exposed at once."""
 
     def __init__(self, world: World, rate_hz: float, renderer: RenderingProcess | None):
         self._world, self._renderer = world, renderer
@@ -77,7 +77,7 @@ class _Shutter:
         self._thread.start()
 
     def frame(self, camera: int, after_ns: int, timeout_s: float) -> Frame | None:
-        """What a camera saw last, if that is newer; else what it sees next."""
+        """The last frame of a camera if it is newer than `after_ns`, else the next one."""
         with self._news:
             self._news.wait_for(lambda: self._closed or self._is_newer(after_ns), timeout_s)
             if self._error is not None:
@@ -85,7 +85,7 @@ class _Shutter:
             return self._frames[camera] if self._is_newer(after_ns) else None
 
     def close(self) -> None:
-        """Look no more."""
+        """End the thread and the renderer."""
         with self._news:
             self._closed = True
             self._news.notify_all()
@@ -144,12 +144,12 @@ class SimCamera:
         return frame
 
     def close(self) -> None:
-        """See `Camera`. The others close with it: they look together."""
+        """See `Camera`. All cameras close together: they share one shutter."""
         self._shutter.close()
 
 
 def open_vehicle(setup: Setup) -> SimVehicle:
-    """The simulated car, at the start of its route.
+    """Open the simulated car at the start of its route.
 
     Options: corner_sigma_px (0.3).
     """
@@ -160,7 +160,7 @@ def open_vehicle(setup: Setup) -> SimVehicle:
     world = World(
         setup.rig, setup.markers, setup.vehicle, setup.start_pose, now_ns, settings, setup.seed
     )
-    world.state(now_ns + 1)  # compiled now, and not while somebody waits
+    world.state(now_ns + 1)  # compiled now, and not while the loop waits
     world.detections(now_ns + 1)
     return SimVehicle(world)
 
@@ -169,7 +169,7 @@ setattr(open_vehicle, "shares_process", True)  # noqa: B010  (mypy: a function h
 
 
 def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
-    """The cameras that look at the world of the simulated car.
+    """Open the cameras of the simulated car.
 
     Options: rate_hz (30), images (false).
     """

@@ -1,4 +1,4 @@
-"""A simulated car in its world, asked at any instant: of real time, or of a test's."""
+"""Simulate a car in its world at any instant of real time or of a test's time."""
 
 import threading
 from collections import deque
@@ -25,7 +25,7 @@ _KEPT = 400  # substeps: two seconds into the past
 
 @kept
 def _moved(vehicle: VehicleModel, row: jax.Array, command: jax.Array, dt_s: jax.Array) -> jax.Array:
-    """`move`, of plain arrays: (x_m, y_m, psi_rad, speed_mps, steering_rad)."""
+    """`move` on plain arrays: (x_m, y_m, psi_rad, speed_mps, steering_rad)."""
     car = CarState(row[:3], row[3], row[4])
     car = move(vehicle, car, Command(command[0], command[1]), dt_s)
     return jnp.concatenate([car.pose, jnp.stack([car.speed_mps, car.steering_rad])])
@@ -38,7 +38,7 @@ def _seen(rig: CameraRig, markers: MarkerMap, pose: jax.Array) -> tuple[jax.Arra
 
 @dataclass(frozen=True)
 class WorldSettings:
-    """What the simulated sensors are like."""
+    """The noise, delay and timeout of the simulated car."""
 
     corner_sigma_px: float = 0.3
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
@@ -47,7 +47,7 @@ class WorldSettings:
 
 
 class World:
-    """The car and where it has been. For several threads."""
+    """The simulated car and its track of the last two seconds. Thread-safe."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class World:
         settings: WorldSettings | None = None,
         seed: int = 0,
     ):
-        """At rest at its start."""
+        """Place the car at rest at its start."""
         self.rig, self.markers, self.vehicle = rig, markers, vehicle
         self.settings = settings or WorldSettings()
         self.rng = np.random.default_rng(seed)
@@ -68,13 +68,13 @@ class World:
         self._row = np.array([*start_pose, 0.0, 0.0], self._dtype)
         self._time_ns = begin_ns
         self._track: deque[tuple[int, np.ndarray]] = deque([(begin_ns, self._row)], maxlen=_KEPT)
-        # What was commanded, and when it acts: the last one that is due is obeyed.
+        # Commands and the times at which they act: the last one that is due is obeyed.
         self._commands: deque[tuple[int, float, float]] = deque([(begin_ns, 0.0, 0.0)])
         self._written_ns = begin_ns
         self._held = False
 
     def write(self, steering_rad: float, throttle: float, now_ns: int) -> None:
-        """A command that acts soon."""
+        """Take a command, which acts after the actuation delay."""
         with self._lock:
             self._advance(now_ns)
             due_ns = now_ns + int(self.settings.actuation_delay_s * 1e9)
@@ -82,12 +82,12 @@ class World:
             self._written_ns = now_ns
 
     def carry_off(self, by: tuple[float, float, float]) -> None:
-        """Somebody takes the car elsewhere: m, m, rad in the world."""
+        """Move the car by (m, m, rad) in the world, as a person would."""
         with self._lock:
             self._row = self._row + np.array([*by, 0.0, 0.0], self._dtype)
 
     def hold(self, held: bool) -> None:
-        """Somebody holds the car fast, wheels and all, or lets it go."""
+        """Hold the car fast, wheels included, or let it go."""
         with self._lock:
             self._held = held
 
@@ -103,7 +103,7 @@ class World:
             self.markers = eqx.tree_at(lambda m: m.Ts_world_marker.wxyz_xyz, self.markers, moved)
 
     def state(self, at_ns: int) -> np.ndarray:
-        """(x_m, y_m, psi_rad, speed_mps, steering_rad) at an instant, of the last two seconds."""
+        """(x_m, y_m, psi_rad, speed_mps, steering_rad) at an instant of the last two seconds."""
         with self._lock:
             self._advance(at_ns)
             newer = self._track[-1]
@@ -117,12 +117,12 @@ class World:
         return np.asarray(older[1] + share * (newer[1] - older[1]))
 
     def pose(self, at_ns: int) -> np.ndarray:
-        """T_world_vehicle (7,), wxyz_xyz, at an instant."""
+        """T_world_vehicle at an instant, (7,) wxyz_xyz."""
         x_m, y_m, psi_rad = self.state(at_ns)[:3]
         return np.array([np.cos(psi_rad / 2), 0, 0, np.sin(psi_rad / 2), x_m, y_m, 0])
 
     def odometry(self, at_ns: int) -> tuple[float, float]:
-        """(speed_mps, steering_rad) as the sensors report them."""
+        """The noisy (speed_mps, steering_rad) of the sensors."""
         noise, state = self.settings.odometry, self.state(at_ns)
         with self._lock:
             errors = self.rng.standard_normal(2)
@@ -132,7 +132,7 @@ class World:
         )
 
     def detections(self, at_ns: int) -> list[Detections]:
-        """What each camera sees of the markers, corners with noise."""
+        """The detections of each camera, with noise on the corners."""
         pose = self.state(at_ns)[:3]
         corners_px, visible = jax.device_get(_seen(self.rig, self.markers, pose))
         sigma_px = self.settings.corner_sigma_px
@@ -159,7 +159,7 @@ class World:
             command = np.array([steering_rad, throttle], self._dtype)
             dt_s = np.asarray(step_ns / 1e9, self._dtype)
             moved = np.asarray(_moved(self.vehicle, self._row, command, dt_s))
-            # Held, it stands where it stands; its wheels are steered nevertheless.
+            # A held car keeps its pose; its wheels are steered nevertheless.
             self._row = (
                 np.array([*self._row[:3], 0, moved[4]], self._dtype) if self._held else moved
             )
