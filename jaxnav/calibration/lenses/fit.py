@@ -121,7 +121,7 @@ def fit_lens(
         used, view_weights = problem.judged(residual_px, sigma_px)
         if np.array_equal(used, before[0]) and np.allclose(view_weights, before[1], rtol=0.05):
             break
-    used, view_weights = before  # what the fit was made with
+    used, view_weights = before  # those of the last fit
     return LensFit(
         lens=lens,
         views=views,

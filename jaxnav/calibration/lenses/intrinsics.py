@@ -71,7 +71,7 @@ class LensCalibration:
 
     @property
     def camera(self) -> Camera:
-        """The lens, in the process's precision."""
+        """The calibrated camera, in the process's precision."""
         return lens_bundle.camera_of(self.fit.lens, jnp.asarray(self.fit.parameters, float))
 
 

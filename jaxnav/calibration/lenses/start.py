@@ -77,7 +77,7 @@ def _pose(points_board_m: np.ndarray, rays_camera: np.ndarray) -> np.ndarray:
     near = np.linalg.norm(image, axis=1) < _WIDEST
     if near.sum() < _FEWEST:
         return nowhere
-    centre_m = points_board_m[near].mean(axis=0)  # IPPE asks for no offset, but is better for none
+    centre_m = points_board_m[near].mean(axis=0)  # IPPE needs no centring, but is better for it
     try:
         _, rotations, translations, _ = cv2.solvePnPGeneric(
             points_board_m[near] - centre_m, image[near], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE

@@ -30,7 +30,7 @@ FAR = float(stats.chi2.ppf(0.999, 8))
 # The search ends when a step promises less than this of the cost, which is 1 a coordinate: every
 # unknown is within a few hundredths of its sigma then.
 _SETTLED = 1e-3
-# The scale is taken from this quantile, so a fourth of all sightings may be anything.
+# The scale is taken from this quantile, so a fourth of all sightings may be wrong.
 _QUANTILE = 0.75
 
 
