@@ -66,7 +66,7 @@ class OdometryCalibration:
     """The calibrated parameters of the odometry, with their uncertainty and the fitted course.
 
     Attributes:
-        before: name -> value at the start, see `odometry_model.NAMES`.
+        before: name -> value at the start, see `model.NAMES`.
         value: name -> value; fixed parameters are as before.
         sigma: name -> standard deviation, of the parameters found.
         fixed: name -> why it was not fitted.
@@ -117,7 +117,7 @@ def calibrate_odometry(
 
     Args:
         drives: the drives of one car.
-        before: name -> present value; see `odometry_model.NAMES`.
+        before: name -> present value; see `model.NAMES`.
         fixed: names of parameters that are not fitted.
         wheelbase_sigma_m: sigma of the present wheelbase, if it was measured, say by tape.
         progress: called at every evaluation.

@@ -38,7 +38,7 @@ class Fit:
 
     Attributes:
         nodes: (N + 1, 5), x_m, y_m, psi_rad, and the errors of readings in standard deviations.
-        theta: (5,), see `odometry_model.NAMES`.
+        theta: (5,), see `model.NAMES`.
         information: (p, p), of the free parameters, with all nodes eliminated.
         blocks: the normal equations at this point.
         converged: true if no step lowers the cost any more.
