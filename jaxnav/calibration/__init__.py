@@ -1,1 +1,1 @@
-"""Boards, lenses, extrinsics, markers and odometry of one's own car, each with its uncertainty."""
+"""Calibration of a car's lenses, camera poses, markers and odometry, each with its uncertainty."""

@@ -1,11 +1,11 @@
-"""Images in, marker corners out.
+"""Detection of markers in images: their ids and their corners.
 
     detector = make_detector("aruco", family="tag36h11")
     detections = detector.detect(image, camera)
     corners_px, visible, sigma_px, ignored = observe([detections, ...], markers)
 
-A decoder (OpenCV's, or AprilTag's own) says which marker is where, to a pixel; the corners
-come from `refine`, the same for both.
+A decoder (OpenCV's, or AprilTag's own) finds each marker's id and its place to a pixel; `refine`
+then fits the corners, in the same way for both.
 """
 
 from jaxnav.detection.apriltag import AprilTagDetector
@@ -32,14 +32,14 @@ BACKENDS = {"aruco": ArucoDetector, "apriltag": AprilTagDetector}
 
 
 def make_detector(backend: str = "aruco", family: str = "tag36h11") -> Detector:
-    """A detector of one family of markers.
+    """Make a detector of one family of markers.
 
     Args:
         backend: "aruco" (OpenCV) or "apriltag" (needs the extra of that name).
         family: one of `jaxnav.models.markers.FAMILY_SIZES`.
 
     Raises:
-        BadInput: unknown backend or family, a family the backend lacks, or a missing extra.
+        BadInput: backend or family is unknown, or the backend lacks the family or its extra.
     """
     if backend not in BACKENDS:
         raise BadInput("detector", f"unknown {backend!r}: expected one of {', '.join(BACKENDS)}")
@@ -47,5 +47,5 @@ def make_detector(backend: str = "aruco", family: str = "tag36h11") -> Detector:
 
 
 def make_detectors(markers: MarkerMap, backend: str = "aruco") -> list[Detector]:
-    """A detector for each family of a map: see `make_detector`."""
+    """Make a detector for each family of a map: see `make_detector`."""
     return [make_detector(backend, family) for family in sorted(set(markers.families))]

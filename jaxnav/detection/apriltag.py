@@ -1,4 +1,4 @@
-"""AprilTag's own detector through pyapriltags, with our corners."""
+"""AprilTag's own detector through pyapriltags, with corners fitted by `refine`."""
 
 import importlib
 
@@ -16,11 +16,11 @@ from jaxnav.models.conventions import (
 )
 
 _TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER_ON_OPENCV]
-_MIN_DECISION_MARGIN = 10.0  # grey levels; what noise decodes to stays below
+_MIN_DECISION_MARGIN = 10.0  # grey levels; tags decoded from noise stay below
 
 
 class AprilTagDetector:
-    """Markers of one AprilTag family. Slower than OpenCV, and sees smaller ones at once."""
+    """Detects markers of one AprilTag family. Slower than OpenCV, but finds small ones at once."""
 
     def __init__(self, family: str = "tag36h11"):
         """See `make_detector`."""
@@ -43,7 +43,7 @@ class AprilTagDetector:
         camera: Camera | None = None,
         predicted_corners_px: np.ndarray | None = None,
     ) -> Detections:
-        """All markers of the family in the image: see `Detector.detect`.
+        """Detect all markers of the family in the image: see `Detector.detect`.
 
         Predictions are not needed and not used.
         """

@@ -1,4 +1,4 @@
-"""OpenCV's aruco decoder, with a closer look at what it saw and could not read."""
+"""OpenCV's aruco decoder, with a closer look at quadrilaterals that it can't read."""
 
 import cv2
 import numpy as np
@@ -11,23 +11,23 @@ from jaxnav.detection.refine import mean_side_px
 from jaxnav.detection.types import Detections, grey, refined_detections
 from jaxnav.models.camera import Camera
 
-# The closer look: quadrilaterals of these sides.
+# Quadrilaterals with sides in this range get a closer look.
 _CLOSER_LOOK_PX = (8.0, 150.0)
-_LOOKS_IN_A_CROWD = 3  # closer ones, of 10 ms
+_LOOKS_IN_A_CROWD = 3  # closer looks, 10 ms each
 _ENLARGE_UP_TO_PX = 40.0
 _ENLARGE = 3
-_PERIMETER_RATE = 0.03  # OpenCV's, of the longer side of the image
-_SMALLEST = 0.6  # part of the predicted perimeter
-_SAME_PLACE_PX = 0.5  # quadrilaterals whose centres are nearer to each other are one
+_PERIMETER_RATE = 0.03  # OpenCV's least perimeter, over the longer side of the image
+_SMALLEST = 0.6  # least perimeter, over the predicted one
+_SAME_PLACE_PX = 0.5  # quadrilaterals whose centres are nearer to each other count as one
 # A prediction may be off by this part of its side, and by some pixels.
 _SEARCH_SIDES, _SEARCH_PX = 0.5, 8
 
 
 class ArucoDetector:
-    """Markers of one family by OpenCV's decoder, their corners by our fit.
+    """Detects markers of one family by OpenCV's decoder and fits their corners by `refine`.
 
-    The decoder's own corner refinement is off. Quadrilaterals that it finds but cannot
-    read, and those around the predictions in a threefold enlargement, are read by `read`.
+    The decoder's own corner refinement is off. `read` reads the quadrilaterals that the decoder
+    finds but can't read, also those in a threefold enlargement around the predictions.
     """
 
     def __init__(self, family: str = "tag36h11", closer_looks: int = 12):
@@ -35,7 +35,7 @@ class ArucoDetector:
 
         Args:
             family: one of `jaxnav.models.markers.FAMILY_SIZES`.
-            closer_looks: at how many quadrilaterals of an image to look again, some ms each.
+            closer_looks: most quadrilaterals of an image to look at again, some ms each.
         """
         self.family = family
         self._closer_looks = closer_looks
@@ -48,7 +48,7 @@ class ArucoDetector:
         camera: Camera | None = None,
         predicted_corners_px: np.ndarray | None = None,
     ) -> Detections:
-        """All markers of the family in the image: see `Detector.detect`."""
+        """Detect all markers of the family in the image: see `Detector.detect`."""
         image = grey(image)
         lens = Lens(camera)
         found, unread = self._decode(image)
@@ -77,7 +77,7 @@ class ArucoDetector:
         quads_px: np.ndarray,
         radius_px: np.ndarray,
     ) -> Detections:
-        """Markers where they should be: see `RegionDetector`."""
+        """Detect markers near their expected places: see `RegionDetector`."""
         image = grey(image)
         found: list[tuple[int, np.ndarray]] = []
         unread: list[np.ndarray] = []
@@ -97,11 +97,11 @@ class ArucoDetector:
         return refined_detections(image, found, self.family, camera)
 
     def _decoder(self, perimeter_rate: float) -> cv2.aruco.ArucoDetector:
-        """For quadrilaterals whose perimeter is at least that part of the image's longer side."""
+        """The decoder whose least perimeter is this part of the image's longer side."""
         if perimeter_rate not in self._decoders:
             parameters = cv2.aruco.DetectorParameters()
             parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-            # By default the outline of the white paper swallows the marker: 3 of 10 frames lost.
+            # With the default, the paper's outline swallows the marker: 3 of 10 frames are lost.
             parameters.minMarkerDistanceRate = 0.02
             parameters.minMarkerPerimeterRate = max(perimeter_rate, _PERIMETER_RATE)
             self._decoders[perimeter_rate] = cv2.aruco.ArucoDetector(
@@ -112,7 +112,7 @@ class ArucoDetector:
     def _decode(
         self, image: np.ndarray, perimeter_rate: float = 0.0
     ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
-        """What OpenCV read, (id, corners) each, and the quadrilaterals that it could not read."""
+        """Decode by OpenCV: (id, corners) of each marker, and the quadrilaterals it can't read."""
         least_px = max(perimeter_rate, _PERIMETER_RATE) * max(image.shape)
         left = thinned(image, self.family, least_px)
         quads, ids, unread = self._decoder(perimeter_rate).detectMarkers(left)
@@ -128,7 +128,7 @@ class ArucoDetector:
     def _decode_around(
         self, image: np.ndarray, quad: np.ndarray
     ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
-        """`_decode` of an enlarged region around a prediction."""
+        """Run `_decode` on an enlarged region around the prediction of a small marker."""
         if mean_side_px(quad) > _ENLARGE_UP_TO_PX:
             return [], []
         return self._decode_region(image, quad, _SEARCH_SIDES * mean_side_px(quad) + _SEARCH_PX)
@@ -136,14 +136,14 @@ class ArucoDetector:
     def _decode_region(
         self, image: np.ndarray, quad: np.ndarray, margin_px: float
     ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
-        """`_decode` of the region around a quadrilateral, a small one enlarged."""
+        """Run `_decode` on the region around a quadrilateral, enlarged if that is small."""
         low = np.maximum(np.floor(quad.min(axis=0) - margin_px), 0).astype(int)
         high = np.minimum(np.ceil(quad.max(axis=0) + margin_px), image.shape[::-1]).astype(int)
         if np.any(high - low < 8):
             return [], []
         region = image[low[1] : high[1], low[0] : high[0]]
         side_px = mean_side_px(quad)
-        # Its cells are no markers: to find out takes OpenCV over 1 ms for each.
+        # The marker's cells are smaller than this; OpenCV would spend over 1 ms on each.
         perimeter_rate = _SMALLEST * 4 * side_px / max(high - low)
         scale = _ENLARGE if side_px <= _ENLARGE_UP_TO_PX else 1
         if scale > 1:
@@ -157,7 +157,7 @@ class ArucoDetector:
 
 
 def _worth_a_look(quads: list[np.ndarray]) -> list[np.ndarray]:
-    """Of the quadrilaterals those neither too small nor too large, each place once."""
+    """The quadrilaterals that are neither too small nor too large, one for each place."""
     if not quads:
         return []
     corners = np.stack(quads)
@@ -165,7 +165,7 @@ def _worth_a_look(quads: list[np.ndarray]) -> list[np.ndarray]:
     centers = corners.mean(axis=1)
     smallest, largest = _CLOSER_LOOK_PX
     kept: list[np.ndarray] = []
-    # By squares of `_SAME_PLACE_PX`: what is nearer than that is in the same or the next one.
+    # In squares of `_SAME_PLACE_PX`, centres nearer than that are in the same or the next one.
     places: dict[tuple[int, int], list[np.ndarray]] = {}
     for index in np.flatnonzero((sides_px >= smallest) & (sides_px <= largest)):
         center = centers[index]

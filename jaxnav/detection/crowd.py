@@ -1,9 +1,9 @@
-"""A picture full of squares, thinned out to those that may be markers.
+"""Reduction of an image full of squares to the squares that may be markers.
 
 A decoder takes a millisecond for every quadrilateral and compares them all with each other: a
-grille, a tiled wall or a poster made for it holds a camera up for seconds. In a picture that has
-more of them than any room, each is first held against the codes of the family by its cells alone,
-all at once, and only what surrounds the best is left in the picture.
+grille, a tiled wall or a poster made for it holds a camera up for seconds. If an image has more of
+them than any room, the cells of all are first compared with the codes of the family at once, and
+everything but the surroundings of the best is erased from the image.
 """
 
 import cv2
@@ -17,22 +17,22 @@ _CROWD = 300
 _CROWD_PIXELS = 820 * 410
 _MOST_LOOKED_AT = 4096
 _KEPT = 48
-_KEPT_SHARE = 2  # of the picture, a half: what is larger holds most of the crowd
-# As OpenCV's decoder: its windows, how much darker than their mean, how straight an edge must be.
+_KEPT_SHARE = 2  # at most 1/2 of the image is kept; a larger region would hold most of the crowd
+# As in OpenCV's decoder: threshold windows, darkness below their mean, straightness of an edge.
 _WINDOWS_PX, _DARKER, _STRAIGHT = (3, 13, 23), 7, 0.03
 _SAME_PLACE_PX = 3.0
-# At half the size: what noise makes dark is gone, and the least outline is that of 3 x 3 pixels.
+# At half the size, dark spots from noise vanish, and the least outline is that of 3 x 3 pixels.
 _HALF_WINDOW_PX, _SPECK, _OUTLINE_PX = 11, np.ones((2, 2), np.uint8), 8
 _MARGIN_SIDES, _MARGIN_PX = 0.25, 4
 
 
 def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.ndarray:
-    """The image, or one with nothing but the likeliest markers in it where it is a crowd.
+    """The image; if it is crowded, a copy that shows nothing but the likeliest markers.
 
     Args:
         image: (H, W) grey levels.
         family: one of `jaxnav.models.markers.FAMILY_SIZES`.
-        least_perimeter_px: of the quadrilaterals that a decoder would look at.
+        least_perimeter_px: least perimeter of the quadrilaterals that the decoder examines.
     """
     crowd = max(_CROWD, min(1000, _CROWD * image.size // _CROWD_PIXELS))
     if not _has_outlines(image, crowd * 2 // 3):
@@ -55,8 +55,8 @@ def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.nda
 
 
 def _has_outlines(image: np.ndarray, more_than: int) -> bool:
-    """Whether there are more outlines, of dark and of light spots, at half the size. It takes a
-    twentieth of a look; to find the quadrilaterals takes as long as a look."""
+    """True if the image at half size has more outlines of dark and light spots than `more_than`. It
+    takes 1/20 of the decoder's time; finding the quadrilaterals would take as long as decoding."""
     small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     dark = cv2.morphologyEx(_dark(small, _HALF_WINDOW_PX), cv2.MORPH_OPEN, _SPECK)
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -69,7 +69,7 @@ def _dark(image: np.ndarray, window_px: int) -> np.ndarray:
 
 
 def _quads(image: np.ndarray, least_perimeter_px: float) -> np.ndarray:
-    """Quadrilaterals (Q, 4, 2), clockwise, the largest first."""
+    """Find the quadrilaterals (Q, 4, 2) of the image, clockwise, the largest first."""
     outlines: list[np.ndarray] = []
     for window_px in _WINDOWS_PX:
         dark = _dark(image, window_px)
@@ -83,7 +83,7 @@ def _quads(image: np.ndarray, least_perimeter_px: float) -> np.ndarray:
             if len(quads) == _MOST_LOOKED_AT:
                 break
     found = np.array(quads, float).reshape(-1, 4, 2)
-    # One place shows in each of the windows.
+    # Each threshold window finds the same quadrilateral again.
     places = np.round(found.mean(axis=1) / _SAME_PLACE_PX)
     found = found[np.sort(np.unique(places, axis=0, return_index=True)[1])]
     edges = np.roll(found, -1, axis=1) - found
@@ -92,7 +92,7 @@ def _quads(image: np.ndarray, least_perimeter_px: float) -> np.ndarray:
 
 
 def _unlikeness(image: np.ndarray, quads: np.ndarray, family: str) -> np.ndarray:
-    """(Q,) how many cells differ from the nearest code of the family, frame and inside."""
+    """(Q,) number of cells, frame included, that differ from the family's nearest code."""
     n = all_cells(family).shape[1]
     at = (np.arange(n) + 0.5) / n
     u, v = (side.ravel()[:, None] for side in np.meshgrid(at, at))

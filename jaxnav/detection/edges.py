@@ -1,19 +1,19 @@
-"""The four edges of a decoded marker, fitted to the grey levels around them: the model and its fit.
+"""Fit of the four edges of a decoded marker to the grey levels around them.
 
-A decoded marker is known: a black frame with known cells inside, on white paper. Its four
-edges (eight numbers, the homography between rays and paper) are those for which the known
-pattern, blurred, explains the pixels best. Fitting them to pixels rather than to points found
-along normals needs no resampling, keeps the noise of the samples independent, so that the
-covariance of the fit is honest, and tells an edge from the cells one or two pixels behind it.
+The pattern of a decoded marker is known: a black frame with known cells inside, on white paper.
+The fit finds the four edges (eight numbers, the homography between rays and paper) for which the
+blurred pattern explains the pixels best. Fitting them to pixels rather than to points found along
+normals needs no resampling, keeps the noise of the samples independent, so that the covariance of
+the fit is honest, and tells an edge from the cells one or two pixels behind it.
 
     I(u) = white - contrast * dark(u) + c1 x + c2 y + c3 far(u),    (x, y, 1) ~ M ray(u)
     dark = sum_kl K_kl Phi2((x - x_l) / s_x, (y - y_k) / s_y; rho)
 
 (x, y) are paper coordinates, K the corners of the cells at (x_l, y_k) (second differences of the
-pattern), Phi2 the integral of the blur on the paper: covariance G (S + I/12) G', G = d(x, y)/du,
-S that of lens and motion (px^2, fitted), 1/12 that of a square pixel, whose flat top is kept (see
-`_dark`); far is 1 beyond the white zone, one cell wide, that every marker has. The light (white,
-contrast, c) enters linearly and is eliminated.
+pattern), Phi2 the integral of the blur on the paper. The blur's covariance is G (S + I/12) G' with
+G = d(x, y)/du, S that of lens and motion (px^2, fitted), 1/12 that of a square pixel, whose flat
+top is kept (see `_dark`). far is 1 beyond the white zone, one cell wide, around every marker. The
+light (white, contrast, c) enters linearly and is eliminated.
 
 Source: Golub and Pereyra (1973), variable projection; Kaufman (1975) for its Jacobian.
 """
@@ -30,7 +30,7 @@ from jaxnav.compiling.executables import kept
 from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
 from jaxnav.numerics.small_matrices import eliminated
 
-PIXELS = 1024  # of one fit: the rest are masked
+PIXELS = 1024  # of one fit; unused ones are masked
 _STEPS = 20
 PIXEL_VARIANCE_PX2 = 1 / 12  # of a square
 _START_BLUR_PX2 = 0.8**2
@@ -38,7 +38,7 @@ _BLUR_LIMITS_PX2 = (0.0, 5.0**2)
 _HUBER = 2.5  # standard deviations
 _MEHLER_ORDERS = 3
 _MAX_RHO = 0.95
-# The far ground is a hundred grey levels off, give or take, where none of it is in view.
+# Prior of the far ground for views without it: within about a hundred grey levels of white.
 _FAR_PRIOR = 1e-3
 _CONVERGED = 1e-4  # of half the marker's side
 _PLATEAU = 1e-4  # of the loss
@@ -46,11 +46,11 @@ _MAX_STEP = 0.1
 
 
 class EdgeFit(NamedTuple):
-    """What the fit gives, in paper coordinates."""
+    """The result of the fit, in paper coordinates."""
 
     M: Array  # (3, 3), rays to paper
     blur_px2: Array  # (3,) xx, xy, yy of S
-    covariance: Array  # (8, 8) of the D in (I + D) M, by rows without the last
+    covariance: Array  # (8, 8) of D in (I + D) M, by rows without the last entry
     noise: Array  # standard deviation of the residual, grey levels
     contrast: Array  # white minus black, grey levels
     residual: Array  # (N,), grey levels
@@ -79,7 +79,7 @@ class _State(NamedTuple):
 
 
 def step_corners(cells: np.ndarray) -> np.ndarray:
-    """K (n + 1, n + 1) of a pattern of cells (n, n), 1 white, 0 black."""
+    """The matrix K (n + 1, n + 1) of a pattern of cells (n, n), 1 white, 0 black."""
     return np.diff(np.diff(np.pad(1 - cells, 1), axis=0), axis=1)
 
 
@@ -91,14 +91,14 @@ def fit_edges(
     K: Float[Array, "k k"],
     mask: Bool[Array, " N"],
 ) -> EdgeFit:
-    """Levenberg-Marquardt with Huber's loss, from M = I, in float32 whatever the process uses.
+    """Fit by Levenberg-Marquardt with Huber's loss, from M = I, in float32 in any process.
 
     Args:
-        rays: through the pixels, in a basis in which the first guess of M is the identity.
+        rays: rays through the pixels, in a basis in which the first guess of M is the identity.
         rays_px: their derivatives by pixel.
         levels: grey levels of the pixels.
         K: `step_corners` of the marker.
-        mask: which of the pixels there are.
+        mask: true for pixels that exist, false for padding.
     """
     patch = _Patch(rays, rays_px, levels, K, mask)
     one = jnp.ones((), levels.dtype)
@@ -145,7 +145,7 @@ _CORNER_MOTION = np.moveaxis(generators(SQUARE.T), -1, 0).reshape(8, 8).astype(n
 
 
 def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Array, ...]:
-    """Residual (N,), normal equations (11, 11), (11,) of D and S without the light, contrast."""
+    """Residual (N,), normal equations (11, 11), (11,) of D and S, light eliminated; contrast."""
     xy, xy_px = on_paper(M, patch.rays, patch.rays_px)
     pixel = PIXEL_VARIANCE_PX2 * jnp.array([1, 0, 1], blur.dtype)
     variance = blur_on_paper(xy_px, blur + pixel)
@@ -153,7 +153,7 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     split = (jnp.sum(xy_px**4, axis=0) / 240) ** 0.25
     dark, slope = _dark(xy, variance, split, patch.K)
     far = _far(xy, variance, patch.K.shape[0] - 1)
-    # By D through x and y at fixed blur; by S through the blur on the paper.
+    # Derivatives by D through x and y at fixed blur; by S through the blur on the paper.
     motion = generators(xy)
     by_D = slope[:1] * motion[0] + slope[1:2] * motion[1]
     units = jnp.eye(3, dtype=blur.dtype)
@@ -178,9 +178,9 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
 def _dark(xy: Array, variance: Array, split: Array, K: Array) -> tuple[Array, Array]:
     """Blurred ink (N,), and its derivatives (5, N) by x, y and the blur's xx, yy, xy.
 
-    Along each axis the blur is a mean of two Gaussians, `split` (2, N) to either side. With
-    U_0(x) = mean Phi and U_m its m-th derivative, up to sign, an ink's corner blurs into
-    Phi2(x, y) = sum_m xy^m / m! U_m(x) U_m(y)  (Mehler). Blurred pictures obey the heat equation:
+    Along each axis the blur is the mean of two Gaussians, offset by `split` (2, N) to either side.
+    With U_0(x) = mean Phi and U_m its m-th derivative, up to sign, the corner of a cell blurs into
+    Phi2(x, y) = sum_m xy^m / m! U_m(x) U_m(y)  (Mehler). Blurred images obey the heat equation:
     d/d xx is half of d^2/dx^2, d/d xy is d^2/dx dy.
     """
     knots = jnp.linspace(-1, 1, K.shape[0], dtype=xy.dtype)[:, None]
@@ -190,7 +190,7 @@ def _dark(xy: Array, variance: Array, split: Array, K: Array) -> tuple[Array, Ar
     columns, rows = (
         _hermite_terms(xy[i : i + 1] - knots, sigma[i : i + 1], split[i : i + 1]) for i in (0, 1)
     )
-    # A product is computed once; all else once more for each of the two dozen sums below.
+    # XLA computes a matrix product once, but the rest again for each of the two dozen sums below.
     rows = [K.T @ term for term in rows]
     columns = [jnp.eye(K.shape[0], dtype=K.dtype) @ term for term in columns]
 
@@ -232,7 +232,7 @@ def _far(xy: Array, variance: Array, n: int) -> Array:
 
 
 def _gauss(z: Array) -> tuple[Array, Array]:
-    """Integral and density of the standard normal.
+    """Integral and density of the standard normal distribution.
 
     Source: Abramowitz and Stegun (1964), 7.1.26; error below 1.5e-7.
     """
@@ -248,7 +248,7 @@ def _gauss(z: Array) -> tuple[Array, Array]:
 def _moved(M: Array, blur: Array, step: Array) -> tuple[Array, Array]:
     D = jnp.append(step[:8], 0).reshape(3, 3)
     xx, xy, yy = blur + step[8:]
-    # The nearest blur that exists: eigenvalues of a 2x2 clipped.
+    # The nearest possible blur: the eigenvalues of the 2x2 covariance are clipped.
     mean, half = (xx + yy) / 2, (xx - yy) / 2
     radius = jnp.sqrt(half**2 + xy**2 + 1e-12)
     low, high = jnp.clip(jnp.stack([mean - radius, mean + radius]), *_BLUR_LIMITS_PX2)

@@ -1,4 +1,4 @@
-"""The marker families OpenCV knows: names, dictionaries and black-and-white cells."""
+"""The marker families that OpenCV knows: their names, dictionaries and black-and-white cells."""
 
 from functools import cache
 
@@ -10,7 +10,7 @@ from jaxnav.models.markers import FAMILY_SIZES, opencv_dictionary_name
 
 
 def dictionary(family: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a family.
+    """OpenCV's dictionary for a family.
 
     Raises:
         BadInput: the family is unknown.
@@ -22,7 +22,7 @@ def dictionary(family: str) -> cv2.aruco.Dictionary:
 
 @cache
 def all_cells(family: str) -> np.ndarray:
-    """Cells of all markers of a family, (ids, n, n) float, with their black frame."""
+    """Cells of all markers of a family with their black frames, (ids, n, n) float."""
     codes = dictionary(family)
     n = codes.markerSize + 2
     cells = [

@@ -1,4 +1,4 @@
-"""Markers of a map looked for in the images of a rig, whatever the families."""
+"""Detection of a map's markers, of all its families, in the images of a rig."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from jaxnav.models.rig import CameraRig
 
 
 class ImageSearch:
-    """One detector for each family of the map. Not for several threads."""
+    """Runs one detector for each family of the map. Not safe for several threads."""
 
     def __init__(self, rig: CameraRig, markers: MarkerMap, corner_backend: str = "aruco"):
         """Args:
@@ -23,7 +23,7 @@ class ImageSearch:
         self._lenses: dict[int, Camera] = {}
 
     def detections(self, camera: int, image: np.ndarray) -> Detections:
-        """All markers of the map's families in a camera's image.
+        """Detect all markers of the map's families in a camera's image.
 
         Args:
             camera: index in the rig.
@@ -36,7 +36,7 @@ class ImageSearch:
 
 
 def size_problem(rig: CameraRig, camera: int, image: np.ndarray) -> str | None:
-    """What is wrong with the size of an image of a rig's camera; None: nothing."""
+    """Say in words how the image's size differs from the camera's; None if it doesn't."""
     height, width = image.shape[:2]
     expected = rig.image_sizes_px[camera]
     if (width, height) == expected:

@@ -1,4 +1,4 @@
-"""Pixels to rays and back for the corner fit, through the camera's own lens.
+"""Conversion of pixels to rays and back through the camera's lens, for the corner fit.
 
 Shapes are fixed and cameras are arguments, so each kind of lens compiles once.
 """
@@ -25,9 +25,9 @@ def _project(camera: Camera, points_camera: jax.Array) -> jax.Array:
 
 @dataclass(frozen=True)
 class Lens:
-    """Directions in which a camera sees. Straight lines stay planes through its centre.
+    """Converts pixels to rays and back. Straight lines become planes through the camera's centre.
 
-    Without a camera, rays are (u, v, 1): straight lines are straight in the image.
+    Without a camera, rays are (u, v, 1), so straight lines are straight in the image.
     """
 
     camera: Camera | None = None
@@ -49,7 +49,7 @@ class Lens:
         return rays.T, jacobian.T
 
     def pixels(self, rays: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of rays (N, 3). Compiles once for each N."""
+        """Project rays (N, 3) to pixels (N, 2). Compiles once for each N."""
         if self.camera is None:
             return rays[:, :2] / rays[:, 2:]
         return np.asarray(_project(self.camera, rays), float)

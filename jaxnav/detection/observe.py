@@ -1,4 +1,4 @@
-"""Detections of all cameras in the order of the marker map."""
+"""Sorting of the detections of all cameras into the order of the marker map."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,18 +9,18 @@ import numpy as np
 from jaxnav.detection.types import Detections
 from jaxnav.models.markers import MarkerMap
 
-SAME_PX = 1.0  # nearer to each other, two detections are one
+SAME_PX = 1.0  # two detections nearer to each other than this count as one
 
 
 class Observed(NamedTuple):
-    """What C cameras see of M markers. Lanes that are not visible hold zeros (sigma: ones).
+    """The corners of M markers in C cameras. Lanes that are not visible hold zeros (sigma: ones).
 
     Attributes:
         corners_px: (C, M, 4, 2), TL TR BR BL.
         visible: (C, M) bool.
         sigma_px: (C, M, 4), standard deviation of each corner along one axis.
-        unknown: how many detections are not of the map.
-        duplicates: how many detections were dropped since their image shows their id elsewhere too.
+        unknown: number of detections of markers that are not in the map.
+        duplicates: number of detections dropped because their image shows their id elsewhere too.
     """
 
     corners_px: np.ndarray
@@ -31,13 +31,13 @@ class Observed(NamedTuple):
 
 
 def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
-    """The observation of one instant, one `Detections` a camera in the rig's order.
+    """The observation of one instant from one `Detections` a camera, in the rig's order.
 
-    A marker found at two places in one image is dropped from it: the map has it once, so one of
-    the two is a copy or a reflection, and nothing in the image says which. One that was merely
-    reported twice is there once.
+    A marker found at two places in one image is dropped: the map has it once, so one of the two
+    is a copy or a reflection, and nothing in the image says which. A marker reported twice at the
+    same place is kept once.
     """
-    # Not by the map's own method: equinox makes a module of it for every call, 0.1 ms.
+    # The map's own method would be slower: equinox wraps it in a module at every call, 0.1 ms.
     lanes = {key: lane for lane, key in enumerate(zip(markers.ids, markers.families, strict=True))}
     shape = (len(detections), len(lanes))
     corners_px = np.zeros((*shape, 4, 2))
@@ -65,7 +65,7 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
 
 
 def _told_once(keys: Sequence[tuple[int, str]], corners_px: np.ndarray) -> list[int]:
-    """Indices of the detections, without those that repeat another of their marker."""
+    """Indices of the detections without repetitions of a marker at the same place."""
     kept: list[int] = []
     for k, key in enumerate(keys):
         if not any(

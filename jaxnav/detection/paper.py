@@ -1,7 +1,7 @@
-"""The marker's paper seen through a homography: coordinates, how they move, how blur looks on it.
+"""Geometry of a marker's paper under a homography: coordinates, their derivatives, blur on it.
 
-Paper coordinates: the marker is [-1, 1]^2, x right, y down. The last axis counts pixels, so that
-sums over the few leading entries run over long rows. NumPy and JAX arrays are both taken.
+In paper coordinates the marker is [-1, 1]^2, x right, y down. The last axis counts pixels, so that
+sums over the few leading entries run over long rows. Functions accept NumPy and JAX arrays.
 """
 
 from typing import Any
@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Numbers = Any  # a NumPy or a JAX array, and out comes the same
+Numbers = Any  # a NumPy or a JAX array; functions return the kind they get
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])  # TL TR BR BL
 
 
 def on_paper(M: Numbers, rays: Numbers, rays_px: Numbers) -> tuple[Numbers, Numbers]:
-    """Where rays meet the paper.
+    """Intersect rays with the paper.
 
     Args:
         M: (3, 3), takes rays to the paper's (x, y, 1), up to scale.
@@ -32,9 +32,9 @@ def on_paper(M: Numbers, rays: Numbers, rays_px: Numbers) -> tuple[Numbers, Numb
 
 
 def generators(xy: Numbers) -> Numbers:
-    """How paper coordinates (2, N) move with D when M becomes (I + D) M, (2, 8, N).
+    """Derivatives (2, 8, N) of paper coordinates (2, N) by D, when M becomes (I + D) M.
 
-    D is counted by rows, without its last entry.
+    D is taken by rows, without its last entry.
     """
     numbers = _library(xy)
     x, y = xy
@@ -45,7 +45,7 @@ def generators(xy: Numbers) -> Numbers:
 
 
 def blur_on_paper(xy_px: Numbers, S: Numbers) -> Numbers:
-    """Covariance (3, N), xx yy xy, of a blur S (xx, xy, yy in px^2) seen on the paper.
+    """Covariance (3, N) on the paper, xx yy xy, of a blur S (xx, xy, yy) in the image, px^2.
 
     Args:
         xy_px: (2, 2, N), derivatives of paper coordinates by pixel.
@@ -59,13 +59,13 @@ def blur_on_paper(xy_px: Numbers, S: Numbers) -> Numbers:
 
 
 def homography(rays: np.ndarray) -> np.ndarray:
-    """M (3, 3) of the four corner rays (4, 3), TL TR BR BL."""
+    """The homography M (3, 3) that takes the corner rays (4, 3), TL TR BR BL, to the paper."""
     M = _basis(np.column_stack([SQUARE, np.ones(4)])) @ np.linalg.inv(_basis(rays))
     return M / (M @ rays.mean(axis=0))[2]
 
 
 def rays_of(M: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Rays (N, 3) to points (N, 2) of the paper."""
+    """Rays (N, 3) through points (N, 2) on the paper."""
     return np.linalg.solve(M, np.vstack([xy.T, np.ones(len(xy))])).T
 
 

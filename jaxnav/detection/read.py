@@ -1,8 +1,8 @@
-"""Which marker is it? For those too small or too blurred for a decoder that looks at cells alone.
+"""Reading of markers that are too small or too blurred for a decoder that samples their cells.
 
-The frame is fitted first, its inside taken for grey. Then every code of the family, turned four
-ways, is compared with the pixels through the blur that the frame showed: the most likely one
-wins if nothing else comes near, and if the whole marker then explains the picture.
+The frame is fitted first, with its inside taken as grey. Then every code of the family, in four
+turns, is compared with the pixels through the blur found at the frame. The most likely code is
+accepted if no other comes near it and if the whole marker then explains the image.
 """
 
 from functools import cache
@@ -22,24 +22,24 @@ from jaxnav.detection.refine import (
     refine_corners,
 )
 
-# The second best code must explain the pixels worse by this many noise variances. Among 2 348
-# codes chance alone gives about 16.
+# The second best code must explain the pixels worse by this many noise variances. Chance alone
+# gives about 16 among 2 348 codes.
 _MIN_ADVANTAGE = 60.0
 _MIN_EDGE_LEVELS = 10.0  # between the two sides of the edges
 _MAX_CELL_ERROR = 0.5  # ink: nearer to the cell as printed than to its opposite
-_MAX_NOISE = 0.15  # of the contrast, once all is explained
+_MAX_NOISE = 0.15  # of the contrast, after the fit of the whole marker
 
 
 def read_marker(
     image: np.ndarray, corners_px: np.ndarray, family: str, lens: Lens
 ) -> tuple[int, RefinedMarker] | None:
-    """Id and corners of the marker in a quadrilateral, None if it holds none.
+    """Read id and corners of the marker in a quadrilateral; None if there is no marker.
 
     Args:
         image: (H, W) grey levels.
         corners_px: (4, 2), clockwise from any corner, about a pixel off at most.
         family: one of `jaxnav.models.markers.FAMILY_SIZES`.
-        lens: through which straight edges are seen.
+        lens: the lens that bends the marker's straight edges.
     """
     n = all_cells(family).shape[1]
     frame = np.pad(np.full((n - 2, n - 2), 0.5), 1)
@@ -64,9 +64,9 @@ def read_marker(
 
 @cache
 def codes_of(family: str) -> np.ndarray:
-    """Ink inside the frame, (4 * ids, cells): each marker as it looks after 0..3 turns."""
+    """Ink inside the frame, (4 * ids, cells): each marker after 0..3 quarter turns."""
     inner = 1 - all_cells(family)[:, 1:-1, 1:-1]
-    # Turned k times clockwise, the marker's own top-left corner is corner k of the picture.
+    # After k clockwise turns, the marker's own top-left corner is corner k of the image.
     turned = [np.rot90(inner, -k, axes=(1, 2)) for k in range(4)]
     return np.stack(turned, axis=1).reshape(4 * len(inner), -1)
 
@@ -74,7 +74,7 @@ def codes_of(family: str) -> np.ndarray:
 def _most_likely(
     image: np.ndarray, fitted: Fitted, family: str, lens: Lens
 ) -> tuple[int, int] | None:
-    """(id, turns) of the code that explains the pixels best, None where others come near."""
+    """(id, turns) of the code that explains the pixels best; None if another comes near."""
     codes = codes_of(family)
     n = all_cells(family).shape[1]
     ink = _cells_in_image(fitted, n, lens)
@@ -98,7 +98,7 @@ def _most_likely(
 
 
 def _worst_cell(fitted: Fitted, n: int, lens: Lens) -> float:
-    """The largest error of ink in a cell: 1 where black should be white or the reverse."""
+    """The largest error of ink over all cells: 1 if a black cell should be white or the reverse."""
     ink = _cells_in_image(fitted, n, lens)
     residual = fitted.edges.residual[: len(fitted.pixels)]
     seen = np.maximum(np.sum(ink**2, axis=1), 0.1)
@@ -106,7 +106,7 @@ def _worst_cell(fitted: Fitted, n: int, lens: Lens) -> float:
 
 
 def _cells_in_image(fitted: Fitted, n: int, lens: Lens) -> np.ndarray:
-    """How much of each pixel's light comes from each cell, (n * n, N)."""
+    """The share of each pixel's light that comes from each cell, (n * n, N)."""
     xy, xy_px = on_paper(fitted.M, *lens.rays(fitted.pixels))
     pixel_px2 = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])
     variance = blur_on_paper(xy_px, np.asarray(fitted.edges.blur_px2) + pixel_px2)[:2]
@@ -118,9 +118,9 @@ def _cells_in_image(fitted: Fitted, n: int, lens: Lens) -> np.ndarray:
 
 
 def frames_first(image: np.ndarray, quads: list[np.ndarray]) -> list[np.ndarray]:
-    """The quadrilaterals that are darker along their edges than around, the clearest first.
+    """The quadrilaterals that are darker inside their edges than outside, the clearest first.
 
-    Levels are taken a little inside and outside of the edges, for all at once.
+    Levels are sampled a little inside and outside of the edges, for all quadrilaterals at once.
     """
     if not quads:
         return []

@@ -1,4 +1,4 @@
-"""From a decoded marker to its corners: which pixels take part in the fit, and what it says."""
+"""Corners of a decoded marker: the choice of pixels, the fit and the check of its result."""
 
 from dataclasses import dataclass
 
@@ -10,21 +10,21 @@ from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges, step_corners
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import SQUARE, generators, homography, on_paper, rays_of
 
-# Markers up to this side are fitted whole; of larger ones only the outline, which is plenty.
+# Markers up to this side are fitted whole; of larger ones the outline suffices.
 _WHOLE_UP_TO_PX = 30.0
-_NOWHERE_PX = 1e6  # as of `ranges`: beyond, no corner is
+_NOWHERE_PX = 1e6  # as in `ranges`: no corner lies beyond
 _OUTLINE_PX = 3.0
 _POINTS_PER_EDGE = 16
 _MIN_PIXELS = 60
 _MAX_NOISE = 0.25  # of the contrast
 _MAX_MOVE = 0.2  # of the side
-# What no residual shows: a pixel is square and not Gaussian, paper is not quite flat.
+# Errors that residuals don't show: pixels are square and not Gaussian, paper is not quite flat.
 _MODEL_SIGMA_PX = 0.006
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit and the pixels it was made on. M takes the lens's rays to the paper."""
+    """A fit and its pixels. M takes the lens's rays to the paper."""
 
     M: np.ndarray
     pixels: np.ndarray  # (N, 2) int
@@ -33,14 +33,14 @@ class Fitted:
 
 @dataclass(frozen=True)
 class RefinedMarker:
-    """Corners after the fit.
+    """The corners of a marker after the fit, with their standard deviations.
 
     Attributes:
-        corners_px: (4, 2), TL TR BR BL; the given ones where the fit failed.
+        corners_px: (4, 2), TL TR BR BL; the given ones if the fit failed.
         sigma_px: (4,), standard deviation of each corner along an axis (RMS of the two).
-        noise: standard deviation of what the fit leaves unexplained, over the contrast.
-        good: whether the fit converged, near its start, on something like the marker.
-        fitted: the fit, where there was one.
+        noise: standard deviation of the residual, over the contrast.
+        good: true if the fit converged, near its start, on something like the marker.
+        fitted: the fit; None if it failed.
     """
 
     corners_px: np.ndarray
@@ -57,14 +57,14 @@ def refine_corners(
     lens: Lens,
     whole: bool = False,
 ) -> RefinedMarker:
-    """Corners of a decoded marker to some hundredths of a pixel.
+    """Fit the corners of a decoded marker to some hundredths of a pixel.
 
     Args:
         image: (H, W) grey levels, uint8.
         corners_px: (4, 2), TL TR BR BL, a pixel or half a cell off at most.
         cells: (n, n), 1 white, 0 black, with the black frame.
-        lens: through which straight edges are seen.
-        whole: look inside a large marker too, not at its outline alone.
+        lens: the lens that bends the marker's straight edges.
+        whole: fit the inside of a large marker too, not its outline alone.
     """
     corners_px = np.asarray(corners_px, float)
     side_px = mean_side_px(corners_px)
@@ -83,7 +83,7 @@ def refine_corners(
     )
     if not good:
         return failed
-    # A ray that stays on its corner moves over the image against the paper.
+    # A corner's pixel moves so that its ray stays on the corner while the paper moves.
     _, paper_px = on_paper(fitted.M, *lens.rays(fitted_px))
     motion = -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
     variance_px2 = np.einsum("ij,jk,ik->i", motion, np.asarray(fit.covariance, float), motion)
@@ -94,7 +94,7 @@ def refine_corners(
 def fit_marker(
     image: np.ndarray, corners_px: np.ndarray, cells: np.ndarray, lens: Lens, whole: bool
 ) -> Fitted | None:
-    """The fit itself, good or not; None where too little of the marker is in the image."""
+    """Fit the marker and return the fit, good or not; None if the image shows too little of it."""
     M = homography(lens.rays(corners_px)[0].T)
     side_px = mean_side_px(corners_px)
     whole = whole or side_px <= _WHOLE_UP_TO_PX
@@ -103,7 +103,7 @@ def fit_marker(
     if count < _MIN_PIXELS:
         return None
     rays, rays_px = lens.rays(pixels)
-    # In the basis of the first guess all numbers are of order one, as float32 likes them.
+    # In the basis of the first guess all numbers are of order one, which suits float32.
     lanes = np.minimum(np.arange(PIXELS), count - 1)
     levels = image[pixels[:, 1], pixels[:, 0]]
     known = (M @ rays)[:, lanes], (M @ rays_px)[:, :, lanes], levels[lanes], step_corners(cells)
@@ -118,21 +118,21 @@ def mean_side_px(corners_px: np.ndarray) -> float:
 
 
 def corners_of(M: np.ndarray, lens: Lens) -> np.ndarray:
-    """Pixels (4, 2) of the corners, TL TR BR BL, of a marker with this M."""
+    """Pixels (4, 2) of the corners, TL TR BR BL, of the marker with homography M."""
     return lens.pixels(rays_of(M, SQUARE))
 
 
 def _pixels_around(
     shape: tuple[int, ...], M: np.ndarray, lens: Lens, cell_px: float, whole: bool
 ) -> np.ndarray:
-    """The pixels (N, 2) to fit: along the outline, or within too."""
+    """The pixels (N, 2) to fit: along the outline, and inside it too if `whole`."""
     t = np.linspace(0, 1, _POINTS_PER_EDGE, endpoint=False)[:, None]
     ends = zip(SQUARE, np.roll(SQUARE, -1, 0), strict=True)
     outline = np.concatenate([(1 - t) * a + t * b for a, b in ends])
     outline_px = lens.pixels(rays_of(M, outline))
-    if not (np.abs(outline_px) < _NOWHERE_PX).all():  # a quadrilateral that is no marker's
+    if not (np.abs(outline_px) < _NOWHERE_PX).all():  # no marker has this outline
         return np.zeros((0, 2), int)
-    # Not past the white zone around the marker, one cell wide.
+    # Pixels stay within the white zone around the marker, one cell wide.
     reach = round(min(_OUTLINE_PX, max(1.0, cell_px)))
     low = np.maximum(np.floor(outline_px.min(0)).astype(int) - reach - 1, 0)
     high = np.minimum(np.ceil(outline_px.max(0)).astype(int) + reach + 2, shape[::-1])
@@ -146,7 +146,7 @@ def _pixels_around(
     rows, columns = np.nonzero(mask)
     pixels = np.column_stack([columns, rows]) + low
     if len(pixels) > PIXELS:
-        # A fixed scattered choice: no row or direction is thinned out alone.
+        # The choice is fixed but scattered, so that it thins out all rows and directions alike.
         order = (pixels @ np.array([12.9898, 78.233]) * 43758.5453) % 1.0
         pixels = pixels[np.argsort(order, kind="stable")[:PIXELS]]
     return pixels

@@ -1,4 +1,4 @@
-"""What a detector is and what it returns."""
+"""The protocols of detectors, and the detections that they return."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ class Detections:
 
     Attributes:
         ids: (N,) int.
-        corners_px: (N, 4, 2), TL TR BR BL, the centre of the top-left pixel being (0, 0).
+        corners_px: (N, 4, 2), TL TR BR BL; the centre of the top-left pixel is (0, 0).
         sigma_px: (N, 4), standard deviation of each corner along one axis.
-        refined: (N,) bool, whether the corners are those of the fit. Where it failed they are
-            the decoder's, and sigma says so.
-        families: the family of each.
+        refined: (N,) bool, true if the corners are from the fit. Where it failed they are the
+            decoder's, with its larger sigma.
+        families: the family of each marker.
     """
 
     ids: np.ndarray
@@ -38,7 +38,7 @@ class Detections:
 
     @staticmethod
     def concatenate(parts: Sequence["Detections"]) -> "Detections":
-        """Detections of one image by several detectors, say of different families."""
+        """Concatenate one image's detections by several detectors, say of different families."""
         return Detections(
             ids=np.concatenate([np.zeros(0, int), *(p.ids for p in parts)]),
             corners_px=np.concatenate([np.zeros((0, 4, 2)), *(p.corners_px for p in parts)]),
@@ -59,23 +59,23 @@ class Detector(Protocol):
         camera: Camera | None = None,
         predicted_corners_px: np.ndarray | None = None,
     ) -> Detections:
-        """All markers of the family in the image.
+        """Detect all markers of the family in the image.
 
         Args:
             image: (H, W) or (H, W, 3) in BGR order, uint8.
             camera: makes edges straight in the world; without it, straight in the image.
-            predicted_corners_px: (K, 4, 2), where markers are expected: a closer look is
-                taken there. They need not be found, nor be all there is.
+            predicted_corners_px: (K, 4, 2), expected corners, around which the detector looks
+                closer. Some may have no marker, and there may be other markers.
 
         Raises:
-            BadInput: not such an image.
+            BadInput: the image has another shape or type.
         """
         ...
 
 
 @runtime_checkable
 class RegionDetector(Protocol):
-    """A detector that can look at a part of an image alone."""
+    """A detector that can search parts of an image alone."""
 
     def detect_near(
         self,
@@ -84,12 +84,12 @@ class RegionDetector(Protocol):
         quads_px: np.ndarray,
         radius_px: np.ndarray,
     ) -> Detections:
-        """Markers where they should be, and nowhere else.
+        """Detect markers near their expected places, and nowhere else.
 
         Args:
-            image: as of `Detector.detect`, as `camera`.
-            quads_px: (K, 4, 2), where markers are expected.
-            radius_px: (K,), how far a corner may be from there.
+            image: as in `Detector.detect`, like `camera`.
+            quads_px: (K, 4, 2), expected corners.
+            radius_px: (K,), the farthest that a corner may be from its expected place.
         """
         ...
 
@@ -98,7 +98,7 @@ def grey(image: np.ndarray) -> np.ndarray:
     """The image in grey levels, (H, W) uint8.
 
     Raises:
-        BadInput: neither (H, W) nor (H, W, 3), not uint8, or empty.
+        BadInput: the image is neither (H, W) nor (H, W, 3), not uint8, or empty.
     """
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.size == 0:
@@ -116,7 +116,7 @@ def refined_detections(
     family: str,
     camera: Camera | None,
 ) -> Detections:
-    """Detections from what a decoder found: (id, (4, 2) corners) each."""
+    """Refine the corners of markers that a decoder found, given as (id, (4, 2) corners) each."""
     lens = Lens(camera)
     fits = [refine_corners(image, corners, marker_cells(family, i), lens) for i, corners in found]
     return Detections(

@@ -1,1 +1,1 @@
-"""Calibration boards: printed, found in pictures, and told apart."""
+"""Calibration boards: their layout, their printed sheet and their detection in images."""

@@ -1,13 +1,13 @@
-"""Calibration boards: what is printed where.
+"""The layout of calibration boards: their points, their markers and their sizes.
 
 A board lies in the plane z = 0 of its own frame: x right, y up, z towards its reader, the origin
-in the centre of its ink. Four kinds:
+in the centre of its ink. There are four kinds:
 
     charuco     a chessboard with a marker in every white square (OpenCV's layout since 4.6); its
                 points are the corners between the squares
     aprilgrid   tags in a grid with black squares between their corners (Kalibr's layout); its
                 points are the corners of the tags
-    chessboard  its points are the corners between the squares
+    chessboard  squares alone; its points are the corners between them
     marker      one navigation marker; its points are its four corners
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from jaxnav.detection import marker_cells
 from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES
 
-MIN_POINTS = 6  # of a board with saddles: fewer can't tell a wrong one among them
+MIN_POINTS = 6  # of a board with saddles: among fewer, a wrong point can't be recognised
 
 BoardKind = Literal["charuco", "aprilgrid", "chessboard", "marker"]
 
@@ -30,10 +30,10 @@ class Tag:
     """One marker of a board.
 
     Attributes:
-        id: of its family.
+        id: number of the marker in its family.
         cells: (n, n), 1 white, 0 black, its black frame included, as a reader of the board sees it.
-        corners_board_m: (4, 2), TL TR BR BL of its black outline, x and y.
-        turns: quarter turns, anticlockwise, from OpenCV's picture of it to this one.
+        corners_board_m: (4, 2), x and y of the corners TL TR BR BL of its black outline.
+        turns: quarter turns, anticlockwise, from OpenCV's image of the marker to `cells`.
     """
 
     id: int
@@ -46,22 +46,22 @@ class Tag:
 class Board:
     """A board of one of the four kinds.
 
-    Points are counted row by row from the top left; those of an aprilgrid tag by tag, row by row
-    from the bottom left, each TL TR BR BL; those of a marker TL TR BR BL.
+    Points are numbered row by row from the top left. The points of an aprilgrid are numbered tag
+    by tag, row by row from the bottom left, each tag TL TR BR BL; those of a marker TL TR BR BL.
 
     Attributes:
         kind: see the module.
-        columns: squares, or tags, side by side; of a marker 1.
-        rows: and one above the other.
+        columns: number of squares, or tags, side by side; 1 for a marker.
+        rows: number of squares, or tags, one above the other; 1 for a marker.
         size_m: the side of a square, or of a tag's black outline.
-        marker_m: of a charuco board, the side of a marker's black outline.
-        spacing: of an aprilgrid, the gap between tags in sides of a tag.
-        family: of its markers, one of `jaxnav.models.markers.FAMILY_SIZES`.
-        first_id: of its markers, which are numbered on from there.
-        border_cells: how wide the black frame of an aprilgrid's tags is; Kalibr prints 2.
+        marker_m: the side of a marker's black outline on a charuco board.
+        spacing: the gap between the tags of an aprilgrid, in sides of a tag.
+        family: family of the markers, one of `jaxnav.models.markers.FAMILY_SIZES`.
+        first_id: id of the first marker; the others follow in order.
+        border_cells: width in cells of the black frame of an aprilgrid's tags; Kalibr prints 2.
 
     Raises:
-        ValueError: one line on what can't be.
+        ValueError: the board is impossible; the message says why in one line.
     """
 
     kind: BoardKind
@@ -121,44 +121,44 @@ class Board:
 
     @property
     def tag_count(self) -> int:
-        """How many markers are on it."""
+        """The number of markers on the board."""
         if self.kind == "charuco":
             return self.columns * self.rows // 2
         return 0 if self.kind == "chessboard" else self.columns * self.rows
 
     @property
     def pitch_m(self) -> float:
-        """From one square, or tag, to the next."""
+        """The distance from one square, or tag, to the next, m."""
         return self.size_m * (1 + self.spacing)
 
     @property
     def width_m(self) -> float:
-        """Of its ink, an aprilgrid's corner squares included."""
+        """The width of the ink, including the corner squares of an aprilgrid, m."""
         return self.columns * self.pitch_m + self.spacing * self.size_m
 
     @property
     def height_m(self) -> float:
-        """Of its ink, an aprilgrid's corner squares included."""
+        """The height of the ink, including the corner squares of an aprilgrid, m."""
         return self.rows * self.pitch_m + self.spacing * self.size_m
 
     @property
     def has_saddles(self) -> bool:
-        """Whether black squares touch in its points; the corners of a marker stand alone."""
+        """True if black squares touch at the points; at a marker's corners they don't."""
         return self.kind != "marker"
 
     @property
     def pattern_columns(self) -> int:
-        """How many of its points are side by side."""
+        """The number of points side by side."""
         return self.columns - 1 if self.kind in ("charuco", "chessboard") else 2 * self.columns
 
     @property
     def pattern_rows(self) -> int:
-        """How many of its points are one above the other."""
+        """The number of points one above the other."""
         return self.rows - 1 if self.kind in ("charuco", "chessboard") else 2 * self.rows
 
     @cached_property
     def points_board_m(self) -> np.ndarray:
-        """(P, 3), all points, m."""
+        """(P, 3), all points in the board's frame, m."""
         if self.kind in ("charuco", "chessboard"):
             x = (np.arange(1, self.columns) - self.columns / 2) * self.size_m
             y = (self.rows / 2 - np.arange(1, self.rows)) * self.size_m
@@ -169,7 +169,7 @@ class Board:
 
     @cached_property
     def grid(self) -> np.ndarray:
-        """(P, 2) int, column and row of each point among the points, from the top left."""
+        """(P, 2) int, each point's column and row in the grid of points, from the top left."""
         _, columns = np.unique(
             _rounded(self.points_board_m[:, 0], self.size_m), return_inverse=True
         )
@@ -178,7 +178,7 @@ class Board:
 
     @cached_property
     def tags(self) -> tuple[Tag, ...]:
-        """Its markers, by id."""
+        """The markers of the board, in order of their ids."""
         if self.kind == "chessboard":
             return ()
         if self.kind == "charuco":
@@ -200,7 +200,7 @@ class Board:
                 (row_from_below - (self.rows - 1) / 2) * self.pitch_m,
             ]
         )
-        # Kalibr prints AprilTags as their authors do, OpenCV upside down.
+        # Kalibr prints AprilTags as their authors do; OpenCV draws them upside down.
         turns = 2 if self.kind == "aprilgrid" and self.family.startswith("tag") else 0
         cells = np.rot90(marker_cells(self.family, marker_id), turns)
         cells = np.pad(cells, self.border_cells - 1)
@@ -208,7 +208,7 @@ class Board:
 
     @cached_property
     def dark_top_left(self) -> np.ndarray:
-        """(P,) bool, whether a saddle is black at its top left and bottom right."""
+        """(P,) bool, true where a saddle is black at its top left and bottom right."""
         if self.kind in ("charuco", "chessboard"):
             return np.asarray(self.grid.sum(axis=1) % 2 == 0)
         # The corner squares touch a tag's TL and BR from outside, its TR and BL from beside.
@@ -216,7 +216,7 @@ class Board:
 
     @property
     def clear_m(self) -> float:
-        """How far around a saddle, along x and y, there is nothing but its four quadrants."""
+        """The distance along x and y from a saddle to the end of its four quadrants, m."""
         if self.kind == "aprilgrid":
             frame_m = self.size_m * self.border_cells / len(self.tags[0].cells)
             return min(frame_m, self.spacing * self.size_m)
@@ -224,11 +224,11 @@ class Board:
 
     @property
     def cross_m(self) -> float:
-        """Off both edges of a saddle by more than this there may be other ink."""
+        """The distance from both edges of a saddle beyond which there may be other ink, m."""
         return (self.size_m - self.marker_m) / 2 if self.kind == "charuco" else self.clear_m
 
     def __str__(self) -> str:
-        """The board in words, with its sizes in mm."""
+        """Describe the board in words, with its sizes in mm."""
         ids = f"{self.family} {self.first_id}"
         if self.tag_count > 1:
             ids += f" to {self.first_id + self.tag_count - 1}"

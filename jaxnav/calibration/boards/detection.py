@@ -1,9 +1,9 @@
-"""A board in an image: its points to some hundredths of a pixel.
+"""Detection of a board in an image: its points to some hundredths of a pixel.
 
-The tags of a charuco board or an aprilgrid say where on the board one looks, and each point is
-then predicted from the tags around it; of a chessboard OpenCV finds all points at once. From
-there all three go the same way: `fit_saddles`, the edges first taken for straight, then bent as
-the neighbours in their rows and columns show. What does not fit to its neighbours is dropped.
+On a charuco board or an aprilgrid, tags are read and each point is predicted from the tags around
+it; on a chessboard, OpenCV finds all points at once. From there all three kinds are treated alike:
+`fit_saddles` fits each point, first with straight edges, then with edges that bend as the
+neighbours in their rows and columns show. Points that don't fit their neighbours are dropped.
 """
 
 from dataclasses import dataclass, replace
@@ -31,24 +31,24 @@ from jaxnav.detection.refine import refine_corners
 from jaxnav.detection.types import grey
 from jaxnav.models.camera import Camera
 
-_GROWTHS = 4  # times that what was found is grown by a pitch
-_RADIUS = 0.45  # of a square, around a saddle
+_GROWTHS = 4  # how often the set of found points is extended by one pitch
+_RADIUS = 0.45  # of a square: radius of the patch around a saddle
 _MIN_RADIUS_PX, _MAX_RADIUS_PX = 3.0, 9.0
 _FIRST_MOVE, _SECOND_MOVE_PX = 0.25, 1.5  # part of a square, px
 _NEIGHBOURS = 12
-# A point is wrong when it is this many times further from where its neighbours want it than the
-# median point, and this many pixels.
+# A point is wrong when its distance from where its neighbours predict it exceeds this many times
+# that of the median point, and this many pixels.
 _MAX_STRAY, _MIN_STRAY_PX = 6.0, 0.7
 
 
 @dataclass(frozen=True)
 class BoardLook:
-    """What there is of a board in one image.
+    """The result of looking for a board in one image.
 
     Attributes:
-        view: its points; None where there are too few.
-        foreign_ids: markers of its family that are not on the board.
-        own_ids: and those that are.
+        view: the points found; None if there are too few.
+        foreign_ids: ids seen of the board's family that are not on the board.
+        own_ids: ids seen that are on the board.
     """
 
     view: BoardView | None
@@ -59,23 +59,23 @@ class BoardLook:
 def find_board(
     board: Board, image: np.ndarray, name: str, camera: Camera | None = None
 ) -> BoardView | None:
-    """The board's points in an image, None where it is not seen, or too little of it.
+    """Find the board's points in an image; None if the board is not seen, or too little of it.
 
     Args:
-        board: what to look for.
+        board: the board to look for.
         image: (H, W) or (H, W, 3) in BGR order, uint8.
-        name: of the view.
+        name: name of the view.
         camera: makes the edges of a marker straight in the world instead of in the image. The
             edges around a saddle are as bent as its neighbours show, with a camera or without.
 
     Raises:
-        BadInput: not such an image.
+        BadInput: the image has another shape or type.
     """
     return look_at(board, image, name, camera).view
 
 
 def look_at(board: Board, image: np.ndarray, name: str, camera: Camera | None = None) -> BoardLook:
-    """`find_board`, and what else was seen."""
+    """Do what `find_board` does, and also return the ids of the markers that were seen."""
     levels = grey(image)
     if board.kind == "marker":
         return _look_for_marker(board, levels, name, camera)
@@ -97,7 +97,7 @@ def look_at(board: Board, image: np.ndarray, name: str, camera: Camera | None = 
 def _view(
     board: Board, levels: np.ndarray, name: str, ids: np.ndarray, places: Places
 ) -> BoardView | None:
-    """What is seen at the places, and around them."""
+    """Fit the saddles at the places and around them; None if too few remain."""
     ids, places = _first_look(board, levels, ids, places)
     if len(ids) < MIN_POINTS:
         return None
@@ -116,7 +116,7 @@ def _view(
 def _first_look(
     board: Board, levels: np.ndarray, ids: np.ndarray, places: Places
 ) -> tuple[np.ndarray, Places]:
-    """The saddles at the places, and at those that they lead to."""
+    """Fit the saddles at the places, then at places predicted from the saddles found."""
     found, there = np.zeros(0, int), no_places(board)[1]
     for _ in range(1 + _GROWTHS):
         if len(ids) == 0:
@@ -161,7 +161,7 @@ def _look_for_marker(
 
 
 def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[np.ndarray, Places]:
-    """Where OpenCV sees all inner corners of the chessboard; nothing where it does not."""
+    """The chessboard's inner corners as OpenCV finds them; empty if it doesn't find all."""
     pattern = (board.pattern_columns, board.pattern_rows)
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     found, corners = cv2.findChessboardCornersSB(levels, pattern, flags=flags)
@@ -182,10 +182,10 @@ def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[np.ndarray, Pl
 def _kept(
     board: Board, ids: np.ndarray, places: Places, saddles: Saddles
 ) -> tuple[np.ndarray, Places, Saddles]:
-    """The good saddles, black where the board is."""
+    """Keep the good saddles that are black in the same quadrants as the board."""
     sign = np.where(board.dark_top_left[ids], 1, -1)
     keep = saddles.good & (saddles.amplitude * sign > 0)
-    # Two that ended in one place: neither can be trusted.
+    # Where two saddles end at the same place, neither can be trusted.
     apart = np.linalg.norm(saddles.points_px[:, None] - saddles.points_px, axis=2)
     np.fill_diagonal(apart, np.inf)
     keep &= apart.min(axis=1, initial=np.inf) > 1.0
@@ -201,7 +201,7 @@ def _kept(
 
 
 def _with_neighbours(board: Board, ids: np.ndarray, points_px: np.ndarray) -> np.ndarray:
-    """(N,) bool: the points that are where the homography of their neighbours wants them."""
+    """(N,) bool: true for points that lie where the homography of their neighbours puts them."""
     if len(ids) < MIN_POINTS:
         return np.zeros(len(ids), bool)
     places = board.points_board_m[ids, :2] / board.pitch_m

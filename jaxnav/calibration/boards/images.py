@@ -1,4 +1,4 @@
-"""Images, folders of images and videos in, views of a board out."""
+"""Collection of the views of a board from images, folders of images and videos."""
 
 import hashlib
 import re
@@ -22,22 +22,22 @@ from jaxnav.models.camera import Camera
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
 
-_MOST_FRAMES = 600  # of a video that are looked at
-# A frame is looked at when it differs by this much from the last that was kept.
+_MOST_FRAMES = 600  # of one video that are searched
+# A frame is searched when its thumbnail differs by this much from that of the last frame kept.
 _THUMBNAIL_PX, _MIN_CHANGE_GREY = (64, 48), 1.5
 _EXAMPLES = 5  # images kept to find out why no board is seen
 
 
 @dataclass(frozen=True)
 class CollectedViews:
-    """The views of a board, and what became of the other images.
+    """The views of a board, and the reasons why other images gave none.
 
     Attributes:
-        views: what calibration takes.
-        files: all that was read, in order: for the hash of the data.
+        views: the input of the calibration.
+        files: all files read, in order, for the hash of the data.
         duplicates: (name, name of the image that it repeats).
         without_board: names of images in which the board is not seen.
-        foreign_ids: markers of the board's family that are not on it.
+        foreign_ids: ids seen of the board's family that are not on the board.
     """
 
     views: BoardViews
@@ -54,7 +54,7 @@ def board_views(
     min_move_px: float = 10.0,
     headless: bool = True,
 ) -> BoardViews:
-    """The views alone: see `collect_views`."""
+    """Collect the views and return them alone: see `collect_views`."""
     return collect_views(board, sources, camera, min_move_px, headless).views
 
 
@@ -67,20 +67,20 @@ def collect_views(
 ) -> CollectedViews:
     """Find the board in images and videos of one camera.
 
-    Of images with the same pixels the first counts. Of a video those frames are taken in which the
-    board has moved since the last one that was taken.
+    Among images with the same pixels only the first counts. A frame of a video is taken if the
+    board has moved since the last frame that was taken.
 
     Args:
-        board: what to look for.
-        sources: folders of images, images, videos; a folder's in the order of their names, numbers
-            by value.
+        board: the board to look for.
+        sources: folders of images, images, videos. The images of a folder are read in the order
+            of their names, with numbers compared by value.
         camera: see `find_board`.
-        min_move_px: how far the board's points must have moved, in the median.
-        headless: no progress bar.
+        min_move_px: the least median distance by which the board's points must have moved.
+        headless: show no progress bar.
 
     Raises:
-        BadInput: a file that can't be read, images of different sizes, or a board that is not
-            seen, with what is seen instead.
+        BadInput: a file can't be read, images differ in size, or the board is not seen; the
+            message then says what is seen instead.
     """
     files = source_files(sources)
     collector = _Collector(board, camera, min_move_px)
@@ -98,7 +98,7 @@ def source_files(sources: Sequence[Path]) -> tuple[Path, ...]:
     """The images and videos that the sources name, in order.
 
     Raises:
-        BadInput: a source that is none, or a folder without images.
+        BadInput: a source is neither image, video nor folder, or a folder has no images.
     """
     files: list[Path] = []
     for source in sources:
@@ -124,7 +124,7 @@ def source_files(sources: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def _names(files: Sequence[Path]) -> list[str]:
-    """What the views are called: file names, whole paths where these repeat."""
+    """Names of the views: the file names, or whole paths where file names repeat."""
     names = [file.name for file in files]
     return [
         name if names.count(name) == 1 else str(file)
@@ -145,7 +145,7 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
 
 
 class _Collector:
-    """What was seen so far."""
+    """Collects views image by image and remembers why images gave none."""
 
     def __init__(self, board: Board, camera: Camera | None, min_move_px: float):
         self._board, self._camera, self._min_move_px = board, camera, min_move_px
@@ -159,7 +159,7 @@ class _Collector:
         self._examples: list[np.ndarray] = []
 
     def add_image(self, file: Path, name: str) -> None:
-        # As the sensor gave it: what a viewer turns upright is of another camera.
+        # As the sensor gave it: an image turned upright belongs to another camera model.
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         image = read_image(file, flags)
         self._same_size(str(file), image)
@@ -186,7 +186,7 @@ class _Collector:
     def collected(self, files: tuple[Path, ...]) -> CollectedViews:
         foreign = sorted({i for look in self._looks for i in look.foreign_ids})
         strange = sum(bool(look.foreign_ids) for look in self._looks)
-        # Another marker may hang in the room; a board brings several into most images.
+        # One foreign marker may hang in the room; a wrong board brings several into most images.
         wrong = len(foreign) > 1 and strange > len(self._looks) / 2
         if wrong or not self._views:
             raise BadInput(
@@ -232,10 +232,10 @@ class _Collector:
 
 
 def _frames(file: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """Numbers and grey images (H, W) of a video's frames, thinned out where it is long.
+    """Yield numbers and grey images (H, W) of a video's frames; every n-th if the video is long.
 
     Raises:
-        BadInput: not a video that OpenCV can read.
+        BadInput: OpenCV can't read the file as a video.
     """
     capture = cv2.VideoCapture(str(file))
     try:
@@ -243,7 +243,7 @@ def _frames(file: Path) -> Iterator[tuple[int, np.ndarray]]:
             raise BadInput(file, "can't be read: no such file")
         if not capture.isOpened():
             raise BadInput(file, "is not a video that OpenCV can read")
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as of images
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as for images
         width, height = map(capture.get, (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if width * height > limits.IMAGE_PIXELS:
             raise BadInput(file, f"has frames of {width:.0f} x {height:.0f} pixels, too many")
@@ -263,7 +263,7 @@ def _frames(file: Path) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _move_px(before: BoardView | None, now: BoardView) -> float:
-    """How far the points that both views have are apart, in the median."""
+    """The median distance between the two views over the points that both have, px."""
     if before is None:
         return np.inf
     _, then, here = np.intersect1d(before.ids, now.ids, return_indices=True)

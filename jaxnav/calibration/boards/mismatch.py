@@ -1,4 +1,4 @@
-"""No board is seen: what is it that is seen instead?"""
+"""Diagnosis of images in which the board is not found: what they show instead."""
 
 from collections.abc import Sequence
 
@@ -14,16 +14,16 @@ _FAMILIES = (
     "tag36h11", "tag25h9", "tag16h5", "4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000",
     "aruco_original", "aruco_mip_36h12",
 )  # fmt: skip
-_MANY = 4  # markers in an image: fewer may be chance
+_MANY = 4  # markers in an image; fewer may be chance
 
 
 def what_is_seen(board: Board, looks: Sequence[BoardLook], examples: Sequence[np.ndarray]) -> str:
-    """One line for a person: why the board is not what the images show, and what to do.
+    """Explain to a person in one line why the board is not found, and what to do.
 
     Args:
-        board: that was looked for.
-        looks: at every image.
-        examples: some of the images without it, (H, W) grey.
+        board: the board that was looked for.
+        looks: the result for every image.
+        examples: some of the images without the board, (H, W) grey.
     """
     foreign = sorted({marker_id for look in looks for marker_id in look.foreign_ids})
     own = sorted({marker_id for look in looks for marker_id in look.own_ids})
@@ -62,7 +62,7 @@ def _listed(ids: Sequence[int], most: int = 6) -> str:
 
 
 def _largest_chessboard(examples: Sequence[np.ndarray]) -> tuple[int, int] | None:
-    """Columns and rows of squares of the largest chessboard in the images."""
+    """Columns and rows, in squares, of the largest chessboard in the images."""
     best: tuple[int, int] | None = None
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     for image in examples:
@@ -75,7 +75,7 @@ def _largest_chessboard(examples: Sequence[np.ndarray]) -> tuple[int, int] | Non
 
 
 def _other_code(board: Board, examples: Sequence[np.ndarray]) -> str | None:
-    """The family of markers that is seen instead, in words."""
+    """Name in words the marker family that the images show instead."""
     most, named = _MANY - 1, None
     for family in _FAMILIES:
         for border in (1, 2):

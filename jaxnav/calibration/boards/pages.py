@@ -1,4 +1,4 @@
-"""A board on a sheet of paper: how large it can be, and where it stands. All in mm."""
+"""Layout of a board on a sheet of paper: its largest size and its place, in mm."""
 
 from dataclasses import replace
 from math import floor
@@ -7,16 +7,16 @@ from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.sheets import sheet_of
 
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-MARGIN_MM = 7.0  # that no printer reaches
+MARGIN_MM = 7.0  # the strip at each edge that printers don't reach
 RULER_MM = 8.0  # a strip for a ruler, along the left side and along the bottom
 TEXT_MM = 9.0  # a strip for three lines, between the lower ruler and the board
 
-# Round sizes: from so many mm on in steps of so many.
+# Round sizes: (from this size on, in steps of this much), mm.
 _ROUND_MM = ((50.0, 5.0), (10.0, 1.0), (1.0, 0.5))
 
 
 def room_mm(paper_mm: tuple[float, float]) -> tuple[float, float]:
-    """Width and height that are left for a board with its white zone."""
+    """Width and height left on the paper for a board with its white zone, mm."""
     width_mm, height_mm = paper_mm
     return (
         width_mm - 2 * MARGIN_MM - RULER_MM,
@@ -25,21 +25,21 @@ def room_mm(paper_mm: tuple[float, float]) -> tuple[float, float]:
 
 
 def centre_mm(paper_mm: tuple[float, float]) -> tuple[float, float]:
-    """Where the board's origin is, from the lower left of the paper."""
+    """The place of the board's origin, from the lower left of the paper, mm."""
     width_mm, height_mm = room_mm(paper_mm)
     return MARGIN_MM + RULER_MM + width_mm / 2, MARGIN_MM + RULER_MM + TEXT_MM + height_mm / 2
 
 
 def resized(board: Board, size_m: float) -> Board:
-    """The board with other squares or tags, all else in proportion."""
+    """The board with squares or tags of another size, all else in proportion."""
     return replace(board, size_m=size_m, marker_m=board.marker_m * size_m / board.size_m)
 
 
 def largest(board: Board, paper_mm: tuple[float, float]) -> Board:
-    """The board in the largest round size that fits.
+    """The board in the largest round size that fits on the paper.
 
     Raises:
-        ValueError: not even the smallest does.
+        ValueError: not even the smallest size fits.
     """
     sheet = sheet_of(board)
     room_m = [side_mm / 1e3 for side_mm in room_mm(paper_mm)]
@@ -54,10 +54,10 @@ def largest(board: Board, paper_mm: tuple[float, float]) -> Board:
 
 
 def check_fit(board: Board, paper_mm: tuple[float, float]) -> None:
-    """Refuse what does not fit.
+    """Check that the board fits on the paper.
 
     Raises:
-        ValueError: what would.
+        ValueError: it doesn't; the message says which size would.
     """
     sheet = sheet_of(board)
     room = room_mm(paper_mm)

@@ -1,6 +1,6 @@
-"""Where the points of a board must be in an image, and how its lines run through them.
+"""Prediction of a board's points in an image, and of the lines that run through them.
 
-Points are predicted from others near them by a homography, which holds over a square or two
+A point is predicted from known points near it by a homography, which holds over a square or two
 through any lens. The lines through a point, and how the lens bends them, follow from its neighbours
 in its row and its column.
 """
@@ -11,22 +11,22 @@ import numpy as np
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.saddles import Places
 
-_KNOWN_AROUND = 16  # points that predict another
-_NEAREST_KNOWN = 1.1  # pitches from a point to the nearest of them, at most
-_SPREAD = 2.0  # pitches that the others may be further away
-_LONGEST_REACH = 2.6  # pitches, to a neighbour in a row
+_KNOWN_AROUND = 16  # most known points that predict one
+_NEAREST_KNOWN = 1.1  # most pitches from a point to the nearest known one
+_SPREAD = 2.0  # most pitches by which the other known points are further away
+_LONGEST_REACH = 2.6  # most pitches to a neighbour in a row or column
 
 
 def no_places(board: Board) -> tuple[np.ndarray, Places]:
-    """Not one point."""
+    """No ids and no places."""
     return np.zeros(0, int), _places(board, np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
 
 def predicted_places(
     board: Board, wanted: np.ndarray, known_m: np.ndarray, known_px: np.ndarray
 ) -> tuple[np.ndarray, Places]:
-    """Those of the wanted points (W,) that have known ones (N, 2) near them, by the homography of
-    these."""
+    """Ids and places of the wanted points (W,), each by the homography of the known points (N, 2)
+    near it; points without enough known ones near are left out."""
     ids, points_px, along_px = [], [], []
     steps = np.array([[0, 0], [1, 0], [-1, 0], [0, -1], [0, 1]]) / 4
     for point_id in wanted:
@@ -47,13 +47,13 @@ def predicted_places(
 
 
 def straight_places(board: Board, ids: np.ndarray, points_px: np.ndarray) -> Places:
-    """Places whose edges lead to their neighbours."""
+    """Places with edges in the directions to their neighbours; not bent."""
     steps, _ = _steps_and_bends(board, ids, points_px)
     return _places(board, points_px, steps)
 
 
 def bent_places(board: Board, ids: np.ndarray, places: Places) -> Places:
-    """The places again, their edges along parabolas through their neighbours."""
+    """The places with edges along parabolas through their neighbours."""
     steps, bends = _steps_and_bends(board, ids, places.points_px)
     known = np.isfinite(steps).all(axis=2)
     along_px = np.where(known[..., None], steps, places.along_px)
@@ -62,7 +62,7 @@ def bent_places(board: Board, ids: np.ndarray, places: Places) -> Places:
 
 
 def joined_places(first: Places, second: Places) -> Places:
-    """Both, one after the other."""
+    """Concatenate two sets of places."""
     return Places(
         np.concatenate([first.points_px, second.points_px]),
         np.concatenate([first.along_px, second.along_px]),
@@ -73,7 +73,7 @@ def joined_places(first: Places, second: Places) -> Places:
 
 
 def chosen_places(places: Places, which: np.ndarray) -> Places:
-    """Some of them, by index or by mask."""
+    """Select places by index or by mask."""
     return Places(
         places.points_px[which],
         places.along_px[which],
@@ -95,12 +95,12 @@ def _places(board: Board, points_px: np.ndarray, along_px: np.ndarray) -> Places
 
 
 def mapped(source: np.ndarray, target: np.ndarray, at: np.ndarray) -> np.ndarray | None:
-    """Points (M, 2) under the homography that takes source (N, 2) to target (N, 2) best."""
+    """Map points (M, 2) by the homography that best takes source (N, 2) to target (N, 2)."""
     H, _ = cv2.findHomography(source, target)
     if H is None:
         return None
     homogeneous = np.column_stack([at, np.ones(len(at))]) @ H.T
-    # Past the horizon of the homography there is nothing.
+    # Points past the horizon of the homography have no image.
     if np.any(homogeneous[:, 2] < 0.1) or not np.all(np.isfinite(homogeneous)):
         return None
     return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
@@ -109,9 +109,9 @@ def mapped(source: np.ndarray, target: np.ndarray, at: np.ndarray) -> np.ndarray
 def _steps_and_bends(
     board: Board, ids: np.ndarray, points_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As in `Places`, (N, 2, 2) and (N, 2), from three neighbours in a row and in a column.
+    """Steps (N, 2, 2) and bends (N, 2) as in `Places`, from three points in a row and in a column.
 
-    NaN where there are none; a step from two, without a bend, where there is no third.
+    NaN where a point has no neighbour. With one neighbour there is a step, but no bend.
     """
     columns, rows = board.grid[ids].T
     table = np.full((2, board.pattern_rows, board.pattern_columns), np.nan)

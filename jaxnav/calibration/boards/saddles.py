@@ -1,12 +1,12 @@
-"""Where two black squares touch: a fit of the grey levels around the point.
+"""Fit of the saddle points where two black squares touch to the grey levels around them.
 
 With d1 and d2 the distances of a pixel from the two edges that cross in the point,
 
     grey = mean + amplitude * erf(d1 / (sqrt(2) sigma1)) * erf(d2 / (sqrt(2) sigma2)),
 
-and d counts from a parabola where the edges are bent. Eight unknowns a point (its place, two
-angles, two blurs, mean, amplitude), all points of an image at once by Levenberg-Marquardt. An
-edge has a blur for itself because motion blurs the one and not the other.
+and d is measured from a parabola where the edges are bent. Each point has eight unknowns (its
+place, two angles, two blurs, mean, amplitude); Levenberg-Marquardt fits all points of an image at
+once. Each edge has its own blur because motion blurs one and not the other.
 """
 
 from dataclasses import dataclass
@@ -25,16 +25,16 @@ EDGE_WIDTH_SIGMAS = 2.563
 
 @dataclass(frozen=True)
 class Places:
-    """Where N saddles are looked for.
+    """First guesses of N saddles: their places and the directions and bends of their edges.
 
     Attributes:
-        points_px: (N, 2).
-        along_px: (N, 2, 2), what a step of the length of a square along the board's x and down
-            along its columns is in the image: [step, of u or v].
+        points_px: (N, 2), the places.
+        along_px: (N, 2, 2), the image of one step, the length of a square, along the board's x
+            and down its columns: [step, u or v].
         bend_px: (N, 2), how far the line along either step is off its tangent one step away, to
             the left of the step (in the image, y down: to its right as one looks at it).
-        clear: part of a step, up to which there is nothing but the saddle.
-        cross: and off both edges by more than this there may be other ink.
+        clear: part of a step up to which there is nothing but the saddle.
+        cross: part of a step off both edges beyond which there may be other ink.
     """
 
     points_px: np.ndarray
@@ -46,14 +46,14 @@ class Places:
 
 @dataclass(frozen=True)
 class Saddles:
-    """What the fit says.
+    """N fitted saddles.
 
     Attributes:
-        points_px: (N, 2).
-        amplitude: (N,) grey levels; positive where it is black at the top left of the board.
+        points_px: (N, 2), the places.
+        amplitude: (N,) grey levels; positive if the saddle's top left on the board is black.
         sigma_px: (N, 2), blur of the edges along x and along y.
-        noise: (N,), RMS of what is left unexplained, grey levels.
-        good: (N,) bool, whether it converged on a saddle.
+        noise: (N,), RMS of the residual, grey levels.
+        good: (N,) bool, true if the fit converged on a saddle.
     """
 
     points_px: np.ndarray
@@ -64,13 +64,13 @@ class Saddles:
 
 
 def fit_saddles(image: np.ndarray, places: Places, radius_px: float, max_move_px: float) -> Saddles:
-    """Saddles near the given places.
+    """Fit saddles near the given places.
 
     Args:
         image: (H, W) grey levels, uint8.
-        places: where they are looked for.
-        radius_px: how far around a point its pixels take part; fewer where other ink is near.
-        max_move_px: what is found further off is no good.
+        places: the first guesses.
+        radius_px: radius around a point of the pixels to fit; fewer are taken near other ink.
+        max_move_px: saddles that move further than this from their places are not good.
     """
     patch = _Patch.around(image, places, radius_px)
     count = len(places.points_px)
@@ -95,7 +95,7 @@ def fit_saddles(image: np.ndarray, places: Places, radius_px: float, max_move_px
         tried_residual, tried_jacobian = _residual(tried, patch)
         tried_loss = np.sum(tried_residual**2, axis=1)
         better = tried_loss <= loss
-        # A step is also short where damping made it so: the noise tells a minimum from a dead end.
+        # Damping also makes steps short; the noise tells a minimum from a dead end.
         converged |= np.abs(step[:, :2]).max(axis=1) < _CONVERGED_PX
         state[better], loss[better] = tried[better], tried_loss[better]
         residual[better], jacobian[better] = tried_residual[better], tried_jacobian[better]
@@ -119,13 +119,13 @@ def fit_saddles(image: np.ndarray, places: Places, radius_px: float, max_move_px
 
 _LONGEST_STEP = np.array([1.5, 1.5, 0.2, 0.2, 0.4, 0.4, 60.0, 60.0])
 _MAX_TURN_RAD = 0.35
-_MIN_AMPLITUDE = 4.0  # half of what black and white differ by
+_MIN_AMPLITUDE = 4.0  # grey levels, half of the difference between black and white
 _MAX_NOISE = 0.35  # of the amplitude
 
 
 @dataclass(frozen=True)
 class _Patch:
-    """The pixels that take part: (N, P, 2) places, (N, P) grey levels and whether they do."""
+    """The pixels of the fit: (N, P, 2) places, (N, P) grey levels and a mask of those used."""
 
     pixels: np.ndarray
     grey: np.ndarray
@@ -145,7 +145,7 @@ class _Patch:
         clipped = np.clip(pixels, 0, (width - 1, height - 1))
         offset = pixels - places.points_px[:, None]
         steps = np.einsum("npj,njk->npk", offset, np.linalg.inv(places.along_px))
-        # A pixel sees half a pixel on each side, and blur a little more.
+        # A pixel integrates over half a pixel on each side, and blur over a little more.
         step_px = np.linalg.norm(places.along_px, axis=2)
         margin = 1.0 / step_px[:, None, :]
         near = np.abs(steps) + margin
@@ -162,7 +162,7 @@ class _Patch:
 
 
 def _residual(state: np.ndarray, patch: _Patch) -> tuple[np.ndarray, np.ndarray]:
-    """What the model exceeds the picture by, (N, P), and its derivatives, (N, P, 8)."""
+    """Residuals (N, P), model minus image, and their derivatives (N, P, 8)."""
     offset = patch.pixels - state[:, None, :2]
     edges, slopes, by_place, by_angle, by_sigma = [], [], [], [], []
     for edge in (0, 1):
@@ -202,7 +202,7 @@ def _residual(state: np.ndarray, patch: _Patch) -> tuple[np.ndarray, np.ndarray]
 
 
 def _with_light(state: np.ndarray, patch: _Patch) -> np.ndarray:
-    """The state with that mean and amplitude which explain most."""
+    """The state with the mean and amplitude that fit the image best."""
     _, jacobian = _residual(state, patch)
     light = jacobian[:, :, 6:8]
     hessian = np.einsum("npi,npj->nij", light, light) + 1e-6 * np.eye(2)

@@ -1,4 +1,4 @@
-"""A board as a grid of modules, each black or white: what is printed, and what is rendered."""
+"""A board as a grid of black and white modules, for printing and for rendering."""
 
 from dataclasses import dataclass
 from fractions import Fraction
@@ -8,15 +8,15 @@ import numpy as np
 
 from jaxnav.calibration.boards.board import Board
 
-_FINEST = 24  # modules a cell
+_FINEST = 24  # most modules a cell
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """The grid of a board, its white zone included. Its middle is the board's origin.
+    """The grid of a board, including its white zone. Its middle is the board's origin.
 
     Attributes:
-        ink: (rows, columns) bool, the top row first.
+        ink: (rows, columns) bool, true where black, the top row first.
         module_m: side of a module.
         quiet_m: width of the white zone.
     """
@@ -34,7 +34,7 @@ class Sheet:
         return self.ink.shape[0] * self.module_m
 
     def rectangles_m(self) -> np.ndarray:
-        """(N, 4), x y width height of black rectangles without overlap, from the lower left."""
+        """(N, 4), x y width height of black rectangles without overlap; x y is their lower left."""
         rows = len(self.ink)
         runs: list[tuple[int, int, int, int]] = []
         begun: dict[tuple[int, int], int] = {}
@@ -57,10 +57,10 @@ class Sheet:
 
 
 def sheet_of(board: Board) -> Sheet:
-    """The sheet of a board, with a white zone of one cell of its tags, or of half a square.
+    """The sheet of a board. Its white zone is as wide as a cell of its tags, or half a square.
 
     Raises:
-        ValueError: its sizes have no common module.
+        ValueError: the board's sizes have no common module.
     """
     if board.kind == "chessboard":
         square = 2

@@ -1,4 +1,4 @@
-"""The tags of a board in an image: which are seen, and where, to a pixel."""
+"""Detection of a board's tags in an image: their ids, and their corners to a pixel."""
 
 from dataclasses import dataclass
 
@@ -10,17 +10,17 @@ from jaxnav.detection.families import dictionary
 
 # Where fewer than this part of the tags are read, the image is read again at twice its size.
 _FEW = 0.5
-_MAX_CORRECTION = 0.4  # of the bits that a family can correct
+_MAX_CORRECTION = 0.4  # part of the bits that a family can correct
 
 
 @dataclass(frozen=True)
 class SeenTags:
-    """Tags in one image.
+    """The tags of a board that were read in one image.
 
     Attributes:
-        places: (N,) int, which of `Board.tags`.
+        places: (N,) int, indices into `Board.tags`.
         corners_px: (N, 4, 2), TL TR BR BL.
-        foreign_ids: those read that are not on the board.
+        foreign_ids: ids that were read, but are not on the board.
     """
 
     places: np.ndarray
@@ -29,7 +29,7 @@ class SeenTags:
 
 
 def read_tags(board: Board, image: np.ndarray) -> SeenTags:
-    """The tags of a charuco board or an aprilgrid in an image (H, W), by OpenCV's decoder."""
+    """Read the tags of a charuco board or an aprilgrid in an image (H, W) by OpenCV's decoder."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.markerBorderBits = board.border_cells
@@ -60,7 +60,7 @@ def read_tags(board: Board, image: np.ndarray) -> SeenTags:
 def _decoded(
     decoder: cv2.aruco.ArucoDetector, image: np.ndarray, scale: int
 ) -> tuple[dict[int, np.ndarray], set[int]]:
-    """Corners (4, 2) of each id in an image that was enlarged, and the ids that it has twice."""
+    """Corners (4, 2) by id in pixels of the image before enlargement, and the ids seen twice."""
     quads, ids, _ = decoder.detectMarkers(image)
     seen: dict[int, np.ndarray] = {}
     twice: set[int] = set()

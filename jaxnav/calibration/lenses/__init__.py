@@ -1,1 +1,1 @@
-"""A camera of its own: its lens from views of a board."""
+"""Calibration of one camera's lens from views of a board."""

@@ -1,4 +1,4 @@
-"""Sentences for a person: what is wrong with a lens's calibration, and what to collect next."""
+"""Sentences on what is wrong with the calibration of a lens, and on what to collect next."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from jaxnav.calibration.lenses.board_shape import check_board
 from jaxnav.calibration.lenses.checks import cells, reach, rim_sigma_px, tilts_deg
 from jaxnav.calibration.lenses.fit import LensFit
 
-GOOD_FOCAL = 0.001  # one sigma in parts of the focal length: what the car's pose needs
+GOOD_FOCAL = 0.001  # one sigma over the focal length, as the car's pose needs it
 GOOD_CENTER_PX = 0.3
 _GOOD_RIM_PX = 0.5
 _CHANCE = 1e-6
@@ -14,17 +14,17 @@ _SYSTEMATIC = 0.3  # of the noise
 _STRETCH, _OFFSET = 0.002, 3e-4  # of the board's height, and of its diagonal
 _GOOD_REACH = 0.8  # of the way to the image's corner
 _GOOD_TILT_DEG = 15.0
-_GOOD_DISTANCES = 1.5  # the farthest view is so many times as far as the nearest
+_GOOD_DISTANCES = 1.5  # distance of the farthest view over that of the nearest
 _ENOUGH_VIEWS = 15
 _SIDES = (("top left", "top", "top right"), ("left", "middle", "right"))
 _REGIONS = (*_SIDES, ("bottom left", "bottom", "bottom right"))
 
 
 def findings(fit: LensFit, better: str) -> tuple[str, ...]:
-    """What is wrong, or was held at zero.
+    """Sentences on what is wrong with the fit, or was held at zero.
 
     Args:
-        better: the lens that explains unseen views clearly better than the fit's, or the same.
+        better: the lens that explains unseen views clearly better, or else the fit's own lens.
     """
     said = []
     if fit.fixed:
@@ -88,7 +88,7 @@ def _of_the_board(fit: LensFit) -> list[str]:
 
 
 def _unseen_sides(fit: LensFit) -> list[str]:
-    """Of the board's outer rows and columns of points those that no view shows."""
+    """Names of the board's outer rows and columns of points that no view shows."""
     points_m, seen = fit.views.points_board_m, np.any(fit.used, axis=0)
     margin_m = 1e-3 * float(np.ptp(points_m, axis=0).max())
     sides = (
@@ -101,7 +101,7 @@ def _unseen_sides(fit: LensFit) -> list[str]:
 
 
 def advice(fit: LensFit) -> tuple[str, ...]:
-    """What to collect next; one sentence that nothing is needed where all is well."""
+    """Sentences on what to collect next, or one that says that nothing is missing."""
     said = []
     focal = float(np.max(fit.sigma[:2] / fit.parameters[:2]))
     center_px = float(np.max(fit.sigma[2:4]))
@@ -140,7 +140,7 @@ def advice(fit: LensFit) -> tuple[str, ...]:
 
 
 def _empty_regions(fit: LensFit) -> list[str]:
-    """Those of nine parts of the image of whose cells a third or more have no corner."""
+    """Names of those of the image's nine parts with no corner in a third or more of their cells."""
     empty = cells(fit).corners == 0
     high, wide = empty.shape
     row, column = (np.arange(n) * 3 // n for n in (high, wide))

@@ -1,4 +1,4 @@
-"""Whether a calibration board is as its file says, by what is left of its corners' residuals."""
+"""Check of a calibration board's shape against its file, from the residuals of its corners."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -17,12 +17,12 @@ from jaxnav.numerics.schur import reduce
 
 @dataclass(frozen=True)
 class BoardCheck:
-    """Whether the board is as its file says.
+    """The deviation of a board from what its file says.
 
     Attributes:
-        stretch: its height is so much larger in parts of its width, with its sigma.
-        offset_m: root mean square by which its points lie elsewhere, beyond chance.
-        p_value: of no more than noise being in that.
+        stretch: part by which the board is taller for its width than its file says, with its sigma.
+        offset_m: RMS distance of the points from where the file has them, beyond chance.
+        p_value: of the offsets if they were noise alone.
     """
 
     stretch: float
@@ -32,10 +32,10 @@ class BoardCheck:
 
 
 def check_board(fit: LensFit) -> BoardCheck:
-    """One Gauss-Newton step with the board free to stretch; then every point free to move.
+    """Take one Gauss-Newton step with the board free to stretch, then with every point free.
 
-    A board that is as a whole too large or too small moves all views away and nothing else: that
-    can't be seen by one camera.
+    One camera can't see that a board is too large or too small as a whole: that scales the
+    distances of all views and changes nothing else.
     """
     seen = lens_bundle.gathered(fit.views)
     rows = len(seen.corners_px)
@@ -55,7 +55,7 @@ def check_board(fit: LensFit) -> BoardCheck:
     residual_px = np.zeros((*weights.shape, 2))
     residual_px[:count] = fit.residual_px
 
-    # (P, 2, 2) and (P, 2): each point's place on the board from all views of it.
+    # (P, 2, 2) and (P, 2): normal equations of each point's place on the board, from all views.
     H = np.einsum("vp,vpci,vpcj->pij", weights, J, J)
     g = np.einsum("vp,vpci,vpc->pi", weights, J, residual_px)
     often = (weights > 0).sum(axis=0) >= 2
@@ -76,7 +76,7 @@ def _board_freedom(
     lens: str, y: Unknowns, seen: lens_bundle.Seen, weights: Array
 ) -> tuple[Array, Array, Array]:
     """Derivatives (V, P, 2, 2) by a point's x and y; information (10, 10) and gradient (10,) of the
-    lens and the board's stretch when no pose is known."""
+    lens and the board's stretch, with the poses eliminated."""
     residual_px, of_lens, of_pose = lens_bundle.linearised(lens, y, seen)
     of_point = of_pose[..., :2]  # a pose that shifts along the board's x and y
     stretch = of_point[..., 1:] * seen.points_board_m[None, :, None, 1:2]

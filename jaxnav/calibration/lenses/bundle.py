@@ -1,8 +1,8 @@
-"""One camera and all its views of a board, as one least-squares problem.
+"""Bundle adjustment of one camera and all its views of a board.
 
-Unknown are the lens, nine numbers that all views share, and a pose of the board in every view. The
-poses are eliminated (`jaxnav.numerics.schur`), so time and memory grow with the number of views.
-The frame is the board's: nothing is left to fix.
+The unknowns are the lens, nine numbers that all views share, and the pose of the board in every
+view. The poses are eliminated (`jaxnav.numerics.schur`), so time and memory grow linearly with the
+number of views. The frame is the board's, so there is no gauge to fix.
 """
 
 from functools import partial
@@ -23,16 +23,16 @@ from jaxnav.models.geometry import rotation_matrix, skew, turn_and_shift
 from jaxnav.models.lenses import LENSES, MOST_COEFFICIENTS
 from jaxnav.numerics.schur import Blocks, SchurLM, SchurState, reduce
 
-# Of the shared unknowns, in their order; zero and fixed beyond what the lens has.
+# Names of the shared unknowns, in order; unknowns that a lens doesn't have are fixed at zero.
 FITTED = ("none", "radtan", "equidistant")
 NAMES = {lens: ("fx", "fy", "cx", "cy", *LENSES[lens].coefficients) for lens in FITTED}
 COUNT = 9
 NO_CUT = 1e8  # in sigmas: plain least squares
-_BATCH = 16  # views are padded to a multiple of so many, so that few sizes are compiled
+_BATCH = 16  # views are padded to a multiple of this, so that few sizes are compiled
 
 
 class Seen(eqx.Module):
-    """What is known, padded: V views, P points of the board. On the host until it is solved."""
+    """The observed corners, padded: V views of P points. They stay on the host until solved."""
 
     points_board_m: Float[Array | np.ndarray, "P 3"]
     corners_px: Float[Array | np.ndarray, "V P 2"]
@@ -40,36 +40,36 @@ class Seen(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """What is to be found."""
+    """The unknowns of the problem: the lens and the pose of the board in every view."""
 
     lens: Float[Array, " 9"]  # fx fy cx cy, then the coefficients as the camera counts them
     Ts_camera_board: Float[Array, "V 7"]  # wxyz_xyz
 
 
 class Bundle(eqx.Module):
-    """A minimum."""
+    """The solution of the least-squares problem: a minimum with its normal equations."""
 
     unknowns: Unknowns
-    residual_px: Float[Array, "V P 2"]  # predicted - seen; 0 where nothing was
-    blocks: Blocks  # in pixels, weighed as the fit was
+    residual_px: Float[Array, "V P 2"]  # predicted - seen; 0 for points not seen
+    blocks: Blocks  # in pixels, weighted as in the fit
     steps: Array
     converged: Array
 
 
 def free_mask(lens: str, fixed: tuple[str, ...] = ()) -> np.ndarray:
-    """(9,) bool: which shared unknowns may move."""
+    """(9,) bool: true for shared unknowns that the fit may change."""
     names = NAMES[lens]
     return np.array([i < len(names) and names[i] not in fixed for i in range(COUNT)])
 
 
 def camera_of(lens: str, parameters: Array) -> Camera:
-    """The camera of nine numbers."""
+    """The camera with these nine parameters."""
     coefficients = jnp.pad(parameters[4:], (0, MOST_COEFFICIENTS + 4 - COUNT))
     return Camera(parameters[:2], parameters[2:4], coefficients, jnp.asarray(0), (lens,))
 
 
 def gathered(views: BoardViews) -> Seen:
-    """The views as arrays, on the host; after the last come empty ones."""
+    """The views as arrays on the host, padded with empty views."""
     rows = -(-len(views.views) // _BATCH) * _BATCH
     points = len(views.points_board_m)
     corners_px, present = np.zeros((rows, points, 2)), np.zeros((rows, points), bool)
@@ -80,7 +80,7 @@ def gathered(views: BoardViews) -> Seen:
 
 
 def padded_poses(Ts_camera_board: np.ndarray, rows: int) -> np.ndarray:
-    """(rows, 7): those given, then some that look at the board from a metre away."""
+    """(rows, 7): the given poses, padded with poses that face the board from 1 m away."""
     away = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     return np.concatenate([Ts_camera_board, np.tile(away, (rows - len(Ts_camera_board), 1))])
 
@@ -96,14 +96,14 @@ def solve(
     cut: Float[Array, ""],
     max_steps: int = 100,
 ) -> Bundle:
-    """The unknowns that explain the corners best.
+    """Find the unknowns that explain the corners best.
 
-    With the distance d of a corner from its prediction, in sigmas, a corner costs
-    cut^2 log(1 + d^2 / cut^2) (Cauchy): d^2 next to 0, and ever less more beyond the cut.
+    A corner at the distance d from its prediction, in sigmas, costs cut^2 log(1 + d^2 / cut^2)
+    (Cauchy): nearly d^2 close to 0, and a logarithm of d beyond the cut.
 
     Args:
-        weights: of every corner, on its squared distance; 0 leaves it out.
-        free: which of the nine move.
+        weights: factors of each corner's squared distance; 0 leaves a corner out.
+        free: mask of the nine shared unknowns that move.
         cut: in sigmas; `NO_CUT` for plain least squares.
     """
     weights = jnp.where(seen.present, weights, 0)
@@ -138,7 +138,7 @@ def solve(
 
 @jax.jit
 def lens_information(blocks: Blocks, free: Bool[Array, " 9"]) -> Float[Array, "9 9"]:
-    """Of the nine when no pose is known, 1 / px^2 of noise; identity where one is fixed."""
+    """Information of the nine, poses eliminated, for 1 px of noise; identity for fixed ones."""
     return reduce(blocks, free, jnp.zeros(())).system
 
 
@@ -146,7 +146,7 @@ def lens_information(blocks: Blocks, free: Bool[Array, " 9"]) -> Float[Array, "9
 def view_information(
     lens: str, y: Unknowns, seen: Seen, weights: Float[Array, "V P"]
 ) -> Float[Array, "V 9 9"]:
-    """What every view alone tells of the nine, its own pose being unknown; 1 / px^2 of noise."""
+    """Information of the nine from each view alone, its pose eliminated, for 1 px of noise."""
     _, of_lens, of_pose = linearised(lens, y, seen)
     root = jnp.sqrt(jnp.where(seen.present, weights, 0))[..., None, None]
     A, B = (
@@ -160,7 +160,7 @@ def view_information(
 
 @partial(jax.jit, static_argnames="lens")
 def residuals_px(lens: str, y: Unknowns, seen: Seen) -> Float[Array, "V P 2"]:
-    """Predicted - seen, 0 where nothing was."""
+    """Residuals, predicted - seen; 0 for points not seen."""
     return jnp.where(seen.present[..., None], _predicted(lens, y, seen) - seen.corners_px, 0)
 
 
@@ -178,7 +178,7 @@ def _predicted(lens: str, y: Unknowns, seen: Seen) -> Float[Array, "V P 2"]:
 
 
 def linearised(lens: str, y: Unknowns, seen: Seen) -> tuple[Array, Array, Array]:
-    """Residuals (V, P, 2), their derivatives by the nine (V, P, 2, 9) and by xi (V, P, 2, 6)."""
+    """Residuals (V, P, 2), their Jacobians by the nine (V, P, 2, 9) and by xi (V, P, 2, 6)."""
 
     def pixel(parameters: Array, point_camera: Array) -> tuple[Array, Array]:
         projected = camera_of(lens, parameters).project(point_camera)
@@ -203,7 +203,7 @@ def linearised(lens: str, y: Unknowns, seen: Seen) -> tuple[Array, Array, Array]
 
 
 def normal_equations(residual_px: Array, of_lens: Array, of_pose: Array, counts: Array) -> Blocks:
-    """Normal equations of residuals that count so much each, (V, P)."""
+    """Normal equations of the residuals, each multiplied by its factor in `counts` (V, P)."""
     views = residual_px.shape[0]
     r = (counts[..., None] * residual_px).reshape(views, -1)
     A, B = (
@@ -221,7 +221,7 @@ def normal_equations(residual_px: Array, of_lens: Array, of_pose: Array, counts:
 
 
 def _moved(y: Unknowns, own: Array, shared: Array) -> Unknowns:
-    # A focal length that turned negative would mirror the image: at most a halving a step.
+    # A negative focal length would mirror the image, so a step at most halves it.
     lens = y.lens + shared
     lens = lens.at[:2].set(jnp.maximum(lens[:2], y.lens[:2] / 2))
     return Unknowns(lens, retracted(y.Ts_camera_board, own))

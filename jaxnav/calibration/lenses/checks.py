@@ -1,4 +1,4 @@
-"""What the views of a board can say of a lens, and whether the lens fits them."""
+"""Measures of how well views of a board determine a lens, and of how well the lens fits them."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -18,17 +18,17 @@ _RIM_POINTS = 9  # along each side of the image
 
 
 def border_px(image_size_px: tuple[int, int]) -> np.ndarray:
-    """(N, 2) pixels around the image's border."""
+    """(N, 2) pixels along the image's border."""
     w, h = np.array(image_size_px) - 1.0
     part = np.linspace(0, 1, _RIM_POINTS)
     return np.concatenate([[[w * p, 0], [w * p, h], [0, h * p], [w, h * p]] for p in part])
 
 
 def rim_sigma_px(fit: LensFit) -> float:
-    """How far off a ray may be drawn at the image's border: the largest standard deviation, px.
+    """The largest standard deviation of a ray's projection at the image's border, px.
 
-    Of focal length and radial coefficients alone: an error of the centre is made up for by the
-    camera's direction. Infinite where the lens reaches no border of the image any more.
+    It counts focal length and radial coefficients alone: the camera's direction makes up for an
+    error of the centre. It is infinite where the fitted lens doesn't reach the image's border.
     """
     pixels = border_px(fit.views.image_size_px)
     drawn_px, J = jax.device_get(
@@ -45,7 +45,7 @@ def rim_sigma_px(fit: LensFit) -> float:
 
 @partial(jax.jit, static_argnames="lens")
 def _drawn_again(lens: str, parameters: Array, pixels: Array) -> tuple[Array, Array]:
-    """Where the rays of the pixels are drawn, (N, 2), and its derivative by the nine, (N, 2, 9)."""
+    """Projections (N, 2) of the pixels' fixed rays, and their Jacobian (N, 2, 9) by the nine."""
     rays = lens_bundle.camera_of(lens, parameters).unproject(pixels)
 
     def drawn(parameters: Array) -> Array:
@@ -55,15 +55,15 @@ def _drawn_again(lens: str, parameters: Array, pixels: Array) -> tuple[Array, Ar
 
 
 def reach(fit: LensFit) -> float:
-    """How far from the middle corners were seen, in parts of the way to the image's corner."""
+    """Distance of the farthest corner seen from the image's middle, over that of its corner."""
     middle = (np.array(fit.views.image_size_px) - 1) / 2
     farthest = np.linalg.norm(_used_px(fit) - middle, axis=1).max(initial=0)
     return float(farthest / np.linalg.norm(middle))
 
 
 def tilts_deg(fit: LensFit) -> tuple[float, float]:
-    """Angle between the board's normal and the camera's axis, median; and the largest angle
-    between two views' normals: 0 when all views are parallel."""
+    """The median angle between the board's normal and the camera's axis; and the largest angle
+    between the normals of two views, 0 if all views are parallel."""
     kept = fit.view_weights > 0
     quaternions = np.roll(fit.Ts_camera_board[kept, :4], -1, axis=1)
     normals_camera = Rotation.from_quat(quaternions).as_matrix()[:, :, 2]
@@ -74,14 +74,14 @@ def tilts_deg(fit: LensFit) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Cells:
-    """The image cut into cells, h x w of them.
+    """Coverage and mean residuals of the image in a grid of h x w cells.
 
     Attributes:
-        corners: (h, w) how many corners of the fit lie in each.
-        mean_px: (h, w, 2) their mean residual, 0 where there is none.
-        middle_px: (h, w, 2).
-        systematic_px: root mean square of what is left in the cells' means beyond their noise.
-        p_value: of no more than noise being in them.
+        corners: (h, w) number of corners of the fit in each cell.
+        mean_px: (h, w, 2) their mean residual, 0 in empty cells.
+        middle_px: (h, w, 2) the middle of each cell.
+        systematic_px: RMS of the cells' means beyond their noise.
+        p_value: of the cells' means if they were noise alone.
     """
 
     corners: np.ndarray
@@ -92,7 +92,7 @@ class Cells:
 
 
 def cells(fit: LensFit) -> Cells:
-    """Coverage and residuals over the image."""
+    """Compute coverage and mean residuals over the image."""
     width, height = fit.views.image_size_px
     wide, high = _CELLS_WIDE, max(2, round(_CELLS_WIDE * height / width))
     corners_px = _used_px(fit)
@@ -121,5 +121,5 @@ def cells(fit: LensFit) -> Cells:
 
 
 def _used_px(fit: LensFit) -> np.ndarray:
-    """(N, 2) the corners in the fit."""
+    """(N, 2) the corners that are in the fit, px."""
     return np.asarray(lens_bundle.gathered(fit.views).corners_px[: len(fit.used)][fit.used])

@@ -1,7 +1,7 @@
-"""Of many views, those that tell most about the lens.
+"""Choice of the views that tell most about the lens.
 
-Source: Fedorov (1972), "Theory of optimal experiments": the determinant of the information
-(D-optimality), raised by one view after the other.
+Source: Fedorov (1972), "Theory of optimal experiments": greedy D-optimality, each view chosen
+raises the determinant of the information most.
 """
 
 import jax.numpy as jnp
@@ -12,12 +12,12 @@ from jaxnav.calibration.lenses.bundle import Unknowns
 from jaxnav.calibration.lenses.start import board_poses
 from jaxnav.calibration.lenses.views import BoardViews
 
-_WRONG = 10.0  # times the median view's error: what such a view tells is not about the lens
-_NO_CURVE = 1e-9  # of the best known parameter, so that the first views have a determinant
+_WRONG = 10.0  # times the median view's error: a view beyond it tells nothing about the lens
+_NO_CURVE = 1e-9  # of the total information, so that the first views have a determinant
 
 
 def informative(views: BoardViews, lens: str, parameters: np.ndarray, most: int) -> tuple[int, ...]:
-    """Numbers of at most so many views, in their order.
+    """Indices, in order, of the at most `most` views that tell most about the lens.
 
     Args:
         parameters: (9,) of the lens, roughly.

@@ -1,7 +1,7 @@
-"""Which lens model the views support, by views that it was not fitted to.
+"""Comparison of lens models by cross-validation over the views.
 
-Every lens is fitted to three quarters of the views and has to explain the last one, whose poses
-alone are then free; four times, so that each view was left out once.
+Every lens is fitted to three quarters of the views and has to explain the last quarter, where only
+the poses are then free; four times, so that each view is left out once.
 
 Source: Stone (1974), "Cross-validatory choice and assessment of statistical predictions".
 """
@@ -18,7 +18,7 @@ from jaxnav.calibration.lenses.fit import LensFit
 
 _FOLDS = 4
 FEWEST_VIEWS = 8
-_WORSE = 1.02  # times the error of the best: a lens of fewer coefficients may be so much worse
+_WORSE = 1.02  # times the least error: a lens of fewer coefficients may be this much worse
 _CLEARLY = 1.05, 3.0  # times the error, and standard errors of the difference
 SIMPLEST_FIRST = ("none", "equidistant", "radtan")
 
@@ -28,8 +28,8 @@ class HeldOut:
     """Errors of views that a lens was not fitted to.
 
     Attributes:
-        view_px: (V,) standard deviation of a corner's x and of its y; NaN of views without weight.
-        rms_px: of all of them.
+        view_px: (V,) standard deviation of a corner's x and of its y; NaN for views without weight.
+        rms_px: root mean square of `view_px`.
     """
 
     view_px: np.ndarray
@@ -37,7 +37,7 @@ class HeldOut:
 
 
 def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
-    """Every view's error when the lens was fitted without it.
+    """The error of every view under the lens fitted without it.
 
     Args:
         weights: (V, P) of the corners, the same for all lenses that are compared.
@@ -72,7 +72,7 @@ def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
 
 
 def best_lens(compared: Mapping[str, HeldOut]) -> str:
-    """The lens of the lowest error, or one of fewer coefficients that is hardly worse."""
+    """The lens with the lowest error, or one with fewer coefficients that is hardly worse."""
     least = min(one.rms_px for one in compared.values())
     return next(
         lens
@@ -82,7 +82,7 @@ def best_lens(compared: Mapping[str, HeldOut]) -> str:
 
 
 def clearly_better(one: HeldOut, other: HeldOut) -> bool:
-    """Whether one lens explains unseen views better than another, more than by chance."""
+    """True if one lens explains unseen views better than the other, by more than chance."""
     ratio, errors = _CLEARLY
     difference = np.log(other.view_px / one.view_px)
     difference = difference[np.isfinite(difference)]

@@ -1,8 +1,8 @@
-"""A lens from views of which some corners, and whole views, may be wrong.
+"""Robust fit of a lens to views of which some corners, and some whole views, may be wrong.
 
-First corners count less the further off they are (Cauchy), which finds what is wrong without being
-led by it. Then what is wrong is left out and the rest is plain least squares, whose covariance
-means what it says; both until nothing changes.
+First corners count less the further off they are (Cauchy), so that outliers are found without
+leading the fit astray. Then outliers are left out and plain least squares fits the rest, so that
+its covariance is honest; this is repeated until nothing changes.
 
 Source: Rousseeuw and Leroy (1987), "Robust regression and outlier detection", chapter 5.2
 (reweighted least squares).
@@ -22,27 +22,27 @@ from jaxnav.calibration.lenses.views import BoardViews
 
 _CUT = 2.0  # in sigmas, of Cauchy's cost
 _FAR = 5.0  # in sigmas: Gaussian noise takes one corner in 270 000 there
-_WEAK, _WRONG = 1.5, 4.0  # a view whose corners are so many times as far off counts less, or not
-_CHANCE = 1e-6  # of a good view's being taken for a worse one
+_WEAK, _WRONG = 1.5, 4.0  # a view whose corners are this many times as far off counts less, or not
+_CHANCE = 1e-6  # probability that a good view is taken for a worse one
 _ROBUST_ROUNDS, _ROUNDS = 3, 10
 _LEAST_SIGMA_PX = 1e-6
 
 
 @dataclass(frozen=True)
 class LensFit:
-    """A lens and its views.
+    """A lens fitted to views, with its covariance, the board's poses and the residuals.
 
     Attributes:
-        parameters: (9,) fx fy cx cy and the coefficients as the camera counts them.
-        covariance: (9, 9) of these; zero where one is fixed.
-        fixed: names of those held at zero.
+        parameters: (9,) fx fy cx cy and the coefficients in the camera's order.
+        covariance: (9, 9) of the parameters; zero for fixed ones.
+        fixed: names of the parameters held at zero.
         Ts_camera_board: (V, 7) wxyz_xyz.
-        residual_px: (V, P, 2) predicted - seen; 0 where nothing was.
-        used: (V, P) which corners were in the fit.
-        view_weights: (V,) 1, less where a view is worse than the others, 0 where it was left out.
+        residual_px: (V, P, 2) predicted - seen; 0 for points not seen.
+        used: (V, P) true for corners in the fit.
+        view_weights: (V,) 1; less for a view that is worse than the others, 0 if it is left out.
         view_sigma_px: (V,) standard deviation of a corner's x and of its y; inf without a pose.
-        sigma_px: the same of all views of weight 1.
-        converged: whether the search ended by itself.
+        sigma_px: the same for a view of weight 1, over the whole fit.
+        converged: true if the search ended before its limit of steps.
     """
 
     lens: str
@@ -60,22 +60,22 @@ class LensFit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the parameters that the lens has."""
+        """Names of the parameters that the lens has."""
         return NAMES[self.lens]
 
     @property
     def sigma(self) -> np.ndarray:
-        """(9,) one standard deviation; 0 where one is fixed."""
+        """(9,) standard deviations of the parameters; 0 for fixed ones."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def rms_px(self) -> float:
-        """Root mean squared distance of the corners in the fit, as OpenCV counts it."""
+        """RMS distance of the corners in the fit from their predictions, as OpenCV defines it."""
         return float(np.sqrt(np.mean(np.sum(self.residual_px[self.used] ** 2, axis=-1))))
 
     @property
     def weights(self) -> np.ndarray:
-        """(V, P) of every corner."""
+        """(V, P) the weight of every corner."""
         return self.used * self.view_weights[:, None]
 
 
@@ -85,11 +85,11 @@ def fit_lens(
     fixed: tuple[str, ...] = (),
     start: np.ndarray | None = None,
 ) -> LensFit:
-    """The lens, the pose of every view, and which corners and views are wrong.
+    """Fit the lens and the pose of every view, and find the corners and views that are wrong.
 
     Args:
         fixed: names of parameters to hold at zero.
-        start: (9,); found if not given.
+        start: (9,) first guess; found by `lens_start` if not given.
     """
     free = lens_bundle.free_mask(lens, fixed)
     parameters = np.where(free, lens_start(views, lens)[0] if start is None else start, 0)
@@ -121,7 +121,7 @@ def fit_lens(
         used, view_weights = problem.judged(residual_px, sigma_px)
         if np.array_equal(used, before[0]) and np.allclose(view_weights, before[1], rtol=0.05):
             break
-    used, view_weights = before  # what the fit was made with
+    used, view_weights = before  # those of the last fit
     return LensFit(
         lens=lens,
         views=views,
@@ -143,7 +143,7 @@ class _Problem:
     lens: str
     seen: Seen
     free: np.ndarray
-    posed: np.ndarray  # (V,) whether there is a pose to begin with
+    posed: np.ndarray  # (V,) true for views with a first guess of the pose
 
     def solved(self, y: Unknowns, weights: np.ndarray, sigma_px: float, cut: float) -> Bundle:
         return jax.block_until_ready(
@@ -159,7 +159,7 @@ class _Problem:
         )
 
     def view_sigma_px(self, residual_px: np.ndarray) -> np.ndarray:
-        """(V,), by the median, of which up to half of the corners may be wrong; inf without a pose.
+        """(V,) sigma by the median, so up to half the corners may be wrong; inf without a pose.
 
         The squared length of two Gaussian coordinates has the median 2 ln 2 sigma^2.
         """
@@ -167,27 +167,27 @@ class _Problem:
         squared[~self.posed] = np.inf
         corners = np.sum(self.seen.present, axis=1)
         known = np.where(corners[:, None] > 0, squared, np.inf)
-        # Six of the 2 n coordinates go into the pose.
+        # The pose takes six of the 2 n degrees of freedom.
         freedom = np.maximum(2 * corners - 6, 1) / np.maximum(2 * corners, 1)
         return np.sqrt(np.nanmedian(known, axis=1) / (2 * np.log(2)) / freedom)
 
     def typical_px(self, residual_px: np.ndarray) -> float:
-        """Standard deviation in the median view."""
+        """Standard deviation of a corner's coordinate in the median view, px."""
         each = self.view_sigma_px(residual_px)[self.posed]
         return max(float(np.median(each)) if len(each) else 1.0, _LEAST_SIGMA_PX)
 
     def sigma_px(self, residual_px: np.ndarray, weights: np.ndarray) -> float:
-        """Standard deviation at weight 1, of what is in the fit."""
+        """Standard deviation of a corner's coordinate at weight 1, over the corners in the fit."""
         views = np.any(weights > 0, axis=1).sum()
         freedom = 2 * np.sum(weights > 0) - 6 * views - self.free.sum()
         squared = float(np.sum(weights * np.sum(residual_px**2, axis=-1)))
         return max(float(np.sqrt(squared / max(freedom, 1))), _LEAST_SIGMA_PX)
 
     def judged(self, residual_px: np.ndarray, sigma_px: float) -> tuple[np.ndarray, np.ndarray]:
-        """Which corners are right (V, P), and what each view weighs (V,)."""
+        """Judge corners and views: a mask of the right corners (V, P) and view weights (V,)."""
         each = self.view_sigma_px(residual_px)
-        # Views of few corners must be granted the spread of a sample median, those of hardly more
-        # than their pose needs that of what is left over.
+        # Views of few corners are granted the spread of a sample median; views of hardly more
+        # corners than their pose needs are granted the spread at their few degrees of freedom.
         corners = np.maximum(np.sum(self.seen.present, axis=1), 1)
         freedom = np.maximum(2 * corners - 6, 1)
         median_spread = 5 / (np.log(2) * np.sqrt(corners))
@@ -199,12 +199,12 @@ class _Problem:
         expected_px = sigma_px / np.sqrt(np.where(right, weights, 1))
         distance_px = np.linalg.norm(residual_px, axis=-1)
         used = self.seen.present & right[:, None] & (distance_px < _FAR * expected_px[:, None])
-        # What keeps no pose in place is worth nothing.
+        # Fewer than four corners don't determine a pose.
         few = used.sum(axis=1) < 4
         return used & ~few[:, None], np.where(few, 0.0, weights)
 
     def covariance(self, bundle: Bundle, sigma_px: float) -> np.ndarray:
-        """(9, 9), zero where fixed; infinite where the views tell nothing."""
+        """(9, 9) covariance; zero for fixed parameters, infinite if the views tell nothing."""
         information = np.asarray(
             lens_bundle.lens_information(bundle.blocks, jnp.asarray(self.free))
         )[np.ix_(self.free, self.free)]
@@ -222,7 +222,7 @@ class _Problem:
 
 
 def _posed_anew(views: BoardViews, problem: _Problem, bundle: Bundle, sigma_px: float) -> Unknowns:
-    """With views that are far off begun again: they may hang in the mirrored pose."""
+    """Give views that are far off a new first pose: they may be stuck in the mirrored one."""
     each = problem.view_sigma_px(np.asarray(bundle.residual_px))
     far = np.flatnonzero(problem.posed & (each > 2 * sigma_px))
     y = bundle.unknowns

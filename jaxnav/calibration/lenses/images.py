@@ -1,9 +1,9 @@
-"""A camera's lens from its images: views of the board, then the lens; of a marker by turns.
+"""Calibration of a camera's lens from images: views of the board first, then the lens.
 
-The edges of a board with saddles are as bent as their neighbours show. The corners of a marker
-stand alone: a lens bends its edges, and lines through bent edges meet beside the corner, by
-pixels where the lens is wide. Only the lens that is sought can tell. So one looks again with what
-was found, until it stays.
+The bend of a board's edges at a saddle follows from its neighbours. The corners of a marker
+have none: a lens bends the marker's edges, and straight lines fitted to them meet beside the
+corner, by pixels if the lens is wide. Only the lens itself tells how they bend, so with a marker
+detection and fit are repeated, each with the last lens, until the lens stays the same.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,12 +37,12 @@ def calibrate_images(
     tell: Callable[[str], None] = lambda stage: None,
     headless: bool = True,
 ) -> tuple[CollectedViews, LensCalibration]:
-    """What the images show of the board, and the lens that explains it best.
+    """Collect the views of the board from images, and calibrate the lens from them.
 
     Args:
         sources: see `collect_views`.
-        lens: see `calibrate_lens`, as of `max_views` and `tell`.
-        headless: no progress bar.
+        lens: see `calibrate_lens`, also for `max_views` and `tell`.
+        headless: show no progress bar.
 
     Raises:
         BadInput: as `collect_views` and `calibrate_lens` do.
@@ -64,7 +64,7 @@ def _camera_of_marker(
     tell: Callable[[str], None],
     headless: bool,
 ) -> Camera | None:
-    """The lens roughly, for the marker's edges; None where there are too few views for any."""
+    """Find the lens roughly, to bend the marker's edges by; None if there are too few views."""
     before: LensFit | None = None
     for look in range(_LOOKS):
         tell(f"look {look + 1}")

@@ -1,7 +1,7 @@
-"""A camera's lens from views of a board: what was found, how sure it is, and what to do about it.
+"""Calibration of a camera's lens from views of a board, with its uncertainty and advice.
 
-What the views can't tell is refused in one line, or held at zero and named; it never comes back as
-noise.
+If the views don't determine focal length or centre, the calibration is refused in one line. Other
+parameters that they don't determine are held at zero and named; none is returned as noise.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,16 +24,16 @@ from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
 
 FEWEST_VIEWS = 5
-_LEAST_SPREAD_DEG = 5.0  # between two views' normals
-_NO_FOCAL = 0.1  # one sigma of a focal length, in parts of it: whatever is held at zero
-_WORST_FOCAL = 0.01  # one sigma of a focal length, in parts of it
-_WORST_CENTER = 0.02  # of the centre, in parts of the image's width
-_LOOSE_CENTER = 0.003  # beyond which the tangential coefficients are held at zero
+_LEAST_SPREAD_DEG = 5.0  # between the normals of two views
+_NO_FOCAL = 0.1  # relative sigma of a focal length beyond which holding others at zero can't help
+_WORST_FOCAL = 0.01  # relative sigma of a focal length
+_WORST_CENTER = 0.02  # sigma of the centre over the image's width
+_LOOSE_CENTER = 0.003  # the same, beyond which the tangential coefficients are held at zero
 _WORST_RIM_PX = 1.0  # one sigma of the radial function at the image's border
-_RIM_SIGMAS = 5.0  # of the corners' noise, where that is more
+_RIM_SIGMAS = 5.0  # the same in sigmas of the corners' noise, if that is more
 _FAR_ENOUGH = 0.85  # of the way to the image's corner
-_WRONG_BOARD = 0.004  # of the image's width: noise larger than this is no noise
-_NO_START = 0.012  # of the image's width, by which the median corner misses the best start
+_WRONG_BOARD = 0.004  # of the image's width: larger residuals are not noise
+_NO_START = 0.012  # of the image's width: largest median residual of the best start
 _WHICH_BOARD = (
     "is it the board of the file, with as many squares in its rows and columns, and is the lens of "
     "this kind?"
@@ -47,16 +47,16 @@ _LAST_FIRST = {
 
 @dataclass(frozen=True)
 class LensCalibration:
-    """A lens and all there is to say of it.
+    """A calibrated lens with its checks, its left-out views and advice.
 
     Attributes:
         fit: the lens, its views and their residuals.
-        held_out_px: by lens, the error of views that it was not fitted to; empty where there
-            were too few views to leave any out.
-        given: how many views there were.
-        left_out: by view, why it is not in the fit; those that only would not have told more
+        held_out_px: lens -> error of views that it was not fitted to; empty if there were too
+            few views to leave any out.
+        given: number of views given.
+        left_out: view -> why it is not in the fit; views left out only because others tell more
             are not named.
-        downweighted: by view, its weight, where it counts less than the others.
+        downweighted: view -> its weight, for views that count less than the others.
         findings: sentences about what is wrong or was held at zero.
         advice: sentences about what to collect next.
     """
@@ -71,7 +71,7 @@ class LensCalibration:
 
     @property
     def camera(self) -> Camera:
-        """The lens, in the process's precision."""
+        """The calibrated camera, in the process's precision."""
         return lens_bundle.camera_of(self.fit.lens, jnp.asarray(self.fit.parameters, float))
 
 
@@ -83,17 +83,17 @@ def calibrate_lens(
     tell: Callable[[str], None] = lambda stage: None,
     gone: Mapping[str, str] = MappingProxyType({}),
 ) -> LensCalibration:
-    """The lens that explains the views best.
+    """Calibrate the lens that explains the views best.
 
     Args:
-        lens: "none", "radtan", "equidistant", or "auto" for whichever explains unseen views best.
-        max_views: at most so many, those that tell most.
-        where: what a person gave, for messages.
-        tell: is called with a word for every stage.
-        gone: images without a view, by name, and why; for messages.
+        lens: "none", "radtan", "equidistant", or "auto" for the one best at unseen views.
+        max_views: the most views to fit; those that tell most are taken.
+        where: the source of the views as the user gave it, for messages.
+        tell: called with a word for every stage.
+        gone: image -> why it gave no view, for messages.
 
     Raises:
-        BadInput: the views can't tell the focal length or the centre, or show another board.
+        BadInput: the views don't determine focal length or centre, or show another board.
     """
     good, left_out = screened(views)
     _require_views(good, {**left_out, **gone}, where)
@@ -175,11 +175,11 @@ def _best(fits: dict[str, LensFit], compared: dict[str, lens_comparison.HeldOut]
 
 
 def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
-    """The fit again, with what the corners don't reach held at zero."""
+    """Refit the lens with coefficients that the corners don't determine held at zero."""
     width = fit.views.image_size_px[0]
     for name in _LAST_FIRST[fit.lens]:
         rim_px = rim_sigma_px(fit)
-        folds = np.isinf(rim_px) and reach(fit) > _FAR_ENOUGH  # no want of corners
+        folds = np.isinf(rim_px) and reach(fit) > _FAR_ENOUGH  # corners aren't lacking
         if folds or rim_px < max(_WORST_RIM_PX, _RIM_SIGMAS * fit.sigma_px):
             break
         tell(f"hold {name}")
@@ -207,7 +207,7 @@ def _require_agreement(fit: LensFit, where: str) -> None:
 
 
 def _require_board(misfit_px: float, width: int, where: str) -> None:
-    # A wrong board fits no view, and then the search would last long.
+    # A wrong board fits no view, and the search would take long to show it.
     if misfit_px > _NO_START * width:
         raise BadInput(
             where, f"no lens explains the corners to less than {misfit_px:.2g} px: {_WHICH_BOARD}"
@@ -231,7 +231,7 @@ def _require_tilt(fit: LensFit, where: str) -> None:
 
 
 def _relative_focal(fit: LensFit) -> float:
-    """One sigma of the focal length, in parts of it; of the less known one."""
+    """The larger of the relative sigmas of the two focal lengths."""
     return float(np.max(fit.sigma[:2] / np.abs(fit.parameters[:2])))
 
 

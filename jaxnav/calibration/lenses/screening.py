@@ -1,4 +1,4 @@
-"""Views that are no use whatever the lens: blurred, seen twice, too little of the board."""
+"""Screening of views that are of no use to any lens: blurred, repeated or with too few points."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from jaxnav.calibration.lenses.views import BoardView, BoardViews
 
 FEWEST_CORNERS = 4
 _SAME_PX = 0.02  # two photographs of one scene differ by more noise than that
-_BLURRED, _BLURRED_PX = 2.0, 4.0  # times the median view's edges, and at least so wide
+_BLURRED, _BLURRED_PX = 2.0, 4.0  # edges this many times as wide as the median view's, at least px
 
 
 def screened(views: BoardViews) -> tuple[BoardViews, dict[str, str]]:
-    """The views worth a look, and why each of the others is not."""
+    """The usable views, and by name why each of the others is left out."""
     left_out: dict[str, str] = {}
     kept: list[BoardView] = []
     edges_px = np.array([view.edge_width_px for view in views.views])

@@ -1,4 +1,4 @@
-"""Views of a board as somebody takes them by hand: corners with noise, no pixels."""
+"""Simulation of hand-held views of a board: corners with noise, without images."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ _FACING = np.diag([1.0, -1.0, -1.0])  # R_camera_board of a board that hangs upr
 
 
 def grid_points_m(columns: int, rows: int, pitch_m: float) -> np.ndarray:
-    """(columns * rows, 3) points of a board, row by row from the top, its centre at 0."""
+    """(columns * rows, 3) points of a board centred at 0, row by row from the top, m."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows)[::-1])
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1) * pitch_m
     return points - points.mean(axis=0)
@@ -32,16 +32,16 @@ def simulated_views(
     reach: float = 1.0,
     fewest: int = 12,
 ) -> tuple[BoardViews, np.ndarray]:
-    """So many views, and where the board truly was, T_camera_board as (count, 7) wxyz_xyz.
+    """Simulate `count` views; return them and the true T_camera_board, (count, 7) wxyz_xyz.
 
     The board's middle is anywhere in the image, its normal anywhere within a cone about the line of
     sight. Points outside of the image are missing.
 
     Args:
         sigma_px: standard deviation of a corner's x and of its y.
-        most_tilt_deg: the cone; 0 holds the board parallel to the image instead.
-        reach: part of the image, from its middle, that the board's middle stays in.
-        fewest: points of a view, or it is taken anew.
+        most_tilt_deg: half angle of the cone; 0 holds the board parallel to the image instead.
+        reach: part of the image, about its middle, that the board's middle stays in.
+        fewest: least number of points of a view; views with fewer are drawn again.
     """
     size = np.array(image_size_px, float)
     views: list[BoardView] = []
@@ -67,7 +67,7 @@ def seen_from(
     points_board_m: np.ndarray,
     T_camera_board: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (P, 2) of the board's points without noise, and which are in the image (P,).
+    """Project the board's points to pixels (P, 2) without noise; (P,) true for those in the image.
 
     Args:
         T_camera_board: (7,) wxyz_xyz.
@@ -94,7 +94,7 @@ def _projected(
 
 
 def _orientation(sight: np.ndarray, most_tilt_deg: float, rng: np.random.Generator) -> np.ndarray:
-    """R_camera_board of a board about whose normal it is turned by up to half a right angle."""
+    """Draw R_camera_board: a tilt within the cone, and a turn about the normal by up to 45 deg."""
     roll = Rotation.from_rotvec([0, 0, rng.uniform(-np.pi / 4, np.pi / 4)]).as_matrix()
     if most_tilt_deg == 0:
         return np.asarray(_FACING @ roll)

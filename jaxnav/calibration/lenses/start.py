@@ -1,7 +1,7 @@
-"""Where the search for a lens begins: OpenCV's answer, or ours where it has none.
+"""First guess of a lens for its fit: OpenCV's calibration, or one from a list of focal lengths.
 
 OpenCV's fisheye calibration throws at ill-conditioned views and often at very wide lenses. So focal
-lengths without distortion are tried as well, and what explains the corners best is the start.
+lengths without distortion are tried as well, and the guess with the least median residual is taken.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,9 +25,9 @@ _FEWEST = 4  # points a pose can be found from
 
 
 def lens_start(views: BoardViews, lens: str) -> tuple[np.ndarray, float]:
-    """(9,) fx fy cx cy and coefficients that explain most of the corners roughly.
+    """Find (9,) fx fy cx cy and coefficients that explain most of the corners roughly.
 
-    With the median distance of a corner from where it is expected, px.
+    Also return the median distance of a corner from its prediction, px.
     """
     some = np.unique(np.linspace(0, len(views.views) - 1, _MOST_VIEWS).round().astype(int))
     few = BoardViews(views.points_board_m, views.image_size_px, tuple(views.views[i] for i in some))
@@ -40,10 +40,10 @@ def lens_start(views: BoardViews, lens: str) -> tuple[np.ndarray, float]:
 def board_poses(
     views: BoardViews, lens: str, parameters: np.ndarray, chosen: Sequence[int] | None = None
 ) -> np.ndarray:
-    """(V, 7) T_camera_board of every view, each by itself; NaN where there is none.
+    """(V, 7) T_camera_board of every view, found from that view alone; NaN where none is found.
 
-    Corners become rays, rays become points of a camera that looks at their middle, whatever the
-    angle to the real one's axis. Of a plane's two poses it is the one of the lower error.
+    Corners become rays, and the rays are projected into a pinhole camera that looks at their
+    middle, whatever its angle to the real axis. Of IPPE's two poses, that of lower error is taken.
 
     Args:
         chosen: the views, by number; all of them if not given.
@@ -77,7 +77,7 @@ def _pose(points_board_m: np.ndarray, rays_camera: np.ndarray) -> np.ndarray:
     near = np.linalg.norm(image, axis=1) < _WIDEST
     if near.sum() < _FEWEST:
         return nowhere
-    centre_m = points_board_m[near].mean(axis=0)  # IPPE asks for no offset, but is better for none
+    centre_m = points_board_m[near].mean(axis=0)  # IPPE needs no centring, but is better for it
     try:
         _, rotations, translations, _ = cv2.solvePnPGeneric(
             points_board_m[near] - centre_m, image[near], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
@@ -93,7 +93,7 @@ def _pose(points_board_m: np.ndarray, rays_camera: np.ndarray) -> np.ndarray:
 
 
 def _misfit_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:
-    """Median distance of a corner from its prediction; infinite where half have no pose."""
+    """Median distance of a corner from its prediction, px; infinite if half have no pose."""
     poses = board_poses(views, lens, parameters)
     lost = np.isnan(poses[:, 0])
     seen = lens_bundle.gathered(views)
@@ -114,7 +114,7 @@ def _focal_lengths(image_size_px: tuple[int, int]) -> Iterator[np.ndarray]:
 
 
 def _opencv(views: BoardViews, lens: str) -> Iterator[np.ndarray]:
-    """What OpenCV makes of it, if anything."""
+    """Yield OpenCV's calibration, if it finds a finite one."""
     usable = [view for view in views.views if len(view.ids) >= 6]
     try:
         matrix, coefficients = opencv_calibration(views, usable, lens)
@@ -130,12 +130,12 @@ def _opencv(views: BoardViews, lens: str) -> Iterator[np.ndarray]:
 def opencv_calibration(
     views: BoardViews, usable: Sequence[BoardView], lens: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix (3, 3) and coefficients by cv2.calibrateCamera or cv2.fisheye.calibrate.
+    """Calibrate by cv2.calibrateCamera or cv2.fisheye.calibrate: matrix (3, 3) and coefficients.
 
     Raises:
-        cv2.error: what is often, of fisheye.calibrate.
+        cv2.error: OpenCV fails, which is frequent with fisheye.calibrate.
     """
-    # OpenCV's boards lie in z = 0 and it starts from homographies, mirrored or not.
+    # OpenCV's boards lie in z = 0, and it starts from homographies, whether mirrored or not.
     points = [views.points_board_m[view.ids].astype(np.float32) for view in usable]
     corners = [view.corners_px.astype(np.float32) for view in usable]
     if lens == "equidistant":
@@ -161,5 +161,5 @@ def opencv_calibration(
 
 
 def _fisheye_flag(name: str) -> int:
-    """OpenCV 5 has one set of flags for all lenses, OpenCV 4 other values for the fisheye."""
+    """The flag's value: OpenCV 5 has one set for all lenses, OpenCV 4 another for the fisheye."""
     return int(getattr(cv2.fisheye, name, None) or getattr(cv2, name))

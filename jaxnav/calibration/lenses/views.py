@@ -1,4 +1,4 @@
-"""What a camera saw of a calibration board."""
+"""Views of a calibration board: the points that a camera saw."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class BoardView:
-    """Points of a board that were found in one image.
+    """The points of a board that were found in one image.
 
     Attributes:
-        name: the image's file, with the frame's number where it is of a video.
-        ids: (N,) int, which points of the board they are, each once.
-        corners_px: (N, 2), the centre of the top-left pixel being (0, 0).
-        edge_width_px: how many pixels an edge of the board takes from dark to light, median: some 2
-            in a sharp image. NaN where it could not be measured.
+        name: the image's file, with the frame's number if it is from a video.
+        ids: (N,) int, indices of the points on the board, each once.
+        corners_px: (N, 2); the centre of the top-left pixel is (0, 0).
+        edge_width_px: median width of the board's edges from dark to light, px: some 2 in a sharp
+            image. NaN if it could not be measured.
     """
 
     name: str
@@ -25,12 +25,12 @@ class BoardView:
 
 @dataclass(frozen=True)
 class BoardViews:
-    """All that one camera saw of one board.
+    """All views of one board by one camera.
 
     Attributes:
         points_board_m: (P, 3), all points of the board: x right, y up, z towards its reader, m.
         image_size_px: width, height.
-        views: one entry an image in which it was found.
+        views: one entry for each image in which the board was found.
     """
 
     points_board_m: np.ndarray

@@ -1,1 +1,1 @@
-"""What wheels and steering get wrong, from drives past markers."""
+"""Calibration of the odometry's parameters from drives past markers."""

@@ -1,17 +1,17 @@
-"""Odometry's own figures from drives past markers, each with its uncertainty.
+"""Calibration of the odometry's parameters from drives past markers, each with its uncertainty.
 
     found = calibrate_odometry(drives, rig, markers, before)
     found.value["speed_scale"], found.sigma["speed_scale"]
 
-All poses of all drives are unknown, one for each reading, and eliminated: dead reckoning from one
-pose would drift away within seconds, and cutting a drive in pieces throws away what leads from one
-to the next. With the readings' errors as unknowns too (see `model`) the figures are those
-of maximum likelihood, and the Schur complement of all the rest is their information.
+All poses of all drives are unknown, one for each reading, and are eliminated: dead reckoning from
+one pose would drift away within seconds, and cutting a drive in pieces would lose the information
+between them. With the readings' errors as unknowns too (see `model`) the parameters are those of
+maximum likelihood, and the Schur complement of all other unknowns is their information.
 
-What a drive can't tell is kept as it was, and named. Speed scale and course come from markers
-passed at a known distance. Steering and wheelbase enter the turning as gain * steering / wheelbase;
-only the car's sideslip, and the bend of the tangent at large angles, tell one from the other. The
-delay shows where speed or steering change.
+A parameter that a drive doesn't determine is kept as it was, and named. Speed scale and course come
+from markers passed at a known distance. Steering and wheelbase enter the turning as
+gain * steering / wheelbase; only the car's sideslip, and the bend of the tangent at large angles,
+tell one from the other. The delay shows where speed or steering change.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +34,7 @@ from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
-# A figure that is less sure than this is none: in parts of itself, rad and s.
+# Largest accepted sigma of each parameter: relative, in rad and in s.
 _LEAST_SURE = {
     "speed_scale": 0.02,
     "steering_gain": 0.02,
@@ -43,9 +43,9 @@ _LEAST_SURE = {
     "camera_delay_s": 0.01,
 }
 _RELATIVE = ("speed_scale", "steering_gain", "wheelbase_m")
-# Of two that can't be told apart the first is kept: a tape measures it, or it matters less.
+# Of two that can't be told apart, the first here stays as it was: measured by tape, or less vital.
 _KEPT_FIRST = ("wheelbase_m", "camera_delay_s", "steering_gain", "steering_offset_rad")
-_GAIN_SIGMA = 0.1  # of a gain that was kept, in what it does to the offset
+_GAIN_SIGMA = 0.1  # of a gain that was kept, for its effect on the offset's sigma
 _LEAST_WAY_M = 1.0
 _REFUSED_CHI2, _AGAIN_CHI2 = 4.0, 1.2  # per degree of freedom
 _MOST_OUTLIERS, _AGAIN_OUTLIERS = 0.3, 0.05
@@ -63,26 +63,26 @@ _WHY = {
 
 @dataclass(frozen=True)
 class OdometryCalibration:
-    """What drives tell of the odometry.
+    """The calibrated parameters of the odometry, with their uncertainty and the fitted course.
 
     Attributes:
-        before: name -> figure at the start, see `odometry_model.NAMES`.
-        value: name -> figure; what was fixed is as before.
-        sigma: name -> one standard deviation, of what was found.
-        fixed: name -> why it was not looked for.
-        correlation: between those found, in the order of `sigma`.
-        chi2_per_dof: 1 where readings and corners are as good as they say. Above 1 all sigma
-            are larger by its root.
-        rms_px: of corners along one axis, without outliers.
-        outliers: (V,) bool, views that count less since they are far off.
+        before: name -> value at the start, see `model.NAMES`.
+        value: name -> value; fixed parameters are as before.
+        sigma: name -> standard deviation, of the parameters found.
+        fixed: name -> why it was not fitted.
+        correlation: between the parameters found, in the order of `sigma`.
+        chi2_per_dof: 1 if the sigmas of readings and corners are right. If it is above 1, all
+            sigmas of the parameters are larger by its root.
+        rms_px: RMS residual of corners along one axis, without outliers.
+        outliers: (V,) bool, true for views that count less because they are far off.
         views_px: (V, 4, 2), residuals.
         view_times_s: (V,), on the time axis of the course.
         node_times_s: (N + 1,).
         poses: (N + 1, 3), x_m y_m psi_rad.
         read: (N, 2), speed and steering as read, m/s and rad.
-        reading_sigma: their noise.
-        way_m: driven while being observed.
-        advice: what to drive next.
+        reading_sigma: the noise of the readings.
+        way_m: distance driven while markers were in view.
+        advice: sentences on what to drive next.
     """
 
     before: dict[str, float]
@@ -113,18 +113,18 @@ def calibrate_odometry(
     wheelbase_sigma_m: float | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> OdometryCalibration:
-    """The figures that explain the drives best.
+    """Find the parameters that explain the drives best.
 
     Args:
-        drives: of one car.
-        before: the figures as they stand; see `odometry_model.NAMES`.
-        fixed: names that are not looked for.
-        wheelbase_sigma_m: of the wheelbase as it stands, where a tape has measured it so well.
+        drives: the drives of one car.
+        before: name -> present value; see `model.NAMES`.
+        fixed: names of parameters that are not fitted.
+        wheelbase_sigma_m: sigma of the present wheelbase, if it was measured, say by tape.
         progress: called at every evaluation.
 
     Raises:
-        BadInput: naming the drives, and what to do: too little was seen, the car did not move, or
-            odometry and cameras contradict each other.
+        BadInput: too little was seen, the car did not move, or odometry and cameras contradict
+            each other; the message names the drives and says what to do.
     """
     where = ", ".join(drive.name for drive in drives)
     try:
@@ -210,7 +210,7 @@ def _calibrated(
 
 @dataclass(frozen=True)
 class _Search:
-    """Fits of one course."""
+    """The search for the best fit of one course, from several starts."""
 
     model: Model
     course: Course
@@ -220,8 +220,8 @@ class _Search:
     progress: Callable[[], object]
 
     def best(self, theta: np.ndarray, fixed: Mapping[str, str]) -> Fit:
-        """From the odometry as it stands; where that ends badly, from other ways through the poses
-        of single views, and from what was found."""
+        """Fit from the present odometry; if that ends badly, also from other ways through the poses
+        of single views, and from the parameters found."""
         found = self._started(theta, fixed, LOOSE)
         for again in range(3):
             outliers = float(np.mean(found.blocks.view_chi2 > FULL_WEIGHT))
@@ -237,7 +237,7 @@ class _Search:
         return self._from(nodes, theta, fixed)
 
     def again(self, found: Fit, fixed: Mapping[str, str]) -> Fit:
-        """With more fixed, at the figures before."""
+        """Fit again from a fit, with more parameters fixed at their values before."""
         kept = np.array([name in fixed for name in NAMES])
         return self._from(found.nodes, np.where(kept, self.prior.mean, found.theta), fixed)
 
@@ -247,7 +247,7 @@ class _Search:
 
 
 def _chi2_per_dof(found: Fit, course: Course) -> float:
-    """Outliers among the views counting neither in the sum nor in the freedom."""
+    """Chi-square per degree of freedom; outliers among the views count in neither."""
     chi2 = found.blocks.view_chi2
     good = chi2 <= FULL_WEIGHT
     far = chi2[~good]
@@ -257,10 +257,10 @@ def _chi2_per_dof(found: Fit, course: Course) -> float:
 
 
 def _least_sure(found: Fit, fixed: Mapping[str, str], scale: float) -> str | None:
-    """The figure to keep next; None: all are sure enough.
+    """The name of the parameter to fix next; None if all are sure enough.
 
-    The weakest direction of the information, every figure in units of what is asked of it, says
-    which can't be told apart.
+    The weakest direction of the information, with every parameter in units of its largest accepted
+    sigma, shows which can't be told apart.
     """
     free = [name for name in NAMES if name not in fixed]
     values = dict(zip(NAMES, found.theta, strict=True))

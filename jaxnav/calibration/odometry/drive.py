@@ -1,4 +1,4 @@
-"""What was read and seen on drives that odometry is calibrated from, put on one time axis."""
+"""Readings and views of the drives for the calibration of odometry, put on one time axis."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,32 +8,32 @@ import numpy as np
 
 from jaxnav.errors import BadInput
 
-GAP_S = 0.25  # without a reading for so long, nobody knows where the car went
-_ROOM_S = 0.5  # of readings kept before the first view and after the last: the delay may be so long
-_BETWEEN_S = 10.0  # stretches lie so far apart on the common time axis
+GAP_S = 0.25  # a longer time without a reading leaves the car's way unknown
+_ROOM_S = 0.5  # of readings kept before the first view and after the last, for the delay
+_BETWEEN_S = 10.0  # between two stretches on the common time axis
 _SPIKE_SIGMAS = 10.0
 _LEAST_READINGS = 20
 _LEAST_VIEWS = 30
-# Readings are not believed to be better than this, be it that they are rounded or made up by a
-# model of the servo.
+# Readings are taken to be no better than this: they may be rounded, or made up by a model of the
+# servo.
 _LEAST_SIGMA_MPS, _LEAST_SIGMA_RAD = 0.002, 0.001
 
 
 @dataclass(frozen=True)
 class Drive:
-    """K readings of the odometer, and V markers seen: a view is one marker in one frame.
+    """K readings of the odometer and V views of markers; a view is one marker in one frame.
 
     Attributes:
-        name: the recording.
-        reading_stamps_ns: (K,) int64, of the odometer's clock.
-        speed_mps: (K,), as read, without any correction.
-        steering_rad: (K,), the same.
-        view_stamps_ns: (V,) int64, of the cameras' clock.
+        name: name of the recording.
+        reading_stamps_ns: (K,) int64, by the odometer's clock.
+        speed_mps: (K,), as read, uncorrected.
+        steering_rad: (K,), as read, uncorrected.
+        view_stamps_ns: (V,) int64, by the cameras' clock.
         camera: (V,) int, index in the rig.
         marker: (V,) int, index in the map.
         corners_px: (V, 4, 2).
         sigma_px: (V, 4), standard deviation of each corner along one axis.
-        left_out: readings and views with numbers that no sensor of a car can mean.
+        left_out: number of readings and views left out for values impossible for a car's sensors.
     """
 
     name: str
@@ -48,24 +48,24 @@ class Drive:
     left_out: int = 0
 
 
-Column = Any  # an array of NumPy's on the host, of JAX's inside jit
+Column = Any  # a NumPy array on the host, a JAX array inside jit
 
 
 class ReadingSigma(NamedTuple):
-    """The noise of single readings."""
+    """The standard deviations of single readings."""
 
     speed_mps: float
     steering_rad: float
 
 
 class Intervals(NamedTuple):
-    """N intervals with one reading each, from one node to the next: it lies in their middle.
+    """N intervals, each from one node to the next, with one reading in the middle.
 
     Attributes:
         begin_s: (N,), on the common time axis.
         dt_s: (N,).
         speed_mps, steering_rad: (N,), as read.
-        linked: (N,), 0. for what lies between two stretches, else 1.
+        linked: (N,), 0. for intervals between two stretches, else 1.
     """
 
     begin_s: Column
@@ -80,7 +80,7 @@ class Views(NamedTuple):
 
     Attributes:
         time_s: (V,), by the cameras' clock, on the common time axis.
-        first, last: (V,) int, the intervals of the stretch that a view is of.
+        first, last: (V,) int, first and last interval of the view's stretch.
     """
 
     time_s: Column
@@ -100,29 +100,29 @@ class Course(NamedTuple):
 
     @property
     def node_times_s(self) -> np.ndarray:
-        """(N + 1,)."""
+        """(N + 1,) times of the nodes on the common time axis."""
         ends = self.intervals.begin_s[-1:] + self.intervals.dt_s[-1:]
         return np.concatenate([self.intervals.begin_s, ends])
 
     @property
     def stretches(self) -> int:
-        """How many."""
+        """The number of stretches."""
         return 1 + int(np.sum(self.intervals.linked == 0))
 
     @property
     def duration_s(self) -> float:
-        """In which the car was observed."""
+        """The total duration of the stretches."""
         return float(np.sum(self.intervals.dt_s * self.intervals.linked))
 
 
 def lay_out(drives: Sequence[Drive]) -> Course:
-    """Stretches without a gap in the readings, with the views in them.
+    """Lay out the stretches without a gap in the readings, and their views, on one time axis.
 
     A reading stands for the time around its stamp, from half-way to its neighbours: by the
     midpoint rule its noise enters one interval alone, and intervals are independent.
 
     Raises:
-        BadInput: too few readings or views; names the drive.
+        BadInput: there are too few readings or views; the message names the drive.
     """
     parts = [part for drive in drives for part in _stretches(drive)]
     if sum(len(found["time_s"]) for _, found in parts) < _LEAST_VIEWS:
@@ -166,10 +166,10 @@ def lay_out(drives: Sequence[Drive]) -> Course:
 
 
 def reading_sigma(intervals: Intervals) -> ReadingSigma:
-    """The noise of readings as they scatter about straight lines through three in a row.
+    """Estimate the noise of readings from their scatter about lines through three in a row.
 
-    The median of second differences: what a car does within three readings counts little, unless it
-    does it all the time.
+    It is the median of second differences: the car's own motion within three readings counts
+    little, unless it goes on all the time.
     """
     steady = (intervals.linked[:-2] * intervals.linked[1:-1] * intervals.linked[2:]) > 0
 
@@ -184,7 +184,7 @@ def reading_sigma(intervals: Intervals) -> ReadingSigma:
 
 
 def _edges(times_s: np.ndarray) -> np.ndarray:
-    """(K + 1,): half-way between (K,) instants, and the outer two."""
+    """(K + 1,): the midpoints between (K,) instants, and the outer two instants."""
     middle = (times_s[1:] + times_s[:-1]) / 2
     return np.concatenate([times_s[:1], middle, times_s[-1:]])
 
@@ -193,7 +193,7 @@ _Columns = dict[str, np.ndarray]
 
 
 def _stretches(drive: Drive) -> list[tuple[_Columns, _Columns]]:
-    """Readings and views of the parts of a drive that can be used."""
+    """Readings and views of each usable stretch of a drive."""
     order = np.unique(drive.reading_stamps_ns, return_index=True)[1]
     speed, steering = drive.speed_mps[order], drive.steering_rad[order]
     good = np.isfinite(speed) & np.isfinite(steering)
@@ -238,7 +238,7 @@ def _chosen(columns: _Columns, rows: np.ndarray) -> _Columns:
 
 
 def _spikes(values: np.ndarray, least_sigma: float) -> np.ndarray:
-    """Readings that neither of their neighbours knows anything of."""
+    """(K,) bool: true for readings far from the median of themselves and their two neighbours."""
     if not len(values):
         return np.zeros(0, bool)
     padded = np.concatenate([values[:1], values, values[-1:]])

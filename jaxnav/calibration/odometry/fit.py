@@ -1,9 +1,9 @@
-"""Levenberg-Marquardt over a whole course: nodes in a band, and a few parameters beside them.
+"""Levenberg-Marquardt over a whole course: nodes in a band, and a few parameters in a border.
 
 The normal equations are block-tridiagonal in the nodes, with a border for the parameters. LAPACK's
-banded Cholesky eliminates the nodes and leaves the parameters' own information, its Schur
-complement: the time grows with the length of the course, and not with its cube. optimistix has no
-solver of this shape: its Levenberg-Marquardt would hold a dense Jacobian of some GiB.
+banded Cholesky eliminates the nodes and leaves the Schur complement, the parameters' information:
+the time grows with the length of the course, and not with its cube. optimistix has no solver of
+this shape: its Levenberg-Marquardt would hold a dense Jacobian of some GiB.
 """
 
 from collections.abc import Callable
@@ -21,11 +21,11 @@ _HOLDS = 1e-9  # of a pose that nothing tells of, as the last of a stretch befor
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the parameters beforehand.
+    """The prior of the parameters.
 
     Attributes:
         mean: (5,).
-        information: (5,), one over the variance; 0: nothing is known.
+        information: (5,), one over the variance; 0 if nothing is known.
     """
 
     mean: np.ndarray
@@ -38,11 +38,11 @@ class Fit:
 
     Attributes:
         nodes: (N + 1, 5), x_m, y_m, psi_rad, and the errors of readings in standard deviations.
-        theta: (5,), see `odometry_model.NAMES`.
-        information: (p, p), of the free parameters, all nodes being unknown.
-        blocks: at this point.
-        converged: no step lowers the cost any more.
-        steps: evaluations.
+        theta: (5,), see `model.NAMES`.
+        information: (p, p), of the free parameters, with all nodes eliminated.
+        blocks: the normal equations at this point.
+        converged: true if no step lowers the cost any more.
+        steps: number of steps tried.
     """
 
     nodes: np.ndarray
@@ -62,13 +62,13 @@ def fit(
     progress: Callable[[], object] = lambda: None,
     most_steps: int = 100,
 ) -> Fit:
-    """From a start to the nearest minimum, with Nielsen's damping relative to the diagonal.
+    """Search the nearest minimum from a start, with Nielsen's damping relative to the diagonal.
 
     Source: Madsen, Nielsen, Tingleff (2004), "Methods for non-linear least squares problems",
     Algorithm 3.16; the scaling is Marquardt's (1963).
 
     Args:
-        free: (5,) bool, parameters to be found; the others stay.
+        free: (5,) bool, true for parameters to fit; the others stay.
         progress: called at every evaluation.
 
     Raises:
@@ -119,7 +119,7 @@ def fit(
 class _Step:
     nodes: np.ndarray
     theta: np.ndarray
-    promised: float  # by which the quadratic model lowers the cost
+    promised: float  # decrease of the cost by the quadratic model
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class _System:
 
     @staticmethod
     def of(blocks: Blocks, theta: np.ndarray, free: np.ndarray, prior: Prior) -> "_System":
-        """Put together what the intervals know."""
+        """Assemble the normal equations from the blocks of the intervals and the prior."""
         H, g = blocks.information, blocks.gradient
         nodes = len(H) + 1
         own = np.zeros((nodes, NODE, NODE))
@@ -165,7 +165,7 @@ class _System:
         )
 
     def reduced(self, damping: float = 0.0) -> np.ndarray:
-        """(p, p): the parameters' information when the nodes are eliminated.
+        """(p, p): the parameters' information with the nodes eliminated.
 
         Raises:
             LinAlgError: as `solved`.
@@ -173,7 +173,7 @@ class _System:
         return self._eliminated(damping)[0]
 
     def solved(self, damping: float) -> _Step:
-        """The damped step.
+        """Solve for the damped step.
 
         Raises:
             LinAlgError: the damped equations are not positive definite.

@@ -1,13 +1,13 @@
-"""What a drive looks like to a car whose odometry is off: the residuals of odometry's calibration.
+"""Residuals of the odometry's calibration: motion between readings, and corners of markers.
 
-Unknowns of a drive are the five parameters and, at every node, the planar pose and the errors of
-the reading that follows it. One interval, with one reading, leads from node to node:
+The unknowns of a drive are the five parameters and, at every node, the planar pose and the errors
+of the reading that follows it. One interval, with one reading, leads from node to node:
 
     speed    = speed_scale * (read - sigma_v e_v)
     steering = steering_gain * (read - sigma_d e_d) + steering_offset
     node'    = advance(node, speed, steering, dt, wheelbase) + slip
 
-and a view shows the corners of a marker from the pose at `stamp - camera_delay`. The errors are
+A view shows the corners of a marker from the pose at `stamp - camera_delay`. The errors are
 unknowns, not variances added to the slip: a regression on noisy readings would find too small a
 gain (Fuller 1987, "Measurement Error Models", section 1.1), and noise would look like steering.
 """
@@ -26,21 +26,21 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
 NAMES = ("speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "camera_delay_s")
-# A wheel neither rolls nor turns exactly, and between two readings the servo turns as it likes:
-# along, across (m) and about (rad), for a second. Well below what the noise of usual readings does,
-# so that it decides little where they are honest.
+# Slip along, across (m) and about (rad), for a second: wheels don't roll exactly, and the servo
+# turns between two readings. It is well below the effect of the noise of usual readings, so it
+# matters little if their sigmas are right.
 SLIP_PER_SQRT_S = (5e-4, 3e-4, 1e-3)
 # A view counts in full up to the 99.9th percentile of chi-square with 8 degrees of freedom.
 FULL_WEIGHT = 26.1
-NODE, NEXT, LOCAL = 5, 3, 13  # unknowns of a node; of the next that an interval knows; all of it
+NODE, NEXT, LOCAL = 5, 3, 13  # unknowns of an interval: of its node, of the next node, all of them
 _PADDED = 512  # sizes are rounded up, so that drives of about one length share a program
 
 
 class Blocks(NamedTuple):
-    """Everything around one point, interval by interval.
+    """Cost and normal equations at one point, interval by interval.
 
     Attributes:
-        cost: sum of squares, outliers counting less.
+        cost: sum of squares, in which outliers count less.
         information: (N, 13, 13), of a node (5), the next pose (3) and the parameters (5).
         gradient: (N, 13).
         view_chi2: (V,), of each view's eight residuals.
@@ -55,12 +55,12 @@ class Blocks(NamedTuple):
 
 
 class Model:
-    """The residuals of one course under one rig and one map."""
+    """Computes the residuals of one course under one rig and one map."""
 
     def __init__(self, course: Course, rig: CameraRig, markers: MarkerMap, sigma: ReadingSigma):
         self._count = len(course.intervals.dt_s), len(course.views.time_s)
         intervals, views = Intervals(*_padded(course.intervals)), Views(*_padded(course.views))
-        # What pads links nothing and begins after all others.
+        # Padding intervals link nothing and begin after all others.
         intervals.begin_s[self._count[0] :] = np.inf
         intervals.linked[self._count[0] :] = 0.0
         used = np.arange(len(views.time_s)) < self._count[1]
@@ -68,7 +68,7 @@ class Model:
         self._world = rig, markers, jnp.asarray(sigma)
 
     def blocks(self, nodes: np.ndarray, theta: np.ndarray) -> Blocks:
-        """At (N + 1, 5) nodes and (5,) parameters, on the host."""
+        """Compute the blocks at (N + 1, 5) nodes and (5,) parameters, on the host."""
         intervals, views = self._count
         size = len(self._data[0].dt_s) + 1
         filled = np.concatenate([nodes, np.repeat(nodes[-1:], size - len(nodes), axis=0)])
@@ -86,7 +86,7 @@ class Model:
 
 
 def view_weights(chi2: Array | np.ndarray) -> Array:
-    """How much views count: in full, or as Cauchy's where they are far off."""
+    """The weights of views: 1 up to `FULL_WEIGHT`, beyond it `FULL_WEIGHT` / chi2."""
     return jnp.where(chi2 <= FULL_WEIGHT, 1.0, FULL_WEIGHT / jnp.maximum(chi2, FULL_WEIGHT))
 
 
@@ -95,12 +95,12 @@ def corrected(
     speed_mps: Float[Array, ""],
     steering_rad: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The true speed and steering of a reading."""
+    """Correct the speed and steering of a reading by the parameters."""
     return theta[0] * speed_mps, theta[1] * steering_rad + theta[2]
 
 
 def _process(local: Array, interval: Intervals, sigma: Array) -> Float[Array, " 5"]:
-    """Whitened: the errors of the reading, and what the car slipped along, across and about."""
+    """Whitened residuals: the reading's two errors, and the slip along, across and about."""
     node, following, theta = local[:NODE], local[NODE : NODE + NEXT], local[NODE + NEXT :]
     led = _led(node, theta, interval, sigma, interval.dt_s)
     cosine, sine = jnp.cos(node[2]), jnp.sin(node[2])
@@ -113,10 +113,9 @@ def _process(local: Array, interval: Intervals, sigma: Array) -> Float[Array, " 
 def _view(
     local: Array, interval: Intervals, sigma: Array, view: Views, rig: CameraRig, markers: MarkerMap
 ) -> Float[Array, " 8"]:
-    """A marker's corners in one camera, in pixels, less those seen.
+    """Residuals of a marker's corners in one camera, predicted minus seen, px.
 
-    Between two nodes the pose follows the arc; what the car slipped in the interval is spread
-    evenly over it.
+    Between two nodes the pose follows the arc; the slip of the interval is spread evenly over it.
     """
     node, following, theta = local[:NODE], local[NODE : NODE + NEXT], local[NODE + NEXT :]
     after_s = view.time_s - theta[4] - interval.begin_s
@@ -132,7 +131,7 @@ def _view(
 
 
 def _led(node: Array, theta: Array, interval: Intervals, sigma: Array, dt_s: Array) -> Array:
-    """The pose after some time of an interval."""
+    """The pose by odometry after the time dt_s of an interval."""
     errors = sigma * node[3:]
     speed_mps, steering_rad = corrected(
         theta, interval.speed_mps - errors[0], interval.steering_rad - errors[1]
@@ -151,7 +150,7 @@ def _blocks(
     nodes: Array,
     theta: Array,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """See `Blocks`; of padding, too."""
+    """Compute the fields of `Blocks`, those of padding included."""
     count = intervals.dt_s.shape[0]
     shared = jnp.broadcast_to(theta, (count, theta.shape[0]))
     local = jnp.concatenate([nodes[:-1], nodes[1:, :NEXT], shared], axis=1)
@@ -187,6 +186,6 @@ def _blocks(
 
 
 def _padded(columns: Intervals | Views) -> list[np.ndarray]:
-    """Columns with as many rows as a multiple of `_PADDED`, the last one repeated."""
+    """Pad columns to a multiple of `_PADDED` rows by repeating the last row."""
     extra = -len(columns[0]) % _PADDED
     return [np.concatenate([column, np.repeat(column[-1:], extra, axis=0)]) for column in columns]

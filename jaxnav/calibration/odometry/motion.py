@@ -1,4 +1,4 @@
-"""What a car did while it was observed, as far as that decides which figures can be told."""
+"""Statistics of a car's motion in a drive, which decide which parameters it can determine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from jaxnav.calibration.odometry.drive import Intervals, ReadingSigma
 from jaxnav.errors import BadInput
 
 _VARIED_RAD, _VARIED_MPS = 0.03, 0.03  # below, noise could pass for steering or driving
-_VARIED_SHARE = 0.2  # of the speed: setting off once tells little of the delay
-_ASIDE_RAD = 0.05  # about a steering so far from straight, gain and offset are one
-_BLOCK = 15  # readings whose mean tells what the car did, some 0.3 s
+_VARIED_SHARE = 0.2  # of the speed: a single start tells little about the delay
+_ASIDE_RAD = 0.05  # at a constant steering this far from straight, gain and offset are one
+_BLOCK = 15  # readings to average, some 0.3 s
 
 STEERED_LITTLE = (
     "the steering hardly changed while the car moved: drive eights, at full lock both ways, to "
@@ -22,14 +22,14 @@ _CHANGED_LITTLE = "neither speed nor steering changed: stop and start, or drive 
 
 
 def _means(intervals: Intervals, values: np.ndarray) -> tuple[np.ndarray, int]:
-    """Of blocks of readings, and how many are in each."""
+    """Means of blocks of readings, and the number of readings in each."""
     linked = values[intervals.linked > 0]
     size = min(_BLOCK, len(linked))
     return linked[: len(linked) // size * size].reshape(-1, size).mean(axis=1), size
 
 
 def driven_m(intervals: Intervals) -> float:
-    """The way by the odometry, without what its noise alone would add."""
+    """The distance driven by the odometry, m, without the length that noise would add."""
     speed_mps, size = _means(intervals, intervals.speed_mps)
     dt_s, _ = _means(intervals, intervals.dt_s)
     return float(np.sum(np.abs(speed_mps) * dt_s * size))
@@ -37,13 +37,13 @@ def driven_m(intervals: Intervals) -> float:
 
 @dataclass(frozen=True)
 class Motion:
-    """What the car did, the noise of its sensors taken off: noise is no motion.
+    """Mean and spread of a car's speed and steering, with the sensors' noise subtracted.
 
     Attributes:
-        speed_mps: mean.
-        varied_mps: standard deviation.
-        steering_rad: mean, along the way.
-        varied_rad: standard deviation, along the way.
+        speed_mps: mean of the absolute speed.
+        varied_mps: standard deviation of the speed.
+        steering_rad: mean of the steering, weighted by distance.
+        varied_rad: standard deviation of the steering, weighted by distance.
     """
 
     speed_mps: float
@@ -53,7 +53,7 @@ class Motion:
 
     @staticmethod
     def of(intervals: Intervals, sigma: ReadingSigma) -> "Motion":
-        """Of blocks of readings, whose means have little noise."""
+        """Compute the motion from means of blocks of readings, which have little noise."""
         speed, size = _means(intervals, intervals.speed_mps)
         steering, _ = _means(intervals, intervals.steering_rad)
         weight = np.abs(speed) / np.sum(np.abs(speed))
@@ -70,10 +70,10 @@ class Motion:
         )
 
     def cannot_tell(self, where: str, fixed: Sequence[str]) -> dict[str, str]:
-        """What such driving does not tell, whatever was seen, and why.
+        """Name -> why this motion can't determine the parameter, whatever was seen.
 
         Raises:
-            BadInput: the steering stood aside, so that every figure of it hangs on the others.
+            BadInput: the steering was turned and constant, so its gain and its offset are one.
         """
         steered = self.varied_rad >= _VARIED_RAD
         aside = abs(self.steering_rad) >= _ASIDE_RAD

@@ -1,8 +1,8 @@
-"""Where a calibration of odometry starts: a course that is roughly right, branch by branch.
+"""First guess for a calibration of odometry: a roughly right course, with a branch for each view.
 
-Every view of a marker has two poses (IPPE). Of all the ways through them the one is taken that
-fits the odometry as it stands best: Viterbi (1967). Between the chosen poses the car is led by its
-odometry, and what is missing in the end is spread over the way.
+Every view of a marker has two poses (IPPE). Of all ways through them, the one is taken that fits
+the present odometry best: Viterbi (1967). Between the chosen poses the course follows the odometry,
+and the remaining error is spread over it.
 """
 
 from typing import NamedTuple
@@ -21,16 +21,16 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.ippe import ippe_from_rays
 
-_MOST = 25.0  # that a view, or a step between two, may cost: wrong detections are among them
+_MOST = 25.0  # largest cost of a view, or of a step between two: some detections are wrong
 _ANCHORS_APART_S = 0.2
 
 
 class Trust(NamedTuple):
-    """How far two views in a row may disagree with the odometry: poses of single views are rough.
+    """The allowed error of the odometry between two views in a row, whose own poses are rough.
 
     Attributes:
-        step_m, step_rad: anyway.
-        per_m, per_rad: and for every metre driven, for every radian turned.
+        step_m, step_rad: constant part.
+        per_m, per_rad: additional part for every metre driven and every radian turned.
     """
 
     step_m: float = 0.1
@@ -39,23 +39,23 @@ class Trust(NamedTuple):
     per_rad: float = 0.2
 
 
-LOOSE = Trust()  # what is to be calibrated is wrong yet
-TIGHT = Trust(per_m=0.02, per_rad=0.02)  # once it is nearly right
+LOOSE = Trust()  # for parameters that are still wrong
+TIGHT = Trust(per_m=0.02, per_rad=0.02)  # for parameters that are nearly right
 
 
 class _Chosen(NamedTuple):
     poses: np.ndarray  # (V, 3), one of the two of each view
-    good: np.ndarray  # (V,), whether it fits one of its neighbours
+    good: np.ndarray  # (V,), true if the pose fits one of its neighbours
 
 
 def start(
     course: Course, rig: CameraRig, markers: MarkerMap, theta: np.ndarray, trust: Trust = LOOSE
 ) -> np.ndarray:
-    """(N + 1, 5) nodes, see `model`.
+    """Find a first guess of the (N + 1, 5) nodes, see `model`.
 
     Args:
-        theta: (5,), the parameters as they stand.
-        trust: in the odometry with them.
+        theta: (5,), the present parameters.
+        trust: trust in the odometry with these parameters.
     """
     times_s = course.node_times_s
     led = _led(course.intervals, theta)
@@ -74,7 +74,7 @@ def start(
 
 
 def _led(intervals: Intervals, theta: np.ndarray) -> np.ndarray:
-    """(N + 1, 3): where odometry alone leads from the origin."""
+    """(N + 1, 3): poses by odometry alone, from the origin."""
 
     @jax.jit
     def run(speed: Array, steering: Array, dt_s: Array, wheelbase_m: Array) -> Array:
@@ -101,7 +101,7 @@ def _branches(
     led: np.ndarray,
     trust: Trust,
 ) -> _Chosen:
-    """The way through both poses of every view that costs least."""
+    """Choose one of the two poses of every view, by the least total cost."""
     views = course.views
     poses, cost = _both_poses(views, rig, markers)
     at = np.column_stack([np.interp(views.time_s - theta[4], times_s, c) for c in led.T])
@@ -128,7 +128,7 @@ def _branches(
 
 
 def _both_poses(views: Views, rig: CameraRig, markers: MarkerMap) -> tuple[np.ndarray, np.ndarray]:
-    """(V, 2, 3) planar poses of the vehicle, and (V, 2) how badly each explains the corners."""
+    """(V, 2, 3) planar poses of the vehicle, and (V, 2) the costs of their corner residuals."""
     extra = -len(views.camera) % 512
     rows = np.concatenate([np.arange(len(views.camera)), np.zeros(extra, int)])
     padded = jax.tree.map(lambda column: jnp.asarray(column[rows]), views)
@@ -143,7 +143,7 @@ def _both_poses(views: Views, rig: CameraRig, markers: MarkerMap) -> tuple[np.nd
 def _poses_of_views(
     rig: CameraRig, markers: MarkerMap, views: Views
 ) -> tuple[Float[Array, "V 2 3"], Float[Array, "V 2 4"]]:
-    """Poses, and the distance of each corner in standard deviations."""
+    """Both poses of each view, and the residual of each corner in standard deviations."""
 
     def one(view: Views) -> tuple[Array, Array]:
         camera = jax.tree.map(lambda leaf: leaf[view.camera], rig.cameras)
@@ -172,7 +172,7 @@ def _poses_of_views(
 def _step_cost(
     a: np.ndarray, b: np.ndarray, befores: np.ndarray, afters: np.ndarray, trust: Trust
 ) -> np.ndarray:
-    """(2, 2): how far each of two poses is from where the odometry leads each of two before."""
+    """(2, 2): costs of the steps from each of two poses to each of the next two, by odometry."""
     turn = b[2] - a[2]
     led_m = _turned(b[:2] - a[:2], -a[2])
     seen_m = _turned(afters[None, :, :2] - befores[:, None, :2], -befores[:, None, 2])
@@ -184,7 +184,7 @@ def _step_cost(
 
 
 def _thinned(times_s: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means over short times, with headings that go on where they left off."""
+    """Mean times and median poses over short times, with unwrapped headings."""
     psi = np.unwrap(poses[:, 2])
     groups = np.floor((times_s - times_s[0]) / _ANCHORS_APART_S).astype(int)
     rows = [np.flatnonzero(groups == group) for group in np.unique(groups)]
@@ -197,9 +197,9 @@ def _thinned(times_s: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.nda
 def _bent(
     times_s: np.ndarray, led: np.ndarray, anchor_s: np.ndarray, poses: np.ndarray
 ) -> np.ndarray:
-    """(n, 3): the led course, moved so that it goes through the anchors."""
+    """(n, 3): the course by odometry, bent so that it goes through the anchors."""
     at = np.column_stack([np.interp(anchor_s, times_s, column) for column in led.T])
-    # Turns that odometry saw while nothing was seen count too.
+    # Whole turns that only the odometry measured, between views, count too.
     psi = poses[:, 2] + 2 * np.pi * np.cumsum(
         np.round(np.diff(at[:, 2] - poses[:, 2], prepend=at[0, 2] - poses[0, 2]) / (2 * np.pi))
     )

@@ -1,1 +1,1 @@
-"""Where the cameras of a rig and the markers are."""
+"""Calibration of the poses of a rig's cameras and of the markers."""

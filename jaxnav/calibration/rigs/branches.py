@@ -1,7 +1,7 @@
-"""The other poses that sightings admit, tried where a search has ended.
+"""Trial of the other poses that sightings admit, after a search has ended.
 
-Each frame has two, and each marker some from as many sightings: a search that began at a mirrored
-pose ends there, and only a comparison tells.
+A frame has two possible poses, and a marker two for each of some sightings. A search that begins
+at a mirrored pose ends there, and only a comparison of costs tells.
 """
 
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from jaxnav.calibration.rigs.linking import Linker, Links, inverted
 from jaxnav.calibration.rigs.pose_arrays import matrices, wxyz_xyz
 from jaxnav.models.rig import CameraRig
 
-_BETTER = 1.0  # by which a cost must be lower to be another one
+_BETTER = 1.0  # a pose is replaced if another lowers its cost by more than this
 
 
 def other_branches(
@@ -25,14 +25,14 @@ def other_branches(
     free: np.ndarray,
     sigma_px: float,
 ) -> tuple[bundle.Unknowns, int]:
-    """Put frames and markers where another pose that their sightings admit costs less.
+    """Move frames and markers to other poses that their sightings admit, if those cost less.
 
     Args:
-        links: brought to where the poses are.
-        free: (S, 6).
+        links: overwritten with the given poses.
+        free: (S, 6), mask of the shared unknowns that move.
 
     Returns:
-        The poses, and how many of them are others.
+        The poses, and how many of them have changed.
     """
     C, views = len(rig), linker.views
     links.Ts_group_camera[:] = matrices(poses.Ts_vehicle_camera)
@@ -46,7 +46,7 @@ def other_branches(
     def best_of(
         of: bundle.Unknowns, name: str, groups: np.ndarray, tries: Iterable[np.ndarray]
     ) -> tuple[bundle.Unknowns, int]:
-        """Each of the poses of that name where it costs its sightings least."""
+        """Replace each of the named poses by the one that costs its sightings least."""
         best, changed = matrices(getattr(of, name)), 0
         least = cost(of, groups, len(best))
         for tried in tries:
@@ -81,7 +81,7 @@ def other_branches(
 
 
 def _spread(marker: np.ndarray, markers: int, count: int = 10) -> np.ndarray:
-    """(count, M) sightings of every marker, spread over the recording; -1 where there is none."""
+    """(count, M) rows of each marker's sightings, spread over the recording; -1 if it has none."""
     chosen = np.full((count, markers), -1)
     for index in range(markers):
         rows = np.flatnonzero(marker == index)

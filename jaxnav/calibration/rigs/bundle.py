@@ -1,7 +1,7 @@
-"""Bundle adjustment of a moving rig: every frame's pose, the cameras' places and the markers'.
+"""Bundle adjustment of a moving rig: the poses of all frames, of the cameras and of the markers.
 
 A sighting whose corners lie further off than noise explains counts less the further off it is: its
-cost grows as the logarithm, so that what is wrong pulls at nothing.
+cost grows as the logarithm, so that wrong sightings hardly pull.
 """
 
 from functools import partial
@@ -24,22 +24,22 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.numerics.schur import Blocks, Reduced, SchurLM, reduce
 from jaxnav.numerics.small_matrices import cho_solve, cholesky
 
-# A sighting has eight coordinates; of those with Gaussian noise one in a thousand is further off.
+# A sighting has eight coordinates; with Gaussian noise one sighting in a thousand is further off.
 FAR = float(stats.chi2.ppf(0.999, 8))
 
 # The search ends when a step promises less than this of the cost, which is 1 a coordinate: every
 # unknown is within a few hundredths of its sigma then.
 _SETTLED = 1e-3
-# The scale is taken from this quantile, so a fourth of all sightings may be anything.
+# The scale is taken from this quantile, so a fourth of all sightings may be wrong.
 _QUANTILE = 0.75
 
 
 class Unknowns(eqx.Module):
-    """Poses, each wxyz_xyz, which are moved from the right, T * cay(xi); and lenses, if they move.
+    """Poses, each wxyz_xyz and moved from the right, T * cay(xi); and lenses, if they move.
 
-    Shared by all frames are S sixes: the twists of C cameras and of M markers; then, where lenses
-    move, of every camera its focal length, centre and first two coefficients, and after these its
-    other six.
+    All frames share S groups of six unknowns: the twists of C cameras and of M markers; then, if
+    lenses move, focal length, centre and first two coefficients of every camera, and after these
+    every camera's other six coefficients.
     """
 
     Ts_world_vehicle: Float[Array, "F 7"]
@@ -49,24 +49,24 @@ class Unknowns(eqx.Module):
 
     @property
     def sixes(self) -> int:
-        """S."""
+        """S, the number of groups of six shared unknowns."""
         placed = self.Ts_vehicle_camera.shape[0] + self.Ts_world_marker.shape[0]
         return placed + 2 * self.lenses.shape[0]
 
 
 def lenses_of(cameras: Camera) -> Float[Array, "*C 12"]:
-    """The figures of lenses as unknowns."""
+    """The parameters of the cameras' lenses as unknowns."""
     return jnp.concatenate([cameras.focal_px, cameras.center_px, cameras.distortion], axis=-1)
 
 
 def with_lenses(cameras: Camera, lenses: Float[Array, "*C 12"]) -> Camera:
-    """The cameras with these figures."""
+    """The cameras with these lens parameters."""
     focal_px, center_px, distortion = jnp.split(lenses, [2, 4], axis=-1)
     return Camera(focal_px, center_px, distortion, cameras.lens_index, cameras.lenses)
 
 
 class Seen(eqx.Module):
-    """All that is known."""
+    """The N sightings and the known sizes, lenses and noise."""
 
     frame: Int[Array, " N"]
     camera: Int[Array, " N"]
@@ -78,7 +78,7 @@ class Seen(eqx.Module):
 
 
 def seen(rig: CameraRig, views: RigViews, sigma_px: float) -> Seen:
-    """For the solver, in the process's precision."""
+    """Convert the views for the solver, in the process's precision."""
     return Seen(
         frame=jnp.asarray(views.frame),
         camera=jnp.asarray(views.camera),
@@ -91,13 +91,13 @@ def seen(rig: CameraRig, views: RigViews, sigma_px: float) -> Seen:
 
 
 class Adjusted(eqx.Module):
-    """Where the search ended."""
+    """The result of a bundle adjustment."""
 
     poses: Unknowns
     residuals_px: Float[Array, "N 4 2"]  # projected minus observed
-    weight: Float[Array, " N"]  # of each sighting, 1 where it counts in full
+    weight: Float[Array, " N"]  # of each sighting; 1 if it counts in full
     cost: Float[Array, ""]
-    reduced: Reduced  # of the weighed problem, undamped
+    reduced: Reduced  # of the weighted problem, undamped
     scores: Float[Array, "B R"]  # of every part of the recording, see `_scores`
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
@@ -107,12 +107,12 @@ class Adjusted(eqx.Module):
 def adjust(
     start: Unknowns, known: Seen, free: Bool[Array, " R"], parts: int = 1, max_steps: int = 60
 ) -> Adjusted:
-    """The most likely poses near a start.
+    """Find the most likely poses near a start.
 
     Args:
-        free: (6 S,), which of the shared unknowns may move. What is not free is the gauge, one
-            camera and one marker at least, and what is known already.
-        parts: B, of how many parts of the recording to tell the scores.
+        free: (6 S,), mask of the shared unknowns that move. Fixed are the gauge, at least one
+            camera and one marker, and whatever is known already.
+        parts: B, the number of parts of the recording to compute scores for.
     """
     solver = SchurLM(rtol=0.0, atol=_SETTLED, norm=optx.max_norm, retract=moved, free=free)
     fn: Any = residuals_and_blocks
@@ -133,7 +133,7 @@ def adjust(
 
 
 def moved(poses: Unknowns, own: Float[Array, "F 6"], shared: Float[Array, " R"]) -> Unknowns:
-    """All poses after a move."""
+    """The unknowns after a move of the frames' twists and of the shared unknowns."""
     counts = [part.shape[0] for part in (poses.Ts_vehicle_camera, poses.Ts_world_marker)]
     ends = np.cumsum([*counts, poses.lenses.shape[0]])
     cameras, markers, lenses, others = jnp.split(shared.reshape(-1, 6), ends)
@@ -148,12 +148,12 @@ def moved(poses: Unknowns, own: Float[Array, "F 6"], shared: Float[Array, " R"])
 
 @jax.jit
 def reprojection_residuals_px(poses: Unknowns, known: Seen) -> Float[Array, "N 4 2"]:
-    """Projected minus observed corners."""
+    """Residuals of the corners, projected minus observed."""
     return _looked_at(poses, known)[0]
 
 
 def residuals_and_blocks(poses: Unknowns, known: Seen) -> tuple[Float[Array, " N"], Blocks]:
-    """Roots of what every sighting costs, and the normal equations at its weight."""
+    """Square roots of the sightings' costs, and the normal equations at their weights."""
     loss, r, J_frame, J_shared = _linearised(poses, known)
     F, slots = poses.Ts_world_vehicle.shape[0], _slots(poses, known)
     S = poses.sixes
@@ -177,11 +177,11 @@ def residuals_and_blocks(poses: Unknowns, known: Seen) -> tuple[Float[Array, " N
 
 
 def _scores(poses: Unknowns, known: Seen, blocks: Blocks, parts: int) -> Float[Array, "B R"]:
-    """What every part of the recording, all equally long, adds to the gradient of the shared
-    unknowns, the frames' poses eliminated. Their sum is zero where a search has ended."""
+    """The contribution of each part of the recording, all equally long, to the gradient of the
+    shared unknowns, with the frames' poses eliminated. At a minimum they add up to zero."""
     _, r, J_frame, J_shared = _linearised(poses, known)
     step = jax.vmap(lambda A, g: cho_solve(cholesky(A), g))(blocks.own, blocks.own_gradient)
-    # What of each residual is left when its frame has moved to where it wants to be.
+    # Each residual after its frame has moved to its own minimum.
     left = r - jnp.einsum("nki,ni->nk", J_frame, step[known.frame])
     part = known.frame * parts // poses.Ts_world_vehicle.shape[0]
     slots = _slots(poses, known)
@@ -192,7 +192,7 @@ def _scores(poses: Unknowns, known: Seen, blocks: Blocks, parts: int) -> Float[A
 
 
 def _slots(poses: Unknowns, known: Seen) -> Int[Array, "N K"]:
-    """Which of the shared sixes a sighting is about."""
+    """Indices of the groups of six shared unknowns that each sighting depends on."""
     C, M = poses.Ts_vehicle_camera.shape[0], poses.Ts_world_marker.shape[0]
     slots = [known.camera, C + known.marker]
     if poses.lenses.shape[0]:
@@ -201,8 +201,8 @@ def _slots(poses: Unknowns, known: Seen) -> Int[Array, "N K"]:
 
 
 def _linearised(poses: Unknowns, known: Seen) -> tuple[Array, Array, Array, Array]:
-    """What sightings cost (N,); residuals (N, 8), times the root of their weight; and how these
-    answer to the twist of the frame (N, 8, 6) and to the shared sixes (N, K, 8, 6)."""
+    """Costs of the sightings (N,); residuals (N, 8), times the root of their weight; and their
+    Jacobians by the frame's twist (N, 8, 6) and by the shared sixes (N, K, 8, 6)."""
     residuals, points, (slopes, lens_slopes), Rs = _looked_at(poses, known)
     in_camera, in_vehicle = points
     R_camera_vehicle, R_camera_marker = Rs
@@ -212,7 +212,7 @@ def _linearised(poses: Unknowns, known: Seen) -> tuple[Array, Array, Array, Arra
     D = slopes * scale[:, None, None, None]  # (N, 4, 2, 3) per m in the camera
 
     def twist(D: Array, points: Array) -> Array:
-        """How residuals answer to a shift and a turn of points (N, 4, 3)."""
+        """Jacobian of the residuals by a shift and a turn of points (N, 4, 3)."""
         crosses = jax.vmap(jax.vmap(skew))(points)
         return jnp.concatenate([D, -D @ crosses], axis=-1).reshape(N, 8, 6)
 
@@ -232,7 +232,7 @@ def _looked_at(
     poses: Unknowns, known: Seen
 ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], tuple[Array, Array]]:
     """Residuals in px; corners in camera and vehicle; d px / d m in the camera and d px / d lens;
-    turns to the camera."""
+    rotations from vehicle and marker to the camera."""
 
     def split(wxyz_xyz: Array) -> tuple[Array, Array]:
         return jax.vmap(lambda T: rotation_matrix(jaxlie.SO3(T[:4])))(wxyz_xyz), wxyz_xyz[:, 4:]
@@ -266,7 +266,7 @@ def _distance2(residuals: Float[Array, "N 4 2"], sigma_px: Array) -> Float[Array
 
 
 def _loss(distance2: Array) -> Array:
-    """Squares of what is near, then the logarithm: its derivative goes on without a step."""
+    """The square up to `FAR`, then a logarithm, with a continuous derivative."""
     return jnp.where(
         distance2 < FAR, distance2, FAR * (1 + jnp.log(jnp.maximum(distance2, FAR) / FAR))
     )
@@ -277,11 +277,11 @@ def _weight(distance2: Array) -> Array:
 
 
 def sigma_px_of(residuals_px: np.ndarray) -> float:
-    """Standard deviation of a corner's coordinate: one fourth of the sightings may be anything."""
+    """Standard deviation of a corner's coordinate; up to a fourth of the sightings may be wrong."""
     distance2 = np.sum(residuals_px**2, axis=(1, 2))
     return float(np.sqrt(np.quantile(distance2, _QUANTILE) / stats.chi2.ppf(_QUANTILE, 8)))
 
 
 def losses(residuals_px: np.ndarray, sigma_px: float) -> np.ndarray:
-    """(N,) what every sighting costs."""
+    """(N,) the cost of every sighting."""
     return np.asarray(_loss(_distance2(jnp.asarray(residuals_px), jnp.asarray(sigma_px))))

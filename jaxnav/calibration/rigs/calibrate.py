@@ -1,9 +1,9 @@
-"""Where the cameras of a rig and the markers are, from sightings of one camera after another.
+"""Calibration of the poses of a rig's cameras and of the markers from sightings.
 
-First everything is linked by what frames agree on (`linking`), from no start at all; then all poses
-are adjusted at once (`bundle`), at a scale of noise that falls with what the residuals say; then
-every frame and every marker is tried at the other poses that its sightings admit, until none is
-better there.
+First cameras and markers are linked by relative poses that frames agree on (`linking`), without a
+first guess. Then all poses are adjusted at once (`bundle`), with the noise estimated from the
+residuals. Then every frame and every marker is tried at the other poses that its sightings admit,
+until no other pose is better.
 """
 
 from collections.abc import Mapping
@@ -25,33 +25,33 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.numerics.schur import Reduced
 from jaxnav.numerics.small_matrices import solve_upper
 
-_LEAST_SIGMA_PX = 1e-3  # of corners that are exact
+_LEAST_SIGMA_PX = 1e-3  # for corners that are exact
 _SAME_SCALE = 0.02  # the estimate of the noise has settled when it changes by no more
 _ROUNDS, _STEPS = 8, 30
-_PARTS = 40  # of a recording, that are held against each other
-_NOTICED = 1.3  # variances that grow by less are as they should be: 40 parts tell no better
+_PARTS = 40  # of a recording, compared with each other
+_NOTICED = 1.3  # a smaller inflation of the variances counts as none: 40 parts tell no better
 
 
 @dataclass(frozen=True)
 class RigCalibration:
-    """Where everything is.
+    """The calibrated poses of cameras and markers, with their covariance and residuals.
 
     Attributes:
-        views: the sightings that took part; its frames are those with a pose.
-        Ts_vehicle_camera: (C, 4, 4); of a camera that is not `calibrated`, as it was given.
+        views: the sightings used; its frames are those with a pose.
+        Ts_vehicle_camera: (C, 4, 4); as given for a camera that is not `calibrated`.
         Ts_world_marker: (M, 4, 4), of all markers of `views`.
-        Ts_world_vehicle: (F, 4, 4).
-        calibrated: (C,) whether anything linked the camera to the others.
-        mapped: (M,) whether anything linked the marker to the known ones.
-        sigma_px: standard deviation of a corner's coordinate, as the residuals say.
+        Ts_world_vehicle: (F, 4, 4), the vehicle's pose in every frame.
+        calibrated: (C,) true for cameras linked to the reference camera.
+        mapped: (M,) true for markers linked to the known ones.
+        sigma_px: standard deviation of a corner's coordinate, from the residuals.
         residuals_px: (N, 4, 2) projected minus observed.
-        weight: (N,), 1 where a sighting counts in full.
-        cameras: their lenses, as given where they were not to be refined.
+        weight: (N,), 1 if a sighting counts in full.
+        cameras: the cameras with their lenses, as given unless they were to be refined.
         covariance: (6 S, 6 S) of the twists xi in T * cay(xi) of T_vehicle_camera and
-            T_world_marker and of the lenses, see `bundle.Unknowns`; zero of what was given.
-        frames_follow: (F, 6, 6 S) how the twists of the frames answer to those unknowns.
-        inflation: by which the covariance is larger than noise that is new in every frame would
-            make it, 1 where that is all there is.
+            T_world_marker and of the lenses, see `bundle.Unknowns`; zero for whatever was given.
+        frames_follow: (F, 6, 6 S) derivatives of the frames' twists by those unknowns.
+        inflation: factor of the covariance over that from noise independent between frames; 1 if
+            there is no other noise.
         turned: how many frames and markers changed their branch after the first adjustment.
     """
 
@@ -71,16 +71,16 @@ class RigCalibration:
     turned: int
 
     def rms_px(self) -> float:
-        """Of a corner's coordinate, over all sightings, outliers among them."""
+        """RMS residual of a corner's coordinate over all sightings, outliers included, px."""
         return float(np.sqrt(np.mean(self.residuals_px**2)))
 
     def sigmas(self) -> np.ndarray:
-        """(C + M, 6): m and rad, along and about the axes of the camera or the marker."""
+        """(C + M, 6) standard deviations along and about the camera's or marker's axes, m, rad."""
         placed = len(self.calibrated) + len(self.mapped)
         return self._sixes()[:placed]
 
     def lens_sigmas(self) -> np.ndarray:
-        """(C, 12): of fx fy cx cy in px and of the eight coefficients."""
+        """(C, 12) standard deviations of fx fy cx cy, px, and of the eight coefficients."""
         C = len(self.calibrated)
         lenses = self._sixes()[C + len(self.mapped) :]
         if not len(lenses):
@@ -98,18 +98,18 @@ def calibrate_rig(
     reference_camera: int | None,
     refine_lenses: bool = False,
 ) -> RigCalibration:
-    """Find the cameras and the markers that are not known.
+    """Calibrate the poses of the cameras and markers that are not known.
 
     Args:
-        views: what was seen, ordered by frame.
-        rig: lenses, and the places of those cameras that are given.
-        known: T_world_marker (4, 4) of the markers that tie the world down, by their index.
-        reference_camera: the one whose given place ties the vehicle frame down; None where all
-            places are given and only markers are looked for.
-        refine_lenses: whether the lenses move too, rather than stay as they are given.
+        views: the sightings, ordered by frame.
+        rig: lenses, and the poses of the cameras as given.
+        known: marker index -> T_world_marker (4, 4) of the markers that define the world frame.
+        reference_camera: the camera whose given pose defines the vehicle frame; None if all
+            cameras' poses are given and only markers are to be found.
+        refine_lenses: true to adjust the lenses too, false to keep them as given.
 
     Raises:
-        BadInput: nothing ties the world down, or no camera can be linked.
+        BadInput: no sighting defines the world frame, or no camera can be linked.
     """
     given = inverted(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))
     start = _start(views, rig, given, known, reference_camera, refine_lenses)
@@ -138,7 +138,7 @@ def _free(
     reference_camera: int | None,
     refine_lenses: bool,
 ) -> np.ndarray:
-    """(S, 6) which of the shared unknowns move, see `bundle.Unknowns`."""
+    """(S, 6) mask of the shared unknowns that move, see `bundle.Unknowns`."""
     C, M = len(rig), len(views.size_m)
     sixes = (C, M, 2 * C if refine_lenses else 0)
     cameras, markers, lenses = (np.zeros((count, 6), bool) for count in sixes)
@@ -174,7 +174,7 @@ def _start(
     reference_camera: int | None,
     refine_lenses: bool,
 ) -> _Start:
-    """Link what can be linked, and leave out what can't."""
+    """Link cameras and markers, and leave out those that can't be linked."""
     rays = rays_camera(rig, views)
     Ts_camera_marker = both_poses(rays, views.size_m[views.marker])
     sound = np.isfinite(Ts_camera_marker).all(axis=(1, 2, 3))
@@ -221,7 +221,7 @@ def _start(
 def _adjusted(
     rig: CameraRig, views: RigViews, poses: bundle.Unknowns, free: np.ndarray, sigma_px: float
 ) -> tuple[bundle.Adjusted, float]:
-    """The most likely poses, at the noise that they leave, and that noise."""
+    """Adjust the poses at the noise estimated from their residuals; return it too, px."""
     for _ in range(_ROUNDS):
         used_px = max(sigma_px, _LEAST_SIGMA_PX)
         known = bundle.seen(rig, views, used_px)
@@ -254,7 +254,7 @@ def _calibration(
     inverse = np.where(flat[:, None] & flat[None], (inverse + inverse.T) / 2, 0)
     residuals = np.asarray(adjusted.residuals_px)
     unknowns = 6 * views.frames + int(flat.sum())
-    # What was fitted has taken up its part of the noise.
+    # The fitted unknowns have taken up their part of the noise.
     left = max(residuals.size - unknowns, 1) / residuals.size
     sigma_px = bundle.sigma_px_of(residuals) / np.sqrt(left)
     inflation = _inflation(np.asarray(adjusted.scores), inverse, int(flat.sum()))
@@ -285,10 +285,10 @@ def _follows(reduced: Reduced) -> Array:
 
 
 def _inflation(scores: np.ndarray, inverse: np.ndarray, unknowns: int) -> float:
-    """How much larger variances are than noise that is new in every frame would make them.
+    """The factor of the variances over those from noise independent between frames.
 
     A lens that is a little off, or a marker that is not flat, errs alike for seconds. Parts of the
-    recording disagree by more then than their residuals tell; one where they don't.
+    recording then disagree by more than their residuals explain. The factor is 1 if they don't.
 
     Source: Liang, Zeger (1986), "Longitudinal data analysis using generalized linear models": the
     robust variance, of which this is the mean over all unknowns.

@@ -1,7 +1,7 @@
-"""The vehicle frame of a rig from driving: where on the rig the bicycle's reference point is.
+"""Calibration of the vehicle frame on a rig from driving: the bicycle's reference point.
 
 On level ground the axis about which the rig turns is the vehicle's z, and the floor gives the
-height. On a straight line the vehicle looks where it goes; in a curve the middle of the rear axle
+height. On a straight line the vehicle heads where it goes. In a curve the middle of the rear axle
 does not slide sideways, and the wheels' speed is that of the reference point alone.
 """
 
@@ -21,28 +21,28 @@ from jaxnav.models.geometry import wrap_angle
 
 _LEAST_S, _MOST_S = 0.3, 1.0  # between the frames of a pair
 _LEAST_PAIRS = 20
-_TILT_RAD = np.deg2rad(5)  # from which on the ground is not level, or the world's z not up
+_TILT_RAD = np.deg2rad(5)  # beyond this the ground is not level, or the world's z not up
 _FAR = 2.0  # sigmas
 _REWEIGHTED = 10  # times
 _LEAST_SPREAD = 1e-5  # m and rad: nothing is known better than this
-# What is asked of a drive.
+# The largest sigmas that are accepted.
 _SIGMA_M, _SIGMA_RAD = 0.02, np.deg2rad(1)
 _NAMES = ("x", "y", "heading", "speed scale", "steering offset", "steering gain")
 
 
 @dataclass(frozen=True)
 class DrivenFrame:
-    """Where driving puts the vehicle frame.
+    """The vehicle frame found from driving, with its uncertainty.
 
     Attributes:
-        T_rig_level: (4, 4), in the frame in which the rig was calibrated: z up, on the ground.
+        T_rig_level: (4, 4), the level frame, z up, on the ground, in the rig's calibrated frame.
         T_level_vehicle: (4, 4), a shift and a turn on the ground.
-        covariance: (6, 6) of the twist xi in T_rig_level * T_level_vehicle * exp(xi), as far as the
-            drive itself is uncertain; for the ground see `level_follows`.
+        covariance: (6, 6) of the twist xi in T_rig_level * T_level_vehicle * exp(xi), from the
+            drive's uncertainty alone; for the ground's see `level_follows`.
         speed_scale, steering_offset_rad, steering_gain: of the odometry, which had to be found
-            with it: read in a curve, a gain that is off moves the frame forward by as much of half
-            the wheelbase.
-        pairs: how many pairs of frames told.
+            with the frame: in a curve, a relative error of the gain moves the frame forward by
+            that part of half the wheelbase.
+        pairs: number of pairs of frames used.
     """
 
     T_rig_level: np.ndarray
@@ -62,15 +62,15 @@ def driven_frame(
     steering_rad: np.ndarray,
     wheelbase_m: float,
 ) -> DrivenFrame:
-    """Find the vehicle frame.
+    """Find the vehicle frame from the rig's poses and the odometry of a drive.
 
     Args:
-        stamps_s: (F,) of the frames, of the same clock as the odometry's.
-        Ts_world_rig: (F, 4, 4), z up and the ground at z = 0.
+        stamps_s: (F,) of the frames, by the odometry's clock.
+        Ts_world_rig: (F, 4, 4), in a world with z up and the ground at z = 0.
         odometry_s, speed_mps, steering_rad: (O,), increasing in time.
 
     Raises:
-        BadInput: too little of a drive, or one that does not tell.
+        BadInput: the drive is too short, or does not determine the frame.
     """
     T_rig_level, weight = _level(Ts_world_rig)
     flat = Ts_world_rig @ T_rig_level
@@ -102,12 +102,12 @@ def driven_frame(
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec([0, 0, x[2]]).as_matrix()
     turn[:2, 3] = x[:2]
-    # What was found is a shift in the level frame; a twist's is in the vehicle's own.
+    # The shift was found in the level frame; a twist's is in the vehicle's own.
     R = turn[:2, :2].T
     to_twist = np.zeros((6, 3))
     to_twist[:2, :2], to_twist[5, 2] = R, 1
     whole = to_twist @ covariance[:3, :3] @ to_twist.T
-    # Of means of frames, of which those next to each other err alike: no more than there are pairs.
+    # Frames next to each other err alike: their mean counts no more frames than there are pairs.
     alone = max(float(np.sum(weight**2)), 1 / len(first))
     whole[2, 2] = alone * (weight @ flat[:, 2, 3] ** 2)
     whole[3, 3] = whole[4, 4] = alone * (weight @ np.mean(flat[:, 2, :2] ** 2, axis=1))
@@ -123,14 +123,14 @@ def driven_frame(
 
 
 def level_follows(Ts_world_rig: np.ndarray, frames_follow: np.ndarray) -> np.ndarray:
-    """(6, R): how the twist of T_rig_level answers to what all frames have in common.
+    """(6, R): derivative of the twist of T_rig_level by the unknowns that all frames share.
 
-    The ground is where the known markers say. How they lie to the others, and so to where the rig
-    drove, is known no better than they were seen; that tilts and lifts all frames alike.
+    The known markers define the ground. Their poses relative to the others, and so to where the rig
+    drove, are known no better than they were seen; such errors tilt and lift all frames alike.
 
     Args:
         Ts_world_rig: (F, 4, 4).
-        frames_follow: (F, 6, R), how their twists answer.
+        frames_follow: (F, 6, R), derivatives of the frames' twists.
     """
     T_rig_level, weight = _level(Ts_world_rig)
     z, height_m = T_rig_level[:3, 2], float(weight @ Ts_world_rig[:, 2, 3])
@@ -145,8 +145,8 @@ def level_follows(Ts_world_rig: np.ndarray, frames_follow: np.ndarray) -> np.nda
 
 
 def _level(Ts_world_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """T_rig_level, z up and its origin on the ground below the rig's; and how much each frame has
-    a say in it, (F,), of 1 together: one that saw little may be far off."""
+    """T_rig_level, z up and its origin on the ground below the rig's; and the weight of each frame
+    in it, (F,), with sum 1: a frame that saw little may be far off."""
     up, height_m = Ts_world_rig[:, 2, :3], Ts_world_rig[:, 2, 3]
     seen = np.column_stack([height_m, up])
     weight = np.full(len(seen), 1 / len(seen))
@@ -173,7 +173,7 @@ def _level(Ts_world_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pairs(stamps_s: np.ndarray, odometry_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frames, one after the other, that are far enough apart to have moved and not too far."""
+    """Indices of first and last frames of pairs, far enough apart in time to move, not too far."""
     first, last = [], []
     begin = 0
     for index in range(1, len(stamps_s)):
@@ -198,7 +198,7 @@ def _pieces(
     speed_mps: np.ndarray,
     steering_rad: np.ndarray,
 ) -> Float[Array, "P J 3"]:
-    """Speed, steering and duration of the pieces between readings that every pair consists of."""
+    """Speed, steering and duration of the pieces between readings that make up each pair."""
     rows = []
     for a, b in zip(begin_s, end_s, strict=True):
         cuts = np.concatenate([[a], odometry_s[(odometry_s > a) & (odometry_s < b)], [b]])
@@ -210,7 +210,7 @@ def _pieces(
 
 
 class _Pairs(NamedTuple):
-    """Level poses of the rig, and what the odometry said in between."""
+    """P pairs of level poses of the rig, x y psi, and the odometry in between."""
 
     first: Float[Array, "P 3"]
     last: Float[Array, "P 3"]
@@ -219,7 +219,7 @@ class _Pairs(NamedTuple):
 
 
 def _fitted(pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
-    """(x, y, heading, log speed scale, steering offset, log steering gain), their covariance."""
+    """Fit (x, y, heading, log speed scale, steering offset, log steering gain); with covariance."""
     best: tuple[float, np.ndarray, np.ndarray] | None = None
     for heading in np.arange(4) * np.pi / 2:
         x, sigma = jnp.zeros(6).at[2].set(heading), jnp.full(3, 0.01)
@@ -236,11 +236,11 @@ def _fitted(pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
 
 @jax.jit
 def _solved(x: Array, sigma: Array, pairs: _Pairs) -> tuple[Array, Array, Array]:
-    """The best near x, its information, and what the odometry leaves of every pair."""
+    """The minimum near x, its information, and every pair's residuals in m and rad."""
 
     def misfits(x: Array, pairs: _Pairs) -> Array:
         rows = _apart(x, pairs) / sigma[None]
-        # Huber's: wheels that slip have a say, but no larger one the more they do.
+        # Huber's loss: wheels that slip pull, but no more the more they slip.
         length = jnp.abs(rows)
         far = jnp.sqrt(jnp.maximum(2 * _FAR * length - _FAR**2, _FAR**2))
         return jnp.where(length < _FAR, rows, jnp.sign(rows) * far)
@@ -252,7 +252,7 @@ def _solved(x: Array, sigma: Array, pairs: _Pairs) -> tuple[Array, Array, Array]
 
 
 def _apart(x: Array, pairs: _Pairs) -> Float[Array, "P 3"]:
-    """Where the vehicle is after each pair, along, across and turned, against its odometry."""
+    """Vehicle's pose at the end of each pair minus that by odometry: along, across, turned."""
 
     def of_vehicle(pose: Array) -> Array:
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])

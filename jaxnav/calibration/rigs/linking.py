@@ -1,11 +1,10 @@
-"""Where cameras and markers are, roughly, from sightings with two poses each and no start.
+"""Rough poses of cameras and markers from sightings with two poses each, without a first guess.
 
-Two markers that one camera sees together are at the same place relative to each other in every
-frame; so are two cameras that see the same marker, or markers whose places are known by then.
-Every frame proposes what follows from each branch of both sightings, all frames vote, and the
-true proposal is the one that returns, for mirrored poses disagree from frame to frame. What is
-linked becomes one, and links to what is left. No sighting is dropped: its branch is left open until
-others decide it.
+Two markers that one camera sees together have the same relative pose in every frame; so have two
+cameras that see the same marker, or markers whose relative poses are known by then. Every frame
+proposes a relative pose for each branch of both sightings, and all frames vote. The true proposal
+is the one that recurs, for mirrored poses disagree from frame to frame. Linked things form a group
+that is then linked as one. No sighting is dropped: its branch is left open until others decide it.
 
 After Ch'ng, Sogi, Latif, Reid, Chin (2020), "Resolving marker pose ambiguity by robust rotation
 averaging with clique constraints", who ask the same consistency of rotations alone.
@@ -18,25 +17,25 @@ import numpy as np
 
 from jaxnav.calibration.rigs.views import RigViews
 
-_NEAR_RAD = 0.03  # a corner predicted through a link is this far off, rather than exact
-_DISTINCT_RAD = np.deg2rad(10)  # between candidates that are two
-_ENOUGH = 400  # frames, where there are many
+_NEAR_RAD = 0.03  # error of a corner predicted through a link at which its vote counts half
+_DISTINCT_RAD = np.deg2rad(10)  # least turn between two different candidates
+_ENOUGH = 400  # frames, if there are many
 _VOTERS = 30  # frames that vote on a link
-# Links are taken in rounds: voters that agree beside the proposer, and what part of all they are.
+# Links are made in rounds: least votes beside the proposer's, and least part of all voters.
 _ROUNDS = ((5.0, 0.5), (2.0, 0.3), (0.5, 0.0), (0.0, 0.0))
 
-# How many agree, how many were asked at most, the two things, and T_a_b.
+# Votes, number of frames that see both, the two groups a and b, and T_a_b.
 Proposal = tuple[float, int, int, int, np.ndarray]
 
 
 @dataclass
 class Links:
-    """Cameras and markers in groups, within each of which places are known.
+    """Groups of cameras and groups of markers, with known relative poses within each group.
 
     Attributes:
-        group_of_camera: (C,), group_of_marker: (M,): which group each is in.
-        Ts_group_camera: (C, 4, 4), in the frame of its group of cameras.
-        Ts_group_marker: (M, 4, 4), in the frame of its group of markers.
+        group_of_camera: (C,), group_of_marker: (M,): the group of each.
+        Ts_group_camera: (C, 4, 4), pose of each camera in the frame of its group.
+        Ts_group_marker: (M, 4, 4), pose of each marker in the frame of its group.
     """
 
     group_of_camera: np.ndarray
@@ -46,7 +45,7 @@ class Links:
 
     @staticmethod
     def none(cameras: int, markers: int) -> "Links":
-        """Everyone alone."""
+        """Links with every camera and every marker in a group of its own."""
         return Links(
             np.arange(cameras),
             np.tile(np.eye(4), (cameras, 1, 1)),
@@ -55,14 +54,14 @@ class Links:
         )
 
     def join_cameras(self, a: int, b: int, T_a_b: np.ndarray) -> None:
-        """Bring the group b of cameras into the group a."""
+        """Merge the group b of cameras into the group a."""
         inside = self.group_of_camera == b
         others = self.Ts_group_camera[inside]
         self.Ts_group_camera[inside] = T_a_b @ others
         self.group_of_camera[inside] = a
 
     def join_markers(self, a: int, b: int, T_a_b: np.ndarray) -> None:
-        """Bring the group b of markers into the group a."""
+        """Merge the group b of markers into the group a."""
         inside = self.group_of_marker == b
         others = self.Ts_group_marker[inside]
         self.Ts_group_marker[inside] = T_a_b @ others
@@ -71,12 +70,12 @@ class Links:
 
 @dataclass(frozen=True)
 class Sights:
-    """What every group of cameras saw of every group of markers in one frame: S of them.
+    """S sights, each of one group of markers by one group of cameras in one frame.
 
     Attributes:
         frame, cameras, markers: (S,) the frame and both groups.
-        Ts_cameras_markers: (S, 2, 4, 4), the most likely pose and the next that is another one.
-        row: (S,) the sighting that appears largest.
+        Ts_cameras_markers: (S, 2, 4, 4), the most likely pose and the next that differs from it.
+        row: (S,) index of the sighting that appears largest.
     """
 
     frame: np.ndarray
@@ -87,12 +86,12 @@ class Sights:
 
 
 class Linker:
-    """Links cameras and markers by what a recording shows."""
+    """Links cameras and markers by the sightings of a recording."""
 
     def __init__(self, views: RigViews, rays: np.ndarray, Ts_camera_marker: np.ndarray):
         """Args:
-        rays: (N, 4, 3), of the corners, in the camera.
-        Ts_camera_marker: (N, 2, 4, 4), both poses.
+        rays: (N, 4, 3), unit rays through the corners, in the camera's frame.
+        Ts_camera_marker: (N, 2, 4, 4), both poses of every sighting.
         """
         self.views, self.rays = views, rays
         self.Ts_camera_marker = Ts_camera_marker
@@ -100,11 +99,11 @@ class Linker:
         self.width_rad = np.linalg.norm(rays[:, 0] - rays[:, 2], axis=1)
 
     def only(self, kept: np.ndarray) -> "Linker":
-        """With these rows alone."""
+        """The linker of these rows alone."""
         return Linker(self.views.only(kept), self.rays[kept], self.Ts_camera_marker[kept])
 
     def link(self, links: Links) -> None:
-        """Make all links that the recording supports: of many frames a part is asked first."""
+        """Make all links that the recording supports, first from a part of the frames if many."""
         frames = self.views.frames
         if frames > 2 * _ENOUGH:
             some = self.views.frame % (frames // _ENOUGH) == 0
@@ -138,7 +137,7 @@ class Linker:
     def _link_cameras(self, links: Links, least: float, part: float) -> bool:
         sights = self.sights(links)
         voted: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
-        # Whichever markers both saw, each group of them is a witness of its own.
+        # Each group of markers that both cameras saw votes on its own.
         for (a, b), x, y in _together(sights.frame, sights.markers, sights.cameras):
             voted.setdefault((a, b), []).append((x, y))
         proposals = []
@@ -151,11 +150,11 @@ class Linker:
     def _vote(
         self, links: Links, sights: Sights, x: np.ndarray, y: np.ndarray, inverse: bool
     ) -> tuple[np.ndarray, float]:
-        """T_x_y that most frames agree to, and how many besides its proposer do.
+        """T_x_y that most frames agree with, and the votes for it besides its proposer's.
 
         Args:
-            x, y: (n,) rows of `sights` that belong together, of the two things to be linked.
-            inverse: whether those are cameras rather than markers.
+            x, y: (n,) corresponding rows of `sights` of the two groups to be linked.
+            inverse: true if the groups are cameras, false if they are markers.
         """
         pick = np.unique(np.linspace(0, len(x) - 1, min(len(x), _VOTERS)).astype(int))
         x, y = x[pick], y[pick]
@@ -168,7 +167,7 @@ class Linker:
             predicted = inverted(predicted)
         error = self._error_rad(links, sights.row[y][:, None, None], predicted).min(axis=1)
         agreement = _agreement(error)
-        # A proposer agrees with itself.
+        # A proposer's vote for itself doesn't count.
         votes = (
             agreement.sum(axis=0)
             - agreement[np.repeat(np.arange(len(x)), 4), np.arange(4 * len(x))]
@@ -177,7 +176,7 @@ class Linker:
         return proposed[best], float(votes[best])
 
     def sights(self, links: Links) -> Sights:
-        """All sightings, gathered by what is linked, each at the branch that explains most."""
+        """All sightings gathered by groups, each at the branch that explains most of its group."""
         views = self.views
         cameras, markers = links.group_of_camera[views.camera], links.group_of_marker[views.marker]
         keys = np.stack([views.frame, cameras, markers], axis=1)
@@ -217,8 +216,8 @@ class Linker:
         return Sights(views.frame[of], cameras[of], markers[of], chosen, rows)
 
     def _error_rad(self, links: Links, row: np.ndarray, Ts: np.ndarray) -> np.ndarray:
-        """How far the corners of rows (...) are, RMS, from where poses (..., 4, 4) of a group of
-        markers in a group of cameras put them."""
+        """RMS angle between the corners of rows (...) and their predictions by poses (..., 4, 4) of
+        a group of markers in a group of cameras."""
         views = self.views
         T_camera_cameras = inverted(links.Ts_group_camera)[views.camera[row]]
         T = T_camera_cameras @ Ts @ links.Ts_group_marker[views.marker[row]]
@@ -231,7 +230,7 @@ class Linker:
 def _together(
     frame: np.ndarray, seer: np.ndarray, seen: np.ndarray
 ) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
-    """Pairs of things seen by the same in the same frame: (a, b), rows of a, rows of b; a < b."""
+    """Yield pairs that one seer sees in the same frames: (a, b), rows of a, rows of b; a < b."""
     order = np.lexsort([seen, seer, frame])
     pairs: dict[tuple[int, int], tuple[list[int], list[int]]] = {}
     starts = np.flatnonzero(
@@ -254,7 +253,7 @@ def _join(
     part: float,
     join: Callable[[int, int, np.ndarray], None],
 ) -> bool:
-    """Make the links that enough frames agree to, the surest first, until none is new."""
+    """Make the links that enough frames agree with, surest first; true if any link is new."""
     joined_to: dict[int, int] = {}
     T_root: dict[int, np.ndarray] = {}
 

@@ -1,7 +1,7 @@
-"""Markers that are not where, or not as large as, a map says; and markers that moved meanwhile.
+"""Check of a marker map against sightings: wrong poses, wrong sizes and markers that moved.
 
-The map is found anew from sightings, freely, and the given one is laid over it so that as many
-markers as can agree. How large a marker is follows from the rays to its corners alone.
+The map is calibrated anew from sightings, and aligned with the given one so that as many markers
+as possible agree. The size of a marker follows from the rays to its corners alone.
 """
 
 from collections.abc import Mapping
@@ -16,25 +16,25 @@ from jaxnav.calibration.rigs.views import RigViews, rays_camera
 from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.models.rig import CameraRig
 
-_SIGMAS = 3.0  # what noise may explain
-_WRONG_SIZE = 0.05  # part of the side that paper and print don't explain
-_MOVED = 0.2  # part of a marker's sightings that don't fit the others
-_FEW = 8  # sightings that say nothing of a size or a second place
-_AGREE_RAD = 0.02  # between a ray and a corner, for the corner to be of one place
+_SIGMAS = 3.0  # deviations up to this many sigmas may be noise
+_WRONG_SIZE = 0.05  # relative error of the side that paper and print don't explain
+_MOVED = 0.2  # part of a marker's sightings that must disagree with the others for a move
+_FEW = 8  # fewer sightings tell neither a size nor a second place
+_AGREE_RAD = 0.02  # largest angle between a ray and its corner for a sighting of the same place
 _STEPS = 30
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found about one marker of the map.
+    """The result of the check for one marker of the map.
 
     Attributes:
-        seen: how often.
-        apart_m, apart_rad: between the map and where it was found; None where nothing linked it.
-        wrong: whether that is more than tolerance and sigma explain.
-        size_m: as its corners are apart; None where too few rays tell.
-        wrong_size: whether the map has another one.
-        moved_m: how far it went while it was watched, 0 where it stood still.
+        seen: number of its sightings.
+        apart_m, apart_rad: deviation of the marker found from the map; None if it isn't linked.
+        wrong: true if the deviation is more than tolerance and sigma explain.
+        size_m: side from the distances of its corners; None if too few rays determine it.
+        wrong_size: true if the map has another size.
+        moved_m: distance that it moved during the recording, 0 if it stood still.
     """
 
     seen: int
@@ -47,18 +47,18 @@ class Verdict:
 
     @property
     def right(self) -> bool:
-        """Whether nothing is the matter with it, as far as one can tell."""
+        """True if no error of the marker was found."""
         return not (self.wrong or self.wrong_size or self.moved_m > 0)
 
 
 @dataclass(frozen=True)
 class Check:
-    """A map held against what was seen.
+    """The result of the check of a map.
 
     Attributes:
-        verdicts: by index of the marker.
-        T_map_world: (4, 4) that lays what was found over the map.
-        agreeing: how many markers agree with each other about it.
+        verdicts: marker index -> verdict.
+        T_map_world: (4, 4) that aligns the markers found with the map.
+        agreeing: number of markers that agree under it.
     """
 
     verdicts: dict[int, Verdict]
@@ -74,12 +74,12 @@ def checked(
     tolerance_m: float,
     tolerance_rad: float,
 ) -> Check:
-    """Hold a map against a calibration that did not believe it.
+    """Compare a map with a calibration that did not use it.
 
     Args:
-        found: with a single marker known, the gauge.
-        views: all sightings, those among them that were not linked.
-        given: T_map_marker (4, 4) of the map's markers, by their index.
+        found: a calibration with a single marker known, the gauge.
+        views: all sightings, including those that were not linked.
+        given: marker index -> T_map_marker (4, 4).
     """
     C = len(rig)
     linked = [index for index in given if found.mapped[index]]
@@ -121,7 +121,7 @@ def checked(
 
 
 def sizes_m(found: RigCalibration, views: RigViews, rig: CameraRig) -> dict[int, float]:
-    """How large markers are by the rays to their corners, of those that tell, by their index."""
+    """Marker index -> side in m from the rays to its corners, for markers with enough rays."""
     rays = _Rays.of(found, views, rig)
     sizes = {index: rays.size_and_move(index)[0] for index in range(len(views.size_m))}
     return {index: size for index, size in sizes.items() if size is not None}
@@ -134,7 +134,7 @@ def _laid_over(
     tolerance_m: float,
     tolerance_rad: float,
 ) -> tuple[np.ndarray, int]:
-    """T_map_world under which most markers agree, fitted to the corners of those."""
+    """T_map_world under which most markers agree, fitted to their corners; and their number."""
 
     def agreeing(T: np.ndarray, slack: float) -> np.ndarray:
         over = T @ found
@@ -158,7 +158,7 @@ def _laid_over(
 
     best, most = np.eye(4), np.zeros(len(given), bool)
     for one in range(len(given)):
-        # A single marker turns its neighbours by its own error: they may be further off at first.
+        # One marker's error turns all others, so they may be further off at first.
         T = given[one] @ inverted(found[one])
         near = agreeing(T, 3)
         near[one] = True
@@ -171,7 +171,7 @@ def _laid_over(
         inside = agreeing(T, 1)
         if inside.sum() > most.sum():
             best, most = T, inside
-    if not most.any():  # everyone alone: the first is as good as any
+    if not most.any():  # no fit has markers that agree: the first is as good as any
         best = given[0] @ inverted(found[0])
         most[0] = True
     return best, int(most.sum())
@@ -187,7 +187,7 @@ class _Rays:
 
     @staticmethod
     def of(found: RigCalibration, views: RigViews, rig: CameraRig) -> "_Rays":
-        """Of the sightings by calibrated cameras in frames with a pose."""
+        """The rays of the sightings by calibrated cameras in frames with a pose."""
         frame_of = {int(stamp): index for index, stamp in enumerate(found.views.stamps_ns)}
         frames = np.array([frame_of.get(int(stamp), -1) for stamp in views.stamps_ns], int)
         posed = (frames[views.frame] >= 0) & found.calibrated[views.camera]
@@ -200,7 +200,7 @@ class _Rays:
         return _Rays(views.marker[posed], Ts[:, :3, 3], directions)
 
     def size_and_move(self, index: int) -> tuple[float | None, float]:
-        """How large a marker is and how far it went, None and 0 where that can't be told."""
+        """Side of a marker and the distance that it moved, m; None and 0 if undetermined."""
         rows = np.flatnonzero(self.marker == index)
         first = self._corners(rows)
         if first is None:
@@ -220,7 +220,7 @@ class _Rays:
         return size_m, moved_m if moved_m > _WRONG_SIZE * size_m else 0.0
 
     def _corners(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """(4, 3) where most rays to each corner meet, and which rows agree; None: nowhere."""
+        """(4, 3) points where most rays to each corner meet, and agreeing rows (n,); or None."""
         if len(rows) < _FEW:
             return None
         origins, directions = self.origins[rows], self.directions[rows]
@@ -236,7 +236,7 @@ class _Rays:
             distance = np.linalg.norm(way, axis=2)
             off = np.einsum("ncij,ncj->nci", across, way)
             angle = np.sqrt(np.mean(np.sum(off**2, axis=2) / distance**2, axis=1))
-            # Nearer rays tell more; those that point elsewhere, next to nothing.
+            # Nearer rays weigh more, rays that point elsewhere hardly at all.
             scale = max(float(np.median(angle)), 1e-4)
             weight = 1 / (distance.mean(axis=1) ** 2 * (1 + (angle / scale) ** 2) ** 2)
             weight /= weight.sum()

@@ -1,4 +1,4 @@
-"""Many poses at once, as the solver holds them and as matrices."""
+"""Conversion of arrays of poses between wxyz_xyz and matrices, and their retraction."""
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +11,13 @@ from jaxnav.models.geometry import cayley
 
 
 def wxyz_xyz(Ts: np.ndarray) -> jax.Array:
-    """(n, 4, 4) as (n, 7)."""
+    """Convert matrices (n, 4, 4) to wxyz_xyz (n, 7)."""
     xyzw = Rotation.from_matrix(Ts[:, :3, :3]).as_quat()
     return jnp.asarray(np.concatenate([xyzw[:, [3, 0, 1, 2]], Ts[:, :3, 3]], axis=1), float)
 
 
 def matrices(poses: jax.Array | np.ndarray) -> np.ndarray:
-    """(n, 7) as (n, 4, 4)."""
+    """Convert wxyz_xyz (n, 7) to matrices (n, 4, 4)."""
     array = np.asarray(poses, float)
     Ts = np.tile(np.eye(4), (len(array), 1, 1))
     Ts[:, :3, :3] = Rotation.from_quat(array[:, [1, 2, 3, 0]]).as_matrix()
@@ -27,5 +27,5 @@ def matrices(poses: jax.Array | np.ndarray) -> np.ndarray:
 
 @jax.vmap
 def retracted(wxyz_xyz: Float[Array, " 7"], xi: Float[Array, " 6"]) -> Float[Array, " 7"]:
-    """Poses (n, 7) moved by twists (n, 6): T * cay(xi)."""
+    """Move poses (n, 7) by twists (n, 6): T * cay(xi)."""
     return (jaxlie.SE3(wxyz_xyz) @ cayley(xi)).normalize().wxyz_xyz

@@ -1,7 +1,7 @@
-"""Where the vehicle frame is on a rig whose cameras know their places relative to each other.
+"""Placement of the vehicle frame on a rig whose cameras' relative poses are calibrated.
 
-Cameras alone can't tell. The frame is where the places that were given by hand fit best, or where
-driving puts it (`driven_frame`); a rig calibrated about one camera is moved there with its
+Cameras alone don't determine it. The frame is fitted to camera poses measured by hand, or found
+from driving (`driven_frame`); a rig calibrated about one camera is moved there with its
 uncertainty.
 """
 
@@ -15,16 +15,16 @@ from jaxnav.calibration.rigs.calibrate import RigCalibration
 from jaxnav.calibration.rigs.driven_frame import DrivenFrame, level_follows
 from jaxnav.calibration.rigs.linking import inverted
 
-# What a tape measure and an eye are good for.
+# Sigmas of poses measured by tape and eye.
 _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 0.01, np.deg2rad(3)
 
 
 def moved_to_places(found: RigCalibration, given: np.ndarray) -> RigCalibration:
-    """The vehicle frame in which the cameras are nearest to where they were said to be.
+    """Move the calibration to the vehicle frame in which the cameras fit their given poses best.
 
     Args:
         given: (C, 4, 4) T_vehicle_camera as measured by hand; those of cameras that were not
-            calibrated have no say.
+            calibrated don't count.
     """
     cameras = np.flatnonzero(found.calibrated)
     Ts_vehicle_camera, wanted = found.Ts_vehicle_camera[cameras], given[cameras]
@@ -37,7 +37,7 @@ def moved_to_places(found: RigCalibration, given: np.ndarray) -> RigCalibration:
         return np.ravel(np.concatenate([apart[:, :3, 3], turned], axis=1) * weight)
 
     T_tied_vehicle = _rigid(least_squares(misfit, np.zeros(6)).x) @ start
-    # The fit takes up what all cameras have in common.
+    # The fit takes up the errors that all cameras have in common.
     A = np.concatenate([adjoint(T) for T in inverted(T_tied_vehicle @ Ts_vehicle_camera)])
     W = np.tile(weight**2, len(cameras))
     keep = np.eye(len(A)) - A @ np.linalg.solve((A.T * W) @ A, A.T * W)
@@ -48,7 +48,7 @@ def moved_to_places(found: RigCalibration, given: np.ndarray) -> RigCalibration:
 
 
 def moved_to_driven(found: RigCalibration, driven: DrivenFrame) -> RigCalibration:
-    """The vehicle frame where driving puts it, with the uncertainty of the drive and the ground."""
+    """Move the calibration to the frame found from driving; add the drive's and ground's errors."""
     cameras = np.flatnonzero(found.calibrated)
     T_tied_vehicle = inverted(driven.T_rig_level @ driven.T_level_vehicle)
     Ts_tied_camera = T_tied_vehicle @ found.Ts_vehicle_camera[cameras]
@@ -67,7 +67,7 @@ def moved_to_driven(found: RigCalibration, driven: DrivenFrame) -> RigCalibratio
 def moved(
     found: RigCalibration, T_tied_vehicle: np.ndarray, covariance: np.ndarray
 ) -> RigCalibration:
-    """A calibration seen from another vehicle frame; cameras that were not calibrated stay."""
+    """Express a calibration in another vehicle frame; cameras that were not calibrated stay."""
     Ts = np.where(
         found.calibrated[:, None, None],
         T_tied_vehicle @ found.Ts_vehicle_camera,
@@ -82,10 +82,10 @@ def moved(
 
 
 def moved_world(found: RigCalibration, move: np.ndarray) -> RigCalibration:
-    """A calibration seen from another world frame; twists of markers are their own, and stay.
+    """Express a calibration in another world frame; covariances stay, as twists are body-fixed.
 
     Args:
-        move: (4, 4), of the old world in the new.
+        move: (4, 4), pose of the old world in the new.
     """
     return replace(
         found,

@@ -1,4 +1,4 @@
-"""What the cameras of a rig saw of markers, and both poses of every marker that was seen."""
+"""Sightings of markers by the cameras of a rig, with their rays and both of their poses."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ _BATCH = 1024  # sightings at a time
 
 @dataclass(frozen=True)
 class RigViews:
-    """N sightings by C cameras of M markers in F frames: one row each, ordered by frame.
+    """N sightings of M markers by C cameras in F frames: one row each, ordered by frame.
 
     Attributes:
-        frame: (N,) which frame.
-        camera: (N,) which camera of the rig.
-        marker: (N,) which marker, an index into `marker_ids`.
+        frame: (N,) index of the frame.
+        camera: (N,) index of the camera in the rig.
+        marker: (N,) index of the marker, into `marker_ids`.
         corners_px: (N, 4, 2), TL TR BR BL.
         size_m: (M,) side of each marker.
-        marker_ids: (M,) what is printed on it.
+        marker_ids: (M,) the id printed on each marker.
         stamps_ns: (F,) of the frames.
     """
 
@@ -43,7 +43,7 @@ class RigViews:
         return len(self.frame)
 
     def only(self, kept: np.ndarray) -> "RigViews":
-        """The rows of a mask, and the frames that are left; markers keep their numbers."""
+        """The rows in a mask, with only the frames that they have; markers keep their indices."""
         frames, frame = np.unique(self.frame[kept], return_inverse=True)
         return RigViews(
             frame=frame,
@@ -57,11 +57,11 @@ class RigViews:
 
     @property
     def frames(self) -> int:
-        """How many frames there are, those without a sighting among them."""
+        """F, the number of frames, including those without a sighting."""
         return len(self.stamps_ns)
 
     def corners_marker_m(self) -> Float[np.ndarray, "N 4 3"]:
-        """Each row's corners in the frame of its marker."""
+        """The corners of each row in the frame of its marker."""
         return self.size_m[self.marker][:, None, None] / 2 * CORNER_SIGNS
 
 
@@ -79,8 +79,8 @@ def rays_camera(rig: CameraRig, views: RigViews) -> Float[np.ndarray, "N 4 3"]:
 def both_poses(rays: Float[np.ndarray, "N 4 3"], size_m: np.ndarray) -> np.ndarray:
     """Both poses of every row's marker, T_camera_marker (N, 2, 4, 4), the better fit first.
 
-    They are looked for by a pinhole camera that looks straight at the marker, so that no lens is
-    too wide. Rows that have no pose hold NaN.
+    They are found in a pinhole camera that looks straight at the marker, so that no lens is too
+    wide. Rows without a pose hold NaN.
     """
     forward = rays.mean(axis=1)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
@@ -103,7 +103,7 @@ def _solved(corners_n: Float[Array, "N 4 2"], size_m: Float[Array, " N"]) -> Arr
 
 
 def _in_batches(function: Callable[..., Array], *rows: np.ndarray) -> np.ndarray:
-    """What a function makes of rows, a batch of one size at a time: it is compiled once."""
+    """Apply a function to rows in batches of one size, so that it is compiled once."""
     count = len(rows[0])
     spots = np.arange(-(-count // _BATCH) * _BATCH) % max(count, 1)
     parts = [
@@ -117,7 +117,7 @@ def _in_batches(function: Callable[..., Array], *rows: np.ndarray) -> np.ndarray
 
 
 def _looking_along(forward: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3 3"]:
-    """Rotations whose z axes are the given directions."""
+    """Rotations with the given directions as z axes."""
     aside = np.where(np.abs(forward[:, 1:2]) < 0.9, [[0.0, 1, 0]], [[1.0, 0, 0]])
     x = np.cross(aside, forward)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
