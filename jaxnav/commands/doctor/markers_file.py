@@ -1,4 +1,4 @@
-"""Does the marker map describe square markers that stand as markers do?
+"""Checks of the marker map: are its markers square, and do they hang or lie as markers do?
 
 The file is read once more as it is: where the loader refuses a marker, this says what may be meant.
 """
@@ -21,7 +21,7 @@ _MOST_SIZE_M = 2.0
 
 
 def measured_corners(path: Path) -> Iterator[Finding]:
-    """Corners as they were measured: a square, flat, of the size that the file says."""
+    """Check that measured corners make a flat square of the size that the file says."""
     checked = 0
     found = False
     for index, entry in enumerate(_entries(path)):
@@ -39,7 +39,7 @@ def measured_corners(path: Path) -> Iterator[Finding]:
 def _entries(path: Path) -> list[dict[str, Any]]:
     try:
         entries = read_mapping(path).get("markers")
-    except BadInput:  # whoever loads the map tells
+    except BadInput:  # the loader reports it
         return []
     if not isinstance(entries, list):
         return []
@@ -47,7 +47,7 @@ def _entries(path: Path) -> list[dict[str, Any]]:
 
 
 def _numbers(corners: Any) -> np.ndarray | None:
-    """(4, 3), None where the file holds anything else."""
+    """Corners as an array (4, 3); None where the file holds anything else."""
     try:
         array = np.array(corners, float)
     except (TypeError, ValueError):
@@ -98,7 +98,7 @@ def _square(name: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding
 
 
 def placed(markers: MarkerMap) -> Iterator[Finding]:
-    """Where markers are, which way up, and how large."""
+    """Check where the markers are, which way up, and how large."""
     corners_world_m = np.asarray(markers.corners_world_m)
     Rs_world_marker = np.asarray(markers.Ts_world_marker.as_matrix())[:, :3, :3]
     found = False
