@@ -1,4 +1,4 @@
-"""`jaxnav calibrate board`: a target on paper, at true scale."""
+"""`jaxnav calibrate board`: a calibration target to print at true scale."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,7 +29,7 @@ _ADVICE = (
 
 
 def run(args: CalibrateBoard) -> int:
-    """Write the PDF, the PNG, what is on them, and how to check them."""
+    """Write the board as PDF, PNG and YAML, and a report that says how to check the print."""
     configure_jax(float64=True)
     paper_mm = _paper_mm(args)
     board = _board(args, paper_mm)
