@@ -1,8 +1,8 @@
 """The size that an image declares, from its header alone.
 
 Every format is read as its decoder reads it, so that both see the same size: the first frame header
-of a JPEG, the first chunk of a PNG. What a decoder would take memory for beside the picture (tiles
-of a TIFF, passes of a JPEG over all of it) counts as pixels, or makes the image none.
+of a JPEG, the first chunk of a PNG. Other memory that a decoder would take (tiles of a TIFF, passes
+of a JPEG over all of the picture) counts as pixels, or the image is refused.
 """
 
 import re
@@ -15,13 +15,13 @@ _PNG_CHUNKS = 2**17  # one of 256 bytes each in the largest picture, where encod
 _TIFF_TAGS = 4096
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
 _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
-_BITS = 16  # a sample; those of 32 and 64 are no pictures of a camera
+_BITS = 16  # per sample at most; no camera's pictures have 32 or 64
 
 SizePx = tuple[int, int]  # width, height
 
 
 def image_size_px(raw: bytes) -> SizePx | None:
-    """Width and height; None where it is no image of a format that we read, or a broken one."""
+    """Width and height of an image; None where it is broken or not of a format that we read."""
     for magic, size_of in _FORMATS:
         if raw.startswith(magic):
             try:
