@@ -28,7 +28,7 @@ def check_outputs(command: Any) -> None:
         outputs = [] if given is None else [given]
     if not outputs:
         return
-    from jaxnav.files.writing import refuse_overwriting, require_writable  # takes JAX along
+    from jaxnav.files.writing import refuse_overwriting, require_writable  # imports JAX
 
     refuse_overwriting(flag, outputs, _inputs(command))
     if one.file:

@@ -53,7 +53,7 @@ class Recording:
     markers: MarkerMap
     reference: Reference | None
     unmapped_detections: int  # of markers that are not in the map
-    dropped_detections: int  # reported twice, or with a corner that is nowhere
+    dropped_detections: int  # reported twice, or with a corner out of range
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -43,7 +43,7 @@ class Replay:
     flip_probability: Float[np.ndarray, "F tracks"]
     branch: Branch  # leaves (F, tracks); meaningless where there is no reference
     frames_per_second: float  # compilation excluded
-    corner_sigma_px: float  # what the filter was told
+    corner_sigma_px: float  # the filter's
 
 
 class _Frames(eqx.Module):

@@ -105,7 +105,7 @@ class KalibrAprilgrid(ForeignEntry):
 
 
 class KalibrCheckerboard(ForeignEntry):
-    """Kalibr's target of `target_type: 'checkerboard'`, which counts the corners inside."""
+    """Kalibr's target of `target_type: 'checkerboard'`; it counts the corners between squares."""
 
     targetCols: Squares
     targetRows: Squares

@@ -9,7 +9,7 @@ import re
 import struct
 from collections.abc import Callable
 
-# Passes of a JPEG over its picture: encoders make 10 at most, some bytes make a thousand.
+# Passes of a JPEG over its picture: encoders make 10 at most, hostile bytes a thousand.
 _JPEG_SCANS = 32
 _PNG_CHUNKS = 2**17  # one of 256 bytes each in the largest picture, where encoders write 8 KiB
 _TIFF_TAGS = 4096
@@ -112,7 +112,7 @@ def _tiff(raw: bytes) -> SizePx:
         if tag in values:
             raise ValueError("a tag twice")
         code = {1: "B", 3: "H", 4: "L"}.get(kind)
-        if tag == _TIFF_BITS and number > 2:  # they stand elsewhere, one a sample
+        if tag == _TIFF_BITS and number > 2:  # stored elsewhere, one for each sample
             (entry,) = struct.unpack_from(f"{order}L", raw, entry + 8)
             entry -= 8
         if code is not None:

@@ -11,12 +11,12 @@ MIB = 2**20
 YAML_BYTES = 2 * MIB
 YAML_VALUES = 300_000
 DEPTH = 24  # our deepest file has 7 levels
-# PhotonVision keeps its snapshots inside, as base64; what else it says is some thousand values.
+# PhotonVision keeps its snapshots inside, as base64; the rest is some thousand values.
 JSON_BYTES = 64 * MIB
 JSON_VALUES = 2_000_000  # 100 bytes and 1 us each
 
-# Pictures. The search for markers takes up to 43 bytes a pixel, of noise: 1.5 GiB. Cameras that
-# drive have 0.3 to 8 million, one for photographs 12 to 30.
+# Pictures. On noise, the search for markers takes up to 43 bytes a pixel: 1.5 GiB. Cameras that
+# drive have 0.3 to 8 million pixels, one for photographs 12 to 30.
 IMAGE_PIXELS = 2**25
 IMAGE_BYTES = 256 * MIB  # of an image with so many pixels, not compressed, 16 bits in 4 channels
 

@@ -43,7 +43,7 @@ def read_npz(path: Path, keys: Collection[str] | None = None) -> Mapping[str, np
 
 def _array(key: str, stream: IO[bytes], most_bytes: int) -> np.ndarray:
     version = np.lib.format.read_magic(stream)
-    if version != (1, 0):  # of the others the header may be 4 GiB; ours need none
+    if version != (1, 0):  # other versions' headers may have 4 GiB; our files need none
         raise ValueError(f"{key}: the version {version} of .npy is not read")
     shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
     count = math.prod(shape)

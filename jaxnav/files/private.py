@@ -20,7 +20,7 @@ from jaxnav.files.locking import create_temporary, sweep
 _ROOT = 0  # may do anything anyway
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _OTHERS_ENTER = stat.S_IXGRP | stat.S_IXOTH
-# O_PATH needs no leave to list a folder, which /home may not give.
+# O_PATH needs no permission to list a folder, which /home may not give.
 _PASSED = os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC | getattr(os, "O_PATH", os.O_RDONLY)
 _LISTED = os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_RDONLY
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -126,7 +126,7 @@ class PrivateFolder:
         Raises:
             NotPrivateError: an entry is another user's, a link, or others may write to it.
         """
-        # Where others can't enter, their leave to write to a file in there means nothing.
+        # Where others can't enter the folder, their permission to write to a file has no effect.
         may_enter = os.fstat(self._fd).st_mode & _OTHERS_ENTER
         for name in self._names():
             with suppress(FileNotFoundError):

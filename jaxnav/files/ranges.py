@@ -79,7 +79,7 @@ RANGES: dict[str, Range] = {
     "corner_sigma_px": Range(1e-3, 100.0, "px", "standard deviation of a corner, of a whole file"),
     "sigma": Range(-1e9, 1e9, "", "standard deviation that a calibration tells; only shown"),
     "parameter": Range(1e-18, 1e9, "", "tuned parameter: float32 holds its square"),
-    # What sensors said: kept by a recording, for it must replay bit for bit.
+    # Values of sensors, which a recording keeps because it must replay bit for bit.
     "stamp_ns": Range(
         -(2**62) + 1, 2**62 - 1, "ns", "stamp: 146 years, so that int64 holds differences"
     ),

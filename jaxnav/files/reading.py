@@ -93,7 +93,7 @@ def parse_json(path: Path, text: str) -> Any:
     Raises:
         BadInput: the text is not JSON, or holds too much.
     """
-    # Every value stands behind one of these, and few are in texts.
+    # Every value follows one of these characters, and few of them are in texts.
     if sum(map(text.count, "[{,")) > limits.JSON_VALUES:
         raise BadInput(path, f"holds more than {limits.JSON_VALUES} values")
     try:

@@ -54,7 +54,7 @@ Name = Annotated[str, Field(strict=True, pattern=NAME_PATTERN)]
 
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
-# In the world: a point, and one on its floor.
+# A point in the world, and one on its floor.
 Place = Annotated[list[Position], Field(min_length=3, max_length=3)]
 FloorPlace = Annotated[list[Position], Field(min_length=2, max_length=2)]
 # On a vehicle.
@@ -122,7 +122,7 @@ def _key(location: tuple[int | str, ...], data: Any) -> str:
     key = ""
     for part in location:
         if isinstance(part, str) and part.startswith("<"):
-            continue  # which form of a pose it is
+            continue  # the tag of a pose's form
         inside = None
         if isinstance(data, dict):
             inside = data.get(part)

@@ -66,7 +66,7 @@ CORRECTIONS = {
     "steering_gain": 1.0,
     "steering_offset_rad": 0.0,
     "camera_delay_s": 0.0,
-}  # and where they correct nothing
+}  # the values that correct nothing
 
 
 class StartEntry(Entry):

@@ -69,7 +69,7 @@ def _board(args: CalibrateBoard, paper_mm: tuple[float, float]) -> Board:
     across, down = (long, short) if paper_mm[0] > paper_mm[1] else (short, long)
     columns, rows = args.columns or across, args.rows or down
     family = _family(args, columns * rows // 2)
-    # A metre a square, to be scaled, where no size is given.
+    # Without a given size, squares of 1 m, which are scaled below.
     size_m = 1.0 if args.size_mm is None else args.size_mm / 1e3
     marker_m = 0.0
     if args.marker_mm is not None:

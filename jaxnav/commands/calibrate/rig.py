@@ -24,9 +24,9 @@ from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_vehicle, output_folder, write_json
 from jaxnav.plots.rig import rig_report
 
-_WRONG_SCALE = 3.0  # between how far apart cameras are and were said to be
-_WRONG_SIZE = 1.5  # between how large a marker looks and was said to be
-_APART_M = 0.05  # a given distance that says anything
+_WRONG_SCALE = 3.0  # ratio of found to given distances between cameras
+_WRONG_SIZE = 1.5  # ratio of a marker's found to its given size
+_APART_M = 0.05  # a smaller given distance is not compared
 
 
 def run(args: Arguments) -> int:

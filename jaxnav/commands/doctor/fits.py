@@ -25,8 +25,8 @@ from jaxnav.pose.ippe import ippe_from_rays
 from jaxnav.pose.observation import MODEL_SIGMA_PX
 
 MOST_ERRORS = 6  # numbers that may be unknown beside the pose
-_HEIGHT_SIGMA_M = 0.01  # how well a floor is level and a car stands on it,
-_TILT_SIGMA_RAD = np.deg2rad(0.5)  # with what a tape leaves in the cameras' places
+_HEIGHT_SIGMA_M = 0.01  # of a car on a floor that is nearly level,
+_TILT_SIGMA_RAD = np.deg2rad(0.5)  # and with a tape's errors in the cameras' places
 _FREE_M, _FREE_RAD = 10.0, 3.0
 
 
@@ -92,7 +92,7 @@ class Sighted:
 
 
 class Unknowns(eqx.Module):
-    """Differences from the files, or their sigmas; a sigma of 0 says that it is not unknown."""
+    """Differences from the files, or their sigmas, where 0 says that a number is known."""
 
     pose: np.ndarray  # (6,) xi in T_world_vehicle * exp(xi)
     size: np.ndarray  # (M,) logarithm of true over written

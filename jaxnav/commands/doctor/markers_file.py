@@ -14,7 +14,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
 from jaxnav.models.markers import MarkerMap
 
-_MAX_ERROR = 0.01  # of a side, what a careful tape leaves
+_MAX_ERROR = 0.01  # of a side: a careful tape's error
 _UPRIGHT = 0.3  # the normal's vertical part, below which a marker hangs on a wall
 _TURNED_RAD = np.deg2rad(45)
 _MOST_SIZE_M = 2.0
@@ -86,7 +86,7 @@ def _square(name: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding
             f"{askew_m * 1e3:.1f} mm",
             "measure its corners again, or give T_world_marker",
         )
-    # The smallest extent of the four corners is that across their plane.
+    # The smallest extent of the four corners is the one across their plane.
     off_m = np.linalg.svd(corners_m - corners_m.mean(axis=0))[1][2] / 2
     if off_m > _MAX_ERROR * side_m:
         yield Finding(

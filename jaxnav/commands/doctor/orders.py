@@ -20,9 +20,9 @@ MIRRORED = tuple(tuple((k - i) % 4 for i in range(4)) for k in range(4))
 _CORNERS = ("top-left", "top-right", "bottom-right", "bottom-left")
 _FALLEN_DEG = 30.0  # no error of extrinsics tilts a car like this
 _STANDS_DEG = 15.0
-_MOST_HEIGHT_M, _MOST_TILT_DEG = 0.03, 2.0  # what tape and floor may leave
+_MOST_HEIGHT_M, _MOST_TILT_DEG = 0.03, 2.0  # errors of tape and floor
 _MAX_WORSE = 40.0  # of chi-square, by which the mirror image of a pose may explain corners worse
-_MAX_ERROR = 3.0  # times what the corners' sigma allows
+_MAX_ERROR = 3.0  # times the RMS that the corners' sigma allows
 _POSE_NUMBERS = 6
 
 

@@ -15,7 +15,7 @@ from jaxnav.files import Route
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
-_MOST_MARKERS = 6  # the largest ones are held against each other
+_MOST_MARKERS = 6  # the largest ones, which are compared
 _SMALL_PX = 12.0
 
 

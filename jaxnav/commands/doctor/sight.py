@@ -12,7 +12,7 @@ from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
-_SAME_RAY = 1e-3  # between a ray and that through its own pixel: one-to-one there
+_SAME_RAY = 1e-3  # between a ray and the ray of its pixel, where the lens is one-to-one
 _PIXELS = 256  # in each call, so that the program is compiled once
 
 

@@ -15,7 +15,7 @@ from jaxnav.models.origin import Origin
 
 _FITS = 2.0  # chi-square for each number, up to which all is well
 _SMALL_PX = 0.3  # an RMS this small is no error of a file either
-_LEAST_SIZE = 0.03  # a size that is wrong by less is not worth a word
+_LEAST_SIZE = 0.03  # a smaller error of a size is not reported
 _CLEARLY = 2.0  # sigma
 
 

@@ -17,7 +17,7 @@ from jaxnav.models.origin import opposite, planar_in_world
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_setup import DriveSetup
 
-# The compiler can not be cut short, and the vehicle stands already.
+# The compiler can't be interrupted, and the vehicle already stands.
 _CLOSE_S = 20.0
 
 

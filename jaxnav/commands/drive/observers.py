@@ -61,7 +61,7 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     if args.record is not None:
         add(Recording(args.record, setup, args.record_images))
     if args.view:
-        from jaxnav.viewer.rerun_view import RerunView  # with all that draws
+        from jaxnav.viewer.rerun_view import RerunView  # imports all that draws
 
         waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
         add(View(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
@@ -88,7 +88,7 @@ class Recording:
 
     @property
     def faults(self) -> Fault:
-        """Whether messages were dropped since the last call, or recording has failed."""
+        """Faults of the recording: messages dropped since the last call, or that it has failed."""
         found = Fault(0)
         if self._recorder.dropped > self._dropped:
             self._dropped, found = self._recorder.dropped, Fault.RECORDER_BEHIND

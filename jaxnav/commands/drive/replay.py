@@ -48,7 +48,7 @@ def run(args: Arguments) -> int:
         recording = recording.first(args.limit)
     if not len(recording):
         raise BadInput(args.recording, "holds no frame")
-    if params is not None:  # bad input shows before the folder is made
+    if params is not None:  # raises on bad input before the folder is made
         apply_params(Navigator(recording.rig, recording.markers), params)
     out = output_folder(args.out)
     if params is not None:

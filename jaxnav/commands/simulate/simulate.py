@@ -58,7 +58,7 @@ def _run(args: Arguments) -> int:
 def _load(args: Arguments) -> ScenarioCar:
     params = None if args.params is None else load_params(args.params)
     car = ScenarioCar.load(args, params)
-    _navigator(car, args.scenario, "multi-hypothesis", told_noise_px=1.0)  # bad input shows
+    _navigator(car, args.scenario, "multi-hypothesis", told_noise_px=1.0)  # raises on bad input
     return car
 
 

@@ -68,7 +68,7 @@ def measure(value: tuple[float, float, float]) -> dict[str, Any]:
     return {"value": value[0], "interval": list(value[1:])}
 
 
-# What NumPy and zipfile raise where a byte is wrong: a flag says "encrypted", a length is absurd.
+# Exceptions of NumPy and zipfile for wrong bytes, such as a flag "encrypted" or an absurd length.
 _DAMAGED = (
     KeyError, ValueError, TypeError, EOFError, OSError, RuntimeError, MemoryError, struct.error,
     zipfile.BadZipFile, zlib.error,

@@ -103,7 +103,7 @@ def _recorded(
         )
     else:
         lanes = markers[:, None]
-        # Piece by piece: of a large map all but one marker is dropped at once.
+        # Piece by piece, so that all markers but one of a large map are dropped at once.
         alone = [
             [lanes_of[:, :, [marker]] for lanes_of in recording.lanes(piece)]
             for piece, marker in zip(frames, markers, strict=True)
