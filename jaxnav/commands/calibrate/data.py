@@ -25,7 +25,7 @@ class RigData:
     """Sightings of several recordings, with their rig and the known markers.
 
     Attributes:
-        markers: the given map, with markers that no camera saw; None where there is none.
+        markers: the map, given or recorded, with markers that no camera saw; None without one.
         keys: (M,) family and id of each marker, in the order of `views`.
         known: T_world_marker (4, 4) of the known markers, by their index.
         parts: the sightings of each recording.

@@ -20,7 +20,7 @@ _LEAST_RATE_HZ = 10.0
 _SKEW_S = 0.02
 _DARK, _BRIGHT = 15.0, 240.0  # mean grey levels
 _LEAST_CONTRAST = 8.0  # standard deviation of grey levels
-_FROZEN = 3  # identical pictures, and no other
+_FROZEN = 3  # pictures that are all identical
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Checks of the marker map: are its markers square, and do they hang or lie as markers do?
 
-The file is read once more as it is: where the loader refuses a marker, this says what may be meant.
+The file is read once more as it is: where the loader refuses a marker, these name the likely slip.
 """
 
 from collections.abc import Iterator
