@@ -1,4 +1,4 @@
-"""What commands write, and that none of it is what they read: asked before any work is done."""
+"""A check, before any work is done, that a command does not write over what it reads."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -8,11 +8,11 @@ from typing import Any
 from jaxnav.commands import COMMANDS, registered
 from jaxnav.commands.calibrate.arguments.cameras import CalibrateIntrinsics
 
-_OUTPUTS = {"out", "json", "record"}  # fields that are no inputs
+_OUTPUTS = {"out", "json", "record"}  # fields of outputs
 
 
 def check_outputs(command: Any) -> None:
-    """Refuse a command that would write over what it reads, or can't write what it is to.
+    """Refuse a command that would write over what it reads, or whose output can't be written.
 
     Raises:
         BadInput: names the flag.
@@ -28,7 +28,7 @@ def check_outputs(command: Any) -> None:
         outputs = [] if given is None else [given]
     if not outputs:
         return
-    from jaxnav.files.writing import refuse_overwriting, require_writable  # takes JAX along
+    from jaxnav.files.writing import refuse_overwriting, require_writable  # imports JAX
 
     refuse_overwriting(flag, outputs, _inputs(command))
     if one.file:
@@ -36,7 +36,7 @@ def check_outputs(command: Any) -> None:
 
 
 def _inputs(value: Any) -> Iterator[Path]:
-    """All paths among arguments, also behind KEY=."""
+    """All paths of input files among a command's arguments, also behind KEY=."""
     if isinstance(value, Path):
         yield value
     elif isinstance(value, str) and value.partition("=")[2]:

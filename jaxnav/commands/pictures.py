@@ -1,4 +1,4 @@
-"""What the commands draw: candidate poses in camera frames, and figures into files."""
+"""Drawing for the commands: candidate poses in camera frames, and figures into files."""
 
 import warnings
 from collections.abc import Iterator
@@ -27,9 +27,9 @@ _NORMAL_SIDES = 0.8  # length of a drawn normal, in sides of the marker
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG, whole or not at all."""
+    """Write a figure as PNG, whole or not at all."""
     for text in _words(figure):
-        # Names of files and markers are no formulas, and hold what they hold.
+        # Names of files and markers are no formulas, and may hold any characters.
         text.set_parse_math(False)
         text.set_text("\n".join(visible(line) for line in text.get_text().split("\n")))
     with atomic_path(path) as beside, warnings.catch_warnings():
@@ -38,7 +38,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def _words(artist: Artist) -> Iterator[Text]:
-    """All texts of a figure but those at its ticks, which are numbers and formulas of powers."""
+    """All texts of a figure except at its ticks, which are numbers and formulas of powers."""
     for child in artist.get_children():
         if isinstance(child, Text):
             yield child
@@ -49,14 +49,14 @@ def _words(artist: Artist) -> Iterator[Text]:
 
 
 def corners_in_world(markers: MarkerMap) -> np.ndarray:
-    """(M, 4, 3) corners of a map as files count, m, float64."""
+    """Corners (M, 4, 3) of a map in the world of its file, m, float64."""
     return np.asarray(points_in_world(markers.corners_world_m, markers.origin_m), float)
 
 
 def normals_px(
     camera: Camera, Ts_camera_marker: jaxlie.SE3, sizes_m: np.ndarray | jax.Array
 ) -> np.ndarray:
-    """The normals of markers as they appear in an image: (N, 2, 2), foot and tip, pixels."""
+    """The normals of N markers in an image, (N, 2, 2): foot and tip, x y, px."""
     length_m = _NORMAL_SIDES * jnp.asarray(sizes_m)
     foot = Ts_camera_marker.translation()
     tip = foot + length_m[:, None] * Ts_camera_marker.rotation().as_matrix()[:, :, 2]
@@ -73,7 +73,7 @@ def views_of(
     output: Output,
     stamp_s: float,
 ) -> list[View]:
-    """Every camera's frame with the markers seen in it and the poses the navigator weighed.
+    """Views of every camera's frame, with the markers seen and the poses the navigator weighed.
 
     Args:
         T_world_marker: poses of the map, batch axis (M,).
@@ -81,8 +81,8 @@ def views_of(
         images: (H, W) of each camera.
         corners_px: (C, M, 4, 2).
         visible: (C, M).
-        output: what the navigator made of them, on the host.
-        stamp_s: for the titles.
+        output: the navigator's, on the host.
+        stamp_s: shown in the titles.
     """
     views = []
     valid = np.flatnonzero(output.candidates.valid)

@@ -1,4 +1,4 @@
-"""The settings of a command's own process."""
+"""JAX's settings in a command's own process."""
 
 import warnings
 
@@ -8,10 +8,10 @@ __all__ = ["cache_refused", "configure_jax", "step_folder"]
 
 
 def configure_jax(float64: bool, threads: int | None = None) -> None:
-    """`jaxnav.configure` for commands, before they build an array.
+    """Call `jaxnav.configure` for a command, before it builds an array.
 
-    Where one is called inside a process that computes already, as tests do, it takes that process
-    as it is, without a word.
+    A command that is called inside a process that computes already, as tests do, takes that process
+    as it is, without a warning.
 
     Args:
         threads: of XLA; by default one a core.

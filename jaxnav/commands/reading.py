@@ -1,4 +1,4 @@
-"""A recorded drive, read before a person who waits."""
+"""Reading of a recorded drive with a progress bar."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +11,7 @@ _PATIENCE_S = 2.0
 
 
 def read_shown(path: Path, headless: bool = False) -> DriveLog:
-    """`read_drive` with a bar where it takes longer than that, and a terminal shows it."""
+    """`read_drive`, with a bar on a terminal where it takes longer than `_PATIENCE_S`."""
     size = None
     with suppress(OSError, ValueError):  # the reader says what is wrong
         size = path.stat().st_size

@@ -1,1 +1,1 @@
-"""Other people's recordings."""
+"""Readers of recordings made by other software."""

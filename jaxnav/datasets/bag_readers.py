@@ -1,7 +1,7 @@
-"""rosbags' readers with an eye on what a bag declares and unpacks, whatever bytes it holds.
+"""rosbags' readers with bounds on what a bag of any bytes may declare and unpack to.
 
-A bag is refused, by an exception as its reader raises them, before more is taken for it than
-`jaxnav.files.limits` allows: for a chunk, for all of them together, for an index, for a definition.
+A bag is refused, by an exception like its reader's own, before it takes more than
+`jaxnav.files.limits` allows: for a chunk, all chunks together, an index, or a definition.
 """
 
 import struct
@@ -31,7 +31,7 @@ _SIZES = {"8": 1, "bool": 1, "byte": 1, "char": 1, "16": 2, "32": 4, "64": 8, "1
 
 
 class Ros1Reader(_Ros1Reader):
-    """Of .bag files."""
+    """rosbags' reader of .bag files, with bounds."""
 
     def __init__(self, path: Path):
         _Ros1Reader.__init__(self, path)
@@ -57,7 +57,7 @@ class Ros1Reader(_Ros1Reader):
         return chunk._replace(decompressor=partial(self._unpacked, kind))
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
-        """See rosbags. Two chunks may name one index: what counts is how often it is read."""
+        """See rosbags. An index counts each time it is read, as two chunks may name the same."""
         assert self.bio is not None
         begin = self.bio.tell()
         _, (size,) = self.bio.seek(begin + 51), struct.unpack("<L", self.bio.read(4))
@@ -75,7 +75,7 @@ class Ros1Reader(_Ros1Reader):
 
 
 class Ros2Reader(_Ros2Reader):
-    """Of folders, .db3 and .mcap files."""
+    """rosbags' reader of folders, .db3 and .mcap files, with bounds."""
 
     def __init__(self, path: Path):
         _Ros2Reader.__init__(self, path)
@@ -115,7 +115,7 @@ def messages(
         known: definitions of types that a bag may use without one.
 
     Raises:
-        Exception: of rosbags, or that a definition or a message is too long or declares too much.
+        Exception: any of rosbags, or a definition or a message is too long or declares too much.
     """
     types = typestore(connections, known)
     is_ros1 = isinstance(reader, Ros1Reader)
@@ -128,7 +128,7 @@ def messages(
 
 
 def typestore(connections: Collection[Connection], known: dict[str, str]) -> Any:
-    """The types of some connections; the rest as in `messages`."""
+    """The message types of some connections; arguments and errors as in `messages`."""
     undefined = {c.msgtype for c in connections if c.msgdef.format is MessageDefinitionFormat.NONE}
     types = get_typestore(Stores.ROS2_HUMBLE if undefined else Stores.EMPTY)
     for kind in undefined - types.fielddefs.keys():
@@ -151,7 +151,7 @@ def typestore(connections: Collection[Connection], known: dict[str, str]) -> Any
 
 
 def _register(types: Any, found: Any) -> None:
-    """Add types of which no message can be larger in memory than its bytes account for."""
+    """Add types; refuse one whose messages take more memory than their bytes account for."""
     least: dict[str, int] = {}
 
     def least_bytes(name: str, above: tuple[str, ...]) -> int:
@@ -186,14 +186,14 @@ def _register(types: Any, found: Any) -> None:
     types.register(found)
 
 
-# rosbags' own tables and names, by which it unpacks: they know of no budget.
+# rosbags' own tables and names, by which it unpacks without a budget.
 _ros1_decompressors = _Ros1Reader.read_chunk.__globals__["decompressors"]
 _now = threading.local()
 
 
 @contextmanager
 def _spending(budget: Budget) -> Iterator[None]:
-    """What rosbags unpacks in this block, and this thread, is taken from a budget."""
+    """Take the bytes that rosbags unpacks in this block and this thread from a budget."""
     before, _now.budget = getattr(_now, "budget", None), budget
     try:
         yield
@@ -206,14 +206,14 @@ def _bounded(kind: str) -> Callable[..., bytes]:
 
 
 class _Zstd:
-    """In place of the module, for folders whose files or messages are packed."""
+    """A replacement of rosbags' zstd module, for folders whose files or messages are packed."""
 
     decompress = staticmethod(_bounded("zstd"))
 
     @staticmethod
     @contextmanager
     def open(file: IO[bytes], mode: str) -> Iterator[Any]:
-        """What can be read of a file, as `shutil.copyfileobj` reads it."""
+        """The unpacked file, with the `read` that `shutil.copyfileobj` calls."""
         pieces, budget = zstd_pieces(file), getattr(_now, "budget", None) or Budget(0)
 
         def read(size: int) -> bytes:
@@ -229,7 +229,7 @@ _rosbag2.zstd = _Zstd  # type: ignore[assignment]
 
 
 def _limit(connection: apsw.Connection) -> None:
-    """A table may make its values up: neither long ones nor for long."""
+    """Bound the length of values and the steps of queries, as a table may make its values up."""
     connection.limit(apsw.SQLITE_LIMIT_LENGTH, limits.CHUNK_BYTES)
     steps = iter(range(limits.SQLITE_STEPS // 1_000_000))
     connection.set_progress_handler(lambda: next(steps, None) is None, 1_000_000)

@@ -1,7 +1,7 @@
-"""ROS 1 bags, compressed or not, read without ROS.
+"""Reading of ROS 1 bags without ROS, compressed or not.
 
-Message definitions come from the bag itself. Of all its messages two kinds matter here: marker
-detections (`apriltag_msgs/ApriltagArrayStamped`, TagSLAM's) and transforms (`/tf`).
+Message definitions come from the bag itself. Two kinds of its messages are read: marker detections
+(`apriltag_msgs/ApriltagArrayStamped`, TagSLAM's) and transforms (`/tf`).
 """
 
 import tempfile
@@ -26,7 +26,7 @@ _TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
 
 @dataclass
 class Detections:
-    """What one camera saw: every message's stamp, and a row for each detection."""
+    """Detections by one camera: every message's stamp, and a row for each detection."""
 
     message_stamps_ns: list[int] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
@@ -36,7 +36,7 @@ class Detections:
 
 @dataclass
 class Bag:
-    """The contents of a bag that concern us."""
+    """The topics, detections and transforms of a bag."""
 
     topics: dict[str, str] = field(default_factory=dict)  # every topic -> its message type
     detections: dict[str, Detections] = field(default_factory=dict)  # by topic
@@ -45,7 +45,7 @@ class Bag:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a file is called a ROS 1 bag."""
+    """Whether a file's name is that of a ROS 1 bag."""
     return path.name.endswith((".bag", ".bag.bz2"))
 
 
@@ -53,20 +53,20 @@ def read_bag(path: Path) -> Bag:
     """Read a .bag or .bag.bz2.
 
     Raises:
-        BadInput: not a bag, or one that ends too early.
+        BadInput: the file is no bag, or ends too early.
     """
     with decompressed(path) as plain:
         try:
             return _read(plain)
         except Exception as error:
-            # The reader meets whatever bytes a file holds, and raises whatever they lead to.
+            # The reader may meet any bytes, and raises whatever they lead to.
             problem = f"is not a readable ROS 1 bag ({type(error).__name__}: {error})"
             raise BadInput(path, problem) from None
 
 
 @contextmanager
 def decompressed(path: Path) -> Iterator[Path]:
-    """The bag itself, or a temporary copy that is gone afterwards."""
+    """The path of the bag, or of a decompressed copy that is removed after the block."""
     try:
         with path.open("rb"):
             pass
@@ -133,13 +133,13 @@ def _nanoseconds(header: Any) -> int:
 
 
 def topics_found(recorded: Sequence[Bag]) -> str:
-    """The topics of some bags, for a message."""
+    """A list of the topics of some bags, for a message."""
     topics = sorted({f"{topic} ({kind})" for bag in recorded for topic, kind in bag.topics.items()})
     return f"topics found: {', '.join(topics) or 'none'}"
 
 
 def rows_of_topics(topics: Sequence[Detections]) -> Rows:
-    """One table from the detections of every camera, in the order of the rig."""
+    """One table of the detections by all cameras, which are in the order of the rig."""
     frame_stamps = [stamp for topic in topics for stamp in topic.message_stamps_ns]
     return Rows(
         stamps_ns=np.array([s for topic in topics for s in topic.stamps_ns], np.int64),
@@ -151,5 +151,5 @@ def rows_of_topics(topics: Sequence[Detections]) -> Rows:
 
 
 def _corners_array(corners_px: list[Any]) -> np.ndarray:
-    """(N, 4, 2), also of none."""
+    """Corners as an array (N, 4, 2), also for none."""
     return np.asarray(corners_px, float).reshape(-1, 4, 2)

@@ -1,4 +1,4 @@
-"""Decoded TagSLAM recordings: one .npz with a row for each detection."""
+"""Reading of decoded TagSLAM recordings: one .npz with a row for each detection."""
 
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ _REFERENCE_KEYS: dict[str, tuple[tuple[str | int, ...], str]] = {
 
 
 def read_decoded(path: Path, rig: CameraRig | None) -> Found:
-    """Read an .npz. The reference may be missing.
+    """Read an .npz, which may have no reference.
 
     The file does not hold the sizes of the images: they are taken as twice the principal point,
     or larger where a corner lies further out.
@@ -73,7 +73,7 @@ def _checked(path: Path) -> dict[str, np.ndarray]:
     return stored
 
 
-# key -> the quantity that its numbers are; the translations of poses apart.
+# key -> the quantity of its numbers in `RANGES`; translations of poses are in `_PLACES`.
 _QUANTITIES = {
     "stamp_ns": "stamp_ns",
     "rig_stamp": "stamp_ns",
@@ -122,7 +122,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
     try:
         return dict(read_npz(path, _KEYS.keys() | _REFERENCE_KEYS.keys() | {"obj_order"}))
     except Exception as error:
-        # NumPy, zipfile and zlib meet whatever bytes a file holds.
+        # NumPy, zipfile and zlib may meet any bytes, and raise whatever they lead to.
         problem = f"is not a readable .npz file ({type(error).__name__}: {error})"
         raise BadInput(path, problem) from None
 

@@ -2,11 +2,11 @@
 
 The vehicle frame is the rig's body, the world is the marker map's frame.
 
-Conventions of the recordings that exist, as found in their data:
+Conventions of the existing recordings, as found in their data:
 
-* Corners come counter-clockwise from the bottom left (AprilTag's order); ours go clockwise from
+* Corners are counter-clockwise from the bottom left (AprilTag's order); ours are clockwise from
   the top left. The marker frame is ours already: x right, y up, z towards the reader.
-* Pixels are taken as they are. Calibration and reference were computed from the same corners, so
+* Pixels are used unchanged. Calibration and reference were computed from the same corners, so
   a shift by half a pixel would only make them disagree (reprojection of the reference over 31 297
   detections: 1.11 px RMS a coordinate as recorded, 1.20 and 1.22 px half a pixel to either side).
 * A marker that one camera reports twice in one frame is not used in that frame and camera: one of
@@ -30,7 +30,7 @@ TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER]
 
 @dataclass(frozen=True)
 class Reference:
-    """Where the vehicle was according to someone else, one row a frame of the recording."""
+    """Reference poses of the vehicle by other software, one row for each frame of a recording."""
 
     stamps_ns: Int[np.ndarray, " F"]
     T_world_vehicle: Float[np.ndarray, "F 7"]  # wxyz xyz, m; the identity where not valid
@@ -39,10 +39,10 @@ class Reference:
 
 @dataclass(frozen=True)
 class Recording:
-    """What C cameras saw of M markers in F frames, N sightings.
+    """A recording of N sightings of M markers by C cameras in F frames.
 
-    Ten minutes of a map of a thousand markers are 70 million lanes, of which as good as all are
-    hidden: `lanes` gives those of some frames.
+    Ten minutes with a map of a thousand markers are 70 million lanes, of which nearly all are
+    hidden: so sightings are stored, and `lanes` makes the lanes of some frames.
     """
 
     name: str
@@ -53,24 +53,24 @@ class Recording:
     markers: MarkerMap
     reference: Reference | None
     unmapped_detections: int  # of markers that are not in the map
-    dropped_detections: int  # reported twice, or with a corner that is nowhere
+    dropped_detections: int  # reported twice, or with a corner out of range
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     @property
     def corners_px(self) -> Float[np.ndarray, "F C M 4 2"]:
-        """Of all frames, zeros where hidden: for short recordings and small maps."""
+        """Corners of all frames, zeros where hidden; for short recordings and small maps."""
         return self.lanes(np.arange(len(self)))[0]
 
     @property
     def visible(self) -> Bool[np.ndarray, "F C M"]:
-        """Of all frames."""
+        """Whether each camera saw each marker, in all frames."""
         return self.lanes(np.arange(len(self)))[1]
 
     @property
     def seen(self) -> Bool[np.ndarray, "F M"]:
-        """Whether any camera saw a marker."""
+        """Whether any camera saw each marker in each frame."""
         seen = np.zeros((len(self), len(self.markers.ids)), bool)
         seen[self.seen_at[0], self.seen_at[2]] = True
         return seen
@@ -78,7 +78,7 @@ class Recording:
     def lanes(
         self, frames: Int[np.ndarray, " K"]
     ) -> tuple[Float[np.ndarray, "K C M 4 2"], Bool[np.ndarray, "K C M"]]:
-        """Corners, zeros where hidden, and what is visible, of some frames in any order."""
+        """Corners, zeros where hidden, and visibility of some frames in any order."""
         shape = (len(frames), len(self.rig), len(self.markers.ids))
         corners_px, visible = np.zeros((*shape, 4, 2)), np.zeros(shape, bool)
         begin = np.searchsorted(self.seen_at[0], frames)
@@ -91,7 +91,7 @@ class Recording:
         return corners_px, visible
 
     def first(self, frames: int) -> "Recording":
-        """The first frames alone."""
+        """The recording cut to its first frames."""
         kept = np.searchsorted(self.seen_at[0], frames)
         reference = self.reference
         if reference is not None:
@@ -111,7 +111,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Rows:
-    """Detections as a table, N rows, as they come out of a file."""
+    """A table of N detections in the order and convention of their file."""
 
     stamps_ns: Int[np.ndarray, " N"]
     cameras: Int[np.ndarray, " N"]  # index in the rig
@@ -122,11 +122,11 @@ class Rows:
 
 @dataclass(frozen=True)
 class Found:
-    """What a file holds: detections and cameras; the rest for who asks for it.
+    """The content of a file: detections and cameras, with functions that read map and reference.
 
     Attributes:
-        markers: the map. Raises BadInput where there is none, or a broken one.
-        reference: stamp in ns -> (7,) wxyz xyz of the vehicle in the world, if the file tells.
+        markers: returns the map; raises BadInput where there is none, or a broken one.
+        reference: returns stamp in ns -> (7,) wxyz xyz of the vehicle in the world, or None.
     """
 
     name: str
@@ -143,7 +143,7 @@ def assemble(
     markers: MarkerMap,
     poses: dict[int, np.ndarray] | None = None,
 ) -> Recording:
-    """A recording from a table of detections.
+    """Make a recording of a table of detections.
 
     Args:
         poses: the reference, stamp in ns -> (7,) wxyz xyz of the vehicle in the world.

@@ -36,10 +36,10 @@ def read_recording(
 
 
 def find(path: Path, rig: CameraRig | None, also: str = "") -> Found:
-    """All detections of a recording, whatever map they are of.
+    """Read all detections of a recording, of markers in any map or none.
 
     Args:
-        also: what else the caller reads, for the message about what nobody does.
+        also: other formats that the caller reads, for the message about an unknown one.
 
     Raises:
         BadInput: one line naming the file, or the flag that is missing.
@@ -57,7 +57,7 @@ def find(path: Path, rig: CameraRig | None, also: str = "") -> Found:
 
 
 def _read_single_bag(path: Path, rig: CameraRig | None) -> Found:
-    """A bag with detections by the cameras of a rig, which are called like its topics."""
+    """Read a bag of detections, in which a rig's cameras are named like the topics."""
     if rig is None:
         raise BadInput("--rig", f"missing: {path} alone does not say what its cameras are")
     bag = bags.read_bag(path)
@@ -71,7 +71,7 @@ def _no_markers(path: Path) -> NoReturn:
 
 
 def _topic_of(path: Path, bag: bags.Bag, camera: str) -> str:
-    """The topic that is called like the camera, or has its name between two slashes."""
+    """The topic with the camera's name, or else with that name between two slashes."""
     candidates = [topic for topic in bag.detections if topic.strip("/") == camera.strip("/")]
     candidates = candidates or [topic for topic in bag.detections if camera in topic.split("/")]
     if len(candidates) == 1:

@@ -1,6 +1,6 @@
-"""A recording through the estimator: every frame localised, in 6 degrees of freedom.
+"""Localisation of every frame of a recording by the estimator, in 6 degrees of freedom.
 
-The very `Navigator.step` that runs on a vehicle is scanned over the frames, a chunk at a time.
+The same `Navigator.step` that runs on a vehicle is scanned over the frames, a chunk at a time.
 """
 
 import functools
@@ -29,13 +29,13 @@ from jaxnav.pose.candidates import find_candidates
 from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot
 
 CHUNK_FRAMES = 64
-SIGMA_SAMPLES = 512  # detections that tell how far a recording's corners scatter
-MAX_DT_S = 1.0  # between two frames; a longer pause is a prediction for one second
+SIGMA_SAMPLES = 512  # detections from which the scatter of a recording's corners is estimated
+MAX_DT_S = 1.0  # between two frames; over a longer pause the motion is predicted for one second
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A localised recording. `tracks` is 1 where all markers serve one pose, else the map's M."""
+    """A localised recording. `tracks` is 1 where all markers share one pose, else the map's M."""
 
     T_world_vehicle: Float[np.ndarray, "F tracks 7"]
     seen: Bool[np.ndarray, "F tracks"]  # a marker of the track was in view
@@ -43,7 +43,7 @@ class Replay:
     flip_probability: Float[np.ndarray, "F tracks"]
     branch: Branch  # leaves (F, tracks); meaningless where there is no reference
     frames_per_second: float  # compilation excluded
-    corner_sigma_px: float  # what the filter was told
+    corner_sigma_px: float  # the filter's
 
 
 class _Frames(eqx.Module):
@@ -67,12 +67,12 @@ def replay(
 
     Args:
         recording: frames, rig and map.
-        selector: which candidate is believed.
-        one_at_a_time: every marker for itself, as if it were the only one; M tracks.
+        selector: chooses the candidate to believe.
+        one_at_a_time: whether each marker is tracked alone, as if it were the only one; M tracks.
         corner_sigma_px: standard deviation of a corner coordinate, by default that of `params`,
-            or as the recording itself tells, see `estimate_corner_sigma_px`.
+            or an estimate from the recording, see `estimate_corner_sigma_px`.
         progress: called with the number of frames done since the last call.
-        params: in place of the navigator's own.
+        params: replace the navigator's own.
 
     Raises:
         BadInput: a parameter that does not fit a rig that moves freely.
@@ -125,11 +125,11 @@ def replay(
 
 
 def estimate_corner_sigma_px(recording: Recording) -> float:
-    """How far a recording's corners scatter, from single markers in single cameras.
+    """Estimate the scatter of a recording's corners, px, from single markers in single cameras.
 
     The best pose of one marker leaves 2 of 8 coordinates over: its e1 is sigma^2 times chi-square
-    with 2 degrees of freedom, whatever the map and the extrinsics are worth. The median over the
-    recording is not moved by a few bad detections. What calibration adds is `MODEL_SIGMA_PX`.
+    with 2 degrees of freedom, however wrong the map and the extrinsics are. A few bad detections
+    do not move the median over the recording. Calibration errors add `MODEL_SIGMA_PX`.
     """
     sightings = len(recording.seen_px)
     if not sightings:
@@ -157,7 +157,7 @@ def estimate_corner_sigma_px(recording: Recording) -> float:
 def _best_e1_px2(
     rig: CameraRig, markers: MarkerMap, corners_px: Array, camera: Array, marker: Array
 ) -> Array:
-    """e1 of the best pose of one marker in one camera."""
+    """The e1, px^2, of the best pose of one marker in one camera."""
     seen = jnp.arange(len(rig)) == camera
     obs = Observation(jnp.broadcast_to(corners_px, (seen.shape[0], 1, 4, 2)), seen[:, None])
     candidates = find_candidates(Snapshot.create(rig, _single(markers, marker), obs))
@@ -168,7 +168,7 @@ def _best_e1_px2(
 def _run_chunk(
     navigator: Navigator, state: State, chunk: _Frames, one_at_a_time: bool
 ) -> tuple[State, tuple]:
-    """All tracks through the frames of a chunk; `state` has a leading axis (tracks,)."""
+    """Run all tracks over the frames of a chunk; `state` has a leading axis (tracks,)."""
     markers = navigator.markers
 
     def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, tuple]:
@@ -199,13 +199,13 @@ def _run_chunk(
 
 
 def _single(markers: MarkerMap, index: Array) -> MarkerMap:
-    """A map of one marker, whichever it is."""
+    """A map of the one marker at an index."""
     T_world_marker = jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[index][None])
     return MarkerMap(T_world_marker, markers.size_m[index][None], ids=(0,), families=("",))
 
 
 def _frames(recording: Recording, begin: int) -> _Frames:
-    """A chunk of frames; those beyond the last one show nothing."""
+    """A chunk of frames, padded beyond the last one with frames that show nothing."""
     frames = np.arange(begin, min(begin + CHUNK_FRAMES, len(recording)))
     padding = CHUNK_FRAMES - len(frames)
     dt_s = (
@@ -232,14 +232,14 @@ def _frames(recording: Recording, begin: int) -> _Frames:
 
 
 def frames_in_view(seen: Bool[np.ndarray, "F tracks"]) -> Int[np.ndarray, "F tracks"]:
-    """How many frames in a row every track has been seen, this one included; 0 where it is not."""
+    """The number of frames in a row, up to each, in which a track is seen; 0 where it is not."""
     frame = np.arange(len(seen))[:, None]
     last_unseen = np.maximum.accumulate(np.where(seen, -1, frame), axis=0)
     return np.where(seen, frame - last_unseen, 0)
 
 
 def errors(replay: Replay, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Position (m) and rotation (deg) error, (F, tracks), NaN where either pose is missing."""
+    """Position errors (m) and rotation errors (deg), (F, tracks); NaN without either pose."""
     reference = recording.reference
     assert reference is not None
     known = replay.seen & reference.valid[:, None]

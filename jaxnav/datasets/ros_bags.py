@@ -1,10 +1,10 @@
-"""Messages of ROS 1 and ROS 2 bags in the order in which they were received, without ROS.
+"""Reading of messages from ROS 1 and ROS 2 bags without ROS, in the order of their reception.
 
     ROS 1   drive.bag, drive.bag.bz2
     ROS 2   a folder with metadata.yaml and .db3 or .mcap files, or one such file alone
 
 Message definitions come from the bag itself. ROS 2 wrote none into .db3 files up to its release
-Humble: for those there are rosbags' definitions of that release, and some of packages outside it.
+Humble: these are read by rosbags' definitions of that release, and a few of packages outside it.
 """
 
 from collections.abc import Callable, Collection, Generator, Mapping
@@ -18,7 +18,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files.ranges import problem_of
 
 _ROS2_FILES = (".db3", ".mcap")
-_LONGEST = 200  # characters of what a library says about broken bytes; it may quote all of them
+_LONGEST = 200  # characters of a library's message about broken bytes, which may quote all of them
 _RULE = "=" * 80 + "\n"  # between the definitions of a message's parts
 
 # Of apriltag_msgs 2 and ackermann_msgs 2.
@@ -52,7 +52,7 @@ float32 jerk
 
 @dataclass(frozen=True)
 class Received:
-    """A message, and when the recorder got it."""
+    """A message, with its topic, its type, and the time at which the recorder received it."""
 
     topic: str
     kind: str  # its type, as `nav_msgs/msg/Odometry`
@@ -65,10 +65,10 @@ Choose = Callable[[Mapping[str, str]], Collection[str]]
 
 
 def read_messages(path: Path, choose: Choose) -> Generator[Received, None, None]:
-    """The messages of some topics.
+    """Read the messages of some topics of a bag.
 
     Raises:
-        BadInput: no bag, one that is broken or ends too early, or what `choose` raises.
+        BadInput: the path is no bag, a broken one, or one that ends too early; or `choose` raises.
     """
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
@@ -88,7 +88,7 @@ def read_messages(path: Path, choose: Choose) -> Generator[Received, None, None]
 
 
 def one_line(error: Exception) -> str:
-    """What went wrong, short enough to be read."""
+    """An exception in one line, short enough to be read."""
     text = " ".join(str(error).split())
     text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
     return f"{type(error).__name__}: {text}"
@@ -110,5 +110,5 @@ def _read(
     except BadInput:
         raise
     except Exception as error:
-        # The reader meets whatever bytes a file holds, and raises whatever they lead to.
+        # The reader may meet any bytes, and raises whatever they lead to.
         raise BadInput(path, f"is not a readable ROS bag ({one_line(error)})") from None

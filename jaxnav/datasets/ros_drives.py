@@ -1,10 +1,10 @@
-"""Drives recorded in ROS bags, as the inputs of a pilot.
+"""Reading of drives recorded in ROS bags, as the inputs of a pilot.
 
     topics = load_topics("topics.yaml")
     inputs = read_ros_drive("drive.bag", topics, rig, markers, vehicle)
 
-An input is there when the recorder got it; its stamp is what the message's header says. Frames of
-several cameras with one stamp are one input, there when the last of them is.
+The time of an input is when the recorder received it; its stamp is the message header's. Frames of
+several cameras with the same stamp are one input, at the time of the last of them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,7 +27,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.models.twists import TwistReader
 
-TOGETHER_NS = 100_000_000  # frames with one stamp that come in later than this are late, not one
+TOGETHER_NS = 100_000_000  # frames of one stamp that come later than this are not joined
 
 
 def read_ros_drive(
@@ -38,14 +38,14 @@ def read_ros_drive(
     vehicle: Vehicle,
     corner_backend: str = "aruco",
 ) -> list[Input]:
-    """All inputs of a bag, in the order in which they are there.
+    """Read all inputs of a bag, in the order of their reception.
 
     Args:
         path: a .bag, a .bag.bz2, the folder of a ROS 2 bag, or one of its .db3 or .mcap files.
-        topics: which topic is what. Cameras of the rig that it leaves out never show a frame.
-        markers: says which families are looked for in images, and of which family an id is that
+        topics: the topics to read. Cameras of the rig that it leaves out never have a frame.
+        markers: their families are searched for in images, and give the family of an id that
             comes without one.
-        vehicle: turns a yaw rate into steering.
+        vehicle: its figures turn a yaw rate into steering.
         corner_backend: see `make_detector`; for images.
 
     Raises:
@@ -71,17 +71,17 @@ def read_ros_drive(
             except BadInput:
                 raise
             except Exception as error:
-                # A definition in the bag may be any other than the one that its name promises.
+                # A definition in the bag may differ from the one that its name promises.
                 problem = f"{received.topic}: a message can't be understood ({one_line(error)})"
                 raise BadInput(path, problem) from None
     return sorted([*inputs, *together(frames)], key=lambda given: given.now_ns)
 
 
 def together(frames: Iterable[tuple[int, Sighted]]) -> list[Input]:
-    """Frames of several cameras with the same stamp as one input.
+    """Join frames of several cameras with the same stamp into one input.
 
     Args:
-        frames: when each was received, in that order.
+        frames: each with the time at which it was received, ns, in the order of these times.
     """
     groups: list[list[tuple[int, Sighted]]] = []
     open_groups: dict[int, list[tuple[int, Sighted]]] = {}  # by stamp
@@ -103,7 +103,7 @@ def together(frames: Iterable[tuple[int, Sighted]]) -> list[Input]:
 
 @dataclass
 class _Reader:
-    """Turns the messages of the cameras' topics into what the cameras show."""
+    """A reader that turns the messages of the cameras' topics into `Sighted` frames."""
 
     path: Path
     topics: TopicMap
@@ -120,7 +120,7 @@ class _Reader:
         self._families = dict(zip(self.markers.ids, self.markers.families, strict=True))
 
     def choose(self, kinds: Mapping[str, str]) -> list[str]:
-        """The topics to read, every one of a type that can be."""
+        """The topics to read, each checked to be of a type that can be read."""
         wanted: dict[str, tuple[str, tuple[str, ...]]] = {
             f"cameras.{name}": (topic, ros_messages.CAMERA_TYPES)
             for name, topic in self.topics.cameras.items()
@@ -149,7 +149,7 @@ class _Reader:
         return found[0]
 
     def sighted(self, received: Received) -> Sighted:
-        """What a frame shows."""
+        """The sightings in a message of detections or of an image."""
         camera = self._camera_of[received.topic.strip("/")]
         stamp_ns = ros_messages.stamp_ns(received.message)
         if received.kind in (ros_messages.IMAGE, ros_messages.COMPRESSED):
@@ -176,5 +176,5 @@ class _Reader:
 
 
 def _same(topic: str, other: str | None) -> bool:
-    """Whether two spellings of a topic's name mean the same."""
+    """Whether two spellings of a topic's name mean the same topic."""
     return other is not None and topic.strip("/") == other.strip("/")

@@ -1,4 +1,4 @@
-"""What ROS messages say, in our words: corners, speed and steering, images.
+"""Conversion of ROS messages into our types: corners, speed and steering, images.
 
     apriltag_msgs/AprilTagDetectionArray   apriltag_ros 2: pixels counted from the image's edge
     apriltag_msgs/ApriltagArrayStamped     TagSLAM: pixels as its calibration counts them
@@ -6,8 +6,8 @@
     ackermann_msgs/AckermannDriveStamped   speed and steering angle
     sensor_msgs/Image, CompressedImage     8 bit, grey, colour or Bayer
 
-Corners are in the image that the detector was given. That of apriltag_ros is rectified: its camera
-in the rig is one without lens.
+Corners are in the image that the detector was given. apriltag_ros takes a rectified image: its
+camera in the rig is one without lens.
 """
 
 from collections.abc import Mapping
@@ -49,7 +49,7 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 
 def stamp_ns(message: Any) -> int:
-    """When its header says that it was measured, on the clock of whoever measured it."""
+    """The stamp in a message's header, ns, on the clock of the computer that measured."""
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
@@ -64,7 +64,7 @@ def detections(
 
     Args:
         sigma_px: of every corner, along one axis.
-        families: of each id in the map; TagSLAM's messages do not tell.
+        families: id in the map -> family, which TagSLAM's messages do not tell.
 
     Raises:
         ValueError: a marker does not have four corners.
@@ -90,10 +90,10 @@ def detections(
 
 
 def odometry(kind: str, message: Any, twists: TwistReader) -> Odometry:
-    """One reading, of a message of `NAV_ODOMETRY` or `ACKERMANN`.
+    """The odometry in a message of `NAV_ODOMETRY` or `ACKERMANN`.
 
     Args:
-        twists: of the same topic's messages, in their order.
+        twists: must read all messages of one topic, in their order.
     """
     if kind == ACKERMANN:
         drive = message.drive
@@ -103,10 +103,10 @@ def odometry(kind: str, message: Any, twists: TwistReader) -> Odometry:
 
 
 def grey_image(kind: str, message: Any) -> np.ndarray | None:
-    """The picture in a message of `IMAGE` or `COMPRESSED`, (H, W) uint8; None where it is broken.
+    """The image in a message of `IMAGE` or `COMPRESSED`, (H, W) uint8; None where it is broken.
 
     Raises:
-        ValueError: an encoding that we do not read.
+        ValueError: the encoding is none that we read.
     """
     data = np.asarray(message.data, np.uint8)
     if kind == COMPRESSED:

@@ -1,4 +1,4 @@
-"""Everything that the cameras of a recording saw of markers, whatever map they are of."""
+"""Reading of all sightings of markers in a recording, of markers in any map or none."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,16 +20,16 @@ from jaxnav.recording.drive_setup import DriveSetup
 
 @dataclass(frozen=True)
 class Sightings:
-    """N sightings in the order of their frames.
+    """N sightings of markers in the order of their frames.
 
     Attributes:
-        rig: the cameras, as the recording has them where no others were given.
-        markers: the map that the recording brings along, if it does.
+        rig: the given cameras, or the recording's.
+        markers: the map in the recording; None without one.
         stamps_ns: (F,) of the frames, increasing.
         frame, camera, ids: (N,).
         corners_px: (N, 4, 2), TL TR BR BL.
-        families: (N,) texts; none where the recording does not tell.
-        odometry: of a drive, in the order in which it came.
+        families: (N,) texts; None where the recording does not tell.
+        odometry: readings of a drive, in the order in which they came.
     """
 
     rig: CameraRig
@@ -49,7 +49,7 @@ def read_sightings(path: str | Path, rig: CameraRig | None = None) -> Sightings:
     A marker that a camera reports twice in a frame is left out there: one of the two is false.
 
     Args:
-        rig: in place of the recording's own.
+        rig: replaces the recording's own.
 
     Raises:
         BadInput: one line naming the file and what is wrong in it, or the flag that is missing.

@@ -1,4 +1,4 @@
-"""TagSLAM's folders: bags with detections and with the result, and its three YAML files.
+"""Reading of TagSLAM's folders: bags with detections and results, and three YAML files.
 
 cameras.yaml       intrinsics (Kalibr's keys), `tagtopic`, `rig_body`
 *.bag[.bz2]        detections; `/tf` with every camera, marker and the rig
@@ -28,14 +28,14 @@ _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 
 
 class Vector(ForeignEntry):
-    """x y z: m, or a rotation vector in rad."""
+    """A vector x y z in a file: a position in m, or a rotation vector in rad."""
 
     x: Position
     y: Position
     z: Position
 
     def xyz(self) -> list[float]:
-        """As a list."""
+        """The vector as a list."""
         return [self.x, self.y, self.z]
 
 
@@ -46,7 +46,7 @@ class PoseEntry(ForeignEntry):
     rotation: Vector
 
     def pose(self) -> np.ndarray:
-        """(7,) wxyz xyz."""
+        """The pose, (7,) wxyz xyz."""
         return poses.pose_from_rotation_vector(self.rotation.xyz(), self.position.xyz())
 
 
@@ -68,7 +68,7 @@ class BodyEntry(ForeignEntry):
 
 
 class TagSlamFile(ForeignEntry):
-    """tagslam.yaml."""
+    """The content of tagslam.yaml."""
 
     default_body: str | None = None
     bodies: Annotated[list[dict[str, BodyEntry]], Field(min_length=1)]
@@ -154,7 +154,7 @@ def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: Edges, body: 
 
 
 def _markers(path: Path, edges: Edges) -> MarkerMap:
-    """Poses from /tf, else the known ones of tagslam.yaml; sizes from tagslam.yaml."""
+    """The map: poses from /tf, or else known ones of tagslam.yaml; sizes from tagslam.yaml."""
     file = path / "tagslam.yaml"
     settings = validate(TagSlamFile, read_mapping(file), file)
     bodies = {name: entry for body in settings.bodies for name, entry in body.items()}
@@ -203,7 +203,7 @@ def _to_root(
 
 
 def _last(stamped: dict[int, tuple[float, ...]]) -> np.ndarray:
-    """The latest value: what TagSLAM published after its last optimisation."""
+    """The latest pose (7,), which TagSLAM published after its last optimisation."""
     return _canonical(stamped[max(stamped)])
 
 

@@ -1,7 +1,7 @@
-"""Rigs, cameras, markers, vehicles, routes, topics, tuned parameters: files in and out.
+"""Reading and writing files: rigs, cameras, markers, vehicles, routes, topics, tuned parameters.
 
-What a person wrote is validated before anything is built from it; what is wrong is one
-`BadInput` line that names the file and the key. Keys carry their units.
+Every file is validated before anything is built from it; an error is one `BadInput` line that
+names the file and the key. Keys carry their units.
 """
 
 from pathlib import Path
@@ -41,10 +41,10 @@ __all__ = [
 
 
 def calib_dir() -> Path:
-    """The shipped calibration data: inside the package when installed, beside it in a checkout.
+    """The folder of the shipped calibration: in the package if installed, beside it in a checkout.
 
     Raises:
-        BadInput: an incomplete installation.
+        BadInput: the installation is incomplete.
     """
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "calib", package.parent / "calib"):

@@ -29,7 +29,7 @@ Squares = Annotated[int, Field(strict=True, ge=1, le=100)]
 
 
 class Charuco(Entry):
-    """A chessboard with markers in its white squares."""
+    """A board file's chessboard with markers in its white squares."""
 
     board: Literal["charuco"]
     columns: Squares
@@ -40,12 +40,12 @@ class Charuco(Entry):
     first_id: Count = 0
 
     def figures(self) -> dict[str, Any]:
-        """As `jaxnav.calibration.boards.board.Board` takes them, as all of these."""
+        """The arguments of `jaxnav.calibration.boards.board.Board`, as in every class here."""
         return _figures(self, size_m=self.square_m)
 
 
 class Aprilgrid(Entry):
-    """Tags in a grid, black squares between them."""
+    """A board file's grid of tags with black squares between them."""
 
     board: Literal["aprilgrid"]
     columns: Squares
@@ -61,7 +61,7 @@ class Aprilgrid(Entry):
 
 
 class Chessboard(Entry):
-    """Black and white squares."""
+    """A board file's chessboard of black and white squares."""
 
     board: Literal["chessboard"]
     columns: Squares
@@ -73,7 +73,7 @@ class Chessboard(Entry):
 
 
 class SingleMarker(Entry):
-    """One navigation marker."""
+    """A board file's single navigation marker."""
 
     board: Literal["marker"]
     size_m: Size
@@ -85,7 +85,7 @@ class SingleMarker(Entry):
 
 
 class KalibrAprilgrid(ForeignEntry):
-    """`target_type: 'aprilgrid'`; the spacing is in sides of a tag."""
+    """Kalibr's target of `target_type: 'aprilgrid'`; the spacing is in sides of a tag."""
 
     tagCols: Squares
     tagRows: Squares
@@ -105,7 +105,7 @@ class KalibrAprilgrid(ForeignEntry):
 
 
 class KalibrCheckerboard(ForeignEntry):
-    """`target_type: 'checkerboard'`; it counts the corners between the squares."""
+    """Kalibr's target of `target_type: 'checkerboard'`; it counts the corners between squares."""
 
     targetCols: Squares
     targetRows: Squares
@@ -131,7 +131,7 @@ _OWN: dict[str, type[Charuco] | type[Aprilgrid] | type[Chessboard] | type[Single
 
 
 def load_board(path: str | Path) -> BoardFile:
-    """A board from jaxnav's own YAML, or from Kalibr's target YAML.
+    """Read a board from jaxnav's own YAML, or from Kalibr's target YAML.
 
     Raises:
         BadInput: one line naming file and key.
@@ -144,10 +144,10 @@ def load_board(path: str | Path) -> BoardFile:
 
 
 def save_board(path: str | Path, data: dict[str, Any]) -> None:
-    """Write what a board's file holds; `load_board` gives it back.
+    """Write the content of a board file, which `load_board` reads back.
 
     Raises:
-        BadInput: a key that is wrong, or the file can't be written.
+        BadInput: a key is wrong, or the file can't be written.
     """
     entry = _own(Path(path), data)
     atomic_write(path, yaml.safe_dump(entry.model_dump(), sort_keys=False))

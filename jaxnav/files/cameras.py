@@ -1,8 +1,8 @@
-"""Calibrated cameras, from the files of whichever tool calibrated them.
+"""Calibrated cameras, read from the files of several calibration tools.
 
-Read: jaxnav's own rig YAML, Kalibr's camchain, ROS's camera_info YAML, OpenCV's FileStorage YAML
-(as its calibration sample and most scripts write it) and PhotonVision's JSON. Which of them a file
-is, its keys tell.
+The formats are jaxnav's own rig YAML, Kalibr's camchain, ROS's camera_info YAML, OpenCV's
+FileStorage YAML (as its calibration sample and most scripts write it) and PhotonVision's JSON. A
+file's keys tell its format.
 """
 
 from collections.abc import Callable
@@ -35,11 +35,11 @@ CameraFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a file of cameras holds.
+    """The cameras of a file, with its format and the keys that were not read.
 
     Attributes:
-        cameras: by the names that the file gives them, at least one.
-        left_out: the keys that say something that no camera of ours holds.
+        cameras: under the names that the file gives them, at least one.
+        left_out: keys with values that a `CameraFigures` can't hold.
     """
 
     format: CameraFormat
@@ -48,7 +48,7 @@ class CameraFile:
 
 
 class _OneCamera(NamedTuple):
-    """How the file of a tool that writes one camera a file is read."""
+    """The functions that read the format of a tool that writes one camera a file."""
 
     format: CameraFormat
     recognised: Callable[[dict[str, Any]], bool]
@@ -64,11 +64,11 @@ _ONE_CAMERA = (
 
 
 def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, ImageSizePx]:
-    """One camera and the size of its images in pixels (width, height).
+    """Read one camera and the size of its images in pixels (width, height).
 
     Args:
         path: a calibration file.
-        name: which camera, where the file holds several.
+        name: of the camera to read, where the file holds several.
 
     Raises:
         BadInput: one line naming file and key; with the names to choose from where there are
@@ -89,11 +89,11 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
 def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
     """All cameras of a file, whichever tool wrote it.
 
-    Those of a camchain are called `cam0`, `cam1` and so on; a camera that its file gives no name
-    is called as the file is.
+    Cameras of a camchain are called `cam0`, `cam1` and so on; a camera without a name in its file
+    is called after the file.
 
     Args:
-        data: what the file holds.
+        data: the content of the file.
 
     Raises:
         BadInput: one line naming file and key.
@@ -119,13 +119,13 @@ def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
 
 
 def _name(named: Any) -> str:
-    """What a tool calls a camera, which may be a serial number; empty where that is no name."""
+    """A tool's name of a camera, which may be a serial number; empty where it is not usable."""
     name = str(named) if isinstance(named, str | int) else ""
     return name if len(name) <= 100 and name.isprintable() else ""
 
 
 def named_by_topic(path: Path, data: dict[str, Any], file: CameraFile) -> CameraFile:
-    """The file with the cameras of a camchain called after their topics; others as they are."""
+    """The file with cameras named after their topics, if it is a camchain; else unchanged."""
     if file.format != "kalibr":
         return file
     names = kalibr.names_by_topic(kalibr.camchain(path, data))
@@ -136,10 +136,10 @@ def named_by_topic(path: Path, data: dict[str, Any], file: CameraFile) -> Camera
 def choose_camera(
     path: Path, cameras: tuple[CameraFigures, ...], name: str | None
 ) -> CameraFigures:
-    """The camera of that name, or the only one.
+    """The camera of a name, or the only one.
 
     Raises:
-        BadInput: there is none, or there are several and no name.
+        BadInput: no camera has that name, or there are several and no name is given.
     """
     named = {camera.name: camera for camera in cameras}
     if name is None and len(cameras) == 1:

@@ -1,8 +1,8 @@
 """The figures of a camera and of a marker as files hold them: float64, whatever JAX's precision is.
 
-Every reader of a camera's file makes these and every writer takes them; a `Camera` or a `CameraRig`
-is made from them and in no other way. So what one format holds and another does too goes from one
-to the other bit for bit.
+Every reader of camera files makes these and every writer takes them; from files, a `Camera` or a
+`CameraRig` is made only of them. So a figure that two formats hold goes from one to the other bit
+for bit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,13 @@ Lens = Literal["none", "radtan", "rational", "equidistant"]
 
 @dataclass(frozen=True, eq=False)
 class CameraFigures:
-    """One camera.
+    """The figures of one camera.
 
     Attributes:
         lens: see `jaxnav.models.camera`.
         focal_px: fx, fy.
         center_px: cx, cy; the centre of the top-left pixel is (0, 0).
-        distortion: as the lens counts its coefficients, all of them.
+        distortion: all coefficients of the lens, in its order.
         image_size_px: width, height.
         T_camera_vehicle: a pose as it is written, (7,) or (4, 4), see `jaxnav.files.poses`; None
             where the file does not place the camera.
@@ -51,7 +51,7 @@ class CameraFigures:
         image_size_px: Sequence[int],
         T_camera_vehicle: np.ndarray | None = None,
     ) -> "CameraFigures":
-        """From fx fy cx cy, and from coefficients whose last ones may be missing: they are zero."""
+        """A camera from fx fy cx cy and coefficients; missing last coefficients are zero."""
         fx, fy, cx, cy = (float(value) for value in pinhole_px)
         missing = LENS_COEFFICIENTS[lens] - len(distortion)
         return CameraFigures(
@@ -65,13 +65,13 @@ class CameraFigures:
         )
 
     def camera(self) -> Camera:
-        """The intrinsic part, in the process's precision."""
+        """The camera without its place, in the process's precision."""
         return Camera.create(self.focal_px, self.center_px, self.lens, self.distortion)
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerFigures:
-    """One marker of a map.
+    """The figures of one marker of a map.
 
     Attributes:
         T_world_marker: a pose as it is written, (7,) or (4, 4).
@@ -84,7 +84,7 @@ class MarkerFigures:
 
 
 def rig_from_figures(cameras: Sequence[CameraFigures]) -> CameraRig:
-    """The rig, in the process's precision; every camera must have its place."""
+    """The rig of some cameras, in the process's precision; every camera must have a place."""
     Ts_camera_vehicle = []
     for camera in cameras:
         assert camera.T_camera_vehicle is not None
@@ -117,12 +117,12 @@ def figures_of_rig(rig: CameraRig) -> list[CameraFigures]:
 
 
 def to_se3(pose: np.ndarray) -> jaxlie.SE3:
-    """A pose in the process's precision."""
+    """A pose (7,) as jaxlie's, in the process's precision."""
     return jaxlie.SE3(jnp.asarray(pose, float))
 
 
 def unread(data: Mapping[str, Any], known: Sequence[str], prefix: str = "") -> list[str]:
-    """The keys of a file that say something and are not among the known ones."""
+    """The keys of a file, except the known ones, whose values are not empty, zero or false."""
     told = []
     for key, value in data.items():
         if key not in known and _says_something(value):

@@ -1,27 +1,27 @@
 """The size that an image declares, from its header alone.
 
 Every format is read as its decoder reads it, so that both see the same size: the first frame header
-of a JPEG, the first chunk of a PNG. What a decoder would take memory for beside the picture (tiles
-of a TIFF, passes of a JPEG over all of it) counts as pixels, or makes the image none.
+of a JPEG, the first chunk of a PNG. Other memory that a decoder would take (tiles of a TIFF, passes
+of a JPEG over all of the picture) counts as pixels, or the image is refused.
 """
 
 import re
 import struct
 from collections.abc import Callable
 
-# Passes of a JPEG over its picture: encoders make 10 at most, some bytes make a thousand.
+# Passes of a JPEG over its picture: encoders make 10 at most, hostile bytes a thousand.
 _JPEG_SCANS = 32
 _PNG_CHUNKS = 2**17  # one of 256 bytes each in the largest picture, where encoders write 8 KiB
 _TIFF_TAGS = 4096
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
 _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
-_BITS = 16  # a sample; those of 32 and 64 are no pictures of a camera
+_BITS = 16  # per sample at most; no camera's pictures have 32 or 64
 
 SizePx = tuple[int, int]  # width, height
 
 
 def image_size_px(raw: bytes) -> SizePx | None:
-    """Width and height; None where it is no image of a format that we read, or a broken one."""
+    """Width and height of an image; None where it is broken or not of a format that we read."""
     for magic, size_of in _FORMATS:
         if raw.startswith(magic):
             try:
@@ -112,7 +112,7 @@ def _tiff(raw: bytes) -> SizePx:
         if tag in values:
             raise ValueError("a tag twice")
         code = {1: "B", 3: "H", 4: "L"}.get(kind)
-        if tag == _TIFF_BITS and number > 2:  # they stand elsewhere, one a sample
+        if tag == _TIFF_BITS and number > 2:  # stored elsewhere, one for each sample
             (entry,) = struct.unpack_from(f"{order}L", raw, entry + 8)
             entry -= 8
         if code is not None:

@@ -1,7 +1,7 @@
-"""Compressed images, of whatever bytes: BMP, JPEG, PNG, PNM, TIFF and WebP.
+"""Decoding of compressed images of any bytes: BMP, JPEG, PNG, PNM, TIFF and WebP.
 
-OpenCV takes memory for what a header declares, whatever follows. So the header is read here first,
-and what it is too large for, or of another format, is not decoded.
+OpenCV takes memory for the size that a header declares, whatever follows. So the header is read
+first, and an image that is too large or of another format is not decoded.
 """
 
 from pathlib import Path
@@ -15,10 +15,10 @@ from jaxnav.files.image_headers import image_size_px
 
 
 def decoded_image(raw: bytes | np.ndarray, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | None:
-    """The picture, uint8: by default (H, W, 3) in BGR order; None where it is none.
+    """Decode an image to uint8, by default (H, W, 3) in BGR order; None where that fails.
 
     Args:
-        raw: the file's bytes, or (N,) uint8 of them.
+        raw: the file's bytes, as `bytes` or (N,) uint8.
         flags: of `cv2.imdecode`.
     """
     data = np.frombuffer(raw, np.uint8) if isinstance(raw, bytes) else raw
@@ -26,16 +26,16 @@ def decoded_image(raw: bytes | np.ndarray, flags: int = cv2.IMREAD_COLOR) -> np.
         return None
     try:
         image = cv2.imdecode(data, flags)
-    except cv2.error:  # of no bytes at all, or of a size that nobody has memory for
+    except cv2.error:  # for no bytes at all, or a size beyond the memory
         return None
     return None if image is None else np.asarray(image)
 
 
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
-    """The picture in a file; see `decoded_image`.
+    """Read the image in a file; see `decoded_image`.
 
     Raises:
-        BadInput: missing, unreadable, too large, or not an image.
+        BadInput: the file is missing, unreadable, too large, or not an image.
     """
     try:
         with path.open("rb") as file:
@@ -50,7 +50,7 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
 
 
 def image_problem(raw: bytes | np.ndarray) -> str | None:
-    """Why an image is not decoded; None: it can be tried."""
+    """The reason why an image is not to be decoded; None where decoding can be tried."""
     if len(raw) > limits.IMAGE_BYTES:
         return f"is larger than {limits.IMAGE_BYTES // limits.MIB} MiB"
     size_px = image_size_px(raw if isinstance(raw, bytes) else raw.tobytes())

@@ -1,4 +1,4 @@
-"""Kalibr's camchain YAML, with imu := vehicle.
+"""Reading and writing Kalibr's camchain YAML, with imu := vehicle.
 
 `T_cam_imu` maps vehicle to camera. A camera without one is chained from the camera before it by
 `T_cn_cnm1`; OpenVINS's inverse, `T_imu_cam`, is read too. A chain that Kalibr made of cameras alone
@@ -103,7 +103,7 @@ class KalibrCamera(ForeignEntry):
         return self
 
     def figures(self, name: str, T_camera_vehicle: np.ndarray | None = None) -> CameraFigures:
-        """The camera under that name at that place."""
+        """The camera under a given name at a given place."""
         lens = _LENS[self.distortion_model]
         coefficients = [] if lens == "none" else self.distortion_coeffs
         return CameraFigures.create(
@@ -111,7 +111,7 @@ class KalibrCamera(ForeignEntry):
         )
 
     def camera(self) -> Camera:
-        """The intrinsic part."""
+        """The camera without its place."""
         return self.figures("").camera()
 
 
@@ -154,10 +154,10 @@ def camchain_figures(chain: dict[str, KalibrCamera]) -> list[CameraFigures]:
 
 
 def require_places(path: Path, cameras: Sequence[CameraFigures]) -> None:
-    """Ask where the cameras of a camchain are, under their keys.
+    """Require a place of every camera of a camchain; cameras are named by their keys.
 
     Raises:
-        BadInput: one is not placed.
+        BadInput: a camera has no place.
     """
     for camera in cameras:
         if camera.T_camera_vehicle is None:
@@ -166,9 +166,9 @@ def require_places(path: Path, cameras: Sequence[CameraFigures]) -> None:
 
 
 def names_by_topic(chain: dict[str, KalibrCamera]) -> list[str]:
-    """What the cameras are called after `rostopic`, else their keys.
+    """The names of the cameras by `rostopic`, or their keys where that gives no distinct names.
 
-    `/front/image_raw` is of the camera `front`; another topic is the name itself.
+    `/front/image_raw` gives the name `front`; any other topic is the name itself.
     """
     names = [
         _name_of(entry.rostopic) if entry.rostopic and entry.rostopic.isprintable() else key
@@ -178,7 +178,7 @@ def names_by_topic(chain: dict[str, KalibrCamera]) -> list[str]:
 
 
 def camchain_left_out(data: dict[str, Any], chain: dict[str, KalibrCamera]) -> list[str]:
-    """The keys that are not read and say something."""
+    """The keys that are not read and not empty, see `unread`."""
     told = unread(data, list(chain))
     read = set(KalibrCamera.model_fields) - {"tagtopic", "rig_body"}
     for key, camera in zip(chain, camchain_figures(chain), strict=True):
@@ -188,7 +188,7 @@ def camchain_left_out(data: dict[str, Any], chain: dict[str, KalibrCamera]) -> l
 
 
 def camchain_text(cameras: Sequence[CameraFigures]) -> str:
-    """The cameras as a camchain. A camera without a place may be in it alone.
+    """The cameras as the text of a camchain; a single camera may have no place.
 
     Raises:
         BadInput: a camera with k3, which Kalibr does not know, or one of several without a place.

@@ -1,8 +1,8 @@
-"""How much a file may hold: every cap on what is unpacked or declared, and where each comes from.
+"""Caps on what a file may declare or unpack to, and where each comes from.
 
-A file of 50 MB, whoever made it, must not take more than 2 GiB or 10 s to be read or refused. So
-every reader asks these before it allocates what a file declares, and counts what it unpacks. What
-honest recordings need is a tenth of a cap or less; docs/files.md says which were tried.
+No file of 50 MB may take more than 2 GiB or 10 s to be read or refused. So every reader checks
+these caps before it allocates what a file declares, and counts what it unpacks. Honest recordings
+need a tenth of a cap or less; docs/files.md says which were tried.
 """
 
 MIB = 2**20
@@ -11,24 +11,24 @@ MIB = 2**20
 YAML_BYTES = 2 * MIB
 YAML_VALUES = 300_000
 DEPTH = 24  # our deepest file has 7 levels
-# PhotonVision keeps its snapshots inside, as base64; what else it says is some thousand values.
+# PhotonVision keeps its snapshots inside, as base64; the rest is some thousand values.
 JSON_BYTES = 64 * MIB
 JSON_VALUES = 2_000_000  # 100 bytes and 1 us each
 
-# Pictures. The search for markers takes up to 43 bytes a pixel, of noise: 1.5 GiB. Cameras that
-# drive have 0.3 to 8 million, one for photographs 12 to 30.
+# Pictures. On noise, the search for markers takes up to 43 bytes a pixel: 1.5 GiB. Cameras that
+# drive have 0.3 to 8 million pixels, one for photographs 12 to 30.
 IMAGE_PIXELS = 2**25
-IMAGE_BYTES = 256 * MIB  # of such a one, not compressed, 16 bits in 4 channels
+IMAGE_BYTES = 256 * MIB  # of an image with so many pixels, not compressed, 16 bits in 4 channels
 
 # Arrays once they are unpacked, all of a file: 3 million detections, two days of a rig of four.
 NPZ_BYTES = 256 * MIB
 
-# Recordings. Compressed, they are a third to a tenth of what they were (TagSLAM's bags in bz2: 1.04
-# to 9.5; ours in zstd: 9); a file may unpack to so many times its size, and to so much in any case.
+# Recordings. Compression makes them 3 to 10 times smaller (TagSLAM's bags in bz2: 1.04 to 9.5; ours
+# in zstd: 9). A file may unpack to UNPACKED_TIMES its size, and to UNPACKED_BYTES on top of that.
 UNPACKED_BYTES = 64 * MIB
 UNPACKED_TIMES = 32
 CHUNK_BYTES = 64 * MIB  # one of a bag or an MCAP file: 0.8 to 4 MiB, or a single large image
-MESSAGE_BYTES = 4 * MIB  # of a message that is no picture: that of 4096 markers in view is 1 MiB
+MESSAGE_BYTES = 4 * MIB  # of a message that is no picture: one of 4096 markers in view has 1 MiB
 CONNECTIONS = 4096  # of a bag: one a topic and publisher
 INDEX_ENTRIES = 2_000_000  # of a bag, 200 bytes each: half an hour of 1 kHz
 DEFINITION_BYTES = 64 * 2**10  # of a type of message; PX4's longest have 10
@@ -41,7 +41,7 @@ MCAP_MESSAGES = 1_000_000
 # Of a recording that is read as a whole: two hours of a rig that has 8 markers in view at 30 Hz.
 DETECTIONS = 2_000_000
 IN_VIEW = 4096  # markers in one frame of a camera: all of the largest map
-TRACKED_POSES = 4_000_000  # of markers each for itself, frames x markers, 90 bytes each
+TRACKED_POSES = 4_000_000  # frames x markers where each marker is tracked alone, 90 bytes each
 
-# Of a study, read at once: a box has 2 million trials at most, in 8 bytes.
+# A study's store, as much as is read at once: a box has 2 million trials at most, 8 bytes each.
 STORE_BYTES = 128 * MIB

@@ -1,4 +1,4 @@
-"""Who is at work on a file: locks that the kernel lets go of, however their process ends."""
+"""File locks of processes at work, which the kernel releases however their process ends."""
 
 import fcntl
 import os
@@ -15,7 +15,7 @@ _OLD = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 @contextmanager
 def sole_writer(path: str | Path) -> Iterator[None]:
-    """While the block runs, no other process enters such a block of the same path.
+    """Keep all other processes out of such a block for the same path while this one runs.
 
     The lock is a file beside it, `.NAME.lock`. Where the disk knows no locks there is none.
 
@@ -34,7 +34,7 @@ def sole_writer(path: str | Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # While it is still locked: whoever waits at the door finds that it is gone.
+        # While it is still locked: a process that opened it then finds that it is gone.
         beside.unlink(missing_ok=True)
         os.close(fd)
 
@@ -42,10 +42,10 @@ def sole_writer(path: str | Path) -> Iterator[None]:
 def create_temporary(
     name_of: Callable[[str], str], mode: int, dir_fd: int | None = None
 ) -> tuple[str, int]:
-    """A new file, locked as long as it is open: `sweep` lets it live until its process has ended.
+    """Create a file that is locked while open, so that `sweep` keeps it until its process ends.
 
     Args:
-        name_of: its name, with some characters in it that nobody else has.
+        name_of: makes its name from some unique characters.
         mode: its permissions, less those that the umask takes.
         dir_fd: the folder of the name, by default the process's own.
 
@@ -58,14 +58,14 @@ def create_temporary(
     while True:
         name = name_of(secrets.token_hex(4))
         fd = os.open(name, _NEW, mode, dir_fd=dir_fd)
-        # Another one may have swept it away before it was locked.
+        # Another process may have swept it away before it was locked.
         if _lock(fd) is not False and os.fstat(fd).st_nlink:
             return name, fd
         os.close(fd)
 
 
 def sweep(names: Iterable[str], dir_fd: int | None = None) -> None:
-    """Remove those files of `create_temporary` whose processes have ended."""
+    """Remove the files of `create_temporary` whose processes have ended."""
     for name in names:
         with suppress(OSError):
             fd = os.open(name, _OLD, dir_fd=dir_fd)
@@ -77,7 +77,7 @@ def sweep(names: Iterable[str], dir_fd: int | None = None) -> None:
 
 
 def _locked(path: Path) -> int | None:
-    """A descriptor of the file, which is then this process's; None: it is another's."""
+    """A descriptor of the file, locked by this process; None where another one has locked it."""
     while True:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         if _lock(fd) is False:
@@ -86,12 +86,12 @@ def _locked(path: Path) -> int | None:
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(fd), path.stat(follow_symlinks=False)):
                 return fd
-        # Between opening and locking, the one who had it has removed it.
+        # Between opening and locking, the process that had it has removed it.
         os.close(fd)
 
 
 def _lock(fd: int) -> bool | None:
-    """Whether the lock is this process's now; None where there are no locks."""
+    """Whether this process now has the lock; None where the disk knows no locks."""
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

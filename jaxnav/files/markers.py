@@ -1,4 +1,4 @@
-"""Marker maps: YAML, in and out.
+"""Reading and writing marker maps in YAML.
 
     markers:
       - id: 0
@@ -6,7 +6,7 @@
         size_m: 0.172
         corners_world_m: [[...], [...], [...], [...]]   # TL TR BR BL, as its reader sees them
 
-Instead of the corners, `T_world_marker` (4x4 or `{wxyz, xyz_m}`): x right, y up, z towards the
+`T_world_marker` (4x4 or `{wxyz, xyz_m}`) may replace the corners: x right, y up, z towards the
 reader. Wherever in the world a map is, its places are exact: see `jaxnav.models.origin`.
 """
 
@@ -29,12 +29,12 @@ from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
 from jaxnav.models.origin import Origin, opposite, origin_near, poses_in_world
 
-# A corner may lie this far from the best square, as a part of the side: a tape measure's error.
+# The most that a corner may be off the best square, in sides: a tape measure's error.
 _MAX_CORNER_ERROR = 0.03
 
 
 class MarkerSigma(Entry):
-    """One standard deviation of a marker's place, as far as it was calibrated."""
+    """One standard deviation of a calibrated marker's place."""
 
     position_m: Point  # along the axes of the world
     rotation_deg: Point  # about the axes of the world
@@ -79,7 +79,7 @@ class MarkerEntry(Entry):
         return self
 
     def figures(self) -> MarkerFigures:
-        """The marker, with the numbers of the file."""
+        """The marker's figures, with the numbers of the file."""
         if self.corners_world_m is not None:
             T_world_marker = fit_square(np.array(self.corners_world_m), self.size_m)
         else:
@@ -88,12 +88,12 @@ class MarkerEntry(Entry):
         return MarkerFigures(self.id, self.family, float(self.size_m), T_world_marker)
 
     def pose(self) -> np.ndarray:
-        """(7,) wxyz_xyz of the marker in the world."""
+        """The pose of the marker in the world, (7,) wxyz_xyz."""
         return poses.pose_as_read(self.figures().T_world_marker)
 
 
 class MarkerFile(Entry):
-    """A map file."""
+    """A marker map file."""
 
     markers: Annotated[list[MarkerEntry], Field(min_length=1, max_length=4096)]
     calibrated: Calibrated | None = None
@@ -121,7 +121,7 @@ class MarkerFile(Entry):
 
 
 def load_markers(path: str | Path) -> MarkerMap:
-    """A marker map.
+    """Read a marker map.
 
     Raises:
         BadInput: one line naming file and key.
@@ -137,10 +137,10 @@ def marker_map(
     families: list[str],
     origin_m: Origin | None = None,
 ) -> MarkerMap:
-    """A map from plain values: (M, 7) wxyz_xyz and M of each of the others.
+    """A map of M markers from plain values: poses (M, 7) wxyz_xyz, sizes, ids and families.
 
     Args:
-        origin_m: that the map counts from; by default one that is near.
+        origin_m: the origin that the map counts from; by default one near the markers.
     """
     if origin_m is None:
         origin_m = origin_near(Ts_world_marker[:, 4:])
@@ -163,8 +163,8 @@ def save_markers(
     """Write a map; `load_markers` gives back the same numbers, bit for bit.
 
     Args:
-        calibrated: where its figures come from.
-        sigmas: how sure they are, one entry a marker; None where a place was given.
+        calibrated: the provenance of the figures.
+        sigmas: one entry for each marker; None where its place was given.
 
     Raises:
         BadInput: the file can't be written.
@@ -177,9 +177,9 @@ def save_markers(
 
 
 def marker_data(markers: MarkerMap) -> dict[str, Any]:
-    """What a file of the map holds, in plain values, all numbers bit for bit; see `MarkerFile`.
+    """The content of a map's file in plain values, all numbers bit for bit; see `MarkerFile`.
 
-    Far from zero places keep the digits that float64 has there: a nanometre at 10 000 km.
+    Far from zero, places keep the digits that float64 has there: a nanometre at 10 000 km.
     """
     Ts_world_marker = poses_in_world(markers.Ts_world_marker.wxyz_xyz, markers.origin_m)
     return figures_data(
@@ -198,7 +198,7 @@ def marker_data(markers: MarkerMap) -> dict[str, Any]:
 
 
 def figures_data(markers: Sequence[MarkerFigures]) -> dict[str, Any]:
-    """What a file of these markers holds, in plain values."""
+    """The content of these markers' file in plain values."""
     entries: list[dict[str, Any]] = [
         {
             "id": marker.id,
@@ -212,27 +212,27 @@ def figures_data(markers: Sequence[MarkerFigures]) -> dict[str, Any]:
 
 
 def markers_text(markers: Sequence[MarkerFigures]) -> str:
-    """The markers as a map file."""
+    """The markers as the text of a map file."""
     return yaml_text(figures_data(markers))
 
 
 def markers_left_out(file: MarkerFile) -> list[str]:
-    """What a map file says beside its figures."""
+    """The names of the entries of a map file that `MarkerFigures` don't hold."""
     told = ["calibrated"] if file.calibrated else []
     sigmas = sum(entry.sigma is not None for entry in file.markers)
     return told + ([f"sigma (of {sigmas} markers)"] if sigmas else [])
 
 
 def fit_square(corners_m: np.ndarray, size_m: float) -> np.ndarray:
-    """(7,) wxyz_xyz of the square marker that fits its measured corners (4, 3) best.
+    """The pose (7,) wxyz_xyz of the square marker that fits measured corners (4, 3) best.
 
     Any square of the right side is a marker facing one way or the other; a bow tie, a rectangle
-    or a folded one is none.
+    or a folded square is none.
 
     Source: Kabsch (1976), "A solution for the best rotation to relate two sets of vectors".
 
     Raises:
-        ValueError: they are not the corners of such a square.
+        ValueError: the corners are not those of such a square.
     """
     model = size_m / 2 * CORNER_SIGNS
     center = corners_m.mean(axis=0)

@@ -1,4 +1,4 @@
-"""A camera as OpenCV's functions take it, and most tools write it: K, row by row, and D."""
+"""Cameras as OpenCV's functions take them and most tools write them: K, row by row, and D."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -48,13 +48,13 @@ def figures_from_matrices(
     distortion: tuple[str, Sequence[float]],
     lens: Lens,
 ) -> CameraFigures:
-    """A camera from K and the lens's coefficients; each with its place in the file.
+    """A camera from K and the lens's coefficients; each comes with its key in the file.
 
     Raises:
         BadInput: not calibrated, skewed, or a lens with more coefficients than ours.
 
     Returns:
-        Of the lens `radtan` with more than five coefficients that matter: `rational`.
+        The camera; a `radtan` lens with more than five coefficients that matter is `rational`.
     """
     where, K = matrix
     if len(K) != 9:
@@ -88,11 +88,11 @@ def figures_from_matrices(
 
 
 def pinhole_matrix(camera: CameraFigures) -> list[float]:
-    """K, row by row."""
+    """K of a camera, 9 numbers row by row."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
 
 def coefficients(camera: CameraFigures) -> list[float]:
-    """D: k1 k2 p1 p2 k3 [k4 k5 k6], or k1 k2 k3 k4 of a fisheye lens; zeros without a lens."""
+    """D of a camera: k1 k2 p1 p2 k3 [k4 k5 k6], k1 k2 k3 k4 of a fisheye, zeros without a lens."""
     return list(camera.distortion) if camera.lens != "none" else [0.0] * 5

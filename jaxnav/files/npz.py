@@ -1,7 +1,7 @@
-"""Arrays of an .npz, of whatever bytes it holds, with no more memory than its headers may declare.
+"""Reading of .npz files of any bytes, with a bound on the memory for their arrays.
 
 NumPy takes memory for the shape that an array declares, and zip unpacks a thousandfold. So shape
-and kind are looked at first, and as many bytes are unpacked as they need, no more.
+and dtype are checked first, and no more bytes are unpacked than they need.
 """
 
 import math
@@ -14,14 +14,14 @@ import numpy as np
 
 from jaxnav.files import limits
 
-_PIECE = 2**20  # read at once, by zip: its list of files too
+_PIECE = 2**20  # the most bytes read at once, by zip too for its list of files
 
 
 def read_npz(path: Path, keys: Collection[str] | None = None) -> Mapping[str, np.ndarray]:
-    """The arrays of an .npz, of some keys or all, where they are there.
+    """Read the arrays of an .npz: all of them, or those of some keys that it has.
 
     Raises:
-        Exception: of NumPy, zipfile, zlib and here, whatever the bytes lead to.
+        Exception: any that the bytes lead to in NumPy, zipfile, zlib and here.
     """
     found: dict[str, np.ndarray] = {}
     left = limits.NPZ_BYTES
@@ -43,7 +43,7 @@ def read_npz(path: Path, keys: Collection[str] | None = None) -> Mapping[str, np
 
 def _array(key: str, stream: IO[bytes], most_bytes: int) -> np.ndarray:
     version = np.lib.format.read_magic(stream)
-    if version != (1, 0):  # of the others the header may be 4 GiB; ours need none
+    if version != (1, 0):  # other versions' headers may have 4 GiB; our files need none
         raise ValueError(f"{key}: the version {version} of .npy is not read")
     shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
     count = math.prod(shape)
@@ -66,7 +66,7 @@ def _array(key: str, stream: IO[bytes], most_bytes: int) -> np.ndarray:
 
 
 class _Bounded:
-    """A file that is read in pieces of bounded size."""
+    """A file that refuses to read more than `_PIECE` bytes at once."""
 
     def __init__(self, file: IO[bytes]):
         self._file = file

@@ -1,4 +1,4 @@
-"""OpenCV's FileStorage YAML, one camera a file, under the names of its calibration sample.
+"""Reading and writing OpenCV's FileStorage YAML: one camera a file, keys as in its samples.
 
 OpenCV 3 and 4 head their files with `%YAML:1.0`, 5 with `%YAML 1.2`; all three read either.
 """
@@ -20,7 +20,7 @@ _SIZE = ("image_size", "imageSize", "image_width", "image_height")
 
 
 class OpenCVCamera(ForeignEntry):
-    """OpenCV's FileStorage, under the names of its samples and those of its Python functions."""
+    """OpenCV's FileStorage of a camera, with the keys of its samples or its Python functions."""
 
     image_width: Pixels | None = None
     image_height: Pixels | None = None
@@ -61,12 +61,12 @@ def opencv_figures(path: Path, data: dict[str, Any], name: str) -> CameraFigures
 
 
 def opencv_left_out(data: dict[str, Any]) -> list[str]:
-    """The keys that are not read and say something."""
+    """The keys that are not read and not empty, see `unread`."""
     return unread(data, [*_MATRIX, *_DISTORTION, *_SIZE, "fisheye_model", "camera_name"])
 
 
 def opencv_text(camera: CameraFigures) -> str:
-    """The camera as a FileStorage file."""
+    """The camera as the text of a FileStorage file."""
     width, height = camera.image_size_px
     D = coefficients(camera)
     return (

@@ -1,7 +1,7 @@
-"""What a tuned parameter may be in a file: a number, a list of them, or a matrix as its rows.
+"""Validation of a tuned parameter's value: a number, a list of them, or a matrix as its rows.
 
-Every number is positive, and a matrix is a covariance: symmetric and positive definite. How many
-entries there must be is the navigator's to say.
+Every number must be positive, and a matrix a covariance: symmetric and positive definite. The
+navigator decides how many entries there must be.
 """
 
 import math
@@ -12,15 +12,15 @@ import numpy as np
 from jaxnav.errors import BadInput
 from jaxnav.files.validation import shown
 
-_LEAST, _MOST = 1e-18, 1e9  # of a number, so that float32 holds its square
+_LEAST, _MOST = 1e-18, 1e9  # bounds of a number, so that float32 holds its square
 _MOST_ENTRIES = 64  # of a list, and rows of a matrix
-# Of the correlations in a matrix, whose entries float32 rounds by 6e-8.
+# Bound for the matrix of correlations, whose entries float32 rounds by 6e-8.
 _LEAST_EIGENVALUE = 1e-6
 _SYMMETRY = 1e-6  # relative to the geometric mean of the two variances: what float32 leaves
 
 
 def param_array(value: Any, where: str, may_be_matrix: bool) -> np.ndarray:
-    """The (), (d,) or (d, d) numbers of a parameter, as they are.
+    """Check a parameter's numbers and return them unchanged as an array (), (d,) or (d, d).
 
     Args:
         value: plain, or an array.
@@ -28,7 +28,7 @@ def param_array(value: Any, where: str, may_be_matrix: bool) -> np.ndarray:
         may_be_matrix: whether it may be (d, d).
 
     Raises:
-        BadInput: anything else, named with its place in the list.
+        BadInput: the value is anything else; names its place in the list.
     """
     value = _plain(value)
     if not isinstance(value, list):

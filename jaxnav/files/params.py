@@ -1,4 +1,4 @@
-"""Tuned parameters of a navigator: YAML, in and out.
+"""Reading and writing tuned parameters of a navigator in YAML.
 
     parameters:
       motion.acceleration_density: [0.01, 0.01, 0.09]   # a number, a list, or a matrix as its rows
@@ -7,9 +7,9 @@
       command: jaxnav tune drive.mcap
       loss: 0.12
 
-`jaxnav.parameters.TUNABLES` has the names, units and meanings. What is not named stays as it is:
-so a number that a navigator has as infinity, which no file may hold, is left out. The provenance
-is kept and shown, and decides nothing.
+`jaxnav.parameters.TUNABLES` has the names, units and meanings. Parameters that are not named stay
+as they are: so a number that is infinite in a navigator, which no file may hold, is left out. The
+provenance is kept and shown, and decides nothing.
 """
 
 import json
@@ -36,7 +36,7 @@ _LONGEST_SHOWN = 300  # characters of a provenance in a line
 
 
 class ParamsFile(Entry):
-    """A file of tuned parameters; what they may be is for `Params.of` to say."""
+    """A file of tuned parameters, whose values `Params.of` checks."""
 
     parameters: Annotated[dict[str, Any], Field(min_length=1)]
     provenance: dict[str, Any] = Field(default_factory=dict)
@@ -44,13 +44,13 @@ class ParamsFile(Entry):
 
 @dataclass(frozen=True, eq=False)
 class Params:
-    """Tuned parameters, each sound by itself.
+    """Tuned parameters, each of which is valid by itself.
 
     Attributes:
         values: name -> float64, (), (d,) or (d, d), in the order of the file.
         provenance: plain values.
         path: the file, for messages.
-        prefix: the key in the file that holds `parameters`; empty: none does.
+        prefix: the key in the file that holds `parameters`; empty where none does.
     """
 
     values: dict[str, np.ndarray]
@@ -65,11 +65,11 @@ class Params:
         provenance: Mapping[str, Any] | None = None,
         prefix: str = "",
     ) -> "Params":
-        """Checked.
+        """Check the values, and make parameters of them.
 
         Args:
             values: name -> number, or nested lists or an array of numbers.
-            path, prefix: where they stand, for messages.
+            path, prefix: their place, for messages.
 
         Raises:
             BadInput: an unknown name, or a value that no parameter can have; names file and key.
@@ -87,12 +87,12 @@ class Params:
         return at(self.path, self.prefix, "parameters", name)
 
     def without(self, name: str) -> "Params":
-        """The others: where something else tells this one."""
+        """All parameters but one, which something else determines."""
         values = {other: value for other, value in self.values.items() if other != name}
         return replace(self, values=values)
 
     def plain(self) -> dict[str, Any]:
-        """Numbers and nested lists, bit for bit; `of` makes the same parameters of them."""
+        """The values as numbers and nested lists, bit for bit, of which `of` makes the same."""
         return {name: value.tolist() for name, value in self.values.items()}
 
     def told(self) -> str:
@@ -109,7 +109,7 @@ class Params:
 
 
 def load_params(path: str | Path) -> Params:
-    """Tuned parameters, each sound by itself; `apply_params` knows whether they fit a navigator.
+    """Read tuned parameters, and check each by itself; `apply_params` checks that they fit.
 
     Raises:
         BadInput: one line naming file and key.
@@ -125,9 +125,9 @@ def write_params(
     """Write tuned parameters; `load_params` gives back the same numbers, bit for bit.
 
     Args:
-        path: what it is called must not end in .json.
+        path: must not end in .json.
         values: name -> number, nested lists or array; written in the order of `TUNABLES`.
-        provenance: of texts, numbers, lists and mappings by texts. What is not finite in it is
+        provenance: texts, numbers, lists and mappings by texts; a number that is not finite is
             written as null.
 
     Raises:
@@ -150,15 +150,15 @@ def write_params(
 
 
 def apply_params(navigator: Navigator, params: Params) -> Navigator:
-    """The navigator with other numbers; those that are not named stay as they are.
+    """The navigator with these parameters; all others stay as they are.
 
     One file serves the car, a simulation of it and every selector, so these are passed over:
     `controller.*` where nothing is driven, and `selector.*` that this selector does not have. A
     `motion.*` that the motion model does not have is of another body, and an error.
 
     Raises:
-        BadInput: a number that this navigator does not have, or not in this shape; names file and
-            key.
+        BadInput: a parameter that this navigator does not have, or not in this shape; names file
+            and key.
     """
     known = parameters_of(navigator)
     values = {}
@@ -192,7 +192,7 @@ def _counted(shape: tuple[int, ...]) -> str:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Without aliases, with rows on one line each, and with texts that nobody takes for numbers."""
+    """A dumper without aliases, with rows on one line, and texts that can't pass for numbers."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

@@ -1,6 +1,6 @@
-"""PhotonVision's JSON of one camera at one resolution: what its calibration page exports, imports.
+"""PhotonVision's JSON of one camera at one resolution, as its calibration page exports and imports.
 
-Snapshots of the board and what was made of them (`observations`) lie in the same file.
+Snapshots of the board and results from them (`observations`) are in the same file.
 """
 
 import json
@@ -35,7 +35,7 @@ class Resolution(ForeignEntry):
 
 
 class PhotonVisionCamera(ForeignEntry):
-    """PhotonVision's JSON. Older versions wrote the lens under `cameraExtrinsics`."""
+    """PhotonVision's JSON of a camera; older versions wrote the lens under `cameraExtrinsics`."""
 
     resolution: Resolution
     cameraIntrinsics: MatrixEntry
@@ -68,7 +68,7 @@ def photonvision_figures(path: Path, data: dict[str, Any], name: str) -> CameraF
 
 
 def photonvision_left_out(data: dict[str, Any]) -> list[str]:
-    """The keys that are not read and say something."""
+    """The keys that are not read and not empty, see `unread`."""
     return unread(data, ["resolution", "cameraIntrinsics", "lensmodel", *_DISTORTION])
 
 

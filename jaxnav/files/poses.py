@@ -1,7 +1,7 @@
 """Rigid transforms as files hold them, in NumPy's float64 whatever JAX's precision is.
 
 A pose is the (7,) array of jaxlie: quaternion w x y z, then translation in m. A pose as it is
-written is that or a 4x4, with the numbers of the file: not yet rounded, repaired or normalised.
+written is such an array or a 4x4, with the file's numbers: not rounded, repaired or normalised.
 """
 
 import math
@@ -9,15 +9,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-# Rounding in a file is forgiven and repaired up to this; beyond, it is no rotation.
+# Rounding in a file is repaired up to this deviation; beyond, the matrix is no rotation.
 _MAX_DEVIATION = 1e-3
 
 
 def check_matrix(rows: list[list[float]]) -> list[list[float]]:
-    """The rows, if they are a rigid 4x4 transform.
+    """Return the rows if they are a rigid 4x4 transform.
 
     Raises:
-        ValueError: a mirror image, not orthonormal, or a wrong last row.
+        ValueError: the rows are a mirror image, not orthonormal, or the last row is wrong.
     """
     T = np.asarray(rows, float)
     R = T[:3, :3]
@@ -32,10 +32,10 @@ def check_matrix(rows: list[list[float]]) -> list[list[float]]:
 
 
 def check_quaternion(wxyz: list[float]) -> list[float]:
-    """The quaternion, if its length is 1 but for rounding.
+    """Return the quaternion if its length is 1 but for rounding.
 
     Raises:
-        ValueError: it isn't.
+        ValueError: its length is not 1.
     """
     length = np.linalg.norm(wxyz)
     if abs(length - 1) > _MAX_DEVIATION:
@@ -44,7 +44,7 @@ def check_quaternion(wxyz: list[float]) -> list[float]:
 
 
 def pose_from_matrix(T: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
-    """(7,) from a 4x4 that `check_matrix` accepts; R becomes the nearest rotation.
+    """The pose (7,) of a 4x4 that `check_matrix` accepts; R becomes the nearest rotation.
 
     Source: Shepperd (1978), "Quaternion from rotation matrix".
     """
@@ -77,26 +77,26 @@ def pose_from_matrix(T: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
 def pose_from_quaternion(
     wxyz: Sequence[float] | np.ndarray, xyz_m: Sequence[float] | np.ndarray
 ) -> np.ndarray:
-    """(7,); normalised only if the length is off by more than float32 rounds, exact otherwise."""
+    """The pose (7,), normalised only if the length is off by more than float32's rounding."""
     q = np.asarray(wxyz, float)
     length = np.linalg.norm(q)
     return np.concatenate([q if abs(length - 1) < 1e-6 else q / length, np.asarray(xyz_m, float)])
 
 
 def pose_as_read(written: np.ndarray) -> np.ndarray:
-    """(7,) of a pose as it is written, (7,) or (4, 4)."""
+    """The pose (7,) of a pose as it is written, (7,) or (4, 4)."""
     if written.shape == (4, 4):
         return pose_from_matrix(written)
     return pose_from_quaternion(written[:4], written[4:])
 
 
 def matrix_as_read(written: np.ndarray) -> np.ndarray:
-    """4x4 of a pose as it is written, (7,) or (4, 4)."""
+    """The 4x4 of a pose as it is written, (7,) or (4, 4)."""
     return written if written.shape == (4, 4) else matrix(written)
 
 
 def quaternion_product(p: Sequence[float], q: Sequence[float]) -> list[float]:
-    """The quaternion p q, wxyz, every number rounded once where one factor holds halves alone."""
+    """The quaternion p q, wxyz; every number is rounded once where a factor holds only halves."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
     return [
@@ -108,7 +108,7 @@ def quaternion_product(p: Sequence[float], q: Sequence[float]) -> list[float]:
 
 
 def pose_from_rotation_vector(rotation_rad: Sequence[float], xyz_m: Sequence[float]) -> np.ndarray:
-    """(7,) from an axis times its angle."""
+    """The pose (7,) of a rotation vector, rad, and a translation, m."""
     rotation = np.asarray(rotation_rad, float)
     half = np.linalg.norm(rotation) / 2
     # sin(half) / (2 half), which tends to 1/2
@@ -118,7 +118,7 @@ def pose_from_rotation_vector(rotation_rad: Sequence[float], xyz_m: Sequence[flo
 
 
 def matrix(pose: np.ndarray) -> np.ndarray:
-    """4x4 of a pose."""
+    """The 4x4 of a pose (7,)."""
     w, x, y, z = pose[:4] / np.linalg.norm(pose[:4])
     T = np.eye(4)
     T[:3, :3] = [
@@ -142,7 +142,7 @@ def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
 
 
 def looking(yaw_deg: float, elevation_deg: float, roll_deg: float) -> np.ndarray:
-    """(3, 3) rotation of a camera in the vehicle frame, R_vehicle_camera.
+    """The rotation R_vehicle_camera (3, 3) of a camera that looks in a direction.
 
     Args:
         yaw_deg: 0 looks forward, 90 to the left.

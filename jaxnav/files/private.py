@@ -1,12 +1,12 @@
-"""Folders that nobody else can put anything into: what lies there may be run as it is found.
+"""Folders that only this user or root can write to, so that code stored there may be run.
 
     with PrivateFolder(path, make=True) as folder:
         folder.write("one.step", raw)
         raw = folder.read("one.step")
 
-Whoever may write to any part of a path, or rename it, decides what is found at its end. So every
-part is opened inside the one before it, never through a link, and what was opened is judged, not
-what its name may lead to a moment later.
+A user who may write to any part of a path, or rename it, decides what is found at its end. So every
+part is opened inside the one before it, never through a link, and the checks look at what was
+opened, not at what its name may lead to a moment later.
 """
 
 import os
@@ -20,31 +20,31 @@ from jaxnav.files.locking import create_temporary, sweep
 _ROOT = 0  # may do anything anyway
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _OTHERS_ENTER = stat.S_IXGRP | stat.S_IXOTH
-# O_PATH needs no leave to list a folder, which /home may not give.
+# O_PATH needs no permission to list a folder, which /home may not give.
 _PASSED = os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC | getattr(os, "O_PATH", os.O_RDONLY)
 _LISTED = os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_RDONLY
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_TEMPORARY = ".part-"  # how a name begins while its file is written
+_TEMPORARY = ".part-"  # prefix of a file's name while it is written
 _MAX_BYTES = 2**28  # executables have some MB
-_MAX_LINKS = 8  # of the root folder, one leading to the other: more are a circle
+_MAX_LINKS = 8  # in the root folder, each leading to the next; more are a circle
 
 
 class NotPrivateError(Exception):
-    """Others could write there. The message is one line: which part of the path, and why."""
+    """Other users could write to a path. The message is one line: which part of it, and why."""
 
 
 class PrivateFolder:
-    """A folder, held open. Nothing is read but what this user or root has written.
+    """A folder, held open, from which only files of this user or root are read.
 
-    Every part of its path is this user's or root's, and nobody else may write to it. All may write
-    to parts before the last where each name in them is its owner's alone, as in /tmp.
+    Every part of its path is this user's or root's, and no other user may write to it. All may
+    write to parts before the last where each name in them is its owner's alone, as in /tmp.
 
     Args:
         path: a link in the root folder, as /tmp is one on some machines, is followed; no other is.
-        make: whether parts that are missing are made, for this user alone.
+        make: whether to make missing parts, for this user alone.
 
     Raises:
-        NotPrivateError: a part is somebody else's, others may write to it, or it is a link.
+        NotPrivateError: a part is another user's, others may write to it, or it is a link.
         OSError: a part is missing, or can't be made or opened.
     """
 
@@ -64,10 +64,10 @@ class PrivateFolder:
         os.close(self._fd)
 
     def read(self, name: str) -> bytes:
-        """A whole file, which counts as used now.
+        """Read a whole file, and mark it as used now.
 
         Raises:
-            NotPrivateError: it is somebody else's, or others may write to it.
+            NotPrivateError: it is another user's, or others may write to it.
             OSError: it is missing, a link, too large, or can't be read.
         """
         fd = os.open(name, _FILE, dir_fd=self._fd)
@@ -81,13 +81,13 @@ class PrivateFolder:
         return raw
 
     def write(self, name: str, raw: bytes) -> None:
-        """A whole file, for this user alone, in place of an older one; or nothing.
+        """Write a whole file, for this user alone, in place of an older one; or nothing.
 
-        It is not forced to the disk: what is kept here can be made anew. What a process has left
-        that was killed while it wrote is swept away.
+        It is not forced to the disk, as all files here can be made anew. Parts of files that
+        killed processes have left are swept away.
 
         Raises:
-            OSError: it can't be written.
+            OSError: the file can't be written.
         """
         sweep([n for n in self._names() if n.startswith(_TEMPORARY)], dir_fd=self._fd)
         beside, fd = create_temporary(lambda word: _TEMPORARY + word, 0o600, dir_fd=self._fd)
@@ -108,7 +108,7 @@ class PrivateFolder:
             return False
 
     def names_by_use(self) -> list[str]:
-        """Of all that is there, what was used longest ago first."""
+        """The names of all entries, the one used longest ago first."""
         found = []
         for name in self._names():
             with suppress(FileNotFoundError):
@@ -116,17 +116,17 @@ class PrivateFolder:
         return [name for _, name in sorted(found)]
 
     def remove(self, name: str) -> None:
-        """A file, if it is still there."""
+        """Remove a file if it is still there."""
         with suppress(FileNotFoundError):
             os.unlink(name, dir_fd=self._fd)
 
     def require_own_entries(self) -> None:
-        """For a reader that opens what is there by its path and looks at nothing.
+        """Check all entries for a reader that opens them by their paths without checks.
 
         Raises:
-            NotPrivateError: something is somebody else's, a link, or others may write to it.
+            NotPrivateError: an entry is another user's, a link, or others may write to it.
         """
-        # Where others can't enter, their leave to write to a file in there means nothing.
+        # Where others can't enter the folder, their permission to write to a file has no effect.
         may_enter = os.fstat(self._fd).st_mode & _OTHERS_ENTER
         for name in self._names():
             with suppress(FileNotFoundError):
@@ -157,7 +157,7 @@ def _opened(path: Path, make: bool) -> int:
             os.close(fd)
             fd = inner
             found = os.fstat(fd)
-            # There, nobody can rename or replace what is ours.
+            # In such a folder no other user can rename or replace what is ours.
             names_are_their_owners = bool(found.st_mode & stat.S_ISVTX) and not is_last
             _require_own(so_far, found, 0 if names_are_their_owners else _OTHERS_WRITE)
     except BaseException:
@@ -172,7 +172,7 @@ def _opened_in(fd: int, name: str, path: Path, flags: int, make: bool) -> int:
     except FileNotFoundError:
         if not make:
             raise
-        with suppress(FileExistsError):  # another process was faster; judged all the same
+        with suppress(FileExistsError):  # another process was faster; its folder is checked too
             os.mkdir(name, 0o700, dir_fd=fd)
         return _opened_in(fd, name, path, flags, make=False)
     except OSError:
@@ -190,7 +190,7 @@ def _require_own(path: Path, found: os.stat_result, forbidden: int) -> None:
 
 
 def _without_links_of_the_root(path: Path) -> Path:
-    """The same folder, absolute, without the links that root has made in its own folder."""
+    """The absolute path, with links in the root folder, which only root can make, resolved."""
     path = Path(os.path.normpath(path.absolute()))
     for _ in range(_MAX_LINKS):
         first = Path(*path.parts[:2])

@@ -1,4 +1,4 @@
-"""Where calibrated figures come from, as their file says it.
+"""The provenance of calibrated figures, as their file states it.
 
 calibrated:
   date: 2026-05-17
@@ -28,14 +28,14 @@ class Calibrated(Entry):
 
 
 def calibrated_now(tool: str, data: Iterable[Path | np.ndarray]) -> Calibrated:
-    """What is to be written today.
+    """The provenance of a calibration made today.
 
     Args:
         tool: name, version and command.
-        data: all that was calibrated from, in an order that does not change.
+        data: all files and arrays that were calibrated from, in an order that does not change.
 
     Raises:
-        BadInput: a file that can't be read.
+        BadInput: a file can't be read.
     """
     digest = hashlib.sha256()
     for item in data:

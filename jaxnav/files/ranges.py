@@ -1,8 +1,8 @@
-"""What a number of a file may be: from the least to the most that a vehicle can have.
+"""Ranges of the numbers in files, from the least to the most that a vehicle can have.
 
-One table for all formats, ours and those of others; `docs/ranges.md` shows it to users. Wide on
-purpose: it keeps out slips of the pen and of the unit, and what arithmetic can't take, and no car
-that anybody drives.
+One table serves all formats, ours and others'; `docs/ranges.md` shows it to users. The ranges are
+wide on purpose: they refuse slips of the pen and of the unit, and numbers that arithmetic can't
+take, but no real car.
 """
 
 import math
@@ -22,13 +22,13 @@ CARRIED = "kept as it came"
 
 @dataclass(frozen=True)
 class Range:
-    """What one quantity may be.
+    """The allowed range of one quantity.
 
     Attributes:
         least, most: both are allowed.
         unit: empty for a pure number.
-        what: what it is, and where the bounds come from.
-        outside: what becomes of a number outside of them.
+        what: the quantity, and where the bounds come from.
+        outside: how a number outside the bounds is treated.
     """
 
     least: float
@@ -38,8 +38,8 @@ class Range:
     outside: str = REFUSED
 
     def holds(self, values: Any) -> Any:
-        """Which of these numbers are in it; NaN and infinities are not. Float32 may have rounded
-        the bounds themselves."""
+        """Which of these numbers are in the range; NaN and infinities are not. A margin allows for
+        bounds that float32 has rounded."""
         if isinstance(self.least, int):
             return (values >= self.least) & (values <= self.most)
         least = self.least - _ROUNDING * abs(self.least)
@@ -79,7 +79,7 @@ RANGES: dict[str, Range] = {
     "corner_sigma_px": Range(1e-3, 100.0, "px", "standard deviation of a corner, of a whole file"),
     "sigma": Range(-1e9, 1e9, "", "standard deviation that a calibration tells; only shown"),
     "parameter": Range(1e-18, 1e9, "", "tuned parameter: float32 holds its square"),
-    # What sensors said: kept by a recording, for it must replay bit for bit.
+    # Values of sensors, which a recording keeps because it must replay bit for bit.
     "stamp_ns": Range(
         -(2**62) + 1, 2**62 - 1, "ns", "stamp: 146 years, so that int64 holds differences"
     ),
@@ -97,7 +97,7 @@ RANGES: dict[str, Range] = {
 
 
 def problem_of(name: str, value: float) -> str | None:
-    """What is wrong with a number, None: nothing. NaN and infinities lie in no range.
+    """What is wrong with a number; None where it is in the range. NaN and infinities never are.
 
     Args:
         name: of a quantity in `RANGES`.
@@ -106,7 +106,7 @@ def problem_of(name: str, value: float) -> str | None:
 
 
 def outside(allowed: Range, value: float) -> str:
-    """That a number is out of a range."""
+    """The message that a number is out of a range."""
     got = f"{value:.6g}" if isinstance(value, float) else str(value)
     unit = f" {allowed.unit}" if allowed.unit else ""
     got = got if len(got) <= 40 else f"{got[:37]}..."
@@ -120,7 +120,7 @@ def is_within(name: str, values: Any) -> np.ndarray:
 
 
 def within(name: str) -> AfterValidator:
-    """The check of a field of a pydantic model."""
+    """A validator for the range of a field of a pydantic model."""
 
     def check(value: Any) -> Any:
         if problem := problem_of(name, value):
@@ -131,9 +131,9 @@ def within(name: str) -> AfterValidator:
 
 
 def placed_within(name: str) -> AfterValidator:
-    """The check of a place: x y z, a 4x4 as rows, or a pose that has `xyz_m`.
+    """A validator for the range of a place: x y z, a 4x4 as rows, or a pose that has `xyz_m`.
 
-    Of a quantity that is no less than 0 the distance from the origin counts, else every axis.
+    For a quantity whose least is 0 it checks the distance from the origin, else every axis.
     """
 
     def check(place: Any) -> Any:
@@ -151,7 +151,7 @@ def placed_within(name: str) -> AfterValidator:
 
 
 def pinhole_problem(pinhole_px: Sequence[float], image_size_px: Sequence[float]) -> str | None:
-    """What is wrong with a pinhole for images of a size; begins with the quantity.
+    """What is wrong with a pinhole for images of a size, the quantity first; None where nothing is.
 
     Args:
         pinhole_px: fx, fy, cx, cy.
@@ -175,7 +175,7 @@ def _problem_in_sides(name: str, value: float, side: float) -> str | None:
 
 
 def table() -> str:
-    """All ranges in Markdown."""
+    """A table of all ranges in Markdown."""
     lines = ["| quantity | from | to | unit | outside of it |", "|---|---|---|---|---|"]
     for allowed in RANGES.values():
         bounds = f"{_number(allowed.least)} | {_number(allowed.most)}"

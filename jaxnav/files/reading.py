@@ -1,9 +1,8 @@
-"""Text, YAML and JSON from disk, with everything surprising refused.
+"""Strict reading of text, YAML and JSON from disk.
 
 YAML is read with the scalars of YAML 1.2: `yes` is a word, `010` is ten and `1e-5` is a number.
 Sizes, depths and numbers of values are bounded, duplicate keys and aliases are refused, and
-OpenCV's matrices (`!!opencv-matrix`, of 5 also `!!opencv-nd-matrix`) are read as the mappings they
-are.
+OpenCV's matrices (`!!opencv-matrix`, in version 5 also `!!opencv-nd-matrix`) are read as mappings.
 """
 
 import json
@@ -26,10 +25,10 @@ from jaxnav.files import limits
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The mapping that a YAML or (`.json`) JSON file holds.
+    """Read the mapping in a YAML or (`.json`) JSON file.
 
     Raises:
-        BadInput: unreadable, too large, not text, not YAML or JSON, or not a mapping.
+        BadInput: the file is unreadable, too large, not text, not YAML or JSON, or not a mapping.
     """
     is_json = path.suffix.lower() == ".json"
     text = read_text(path, limits.JSON_BYTES if is_json else limits.YAML_BYTES)
@@ -42,7 +41,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def read_text(path: Path, max_bytes: int) -> str:
-    """A UTF-8 file of bounded size.
+    """Read a UTF-8 file of at most `max_bytes`.
 
     Raises:
         BadInput: it can't be read, is larger than that, or is not UTF-8.
@@ -63,10 +62,10 @@ def read_text(path: Path, max_bytes: int) -> str:
 
 
 def parse_yaml(path: Path, text: str) -> Any:
-    """What a text of YAML holds.
+    """Parse a text of YAML.
 
     Raises:
-        BadInput: it is not YAML, or holds too much.
+        BadInput: the text is not YAML, or holds too much.
     """
     # OpenCV 3 and 4 head their files with "%YAML:1.0", which is not a YAML directive.
     if text.startswith("%YAML:"):
@@ -89,12 +88,12 @@ def parse_yaml(path: Path, text: str) -> Any:
 
 
 def parse_json(path: Path, text: str) -> Any:
-    """What a text of JSON holds.
+    """Parse a text of JSON.
 
     Raises:
-        BadInput: it is not JSON, or holds too much.
+        BadInput: the text is not JSON, or holds too much.
     """
-    # Every value stands behind one of these, and few are in texts.
+    # Every value follows one of these characters, and few of them are in texts.
     if sum(map(text.count, "[{,")) > limits.JSON_VALUES:
         raise BadInput(path, f"holds more than {limits.JSON_VALUES} values")
     try:
@@ -117,7 +116,7 @@ try:
 except ImportError:  # a PyYAML that was built without it
 
     class _Parser(Reader, Scanner, Parser):  # type: ignore[no-redef]
-        """PyYAML's own."""
+        """PyYAML's own parser, in Python."""
 
         def __init__(self, stream: str):
             Reader.__init__(self, stream)
@@ -126,7 +125,7 @@ except ImportError:  # a PyYAML that was built without it
 
 
 class _Loader(Composer, _Parser, SafeConstructor, Resolver):
-    """PyYAML's safe loader, stricter."""
+    """A stricter version of PyYAML's safe loader."""
 
     # PyYAML's own names, filled below.
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012

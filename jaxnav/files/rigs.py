@@ -1,4 +1,4 @@
-"""Camera rigs: jaxnav's own YAML, in and out.
+"""Reading and writing camera rigs in jaxnav's own YAML.
 
     cameras:
       - name: front
@@ -11,8 +11,8 @@
         yaw_deg: 0.0                     # elevation_deg (up) and roll_deg (clockwise from behind)
 
 The place of a camera may also be `T_vehicle_camera` or its inverse `T_camera_vehicle`, each
-either 4x4 or `{wxyz: [...], xyz_m: [...]}`. What was calibrated may say how sure it is (`sigma`,
-of a camera) and where it comes from (`calibrated`, of the file, see `jaxnav.files.provenance`).
+either 4x4 or `{wxyz: [...], xyz_m: [...]}`. A calibrated camera may have standard deviations
+(`sigma`), and the file a provenance (`calibrated`, see `jaxnav.files.provenance`).
 """
 
 import re
@@ -57,7 +57,7 @@ from jaxnav.models.rig import CameraRig
 
 
 class CameraSigma(Entry):
-    """One standard deviation of a camera's figures, as far as they were calibrated."""
+    """One standard deviation of each figure of a camera that was calibrated."""
 
     focal_px: Pair | None = None
     center_px: Pair | None = None
@@ -118,7 +118,7 @@ class CameraEntry(Entry):
         return self
 
     def figures(self) -> CameraFigures:
-        """The camera, with the numbers of the file."""
+        """The camera's figures, with the numbers of the file."""
         if self.T_camera_vehicle is not None:
             T_camera_vehicle = written_pose(self.T_camera_vehicle)
         elif self.T_vehicle_camera is not None:
@@ -134,11 +134,11 @@ class CameraEntry(Entry):
         )
 
     def camera(self) -> Camera:
-        """The intrinsic part."""
+        """The camera without its place."""
         return self.figures().camera()
 
     def T_camera_vehicle_pose(self) -> np.ndarray:
-        """(7,) wxyz_xyz of the vehicle in the camera."""
+        """The pose of the vehicle in the camera, (7,) wxyz_xyz."""
         written = self.figures().T_camera_vehicle
         assert written is not None
         return poses.pose_as_read(written)
@@ -165,7 +165,7 @@ class RigFile(Entry):
 
 
 def load_rig(path: str | Path) -> CameraRig:
-    """A camera rig from jaxnav's own YAML, or from a Kalibr camchain with imu := vehicle.
+    """Read a camera rig from jaxnav's own YAML, or a Kalibr camchain with imu := vehicle.
 
     Raises:
         BadInput: one line naming file and key.
@@ -196,8 +196,8 @@ def save_rig(
     """Write a rig in jaxnav's own YAML; `load_rig` gives back the same numbers, bit for bit.
 
     Args:
-        calibrated: where its figures come from.
-        sigmas: how sure they are, one entry a camera.
+        calibrated: the provenance of the figures.
+        sigmas: one entry for each camera.
 
     Raises:
         BadInput: the file can't be written.
@@ -209,17 +209,17 @@ def save_rig(
 
 
 def with_provenance(data: dict[str, Any], calibrated: Calibrated | None) -> dict[str, Any]:
-    """What a file holds, where it comes from first."""
+    """The content of a file, headed by its provenance if there is one."""
     return data if calibrated is None else {"calibrated": calibrated.model_dump()} | data
 
 
 def rig_data(rig: CameraRig) -> dict[str, Any]:
-    """What a file of the rig holds, in plain values, all numbers bit for bit; see `RigFile`."""
+    """The content of a rig's file in plain values, all numbers bit for bit; see `RigFile`."""
     return camera_data(figures_of_rig(rig))
 
 
 def camera_data(cameras: Sequence[CameraFigures]) -> dict[str, Any]:
-    """What a rig file of these cameras holds, in plain values; all of them must have a place."""
+    """The content of these cameras' rig file in plain values; every camera must have a place."""
     entries: list[dict[str, Any]] = []
     for camera in cameras:
         assert camera.T_camera_vehicle is not None
@@ -238,10 +238,10 @@ def camera_data(cameras: Sequence[CameraFigures]) -> dict[str, Any]:
 
 
 def rig_text(cameras: Sequence[CameraFigures]) -> str:
-    """The cameras as a rig file.
+    """The cameras as the text of a rig file.
 
     Raises:
-        BadInput: one has no place, or a name that a rig can't hold.
+        BadInput: a camera has no place, or a name that a rig can't hold.
     """
     for camera in cameras:
         where = f"--to jaxnav: {camera.name}"
@@ -256,13 +256,13 @@ def rig_text(cameras: Sequence[CameraFigures]) -> str:
 
 
 def rig_left_out(file: RigFile) -> list[str]:
-    """What a rig file says beside its figures."""
+    """The names of the entries of a rig file that `CameraFigures` don't hold."""
     told = ["calibrated"] if file.calibrated else []
     return told + [f"cameras.{entry.name}.sigma" for entry in file.cameras if entry.sigma]
 
 
 def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> np.ndarray:
-    """(7,) wxyz_xyz of the vehicle in a camera at that place, which looks there.
+    """The pose T_camera_vehicle, (7,) wxyz_xyz, of a camera by its position and direction.
 
     Args:
         position_m: of the camera in the vehicle.
@@ -275,14 +275,14 @@ def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> np.ndarra
 
 
 def written_pose(pose: QuaternionPose | Sequence[Sequence[float]]) -> np.ndarray:
-    """A pose with the numbers of the file, (7,) wxyz_xyz or (4, 4)."""
+    """A pose as it is written, with the numbers of the file: (7,) wxyz_xyz or (4, 4)."""
     if isinstance(pose, QuaternionPose):
         return np.array([*pose.wxyz, *pose.xyz_m], float)
     return np.array(pose, float)
 
 
 def plain_pose(written: np.ndarray) -> dict[str, list[float]] | list[list[float]]:
-    """A pose as we write it."""
+    """A pose in the plain values that we write."""
     if written.shape == (4, 4):
         rows: list[list[float]] = written.tolist()
         return rows

@@ -1,7 +1,7 @@
 """ROS's camera_info YAML, one camera a file, as camera_calibration writes it.
 
 Source: the documentation of sensor_msgs/CameraInfo: D is k1 k2 t1 t2 k3 for plumb_bob, k1 to k4 for
-equidistant; R is the identity and P is [K 0] for a camera that is nobody's half.
+equidistant; R is the identity and P is [K 0] for a camera that is not one of a stereo pair.
 """
 
 from pathlib import Path
@@ -28,7 +28,7 @@ _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 class CameraInfo(ForeignEntry):
-    """ROS's camera_info YAML."""
+    """A camera in ROS's camera_info YAML."""
 
     image_width: Pixels
     image_height: Pixels
@@ -63,7 +63,7 @@ def camera_info_figures(path: Path, data: dict[str, Any], name: str) -> CameraFi
 
 
 def camera_info_left_out(data: dict[str, Any]) -> list[str]:
-    """The keys that are not read and say something: a rectification is no part of a camera."""
+    """The keys that are not read and not empty, as a rectification is no part of a camera."""
     K = data["camera_matrix"]["data"]
     rectified = {
         "rectification_matrix": _IDENTITY,
@@ -78,7 +78,7 @@ def camera_info_left_out(data: dict[str, Any]) -> list[str]:
 
 
 def camera_info_text(camera: CameraFigures) -> str:
-    """The camera as a camera_info file."""
+    """The camera as the text of a camera_info file."""
     K, D = pinhole_matrix(camera), coefficients(camera)
     projection = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
     data = {

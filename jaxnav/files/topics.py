@@ -1,4 +1,4 @@
-"""Topic maps: which topic of a ROS bag is what. YAML in.
+"""Reading of topic maps in YAML: the topics of a ROS bag with cameras and odometry.
 
     cameras: {front: /front/detections, left: /left/image_raw}   # names as in the rig
     odometry: /odom                # nav_msgs/Odometry or ackermann_msgs/AckermannDriveStamped
@@ -7,8 +7,7 @@
 
 AprilTag counts a marker's corners counter-clockwise from the bottom left of its own picture.
 OpenCV's picture of the same marker stands on its head. A map made for AprilTag's picture goes
-with `bottom_left`; one made for OpenCV's, which is what jaxnav's own detectors see, with
-`top_right`.
+with `bottom_left`; one made for OpenCV's, as jaxnav's own detectors see it, with `top_right`.
 """
 
 from collections.abc import Mapping
@@ -51,15 +50,15 @@ class TopicsFile(Entry):
 
 @dataclass(frozen=True)
 class TopicMap:
-    """Which topic is what.
+    """The topics of a ROS bag that hold the cameras' frames and the odometry.
 
     Attributes:
         path: the file, for messages.
         cameras: name in the rig -> topic of detections or of images.
-        odometry: None where the bag has none.
+        odometry: the topic; None where the bag has none.
         corner_sigma_px: standard deviation of a detected corner along one axis.
         first_corner: the corner, as the marker map sees the marker, that a detection begins with;
-            from there they go counter-clockwise.
+            the others follow counter-clockwise.
     """
 
     path: Path
@@ -70,7 +69,7 @@ class TopicMap:
 
 
 def load_topics(path: str | Path) -> TopicMap:
-    """A topic map.
+    """Read a topic map.
 
     Raises:
         BadInput: one line naming file and key.

@@ -1,4 +1,4 @@
-"""Compressed bytes unpacked with an eye on how much comes out, before it is there."""
+"""Decompression with a bound on the bytes that come out, checked as they come."""
 
 import bz2
 from collections.abc import Callable, Iterator
@@ -17,40 +17,40 @@ _PIECE = 2**20
 
 @dataclass
 class Budget:
-    """How many bytes a file may still unpack to.
+    """The bytes that a file may still unpack to.
 
     Attributes:
-        left: of them.
+        left: how many.
     """
 
     left: int
 
     @staticmethod
     def of_file(path: Path) -> "Budget":
-        """Of one of this size: what compresses better than any recording is none."""
+        """The budget by a file's size; a file that compresses far better is no recording."""
         packed = 0
         with suppress(OSError):
             packed = path.stat().st_size
         return Budget(limits.UNPACKED_BYTES + limits.UNPACKED_TIMES * packed)
 
     def take(self, count: int) -> None:
-        """Raises ValueError: there are not so many left."""
+        """Take bytes from the budget; raise ValueError where too few are left."""
         self.left -= count
         if self.left < 0:
             raise ValueError("it unpacks to far more than any recording does")
 
 
 def unpacked(kind: str, data: bytes, budget: Budget, most: int = limits.CHUNK_BYTES) -> bytes:
-    """All that one chunk of a recording holds.
+    """Unpack one chunk of a recording.
 
     Args:
         kind: bz2, lz4 or zstd; "" or none for bytes that are not packed.
         budget: of its file.
-        most: bytes of this chunk.
+        most: bytes that this chunk may unpack to.
 
     Raises:
-        ValueError: it is more than that.
-        Exception: of a decompressor, whatever the bytes lead to.
+        ValueError: it unpacks to more than `most`, or than the budget.
+        Exception: any that the bytes lead to in a decompressor.
     """
     if kind in ("", "none"):
         pieces = iter([data])
@@ -71,10 +71,10 @@ def unpacked(kind: str, data: bytes, budget: Budget, most: int = limits.CHUNK_BY
 
 
 def copy_bz2(source: Path, target: IO[bytes], budget: Budget) -> None:
-    """Write what a .bz2 holds.
+    """Unpack a .bz2 into a file.
 
     Raises:
-        ValueError: it is more than its budget.
+        ValueError: it unpacks to more than its budget.
         OSError, EOFError: it is damaged, or the disk is full.
     """
     with bz2.open(source) as stream:
@@ -84,12 +84,12 @@ def copy_bz2(source: Path, target: IO[bytes], budget: Budget) -> None:
 
 
 def zstd_pieces(data: bytes | IO[bytes]) -> Iterator[bytes]:
-    """What zstd's frames hold, one after the other.
+    """The content of zstd's frames in pieces, one frame after the other.
 
     Raises:
-        zstandard.ZstdError: they are damaged.
+        zstandard.ZstdError: a frame is damaged.
     """
-    # What a frame's window takes is the frame's own word: not more than a chunk.
+    # A frame declares the size of its window itself: no more than a chunk is allowed.
     window = 2 ** (limits.CHUNK_BYTES.bit_length() - 1)
     reader = zstandard.ZstdDecompressor(max_window_size=window).stream_reader(
         data, read_across_frames=True
@@ -99,7 +99,7 @@ def zstd_pieces(data: bytes | IO[bytes]) -> Iterator[bytes]:
 
 
 def _framed(make: Callable[[], Any], data: bytes) -> Iterator[bytes]:
-    """One stream after the other, a piece at a time."""
+    """The content of concatenated streams, in pieces of at most `_PIECE` bytes."""
     while data:
         stream = make()
         piece = stream.decompress(data, _PIECE)

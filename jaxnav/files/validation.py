@@ -1,7 +1,7 @@
-"""What a key may hold, and how a person hears that it doesn't.
+"""Types of the values in files, and messages about values that are not valid.
 
-Files are validated by frozen pydantic models. `validate` turns the first thing pydantic finds
-into one line with the file and the key: `rig.yaml: cameras.front.focal_px[0]: must be > 0, got 0`.
+Files are validated by frozen pydantic models. `validate` turns the first error of pydantic into
+one line with the file and the key: `rig.yaml: cameras.front.focal_px[0]: must be > 0, got 0`.
 """
 
 from pathlib import Path
@@ -34,8 +34,8 @@ class ForeignEntry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-# A number is a number: not text, not true/false, finite, and within what float32 can hold. What it
-# may be beside that, `ranges` says.
+# A number is a number: not text, not true/false, finite, and within what float32 can hold. `ranges`
+# has the bounds of each quantity.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
 Positive = Annotated[Number, Field(gt=0)]
 Size = Annotated[Positive, within("size_m")]
@@ -54,7 +54,7 @@ Name = Annotated[str, Field(strict=True, pattern=NAME_PATTERN)]
 
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
-# In the world: a point, and one on its floor.
+# A point in the world, and one on its floor.
 Place = Annotated[list[Position], Field(min_length=3, max_length=3)]
 FloorPlace = Annotated[list[Position], Field(min_length=2, max_length=2)]
 # On a vehicle.
@@ -69,7 +69,7 @@ Matrix = Annotated[
 
 
 class QuaternionPose(Entry):
-    """A rigid transform as jaxlie stores it; what we write, because it reads back exactly."""
+    """A rigid transform as jaxlie stores it. We write this form because it reads back exactly."""
 
     wxyz: Annotated[
         list[Number], Field(min_length=4, max_length=4), AfterValidator(check_quaternion)
@@ -89,16 +89,16 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def validate(model: type[Model], data: Any, path: Path, prefix: str = "") -> Model:
-    """The data as the model, or one line about the first thing wrong with it.
+    """Validate data as a model, or raise one line about the first error.
 
     Args:
         model: a pydantic model.
-        data: what the file holds, or a part of it.
+        data: the content of the file, or a part of it.
         path: the file, for the message.
         prefix: the key of that part in the file.
 
     Raises:
-        BadInput: naming file, key, what is expected and what was found.
+        BadInput: names file, key, the expected value and the value found.
     """
     try:
         return model.model_validate(data)
@@ -112,17 +112,17 @@ def validate(model: type[Model], data: Any, path: Path, prefix: str = "") -> Mod
 
 
 def at(path: Path, *keys: str) -> str:
-    """`file: key.key[0]`, leaving out what is empty."""
+    """File and keys as `file: key.key[0]`, without keys that are empty."""
     dotted = "".join(key if key.startswith("[") else f".{key}" for key in keys if key)
     return f"{path}: {dotted.removeprefix('.')}" if dotted else str(path)
 
 
 def _key(location: tuple[int | str, ...], data: Any) -> str:
-    """The place in the file, with named things under their names: `cameras.front.lens`."""
+    """The key in the file, with named list entries under their names: `cameras.front.lens`."""
     key = ""
     for part in location:
         if isinstance(part, str) and part.startswith("<"):
-            continue  # which form of a pose it is
+            continue  # the tag of a pose's form
         inside = None
         if isinstance(data, dict):
             inside = data.get(part)
@@ -184,6 +184,6 @@ _BOUNDS = {
 
 
 def shown(value: Any) -> str:
-    """What was found, short enough for a line."""
+    """A value as text, short enough for a line."""
     text = repr(value) if not isinstance(value, str) else f"the text {value!r}"
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,4 +1,4 @@
-"""Vehicles and routes: YAML in.
+"""Reading vehicles and routes in YAML, and writing vehicles.
 
 wheelbase_m: 0.256                     start: {x_m: 2.0, y_m: -1.0, psi_deg: 125.0}
 steering_limit_rad: 0.5                waypoints_m: [[1.30, 0.0], [0.50, 0.65]]
@@ -7,9 +7,9 @@ throttle_limit: 0.3
 speed_per_throttle_mps: 10.0
 speed_time_constant_s: 0.3
 
-A calibrated vehicle also says how its sensors are off: true speed = `speed_scale` * the speed
+A calibrated vehicle also has corrections of its sensors: true speed = `speed_scale` * the speed
 read, true steering = `steering_gain` * the angle read + `steering_offset_rad`, and a camera's stamp
-is `camera_delay_s` later than the odometer's of the same instant. Left out, they are not.
+is `camera_delay_s` later than the odometer's of the same instant. Left out, they correct nothing.
 """
 
 import math
@@ -66,11 +66,11 @@ CORRECTIONS = {
     "steering_gain": 1.0,
     "steering_offset_rad": 0.0,
     "camera_delay_s": 0.0,
-}  # and where they correct nothing
+}  # the values that correct nothing
 
 
 class StartEntry(Entry):
-    """Where a drive starts."""
+    """The pose at which a drive starts."""
 
     x_m: Position
     y_m: Position
@@ -87,14 +87,14 @@ class RouteFile(Entry):
 
 @dataclass(frozen=True)
 class Route:
-    """Where a drive goes, in the world."""
+    """The waypoints of a drive and the pose at its start, in the world."""
 
     waypoints_m: tuple[tuple[float, float], ...]  # (N, 2) x y
     waypoint_radius_m: float  # a waypoint is reached within this
     start_pose: tuple[float, float, float]  # (x m, y m, psi rad) where a simulated drive starts
 
     def relative_to(self, origin_m: Origin) -> "Route":
-        """The route in the coordinates of a map that counts from there, see `MarkerMap`."""
+        """The route in the coordinates of a map with this origin, see `MarkerMap`."""
         away_m = opposite(origin_m)
         waypoints_m = points_in_world(self.waypoints_m, away_m)
         x_m, y_m, psi_rad = planar_in_world(self.start_pose, away_m)
@@ -106,7 +106,7 @@ class Route:
 
 
 def load_vehicle(path: str | Path) -> Vehicle:
-    """Bicycle parameters and limits.
+    """Read a vehicle's bicycle parameters and limits.
 
     Raises:
         BadInput: one line naming file and key.
@@ -116,9 +116,9 @@ def load_vehicle(path: str | Path) -> Vehicle:
 
 
 def vehicle_data(vehicle: Vehicle) -> dict[str, float]:
-    """What a file of the vehicle holds, all numbers bit for bit; see `VehicleFile`."""
+    """The content of a vehicle's file, all numbers bit for bit; see `VehicleFile`."""
     data = {name: float(getattr(vehicle, name)) for name in _FIGURES}
-    # Without those that correct nothing any version of the program reads it.
+    # Without corrections that correct nothing, any version of the program reads the file.
     return {name: v for name, v in data.items() if CORRECTIONS.get(name) != v}
 
 
@@ -131,8 +131,8 @@ def save_vehicle(
     """Write a vehicle; `load_vehicle` gives back the same numbers, bit for bit.
 
     Args:
-        calibrated: where its figures come from.
-        sigma: how sure they are, by the names of their keys.
+        calibrated: the provenance of the figures.
+        sigma: their standard deviations, by the names of their keys.
 
     Raises:
         BadInput: the file can't be written.
@@ -144,7 +144,7 @@ def save_vehicle(
 
 
 def load_route(path: str | Path) -> Route:
-    """Waypoints and the start of a simulated drive.
+    """Read a route: waypoints, and the start of a simulated drive.
 
     Raises:
         BadInput: one line naming file and key.

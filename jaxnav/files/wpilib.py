@@ -1,12 +1,12 @@
-"""WPILib's field layout: AprilTags on a field, JSON.
+"""Reading and writing WPILib's field layout in JSON: AprilTags on a field.
 
     {"tags": [{"ID": 7, "pose": {"translation": {"x": 0.0, "y": 5.5, "z": 1.45},
         "rotation": {"quaternion": {"W": 1.0, "X": 0.0, "Y": 0.0, "Z": 0.0}}}}],
      "field": {"length": 16.541, "width": 8.211}}
 
 The tags are of one family and one size, and the file says neither. The field's frame, x along its
-length and z up, is our world; how a tag is turned against our marker is told by
-`jaxnav.models.conventions`.
+length and z up, is our world; `jaxnav.models.conventions` has the rotation from a tag to our
+marker.
 """
 
 import json
@@ -38,7 +38,7 @@ FAMILY = "tag36h11"  # FIRST's since 2024
 
 
 class Translation(ForeignEntry):
-    """m."""
+    """The position of a tag on the field, m."""
 
     x: Position
     y: Position
@@ -46,7 +46,7 @@ class Translation(ForeignEntry):
 
 
 class Quaternion(ForeignEntry):
-    """Of length 1."""
+    """A quaternion of length 1."""
 
     W: Number
     X: Number
@@ -60,27 +60,27 @@ class Quaternion(ForeignEntry):
 
 
 class Rotation(ForeignEntry):
-    """Of the tag on the field."""
+    """The rotation of a tag on the field."""
 
     quaternion: Quaternion
 
 
 class TagPose(ForeignEntry):
-    """Of the tag on the field."""
+    """The pose of a tag on the field."""
 
     translation: Translation
     rotation: Rotation
 
 
 class Tag(ForeignEntry):
-    """One tag."""
+    """One tag of a layout."""
 
     ID: Count
     pose: TagPose
 
 
 class FieldSize(ForeignEntry):
-    """m."""
+    """The size of a field, m."""
 
     length: Annotated[Positive, within("position_m")]
     width: Annotated[Positive, within("position_m")]
@@ -134,7 +134,7 @@ def layout_figures(
 
 
 def layout_left_out(data: dict[str, Any]) -> list[str]:
-    """The keys that are not read and say something; the size of the field is one."""
+    """The keys that are not read and not empty, with the size of the field among them."""
     told = unread(data, ["tags", "field"])
     if data.get("field"):
         size = data["field"]
@@ -145,7 +145,7 @@ def layout_left_out(data: dict[str, Any]) -> list[str]:
 
 
 def layout_text(markers: Sequence[MarkerFigures], field_size_m: tuple[float, float]) -> str:
-    """The map as a field layout.
+    """The markers as the text of a field layout.
 
     Args:
         field_size_m: length (along x) and width.
@@ -174,7 +174,7 @@ def layout_text(markers: Sequence[MarkerFigures], field_size_m: tuple[float, flo
 
 
 def extent_m(markers: Sequence[MarkerFigures]) -> tuple[float, float]:
-    """(along x, along y) of the smallest box around the origin and all corners of all markers."""
+    """The extent (along x, along y), m, of the smallest box around the origin and all corners."""
     corners = [np.zeros((1, 2))]
     for marker in markers:
         T_world_marker = poses.matrix(poses.pose_as_read(marker.T_world_marker))

@@ -1,4 +1,4 @@
-"""Files out: written beside, then renamed, so that nobody ever reads half of one."""
+"""Writing of files: written beside and then renamed, so that no reader ever sees half of one."""
 
 import hashlib
 import json
@@ -21,9 +21,9 @@ from jaxnav.files.locking import create_temporary, sweep
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A path beside `path`, with the same suffix, that becomes `path` when the block succeeds.
 
-    When the block raises, nothing is left and an older file stays as it was; when the power goes,
-    there is the older one or the new one. What was left by a process that was killed is swept
-    away. An older file's permissions and owner stay; a link stays, and what it leads to is written.
+    When the block raises, nothing is left and an older file stays as it was; after a power cut
+    there is the older file or the new one. Files that killed processes have left are swept away.
+    An older file's permissions and owner stay; a link stays, and the file it leads to is written.
 
     Raises:
         BadInput: the folder is missing or closed to writing, or `path` is a folder, a device or
@@ -34,7 +34,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         word = hashlib.blake2b(os.fsencode(target.name), digest_size=4).hexdigest()
         begin = f".jaxnav-{word}-"
         sweep(map(str, target.parent.glob(f"{begin}*")))
-        # Nobody may read on the way what nobody else could read before.
+        # While it is written, the file must not be open to more readers than the older one.
         name, fd = create_temporary(
             lambda unique: f"{target.parent}/{begin}{unique}{target.suffix}",
             0o600 if older else 0o666,
@@ -53,7 +53,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def require_writable(path: str | Path) -> None:
-    """Find out before the work what `atomic_path` would say after it.
+    """Raise before the work the error that `atomic_path` would raise after it.
 
     Raises:
         BadInput: the file can't be written.
@@ -90,14 +90,14 @@ def atomic_write_all(contents: Mapping[Path, str]) -> None:
 def refuse_overwriting(
     flag: str, outputs: Iterable[Path | None], inputs: Iterable[Path | None]
 ) -> None:
-    """Refuse to write over what is read.
+    """Refuse to write over files that are read.
 
-    Files are the same where the disk says so, whatever leads there: links of both kinds, another
-    spelling, letters that this disk takes for each other.
+    Two paths are the same file where the disk says so, whatever their names: links of both kinds,
+    another spelling, letters that this disk takes for each other.
 
     Args:
-        flag: that named the outputs.
-        outputs: files. Those that are not there yet can't be meant by an input.
+        flag: the one that names the outputs.
+        outputs: files. Files that do not exist yet can't be inputs.
         inputs: files, and folders with the files in them.
 
     Raises:
@@ -117,10 +117,10 @@ def refuse_overwriting(
 
 
 def output_folder(path: str | Path) -> Path:
-    """The folder, made with its parents where it is missing.
+    """Make a folder with its parents where it is missing, and return its path.
 
     Raises:
-        BadInput: a file is in the way, or it can't be made or written to.
+        BadInput: a file is in the way, or the folder can't be made or written to.
     """
     path = Path(path)
     try:
@@ -135,7 +135,7 @@ def output_folder(path: str | Path) -> Path:
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write JSON. NumPy and JAX values become plain ones, what is not finite becomes null.
+    """Write JSON. NumPy and JAX values become plain, numbers that are not finite become null.
 
     Raises:
         BadInput: it can't be written.
@@ -165,7 +165,7 @@ def write_tum(path: str | Path, stamps_s: np.ndarray, Ts_world_vehicle: np.ndarr
 
 @contextmanager
 def _naming(path: str | Path) -> Iterator[None]:
-    """What the system says of a file, as a person is told."""
+    """Turn the system's errors about a file into `BadInput`."""
     try:
         yield
     except OSError as error:
@@ -174,7 +174,7 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 def _target(path: str | Path) -> tuple[Path, os.stat_result | None]:
-    """The file that a path leads to, and what is there already."""
+    """The file that a path leads to, and the status of an older file there; None without one."""
     if "\0" in str(path):
         raise BadInput(path, "can't be written: a name has no NUL")
     target = Path(os.path.realpath(path))
@@ -198,7 +198,7 @@ def _take_over(fd: int, older: os.stat_result) -> None:
 
 
 def _remember(folder: Path) -> None:
-    """Let the names in a folder survive a power cut too, where its disk can do that."""
+    """Force the names in a folder to its disk, if it can do that, to survive a power cut."""
     with suppress(OSError):
         fd = os.open(folder, os.O_RDONLY)
         try:
@@ -208,7 +208,7 @@ def _remember(folder: Path) -> None:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Device and number of what is there; None: nothing, or no name of a file at all."""
+    """Device and inode of a path; None where there is no such file, or it can't be a name."""
     try:
         found = path.stat()
     except (OSError, ValueError):
@@ -217,12 +217,12 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def _metres(value: float) -> str:
-    """To 9 digits, and to the um where these would be fewer."""
+    """A length as text with 9 digits, or to the um from 1000 m on, where 9 digits give less."""
     return f"{value:.9g}" if abs(value) < 1e3 else f"{value:.6f}"
 
 
 def yaml_text(data: dict[str, Any]) -> str:
-    """YAML with lists of numbers on one line each."""
+    """Data as YAML, with each list of numbers on one line."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=200)
 
 
@@ -232,7 +232,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 class Quoted(str):
-    """Text in quotes in any case, so that no reader takes it for a number."""
+    """Text that is always written in quotes, so that no reader takes it for a number."""
 
 
 _Dumper.add_representer(
@@ -241,7 +241,7 @@ _Dumper.add_representer(
 
 
 def plain_data(value: Any) -> Any:
-    """NumPy, JAX and paths as plain values, what is not finite as None; the rest as it is."""
+    """NumPy, JAX and paths as plain values, and None for numbers not finite; the rest unchanged."""
     if isinstance(value, dict):
         return {str(key): plain_data(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

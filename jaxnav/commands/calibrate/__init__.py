@@ -1,1 +1,1 @@
-"""The figures of one's own car."""
+"""Commands that calibrate one's own car: cameras, markers, odometry."""

@@ -1,4 +1,4 @@
-"""`jaxnav calibrate board`: a target on paper, at true scale."""
+"""`jaxnav calibrate board`: a calibration target to print at true scale."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,7 +29,7 @@ _ADVICE = (
 
 
 def run(args: CalibrateBoard) -> int:
-    """Write the PDF, the PNG, what is on them, and how to check them."""
+    """Write the board as PDF, PNG and YAML, and a report that says how to check the print."""
     configure_jax(float64=True)
     paper_mm = _paper_mm(args)
     board = _board(args, paper_mm)
@@ -69,7 +69,7 @@ def _board(args: CalibrateBoard, paper_mm: tuple[float, float]) -> Board:
     across, down = (long, short) if paper_mm[0] > paper_mm[1] else (short, long)
     columns, rows = args.columns or across, args.rows or down
     family = _family(args, columns * rows // 2)
-    # A metre a square, to be scaled, where no size is given.
+    # Without a given size, squares of 1 m, which are scaled below.
     size_m = 1.0 if args.size_mm is None else args.size_mm / 1e3
     marker_m = 0.0
     if args.marker_mm is not None:

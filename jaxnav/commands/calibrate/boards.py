@@ -1,4 +1,4 @@
-"""Boards between their files and calibration."""
+"""Calibration boards read from files and written to them."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from jaxnav.files import boards
 
 
 def read_board(path: Path) -> Board:
-    """The board of a file.
+    """Read the board of a file.
 
     Raises:
         BadInput: one line naming file and key.
@@ -22,7 +22,7 @@ def read_board(path: Path) -> Board:
 
 
 def write_board(path: Path, board: Board) -> None:
-    """Write it as `read_board` reads it.
+    """Write a board to a file that `read_board` reads.
 
     Raises:
         BadInput: the file can't be written.

@@ -21,7 +21,7 @@ EXIT_WRONG = 1
 
 
 def run(args: Arguments) -> int:
-    """Look, write, and name what is wrong."""
+    """Compare the map with the recordings, write a report, name wrong markers; 1 if there are."""
     configure_jax(float64=True)
     data = gathered(
         args.recordings, args.rig, args.markers_file, None, args.family, only_known=True

@@ -1,4 +1,4 @@
-"""`jaxnav calibrate convert`: cameras and marker maps from one tool's file to another's."""
+"""`jaxnav calibrate convert`: cameras and marker maps from one tool's file into another's."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ _YAML = (".yaml", ".yml")
 
 @dataclass(frozen=True)
 class _Source:
-    """What was read: cameras or markers, of which format, and what is not carried over."""
+    """The content of SOURCE: its format, cameras or markers, and what is not carried over."""
 
     format: str
     cameras: tuple[CameraFigures, ...]
@@ -44,7 +44,7 @@ class _Source:
 
 
 def run(args: CalibrateConvert) -> int:
-    """Read, refuse or write, and tell what was left out."""
+    """Read SOURCE, write it in the other format, and print what was left out."""
     source = _read(args)
     _refuse_flags(args, source)
     if source.format == args.to:
@@ -76,7 +76,7 @@ def _read(args: CalibrateConvert) -> _Source:
 
 
 def _refuse_flags(args: CalibrateConvert, source: _Source) -> None:
-    """A flag that would do nothing is a mistake."""
+    """Raise BadInput for a flag that would have no effect."""
     layout, cameras = "goes with a WPILib layout as SOURCE", "goes with cameras as SOURCE"
     for flag, given, fits, problem in (
         ("--marker-size-m", args.marker_size_m, source.format == "wpilib", layout),
@@ -139,7 +139,7 @@ def _write_cameras(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, 
 
 
 def _chosen(args: CalibrateConvert, source: _Source) -> tuple[CameraFigures, ...]:
-    """The cameras that are asked for, under the names and at the places that are given."""
+    """The cameras that the flags choose, with the name and place that the flags give."""
     cameras = source.cameras
     if args.camera_name is not None:
         if len(cameras) > 1:
@@ -157,7 +157,7 @@ def _chosen(args: CalibrateConvert, source: _Source) -> tuple[CameraFigures, ...
 
 
 def _paths(args: CalibrateConvert, cameras: Sequence[CameraFigures]) -> list[Path]:
-    """A file for each camera: --out itself, or in it."""
+    """The output file of each camera: --out itself, or files in the folder --out."""
     suffixes = _SUFFIXES.get(args.to, _YAML)
     if len(cameras) == 1 and args.out.suffix and not args.out.is_dir():
         _require_suffix(args.to, args.out)

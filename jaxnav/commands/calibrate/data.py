@@ -1,4 +1,4 @@
-"""What `jaxnav calibrate rig`, `markers` and `check` look at: sightings, and what is known."""
+"""Input data of `jaxnav calibrate rig`, `markers` and `check`: sightings and known markers."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ MarkerKey = tuple[str, int]  # family, id
 
 @dataclass(frozen=True)
 class RigData:
-    """What was seen by whom.
+    """Sightings of several recordings, with their rig and the known markers.
 
     Attributes:
-        markers: the map that was given, those that nobody saw among them; None where there is none.
-        keys: (M,) of the markers, in the order of `views`.
-        known: T_world_marker (4, 4) of those that are known, by their index.
-        parts: the recordings.
-        anchored: whether a file or a recording knew a marker, or one of them was made the world.
+        markers: the map, given or recorded, with markers that no camera saw; None without one.
+        keys: (M,) family and id of each marker, in the order of `views`.
+        known: T_world_marker (4, 4) of the known markers, by their index.
+        parts: the sightings of each recording.
+        anchored: whether a file or a recording knew a marker; if none did, one is the world.
     """
 
     rig: CameraRig
@@ -49,13 +49,13 @@ def gathered(
     family: str,
     only_known: bool = False,
 ) -> RigData:
-    """All recordings, one after the other.
+    """Read all recordings and join their sightings, one recording after the other.
 
     Args:
-        only_known: whether markers that are in no map are left out.
+        only_known: whether to leave out markers that are in no map.
 
     Raises:
-        BadInput: names file or flag.
+        BadInput: names the file or the flag.
     """
     if family not in FAMILY_SIZES:
         raise BadInput("--family", f"unknown {family!r}: expected one of {', '.join(FAMILY_SIZES)}")
@@ -104,7 +104,7 @@ def gathered(
 
 
 def _one_after_the_other(stamps_ns: Sequence[np.ndarray]) -> np.ndarray:
-    """All stamps, increasing: those of the first recording as they are."""
+    """Stamps of all recordings, ns, increasing; those of the first recording do not change."""
     together = list(stamps_ns[:1])
     for stamps in stamps_ns[1:]:
         before = together[-1]
@@ -115,7 +115,7 @@ def _one_after_the_other(stamps_ns: Sequence[np.ndarray]) -> np.ndarray:
 def _wanted(key: MarkerKey, count: int, markers: MarkerMap | None, only_known: bool) -> bool:
     if markers is not None and markers.index(key[1], key[0]) is not None:
         return True
-    # What is seen that rarely is another pattern, taken for a marker.
+    # An id that is seen more rarely is another pattern, taken for a marker.
     return count >= _LEAST_SIGHTINGS and not only_known
 
 
@@ -134,7 +134,7 @@ def _one_rig(parts: Sequence[Sightings], recordings: Sequence[Path]) -> None:
 def _known(
     markers: MarkerMap | None, keys: Sequence[MarkerKey], marker_size_m: float | None
 ) -> tuple[dict[int, np.ndarray], list[float]]:
-    """Places by index, and sizes of all."""
+    """T_world_marker (4, 4) of the known markers by index, and the sizes of all, m."""
     known, sizes_m = {}, []
     given = [] if markers is None else sorted({float(size) for size in markers.size_m})
     for index, (family, marker_id) in enumerate(keys):

@@ -1,4 +1,4 @@
-"""`jaxnav calibrate intrinsics`: the lens of a camera, or of several."""
+"""`jaxnav calibrate intrinsics`: calibrate the lens of a camera, or of several."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,12 +32,12 @@ from jaxnav.files.validation import validate
 from jaxnav.models.camera import LENS_COEFFICIENTS
 from jaxnav.plots.lens import lens_report
 
-# Where a camera of such a name looks, until somebody says where it is.
+# The yaw of a camera with such a name, until its place is measured.
 _YAWS_DEG = {"front": 0.0, "left": 90.0, "rear": 180.0, "back": 180.0, "right": -90.0}
 
 
 def run(args: CalibrateIntrinsics) -> int:
-    """Find the board, fit the lenses, write what was found."""
+    """Find the board in the images, fit the lenses, write camera.yaml and a report."""
     configure_jax(float64=True)
     board = read_board(args.board)
     placed = _placed(args.rig)
@@ -88,7 +88,7 @@ def _placed(path: Path | None) -> dict[str, CameraEntry]:
 
 
 def _entry(name: str, found: LensCalibration, placed: CameraEntry | None) -> CameraEntry:
-    """A camera of a rig file, at its place."""
+    """The rig file's entry of a calibrated camera, at its place where that is known."""
     fit = found.fit
     coefficients = slice(4, 4 + LENS_COEFFICIENTS[fit.lens])
     before = placed.sigma if placed and placed.sigma else CameraSigma()

@@ -1,4 +1,4 @@
-"""`jaxnav calibrate markers`: where the markers are, by a rig that is calibrated."""
+"""`jaxnav calibrate markers`: find the places of markers with a calibrated rig."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from jaxnav.commands.process import configure_jax
 
 
 def run(args: Arguments) -> int:
-    """Find, write, and say in a few lines what came of it."""
+    """Find the markers, write the files, and print a summary."""
     configure_jax(float64=True)
     data = gathered(args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family)
     given = inverted(np.asarray(data.rig.Ts_camera_vehicle.as_matrix(), float))

@@ -24,7 +24,7 @@ from jaxnav.plots.odometry import odometry_report
 
 
 def run(args: Arguments) -> int:
-    """Calibrate, write, and say what was found."""
+    """Calibrate odometry, write vehicle.yaml and a report, and print a summary."""
     configure_jax(float64=True)
     recorded = read_recordings(args)
     before = {name: float(getattr(recorded.vehicle, name)) for name in NAMES}
@@ -58,7 +58,7 @@ def run(args: Arguments) -> int:
 
 
 def calibrated_vehicle(vehicle: Vehicle, found: OdometryCalibration) -> Vehicle:
-    """The vehicle with the figures found."""
+    """The vehicle with the calibrated figures."""
     values: dict[str, Any] = dict(found.value)
     values["wheelbase_m"] = jnp.asarray(values["wheelbase_m"], vehicle.wheelbase_m.dtype)
     return dataclasses.replace(vehicle, **values)
@@ -67,7 +67,7 @@ def calibrated_vehicle(vehicle: Vehicle, found: OdometryCalibration) -> Vehicle:
 def report(
     args: Arguments, recorded: Recorded, found: OdometryCalibration, calibrated: Calibrated
 ) -> dict[str, Any]:
-    """What report.json holds."""
+    """The content of report.json."""
     speed_mps, steering_rad = np.abs(found.read[:, 0]), found.read[:, 1]
     return calibrated.model_dump() | {
         "recordings": list(args.recordings),
@@ -99,7 +99,7 @@ def report(
 
 
 def head(found: OdometryCalibration) -> str:
-    """What was driven, and how well it is explained."""
+    """A line with distance, duration, views, and how well the fit explains them."""
     return (
         f"{found.way_m:.1f} m in {found.duration_s:.0f} s, {len(found.outliers)} views "
         f"({int(found.outliers.sum())} far off), {found.rms_px:.2f} px RMS, chi-square "

@@ -1,4 +1,4 @@
-"""Recorded drives as what odometry is calibrated from."""
+"""Recorded drives as data for the calibration of odometry."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -24,15 +24,15 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import DriveSetup
 
 _NONE = Detections.concatenate([])
-_SHARED = ("rig", "markers", "vehicle")  # of all recordings, as their headers have them
+_SHARED = ("rig", "markers", "vehicle")  # header keys that must agree in all recordings
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """Drives, and what they were driven with.
+    """Recorded drives, and the rig, map and vehicle that they were driven with.
 
     Attributes:
-        files: all that was read, in an order that does not change.
+        files: all files that were read, in an order that does not change.
     """
 
     drives: tuple[Drive, ...]
@@ -43,10 +43,10 @@ class Recorded:
 
 
 def read_recordings(args: Arguments) -> Recorded:
-    """Everything that the command is given. The process has its precision already.
+    """Read all recordings and files of the command; JAX's precision must be set before.
 
     Raises:
-        BadInput: naming file or flag.
+        BadInput: names the file or the flag.
     """
     given = [path for path in (args.rig, args.markers_file, args.vehicle) if path is not None]
     files = (*(file for path in args.recordings for file in _files(path)), *given)
@@ -102,10 +102,10 @@ def drive_of(
     markers: MarkerMap,
     corner_sigma_px: float | None = None,
 ) -> Drive:
-    """The readings and views among the inputs of a pilot, as the sensors gave them.
+    """The drive of a pilot's inputs: readings and views of markers, as the sensors gave them.
 
     Args:
-        corner_sigma_px: of every corner along one axis; by default as each detection says.
+        corner_sigma_px: of every corner along one axis; by default each detection's own.
     """
     left_out = 0
     readings: list[tuple[int, float, float]] = []
@@ -162,7 +162,7 @@ def _columns(rows: Sequence[tuple[Any, ...]], count: int) -> list[tuple[Any, ...
 
 
 def _files(path: Path) -> list[Path]:
-    """A recording's files: a ROS 2 bag is a folder of some."""
+    """The files of a recording; a ROS 2 bag is a folder of several."""
     if not path.exists():
         raise BadInput(path, "there is no such recording")
     return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]

@@ -1,4 +1,4 @@
-"""What `jaxnav calibrate rig` and `markers` say of what they found: numbers, files, advice."""
+"""Reports of `jaxnav calibrate rig`, `markers` and `check`: numbers, files, advice."""
 
 from pathlib import Path
 from typing import Any
@@ -31,14 +31,14 @@ _LITTLE_SEEN = 0.25  # of a camera's image
 
 
 def provenance(data: RigData, command: str) -> Calibrated:
-    """What the files say of themselves."""
+    """The provenance that the written files state: date, tool, digest of the sightings."""
     views = data.views
     arrays = [views.corners_px, views.frame, views.camera, views.marker, views.size_m]
     return calibrated_now(f"jaxnav {jaxnav.__version__} calibrate {command}", arrays)
 
 
 def calibrated_rig(data: RigData, found: RigCalibration) -> CameraRig:
-    """The rig with the cameras where, and with the lenses that, they were found."""
+    """The rig with the calibrated places and lenses of its cameras."""
     poses = [pose_from_matrix(T) for T in inverted(found.Ts_vehicle_camera)]
     return CameraRig(
         found.cameras,
@@ -49,7 +49,7 @@ def calibrated_rig(data: RigData, found: RigCalibration) -> CameraRig:
 
 
 def found_markers(data: RigData, found: RigCalibration) -> tuple[MarkerMap, list[int]]:
-    """The map of all markers that could be linked, and which of `data.keys` they are."""
+    """The map of all markers that could be linked, and their indices in `data.keys`."""
     mapped = [int(index) for index in np.flatnonzero(found.mapped)]
     return marker_map(
         np.stack([pose_from_matrix(found.Ts_world_marker[index]) for index in mapped]),
@@ -60,8 +60,8 @@ def found_markers(data: RigData, found: RigCalibration) -> tuple[MarkerMap, list
 
 
 def with_unseen(data: RigData, found: MarkerMap) -> tuple[MarkerMap, int]:
-    """The map with those of the given one that nobody saw, which stay where they are; and how many
-    these are."""
+    """The found map with the given map's unseen markers added where they are, and how many these
+    are."""
     if data.markers is None:
         return found, 0
     given = data.markers
@@ -81,8 +81,8 @@ def with_unseen(data: RigData, found: MarkerMap) -> tuple[MarkerMap, int]:
 
 
 def axes_sigmas(found: RigCalibration) -> np.ndarray:
-    """(C + M, 6) of cameras and markers, m and deg, along and about the axes of the vehicle and
-    the world."""
+    """Sigmas (C + M, 6) of cameras and markers, m and deg, along and about the axes of the vehicle
+    for cameras and of the world for markers."""
     Ts = np.concatenate([found.Ts_vehicle_camera, found.Ts_world_marker])
     sigmas = np.zeros((len(Ts), 6))
     for index, T in enumerate(Ts):
@@ -102,13 +102,13 @@ def write_files(
     with_rig: bool,
     all_found: bool = False,
 ) -> None:
-    """rig.yaml where it was looked for, markers.yaml, trajectory.tum.
+    """Write markers.yaml, trajectory.tum and, `with_rig`, rig.yaml.
 
     Args:
-        all_found: whether no marker's place was taken as it was given.
+        all_found: whether all markers' places were found, none of them taken as given.
 
     Raises:
-        BadInput: they can't be written.
+        BadInput: a file can't be written.
     """
     sigmas, C = axes_sigmas(found), len(data.rig)
     if with_rig:
@@ -141,7 +141,7 @@ def write_files(
 
 
 def _lens_sigma(data: RigData, found: RigCalibration, camera: int) -> dict[str, list[float]]:
-    """As `CameraSigma` has it; empty where the lens was not to be refined."""
+    """Sigmas of a camera's lens by the fields of `CameraSigma`; empty if it was not refined."""
     sigma = found.lens_sigmas()[camera]
     if not sigma.any():
         return {}
@@ -154,7 +154,7 @@ def _lens_sigma(data: RigData, found: RigCalibration, camera: int) -> dict[str, 
 
 
 def _lens(data: RigData, found: RigCalibration, camera: int) -> dict[str, Any]:
-    """Of the report: every figure, and where it was before; empty likewise."""
+    """The report's lens figures, with sigma and given value each; empty if it was not refined."""
     sigma = _lens_sigma(data, found, camera)
     return {
         name: {
@@ -169,10 +169,10 @@ def _lens(data: RigData, found: RigCalibration, camera: int) -> dict[str, Any]:
 def summary(
     data: RigData, found: RigCalibration, given: np.ndarray, calibrated: Calibrated
 ) -> dict[str, Any]:
-    """The report as data.
+    """The content of report.json.
 
     Args:
-        given: (C, 4, 4) T_vehicle_camera before.
+        given: (C, 4, 4) T_vehicle_camera before calibration.
     """
     sigmas, C = axes_sigmas(found), len(data.rig)
     views = found.views
@@ -232,7 +232,7 @@ def summary(
 
 
 def coverage(corners_px: np.ndarray, image_size_px: tuple[int, int]) -> float:
-    """Which part of an image's cells, 8 of them across, corners were seen in."""
+    """The share of an image's cells, 8 of them across, in which corners were seen."""
     width, height = image_size_px
     across, down = _CELLS, max(1, round(_CELLS * height / width))
     cell = (corners_px.reshape(-1, 2) + 0.5) / [width, height] * [across, down]
@@ -241,7 +241,7 @@ def coverage(corners_px: np.ndarray, image_size_px: tuple[int, int]) -> float:
 
 
 def advice(data: RigData, found: RigCalibration, sigmas: np.ndarray) -> list[str]:
-    """What to collect next, and what to look at."""
+    """Advice in sentences: what to record next, and what to check."""
     told = []
     rows = data.views
     for c, name in enumerate(data.rig.names):
@@ -289,7 +289,7 @@ def advice(data: RigData, found: RigCalibration, sigmas: np.ndarray) -> list[str
 
 
 def text(report: dict[str, Any]) -> str:
-    """What a person wants to know first."""
+    """The report in a few lines: counts, errors, places of cameras, and advice."""
     lines = [
         f"{report['frames']} frames, {report['sightings']} sightings "
         f"({report['outliers']} outliers), reprojection RMS "

@@ -1,4 +1,4 @@
-"""`jaxnav calibrate rig`: where the cameras are, and the markers with them."""
+"""`jaxnav calibrate rig`: find the places of the cameras, and of the markers with them."""
 
 from pathlib import Path
 
@@ -24,13 +24,13 @@ from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_vehicle, output_folder, write_json
 from jaxnav.plots.rig import rig_report
 
-_WRONG_SCALE = 3.0  # between how far apart cameras are and were said to be
-_WRONG_SIZE = 1.5  # between how large a marker looks and was said to be
-_APART_M = 0.05  # a given distance that says anything
+_WRONG_SCALE = 3.0  # ratio of found to given distances between cameras
+_WRONG_SIZE = 1.5  # ratio of a marker's found to its given size
+_APART_M = 0.05  # a smaller given distance is not compared
 
 
 def run(args: Arguments) -> int:
-    """Find, write, and say in a few lines what came of it."""
+    """Find cameras and markers, write the files, and print a summary."""
     configure_jax(float64=True)
     data = gathered(args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family)
     names = data.rig.names
@@ -51,14 +51,14 @@ def run(args: Arguments) -> int:
 def publish(
     folder: Path, data: RigData, found: RigCalibration, given: np.ndarray, with_rig: bool
 ) -> None:
-    """Write all files, and say in a few lines what they hold.
+    """Write all files, and print in a few lines what they hold.
 
     Args:
-        given: (C, 4, 4) T_vehicle_camera before.
-        with_rig: whether cameras were looked for, or markers alone.
+        given: (C, 4, 4) T_vehicle_camera before calibration.
+        with_rig: whether cameras were calibrated, or markers alone.
 
     Raises:
-        BadInput: they can't be written.
+        BadInput: a file can't be written.
     """
     out = output_folder(folder)
     calibrated = provenance(data, "rig" if with_rig else "markers")
@@ -90,14 +90,14 @@ def _write_picture(out: Path, data: RigData, found: RigCalibration, given: np.nd
 
 
 def _reference_camera(args: Arguments, data: RigData) -> int:
-    """The camera that stays where it is while all others move: the one that saw most."""
+    """The index of the camera held fixed: the one that --vehicle-frame names, or that saw most."""
     if args.vehicle_frame in data.rig.names:
         return data.rig.names.index(args.vehicle_frame)
     return int(np.argmax(np.bincount(data.views.camera, minlength=len(data.rig))))
 
 
 def refuse_wrong_sizes(data: RigData, found: RigCalibration) -> None:
-    """Raise BadInput where a marker is far from as large as it was said to be."""
+    """Raise BadInput where a marker's size is far from the given one."""
     for index, size_m in sizes_m(found, data.views, data.rig).items():
         said_m = float(data.views.size_m[index])
         if not 1 / _WRONG_SIZE < size_m / said_m < _WRONG_SIZE:
@@ -111,7 +111,7 @@ def refuse_wrong_sizes(data: RigData, found: RigCalibration) -> None:
 def _refuse_nonsense(
     args: Arguments, data: RigData, found: RigCalibration, given: np.ndarray
 ) -> None:
-    """Raise BadInput where what was found can't be what was meant."""
+    """Raise BadInput for wrong sizes, cameras that can't be linked, or a rig of another scale."""
     refuse_wrong_sizes(data, found)
     cameras = np.flatnonzero(found.calibrated)
     if len(cameras) < 2:
@@ -135,7 +135,7 @@ def _refuse_nonsense(
 
 
 def _wheelbase_m(args: Arguments, data: RigData) -> float:
-    """What a drive needs beside itself, asked for before any work is done."""
+    """The wheelbase, m, that a drive needs; refuses other recordings before any work is done."""
     if len(data.parts) != 1 or not any(one.valid for one in data.parts[0].odometry):
         problem = "needs one recording, of a drive with odometry (a .mcap)"
         raise BadInput("--vehicle-frame drive", problem)
@@ -150,7 +150,7 @@ def _tied(
     given: np.ndarray,
     wheelbase_m: float,
 ) -> RigCalibration:
-    """The vehicle frame where it was asked to be."""
+    """The calibration moved into the vehicle frame that --vehicle-frame asks for."""
     if args.vehicle_frame in data.rig.names:
         return found
     if args.vehicle_frame == "places":

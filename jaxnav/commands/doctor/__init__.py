@@ -1,1 +1,1 @@
-"""What a car will run with, looked at."""
+"""Checks of what a car will run with: `jaxnav doctor`."""

@@ -1,4 +1,4 @@
-"""What cameras give within a second: sizes, light, rate, age, and whether they look together."""
+"""Checks of a second of each camera's frames: size, light, rate, age, and skew between cameras."""
 
 import time
 import zlib
@@ -20,19 +20,19 @@ _LEAST_RATE_HZ = 10.0
 _SKEW_S = 0.02
 _DARK, _BRIGHT = 15.0, 240.0  # mean grey levels
 _LEAST_CONTRAST = 8.0  # standard deviation of grey levels
-_FROZEN = 3  # of the very same pictures
+_FROZEN = 3  # pictures that are all identical
 
 
 @dataclass
 class Watched:
-    """One camera for a second.
+    """What one camera gave within a second.
 
     Attributes:
         stamps_ns: of its frames.
-        ages_s: of each frame when it was there.
+        ages_s: the age of each frame when `read` returned it.
         pictures: a checksum of each image.
         first: the first frame.
-        failure: the last time it could not be read, or that it hung.
+        failure: the last error of `read`, or that it hung; empty without one.
     """
 
     name: str
@@ -44,13 +44,13 @@ class Watched:
 
     @property
     def rate_hz(self) -> float:
-        """Of its stamps."""
+        """The mean rate of the stamps, Hz; 0 where they span no time."""
         span_s = (max(self.stamps_ns) - min(self.stamps_ns)) / 1e9
         return (len(self.stamps_ns) - 1) / span_s if span_s > 0 else 0.0
 
 
 def watch(cameras: Sequence[Camera]) -> list[Watched]:
-    """Read all cameras at a time, each in its own thread, for a second after its first picture."""
+    """Read all cameras at once, each in its own thread, for a second after its first picture."""
     watched = [Watched(camera.name) for camera in cameras]
     looks: list[Finish] = []
     for camera, into in zip(cameras, watched, strict=True):
@@ -86,7 +86,7 @@ def _look(camera: Camera, into: Watched) -> None:
 def judge_cameras(
     watched: Sequence[Watched], sizes_px: Sequence[tuple[int, int]]
 ) -> Iterator[Finding]:
-    """What is wrong with each camera, and with all of them.
+    """Report what is wrong with each camera, and the skew between all of them.
 
     Args:
         sizes_px: (width, height) of the rig's images.
@@ -187,7 +187,7 @@ def _light(camera: Watched) -> str:
 
 
 def skew(watched: Sequence[Watched]) -> Iterator[Finding]:
-    """How far apart in time the cameras look: each against the nearest frame of the first."""
+    """Report the time between each camera's frames and the nearest ones of the first camera."""
     seen = [camera for camera in watched if len(camera.stamps_ns) > 1]
     if len(seen) < 2:
         return

@@ -1,6 +1,6 @@
 """`jaxnav doctor`: is what a car will run with in order, and what is to be done about it?
 
-What is examined may be broken: all but the findings is imported when it is its turn.
+Any part may be broken, so that each check is imported only when its turn comes.
 """
 
 import importlib
@@ -18,7 +18,7 @@ _CHECKS = "jaxnav.commands.doctor"
 
 
 def run(args: Doctor) -> int:
-    """Examine computer, files, pictures and plug-ins, in this order, and sum up."""
+    """Examine computer, files, pictures, plug-ins and stamps, in this order, and sum up."""
     report = Report(lambda finding: print(finding, flush=True))
     _computer(report)
     patient = _files(report, args)
@@ -38,7 +38,7 @@ def run(args: Doctor) -> int:
 
 
 def _check(module: str, name: str) -> Any:
-    """A function of the checks, imported now."""
+    """Import a module of checks and return one of its functions."""
     return getattr(importlib.import_module(f"{_CHECKS}.{module}"), name)
 
 
@@ -52,7 +52,7 @@ def _computer(report: Report) -> None:
 
 
 def _jax() -> Iterable[Finding]:
-    """As the car will be started: one thread, float64."""
+    """Examine JAX, configured as the car will be started: one thread, float64."""
     process = importlib.import_module("jaxnav.commands.process")
     process.configure_jax(float64=True, threads=1)
     found: Iterable[Finding] = _check("software", "jax_device")()
@@ -60,7 +60,7 @@ def _jax() -> Iterable[Finding]:
 
 
 def _files(report: Report, args: Doctor) -> SimpleNamespace:
-    """What can be read of rig, markers, vehicle and route, each examined; None for the others."""
+    """Read and examine rig, markers, vehicle and route; None for each that can't be read."""
     patient = SimpleNamespace(rig=None, markers=None, vehicle=None, route=None)
     files = report.read("files", lambda: importlib.import_module("jaxnav.files"))
     if files is None:
@@ -92,7 +92,7 @@ def _files(report: Report, args: Doctor) -> SimpleNamespace:
 
 
 def _cache(patient: SimpleNamespace) -> Iterable[Finding]:
-    """Whether the program that a car runs with these files is compiled."""
+    """Report whether the program that a car runs with these files is compiled."""
     import jax
 
     from jaxnav.commands.process import cache_refused, step_folder
@@ -108,7 +108,7 @@ def _cache(patient: SimpleNamespace) -> Iterable[Finding]:
 
 
 def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
-    """As `jaxnav run` would look for it: in single precision."""
+    """Whether the step is compiled as `jaxnav run` would look for it: in single precision."""
     import equinox as eqx
     import jax
     import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Which single error would explain what is seen: a size, a moved marker, a lens, a camera."""
+"""Search for one error that would explain the corners: a size, a moved marker, a lens, a camera."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ SIZE_SIGMA = 0.3  # of a logarithm
 _FOCAL_SIGMA = 0.1
 _MOVED_SIGMA = 1.0  # m and rad
 _TURNED_SIGMA_RAD = 0.1
-# What an explanation may leave: of the chi-square, and of the corners' errors.
+# The most an explanation may leave: a share of the chi-square, and an RMS error of the corners.
 _EXPLAINS, _MOST_PX = 0.1, 1.0
 _SCALED_ALIKE = 0.01  # sizes that a printer scaled agree this well
 _ALIKE = 6.0  # two explanations this close can't be told apart
@@ -20,13 +20,13 @@ _ALIKE = 6.0  # two explanations this close can't be told apart
 
 @dataclass(frozen=True)
 class Explanation:
-    """One error that a file may hold.
+    """One error that a file may hold, with the best fit that allows for it.
 
     Attributes:
         kind: "size", "sizes", "moved", "focal" or "turned".
-        index: of the marker or the camera; None where it is all of them.
-        count: of the numbers that it frees.
-        fit: what then fits best.
+        index: of the marker or the camera; None for all of them.
+        count: how many numbers it frees.
+        fit: the best fit with these numbers free.
     """
 
     kind: str
@@ -36,7 +36,7 @@ class Explanation:
 
 
 def explained(seen: Sighted, starts: Sequence[np.ndarray], whole: Fit) -> list[Explanation]:
-    """The errors that explain the corners best, all that can't be told apart; often none.
+    """The errors that explain the corners best: up to three that can't be told apart, often none.
 
     Args:
         starts: level poses to begin at.
@@ -56,7 +56,7 @@ def explained(seen: Sighted, starts: Sequence[np.ndarray], whole: Fit) -> list[E
     misfit = min((max(each.fit.cost / seen.numbers, 1.0) for each in good), default=1.0)
 
     def price(each: Explanation) -> float:
-        """Schwarz (1978): what is not explained, and that more numbers explain more."""
+        """Schwarz's criterion (1978): the misfit left, and a penalty for each number freed."""
         return each.fit.cost / misfit + each.count * math.log(seen.numbers)
 
     good.sort(key=price)
@@ -64,7 +64,7 @@ def explained(seen: Sighted, starts: Sequence[np.ndarray], whole: Fit) -> list[E
 
 
 def _errors_of_files(seen: Sighted) -> Iterator[tuple[str, int | None, int, Unknowns]]:
-    """All that several markers can tell from each other, with the prior sigmas of each."""
+    """Each error that several markers can tell apart: kind, index, count, and prior sigmas."""
     C, M = seen.visible.shape
     used = np.flatnonzero(seen.visible.any(axis=1))[:MOST_ERRORS]
 
@@ -87,7 +87,7 @@ def _errors_of_files(seen: Sighted) -> Iterator[tuple[str, int | None, int, Unkn
 
 
 def in_words(seen: Sighted, explanation: Explanation) -> tuple[str, str]:
-    """An explanation, and what to do about it."""
+    """An explanation as text, and what to do about it."""
     value, index = explanation.fit.value, explanation.index
     ids, names = seen.markers.ids, seen.rig.names
     if index is None:

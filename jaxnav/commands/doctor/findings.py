@@ -1,6 +1,6 @@
-"""What the doctor finds: a line for each, and what to do about it.
+"""Findings of the doctor: one line for each, and what to do about it.
 
-Imports nothing heavy: it must work where JAX, OpenCV or a driver does not.
+This module imports nothing heavy: it must work where JAX, OpenCV or a driver does not.
 """
 
 import dataclasses
@@ -25,12 +25,12 @@ Loaded = TypeVar("Loaded")
 
 @dataclass(frozen=True)
 class Finding:
-    """What a look at one thing gave.
+    """The result of one check.
 
     Attributes:
-        name: what was looked at.
+        name: of the thing that was checked.
         level: "ok"; "note", good to know; "warning", it may go wrong; "error", it will.
-        what: in one line.
+        what: the result in one line.
         do: what a person can do about it.
     """
 
@@ -40,7 +40,7 @@ class Finding:
     do: str = ""
 
     def __str__(self) -> str:
-        """Aligned with all others; what to do indented below."""
+        """One line, in columns that are the same for all findings, and `do` indented below."""
         line = f"{_SHOWN[self.level]:<7}  {self.name:<{_NAME_WIDTH}}  {_one_line(self.what)}"
         return f"{line}\n{'':9}do: {_one_line(self.do)}" if self.do else line
 
@@ -50,7 +50,7 @@ Check = Callable[[], Iterable[Finding]]
 
 @dataclass
 class Report:
-    """All findings so far. A check that fails is one of them, and hides no other.
+    """All findings so far. A check that raises becomes a finding too, and hides no other.
 
     Attributes:
         show: called with each finding as soon as it is known.
@@ -62,16 +62,16 @@ class Report:
     unreadable: bool = False
 
     def add(self, finding: Finding) -> None:
-        """One more."""
+        """Append a finding and show it."""
         self.findings.append(finding)
         self.show(finding)
 
     def examine(self, name: str, check: Check) -> None:
-        """Run a check; what it found before it failed is kept.
+        """Run a check, and keep what it found before it failed.
 
         Args:
-            name: for the finding that it failed.
-            check: it may raise anything: a broken installation does.
+            name: of the finding that says that it failed.
+            check: may raise anything, as a broken installation does.
         """
         try:
             for finding in check():
@@ -90,7 +90,7 @@ class Report:
             )
 
     def read(self, name: str, load: Callable[[], Loaded]) -> Loaded | None:
-        """What a file holds; None, and a finding, where it can't be read."""
+        """Load a file and return its content; None, and a finding, where it can't be read."""
         loaded: list[Loaded] = []
 
         def check() -> Iterable[Finding]:
@@ -109,7 +109,7 @@ class Report:
         return EXIT_ERROR_FOUND if wrong else 0
 
     def summary(self) -> str:
-        """How many of each level there are."""
+        """A line that counts the findings of each level."""
         counts = Counter(finding.level for finding in self.findings)
         return ", ".join(
             f"{counts[level]} {level}{'s' if level != 'ok' and counts[level] > 1 else ''}"
@@ -118,7 +118,7 @@ class Report:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """For other programs."""
+        """The exit code and all findings as JSON data, for other programs."""
         return {
             "exit_code": self.exit_code,
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
@@ -131,7 +131,7 @@ def said(error: BaseException) -> str:
 
 
 def listed(things: Iterable[object], most: int = 8) -> str:
-    """The first few, with commas."""
+    """The first few things, separated by commas, and how many more there are."""
     shown = [str(thing) for thing in things]
     more = f" and {len(shown) - most} more" if len(shown) > most else ""
     return ", ".join(shown[:most]) + more

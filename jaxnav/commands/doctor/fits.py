@@ -1,8 +1,8 @@
-"""Poses of a standing car, and errors of its files, fitted to the corners in its pictures.
+"""Fits of a standing car's pose, and of errors in its files, to the corners in its pictures.
 
 The pose may be anywhere, or nearly level on the ground; sizes, places and lenses are as the files
-say, or a few of them are unknown too. Unknowns are counted in their own prior sigma. SciPy
-minimises: each fit is another problem, and but one small program has to be compiled for all.
+say, or a few of them are unknown too. Each unknown is measured in its prior sigma. SciPy minimises,
+so that only one small program has to be compiled for fits with different unknowns.
 """
 
 from collections.abc import Iterable
@@ -25,19 +25,19 @@ from jaxnav.pose.ippe import ippe_from_rays
 from jaxnav.pose.observation import MODEL_SIGMA_PX
 
 MOST_ERRORS = 6  # numbers that may be unknown beside the pose
-_HEIGHT_SIGMA_M = 0.01  # how well a floor is level and a car stands on it,
-_TILT_SIGMA_RAD = np.deg2rad(0.5)  # with what a tape leaves in the cameras' places
+_HEIGHT_SIGMA_M = 0.01  # of a car on a floor that is nearly level,
+_TILT_SIGMA_RAD = np.deg2rad(0.5)  # and with a tape's errors in the cameras' places
 _FREE_M, _FREE_RAD = 10.0, 3.0
 
 
 @dataclass(frozen=True)
 class Sighted:
-    """What C cameras see of the M markers that they see at all, in the order of the map.
+    """Sightings by C cameras of the M markers that any of them sees, in the order of the map.
 
     Attributes:
         corners_px: (C, M, 4, 2).
         visible: (C, M).
-        sigma_px: (C, M, 4), with what a calibration leaves.
+        sigma_px: (C, M, 4), of detection and calibration together.
     """
 
     rig: CameraRig
@@ -48,7 +48,7 @@ class Sighted:
 
     @staticmethod
     def of(rig: CameraRig, markers: MarkerMap, seen: Observed, most: int) -> "Sighted":
-        """Of all markers that are seen so many, the largest ones."""
+        """The sightings of the `most` markers that look largest in any image."""
         diagonals_px = seen.corners_px[..., :2, :] - seen.corners_px[..., 2:, :]
         area_px2 = np.abs(
             diagonals_px[..., 0, 0] * diagonals_px[..., 1, 1]
@@ -68,13 +68,13 @@ class Sighted:
         return Sighted(rig, chosen, seen.corners_px[:, kept], seen.visible[:, kept], sigma_px)
 
     def only(self, marker: int) -> "Sighted":
-        """The same with one marker in view."""
+        """These sightings with only one marker in view."""
         alone = np.arange(self.visible.shape[1]) == marker
         visible = self.visible & alone
         return Sighted(self.rig, self.markers, self.corners_px, visible, self.sigma_px)
 
     def reordered(self, marker: int, order: tuple[int, ...]) -> "Sighted":
-        """The same with the corners of one marker in another order."""
+        """These sightings with the corners of one marker in another order."""
         corners_px, sigma_px = self.corners_px.copy(), self.sigma_px.copy()
         corners_px[:, marker] = corners_px[:, marker, list(order)]
         sigma_px[:, marker] = sigma_px[:, marker, list(order)]
@@ -82,17 +82,17 @@ class Sighted:
 
     @property
     def numbers(self) -> int:
-        """How many coordinates of corners there are."""
+        """The number of corner coordinates."""
         return 8 * int(self.visible.sum())
 
     @property
     def allowed_px(self) -> float:
-        """RMS of the corners' sigma."""
+        """RMS of the corners' sigmas, px."""
         return float(np.sqrt(np.mean(self.sigma_px[self.visible] ** 2)))
 
 
 class Unknowns(eqx.Module):
-    """What may differ from the files, or the sigma of it: 0 where it is no unknown."""
+    """Differences from the files, or their sigmas, where 0 says that a number is known."""
 
     pose: np.ndarray  # (6,) xi in T_world_vehicle * exp(xi)
     size: np.ndarray  # (M,) logarithm of true over written
@@ -102,7 +102,7 @@ class Unknowns(eqx.Module):
 
     @staticmethod
     def of_pose(seen: Sighted, level: bool, **others: np.ndarray) -> "Unknowns":
-        """Prior sigmas of a pose anywhere in space, or on the ground; and of what else is given."""
+        """Prior sigmas of a pose anywhere in space, or level on the ground, and of `others`."""
         C, M = seen.visible.shape
         on_ground = [_HEIGHT_SIGMA_M, _TILT_SIGMA_RAD, _TILT_SIGMA_RAD]
         z_m, roll_rad, pitch_rad = on_ground if level else [_FREE_M, _FREE_RAD, _FREE_RAD]
@@ -118,12 +118,12 @@ class Unknowns(eqx.Module):
 
 @dataclass(frozen=True)
 class Fit:
-    """What fits best.
+    """The best fit of a pose and of unknowns to the corners.
 
     Attributes:
         T_world_vehicle: (4, 4).
         cost: chi-square of corners and priors.
-        error_px: RMS of all coordinates.
+        error_px: RMS error of all corner coordinates.
         value: of the unknowns.
         sigma: of the unknowns.
         pose_covariance: (6, 6), of xi in T_world_vehicle * exp(xi).
@@ -138,18 +138,18 @@ class Fit:
 
     @property
     def planar(self) -> tuple[float, float, float]:
-        """x m, y m, psi rad."""
+        """The pose on the ground: x m, y m, psi rad."""
         T = self.T_world_vehicle
         return float(T[0, 3]), float(T[1, 3]), float(np.arctan2(T[1, 0], T[0, 0]))
 
     @property
     def tilt_rad(self) -> float:
-        """Between the vehicle's z axis and the world's."""
+        """The angle between the vehicle's z axis and the world's, rad."""
         return float(np.arccos(np.clip(self.T_world_vehicle[2, 2], -1, 1)))
 
 
 def poses_by_each(seen: Sighted) -> list[np.ndarray]:
-    """Both poses (7,) of T_world_vehicle by each marker in each camera, wxyz_xyz."""
+    """Both T_world_vehicle, (7,) wxyz_xyz each, by each marker in each camera."""
     both = np.asarray(_both(seen.rig, seen.markers, jnp.asarray(seen.corners_px)))
     return list(both[seen.visible].reshape(-1, 7))
 
@@ -237,7 +237,7 @@ def _errors(
     slots: jax.Array,
     u: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Errors of corners in their sigma, their derivatives by u, and T_world_vehicle at u."""
+    """Corner errors in sigmas, their derivatives by u, and T_world_vehicle (7,) at u."""
     flat_sigma, unravel = ravel_pytree(prior_sigma)
 
     def errors(u: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:

@@ -1,4 +1,4 @@
-"""Does the computer keep up: its clock, its scheduler, its processor's frequency, its disk."""
+"""Checks of the computer: its clock, its scheduler, its processor's frequency, its disk."""
 
 import math
 import os
@@ -18,7 +18,7 @@ _MAX_RESOLUTION_S = 1e-4
 _MAX_DRIFT_S = 1e-3  # 0.5 %: no oscillator is that bad, so somebody set the clock
 _MAX_LATE_S = 5e-3  # of a tick of 20 ms
 _CYCLE_S = 20e-3
-_MIN_CLOCK_SHARE = 0.8  # of what the processor could do
+_MIN_CLOCK_SHARE = 0.8  # of the processor's highest frequency
 _SLOW_GOVERNORS = ("powersave", "conservative", "ondemand")
 _MIB = 2**20
 _WRITTEN_MIB = 16
@@ -28,7 +28,7 @@ _LEAST_SPEED_MIB_S = 10.0  # four cameras of 820 x 410 as JPEG at 30 Hz need abo
 
 @dataclass(frozen=True)
 class Clocks:
-    """What tells the time, and waits."""
+    """The functions that tell the time and sleep."""
 
     monotonic_ns: Callable[[], int] = time.monotonic_ns
     wall_ns: Callable[[], int] = time.time_ns
@@ -36,7 +36,7 @@ class Clocks:
 
 
 def clock(clocks: Clocks | None = None) -> Iterator[Finding]:
-    """Resolution and steadiness of the clocks, and how late a thread that sleeps wakes up."""
+    """Check the clocks' resolution and steadiness, and how late a sleeping thread wakes up."""
     clocks = clocks or Clocks()
     resolution_s = _resolution_s(clocks)
     if resolution_s > _MAX_RESOLUTION_S:
@@ -73,7 +73,7 @@ def clock(clocks: Clocks | None = None) -> Iterator[Finding]:
 
 
 def _resolution_s(clocks: Clocks) -> float:
-    """The smallest step seen."""
+    """The smallest step of the monotonic clock seen, s."""
     steps = []
     for _ in range(50):
         begin_ns = now_ns = clocks.monotonic_ns()
@@ -86,7 +86,7 @@ def _resolution_s(clocks: Clocks) -> float:
 
 
 def _drift_s(clocks: Clocks) -> float:
-    """By how much the wall clock gained on the monotonic one."""
+    """The time that the wall clock gained on the monotonic one within `_DRIFT_OVER_S`, s."""
     wall_ns, monotonic_ns = clocks.wall_ns(), clocks.monotonic_ns()
     clocks.sleep(_DRIFT_OVER_S)
     return (clocks.wall_ns() - wall_ns - (clocks.monotonic_ns() - monotonic_ns)) / 1e9
@@ -102,10 +102,10 @@ def _lateness_s(clocks: Clocks) -> list[float]:
 
 
 def processor(folder: Path = Path("/sys/devices/system/cpu")) -> Iterator[Finding]:
-    """What the kernel does to the processor's frequency; nothing where it does not tell.
+    """Check whether the kernel holds the processor's frequency down, as far as it tells.
 
     Args:
-        folder: of the kernel's files, `cpu0/cpufreq/...`.
+        folder: with the kernel's files, `cpu0/cpufreq/...`.
     """
     cores = sorted(folder.glob("cpu[0-9]*/cpufreq"))
     governors = sorted({name for core in cores if (name := _text(core / "scaling_governor"))})
@@ -126,7 +126,7 @@ def processor(folder: Path = Path("/sys/devices/system/cpu")) -> Iterator[Findin
 
 
 def _share(core: Path, name: str) -> float | None:
-    """A frequency as a part of what the core could do."""
+    """A frequency as a share of the core's highest; None where the kernel does not tell."""
     value, most = _text(core / name), _text(core / "cpuinfo_max_freq")
     return float(value) / float(most) if value.isdecimal() and most.isdecimal() else None
 
@@ -143,7 +143,7 @@ def disk(
     usage: Callable[[Path], Sequence[int]] = shutil.disk_usage,
     monotonic_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Iterator[Finding]:
-    """Free space, and how fast a recording can be written.
+    """Check the free space, and how fast a recording can be written.
 
     Args:
         folder: where recordings go.

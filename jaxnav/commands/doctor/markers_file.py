@@ -1,6 +1,6 @@
-"""Does the marker map describe square markers that stand as markers do?
+"""Checks of the marker map: are its markers square, and do they hang or lie as markers do?
 
-The file is read once more as it is: where the loader refuses a marker, this says what may be meant.
+The file is read once more as it is: where the loader refuses a marker, these name the likely slip.
 """
 
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
 from jaxnav.models.markers import MarkerMap
 
-_MAX_ERROR = 0.01  # of a side, what a careful tape leaves
+_MAX_ERROR = 0.01  # of a side: a careful tape's error
 _UPRIGHT = 0.3  # the normal's vertical part, below which a marker hangs on a wall
 _TURNED_RAD = np.deg2rad(45)
 _MOST_SIZE_M = 2.0
 
 
 def measured_corners(path: Path) -> Iterator[Finding]:
-    """Corners as they were measured: a square, flat, of the size that the file says."""
+    """Check that measured corners make a flat square of the size that the file says."""
     checked = 0
     found = False
     for index, entry in enumerate(_entries(path)):
@@ -39,7 +39,7 @@ def measured_corners(path: Path) -> Iterator[Finding]:
 def _entries(path: Path) -> list[dict[str, Any]]:
     try:
         entries = read_mapping(path).get("markers")
-    except BadInput:  # whoever loads the map tells
+    except BadInput:  # the loader reports it
         return []
     if not isinstance(entries, list):
         return []
@@ -47,7 +47,7 @@ def _entries(path: Path) -> list[dict[str, Any]]:
 
 
 def _numbers(corners: Any) -> np.ndarray | None:
-    """(4, 3), None where the file holds anything else."""
+    """Corners as an array (4, 3); None where the file holds anything else."""
     try:
         array = np.array(corners, float)
     except (TypeError, ValueError):
@@ -86,7 +86,7 @@ def _square(name: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding
             f"{askew_m * 1e3:.1f} mm",
             "measure its corners again, or give T_world_marker",
         )
-    # The smallest extent of the four corners is that across their plane.
+    # The smallest extent of the four corners is the one across their plane.
     off_m = np.linalg.svd(corners_m - corners_m.mean(axis=0))[1][2] / 2
     if off_m > _MAX_ERROR * side_m:
         yield Finding(
@@ -98,7 +98,7 @@ def _square(name: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding
 
 
 def placed(markers: MarkerMap) -> Iterator[Finding]:
-    """Where markers are, which way up, and how large."""
+    """Check where the markers are, which way up, and how large."""
     corners_world_m = np.asarray(markers.corners_world_m)
     Rs_world_marker = np.asarray(markers.Ts_world_marker.as_matrix())[:, :3, :3]
     found = False

@@ -1,7 +1,7 @@
-"""Each marker by itself: are its corners in the order of the print, and does the car then stand?
+"""Checks of each marker alone: are its corners in the print's order, and is the car then level?
 
-What is printed is the truth here, and the map is on trial: the corners are tried in every order
-that a person may have written them down in.
+The print is taken as true and the map is tested: the corners are tried in every order in which a
+person may have written them down.
 """
 
 from collections.abc import Iterator
@@ -13,28 +13,28 @@ from jaxnav.commands.doctor.fits import Fit, Sighted, Unknowns, fit, poses_by_ea
 from jaxnav.files import Route
 from jaxnav.models.markers import MarkerMap
 
-# Corner i of the map is corner order[i] of the print: turned ones, and those that are counted the
-# other way round, as seen from behind.
+# Corner i of the map is corner order[i] of the print: orders that are turned, and orders that count
+# the other way round, as seen from behind.
 TURNED = tuple(tuple((k + i) % 4 for i in range(4)) for k in range(4))
 MIRRORED = tuple(tuple((k - i) % 4 for i in range(4)) for k in range(4))
 _CORNERS = ("top-left", "top-right", "bottom-right", "bottom-left")
 _FALLEN_DEG = 30.0  # no error of extrinsics tilts a car like this
 _STANDS_DEG = 15.0
-_MOST_HEIGHT_M, _MOST_TILT_DEG = 0.03, 2.0  # what tape and floor may leave
+_MOST_HEIGHT_M, _MOST_TILT_DEG = 0.03, 2.0  # errors of tape and floor
 _MAX_WORSE = 40.0  # of chi-square, by which the mirror image of a pose may explain corners worse
-_MAX_ERROR = 3.0  # times what the corners' sigma allows
+_MAX_ERROR = 3.0  # times the RMS that the corners' sigma allows
 _POSE_NUMBERS = 6
 
 
 def in_their_order(seen: Sighted, route: Route | None) -> tuple[Sighted, list[Fit], list[Finding]]:
-    """Look at each marker.
+    """Find the order of each marker's corners, and the pose of the car by that marker alone.
 
     Args:
         route: tells on which side of a marker the car may be.
 
     Returns:
         The sightings with corners as the map should have them, a pose by each marker alone, and
-        what was found.
+        the findings.
     """
     poses, findings = [], []
     for index in np.flatnonzero(seen.visible.any(axis=0)).tolist():
@@ -51,7 +51,7 @@ def in_their_order(seen: Sighted, route: Route | None) -> tuple[Sighted, list[Fi
 
 
 def standing(seen: Sighted) -> Fit:
-    """The pose anywhere by what is seen: of those that explain it, the most level one."""
+    """The most level pose, anywhere in space, among those that explain the corners."""
     anywhere = Unknowns.of_pose(seen, level=False)
     fits = [fit(seen, [start], anywhere) for start in poses_by_each(seen)]
     least = min(each.cost for each in fits)
@@ -61,7 +61,7 @@ def standing(seen: Sighted) -> Fit:
 
 
 def _best_order(seen: Sighted, index: int, route: Route | None) -> tuple[Fit, tuple[int, ...]]:
-    """The order of corners that leaves the car standing: the map's own wherever it does."""
+    """The pose and the corner order that leave the car level; the map's own order where it does."""
     alone = seen.only(index)
     behind = route is not None and _is_behind(seen.markers, index, route)
     as_written = standing(alone)
@@ -81,7 +81,7 @@ def _tilt_deg(pose: Fit) -> float:
 
 
 def _is_behind(markers: MarkerMap, index: int, route: Route) -> bool:
-    """Whether start and all waypoints lie on the side of a marker that is not printed."""
+    """Whether start and all waypoints lie on the unprinted side of a marker."""
     T = np.asarray(markers.Ts_world_marker.as_matrix())[index]
     places_m = np.array([route.start_pose[:2], *route.waypoints_m])
     return bool(np.all((places_m - T[:2, 3]) @ T[:2, 2] < 0))
@@ -127,7 +127,7 @@ def _on_ground(name: str, pose: Fit) -> Finding:
 
 
 def _square(name: str, alone: Sighted, pose: Fit) -> Iterator[Finding]:
-    """Whether the corners are those of any square at all."""
+    """Warn where the corners fit no square at all."""
     free = (alone.numbers - _POSE_NUMBERS) / alone.numbers
     allowed_px = alone.allowed_px * float(np.sqrt(free))
     if pose.error_px > _MAX_ERROR * allowed_px:

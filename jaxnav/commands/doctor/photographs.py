@@ -1,4 +1,4 @@
-"""What a picture of the standing car says of the files: `--frame CAMERA=IMAGE`."""
+"""Checks of the files by pictures of the standing car: `--frame CAMERA=IMAGE`."""
 
 import math
 from collections import Counter
@@ -15,12 +15,12 @@ from jaxnav.files import Route
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
-_MOST_MARKERS = 6  # the largest ones are held against each other
+_MOST_MARKERS = 6  # the largest ones, which are compared
 _SMALL_PX = 12.0
 
 
 def usable(rig: CameraRig, images: Mapping[str, np.ndarray]) -> Iterator[Finding]:
-    """Whether pictures have the size that their camera was calibrated at."""
+    """Report pictures of another size than their camera was calibrated at."""
     for name, image in images.items():
         width_px, height_px = rig.image_sizes_px[rig.names.index(name)]
         if image.shape[:2] != (height_px, width_px):
@@ -36,7 +36,7 @@ def usable(rig: CameraRig, images: Mapping[str, np.ndarray]) -> Iterator[Finding
 def _detections(
     rig: CameraRig, markers: MarkerMap, images: Mapping[str, np.ndarray]
 ) -> list[Detections]:
-    """All markers of the map's families in the picture of each camera that has one."""
+    """Detections of the map's families for each camera; none where it has no picture."""
     detectors = make_detectors(markers)
     return [
         Detections.concatenate(
@@ -53,7 +53,7 @@ def _detections(
 def identities(
     rig: CameraRig, markers: MarkerMap, found: Sequence[Detections]
 ) -> Iterator[Finding]:
-    """Which markers are in view, of the map and others."""
+    """Report which markers are in view, of the map and others."""
     known, foreign, twice = [], [], []
     for name, detections in zip(rig.names, found, strict=True):
         keys = list(zip(detections.ids.tolist(), detections.families, strict=True))
@@ -101,7 +101,7 @@ def _side_px(corners_px: np.ndarray) -> float:
 def examine_pictures(
     rig: CameraRig, markers: MarkerMap, route: Route | None, images: Mapping[str, np.ndarray]
 ) -> Iterator[Finding]:
-    """All that pictures of one standing car tell.
+    """Run all checks of pictures of one standing car.
 
     Args:
         images: by the names of their cameras.

@@ -1,4 +1,4 @@
-"""Do the vehicle and its cameras answer: opened, read for a moment, closed. Nothing is driven."""
+"""Checks that open the vehicle and its cameras, read them for a moment, and never drive."""
 
 import math
 import time
@@ -29,7 +29,7 @@ _OPENS_WITHIN_S = 30.0
 
 @dataclass(frozen=True)
 class Reading:
-    """One `read` of a vehicle: what it gave, when it returned, and how long it took."""
+    """One `read` of a vehicle: its odometry, when it returned, and how long it took."""
 
     odometry: Odometry
     now_ns: int
@@ -39,7 +39,7 @@ class Reading:
 def plug_ins(
     report: Report, setup: Setup, vehicle_name: str | None, cameras_name: str | None
 ) -> None:
-    """Examine what was named. What one of the two does wrong hides nothing of the other.
+    """Examine the plug-ins that were named; a failure of one hides no finding of the other.
 
     Cameras without a vehicle get one that stands still.
     """
@@ -81,7 +81,7 @@ def _open_vehicle(name: str, setup: Setup, opened: list[Vehicle]) -> Iterator[Fi
 
 
 def _guard(name: str) -> Finding:
-    """Whether `jaxnav run` would open it in the guard's process, as far as its import tells."""
+    """Report whether `jaxnav run` would open a vehicle in the guard's process, by its import."""
     guarding = GuardProcess(name)
     until_s = time.monotonic() + _OPENS_WITHIN_S
 
@@ -119,7 +119,7 @@ def _close(part: str, things: Sequence[Any]) -> Iterator[Finding]:
 
 
 def _odometry(vehicle: Vehicle, limits: Limits) -> Iterator[Finding]:
-    """Read it some times, in a thread of its own: a driver may hang."""
+    """Read the vehicle `READINGS` times, in a thread of its own as a driver may hang, and judge."""
     worker = Worker()
     readings: list[Reading] = []
     failures: list[OSError] = []
@@ -142,11 +142,11 @@ def _odometry(vehicle: Vehicle, limits: Limits) -> Iterator[Finding]:
 def judge_odometry(
     readings: Sequence[Reading], failures: Sequence[OSError], limits: Limits
 ) -> Iterator[Finding]:
-    """What is wrong with the readings of a vehicle that stands.
+    """Report what is wrong with the readings of a vehicle that stands.
 
     Args:
-        readings: in their order.
-        failures: of further attempts to read.
+        readings: in the order in which they were taken.
+        failures: the errors of further attempts to read.
     """
     if failures:
         yield Finding(
@@ -178,7 +178,7 @@ def _ages_s(readings: Sequence[Reading]) -> list[float]:
 
 
 def _rate_hz(stamps_ns: Sequence[int]) -> float:
-    """Of fresh stamps; 0 where there is one alone."""
+    """The rate of distinct stamps, Hz; 0 where there is only one."""
     fresh = sorted(set(stamps_ns))
     return (len(fresh) - 1) / max((fresh[-1] - fresh[0]) / 1e9, 1e-9) if len(fresh) > 1 else 0.0
 

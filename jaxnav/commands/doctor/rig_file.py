@@ -1,4 +1,4 @@
-"""Does the rig file describe a plausible car: places, directions and lenses of its cameras."""
+"""Checks of the rig file: are places, directions and lenses of its cameras plausible?"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,14 +17,14 @@ _SAME_PLACE_M, _SAME_DIRECTION = 0.02, np.cos(np.deg2rad(5))
 _MAX_OFF_CENTER = 0.1  # of the image's size
 _MAX_ASPECT = 1.05  # fx : fy; pixels are squares
 _FIELD_DEG = (20.0, 220.0)  # of lenses that see markers from a vehicle
-_LENS_PX = 0.5  # farther than this from its pixel a ray belongs to another one
-_ALONG = 64  # places from the centre to each corner of the image
+_LENS_PX = 0.5  # a ray that lands farther than this from its pixel belongs to another one
+_ALONG = 64  # pixels from the centre to each corner of the image
 _ROUNDED = 2e-4  # a hundredth of a degree
 _DEGREES = np.arange(360)
 
 
 def rig_file(path: Path, rig: CameraRig) -> Iterator[Finding]:
-    """All checks of a rig that was loaded from a file."""
+    """Run all checks of a rig that was loaded from a file."""
     yield Finding("rig", "ok", f"{len(rig)} cameras: {listed(rig.names)}")
     yield from rotations(path)
     yield from places(rig)
@@ -34,7 +34,7 @@ def rig_file(path: Path, rig: CameraRig) -> Iterator[Finding]:
 
 
 def rotations(path: Path) -> Iterator[Finding]:
-    """How far the matrices in the file are from rotations. Worse ones are refused on loading."""
+    """Check how far the file's matrices are from rotations; the loader refuses worse ones."""
     worst, where = 0.0, ""
     for key, T in _matrices(read_mapping(path), ""):
         R = np.asarray(T, float)[:3, :3]
@@ -53,7 +53,7 @@ def rotations(path: Path) -> Iterator[Finding]:
 
 
 def _matrices(data: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Every 4x4 in a file, with its key."""
+    """Every 4x4 matrix in a file, with its key."""
     if isinstance(data, dict):
         for name, value in data.items():
             yield from _matrices(value, f"{key}.{name}".removeprefix("."))
@@ -67,7 +67,7 @@ def _matrices(data: Any, key: str) -> Iterator[tuple[str, Any]]:
 
 
 def places(rig: CameraRig) -> Iterator[Finding]:
-    """Where the cameras are and how they are turned."""
+    """Check where the cameras are and how they are turned."""
     T = Ts_vehicle_camera(rig)
     for name, position_m, R in zip(rig.names, T[:, :3, 3], T[:, :3, :3], strict=True):
         height_m, distance_m = position_m[2], np.hypot(*position_m[:2])
@@ -115,7 +115,7 @@ def places(rig: CameraRig) -> Iterator[Finding]:
 
 
 def intrinsics(rig: CameraRig) -> Iterator[Finding]:
-    """Principal points and focal lengths against the size of the images."""
+    """Check principal points and focal lengths against the size of the images."""
     sizes_px = np.array(rig.image_sizes_px, float)
     centers_px, focals_px = np.asarray(rig.cameras.center_px), np.asarray(rig.cameras.focal_px)
     middle_px = (sizes_px - 1) / 2
@@ -160,7 +160,7 @@ def intrinsics(rig: CameraRig) -> Iterator[Finding]:
 
 
 def lenses(rig: CameraRig) -> Iterator[Finding]:
-    """Whether every pixel belongs to one ray: lens models may fold back before the corners."""
+    """Check that every pixel belongs to one ray: lens models may fold back before the corners."""
     sizes_px = np.array(rig.image_sizes_px, float)
     corners_px = (sizes_px - 1)[:, None] * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     centers_px = np.asarray(rig.cameras.center_px)[:, None]
@@ -184,7 +184,7 @@ def lenses(rig: CameraRig) -> Iterator[Finding]:
 
 
 def bearings(rig: CameraRig) -> Iterator[Finding]:
-    """In which directions along the horizon a far marker is seen, by how many cameras."""
+    """Report the bearings on the horizon at which a far marker is seen by no or by two cameras."""
     radians = np.deg2rad(_DEGREES)
     horizon = np.stack([np.cos(radians), np.sin(radians), np.zeros(len(radians))], axis=1)
     count = sees_directions(rig, horizon).sum(axis=0)
@@ -203,10 +203,10 @@ def bearings(rig: CameraRig) -> Iterator[Finding]:
 
 
 def spans(bearings: np.ndarray) -> list[tuple[int, int]]:
-    """Runs of whole degrees on the circle that are True: first and last, in (-180, 180].
+    """Runs of True on the circle: the first and last whole degree of each, in (-180, 180].
 
     Args:
-        bearings: (360,) bool, from 0 on.
+        bearings: (360,) bool, one for each degree from 0 on.
     """
     if bearings.all():
         return [(-179, 180)]

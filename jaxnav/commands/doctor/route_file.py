@@ -1,4 +1,4 @@
-"""Do vehicle and route fit each other, and are markers seen along the route?"""
+"""Checks of vehicle and route: do they fit each other, and are markers seen along the route?"""
 
 import math
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
 READABLE_PX = 12.0  # a marker this wide is read in every second picture of a car at rest
-_ALONG = 48  # places between start and end that are looked from
+_ALONG = 48  # poses along the route from which views are computed
 _LONG_BLIND_M = 1.0  # farther than this the odometer should not be trusted alone
 _NEAR_M = 0.25  # the car is about that wide
 _HIGH_M = 1.5
@@ -25,12 +25,12 @@ _LEAST_RADIUS_M = 0.05  # the estimate's own error is about that
 
 
 def turning_radius_m(vehicle: Vehicle) -> float:
-    """The smallest, of the point midway between the axles."""
+    """The smallest turning radius, m, of the point midway between the axles."""
     return 1 / float(curvature_per_m(vehicle.steering_limit_rad, vehicle.wheelbase_m))
 
 
 def vehicle_file(vehicle: Vehicle) -> Iterator[Finding]:
-    """Whether these are the figures of a small car, in the units that are meant."""
+    """Check that the figures are those of a small car, in the units that are meant."""
     top_mps = float(vehicle.throttle_limit * vehicle.speed_per_throttle_mps)
     limit_rad, wheelbase_m = float(vehicle.steering_limit_rad), float(vehicle.wheelbase_m)
     lag_s = float(vehicle.speed_time_constant_s)
@@ -68,7 +68,7 @@ def vehicle_file(vehicle: Vehicle) -> Iterator[Finding]:
 
 
 def route_file(route: Route, vehicle: Vehicle, markers: MarkerMap) -> Iterator[Finding]:
-    """Whether the waypoints can be driven to, and what stands in the way."""
+    """Check that the waypoints can be driven to, and that no marker stands in the way."""
     poses, length_m = along(route)
     radius_m, turn_m = route.waypoint_radius_m, turning_radius_m(vehicle)
     places = np.array([route.start_pose[:2], *route.waypoints_m])
@@ -126,7 +126,7 @@ def route_file(route: Route, vehicle: Vehicle, markers: MarkerMap) -> Iterator[F
 
 
 def sight_along(rig: CameraRig, markers: MarkerMap, route: Route) -> Iterator[Finding]:
-    """From where which marker is seen how large."""
+    """Check which markers are seen, and how large, from start, waypoints and along the route."""
     poses, length_m = along(route)
     arrivals = _arrivals(route)
     seen = views(rig, markers, np.concatenate([arrivals, poses]))
@@ -178,7 +178,7 @@ def _never_seen(seen: Views, markers: MarkerMap) -> Finding:
 
 
 def _from_place(rig: CameraRig, markers: MarkerMap, seen: Views, number: int) -> Finding:
-    """The best view from the start or from a waypoint."""
+    """Report the best view from the start (number 0) or from a waypoint."""
     place = "the start" if number == 0 else f"waypoint {number}"
     sides_px = seen.side_px[number]
     camera, marker = np.unravel_index(int(sides_px.argmax()), sides_px.shape)
@@ -207,7 +207,7 @@ def _from_place(rig: CameraRig, markers: MarkerMap, seen: Views, number: int) ->
 
 
 def along(route: Route) -> tuple[np.ndarray, float]:
-    """Poses (N, 3) evenly along straight lines through start and waypoints, and their length, m."""
+    """Poses (N, 3), evenly along straight lines through start and waypoints, and the length, m."""
     places = np.array([route.start_pose[:2], *route.waypoints_m], float)
     legs = np.diff(places, axis=0)
     ends_m = np.append(0, np.cumsum(np.linalg.norm(legs, axis=1)))
@@ -218,7 +218,7 @@ def along(route: Route) -> tuple[np.ndarray, float]:
 
 
 def _arrivals(route: Route) -> np.ndarray:
-    """The start, and each waypoint with the heading in which the car comes."""
+    """Poses (W + 1, 3) of the start, and of each waypoint with the heading of its leg."""
     places = np.array([route.start_pose[:2], *route.waypoints_m], float)
     legs = np.diff(places, axis=0)
     headings = [route.start_pose[2], *np.arctan2(legs[:, 1], legs[:, 0])]
@@ -226,7 +226,7 @@ def _arrivals(route: Route) -> np.ndarray:
 
 
 def _longest(flags: np.ndarray) -> int:
-    """The longest run of True."""
+    """The length of the longest run of True."""
     longest = run = 0
     for flag in flags:
         run = run + 1 if flag else 0

@@ -1,4 +1,4 @@
-"""What cameras see from where: the few compiled programs that the checks of files share."""
+"""Lenses, bearings and views of markers: the few compiled programs that checks of files share."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,13 @@ from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
-_SAME_RAY = 1e-3  # between a ray and that through its own pixel: one-to-one there
-_PIXELS = 256  # are looked through at a time, so that it is compiled once
+_SAME_RAY = 1e-3  # between a ray and the ray of its pixel, where the lens is one-to-one
+_PIXELS = 256  # in each call, so that the program is compiled once
 
 
 @jax.jit
 def _through_lens(cameras: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Rays (C, N, 3) through pixels (C, N, 2) of C cameras, and how far they miss them, px."""
+    """Rays (C, N, 3) of pixels (C, N, 2) of C cameras, and how far these miss the pixels, px."""
 
     def one(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
         rays = camera.unproject(pixels)
@@ -28,14 +28,14 @@ def _through_lens(cameras: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def through_lens(rig: CameraRig, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where pixels look.
+    """The rays of pixels, and their reprojection errors.
 
     Args:
         pixels: (C, N, 2), N up to 256.
 
     Returns:
-        Unit rays in each camera (C, N, 3), and how far the lens model sends them from their
-        pixel, (C, N) px: next to nothing where it can be inverted.
+        Unit rays in each camera (C, N, 3), and how far from its pixel the lens model projects each
+        ray, (C, N) px: next to nothing where it can be inverted.
     """
     count = pixels.shape[1]
     padded = np.pad(pixels, ((0, 0), (0, _PIXELS - count), (0, 0)), mode="edge")
@@ -59,18 +59,18 @@ def _sees_directions(rig: CameraRig, directions_vehicle: jax.Array) -> jax.Array
 
 
 def sees_directions(rig: CameraRig, directions_vehicle: np.ndarray) -> np.ndarray:
-    """Which cameras see what is far away in unit directions (N, 3) of the vehicle: (C, N) bool."""
+    """Which cameras see far objects in unit directions (N, 3) of the vehicle: (C, N) bool."""
     return np.asarray(_sees_directions(rig, jnp.asarray(directions_vehicle, float)))
 
 
 def Ts_vehicle_camera(rig: CameraRig) -> np.ndarray:
-    """(C, 4, 4)."""
+    """T_vehicle_camera of all cameras, (C, 4, 4)."""
     return np.linalg.inv(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))
 
 
 @dataclass(frozen=True)
 class Views:
-    """Every marker in every camera from P poses.
+    """Views of every marker in every camera from P poses of the vehicle.
 
     Attributes:
         side_px: (P, C, M), the side of a square of the marker's area in the image; 0 where the
@@ -96,7 +96,7 @@ def _corners(rig: CameraRig, markers: MarkerMap, poses: jax.Array) -> tuple[jax.
 
 
 def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> Views:
-    """What is seen from planar poses (P, 3): x m, y m, psi rad."""
+    """`Views` from planar poses (P, 3): x m, y m, psi rad."""
     corners_px, inside = jax.device_get(_corners(rig, markers, jnp.asarray(poses, float)))
     diagonals_px = corners_px[..., :2, :] - corners_px[..., 2:, :]
     # Clockwise as the reader sees them, and y down in the image: positive from the front.

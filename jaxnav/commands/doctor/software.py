@@ -1,4 +1,4 @@
-"""Is what jaxnav runs on there: Python packages, OpenCV, JAX, and code that is compiled already."""
+"""Checks of the software below jaxnav: Python packages, OpenCV, JAX, and the compile cache."""
 
 import importlib.metadata
 import os
@@ -17,7 +17,7 @@ _LARGE_CACHE_MIB = 2000
 
 
 def packages(distribution: str = "jaxnav") -> Iterator[Finding]:
-    """Versions of Python and of what a distribution requires, against the ranges it declares."""
+    """Check Python and the required packages against the versions that a distribution declares."""
     metadata = importlib.metadata.metadata(distribution)
     python = platform.python_version()
     if not SpecifierSet(metadata["Requires-Python"]).contains(python, prereleases=True):
@@ -58,7 +58,7 @@ def packages(distribution: str = "jaxnav") -> Iterator[Finding]:
 
 
 def opencv() -> Iterator[Finding]:
-    """Whether OpenCV has what detection and cameras use."""
+    """Check that OpenCV has what detection and cameras use."""
     import cv2
 
     from jaxnav.vehicles.opencv_cameras import has_gstreamer
@@ -85,10 +85,10 @@ def opencv() -> Iterator[Finding]:
 
 
 def jax_device(model_file: Path = _JETSON_MODEL) -> Iterator[Finding]:
-    """Where the step will run, and whether it can do so in float64.
+    """Check on which device the step will run, and that it can do so in float64.
 
     Args:
-        model_file: in which a single-board computer says what it is.
+        model_file: the file in which a single-board computer names its model.
     """
     import jax
     import jax.numpy as jnp
@@ -128,12 +128,12 @@ def _is_jetson(model_file: Path) -> bool:
 def compile_cache(
     directory: Path | None, compiled: bool | None, refused: str | None = None
 ) -> Iterator[Finding]:
-    """Whether compiled code can be kept, and whether that of the step is there.
+    """Check that compiled code can be kept, and whether the step's is there.
 
     Args:
         directory: JAX's cache; None where there is none.
         compiled: whether the step's program is in it; None where that is not known.
-        refused: why a folder for it is not used.
+        refused: why a folder for the cache is not used.
     """
     if directory is None or not os.access(_existing(directory), os.W_OK | os.X_OK):
         where = f"{directory} can't be written" if directory else "there is no folder for it"
@@ -164,5 +164,5 @@ def compile_cache(
 
 
 def _existing(path: Path) -> Path:
-    """The nearest folder that is there."""
+    """The path itself or its nearest parent that exists."""
     return next(folder for folder in (path, *path.parents) if folder.exists())

@@ -1,4 +1,4 @@
-"""Do the cameras' stamps tell when their images were taken? A recorded drive knows."""
+"""Check by a recorded drive that the cameras' stamps tell when their images were taken."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,10 +13,10 @@ _DRIVE_EIGHTS = "drive eights, or stop and start, with a marker in view of it"
 
 
 def stamps(path: Path) -> Iterator[Finding]:
-    """Each camera's delay against the odometer, by a drive that `jaxnav run --record` wrote.
+    """Report each camera's delay against the odometer in a drive that `jaxnav run --record` wrote.
 
     Raises:
-        BadInput: the recording is none, or damaged.
+        BadInput: the file is no recording, or damaged.
     """
     log = read_drive(path)
     setup = DriveSetup.of_header(log.header, path)

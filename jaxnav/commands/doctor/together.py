@@ -1,4 +1,4 @@
-"""All markers of the pictures at once: do sizes, places, lenses and cameras agree?"""
+"""Checks of all markers in the pictures at once: do sizes, places, lenses and cameras agree?"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -14,17 +14,17 @@ from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.origin import Origin
 
 _FITS = 2.0  # chi-square for each number, up to which all is well
-_SMALL_PX = 0.3  # nor is this much an error of a file
-_LEAST_SIZE = 0.03  # a size that is wrong by less is not worth a word
+_SMALL_PX = 0.3  # an RMS this small is no error of a file either
+_LEAST_SIZE = 0.03  # a smaller error of a size is not reported
 _CLEARLY = 2.0  # sigma
 
 
 def together(seen: Sighted, poses: Sequence[Fit], route: Route | None) -> Iterator[Finding]:
-    """Where the car stands, and what of the files contradicts the rest.
+    """Report where the car stands, and which part of the files contradicts the rest.
 
     Args:
         seen: corners in the order of the print.
-        poses: by each marker alone.
+        poses: the pose by each marker alone.
     """
     starts = [_on_ground(pose) for pose in poses]
     whole = fit(seen, starts, Unknowns.of_pose(seen, level=True))
@@ -77,7 +77,7 @@ def _place(whole: Fit, route: Route, origin_m: Origin) -> Finding:
 
 
 def _size_alone(seen: Sighted, starts: Sequence[np.ndarray]) -> Finding:
-    """One marker: how high it hangs above the camera tells its distance, and that its size."""
+    """Check the size of a single marker: its height over the camera tells its distance, so size."""
     size = Unknowns.of_pose(seen, level=True, size=np.full(1, SIZE_SIGMA))
     found = fit(seen, starts, size)
     logarithm, sigma = float(found.value.size[0]), float(found.sigma.size[0])

@@ -1,1 +1,1 @@
-"""A car that drives, and recorded drives."""
+"""Commands for a car that drives, and for recorded drives."""

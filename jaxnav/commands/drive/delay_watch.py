@@ -1,4 +1,4 @@
-"""Whether the cameras' stamps tell the truth: while a car drives, and of a recorded drive."""
+"""Checks of the cameras' stamps, while a car drives and in a recorded drive."""
 
 import math
 import sys
@@ -17,19 +17,19 @@ from jaxnav.models.origin import opposite, planar_in_world
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_setup import DriveSetup
 
-# The compiler can not be cut short, and the vehicle stands already.
+# The compiler can't be interrupted, and the vehicle already stands.
 _CLOSE_S = 20.0
 
 
 class DelayWatch:
     """Warns once when a camera is later than its stamps say; see `Onlooker`.
 
-    What takes milliseconds is done by a thread of its own, beside whoever drives.
+    Work that takes milliseconds is done in a thread of its own, beside the loop.
     """
 
     def __init__(self, setup: DriveSetup, warns: bool):
         """Args:
-        warns: on the terminal, when it is found.
+        warns: on the terminal, as soon as a camera is found to be late.
         """
         self._setup, self._warns = setup, warns
         self._delays = CameraDelays(setup.rig, setup.markers, setup.vehicle)
@@ -78,7 +78,7 @@ class DelayWatch:
 
 
 def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
-    """A line for each camera whose stamps are surely wrong, or one for all of them."""
+    """A line for each camera whose stamps are surely wrong, or one line for all cameras."""
     found, together = delays.found, delays.together
     known = [one for one in found if one.known]
     if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
@@ -97,7 +97,7 @@ def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
 
 
 def told(delay: Delay) -> str:
-    """`48 +- 6 ms later than its stamps say`."""
+    """A delay as text: `48 +- 6 ms later than stamps say`."""
     way = "later" if delay.delay_s > 0 else "earlier"
     off_ms, sigma_ms = abs(delay.delay_s) * 1e3, max(delay.sigma_s * 1e3, 1.0)
     return f"{off_ms:.0f} +- {sigma_ms:.0f} ms {way} than stamps say"
@@ -109,7 +109,7 @@ def _agree(one: Delay, together: Delay) -> bool:
 
 
 def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
-    """What a recorded drive tells of its cameras' stamps."""
+    """The delays of the cameras in a recorded drive."""
     delays = CameraDelays(setup.rig, setup.markers, setup.vehicle)
     corrections = Corrections.of(setup.vehicle)
     frames = Frames(len(setup.rig), setup.markers, setup.corner_sigma_px)

@@ -1,4 +1,4 @@
-"""`jaxnav faults`: the fault matrix as a table."""
+"""`jaxnav faults`: drive with every fault of the matrix, and print a table."""
 
 from tqdm import tqdm
 
@@ -14,7 +14,7 @@ EXIT_BROKEN = 1
 
 
 def run(args: Faults) -> int:
-    """Drive with every fault, print what came of it; 1 where a promise was not kept."""
+    """Drive with every fault and print the results; 1 where a promise was not kept."""
     configure_jax(float64=args.float64, threads=1)
     qcar = calib_dir() / "qcar"
     trial = Trial(

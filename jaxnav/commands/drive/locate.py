@@ -1,4 +1,4 @@
-"""`jaxnav locate`: the markers of a photograph, both poses of each."""
+"""`jaxnav locate`: find the markers in a photograph, with both poses of each."""
 
 import json
 from typing import Any
@@ -26,7 +26,7 @@ from jaxnav.pose.observation import Observation, Snapshot
 
 
 def run(args: Locate) -> int:
-    """Detect, solve, print, and draw where asked to."""
+    """Detect markers, solve for their poses, print them and, with --out, draw them."""
     configure_jax(float64=True)
     detector = make_detector(args.corner_backend, args.family)
     camera, image_size_px = load_camera(args.camera, args.camera_name)
@@ -60,7 +60,7 @@ def run(args: Locate) -> int:
 
 @jax.jit
 def _solve(rig: CameraRig, markers: MarkerMap, obs: Observation) -> tuple[Candidates, jax.Array]:
-    """Both poses of one marker, and the probability that the better one is the mirrored one."""
+    """Both poses of one marker, and the probability that the better one is the mirror image."""
     snapshot = Snapshot.create(rig, markers, obs)
     candidates = find_candidates(snapshot, max_steps=32)
     prior = ConstantVelocity().poses(ConstantVelocity().init())

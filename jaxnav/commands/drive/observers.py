@@ -1,4 +1,4 @@
-"""Who looks on while `jaxnav run` drives: the recording, Rerun's window, the status line.
+"""Observers of `jaxnav run`: the recording, Rerun's window, the delay watch, the status line.
 
 None of them waits for a disk or a screen, and none raises: see `Observer`.
 """
@@ -27,27 +27,27 @@ if TYPE_CHECKING:
     from jaxnav.viewer.rerun_view import RerunView
 
 _STATUS_NS = 200_000_000
-_MARKER_NS = 200_000_000  # for so long after a marker it counts as seen
+_MARKER_NS = 200_000_000  # a marker counts as seen for this long
 
 
 class Onlooker(Observer, Protocol):
-    """An observer of a command: it is closed, and then says in a line what came of it."""
+    """An observer that a command closes after the drive, and that then sums up in a line."""
 
     def close(self) -> None:
-        """Bring what it does to an end."""
+        """End its work."""
         ...
 
     @property
     def told(self) -> str | None:
-        """For the person; None: nothing to say."""
+        """A summary to print; None without one."""
         ...
 
 
 def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onlooker]:
-    """Those that the arguments ask for.
+    """Open the observers that the arguments ask for.
 
     Args:
-        closing: closes them.
+        closing: closes them in the end.
 
     Raises:
         BadInput: the file can't be written, Rerun is missing or its window does not open.
@@ -61,7 +61,7 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     if args.record is not None:
         add(Recording(args.record, setup, args.record_images))
     if args.view:
-        from jaxnav.viewer.rerun_view import RerunView  # with all that draws
+        from jaxnav.viewer.rerun_view import RerunView  # imports all that draws
 
         waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
         add(View(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
@@ -72,11 +72,11 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
 
 
 class Recording:
-    """What the loop does, into a file."""
+    """An observer that records the loop's inputs and outcomes into a file."""
 
     def __init__(self, path: Path, setup: DriveSetup, images: bool):
         """Args:
-        images: the cameras' images too, as JPEG.
+        images: whether to record the cameras' images too, as JPEG.
 
         Raises:
             BadInput: the file can't be written.
@@ -88,7 +88,7 @@ class Recording:
 
     @property
     def faults(self) -> Fault:
-        """What it can't do any more."""
+        """Faults of the recording: messages dropped since the last call, or that it has failed."""
         found = Fault(0)
         if self._recorder.dropped > self._dropped:
             self._dropped, found = self._recorder.dropped, Fault.RECORDER_BEHIND
@@ -106,7 +106,7 @@ class Recording:
             self._recorder.image(f"/camera/{name}", frame.stamp_ns, frame.image)
 
     def close(self) -> None:
-        """See `Onlooker`. A drive that was called off leaves no file."""
+        """See `Onlooker`. A drive without a message leaves no file."""
         self._recorder.close(keep_empty=False)
 
     @property
@@ -119,13 +119,13 @@ class Recording:
 
 
 class View:
-    """What the loop does, in Rerun's window. That it is closed is no fault of the vehicle's."""
+    """An observer that shows outcomes in Rerun's window; a closed window is no fault."""
 
     faults = Fault(0)
 
     def __init__(self, view: "RerunView"):
         """Args:
-        view: a live one.
+        view: a live view.
         """
         self._view = view
 
@@ -153,7 +153,7 @@ class View:
 
 
 class StatusLine:
-    """One line in the terminal, five times a second."""
+    """An observer that writes one line in the terminal, five times a second."""
 
     faults = Fault(0)
     told: str | None = None

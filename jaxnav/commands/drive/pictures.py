@@ -16,19 +16,19 @@ from jaxnav.plots.drive import drive_log_report
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.plausible import left_out, plausible
 
-_LONGEST_STEP_S = 1.0  # between readings, for the distance: beyond it nobody knows
+_LONGEST_STEP_S = 1.0  # between two readings, for the distance; a longer gap counts as this
 
 
 def is_recording(path: Path) -> bool:
-    """Whether it is called like a recorded drive."""
+    """Whether a path has the suffix of a recorded drive, .mcap."""
     return path.suffix.lower() == ".mcap"
 
 
 def read_outcomes(path: Path, headless: bool) -> DriveLog:
-    """A recorded drive that there is something to show of.
+    """Read a recorded drive that has outcomes to show.
 
     Raises:
-        BadInput: not such a file, damaged, or without outcomes.
+        BadInput: the file is no recorded drive, damaged, or without outcomes.
     """
     log = read_shown(path, headless)
     if not len(log.outcomes.now_ns):
@@ -37,7 +37,7 @@ def read_outcomes(path: Path, headless: bool) -> DriveLog:
 
 
 def draw_drive(args: Arguments) -> int:
-    """Write drive.png, and print what happened."""
+    """Write drive.png, and print a summary of the drive."""
     log = read_outcomes(args.store, args.headless)
     outcomes, odd = plausible(log.outcomes)
     log = replace(log, outcomes=outcomes)
@@ -52,10 +52,10 @@ def draw_drive(args: Arguments) -> int:
 
 
 def summary_lines(log: DriveLog) -> list[str]:
-    """Duration, distance, shares of health by time, faults and rejects, restarts, what is missing.
+    """Lines with duration, distance, health by time, faults, rejects, restarts, and gaps.
 
     Args:
-        log: with one outcome at least.
+        log: a drive with at least one outcome.
     """
     outcomes = log.outcomes
     count, duration_s = len(outcomes.now_ns), float(outcomes.times_s[-1])
@@ -84,7 +84,7 @@ def summary_lines(log: DriveLog) -> list[str]:
 
 
 def distance_m(log: DriveLog) -> float:
-    """How far the vehicle drove, forwards and backwards, by what its odometer said."""
+    """The distance, m, that the vehicle drove forwards and backwards, by its odometer."""
     readings = [
         given.odometry
         for given in log.inputs

@@ -1,4 +1,4 @@
-"""`jaxnav replay`: a recorded rig localised in every frame, or a drive driven again."""
+"""`jaxnav replay`: localise a recorded rig in every frame, or drive a recorded drive again."""
 
 import dataclasses
 from typing import Any
@@ -29,11 +29,11 @@ from jaxnav.navigator import Navigator
 from jaxnav.plots.localisation import localisation_report
 
 DEFAULT_SELECTOR: Selector = "multi-hypothesis"
-SETTLED_FRAMES = 5  # of an appearance: a choice made later has had a history
+SETTLED_FRAMES = 5  # of a marker in view; a choice made later can use a history
 
 
 def run(args: Arguments) -> int:
-    """Localise, write the trajectory, and measure it where there is a reference."""
+    """Localise the rig, write the trajectory, and its errors where there is a reference."""
     if replay_drive.is_for(args):
         return replay_drive.run(args)
     args = dataclasses.replace(args, selector=args.selector or DEFAULT_SELECTOR)
@@ -48,7 +48,7 @@ def run(args: Arguments) -> int:
         recording = recording.first(args.limit)
     if not len(recording):
         raise BadInput(args.recording, "holds no frame")
-    if params is not None:  # bad input shows before the folder is made
+    if params is not None:  # raises on bad input before the folder is made
         apply_params(Navigator(recording.rig, recording.markers), params)
     out = output_folder(args.out)
     if params is not None:
@@ -78,7 +78,7 @@ def run(args: Arguments) -> int:
 
 
 def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str, Any]:
-    """Counts, speed and, against a reference, errors and branches."""
+    """The content of summary.json: counts, speed and, with a reference, errors and branches."""
     summary: dict[str, Any] = {
         "recording": recording.name,
         "markers": args.markers,
@@ -122,7 +122,7 @@ def _spread(values: np.ndarray) -> dict[str, float]:
 
 
 def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None:
-    """One TUM file; one for each marker where every marker has a track of its own."""
+    """Write one TUM file, or one for each marker where every marker has a track of its own."""
     stamps_s = recording.stamps_ns / 1e9
     for track in range(result.seen.shape[1]):
         name = "trajectory"

@@ -1,4 +1,4 @@
-"""`jaxnav replay` of a drive: the pilot at its recorded inputs, held against what was recorded."""
+"""`jaxnav replay` of a drive: run the pilot on recorded inputs, and compare its outcomes."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -59,7 +59,7 @@ def is_for(args: Arguments) -> bool:
     """Whether a recording is a drive.
 
     Raises:
-        BadInput: flags that do not go with it.
+        BadInput: a flag that does not go with such a recording.
     """
     path = args.recording
     if args.topics is not None or profile_of(path) == PROFILE:
@@ -77,7 +77,7 @@ def is_for(args: Arguments) -> bool:
 
 
 def run(args: Arguments) -> int:
-    """Drive again, compare, and write what came of it."""
+    """Drive again, compare, write a summary and the trajectory; 1 where outcomes differ."""
     params = None if args.params is None else load_params(args.params)
     load = _own_drive if args.topics is None else _ros_drive
     log, setup, inputs = load(args, params)
@@ -186,7 +186,7 @@ def _replayed(
         if args.record:
             path = args.out / "replay.mcap"
             beside = closing.enter_context(atomic_path(path))
-            # Nobody drives, so nothing need be left out.
+            # No car waits for this replay, so that the queue may hold every message.
             recorder = Recorder(beside, setup.header(), queue_messages=2 * len(inputs) + 1)
             closing.callback(recorder.close, timeout_s=60.0)
         bar = closing.enter_context(tqdm(total=len(inputs), unit="input", disable=args.headless))
@@ -212,7 +212,7 @@ def _picture(setup: DriveSetup, track: Track, recorded: Outcomes | None, title: 
     recorded_m, drawn = None, {}
     if recorded is not None:
         shift_m, turn_rad = track.off(recorded)
-        # On a logarithmic axis nothing is the least that is drawn.
+        # A logarithmic axis shows no zero: 1e-9 stands for it.
         drawn = {
             "position off (m)": np.maximum(shift_m, 1e-9),
             "heading off (deg)": np.maximum(np.rad2deg(turn_rad), 1e-9),

@@ -1,6 +1,6 @@
-"""`jaxnav run`: the loop that drives, with all that looks on.
+"""`jaxnav run`: run the loop that drives, with its observers.
 
-Every step of the start asks whether a signal has come, and arming above all: see `Signals`.
+Every step of the start checks whether a signal has come, arming above all: see `Signals`.
 """
 
 import gc
@@ -41,13 +41,13 @@ EXIT_STOPPED = 1  # by the watchdog, not by a person
 
 @before_others()
 def run(args: Run, signals: Signals) -> int:
-    """Drive, and say why it ended.
+    """Drive, and print why the drive ended.
 
     Args:
         signals: of the process, since its first line.
 
     Raises:
-        Interrupted: a signal came before it drove.
+        Interrupted: a signal came before the drive began.
     """
     configure_jax(float64=args.float64, threads=1)
     keep_in(step_folder())
@@ -65,7 +65,7 @@ def run(args: Run, signals: Signals) -> int:
         guarding = _guarding(args)
         if guarding is not None:
             closing.callback(guarding.end)
-            guarding.prepare(signals.check)  # what is wrong with it is said before it compiles
+            guarding.prepare(signals.check)  # its errors are reported before anything is compiled
         searches = _searches(args, setup)
         onlookers = open_onlookers(args, setup, closing)
         signals.check()
@@ -96,8 +96,8 @@ def _options(given: Sequence[str]) -> dict[str, str]:
 
 
 def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
-    """Read all files and find all plug-ins first: bad input is found before anything is compiled,
-    let alone moves."""
+    """Read all files and find all plug-ins before anything is compiled or moves, so that bad input
+    is found first."""
     factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
     plugins.find("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
     own = factory.own_files(options) if isinstance(factory, HasOwnFiles) else None
@@ -120,7 +120,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
 
 
 def _guarding(args: Run) -> GuardProcess | None:
-    """The process that will own the vehicle; None where its plug-in wants to stay in this one."""
+    """The process that will own the vehicle; None where its plug-in must stay in this one."""
     factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
     if isinstance(factory, SharesProcess) and factory.shares_process:
         return None
@@ -132,14 +132,14 @@ def _guarding(args: Run) -> GuardProcess | None:
 
 
 def _searches(args: Run, setup: DriveSetup) -> list[Search]:
-    """One for each camera."""
+    """A search for markers for each camera."""
     detectors = make_detectors(setup.markers, args.corner_backend)
-    rig = jax.device_get(setup.rig)  # of which NumPy takes a camera without compiling anything
+    rig = jax.device_get(setup.rig)  # NumPy indexes its cameras without compiling anything
     return [Search(c, rig.image_sizes_px[c], rig.camera(c), detectors) for c in range(len(rig))]
 
 
 def _compiled(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot:
-    """A pilot that need not compile any more, nor need those who look for markers."""
+    """A pilot and searches that are compiled and warmed up; returns the pilot."""
     _say(args, "compiling")
     began_s = time.monotonic()
     with ThreadPoolExecutor(1) as beside:
@@ -152,11 +152,11 @@ def _compiled(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot
 
 
 class _Drive:
-    """What moves, from opening it to letting go of it.
+    """One drive, from opening the vehicle and its cameras to closing them.
 
     Attributes:
-        kept_by: who stops the vehicle whatever happens here, in words.
-        unheard: why the vehicle may not have heard the last stop; None: it has.
+        kept_by: in words, the guard that stops the vehicle whatever happens here.
+        unheard: why the vehicle may not have heard the last stop; None where it has.
     """
 
     loop: Loop
@@ -165,18 +165,18 @@ class _Drive:
     unheard: str | None = None
 
     def __init__(self, args: Run, told: Setup, guarding: GuardProcess | None, signals: Signals):
-        """Nothing is opened yet.
+        """Open nothing yet.
 
         Args:
-            guarding: the process for the vehicle; None: it stays in this one.
+            guarding: the process for the vehicle; None keeps it in this one.
         """
         self._args, self._told, self._guarding, self._signals = args, told, guarding, signals
 
     def run(self, pilot: Pilot, searches: list[Search], onlookers: Sequence[Observer]) -> str:
-        """Open, drive, stop, and let go. Returns why it ended."""
+        """Open, drive, stop and close; return why the drive ended."""
         args, signals = self._args, self._signals
         with ExitStack() as closing:
-            # Python looks through all objects now and then: not through those of JAX, 50 ms a time.
+            # Else the garbage collector goes through JAX's objects now and then, 50 ms a time.
             gc.freeze()
             closing.callback(gc.unfreeze)
             signals.hold()
@@ -187,14 +187,14 @@ class _Drive:
             cameras = plugins.open_cameras(args.cameras or args.vehicle, self._told, vehicle)
             self.eyes = Eyes(cameras, searches, guard, workers=max(1, os.cpu_count() or 1))
             closing.callback(self.eyes.close)
-            # Before the eyes are closed, for which their threads may take a while.
+            # The guard trips before the eyes are closed, which their threads may delay.
             closing.callback(guard.trip, "the drive is over")
             self.loop = Loop(pilot, guard, vehicle, self.eyes, onlookers, args.period_s)
             signals.check()
             return self.loop.run(args.duration_s if args.duration_s is not None else float("inf"))
 
     def _guarded(self, limits: Limits) -> tuple[Vehicle, Guard]:
-        """The vehicle, in a process of its own where that can be, and the guard of this one."""
+        """The vehicle, in a process of its own where possible, and the guard of this process."""
         args, why = self._args, "it shares its process"
         if self._guarding is not None:
             moved = self._guarding.open(self._told, limits, args.timeout_s, self._signals.check)

@@ -1,4 +1,4 @@
-"""How a drive goes, in one line of the terminal."""
+"""The status line of a drive in the terminal, and notices of faults."""
 
 import math
 
@@ -14,17 +14,17 @@ _FAR = 12  # of a coordinate to the cm, 10 000 km from zero
 def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen: bool) -> str:
     """Rate, latency, health, marker, flip probability, position, command: at most 100 characters.
 
-    Far from the world's zero a position takes up more of them, and the units are left out.
+    Far from the world's origin a position takes up more of them, and the units are left out.
 
         30 Hz   4.2 ms OK             marker flip  0.1% x  1.83 y -0.79 m 124 deg thr  0.037 ...
 
-    Every column has its place, so that the eye finds it again in the next line. What does not fit
-    into its column is shown as `#`, what is no number as `?`, a pose before the first as `-`.
+    Every column has its place, so that the eye finds it again in the next line. A number that does
+    not fit its column is shown as `#`, one that is not finite as `?`, and no pose yet as `-`.
 
     Args:
-        rate_hz: of what the caller counts, outcomes or frames.
+        rate_hz: of the outcomes or frames that the caller counts.
         latency_ms: from an exposure to its command.
-        marker_seen: of late.
+        marker_seen: whether a marker was seen lately.
     """
     output, far = outcome.output, outcome.origin_m != ZERO
     x_m, y_m, psi_rad = (float(value) for value in outcome.pose)
@@ -60,7 +60,7 @@ def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen
 
 
 def _fixed(value: float, width: int, decimals: int) -> str:
-    """A number in so many characters, whatever it is."""
+    """A number in exactly `width` characters, `#` or `?` where it can't be shown."""
     if not math.isfinite(value):
         return f"{'?':>{width}}"
     shown = f"{value:{width}.{decimals}f}"
@@ -68,7 +68,7 @@ def _fixed(value: float, width: int, decimals: int) -> str:
 
 
 def notice(outcome: Outcome, before: Fault) -> str | None:
-    """What a person should hear of when it begins; None: nothing did.
+    """A notice of faults that a person should hear of as they begin; None without one.
 
     Args:
         before: the faults of the outcome before.

@@ -1,4 +1,4 @@
-"""What is kept of a drive that is driven again: where it was, and what was wrong."""
+"""The track of a drive that is driven again: its poses, health and faults."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from jaxnav.recording.drive_log import Outcomes
 
 
 class Row(NamedTuple):
-    """Of one outcome; its bank of hypotheses is let go."""
+    """The kept part of one outcome, without its bank of hypotheses."""
 
     now_ns: int
     pose: np.ndarray  # (3,), x_m y_m psi_rad
@@ -28,7 +28,7 @@ class Row(NamedTuple):
 
     @staticmethod
     def of(outcome: Outcome) -> "Row":
-        """What is kept of it."""
+        """The kept part of an outcome."""
         output = outcome.output
         return Row(
             outcome.now_ns,
@@ -46,37 +46,37 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Track:
-    """N rows, one after the other."""
+    """A track of N rows in the order of their outcomes."""
 
     rows: Sequence[Row]
 
     @property
     def now_ns(self) -> np.ndarray:
-        """(N,)."""
+        """When each input reached the pilot, (N,) ns."""
         return np.array([row.now_ns for row in self.rows], np.int64)
 
     @property
     def times_s(self) -> np.ndarray:
-        """(N,), since the first."""
+        """Times since the first row, (N,) s."""
         return np.asarray((self.now_ns - self.rows[0].now_ns) / 1e9)
 
     @property
     def located(self) -> np.ndarray:
-        """(N,) bool."""
+        """Whether each outcome has a pose, (N,) bool."""
         return np.array([row.located for row in self.rows])
 
     @property
     def Ts_world_vehicle(self) -> np.ndarray:
-        """(N, 7) wxyz_xyz."""
+        """Poses of the vehicle, (N, 7) wxyz_xyz."""
         return np.stack([row.T_world_vehicle for row in self.rows])
 
     @property
     def positions_m(self) -> np.ndarray:
-        """(N, 3), NaN where not located."""
+        """Positions of the vehicle, (N, 3) m, NaN where not located."""
         return np.where(self.located[:, None], self.Ts_world_vehicle[:, 4:], np.nan)
 
     def summary(self) -> dict[str, Any]:
-        """Counts of what was wrong, shares of all outcomes, and how it ended."""
+        """Counts of faults and rejects, shares of health, and the last pose and restarts."""
         healths = Counter(row.health.name for row in self.rows)
         last = self.rows[-1]
         return {
@@ -93,7 +93,7 @@ class Track:
         }
 
     def off(self, recorded: Outcomes) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) m and (N,) rad from the recorded track, NaN where either was not located."""
+        """Distances (N,) m and (N,) rad to the recorded track, NaN where either has no pose."""
         index = np.searchsorted(recorded.now_ns, self.now_ns)
         known = index < len(recorded.now_ns)
         index = np.where(known, index, 0)

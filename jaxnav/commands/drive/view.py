@@ -1,4 +1,4 @@
-"""`jaxnav view`: a recorded drive in Rerun, or as a file for it."""
+"""`jaxnav view`: show a recorded drive in Rerun, or write a file for it."""
 
 from contextlib import ExitStack
 
@@ -42,7 +42,7 @@ def run(args: Arguments) -> int:
 
 
 def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool) -> None:
-    """All outcomes, all frames, all images."""
+    """Show all outcomes, all frames and all images of a drive in a view."""
     outcomes, odd = plausible(log.outcomes)
     if odd:
         print(left_out(odd))

@@ -1,1 +1,1 @@
-"""Simulated cars."""
+"""Commands that simulate cars."""

@@ -40,11 +40,11 @@ METHOD_A = "method_a_kf"
 LABELS = {OURS: "our method", METHOD_A: "Method A + KF"}
 START_SPREAD = np.array([0.05, 0.05, np.deg2rad(5.0)])  # around the route's start, m m rad
 MOSAIC_ROWS = 3
-KEEP_EVERY = 8  # of so many frames one keeps its images, for the mosaic
+KEEP_EVERY = 8  # one of this many frames keeps its images, for the mosaic
 
 
 def run(args: Demo) -> int:
-    """Drive, report, and say in one line how it went."""
+    """Drive with every seed, write reports, and print a line for each drive."""
     configure_jax(float64=True, threads=1)
     world = World.load(args)
     navigators = {
@@ -73,18 +73,18 @@ def run(args: Demo) -> int:
 
 @dataclass(frozen=True)
 class Record:
-    """A finished drive."""
+    """A finished drive: its N frames, and the images that were kept."""
 
     frames: list[Frame]
     kept: dict[int, list[np.ndarray]]  # frame number -> images
 
     @property
     def true_poses(self) -> np.ndarray:
-        """(N, 3)."""
+        """True planar poses (N, 3): x m, y m, psi rad."""
         return np.array([frame.true_pose for frame in self.frames])
 
     def poses(self, method: str) -> np.ndarray:
-        """(N, 3), NaN before the first pose."""
+        """A method's planar poses (N, 3): x m, y m, psi rad; NaN where it has none."""
         outputs = [frame.outputs[method] for frame in self.frames]
         return np.array([o.pose if o.located else np.full(3, np.nan) for o in outputs])
 

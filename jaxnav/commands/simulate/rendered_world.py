@@ -1,4 +1,4 @@
-"""The world of a demo: its files as objects, and cameras that look at the rendered scene."""
+"""The world of a demo: objects built from its files, and cameras that render the scene."""
 
 from dataclasses import dataclass, field
 
@@ -39,7 +39,7 @@ FLOOR_M = 5.0  # side of the floor around start, waypoints and markers, at least
 
 @dataclass(frozen=True)
 class World:
-    """The files of a demo as objects, and the cameras that look at the scene."""
+    """The objects of a demo, built from its files, with a renderer and marker detectors."""
 
     rig: CameraRig
     markers: MarkerMap
@@ -93,7 +93,7 @@ class World:
         return navigator if self.params is None else apply_params(navigator, self.params)
 
     def floor_m(self) -> tuple[float, float, float, float]:
-        """The part of the map the car may use: x_min, x_max, y_min, y_max."""
+        """The floor that the car may use: x_min, x_max, y_min, y_max, m."""
         points = np.vstack(
             [
                 self.route.waypoints_m,
@@ -109,17 +109,17 @@ class World:
 
 @dataclass
 class Cameras:
-    """Rendered images, searched for markers around the driver's belief and everywhere else."""
+    """Cameras whose rendered images are searched around the driver's belief and everywhere else."""
 
     world: World
     rng: np.random.Generator
-    corner_noise_px: float = 0.0  # on top of what detection leaves
+    corner_noise_px: float = 0.0  # on top of the detection's errors
     images: list[np.ndarray] = field(default_factory=list)  # the latest, one a camera
 
     def look(
         self, T_world_vehicle_at: PoseAt, stamp_s: float, believed: Output | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corners, visibility and sigma of one instant."""
+        """Corners (C, M, 4, 2), visibility (C, M) and sigmas (C, M, 4) at one instant."""
         world = self.world
         self.images = world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)
         predicted_px, expected = self._predicted(believed)
@@ -146,7 +146,7 @@ class Cameras:
 
 @jax.jit
 def _expect(rig: CameraRig, markers: MarkerMap, pose: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where each marker should appear from a pose, (C, M, 4, 2), and whether it should, (C, M)."""
+    """Expected corners (C, M, 4, 2) from a pose, and whether each marker is in view, (C, M)."""
     T_vehicle_world = T_world_vehicle_from_planar(jnp.asarray(pose)).inverse()
     corners_world_m = markers.corners_world_m
     return (

@@ -15,7 +15,7 @@ from jaxnav.simulation.scenarios import Scenario
 
 
 class _Files(Protocol):
-    """Whatever names a car's files; None is the QCar's."""
+    """Arguments that name a car's files; None stands for the QCar's."""
 
     @property
     def rig(self) -> Path | None: ...
@@ -27,7 +27,7 @@ class _Files(Protocol):
 
 @dataclass(frozen=True)
 class ScenarioCar:
-    """What all drives have in common, whatever happens in them."""
+    """The rig, markers, vehicle and parameters that all scenarios share."""
 
     rig: CameraRig
     markers: MarkerMap
@@ -36,10 +36,10 @@ class ScenarioCar:
 
     @staticmethod
     def load(files: _Files, params: Params | None = None) -> "ScenarioCar":
-        """A car as its files say.
+        """Load a car from its files.
 
         Raises:
-            BadInput: a file that is no good.
+            BadInput: a file that is not valid.
         """
         qcar = calib_dir() / "qcar"
         return ScenarioCar(
@@ -50,7 +50,7 @@ class ScenarioCar:
         )
 
     def navigator(self, scenario: Scenario, selector: Selector) -> Navigator:
-        """What drives in a scenario. Parameters go before what the scenario tells.
+        """The navigator for a scenario; parameters override what the scenario tells.
 
         Raises:
             BadInput: a parameter that does not fit it.

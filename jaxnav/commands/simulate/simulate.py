@@ -1,4 +1,4 @@
-"""`jaxnav simulate`: many closed-loop drives at corner level, counted."""
+"""`jaxnav simulate`: statistics of many closed-loop drives at corner level."""
 
 import itertools
 import math
@@ -43,7 +43,7 @@ def _run(args: Arguments) -> int:
     print(_HEADER)
     for name, noise_px in wanted:
         key = _key(args, car, name, noise_px)
-        # A result of a version that knew no parameters had none.
+        # A result of a version without parameters has no such key.
         found = [one for one in done if {"params": None} | one["run"] == key]
         result = found[0] if found else {"run": key} | _drive(args, car, key)
         if not found:
@@ -58,19 +58,19 @@ def _run(args: Arguments) -> int:
 def _load(args: Arguments) -> ScenarioCar:
     params = None if args.params is None else load_params(args.params)
     car = ScenarioCar.load(args, params)
-    _navigator(car, args.scenario, "multi-hypothesis", told_noise_px=1.0)  # bad input shows
+    _navigator(car, args.scenario, "multi-hypothesis", told_noise_px=1.0)  # raises on bad input
     return car
 
 
 def _navigator(car: ScenarioCar, scenario: str, selector: str, told_noise_px: float) -> Navigator:
-    """What drives, and takes its corners for so good whatever its parameters say."""
+    """The navigator, with the told corner sigma whatever its parameters say."""
     navigator = car.navigator(scenarios()[scenario], make_selector(selector))
     told_sigma_px = jnp.asarray(told_noise_px, navigator.corner_sigma_px.dtype)
     return eqx.tree_at(lambda n: n.corner_sigma_px, navigator, told_sigma_px)
 
 
 def _drive(args: Arguments, car: ScenarioCar, key: dict[str, Any]) -> dict[str, Any]:
-    """All drives of one row of the table."""
+    """Run all drives of one row of the table, and return their summary."""
     name, noise_px = key["selector"], key["corner_noise_px"]
     scenario = scenarios()[args.scenario]
     navigator = _navigator(car, args.scenario, name, key["told_noise_px"])
@@ -88,7 +88,7 @@ def _drive(args: Arguments, car: ScenarioCar, key: dict[str, Any]) -> dict[str, 
 
 
 def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[str, Any]:
-    """What a result belongs to."""
+    """The settings that identify a result."""
     told_noise_px = noise_px
     if car.params is not None and "corner_sigma_px" in car.params.values:
         told_noise_px = float(car.params.values["corner_sigma_px"])
@@ -125,20 +125,20 @@ def _resumed(args: Arguments) -> list[dict[str, Any]]:
 
 
 class _Measure(ForeignEntry):
-    """A number, null where there was none."""
+    """A measured number; null where there is none."""
 
     value: Annotated[float, Field(strict=True)] | None
 
 
 class _Quantiles(ForeignEntry):
-    """Of a distribution."""
+    """Quantiles of a distribution."""
 
     median: _Measure
     p95: _Measure
 
 
 class _Kept(ForeignEntry):
-    """What is read of a row of an earlier result."""
+    """The part that is read of a row of an earlier result."""
 
     run: dict[str, Any]
     success_rate: _Measure

@@ -1,1 +1,1 @@
-"""Monte-Carlo studies, and pictures of them."""
+"""Commands for Monte-Carlo studies, and for pictures of them."""

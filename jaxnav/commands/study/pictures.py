@@ -1,4 +1,4 @@
-"""`jaxnav plot STORE`: pictures of a study."""
+"""`jaxnav plot STORE`: draw pictures of a study."""
 
 import itertools
 from collections.abc import Iterator
@@ -45,7 +45,7 @@ _MAX_PICTURES = 24  # of one sort
 
 
 def draw_study(args: Arguments) -> int:
-    """Sum up what is there, draw it, say what is missing."""
+    """Summarise the stored trials, draw them, and print how many are missing."""
     with tqdm(unit="trial", unit_scale=True, disable=args.headless, leave=False) as bar:
         kind, done, summary = summary_of(args.store, bar)
         total = int(bar.total or 0)
@@ -81,7 +81,7 @@ def draw_study(args: Arguments) -> int:
 
 
 def _first_of(summary: xr.Dataset, taken: tuple[str | None, ...]) -> str | None:
-    """The axis that is left for panels or lines: the selectors, else the shortest one."""
+    """The remaining axis for panels or lines: the selectors, else the shortest one."""
     left = [
         str(name)
         for name in summary.coords

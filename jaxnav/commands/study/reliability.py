@@ -1,4 +1,4 @@
-"""`jaxnav reliability`: whether flip probabilities mean what they say, as a diagram."""
+"""`jaxnav reliability`: compare flip probabilities with observed flips in a diagram."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from jaxnav.simulation.statistics import Reliability
 
 
 def run(args: Arguments) -> int:
-    """Predict, look, count, draw."""
+    """Compute flip probabilities, compare them with the truth, write a diagram and a summary."""
     configure_jax(float64=True)
     name, probability, flipped = _simulated(args) if args.recording is None else _recorded(args)
     if not len(probability):
@@ -52,7 +52,7 @@ def run(args: Arguments) -> int:
 
 
 def _simulated(args: Arguments) -> tuple[str, np.ndarray, np.ndarray]:
-    """What the image alone says of a pair, on random views."""
+    """Name, probabilities (N,) by the image alone and flips (N,) of pairs, on random views."""
     with tqdm(total=args.frames, unit="frame", disable=args.headless) as bar:
         frames = random_views(args.frames, args.seed, progress=bar.update)
     pair = np.asarray(frames.pair)
@@ -64,7 +64,7 @@ def _simulated(args: Arguments) -> tuple[str, np.ndarray, np.ndarray]:
 
 
 def _recorded(args: Arguments) -> tuple[str, np.ndarray, np.ndarray]:
-    """What a selector says of every marker of a recording, each by itself."""
+    """Name, probabilities (N,) by a selector and flips (N,); each marker of a recording alone."""
     assert args.recording is not None
     recording = read_recording(args.recording, None, None)
     if recording.reference is None:

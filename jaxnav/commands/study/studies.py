@@ -1,4 +1,4 @@
-"""Studies by their config files: what `study` and `plot` share."""
+"""Loading of studies by their config files and of their stores, for `study` and `plot`."""
 
 import hashlib
 from collections.abc import Mapping
@@ -24,12 +24,12 @@ SHIPPED = Path(__file__).resolve().parents[2] / "studies" / "configs"
 
 
 def shipped_configs(kind: str) -> dict[str, Path]:
-    """The configs of a kind that come with jaxnav, by name."""
+    """Paths of the configs of a kind that come with jaxnav, by name."""
     return {path.stem: path for path in sorted((SHIPPED / kind).glob("*.yaml"))}
 
 
 def load_study(kind: str, path: Path) -> Study:
-    """The study that a config file describes.
+    """Load the study that a config file describes.
 
     Args:
         path: the file, or the name of a shipped one.
@@ -64,13 +64,13 @@ def load_study(kind: str, path: Path) -> Study:
 
 
 def summary_of(path: Path, bar: Any) -> tuple[str, int, xr.Dataset]:
-    """Kind of a store, how many trials it holds, and its summary.
+    """The kind of a store, the number of trials in it, and its summary.
 
     Args:
-        bar: a tqdm that is told what has been read.
+        bar: a tqdm that shows how many trials have been read.
 
     Raises:
-        BadInput: it is not a store of a study.
+        BadInput: the path is not a store of a study.
     """
     grid = _stored_grid(path)
     layout, trials = read_layout(path), read_dataset(path)
@@ -83,7 +83,7 @@ def summary_of(path: Path, bar: Any) -> tuple[str, int, xr.Dataset]:
 
 
 def _stored_grid(path: Path) -> Grid:
-    """What a store says that it is the result of, checked as if a person had written it."""
+    """The grid of a store by its stored config, which is checked as if a person had written it."""
     stored = read_attributes(path)["config"]
     kind = stored.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
@@ -94,7 +94,7 @@ def _stored_grid(path: Path) -> Grid:
 
 
 def _calibration(data: Mapping[str, Any], path: Path, kind: str) -> dict[str, Path]:
-    """The calibration files, relative to the config; `qcar` is the shipped one."""
+    """The calibration files of a config, relative to it; `qcar` stands for the shipped ones."""
     wanted = ("rig",) if kind == "ambiguity" else ("rig", "markers", "vehicle")
     found = {}
     for name in ("rig", "markers", "vehicle"):

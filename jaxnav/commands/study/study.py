@@ -19,7 +19,7 @@ from jaxnav.studies.store import count_done, open_store, sweep_unfinished
 
 
 def run(args: Arguments) -> int:
-    """Run what is missing; print what came out."""
+    """Run the trials that are missing in the store, and print how many it holds."""
     if str(args.config) == "list":
         _list(args.kind)
         return 0
@@ -56,7 +56,7 @@ def run(args: Arguments) -> int:
 
 
 def _cluster(args: Arguments, stack: ExitStack) -> Any:
-    """A client of the cluster that was asked for, None without one."""
+    """A client of the cluster that the arguments ask for; None without one."""
     if args.workers is not None:
         _hand_down_the_cache()
         return stack.enter_context(local_cluster(args.workers))
@@ -69,12 +69,12 @@ def _cluster(args: Arguments, stack: ExitStack) -> Any:
 
 
 def prepare_worker() -> None:
-    """What this process does to itself, in a worker of somebody's cluster."""
+    """Configure JAX in a worker of a remote cluster as in this process."""
     configure_jax(float64=False)
 
 
 def _hand_down_the_cache() -> None:
-    """Worker processes take JAX's settings from the environment."""
+    """Set JAX's compile cache in the environment, where local worker processes take it from."""
     directory: str | None = getattr(jax.config, "jax_compilation_cache_dir")  # noqa: B009  (mypy knows no such field)
     if directory:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", directory)
@@ -82,7 +82,7 @@ def _hand_down_the_cache() -> None:
 
 
 def _list(kind: str) -> None:
-    """What can be studied."""
+    """Print the shipped configs and the axes of a kind of study."""
     print(f"configs of kind {kind} that come with jaxnav:")
     for name, path in shipped_configs(kind).items():
         first = path.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ")

@@ -1,1 +1,1 @@
-"""Parameters learned by gradient."""
+"""Commands that learn parameters by gradient."""

@@ -1,4 +1,4 @@
-"""`jaxnav tune controller`: gains from simulated drives, every step other ones."""
+"""`jaxnav tune controller`: learn gains from simulated drives, new ones in every step."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -41,14 +41,14 @@ GAINS = (
     "controller.lookahead_m",
     "controller.slows_at_rad",
 )
-# What the cars differ in; most odometers report too much where wheels slip.
+# The spread between the cars; most odometers report too much where wheels slip.
 _CARS = Spread(odometer_scale=(0.95, 1.2))
 _SOFTNESS_M = (0.06, 0.01)  # of the switch between waypoints, at the first step and at the last
 _HELD_OUT_SEED, _TEST_SEED = 10**8, 10**9
 
 
 def run(args: Arguments) -> int:
-    """Learn, report, and say in a few lines what came of it."""
+    """Learn the gains, write parameters and report, and print a summary."""
     configure_jax(float64=False)
     params = None if args.params is None else load_params(args.params)
     loop, *tests = (closed_loop(args, name, params) for name in (args.scenario, *_tests(args)))
@@ -84,10 +84,10 @@ def _tests(args: Arguments) -> list[str]:
 
 
 def closed_loop(args: Arguments, name: str, params: Params | None = None) -> ClosedLoop:
-    """Drives of a scenario, each by a car of its own.
+    """The closed loop of a scenario, in which every drive has a car of its own.
 
     Raises:
-        BadInput: a file that is no good, or a scenario in which nothing drives.
+        BadInput: a file that is not valid, or a scenario in which nothing drives.
     """
     scenario = scenarios()[name]
     if not scenario.drives:
@@ -100,10 +100,10 @@ def closed_loop(args: Arguments, name: str, params: Params | None = None) -> Clo
 
 
 def gains_of(args: Arguments, navigator: Navigator) -> Space:
-    """What is to be learned, where a navigator stands.
+    """The space of the gains to be learned, starting at a navigator's values.
 
     Raises:
-        BadInput: names that its controller does not have.
+        BadInput: a name that its controller does not have.
     """
     known = [name for name in parameters_of(navigator) if name.startswith("controller.")]
     for name in args.train:
@@ -115,7 +115,7 @@ def gains_of(args: Arguments, navigator: Navigator) -> Space:
 
 @dataclass(frozen=True)
 class Tested:
-    """A controller in one scenario, on seeds never trained on."""
+    """Results of a controller in one scenario, on seeds never trained on."""
 
     loss: tuple[float, float, float]  # mean with its 95 % interval
     parts: dict[str, float]
@@ -126,7 +126,7 @@ class Tested:
 
 
 class Gains:
-    """The loss of drives, as a fit asks for it."""
+    """The loss of simulated drives as a problem for a fit, and tests of its result."""
 
     def __init__(
         self, args: Arguments, loop: ClosedLoop, tests: dict[str, ClosedLoop], space: Space
@@ -134,7 +134,7 @@ class Gains:
         self._args, self._loop, self._tests, self._space = args, loop, tests, space
 
     def problem(self) -> Problem:
-        """Other seeds in every step; the same ones held out."""
+        """The problem of the fit: new seeds in every step, the same seeds held out."""
         args = self._args
         return Problem(
             optimiser=Noisy(self._evaluate, args.learning_rate, args.steps),
@@ -148,7 +148,7 @@ class Gains:
         )
 
     def tested(self, fit: Fit) -> dict[str, tuple[Tested, Tested]]:
-        """Before and after, by scenario."""
+        """Test results before and after the fit, by scenario."""
         count = self._args.test_seeds
         with tqdm(
             total=2 * count * len(self._tests),
@@ -173,7 +173,7 @@ class Gains:
         return _keys(self._args.seed + step * self._args.seeds, self._args.seeds)
 
     def _evaluate(self, x: Array, batch: Batch, softness: Array) -> tuple[Array, Array]:
-        """Mean loss and gradient of a step's drives."""
+        """The mean loss of a step's drives, and its gradient."""
         soft = dataclasses.replace(self._loop, softness_m=softness)
         losses, gradients = soft.value_and_grad(x, self._space, self._training(batch.items))
         return jnp.mean(losses), jnp.mean(gradients, axis=0)
@@ -195,7 +195,7 @@ class Gains:
     def _test(
         self, loop: ClosedLoop, values: Mapping[str, Array], progress: Callable[[int], object]
     ) -> Tested:
-        """The car is the scenario's own: nothing is drawn but what its seed draws."""
+        """Drive with the scenario's own car: only what the seed draws is random."""
         nominal = dataclasses.replace(loop, rollout=dataclasses.replace(loop.rollout, spread=None))
         keys = _keys(_TEST_SEED, self._args.test_seeds)
         losses, costs, trace = nominal.value(values, keys, progress)

@@ -1,4 +1,4 @@
-"""What a filter is tuned on, stopped by and judged by: simulated drives, or recordings."""
+"""Data to tune, stop and test a filter with: simulated drives, or recordings."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.tuning.recorded import Recorded, simulated
 
-AT_A_TIME = 64  # sequences side by side, where nothing is to be differentiated
+AT_A_TIME = 64  # sequences in a batch, where nothing is to be differentiated
 _TEST_SEED = 10**6
-_HELD_OUT = 4  # of so many sequences of a recording one
+_HELD_OUT = 4  # one of this many sequences of a recording is held out
 _DRIVE = ".mcap"
 
 Progress = Callable[[int], object]
@@ -36,7 +36,7 @@ Progress = Callable[[int], object]
 
 @dataclass(frozen=True)
 class Test:
-    """Sequences that have no part in the tuning, and the navigator that they are of."""
+    """Sequences that have no part in the tuning, and the navigator that goes with them."""
 
     name: str
     navigator: Navigator
@@ -46,7 +46,7 @@ class Test:
 
 @dataclass(frozen=True)
 class Data:
-    """A navigator as it stands, and what it is tuned on, stopped by and judged by."""
+    """A navigator before tuning, and the sequences to learn from, to stop by and to test on."""
 
     navigator: Navigator
     learned: Recorded
@@ -55,23 +55,23 @@ class Data:
 
 
 def read_data(args: Arguments) -> Data:
-    """Everything, read before any work is done; simulated tests are driven when they are asked for.
+    """Read all data before any work is done; simulated tests are driven only when called for.
 
     Raises:
-        BadInput: names file or flag.
+        BadInput: names the file or the flag.
     """
     return _recorded(args) if args.recordings else _simulated(args)
 
 
 def _simulated(args: Arguments) -> Data:
     car, scenario = ScenarioCar.load(args), scenarios()[args.scenario]
-    # Whoever is tuned, the drives are the same.
+    # The drives are the same whichever estimator is tuned.
     driver = car.navigator(scenario, MultiHypothesis())
     noise_px = jnp.asarray(args.corner_noise_px)
     rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px)
 
     def drive(first: int, count: int, progress: Progress) -> Recorded:
-        """In batches of one size, of which the last repeats its last drive."""
+        """Simulate drives in batches of one size; the last batch repeats its last drive."""
         size, parts = min(count, AT_A_TIME), []
         for begin in range(0, count, size):
             seeds = first + np.minimum(np.arange(begin, begin + size), count - 1)
@@ -121,7 +121,7 @@ def _recorded(args: Arguments) -> Data:
 
 
 def _judging(args: Arguments, tests: Sequence[tuple[Path, tuple[float, float]]]) -> list[Test]:
-    """Those of which somebody knows where the vehicle was."""
+    """The tests with a known pose of the vehicle in some frame."""
     found = []
     for path, part in tests:
         named = _sequences(args, path, part)

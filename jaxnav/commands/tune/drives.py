@@ -1,7 +1,7 @@
-"""Recorded drives of a car as what a filter is tuned on.
+"""Recorded drives of a car as sequences to tune a filter on.
 
-Inputs become what the pilot would make of them: the same stamps, frames and readings are believed.
-But everything is in its place in time, as if nothing had ever come late.
+Inputs are treated as the pilot treats them: the same stamps, frames and readings are believed.
+But they are in the order of their stamps, as if nothing had ever come late.
 """
 
 import math
@@ -31,7 +31,7 @@ _NS_PER_US = 1000
 
 
 class Event(NamedTuple):
-    """Something that was sensed, and when."""
+    """A reading of the odometry or a sighting of markers, with its stamp."""
 
     stamp_ns: int
     told: Told  # odometry, or corners of some cameras
@@ -40,7 +40,7 @@ class Event(NamedTuple):
 def drives(
     log: DriveLog, setup: DriveSetup, part: tuple[float, float], length: int = 400
 ) -> Recorded:
-    """Sequences of a drive. Nobody knows where the car was: none of it is judged.
+    """Sequences of a drive. The car's true pose is unknown, so that no frame is judged.
 
     Odometry that the pilot refused on the way is left out.
 
@@ -69,7 +69,7 @@ def driven(
     length: int = 400,
     refused_ns: Collection[int] = (),
 ) -> Recorded:
-    """`drives` of what reached a pilot, a ROS bag's perhaps.
+    """`drives` for inputs of a pilot, which may come from a ROS bag.
 
     Args:
         where: the file that the inputs are of.
@@ -106,9 +106,9 @@ def driven(
 def sensed(
     inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int] = ()
 ) -> list[Event]:
-    """What a pilot would believe of its inputs, in the order of the stamps.
+    """Events that a pilot would believe of its inputs, in the order of the stamps.
 
-    What cameras show at one instant is one event.
+    Sightings by several cameras at one instant are one event.
     """
     events = sorted(_told(inputs, setup, refused_ns), key=_order)
     merged: list[Event] = []
@@ -123,7 +123,7 @@ def sensed(
 def _told(
     inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int]
 ) -> Iterator[Event]:
-    """As `Pilot.handle` does, without an estimate."""
+    """Events of the inputs that `Pilot.handle` would believe, without an estimate."""
     frames = Frames(len(setup.rig), setup.markers, setup.corner_sigma_px)
     stamps = Stamps()
     for given in inputs:
@@ -141,12 +141,12 @@ def _told(
 
 
 def _order(event: Event) -> tuple[int, bool]:
-    """By stamp, corners first."""
+    """A sort key: by stamp, corners first."""
     return event.stamp_ns, event.told.corners_px is None
 
 
 def _both(one: Event, other: Event) -> Event | None:
-    """Two events as one; None where they are not of one instant, or of the same camera."""
+    """Two events merged into one; None for different instants or the same camera."""
     a, b = one.told, other.told
     if one.stamp_ns != other.stamp_ns or a.visible is None or b.visible is None:
         return None
@@ -177,7 +177,7 @@ class _Rows(NamedTuple):
 
     @staticmethod
     def of(events: Sequence[Event], cameras: int, markers: int) -> "_Rows":
-        """Whole microseconds, as the pilot counts them."""
+        """Arrays of the events, with stamps in whole microseconds as the pilot counts them."""
         lanes = (len(events), cameras, markers)
         rows = _Rows(
             stamps_us=np.array([event.stamp_ns // _NS_PER_US for event in events], np.int64),
@@ -208,7 +208,7 @@ def _observations(
     has_odometry: Array,
     dt_s: Float[Array, ""],
 ) -> Observation:
-    """Events as `step` takes them, (B, T)."""
+    """Observations (B, T) of events, as `step` takes them."""
     return Observation(
         corners_px,
         visible,

@@ -1,4 +1,4 @@
-"""`jaxnav tune filter`: Q and R from recordings or simulated drives."""
+"""`jaxnav tune filter`: learn Q and R from recordings or simulated drives."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ _STAGES = 4
 
 
 def run(args: Arguments) -> int:
-    """Learn, report, and say in a few lines what came of it."""
+    """Learn the parameters, write them and a report, and print a summary."""
     configure_jax(float64=False)
     params = None if args.params is None else load_params(args.params)
     data = read_data(args)
@@ -67,10 +67,10 @@ def run(args: Arguments) -> int:
 
 
 def space_of(args: Arguments, navigator: Navigator, learned: Recorded) -> Space:
-    """What is to be learned, where a navigator stands.
+    """The space of the parameters to be learned, starting at a navigator's values.
 
     Raises:
-        BadInput: names that it does not have.
+        BadInput: a name that the navigator does not have.
     """
     names = args.train or _by_default(navigator, learned)
     for flag, given in (("--train", args.train), ("--full", args.full)):
@@ -86,8 +86,8 @@ def space_of(args: Arguments, navigator: Navigator, learned: Recorded) -> Space:
 
 
 def _by_default(navigator: Navigator, learned: Recorded) -> tuple[str, ...]:
-    """Of a car Q, and all of R that this estimator looks at; of a free body Q alone: how far its
-    corners scatter its recordings tell by themselves."""
+    """The default names: Q and all of R that the estimator uses for a car; Q alone for a free body,
+    whose recordings tell by themselves how far its corners scatter."""
     names = ("motion.acceleration_density",)
     if not isinstance(navigator.motion, BicycleKalman):
         return names
@@ -119,19 +119,19 @@ def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: Data
 
 @dataclass(frozen=True)
 class Tested:
-    """An estimator on drives that had no part in the tuning."""
+    """Results of an estimator on drives that had no part in the tuning."""
 
     rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
     anees: tuple[float, float, float]
     band: tuple[float, float]  # in which ANEES is consistent, 99.9 %
     error_m: np.ndarray  # of every judged frame
-    indefinite: int  # judged frames whose covariance is none, by rounding; not in ANEES
+    indefinite: int  # judged frames whose covariance is indefinite by rounding; not in ANEES
 
 
 def _tested(
     args: Arguments, data: Data, params: Params | None, space: Space, fit: Fit
 ) -> dict[str, tuple[Tested, Tested]]:
-    """Before and after, by the name of what they were held against."""
+    """Results before and after the fit, by the name of the test."""
     found = {}
     for test in data.tests:
         with tqdm(
@@ -184,7 +184,7 @@ def _told(tested: Tested) -> dict[str, Any]:
 
 
 def _text(summary: dict[str, Any]) -> str:
-    """What a person wants to know first."""
+    """The summary in lines: parameters, held-out loss, and the tests before and after."""
     lines = [f"{summary['steps']} steps, {summary['stages']} stages: {summary['ended']}"]
     before, after = summary["parameters"]["before"], summary["parameters"]["after"]
     for name in before:

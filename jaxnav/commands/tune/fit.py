@@ -1,4 +1,4 @@
-"""A fit under the eyes of a person: a bar, the best so far in a file, and a way to go on."""
+"""A fit run by a command: a progress bar, the best parameters in a file, and a checkpoint."""
 
 import dataclasses
 import datetime
@@ -25,12 +25,12 @@ from jaxnav.files.writing import atomic_write, plain_data
 from jaxnav.tuning.fit import Fit, Problem, advanced, arrays_of, fit_of
 from jaxnav.tuning.unconstrained import Space
 
-# What a fit doesn't depend on.
+# Arguments on which a fit doesn't depend.
 _OF_THE_REPORT = ("out", "headless", "test", "test_seeds")
 
 
 def plain_key(command: str, args: Any) -> dict[str, Any]:
-    """All that a result depends on: what was told, and by what it was computed."""
+    """All that a result depends on, as plain values: command, arguments, versions."""
     told = {
         name: plain_data(value)
         for name, value in dataclasses.asdict(args).items()
@@ -47,7 +47,7 @@ def summary_of(
     after: Mapping[str, Array],
     test: Mapping[str, tuple[Any, Any]],
 ) -> dict[str, Any]:
-    """What came of a fit: parameters by name, and what is told of each test before and after."""
+    """The summary of a fit: parameters by name, and each test's results before and after."""
 
     def plain(values: Mapping[str, Array]) -> dict[str, Any]:
         return {name: np.asarray(value).tolist() for name, value in values.items()}
@@ -64,11 +64,11 @@ def summary_of(
 
 
 def measure(value: tuple[float, float, float]) -> dict[str, Any]:
-    """A mean with its interval, as a summary tells it."""
+    """A mean with its interval, in the form of a summary."""
     return {"value": value[0], "interval": list(value[1:])}
 
 
-# What NumPy and zipfile raise where a byte is wrong: a flag says "encrypted", a length is absurd.
+# Exceptions of NumPy and zipfile for wrong bytes, such as a flag "encrypted" or an absurd length.
 _DAMAGED = (
     KeyError, ValueError, TypeError, EOFError, OSError, RuntimeError, MemoryError, struct.error,
     zipfile.BadZipFile, zlib.error,
@@ -76,14 +76,14 @@ _DAMAGED = (
 
 
 class Fitting:
-    """A fit in a folder.
+    """A fit that keeps its best parameters and a checkpoint in a folder.
 
     Args:
         folder: of params.yaml and checkpoint.npz.
         key: all that the result depends on, plain values; a checkpoint of another key is refused.
-        prior_sigma: see `Objective`; what the loss asks of parameters that no drive depends on.
-        named: parameters that a person asks for, who is told where no drive depends on one; None:
-            all.
+        prior_sigma: see `Objective`; it decides parameters on which no drive depends.
+        named: parameters that a person asks for; one on which no drive depends is refused. None
+            for all.
     """
 
     def __init__(
@@ -102,16 +102,16 @@ class Fitting:
 
     @property
     def checkpoint(self) -> Path:
-        """Where the fit stands."""
+        """The file that holds the state of the fit."""
         return self._folder / "checkpoint.npz"
 
     def run(self, headless: bool) -> Fit:
-        """To the end, or on from where it was left.
+        """Run the fit to its end, from its checkpoint where there is one.
 
         Raises:
-            BadInput: a checkpoint of something else or at which another process is at work, or a
-                parameter that the loss doesn't ask.
-            KeyboardInterrupt: what was reached is kept.
+            BadInput: a checkpoint of another run or that another process is writing, or a
+                parameter on which the loss doesn't depend.
+            KeyboardInterrupt: the state reached is kept.
         """
         with sole_writer(self.checkpoint):
             return self._run(headless)
@@ -133,7 +133,7 @@ class Fitting:
                 if not bool(fit.descent.finite):
                     bar.clear()
                     self._told(self._where(before, fit.descent.asked_x))
-                # Not by the losses: those of another stage are others.
+                # Losses can't be compared here: another stage has other ones.
                 if fit.step == 1 or bool(jnp.any(fit.best_x != before.best_x)):
                     self.write(fit)
                 self._keep(fit)
@@ -142,7 +142,7 @@ class Fitting:
         return fit
 
     def write(self, fit: Fit) -> None:
-        """The best parameters so far."""
+        """Write the best parameters so far to params.yaml."""
         values = {name: np.asarray(value) for name, value in self._space.values(fit.best_x).items()}
         write_params(self._folder / "params.yaml", values, self._provenance(fit))
 
@@ -154,7 +154,7 @@ class Fitting:
         }
 
     def _where(self, before: Fit, x: Array) -> str:
-        """What is said of a gradient at x that is not finite."""
+        """A message about a gradient at x that is not finite."""
         step = before.step
         softness = jnp.asarray(self._problem.softness(step), x.dtype)
         batch = self._problem.batch(before.stage_x, before.stage, step)

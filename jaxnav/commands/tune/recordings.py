@@ -1,4 +1,4 @@
-"""Recordings of a rig without odometry as what a filter is tuned on."""
+"""Recordings of a rig without odometry as sequences to tune a filter on."""
 
 import jax
 import jax.numpy as jnp
@@ -26,11 +26,11 @@ def navigator_of(
     selector: str,
     corner_sigma_px: float | None = None,
 ) -> Navigator:
-    """What localises the rig of a recording by its `tracks`.
+    """The navigator that localises the rig of a recording by its `tracks`.
 
     Args:
         selector: one of `SELECTORS`.
-        corner_sigma_px: by default as the recording itself tells.
+        corner_sigma_px: by default estimated from the recording itself.
     """
     if corner_sigma_px is None:
         corner_sigma_px = estimate_corner_sigma_px(recording)
@@ -56,7 +56,7 @@ def tracks(
     Args:
         one_at_a_time: a sequence is an appearance of one marker, as if it were the only one, and
             has the frames that show it; else it has all markers and consecutive frames. Either
-            ends where nothing came for `GAP_S`, and is cut in equal pieces where it is too long.
+            ends at a gap of more than `GAP_S`, and is cut in equal pieces where it is too long.
         part: which of the frames, as shares of them: (0, 0.5) is the first half.
         length: frames of a sequence, at most.
         shortest: sequences of fewer frames are left out.
@@ -89,10 +89,10 @@ def tracks(
 def _recorded(
     recording: Recording, markers: Int[np.ndarray, " B"] | None, pieces: list[np.ndarray]
 ) -> Recorded:
-    """Pieces of a recording.
+    """Pieces of a recording as sequences side by side.
 
     Args:
-        markers: the only one of each piece; None: all of them.
+        markers: the only marker of each piece; None for all of them.
     """
     frames, used = side_by_side(pieces)
     if markers is None:
@@ -103,7 +103,7 @@ def _recorded(
         )
     else:
         lanes = markers[:, None]
-        # Piece by piece: of a large map all but one marker is dropped at once.
+        # Piece by piece, so that all markers but one of a large map are dropped at once.
         alone = [
             [lanes_of[:, :, [marker]] for lanes_of in recording.lanes(piece)]
             for piece, marker in zip(frames, markers, strict=True)
@@ -136,5 +136,5 @@ def _recorded(
 def _observations(
     corners_px: Float[Array, "C M 4 2"], visible: Array, dt_s: Float[Array, ""]
 ) -> Observation:
-    """Of frames without odometry, (B, T)."""
+    """Observations (B, T) of frames without odometry."""
     return Observation(corners_px, visible, dt_s=dt_s, has_odometry=False)

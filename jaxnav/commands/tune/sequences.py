@@ -1,4 +1,4 @@
-"""Recordings as sequences of equal length: cut, padded, and put one beside the other."""
+"""Recordings as sequences of equal length: cut, padded, and stacked."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,21 +18,21 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # wxyz xyz
 
 
 class Named(NamedTuple):
-    """The sequences of one recording."""
+    """The sequences of one recording, with its name and navigator."""
 
-    name: str  # of the file, for a person
-    navigator: Navigator  # that goes with them
+    name: str  # of the file, for messages
+    navigator: Navigator  # that goes with the sequences
     recorded: Recorded
 
 
 def bounds(count: int, part: tuple[float, float]) -> tuple[int, int]:
-    """First and end of a part of `count` rows; parts that adjoin share none."""
+    """The first row and the end of a part of `count` rows; adjoining parts share no row."""
     begin, end = (round(share * count) for share in part)
     return begin, end
 
 
 def cut(indices: Int[np.ndarray, " N"], length: int) -> list[Int[np.ndarray, " T"]]:
-    """Pieces of at most `length`, as few as will do, that differ by one at most."""
+    """The fewest pieces of at most `length` indices, whose lengths differ by one at most."""
     if not len(indices):
         return []
     return np.array_split(indices, -(-len(indices) // length))
@@ -41,7 +41,7 @@ def cut(indices: Int[np.ndarray, " N"], length: int) -> list[Int[np.ndarray, " T
 def runs(
     indices: Int[np.ndarray, " N"], stamps_ns: Int[np.ndarray, " F"], gap_s: float
 ) -> list[Int[np.ndarray, " T"]]:
-    """Rising indices apart where more than `gap_s` lies between the stamps of two neighbours."""
+    """Rising indices, split where the stamps of two neighbours are more than `gap_s` apart."""
     if not len(indices):
         return []
     apart_s = np.diff(stamps_ns[indices]) / 1e9
@@ -51,7 +51,7 @@ def runs(
 def side_by_side(
     pieces: Sequence[Int[np.ndarray, " N"]],
 ) -> tuple[Int[np.ndarray, "B T"], Bool[np.ndarray, "B T"]]:
-    """Pieces padded to the longest with their last index, and what is no padding."""
+    """Pieces padded to the longest with their last index, and a mask that is False at padding."""
     length = max(len(piece) for piece in pieces)
     indices = np.array([np.pad(piece, (0, length - len(piece)), mode="edge") for piece in pieces])
     lengths = np.array([len(piece) for piece in pieces])
@@ -59,7 +59,7 @@ def side_by_side(
 
 
 def maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
-    """A map a sequence, (B,), of some markers each. Who they are, no estimate asks."""
+    """A map for each of B sequences, of N markers; ids are dummies, which no estimate uses."""
 
     def some(wxyz_xyz: Float[Array, "N 7"], size_m: Float[Array, " N"]) -> MarkerMap:
         ids = tuple(range(len(size_m)))
@@ -73,7 +73,7 @@ def joined(recordings: Sequence[Named]) -> Recorded:
     """The sequences of all recordings, padded to the longest.
 
     Raises:
-        BadInput: names the two that one estimator can't take.
+        BadInput: names two recordings that one estimator can't take together.
     """
     first = recordings[0]
     for other in recordings[1:]:
@@ -83,7 +83,7 @@ def joined(recordings: Sequence[Named]) -> Recorded:
 
 
 def _apart(one: Named, other: Named) -> str | None:
-    """What keeps two recordings from one estimator."""
+    """The reason why one estimator can't take two recordings together; None without one."""
     lanes, lanes_other = (named.recorded.obs.visible.shape[2:] for named in (one, other))
     for what, here, there in zip(("cameras", "markers"), lanes, lanes_other, strict=True):
         if here != there:
@@ -100,7 +100,7 @@ def _apart(one: Named, other: Named) -> str | None:
 
 
 def _rig(navigator: Navigator) -> Any:
-    """What poses depend on; image sizes may be guessed from what was seen."""
+    """The parts on which poses depend; image sizes may be guesses from the corners seen."""
     return navigator.rig.cameras, navigator.rig.Ts_camera_vehicle
 
 
@@ -109,5 +109,5 @@ def _vehicle(navigator: Navigator) -> Any:
 
 
 def _alike(one: Any, other: Any) -> bool:
-    """Whether two trees have the same leaves, whatever is in them."""
+    """Whether two trees have the same structure, whatever their leaves hold."""
     return bool(eqx.tree_equal(*(jax.tree.map(lambda _: 0, tree) for tree in (one, other))))
