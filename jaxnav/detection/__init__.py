@@ -2,7 +2,7 @@
 
     detector = make_detector("aruco", family="tag36h11")
     detections = detector.detect(image, camera)
-    corners_px, visible, sigma_px, ignored = observe([detections, ...], markers)
+    observed = observe([detections, ...], markers)  # corners_px, visible, sigma_px
 
 A decoder (OpenCV's, or AprilTag's own) finds each marker's id and its place to a pixel; `refine`
 then fits the corners, in the same way for both.

@@ -1,7 +1,7 @@
 """Run a vehicle in its guard's process, and give the loop a `Vehicle` that talks to it.
 
 guarding = GuardProcess("qcar")                  # starts in parallel to other work
-vehicle = guarding.open(setup, timeout_s)        # None: it can't be moved, `stays` says why
+vehicle = guarding.open(setup, limits, timeout_s)        # None: it can't be moved, `stays` says why
 vehicle.watch(guard.trip)                        # called when it was stopped there, or is dead
 """
 

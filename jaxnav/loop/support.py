@@ -1,6 +1,6 @@
 """Check what supports an estimate, and so decide whether to act on it.
 
-    support.drove(reading, heading_rad, gap_s, throttle, seeing)    # with every odometry
+    support.drove(speed_mps, steering_rad, heading_rad, gap_s, throttle, seeing)  # each reading
     is_fix = support.corners(accepted, agrees, now_ns, fix, possible)  # with every frame
     support.doubt(contradicted)
 
