@@ -59,9 +59,8 @@ def configure(
 
     Args:
         float64: whether arrays are double by default; None: JAX's setting.
-        threads: number of XLA's threads; by default one per core. A single car's kernels are so
-            small that handing them to another thread takes longer than running them: with one
-            thread the time is 0.9 to 0.7 of that.
+        threads: of XLA; by default one per core. A single car's kernels are so small that handing
+            them to another thread takes longer than they do: one is 0.9 to 0.7 of the time.
         cache: whether compiled code is kept between runs, in $XDG_CACHE_HOME/jaxnav
             (~/.cache/jaxnav), in a folder of this machine and jaxlib; $JAX_COMPILATION_CACHE_DIR
             has precedence. A path: kept there. If others could write there, or this user can't,

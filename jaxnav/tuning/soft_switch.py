@@ -32,9 +32,8 @@ class SoftState(ControlState):
 class SoftController(eqx.Module):
     """A replacement for a navigator's `Controller` that applies its law to every waypoint.
 
-    In each frame the part sigmoid((radius - distance) / softness) of a share moves on. The command
-    is the sum of the commands towards each waypoint, weighted by the shares; the increments of the
-    integrals are weighted in the same way.
+    In each frame the part sigmoid((radius - distance) / softness) of a share moves on. The shares
+    weight the commands towards the waypoints, which are summed, and the integrals' increments.
     """
 
     controller: Controller
