@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from jaxnav.calibration.odometry.calibrate import OdometryCalibration
 from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
 
-_GROUPS = 60  # groups of views whose mean and scatter are drawn
+_GROUPS = 60  # groups of views whose means are drawn
 
 
 def odometry_report(
