@@ -1,4 +1,4 @@
-"""How precisely the points of calibration boards are found, against OpenCV. One thread.
+"""Measure the precision of calibration boards' points, against OpenCV. One thread.
 
 OMP_NUM_THREADS=1 python benchmarks/bench_boards.py          # rewrites README-boards.md
 

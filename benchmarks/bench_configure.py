@@ -1,4 +1,4 @@
-"""What each of the flags that `jaxnav.configure` sets buys: the table of docs/guide/performance.md.
+"""Measure the gain of each flag of `jaxnav.configure`: the table of docs/guide/performance.md.
 
     python -m benchmarks.bench_configure [TURNS]
 

@@ -1,4 +1,4 @@
-"""Detectors compared: how precise, how small, how fast. One thread.
+"""Compare detectors: precision, smallest readable markers and speed. One thread.
 
 OMP_NUM_THREADS=1 python benchmarks/bench_detection.py          # rewrites README-detection.md
 OMP_NUM_THREADS=1 pytest benchmarks/bench_detection.py --benchmark-only

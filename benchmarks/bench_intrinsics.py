@@ -1,4 +1,4 @@
-"""Lenses from views of a board: how true the sigmas are, and jaxnav against OpenCV.
+"""Calibrate lenses from views of a board: check the sigmas, and compare jaxnav with OpenCV.
 
     python benchmarks/bench_intrinsics.py        # the tables of README-intrinsics.md
 

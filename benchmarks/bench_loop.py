@@ -1,4 +1,4 @@
-"""The loop on the car, part by part: the search for markers, the estimator, and how soon it drives.
+"""Time the car's loop part by part: the search for markers, the estimator, and the start.
 
     python benchmarks/bench_loop.py
     pytest benchmarks/bench_loop.py --benchmark-enable --benchmark-only

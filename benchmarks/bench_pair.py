@@ -1,4 +1,4 @@
-"""Both poses of one marker, closed form and refined: jaxnav against OpenCV.
+"""Time both poses of one marker, closed form and refined: jaxnav against OpenCV.
 
     python benchmarks/bench_pair.py              # the tables of README-pose.md
     pytest benchmarks/bench_pair.py --benchmark-enable --benchmark-only

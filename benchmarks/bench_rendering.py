@@ -1,4 +1,4 @@
-"""What a rendered frame costs: one QCar camera, 820 x 410 px, blur and rolling shutter, one thread.
+"""Time a rendered frame: one QCar camera, 820 x 410 px, blur and rolling shutter, one thread.
 
 Run with `OMP_NUM_THREADS=1 pytest benchmarks/bench_rendering.py --benchmark-only`.
 """

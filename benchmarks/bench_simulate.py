@@ -1,11 +1,11 @@
-"""Closed-loop simulation: steps a second over all lanes, whole drives.
+"""Time closed-loop simulation: steps a second over all lanes, whole drives.
 
     python benchmarks/bench_simulate.py [--seeds N]
     pytest benchmarks/bench_simulate.py --benchmark-enable --benchmark-only
 
-The paper's scenario at corner noise of 1 px. A step counts where its drive is still under way. Few
+The paper's scenario at corner noise of 1 px. A step counts if its drive is still under way. Few
 drives run under `vmap` (as all did once), many through `over_lanes`; both in one process, in turns.
-CPU time is that of all threads: on a machine that others use it says more than the clock.
+CPU time is that of all threads: on a shared machine it is more reliable than the clock.
 """
 
 import platform

@@ -1,4 +1,4 @@
-"""One step of the car: how long it takes, against OpenCV and NumPy; to compile; to differentiate.
+"""Time one step of the car against OpenCV and NumPy, its compilation and its gradient.
 
     python benchmarks/bench_step.py
     pytest benchmarks/bench_step.py --benchmark-enable --benchmark-only

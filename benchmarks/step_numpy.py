@@ -1,4 +1,4 @@
-"""The step of the car as one would write it with OpenCV and NumPy: the peer of `bench_step.py`.
+"""Implement the car's step with OpenCV and NumPy: the peer of `bench_step.py`.
 
 Both poses of a marker by IPPE and two `solvePnPRefineLM`, the paper's rule and its Kalman filter;
 or the same bank of hypotheses as `MultiHypothesis`, all of them at once in arrays: corners

@@ -1,10 +1,10 @@
-"""How this process compiles and runs what it computes: `jn.configure()`, said once, at the start.
+"""Configure how this process compiles and runs programs: call `jn.configure()` once, at the start.
 
     import jaxnav as jn
 
     jn.configure()
 
-Nothing is configured on import. `docs/guide/performance.md` has what it buys.
+Nothing is configured on import. `docs/guide/performance.md` has the gains.
 """
 
 import json
@@ -25,14 +25,14 @@ import jaxlib
 from jaxnav.files.private import NotPrivateError, PrivateFolder
 
 FLAGS = {
-    # Halves the time to compile a step and leaves that to run it.
+    # Halves the time to compile a step and leaves the time to run it.
     "xla_cpu_use_fusion_emitters": "false",
-    # YNNPACK takes 10 us for what a loop does in 0.3 us: sums over a handful of products. It can't
-    # be switched off, but told to look for convolutions, of which there are none.
+    # YNNPACK takes 10 us for a sum over a handful of products, a loop 0.3 us. It can't be switched
+    # off, but restricted to convolutions, of which there are none.
     "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION",
 }
-# XLA ends a process that has a flag or a value it doesn't know: another one is asked before.
-# The short way takes 0.2 s, and is nobody's promise.
+# XLA aborts a process on a flag or a value it doesn't know, so a child process tries them before.
+# The short way takes 0.2 s but is no public interface.
 _PROBE = """
 import sys
 sys.path += sys.argv[1:]
@@ -51,24 +51,24 @@ _refused: list[str] = []
 def configure(
     *, float64: bool | None = None, threads: int | None = None, cache: bool | Path = True
 ) -> None:
-    """Set how this process compiles and runs: XLA's flags, its threads, precision, a cache.
+    """Set this process's XLA flags and threads, its precision and its compilation cache.
 
-    Call it once, before the first array. Flags that $XLA_FLAGS sets already stay as they are, and
-    of ours those are left out that this jaxlib does not know; the first call on a machine asks
-    it, in a process of 0.2 s. A second call that asks for the same changes nothing.
+    Call it once, before the first array. Flags already in $XLA_FLAGS stay as they are, and flags
+    of ours that this jaxlib does not know are left out; the first call on a machine asks it, in a
+    process of 0.2 s. A second call with the same arguments changes nothing.
 
     Args:
-        float64: whether arrays are double by default; None: as JAX has it.
-        threads: of XLA; by default one a core. The kernels of a single car are so small that
-            handing them to another thread takes longer than they do: one is 0.9 to 0.7 of the time.
+        float64: whether arrays are double by default; None: JAX's setting.
+        threads: of XLA; by default one per core. A single car's kernels are so small that handing
+            them to another thread takes longer than they do: one is 0.9 to 0.7 of the time.
         cache: whether compiled code is kept between runs, in $XDG_CACHE_HOME/jaxnav
             (~/.cache/jaxnav), in a folder of this machine and jaxlib; $JAX_COMPILATION_CACHE_DIR
-            goes first. A path: kept there. Where others could write there, or this user can't,
-            there is none, and one line on stderr says why. False: as JAX has it.
+            has precedence. A path: kept there. If others could write there, or this user can't,
+            there is no cache, and one line on stderr says why. False: JAX's setting.
 
     Warns:
-        RuntimeWarning: JAX runs already, so that flags and threads come too late. They are left
-            as they are; precision and cache are set all the same.
+        RuntimeWarning: JAX runs already, so flags and threads come too late and stay as they
+            are; precision and cache are set all the same.
     """
     wanted = {} if threads is None else {"PJRT_NPROC": os.environ.get("PJRT_NPROC", str(threads))}
     if cache is not False:
@@ -89,11 +89,11 @@ def configure(
 
 
 def known_flags(flags: dict[str, str]) -> dict[str, str]:
-    """Those that this jaxlib's XLA takes with these values, asked once where a cache is set.
+    """The flags that this jaxlib's XLA accepts with these values, asked once if a cache is set.
 
     XLA reads all flags of a process at once and aborts it over the first it doesn't know. Names
-    found in the library's bytes could be a message's, and say nothing of values: so a child
-    starts with them, which takes 0.2 s.
+    found in the library's bytes could be part of a message and say nothing of values, so a child
+    process is started with the flags, which takes 0.2 s.
     """
     build = Path(jaxlib.__file__).stat().st_mtime_ns  # a build by hand may keep its version
     asked = repr((sorted(flags.items()), jax.__version__, jaxlib.__version__, build))
@@ -117,18 +117,18 @@ def known_flags(flags: dict[str, str]) -> dict[str, str]:
 
 
 def step_folder() -> Path | None:
-    """Where `compiled_step` may keep executables: beside the cache that `configure` has set."""
+    """The folder for `compiled_step`'s executables, beside the cache that `configure` has set."""
     directory = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     return _private(Path(directory) / "steps") if directory else None
 
 
 def cache_refused() -> str | None:
-    """Why this process goes without compiled code of others; None where it doesn't."""
+    """The reason why this process has no compilation cache, or None."""
     return _refused[-1] if _refused else None
 
 
 def _with_flags(theirs: str) -> str:
-    """Flags of the user, and ours that they say nothing of."""
+    """The user's flags, followed by those of ours that the user has not set."""
     if theirs.strip() and not theirs.strip().startswith("-"):
         return theirs  # the name of a file of flags
     missing = {flag: value for flag, value in FLAGS.items() if flag not in theirs}
@@ -137,7 +137,7 @@ def _with_flags(theirs: str) -> str:
 
 
 def _taken(flags: dict[str, str]) -> bool:
-    """Whether a process that is started with these flags lives."""
+    """Whether a process started with these flags survives."""
     inherited = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "TF_"))}
     run = subprocess.run(
         [sys.executable, "-P", "-c", _PROBE, *filter(None, sys.path)],
@@ -147,16 +147,16 @@ def _taken(flags: dict[str, str]) -> bool:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         timeout=_PROBE_S,
-        start_new_session=True,  # a Ctrl-C is meant for us, and says nothing of flags
+        start_new_session=True,  # a Ctrl-C is meant for the parent, and says nothing about flags
     )
-    if run.returncode < 0 and run.returncode != -signal.SIGABRT:  # killed, by want of memory say
+    if run.returncode < 0 and run.returncode != -signal.SIGABRT:  # killed, for want of memory say
         raise subprocess.SubprocessError(f"ended by signal {-run.returncode}")
     return run.returncode == 0
 
 
 def _jax_runs() -> bool:
     """Whether JAX has started a backend, which is when XLA reads its flags."""
-    # JAX tells nobody in public, so this may be gone one day: then nobody is warned.
+    # No public API tells it, so this may vanish one day: then there is no warning.
     with suppress(ImportError, AttributeError):
         from jax._src import xla_bridge
 
@@ -165,10 +165,10 @@ def _jax_runs() -> bool:
 
 
 def _choose_cache(own: Path | None) -> None:
-    """Compiled code is run as it is found: it must come from this jaxlib, this machine, this user.
+    """Set the cache's folder, whose code must be of this jaxlib, this machine and this user.
 
-    JAX's own entries are XLA's bytes and no pickle, but it opens them by their path and looks at
-    nothing: the path is judged before, and what lies at its end.
+    Compiled code is run as it is found. JAX's own entries are XLA's bytes and no pickle, but JAX
+    opens them by path without any check, so the path and the folder are checked before.
     """
     asked = str(own) if own is not None else None
     if asked is None and os.environ.get("JAX_COMPILATION_CACHE_DIR"):
@@ -197,9 +197,9 @@ def _choose_cache(own: Path | None) -> None:
 
 @once
 def _private(folder: Path) -> Path | None:
-    """A folder to keep compiled code in, made where it is missing; None, and said why: it is none.
+    """The folder for compiled code, created if missing; or None, with the reason on stderr.
 
-    The path holds no link any more.
+    The returned path contains no links.
     """
     try:
         with PrivateFolder(folder, make=True) as found:
@@ -218,14 +218,14 @@ def _private(folder: Path) -> Path | None:
 
 
 def _refuse(problem: str) -> None:
-    """Say it in one line."""
+    """Record and print, in one line, why compiled code is not kept."""
     _refused.append(problem)
     if sys.stderr is not None:
-        with suppress(OSError, ValueError):  # nobody reads it
+        with suppress(OSError, ValueError):  # stderr may be closed
             print(f"compiled code is not kept: {problem}", file=sys.stderr)
 
 
 def _cache_home() -> Path:
-    # The XDG specification: a relative path is invalid and to be ignored.
+    # XDG specification: a relative path is invalid and must be ignored.
     configured = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return configured if configured.is_absolute() else Path.home() / ".cache"

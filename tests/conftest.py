@@ -1,4 +1,4 @@
-"""Strict numerics for every test: warnings raise, ranks never promote by themselves, jaxtyping's
+"""Set strict numerics for every test: warnings raise, ranks never promote implicitly, jaxtyping's
 shapes are checked at every call, and float64 is the default."""
 
 import functools

@@ -1,4 +1,4 @@
-"""The three-way derivative check: forward mode, reverse mode, central differences."""
+"""Check derivatives in three ways: forward mode, reverse mode, central differences."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""A room of markers and a path through it, for calibrations of a rig."""
+"""Build a room of markers and a path through it, for calibrations of a rig."""
 
 import jax.numpy as jnp
 import jaxlie

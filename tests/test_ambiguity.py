@@ -1,4 +1,4 @@
-"""The selectors: what they compare, what they pick, what they say of the doubt."""
+"""The selectors: their costs, their choices and their flip probabilities."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""The bicycle against its differential equations in tiny steps."""
+"""The bicycle model against its differential equations, integrated in tiny steps."""
 
 import jax
 import jax.numpy as jnp

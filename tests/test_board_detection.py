@@ -1,4 +1,4 @@
-"""Boards found in rendered images whose truth is known, and what is said when they are not."""
+"""Detection of boards in rendered images with known truth, and the messages if it fails."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,4 +1,4 @@
-"""Small files that declare or unpack to gigabytes: refused in one line, in seconds and 2 GiB."""
+"""Small files that declare or unpack to gigabytes are refused in one line, in seconds and 2 GiB."""
 
 import resource
 import tempfile

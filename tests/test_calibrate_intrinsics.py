@@ -1,4 +1,4 @@
-"""`jaxnav calibrate intrinsics` on images of a rendered board: what it writes, and what it says."""
+"""`jaxnav calibrate intrinsics` on images of a rendered board: its files and its messages."""
 
 import json
 import re

@@ -1,5 +1,4 @@
-"""`jaxnav calibrate odometry`: from a recorded drive to the files it leaves, and what bad input
-gets."""
+"""`jaxnav calibrate odometry`: from a recorded drive to its files, and the errors for bad input."""
 
 import dataclasses
 import json

@@ -1,5 +1,5 @@
-"""A rig without common views is found from nothing, with the right uncertainty; what is wrong is
-named."""
+"""A rig without common views is calibrated without a first guess, with the right uncertainty;
+errors in the input are named."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""`jaxnav calibrate rig`, `markers` and `check`: from a recording to files, or one line."""
+"""`jaxnav calibrate rig`, `markers` and `check`: from a recording to files, or a one-line error."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Cameras that are later than their stamps say are told apart from all else that may be wrong."""
+"""Cameras later than their stamps are distinguished from all other faults."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Both poses of everything in view, merged and pruned."""
+"""The candidates: both poses of every sighting, merged and pruned."""
 
 import functools
 

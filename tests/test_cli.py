@@ -1,4 +1,4 @@
-"""The command line: what a person types reaches the command, what is wrong gets one line."""
+"""The command line: typed arguments reach the command, and wrong ones get a one-line error."""
 
 import dataclasses
 import os

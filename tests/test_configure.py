@@ -1,4 +1,4 @@
-"""`jn.configure()`: what it sets, what it leaves, and that no flag can end the process."""
+"""`jn.configure()`: what it sets and what it leaves alone; no flag can abort the process."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The checks for plug-ins: a good one passes, and of each bad one they say what is wrong."""
+"""The checks for plug-ins: a good plug-in passes, and each fault of a bad one is named."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""What is no marker, and what the others outvote, is left out; the rest is as it was."""
+"""Sightings that are no marker, or that others outvote, are left out; the rest is unchanged."""
 
 import equinox as eqx
 import jax

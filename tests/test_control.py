@@ -1,5 +1,5 @@
-"""The paper's control laws: arcs that meet their waypoint, sums that stay bounded, commands that
-stay inside the limits whatever comes in."""
+"""The paper's control laws: arcs meet their waypoint, integrals stay bounded, and commands stay
+inside the limits for any input."""
 
 import equinox as eqx
 import jax

@@ -1,4 +1,4 @@
-"""Corner orders, pixel origins and the frame of a tag, held against the tools themselves."""
+"""Corner orders, pixel origins and the frame of a tag, compared with the tools themselves."""
 
 import cv2
 import numpy as np

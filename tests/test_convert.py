@@ -1,4 +1,4 @@
-"""`jaxnav calibrate convert`: there and back, number by number; and what damage comes to."""
+"""`jaxnav calibrate convert`: round trips, number by number, and the effects of damage."""
 
 import json
 import os

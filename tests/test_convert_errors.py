@@ -1,4 +1,4 @@
-"""`jaxnav calibrate convert`: what a format can't hold is refused in one line, or told."""
+"""`jaxnav calibrate convert`: what a format can't hold is refused in one line, or reported."""
 
 import json
 from pathlib import Path

@@ -1,5 +1,5 @@
-"""A calibrated vehicle in the runtime: what its sensors say becomes true where it enters, what is
-commanded becomes the servo's where it leaves, and one that is not calibrated changes no bit."""
+"""A calibrated vehicle in the runtime: sensor readings are corrected on entry and commands on exit
+to the servo; a vehicle without calibration changes no bit."""
 
 import dataclasses
 import math

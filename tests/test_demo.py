@@ -1,4 +1,4 @@
-"""`jaxnav demo`: the paper's experiment from images, and what it leaves behind."""
+"""`jaxnav demo`: the paper's experiment from images, and the files it leaves."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Detectors: what they find, what they do not, and where; on photographs and on drawn scenes."""
+"""Detectors: which markers they find, and where, on photographs and on drawn scenes."""
 
 import importlib
 import re

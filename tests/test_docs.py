@@ -1,4 +1,4 @@
-"""What the pages say can be followed: links lead somewhere, commands parse, the Python runs."""
+"""The pages can be followed: their links lead somewhere, commands parse, and the Python runs."""
 
 import functools
 import re

@@ -1,4 +1,4 @@
-"""`jaxnav doctor` from the command line: what it says, what it exits with, and what it survives."""
+"""`jaxnav doctor` from the command line: its report, its exit code, and the faults it survives."""
 
 import json
 import sys

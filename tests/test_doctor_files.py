@@ -1,4 +1,4 @@
-"""Rig, markers, vehicle and route: each check finds its mistake, and is content with the QCar."""
+"""Checks of rig, markers, vehicle and route: each finds its mistake, and passes the QCar."""
 
 import dataclasses
 from pathlib import Path

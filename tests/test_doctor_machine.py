@@ -1,4 +1,4 @@
-"""The computer: each check finds what is wrong with it, and is content with one in order."""
+"""Checks of the computer: each finds its fault, and passes a computer in order."""
 
 import importlib.metadata
 import itertools

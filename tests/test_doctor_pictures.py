@@ -1,4 +1,4 @@
-"""Rendered pictures of a standing car, held against maps and rigs with a mistake in them."""
+"""Rendered pictures of a standing car, compared with maps and rigs that contain a mistake."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Vehicles and cameras that work, and those that do anything wrong: each is found and closed."""
+"""Checks of vehicles and cameras that work or misbehave: each fault is found, each one closed."""
 
 import sys
 import threading

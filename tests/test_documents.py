@@ -1,4 +1,4 @@
-"""Documents that are named exist, and so do the headings and files that they are named for."""
+"""Every document, heading and file that is referred to exists."""
 
 import io
 import re

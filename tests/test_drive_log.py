@@ -1,4 +1,4 @@
-"""A recorded drive is read back whole, up to a cut, or not at all; never wrongly."""
+"""A recorded drive is read back whole, up to a cut, or not at all, but never wrongly."""
 
 import dataclasses
 import io

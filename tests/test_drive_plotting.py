@@ -1,4 +1,4 @@
-"""The picture and the summary of a recorded drive say what is in it, whatever that is."""
+"""The picture and the summary of a recorded drive show its content, whatever it is."""
 
 import dataclasses
 import io

@@ -1,4 +1,4 @@
-"""A recorded drive driven again: bit for bit, and where it is not, it is said."""
+"""A replay of a recorded drive is bit for bit the same, or the differences are reported."""
 
 import dataclasses
 import json

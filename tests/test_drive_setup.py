@@ -1,4 +1,4 @@
-"""What a drive was driven with comes back from its header bit for bit, or not at all."""
+"""The setup of a drive is restored from its header bit for bit, or not at all."""
 
 import dataclasses
 import json

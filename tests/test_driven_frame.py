@@ -1,4 +1,4 @@
-"""Where the vehicle frame is on a rig follows from driving lines and circles both ways."""
+"""The vehicle frame of a rig is found from driving lines and circles in both directions."""
 
 import jax
 import jax.numpy as jnp

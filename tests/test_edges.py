@@ -1,4 +1,4 @@
-"""Corners from the edge fit, against markers drawn by brute force."""
+"""Corners of the edge fit against markers drawn by brute force."""
 
 import warnings
 

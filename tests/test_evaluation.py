@@ -1,4 +1,4 @@
-"""Branches and errors against poses made up for the purpose."""
+"""Branches and errors against constructed poses."""
 
 import jax.numpy as jnp
 import jaxlie

@@ -1,4 +1,4 @@
-"""Every script of examples/ runs, at a small size, and comes to what it says.
+"""Every script of examples/ runs, at a small size, with the result that it states.
 
 They are imported and called in this process, so that a program is compiled once for all of them.
 """

@@ -1,4 +1,4 @@
-"""Where markers are expected, against the poses that the belief stands for, drawn one by one."""
+"""The expected places of markers against poses sampled one by one from the belief."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The fault matrix: every fault comes to what docs/promises.md says of it."""
+"""The fault matrix: every fault has the effect that docs/promises.md states."""
 
 import dataclasses
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Files in and out: what is right is read exactly, what is wrong is one line with file and key."""
+"""Files in and out: valid files are read exactly, invalid ones give one line with file and key."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A descent from its beginning to its end: when it is over, what it found, and how it goes on."""
+"""A descent from its beginning to its end: its stopping, its result and its resumption."""
 
 import io
 import os

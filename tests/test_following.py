@@ -1,4 +1,4 @@
-"""The filter along recorded drives: which branch it follows, and how what it says changes."""
+"""The filter along recorded drives: the branch that it follows, and its derivatives."""
 
 import dataclasses
 import functools

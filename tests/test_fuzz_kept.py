@@ -1,4 +1,4 @@
-"""What the long run (`make fuzz`) once found stays mended: its kept cases, one by one."""
+"""The failures once found by the long run (`make fuzz`) stay fixed: its kept cases, one by one."""
 
 import pytest
 

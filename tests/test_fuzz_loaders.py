@@ -1,8 +1,8 @@
-"""Whatever is done to a file: it is read as something sound, or one line names file and key.
+"""A file altered in any way is read as something sound, or one line names file and key.
 
 See docs/promises.md, Files can't hurt.
 
-JAXNAV_FUZZ=3000 pytest tests/test_fuzz_loaders.py      # so many examples for each loader
+JAXNAV_FUZZ=3000 pytest tests/test_fuzz_loaders.py      # number of examples for each loader
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The watchdog: whatever happens, the last that a vehicle hears is zero throttle, and soon."""
+"""The watchdog: whatever happens, a vehicle's last command is zero throttle, and soon."""
 
 import math
 import signal

@@ -1,4 +1,4 @@
-"""The guard's process: whatever becomes of the one that computes, the vehicle stands, and soon."""
+"""The guard's process: whatever happens to the computing process, the vehicle stops, and soon."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""How well the vehicle is: worse at once, better after a while, and never in motion when blind."""
+"""The vehicle's health: worse at once, better after a while, and never in motion when blind."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Events in the order of their stamps, however they come, against a list that is sorted."""
+"""Events in the order of their stamps, in whatever order they arrive, against a sorted list."""
 
 import numpy as np
 from hypothesis import given, settings

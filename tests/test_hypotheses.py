@@ -1,4 +1,4 @@
-"""The bank of hypotheses: its start, its fits and weights, its mergers, and what it decides."""
+"""The bank of hypotheses: its start, its fits and weights, its mergers and its decisions."""
 
 import functools
 

@@ -1,6 +1,6 @@
-"""Rendered images that break on their way: what the search makes of them, and the pilot of that.
+"""Rendered images damaged on their way: the search's results, and the pilot's.
 
-Nothing raises. What can be seen is found where it is, what can't be is not made up.
+Nothing raises. Visible markers are found in their places, and no others are invented.
 """
 
 import time

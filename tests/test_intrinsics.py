@@ -1,4 +1,4 @@
-"""Lenses from corners: true within their sigmas, unmoved by what is wrong, refused where untold."""
+"""Lenses from corners: true within their sigmas, robust to bad data, refused if undetermined."""
 
 from dataclasses import replace
 

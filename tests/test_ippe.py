@@ -1,4 +1,4 @@
-"""Closed-form poses against OpenCV where it is right, and against the truth where it is not."""
+"""Closed-form poses against OpenCV where OpenCV is right, and against the truth elsewhere."""
 
 import cv2
 import jax

@@ -1,6 +1,6 @@
-"""Several markers on one wall, solved together, are one larger plane: they still flip.
+"""Several markers on one wall, solved together, form one larger plane, and still flip.
 
-What a frame alone says of that must be true for joint solves as it is for single markers.
+A single frame's flip probability must be right for joint solves as it is for single markers.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Who may import whom: every import in jaxnav/ is parsed and held against the arrows.
+"""Every import in jaxnav/ is parsed and compared with the allowed arrows between layers.
 
 shell -> pictures -> users -> navigator -> belief & control -> pose -> models -> numerics, never
 upward.

@@ -1,4 +1,4 @@
-"""The bundle of a camera and its board: held against SciPy's solver on OpenCV's projection."""
+"""The bundle adjustment of a camera and its board against SciPy's on OpenCV's projection."""
 
 import cv2
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""How likely corners are: against integrals over all poses, statistics, and the world turned."""
+"""The likelihood of corners against integrals over all poses, statistics and a rotated world."""
 
 import dataclasses
 import functools

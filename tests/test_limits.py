@@ -1,4 +1,4 @@
-"""Whatever is computed, the command is finite and in the limits (docs/promises.md, It stops)."""
+"""The command is always finite and inside the limits (docs/promises.md, It stops)."""
 
 import math
 

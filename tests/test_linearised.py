@@ -1,4 +1,4 @@
-"""Closed derivatives of the corners' residuals against differentiated projections."""
+"""Closed-form derivatives of the corners' residuals against differentiated projections."""
 
 import dataclasses
 

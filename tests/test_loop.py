@@ -1,4 +1,4 @@
-"""The loop with its threads: what it does when any of them fails, hangs, or is told to stop."""
+"""The loop with its threads: its reaction if any of them fails, hangs or is told to stop."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Messages of recorded drives: every number comes back, and other tools can read them."""
+"""Messages of recorded drives: every number is read back, and other tools can read them."""
 
 import dataclasses
 import json

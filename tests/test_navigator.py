@@ -1,4 +1,4 @@
-"""Algorithm 1 as one pure step: the same alone, scanned, mapped, differentiated and spoilt."""
+"""Algorithm 1 as one pure step: the same alone, scanned and vmapped; its gradient; bad input."""
 
 import functools
 from typing import ClassVar

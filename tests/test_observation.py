@@ -1,4 +1,4 @@
-"""Which lanes count, and what is kept of an observation that is broken."""
+"""Which sightings count, and which parts of a broken observation are kept."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""Who looks on is told all there is, is closed in the end, and is no reason to drive otherwise."""
+"""Observers of a drive receive every event, are closed at the end, and do not affect the drive."""
 
 import sys
 from contextlib import ExitStack

@@ -1,4 +1,4 @@
-"""Which odometry is believed: what the vehicle can do, and not what its sensor makes of it."""
+"""Odometry is believed if the vehicle can move so; stuck and impossible readings are not."""
 
 import math
 

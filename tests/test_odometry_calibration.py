@@ -1,5 +1,5 @@
-"""Odometry from drives past a marker: against the truth of a simulated car, and against what a
-drive can't tell."""
+"""Calibration of odometry from drives past a marker: against a simulated car's truth, and on drives
+that cannot determine it."""
 
 import dataclasses
 import math

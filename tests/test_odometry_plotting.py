@@ -1,4 +1,4 @@
-"""The picture of odometry's calibration: everything found is drawn, in units, and what to do."""
+"""The picture of odometry's calibration shows every result with its unit, and the advice."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""One step: what the car's compiled program makes of events is what a scan of `step` makes."""
+"""The car's compiled program makes the same of events as a scan of `step`."""
 
 import operator
 from functools import partial

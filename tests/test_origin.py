@@ -1,4 +1,4 @@
-"""Far from the world's zero all is as it is at zero, in float32 too."""
+"""Far from the world's zero all results are as at zero, in float32 too."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""What a drive prints holds nobody up, and breaks nothing, whoever reads it."""
+"""The output of a drive blocks no thread and breaks nothing, whatever reads it."""
 
 import os
 import subprocess

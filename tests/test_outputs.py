@@ -1,4 +1,4 @@
-"""Nothing that a command reads is written over, whatever name it goes by; and two processes at one
+"""A command overwrites none of its inputs, under whatever name; and two processes that write one
 result don't lose each other's."""
 
 import dataclasses

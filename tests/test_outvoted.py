@@ -1,4 +1,4 @@
-"""A marker that others have outvoted does not count when it is alone."""
+"""A marker that others have outvoted does not count while it is alone in view."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Trees as two vectors, and back."""
+"""Packing of trees into two vectors, and back."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The lane-parallel path against the general one, lane by lane."""
+"""The lane-parallel solver of marker poses against the general one, lane by lane."""
 
 import jax
 import jax.numpy as jnp

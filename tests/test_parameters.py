@@ -1,4 +1,4 @@
-"""What can be tuned by name: every name leads to its number, and other numbers stay."""
+"""Tunable parameters by name: every name changes its number, and other numbers stay."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Tuned parameters come back bit for bit and reach the navigator, or one line says why not."""
+"""Tuned parameters are read back bit for bit and reach the navigator, or one line says why not."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""From events to commands: the same again, in any order, and whatever the data are."""
+"""The pilot, from events to commands: reproducible, for any order of events and any data."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""The simulated car against what physics says of it."""
+"""The simulated car against physics."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Numbers that nobody can draw are left out of a picture, and counted."""
+"""Numbers that cannot be drawn are left out of a picture, and counted."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Plug-ins by name: what is found is opened, and whatever is wrong is one line."""
+"""Plug-ins by name: a plug-in that is found is opened, and any error is one line."""
 
 import importlib.metadata
 import sys

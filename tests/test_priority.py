@@ -1,4 +1,4 @@
-"""A process that comes before others, and a terminal that is afterwards as it was."""
+"""A process gets priority over others, and its terminal is restored afterwards."""
 
 import os
 import sys

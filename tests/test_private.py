@@ -1,4 +1,4 @@
-"""Folders whose content is run as it is found: what others could have put there is never read."""
+"""Folders whose content is executed: files that others could have put there are never read."""
 
 import os
 import signal

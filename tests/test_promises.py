@@ -1,4 +1,4 @@
-"""Every promise of docs/promises.md names a test that there is."""
+"""Every promise of docs/promises.md names an existing test."""
 
 import ast
 import re

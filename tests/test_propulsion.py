@@ -1,4 +1,4 @@
-"""What the throttle says about the odometer."""
+"""Evidence about the odometer from the throttle."""
 
 import math
 

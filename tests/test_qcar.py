@@ -1,4 +1,4 @@
-"""The QCar's plug-in on a copy of its maker's driver, bad habits included."""
+"""The QCar's plug-in on an imitation of its maker's driver, bad habits included."""
 
 import contextlib
 import math

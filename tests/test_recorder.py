@@ -1,4 +1,4 @@
-"""The recorder writes what it is given, and whatever happens to the disk, nobody waits for it."""
+"""The recorder writes its input, and no caller waits for it, whatever happens to the disk."""
 
 import errno
 import json

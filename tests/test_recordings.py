@@ -1,4 +1,4 @@
-"""Recordings: the same detections out of bags and arrays, and one line for what can't be read."""
+"""Recordings: the same detections from bags and arrays, and one line for an unreadable one."""
 
 import bz2
 import shutil

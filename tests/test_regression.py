@@ -1,8 +1,8 @@
-"""Recorded drives of the simulated car come out as they did when they were recorded.
+"""Recorded drives of the simulated car give the same outcomes as when they were recorded.
 
 `pytest tests/test_regression.py --update-refs` replays the recorded inputs, makes the outcomes the
-new reference, and writes beside each recording what a review wants to see of it. A recording
-that is missing is driven first.
+new reference, and writes a summary for review beside each recording. A recording that is missing
+is driven first.
 """
 
 from pathlib import Path

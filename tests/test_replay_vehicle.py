@@ -1,4 +1,4 @@
-"""A recorded drive as a vehicle: what was recorded comes once more, at its pace, into the loop."""
+"""A recorded drive as a vehicle: it replays the recorded data into the loop at their pace."""
 
 import dataclasses
 import time

@@ -1,4 +1,4 @@
-"""Rollouts at corner level: what is seen, what happens in each scenario, and nothing else."""
+"""Rollouts at corner level: their observations, and the events of each scenario."""
 
 import dataclasses
 from types import SimpleNamespace

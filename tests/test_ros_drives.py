@@ -1,4 +1,4 @@
-"""Drives out of ROS bags: the inputs that were written come back, whatever the format."""
+"""Drives from ROS bags: the written inputs are read back, whatever the format."""
 
 import bz2
 import math

@@ -1,4 +1,4 @@
-"""ROS bags and topic maps that do not fit or are broken: one line, or a result."""
+"""ROS bags and topic maps that do not fit or are broken give a one-line error, or a result."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""What ROS messages say: steering from a yaw rate, the order of corners, pixels of images."""
+"""The content of ROS messages: steering from a yaw rate, the order of corners, image pixels."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""`jaxnav run` as a person runs it, in processes of its own: it arrives, or it stands."""
+"""`jaxnav run` as a person runs it, in separate processes: the car arrives, or it stops."""
 
 import os
 import pty

@@ -1,4 +1,4 @@
-"""Signals of a drive: none is lost, whatever the interpreter does when it comes."""
+"""Signals to a drive: none is lost, whatever the interpreter is doing when it arrives."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""`jaxnav simulate` and `jaxnav reliability`: what they count, and what bad input gets."""
+"""`jaxnav simulate` and `jaxnav reliability`: their counts, and the errors for bad input."""
 
 import json
 import os

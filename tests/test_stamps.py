@@ -1,4 +1,4 @@
-"""Which stamps are believed: repeated and impossible ones are not, a clock that jumped is again."""
+"""Stamps: repeated and impossible ones are rejected, those of a clock that jumped are accepted."""
 
 from hypothesis import given
 from hypothesis import strategies as st

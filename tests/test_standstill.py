@@ -1,4 +1,4 @@
-"""Who stands still while others move, on a road that leads past a marker."""
+"""Standstill of a camera, an odometer or the car while others move, on a road past a marker."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The line that a person watches while the car drives keeps its width and its places."""
+"""The status line of a drive keeps its width and its columns."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Studies: what a config may say, how a grid is cut, what is kept and what it amounts to."""
+"""Studies: the config, the cutting of the grid, the store and the summary."""
 
 import errno
 import json

@@ -1,5 +1,5 @@
-"""Studies of single frames and of drives: what they count, against OpenCV and against `simulate`;
-and the command, killed and continued, on other devices and on workers: the same bits."""
+"""Studies of single frames and of drives: their counts against OpenCV and against `simulate`; and
+the command, killed and continued, on other devices and on workers, gives the same bits."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""What an estimate rests on: never a single frame, and no leap that wheels can't explain."""
+"""The support of an estimate: never a single frame, and no leap that the wheels can't explain."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""`jaxnav tune`: from the command line to the files it leaves, and what bad input gets."""
+"""`jaxnav tune`: from the command line to its files, and the errors for bad input."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A fit in a folder: what is written, what goes on, and what is refused in one line."""
+"""A fit in a folder: its files, its resumption, and the one-line refusals."""
 
 from pathlib import Path
 

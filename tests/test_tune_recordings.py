@@ -1,4 +1,4 @@
-"""Recordings as what a filter is tuned on: nothing lost, nothing twice, each in its place."""
+"""Recordings for the tuning of a filter: no frame lost or repeated, each in its place."""
 
 import dataclasses
 import itertools

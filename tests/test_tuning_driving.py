@@ -1,4 +1,4 @@
-"""The loss of a drive and its derivatives: what is summed, the soft switch, and the whole loop."""
+"""The loss of a drive and its derivatives: the costs, the soft switch, and the whole loop."""
 
 import dataclasses
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Parameters as numbers that may be anything: there and back, and never out of what is allowed."""
+"""Parameters as unconstrained numbers: there and back, and always inside the allowed values."""
 
 import functools
 

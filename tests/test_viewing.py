@@ -1,6 +1,6 @@
-"""What is shown in Rerun is in its file, nobody waits for it, and what is missing gets one line.
+"""Everything shown in Rerun is in its file, no caller waits for it, and a failure gets one line.
 
-No window is opened: where one is meant, a program that only listens stands for it.
+No window is opened: a program that only listens takes the place of one.
 """
 
 import dataclasses

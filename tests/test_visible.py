@@ -1,4 +1,4 @@
-"""Names and texts of others, shown: a terminal obeys nothing of them, a picture no formula."""
+"""Foreign names and texts are harmless when shown: no terminal codes, no formulas in pictures."""
 
 import sys
 

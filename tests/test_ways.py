@@ -1,4 +1,4 @@
-"""Where corners and wheels part, and what no slip explains."""
+"""Disagreement between corners and wheels, and motion that no slip explains."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Worlds that several tests share: rigs, marker maps and what is seen in them."""
+"""Build the worlds that several tests share: rigs, marker maps and observations."""
 
 import jax
 import jax.numpy as jnp

@@ -1,1 +1,1 @@
-"""A vmap whose lanes lie last: what simulation and tuning run thousands of drives by."""
+"""Evaluate a function for thousands of lanes, batch axis last, for simulation and tuning."""

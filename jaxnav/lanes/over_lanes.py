@@ -1,13 +1,13 @@
-"""`jax.vmap` for thousands of small problems: the same function, its lanes along the last axis.
+"""Evaluate a function like `jax.vmap`, with the batch axis last, for thousands of small problems.
 
-`vmap` puts the batch first, so a batch of 6 x 6 matrices is worked off six numbers at a time, every
-branch of a `cond` is computed for every lane, and a loop runs until the slowest of all lanes ends.
-`over_lanes` evaluates the same jaxpr with the batch last: whatever the function does to one number
-is done to a row of lanes in vector registers, products of small matrices are sums of rows, and a
-`cond` whose index differs between the lanes sorts them: each branch runs over blocks of its own
-lanes, and costs what they cost.
+`vmap` puts the batch axis first: it computes a batch of 6 x 6 matrices six numbers at a time,
+every branch of a `cond` for every lane, and a loop until the slowest of all lanes ends.
+`over_lanes` evaluates the same jaxpr with the batch axis last: an operation on one number becomes
+an operation on a row of lanes in vector registers, and products of small matrices are sums of rows.
+A `cond` whose index differs between the lanes sorts them by branch: each branch runs over blocks of
+its own lanes and costs only those blocks.
 
-What one lane computes does not depend on the others. Derivatives are those of `vmap`.
+A lane's result does not depend on the other lanes. Derivatives are those of `vmap`.
 """
 
 import collections
@@ -24,8 +24,8 @@ from jaxnav.lanes.rules import ELEMENTWISE, NUMPY, RULES, VIEWS, elementwise
 from jaxnav.lanes.strips import CALLS, STRIP, by_itself, in_strips
 from jaxnav.lanes.values import CHEAP, DEAR, Lane, Value, known, rows_of, scanned, written
 
-# What `over_lanes` writes to memory once, XLA for the CPU would compute again wherever it is read,
-# if it did not see the barriers; and its costly passes double the time to compile, for nothing.
+# Without barriers XLA for the CPU computes anew, at every use, the values that `over_lanes` writes
+# to memory once. Its costly passes double the compile time and buy nothing.
 COMPILER_OPTIONS = {
     "xla_disable_hlo_passes": "cse_barrier_expander",
     "xla_backend_optimization_level": 1,
@@ -33,11 +33,11 @@ COMPILER_OPTIONS = {
 
 
 def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
-    """`jax.vmap(fn, in_axes=-1, out_axes=-1)`, evaluated as the module says.
+    """`jax.vmap(fn, in_axes=-1, out_axes=-1)`, evaluated as the module docstring says.
 
     Args:
-        fn: pure, of pytrees of arrays.
-        block: lanes that a branch of a `cond` takes at a time, however few have chosen it.
+        fn: a pure function of pytrees of arrays.
+        block: number of lanes in each block of a `cond`'s branch, however few lanes chose it.
     """
 
     def batched(*args: Any) -> Any:
@@ -73,12 +73,12 @@ def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
 
 
 def lanes_last(tree: Any) -> Any:
-    """Arrays (L, ...) as (..., L)."""
+    """Move the batch axis of every leaf from first to last: (L, ...) to (..., L)."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), tree)
 
 
 def lanes_first(tree: Any) -> Any:
-    """Arrays (..., L) as (L, ...)."""
+    """Move the batch axis of every leaf from last to first: (..., L) to (L, ...)."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), tree)
 
 
@@ -87,7 +87,7 @@ class _Evaluation(NamedTuple):
     block: int
 
     def run(self, jaxpr: Any, consts: Sequence[Value], args: Sequence[Value]) -> list[Value]:
-        """The outputs of a jaxpr."""
+        """Evaluate a jaxpr: its outputs."""
         uses = collections.Counter(
             var for eqn in jaxpr.eqns for var in eqn.invars if not isinstance(var, core.Literal)
         )
@@ -117,7 +117,7 @@ class _Evaluation(NamedTuple):
         if name == "platform_index":
             return [_platform_index(params["platforms"])]
         if name in ("cond", "while", "scan"):
-            for arg in args:  # before another trace begins
+            for arg in args:  # fetched before another trace begins
                 _ = arg.rows if isinstance(arg, Lane) else arg
         if name == "cond":
             return self._cond(args, params)
@@ -137,21 +137,21 @@ class _Evaluation(NamedTuple):
             return self._scan(args, params)
         if name in ELEMENTWISE and name not in RULES:
             return [elementwise(eqn.primitive, args, params, self.lanes)]
-        if name not in VIEWS:  # a sum asks for every term once
+        if name not in VIEWS:  # a sum reads every term once
             args = [written(arg, CHEAP if name == "reduce_sum" else 0) for arg in args]
         rule = RULES.get(name)
         outs = rule(args, params, self.lanes) if rule else None
         return self._generic(eqn.primitive, args, params) if outs is None else outs
 
     def _generic(self, primitive: Any, args: list[Value], params: dict[str, Any]) -> list[Value]:
-        """By `vmap`'s own rule."""
+        """Evaluate a primitive by `vmap`'s own batching rule."""
         axes = [-1 if isinstance(arg, Lane) else None for arg in args]
         arrays = [arg.rows if isinstance(arg, Lane) else arg for arg in args]
         outs = jax.vmap(lambda *a: primitive.bind(*a, **params), in_axes=axes, out_axes=-1)(*arrays)
         return [Lane(out) for out in (outs if primitive.multiple_results else [outs])]
 
     def _while(self, args: list[Value], params: dict[str, Any]) -> list[Value]:
-        """Until the last lane ends; what has ended keeps what it has."""
+        """Run a loop until the last lane ends; a lane that has ended keeps its carry."""
         n_cond, n_body = params["cond_nconsts"], params["body_nconsts"]
         cond_consts, body_consts = args[:n_cond], args[n_cond : n_cond + n_body]
         cond, body = params["cond_jaxpr"], params["body_jaxpr"]
@@ -171,9 +171,9 @@ class _Evaluation(NamedTuple):
                 [*body_consts, *(Lane(c) for c in carry)],
             )
             moved, still = [rows_of(out, self.lanes) for out in outs], goes(carry)
-            if not isinstance(still, Lane):  # whoever asks all lanes at once freezes them himself
+            if not isinstance(still, Lane):  # one condition for all: the body freezes lanes
                 return moved
-            # (*batch, L): `vmap` inside has put its axes first.
+            # (*batch, L): a `vmap` inside `fn` put its axes first.
             return [
                 jnp.where(_spread(still.rows, old.ndim), new, old)
                 for new, old in zip(moved, carry, strict=True)
@@ -248,7 +248,7 @@ def _sorted_switch(
     shapes: Sequence[Any],
     block: int,
 ) -> list[jax.Array]:
-    """Each branch over blocks of the lanes that have chosen it; its last block repeats a lane."""
+    """Run each branch over blocks of the lanes that chose it; the last block repeats a lane."""
     lanes, count = chosen.shape[0], len(branches)
     is_in = chosen[None] == jnp.arange(count)[:, None]
     running = scanned(is_in.astype(jnp.int32), 1, lax.add, 0, False)
@@ -288,7 +288,7 @@ def _sorted_switch(
 
 
 def _spread(rows: jax.Array, ndim: int) -> jax.Array:
-    """(*batch, L), against (*batch, ..., L)."""
+    """Reshape (*batch, L) to `ndim` axes, to broadcast against (*batch, ..., L)."""
     return rows.reshape(rows.shape[:-1] + (1,) * (ndim - rows.ndim) + rows.shape[-1:])
 
 

@@ -1,7 +1,7 @@
-"""Rules for `over_lanes`: arithmetic, sums and products of small arrays, their shapes.
+"""Evaluate primitives for `over_lanes`: arithmetic, sums and products of small arrays, shapes.
 
-A rule takes (arguments, parameters, lanes) and gives the outputs, or None where `vmap`'s own rule
-has to do.
+A rule takes (arguments, parameters, lanes) and returns the outputs, or None to fall back to
+`vmap`'s own batching rule.
 """
 
 import math
@@ -49,7 +49,7 @@ def elementwise(primitive: Any, args: list[Any], params: dict[str, Any], lanes: 
 
 
 def _atan2(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
-    """In float32 a polynomial, to 2 ulp; XLA's calls the C library for every number.
+    """atan2 in float32 as a polynomial, to 2 ulp; XLA's own calls the C library for every number.
 
     Source: Moshier (1989), "Methods and programs for mathematical functions" (Cephes, atanf).
     """
@@ -58,7 +58,7 @@ def _atan2(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] |
         return None
     y, x = (jnp.broadcast_to(rows_of(arg, lanes), (*shape, lanes)) for arg in args)
     longer, shorter = jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.minimum(jnp.abs(x), jnp.abs(y))
-    ratio = shorter / jnp.where(longer > 0, longer, 1)  # tan of the angle to the nearer axis
+    ratio = shorter / jnp.where(longer > 0, longer, 1)  # tangent of the angle to the nearer axis
     far = ratio > 0.41421356  # tan(pi / 8): there of the angle to the diagonal
     t = jnp.where(far, (ratio - 1) / (ratio + 1), ratio)
     z = t * t
@@ -166,7 +166,7 @@ def _reduce(combine: Callable[[Any, Any], Any]) -> Callable[..., list[Value] | N
 
 
 def _running(combine: Callable[[Any, Any], Any], neutral: int) -> Callable[..., list[Value]]:
-    """Sums or products of all before, by doubling: XLA takes the square of the length."""
+    """The rule of a cumulative sum or product, by doubling: XLA's cost is quadratic in length."""
 
     def rule(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
         axis, rows = params["axis"], args[0].rows
@@ -257,7 +257,7 @@ RULES: dict[str, Callable[..., list[Value] | None]] = {
     "stop_gradient": _same,
     "nondifferentiable_backward": _same,
     "nonbatchable": _same,
-    "unvmap_any": _any_lane,  # equinox's loops, which freeze what has ended themselves
+    "unvmap_any": _any_lane,  # equinox's loops, which freeze ended lanes themselves
     "broadcast_in_dim": _broadcast_in_dim,
     "reshape": _reshape,
     "squeeze": _squeeze,

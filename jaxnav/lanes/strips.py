@@ -1,8 +1,8 @@
-"""Loops of `over_lanes` that run through a strip of lanes at a time, each in a single kernel.
+"""Run a loop of `over_lanes` one strip of lanes at a time, in a single kernel.
 
-XLA for the CPU makes a kernel of every fused operation, and each passes over all lanes of a block
-before the next one starts: by then its operands have left the first-level cache. What it finds in a
-call that says `xla_cpu_small_call` becomes one function, loops included. A strip iterates
+XLA for the CPU makes a kernel of every fused operation, and each kernel passes over all lanes of a
+block before the next one starts: by then its operands have left the first-level cache. XLA compiles
+a call with the attribute `xla_cpu_small_call` to one function, loops included. A strip iterates
 until its own slowest lane ends, not the slowest of the block.
 """
 
@@ -18,7 +18,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxnav.lanes.rules import ELEMENTWISE, RULES
 from jaxnav.lanes.values import Lane, Value, one_kernel, rows_of
 
-STRIP = 32  # lanes; loops over 16 LLVM leaves as they are, 64 leave the first-level cache
+STRIP = 32  # lanes; LLVM does not vectorise loops over 16, and 64 leave the first-level cache
 CALLS = {
     "jit": "jaxpr",
     "pjit": "jaxpr",
@@ -28,12 +28,12 @@ CALLS = {
     "custom_vjp_call": "call_jaxpr",
 }
 _LOOPS = {"while": ("cond_jaxpr", "body_jaxpr"), "scan": ("jaxpr",)}
-# What neither sorts lanes nor calls a library.
+# Primitives that neither sort lanes nor call a library.
 _FITTING = ELEMENTWISE | RULES.keys() | {"iota", "select_if_vmap"}
 
 
 def by_itself(eqn: Any) -> bool:
-    """Whether it can become part of a kernel here."""
+    """Whether an equation can become part of a single kernel on this backend."""
     name, params = eqn.primitive.name, eqn.params
     inner = _LOOPS.get(name, (CALLS[name],) if name in CALLS else ())
     if not inner:
@@ -45,11 +45,11 @@ def by_itself(eqn: Any) -> bool:
 def in_strips(
     loop: Callable[[list[Value]], list[Value]], fixed: Sequence[Value], start: list[jax.Array]
 ) -> list[jax.Array]:
-    """A loop of `STRIP` lanes at a time; the last strip repeats some where they don't divide.
+    """Run a loop `STRIP` lanes at a time; the last strip repeats lanes if they don't divide evenly.
 
     Args:
-        loop: what it carries in the end, of `fixed` and what it starts with.
-        start: (..., L). Computed outside: XLA aborts on some constants that a kernel begins with.
+        loop: from `fixed` and the initial carry to the final carry.
+        start: (..., L), the initial carry, computed outside: XLA aborts on some initial constants.
     """
     lanes = start[0].shape[-1]
     varying = [arg.rows for arg in fixed if isinstance(arg, Lane)]
@@ -77,7 +77,7 @@ def in_strips(
                 for out, end in zip(outs, ends, strict=True)
             ]
 
-        # Of what is inside only the barriers are marked.
+        # Inside the kernel only the barriers carry attributes.
         with one_kernel(), set_xla_metadata(inlineable=None, xla_cpu_small_call=None):
             return lax.fori_loop(0, -(-lanes // STRIP), strip, [jnp.zeros_like(s) for s in start])
 

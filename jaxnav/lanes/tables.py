@@ -1,7 +1,7 @@
-"""Rules for `over_lanes`: rows taken from, put into and sorted in small tables.
+"""Evaluate primitives for `over_lanes`: gather, scatter and sort in small tables.
 
-A rule takes (arguments, parameters, lanes) and gives the outputs, or None where `vmap`'s own rule
-has to do.
+A rule takes (arguments, parameters, lanes) and returns the outputs, or None to fall back to
+`vmap`'s own batching rule.
 """
 
 import math
@@ -26,9 +26,9 @@ def _windows(
     operand_batch: Sequence[Any],
     index_batch: Sequence[Any],
 ) -> np.ndarray | None:
-    """Flat positions in the operand that a gather reads and a scatter writes.
+    """The flat positions in the operand that a gather reads or a scatter writes.
 
-    None where a window does not lie inside.
+    None if a window does not lie inside the operand.
     """
     batch_shape = index.shape[:-1]
     start = np.zeros((*batch_shape, len(shape)), int)
@@ -73,7 +73,7 @@ def gather(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] |
         return None if flat is None else [Lane(_rows_at(operand.rows, flat), DEAR)]
     if not isinstance(index, Lane):
         return None
-    # A table whose row every lane chooses for itself.
+    # Every lane chooses its own row of the table.
     if len(dn.start_index_map) != 1 or dn.collapsed_slice_dims != dn.start_index_map:
         return None
     axis = dn.start_index_map[0]
@@ -169,7 +169,7 @@ def scatter(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] 
 
 
 def _rows_at(rows: jax.Array, flat: np.ndarray) -> jax.Array:
-    """The rows at known flat positions, as few copies of neighbours as there can be."""
+    """The rows at known flat positions, with neighbouring rows copied together."""
     lanes = rows.shape[-1]
     rows = rows.reshape(-1, lanes)
     order = flat.reshape(-1)
@@ -206,9 +206,9 @@ def arg_extreme(better: Callable[[Any, Any], Any]) -> Callable[..., list[Value] 
 
 
 def _ranks(keys: jax.Array, descending: bool) -> jax.Array:
-    """(n, ..., L): at which place of the order each one comes; equal ones as they are.
+    """The rank (n, ..., L) of each key in the order; equal keys keep their order.
 
-    Ascending, NaN comes last and zeros are equal; descending, the order is IEEE's: as XLA has it.
+    Ascending, NaN comes last and zeros are equal; descending, the order is IEEE's: as in XLA.
     """
     if jnp.issubdtype(keys.dtype, jnp.floating):
         if not descending:
@@ -228,7 +228,7 @@ def _ranks(keys: jax.Array, descending: bool) -> jax.Array:
 
 
 def _placed(ranks: jax.Array, values: jax.Array, places: int) -> jax.Array:
-    """values (n, ..., L) in the order of their ranks."""
+    """The first `places` of values (n, ..., L) in the order of their ranks."""
     place = jnp.arange(places, dtype=jnp.int32).reshape((-1,) + (1,) * (values.ndim - 1))
     shape = (places, *values.shape[1:])
     out = jnp.broadcast_to(values[:1], shape)

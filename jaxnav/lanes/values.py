@@ -1,4 +1,4 @@
-"""What `over_lanes` computes with: values that differ between the lanes, and others."""
+"""Represent the values of `over_lanes`: those that differ between lanes, and those that don't."""
 
 import contextvars
 from collections.abc import Callable, Iterator
@@ -11,8 +11,8 @@ import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
-UNROLLED = 32  # terms of a sum, rows of a table that a lane chooses from
-# Operations a number: what is worth computing twice, and what is worth a pass over memory.
+UNROLLED = 32  # the most terms of a sum, or rows of a table, that are written out
+# Operations per number: the most worth computing twice, and those worth a pass over memory.
 CHEAP, DEAR = 2, 24
 
 
@@ -21,7 +21,7 @@ _in_kernel = contextvars.ContextVar("in_kernel", default=False)
 
 @contextmanager
 def one_kernel() -> Iterator[None]:
-    """What is traced here becomes part of one kernel: see `lane_strips.py`."""
+    """Trace the block as part of one kernel: see `strips.py`."""
     token = _in_kernel.set(True)
     try:
         yield
@@ -30,9 +30,9 @@ def one_kernel() -> Iterator[None]:
 
 
 def barrier(rows: jax.Array) -> jax.Array:
-    """The same, computed once and not anew for whoever reads it.
+    """The same rows, computed once and not anew at every use.
 
-    Inside a kernel XLA knows no barriers, but calls, which LLVM makes a copy.
+    Inside a kernel XLA knows no barriers; a call, which LLVM makes a copy, serves as one there.
     """
     if not _in_kernel.get():
         return lax.optimization_barrier(rows)
@@ -45,9 +45,9 @@ def _same(rows: jax.Array) -> jax.Array:
 
 
 def joined(rows: list[jax.Array], axis: int) -> "Lane":
-    """Along an existing axis.
+    """Concatenate rows along an existing axis.
 
-    Inside a kernel by itself: fused with anything else it asks for every number where it is from.
+    Inside a kernel it is kept unfused: fused, it would look up the source of every single number.
     """
     if not _in_kernel.get():
         return Lane(lax.concatenate(rows, axis), DEAR)
@@ -55,10 +55,10 @@ def joined(rows: list[jax.Array], axis: int) -> "Lane":
 
 
 class Lane:
-    """A value that differs between the lanes: (*shape, L).
+    """A value that differs between the lanes, (*shape, L).
 
-    `work` counts the operations a number has cost since it was last written to memory. With `at` it
-    is some lanes of a longer row, fetched when somebody looks at them.
+    `work` counts the operations per number since the value was last written to memory. With `at`
+    the value is some lanes of a longer row, fetched when `rows` is first read.
     """
 
     def __init__(self, source: jax.Array, work: int = 0, at: jax.Array | None = None):
@@ -66,31 +66,31 @@ class Lane:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """That of one lane."""
+        """The shape of one lane's value."""
         return self.source.shape[:-1]
 
     @property
     def rows(self) -> jax.Array:
-        """The array itself."""
+        """The array (*shape, L)."""
         if self.at is not None:
             fetched = self.source.at[..., self.at].get(mode="promise_in_bounds")
             self.source, self.at = barrier(fetched), None
         return self.source
 
 
-# A value that differs between lanes; one that does not; one that is known while tracing.
+# A value that differs between lanes; one that does not; one that is known at trace time.
 Value = Lane | jax.Array | np.ndarray
 
 
 def written(value: Value, cheap: int) -> Value:
-    """A value that whoever needs it reads, instead of computing it once more for himself."""
+    """The value written to memory, for its users to read, if it cost more than `cheap`."""
     if not isinstance(value, Lane) or value.work <= cheap:
         return value
     return Lane(barrier(value.rows))
 
 
 def known(value: Any) -> Value:
-    """Small constants are worth knowing: they choose rows."""
+    """A small constant as a NumPy array, so that it can select rows at trace time."""
     if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
         return value if isinstance(value, jax.core.Tracer) else np.asarray(value)
     if jnp.issubdtype(value.dtype, jax.dtypes.prng_key) or value.size > 4096:
@@ -99,7 +99,7 @@ def known(value: Any) -> Value:
 
 
 def rows_of(value: Value, lanes: int) -> jax.Array:
-    """(*shape, L), whether or not the lanes differ."""
+    """The value broadcast to (*shape, L), whether or not the lanes differ."""
     if isinstance(value, Lane):
         return value.rows
     value = jnp.asarray(value)
@@ -107,7 +107,7 @@ def rows_of(value: Value, lanes: int) -> jax.Array:
 
 
 def at_place(rows: jax.Array, index: dict[Any, Any]) -> jax.Array:
-    """rows[index], some axes at one place each."""
+    """The rows at one index along each of some axes, which are dropped."""
     start = [index.get(axis, 0) for axis in range(rows.ndim)]
     stop = [index[a] + 1 if a in index else size for a, size in enumerate(rows.shape)]
     return lax.squeeze(lax.slice(rows, start, stop), tuple(index))

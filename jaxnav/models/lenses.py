@@ -1,8 +1,8 @@
-"""Projection through a lens, its slope, and its inverse: a new lens is a row of `LENSES`.
+"""Project through a lens, with derivatives, and invert it; a new lens is a row of `LENSES`.
 
-Coordinates come first: points (3, ...) in m in the camera frame, images (2, ...) at focal length 1,
-slopes (3, 2, ...) by the three coordinates of the point, per m. Coefficients are in the order of
-OpenCV, one or an array for each that broadcasts with the points; a lens gets only its own.
+The coordinate axis comes first: points (3, ...) in m in the camera frame, images (2, ...) at focal
+length 1, slopes (3, 2, ...) with respect to the point's coordinates, per m. Coefficients are in the
+order of OpenCV, each a number or an array that broadcasts with the points; a lens gets its own.
 """
 
 from collections.abc import Callable
@@ -15,19 +15,19 @@ from jaxtyping import Array, Float
 
 from jaxnav.models.geometry import on_last_axis, safe_norm
 
-# Points nearer to the camera's plane than this multiple of their distance are projected as
-# if they lay there: finite and far outside of any image instead of infinite or mirrored.
+# Points nearer to the camera's plane than this multiple of their distance are projected with this
+# depth: finite and far outside of any image instead of infinite or mirrored.
 MIN_DEPTH_RATIO = 1e-3
-# Where an inverse lens starts: 96 angles from the axis, up to 89 or 180 degrees.
+# Size of the table from which an inverse lens starts: angles up to 89 or 180 degrees.
 _TABLE_SIZE = 96
 _NEWTON_STEPS = 4
-_LEAST_DENOMINATOR = 1e-3  # of a rational lens, far outside of what it was fitted to
+_LEAST_DENOMINATOR = 1e-3  # bound for a rational lens far outside of its fitted range
 
 Image = tuple[Float[Array, "2 ..."], Float[Array, "3 2 ..."]]
 
 
 class Lens(NamedTuple):
-    """One kind of lens."""
+    """A kind of lens: its coefficients, its projection and the inverse."""
 
     coefficients: tuple[str, ...]
     image: Callable[[Array, Array], Image]  # of points (3, ...), with the slope
@@ -73,7 +73,7 @@ def _bent(x: Array, y: Array, coefficients: Array) -> tuple[Array, tuple[Array, 
     _, _, p1, p2, *_ = coefficients
     r2 = x**2 + y**2
     radial, rise = _radial(r2, coefficients)
-    bend = 2 * rise  # of radial, per x or y
+    bend = 2 * rise  # derivative of `radial`, over x or y
     bent = jnp.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
@@ -87,7 +87,7 @@ def _bent(x: Array, y: Array, coefficients: Array) -> tuple[Array, tuple[Array, 
 
 
 def _radial(r2: Array, coefficients: Array) -> tuple[Array, Array]:
-    """Factor on the radius, and its derivative by r2, the squared radius."""
+    """The factor on the radius, and its derivative with respect to r2, the squared radius."""
     k1, k2, _, _, k3, *below = coefficients
 
     def polynomial(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
@@ -135,7 +135,7 @@ def _equidistant_gain(theta2: Array, coefficients: Array) -> Array:
 
 
 def _axes(constant: Array, points: Array) -> Array:
-    """A constant with trailing axes of length 1, which broadcasts over all points."""
+    """The constant with trailing axes of length 1, to broadcast over all points."""
     return constant.reshape(*constant.shape, *(1,) * (points.ndim - 1))
 
 
@@ -188,8 +188,8 @@ def _equidistant_bearing(xy_bent: Array, coefficients: Array) -> Array:
 def _invert(profile: Callable[[Array], Array], target: Array, table: np.ndarray) -> Array:
     """The smallest x >= 0 with profile(x) = target: table look-up, then Newton in its cell.
 
-    The table ends where the profile stops rising, which is as far as the lens is one-to-one.
-    The last Newton step alone carries the gradient, and it is the implicit one.
+    The table ends where the profile stops rising: the lens is one-to-one up to there. Only the last
+    Newton step carries the gradient, which is that of the implicit function.
     """
     grid = jnp.asarray(table, target.dtype)
     values = profile(grid)

@@ -1,1 +1,1 @@
-"""Pictures: of drives, studies, calibrations and tuning, as matplotlib draws them."""
+"""Draw drives, studies, calibrations and tuning with matplotlib."""

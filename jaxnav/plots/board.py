@@ -1,4 +1,4 @@
-"""A calibration board on paper, at true scale, with rulers to check the print by."""
+"""Draw a calibration board for printing at true scale, with rulers to check the print."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,17 +11,17 @@ from jaxnav.calibration.boards.pages import MARGIN_MM, RULER_MM, TEXT_MM, centre
 from jaxnav.calibration.boards.sheets import Sheet
 
 _MM_PER_INCH = 25.4
-_RULERS_MM = (100, 50, 20)  # the longest that fits
+_RULERS_MM = (100, 50, 20)  # the longest that fits is drawn
 _LINE_PT = 0.35
 _TEXT_PT = 6.5
 
 
 def board_page(sheet: Sheet, words: str, paper_mm: tuple[float, float]) -> Figure:
-    """The page, as large as the paper: save it without a bounding box of its own.
+    """Draw the page at the paper's size: save it without a bounding box of its own.
 
     Args:
-        sheet: of the board; its middle comes to `centre_mm`.
-        words: what is printed, with its sizes.
+        sheet: the board's sheet; its middle is at `centre_mm`.
+        words: caption, with the board's sizes.
         paper_mm: width and height.
     """
     width_mm, height_mm = paper_mm
@@ -43,7 +43,7 @@ def board_page(sheet: Sheet, words: str, paper_mm: tuple[float, float]) -> Figur
 
 
 def _ink(rectangles_mm: np.ndarray) -> PathPatch:
-    """All black rectangles (N, 4) as one path: edges that they share leave no seam."""
+    """All black rectangles (N, 4) as one path, so that shared edges leave no seam."""
     x, y, width, height = rectangles_mm.T
     corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height), (x, y)]
     vertices = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
@@ -54,7 +54,7 @@ def _ink(rectangles_mm: np.ndarray) -> PathPatch:
 
 
 def _ruler(axes: Axes, length_mm: int, start_mm: float, horizontal: bool) -> None:
-    """From `start_mm` on, in the strip along the bottom or the left side."""
+    """Draw a ruler from `start_mm` on, in the strip along the bottom or the left side."""
     marks = np.arange(length_mm + 1)
     reach_mm = np.where(marks % 10 == 0, 4.0, np.where(marks % 5 == 0, 3.0, 2.0))
     along = start_mm + np.concatenate([marks, [0]]).astype(float)
@@ -65,7 +65,7 @@ def _ruler(axes: Axes, length_mm: int, start_mm: float, horizontal: bool) -> Non
     lines = np.stack([ends, others], axis=1)
     if not horizontal:
         lines = lines[..., ::-1]
-    # Ticks end where they say: caps would add half a line's width.
+    # Ticks end exactly at their marks: caps would add half a line's width.
     axes.add_collection(
         LineCollection(list(lines), colors="black", linewidths=_LINE_PT, capstyle="butt")
     )

@@ -1,6 +1,6 @@
-"""The picture of a recorded drive: a map, and below it what happened, over time.
+"""Draw a recorded drive: a map, and below it health, doubts, commands and ages over time.
 
-One function, one Figure; nothing is shown or saved here.
+One function returns one Figure; nothing is shown or saved here.
 """
 
 from collections.abc import Iterator
@@ -17,22 +17,22 @@ from jaxnav.plots.localisation import BLACK, BLUE, GREEN, VERMILION
 from jaxnav.plots.scenery import Scenery
 from jaxnav.recording.drive_log import DriveLog, Outcomes
 
-_FAULT = "#444444"  # apart from all colours of health
-_JOIN_S = 0.15  # a flag that is down for less was up all the while: not every event can raise it
-_LETTER = 0.012  # its width on the time axis, as a part of it
-_SMALLEST_FLIP = 1e-6  # the end of its axis
+_FAULT = "#444444"  # distinct from all colours of health
+_JOIN_S = 0.15  # a shorter gap in a flag is closed: not every event can raise it
+_LETTER = 0.012  # width of a letter as a fraction of the time axis
+_SMALLEST_FLIP = 1e-6  # lower end of the axis of the flip probability
 _WIDTH_IN, _MAP_IN, _LANE_IN, _PANEL_IN = 8.0, 4.7, 0.17, 1.05
 
 
 def drive_log_report(log: DriveLog, title: str = "") -> Figure:
-    """A recorded drive: where it went, and health, doubts, commands and ages over time.
+    """Draw a recorded drive: its map, and health, doubts, commands and ages over time.
 
     Args:
-        log: with one outcome at least.
-        title: above everything.
+        log: a log of at least one outcome.
+        title: title of the figure.
 
     Raises:
-        ValueError: without any outcome.
+        ValueError: the log has no outcome.
     """
     outcomes = log.outcomes
     if not len(outcomes.now_ns):
@@ -64,7 +64,7 @@ def drive_log_report(log: DriveLog, title: str = "") -> Figure:
 
 
 def _lanes(outcomes: Outcomes) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Name, colour and bars (begin s, duration s) of each flag that ever was up."""
+    """Name, colour and bars (begin s, duration s) of each flag that was ever raised."""
     for kinds, values, color in (
         (Fault, outcomes.faults, _FAULT),
         (Reject, outcomes.rejects, PURPLE),
@@ -76,7 +76,7 @@ def _lanes(outcomes: Outcomes) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _bars(times_s: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(K, 2): begin and duration, wide enough to be seen."""
+    """The bars (K, 2) of a flag, begin and duration in s, wide enough to be visible."""
     ends_s = np.append(times_s[1:], times_s[-1])
     begins_s, ends_s = times_s[up], ends_s[up]
     apart = np.append(True, begins_s[1:] - ends_s[:-1] > _JOIN_S)
@@ -87,7 +87,7 @@ def _bars(times_s: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def _draw_lanes(axes: Axes, outcomes: Outcomes, lanes: list[tuple[str, str, np.ndarray]]) -> None:
-    """Health on top, below it a lane for each fault and reject."""
+    """Draw health on top, and below it a lane for each fault and reject."""
     for state in Health:
         bars = _runs(outcomes.times_s, outcomes.health == state)
         axes.broken_barh(bars, (-0.4, 0.8), color=HEALTH_COLORS[state], lw=0)
@@ -105,7 +105,7 @@ def _draw_lanes(axes: Axes, outcomes: Outcomes, lanes: list[tuple[str, str, np.n
 
 
 def _runs(times_s: np.ndarray, up: np.ndarray) -> list[tuple[float, float]]:
-    """Begin and duration of each run of events, up to the next event."""
+    """Begin and duration in s of each run of events, up to the next event."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], up.astype(int), [0]])))
     ends_s = np.append(times_s, times_s[-1])
     return [
@@ -158,7 +158,7 @@ def _draw_sigma(axes: Axes, outcomes: Outcomes) -> None:
 
 
 def _ages_ms(log: DriveLog) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Name, colour and (N, 2) time s and age ms of what was handled, where there was any."""
+    """Name, colour and (N, 2) time s and age ms of each kind of data that was handled."""
     begin_ns = int(log.outcomes.now_ns[0])
     frames = [(given.now_ns, given.frames[0].stamp_ns) for given in log.inputs if given.frames]
     readings = [(i.now_ns, i.odometry.stamp_ns) for i in log.inputs if i.odometry is not None]
@@ -169,7 +169,7 @@ def _ages_ms(log: DriveLog) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _draw_ages(axes: Axes, ages: list[tuple[str, str, np.ndarray]]) -> None:
-    """How old data were when they were handled; a clock that jumped is beyond the axis."""
+    """Draw the ages of data when they were handled; a clock's jumps lie beyond the axis."""
     for name, color, rows in ages:
         axes.plot(rows[:, 0], rows[:, 1], ".", ms=2.5, color=color, label=name)
     usual_ms = max(float(np.median(np.abs(rows[:, 1]))) for _, _, rows in ages)

@@ -1,4 +1,4 @@
-"""The map of a recorded drive: where the car went, and where else it may have been."""
+"""Draw the map of a recorded drive: the car's track, and its alternative poses."""
 
 import math
 
@@ -24,7 +24,7 @@ from jaxnav.plots.scenery import Scenery
 from jaxnav.recording.drive_log import Outcomes
 
 GREY, PURPLE = "#999999", "#CC79A7"
-# From pale to dark as it gets worse, so that it reads in grey too.
+# From pale to dark as health gets worse, so that it is readable in grey too.
 HEALTH_COLORS = {
     Health.INIT: GREY,
     Health.ALIGNED: SKY,
@@ -34,11 +34,11 @@ HEALTH_COLORS = {
     Health.STOP: BLACK,
 }
 _CHI2_2DOF_95 = 5.991
-_ELLIPSES, _CANDIDATES = 14, 40  # at most so many are drawn
+_ELLIPSES, _CANDIDATES = 14, 40  # the most that are drawn
 
 
 def draw_drive_map(axes: Axes, outcomes: Outcomes, scenery: Scenery) -> None:
-    """Track in the colour of its health, ellipses, hypotheses, candidates, waypoints, markers."""
+    """Draw the track by health, ellipses, hypotheses, candidates, waypoints and markers."""
     located = outcomes.located & np.isfinite(outcomes.pose).all(axis=1)
     track_m = np.where(located[:, None], outcomes.pose[:, :2], np.nan)
     others = _candidate_poses(outcomes)
@@ -72,18 +72,18 @@ def draw_drive_map(axes: Axes, outcomes: Outcomes, scenery: Scenery) -> None:
 
 
 def _look_at(axes: Axes, places_m: np.ndarray) -> None:
-    """Show these places (N, 2) at equal scales, whatever lies farther off."""
+    """Limit the axes to points (N, 2), at equal scales; anything farther off is cut."""
     axes.set_aspect("equal", adjustable="datalim")
     if len(places_m):
         low, high = places_m.min(axis=0), places_m.max(axis=0)
         margin_m = np.maximum(0.08 * np.max(high - low), 0.2)
-        # Limits that are fixed would forbid the axes to make both scales equal.
+        # Fixed limits would keep the axes from making both scales equal.
         axes.dataLim.set_points(np.stack([low - margin_m, high + margin_m]))
         axes.autoscale_view()
 
 
 def _draw_track(axes: Axes, track_m: np.ndarray, health: np.ndarray) -> None:
-    """Each piece in the colour of the health that it was driven in."""
+    """Draw each piece of the track in the colour of its health."""
     pieces = np.stack([track_m[:-1], track_m[1:]], axis=1)
     drawn = np.isfinite(pieces).all(axis=(1, 2))
     colors = [HEALTH_COLORS[Health(value)] for value in health[1:][drawn]]
@@ -101,7 +101,7 @@ def _health_handles(health: np.ndarray) -> list[Line2D]:
 
 
 def _draw_ellipses(axes: Axes, outcomes: Outcomes, known: np.ndarray) -> None:
-    """Where the vehicle is with 95 %, at equal times."""
+    """Draw the 95 % ellipses of the vehicle's position, evenly spaced in time."""
     for number, index in enumerate(known[_evenly(len(known), _ELLIPSES)]):
         covariance = outcomes.covariance[index][:2, :2]
         if covariance.shape != (2, 2) or not np.isfinite(covariance).all():
@@ -125,7 +125,7 @@ def _draw_ellipses(axes: Axes, outcomes: Outcomes, known: np.ndarray) -> None:
 
 
 def _candidate_poses(outcomes: Outcomes) -> dict[bool, np.ndarray]:
-    """Whether taken -> (N, 3) planar poses of what single frames said, at equal times."""
+    """Whether selected -> (N, 3) planar poses of single frames' candidates, evenly spaced."""
     found: dict[bool, list[np.ndarray]] = {True: [], False: []}
     seen = [index for index, Ts in enumerate(outcomes.Ts_vehicle_world) if len(Ts)]
     for index in (seen[number] for number in _evenly(len(seen), _CANDIDATES)):
@@ -138,7 +138,7 @@ def _candidate_poses(outcomes: Outcomes) -> dict[bool, np.ndarray]:
 
 
 def _alternatives(outcomes: Outcomes) -> np.ndarray:
-    """(N, 3) what else was believed possible, at equal times."""
+    """The planar poses (N, 3) of all but the best hypothesis, evenly spaced."""
     several = [index for index, bank in enumerate(outcomes.hypotheses) if len(bank) > 1]
     rows = [
         np.delete(outcomes.hypotheses[index], np.argmax(outcomes.log_weight[index]), axis=0)
@@ -148,7 +148,7 @@ def _alternatives(outcomes: Outcomes) -> np.ndarray:
 
 
 def _draw_headings(axes: Axes, rows: np.ndarray, color: str, marker: str, label: str) -> None:
-    """Planar poses (N, 3) as signs with a stroke ahead."""
+    """Draw planar poses (N, 3) as signs with a stroke ahead."""
     rows = rows[np.isfinite(rows).all(axis=1)]
     if not len(rows):
         return
@@ -167,5 +167,5 @@ def _draw_headings(axes: Axes, rows: np.ndarray, color: str, marker: str, label:
 
 
 def _evenly(count: int, most: int) -> np.ndarray:
-    """At most so many indices of `count`, from the first to the last."""
+    """At most `most` evenly spaced indices below `count`, from the first to the last."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(int))

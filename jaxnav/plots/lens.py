@@ -1,4 +1,4 @@
-"""Pictures of a lens's calibration: residuals, coverage, views, and how sure it is."""
+"""Draw a lens's calibration: residuals, coverage, views and uncertainty."""
 
 from collections.abc import Mapping
 
@@ -11,15 +11,15 @@ from jaxnav.calibration.lenses.checks import Cells, cells
 from jaxnav.calibration.lenses.intrinsics import LensCalibration
 from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
 
-_ARROW = 0.5  # of a cell, the longest one
-_MOST_NAMES = 30  # of views that can be read below their bars
+_ARROW = 0.5  # length of the longest arrow in cells
+_MOST_NAMES = 30  # the most view names that are readable below their bars
 
 
 def lens_report(calibrations: Mapping[str, LensCalibration]) -> Figure:
-    """Residual map, coverage, error of every view and table of parameters, for each camera.
+    """Draw each camera's residual map, coverage, error of every view and table of parameters.
 
     Args:
-        calibrations: by the camera's name.
+        calibrations: camera name -> calibration.
     """
     figure = Figure(figsize=(12, 7.6 * len(calibrations)), layout="constrained")
     parts = figure.subfigures(len(calibrations), 1, squeeze=False)[:, 0]
@@ -43,7 +43,7 @@ def _draw(part: SubFigure, name: str, calibration: LensCalibration) -> None:
 
 
 def _draw_residuals(axes: Axes, calibration: LensCalibration, seen: Cells) -> None:
-    """Mean residual of every cell over the corners themselves."""
+    """Draw the mean residual of every cell, over the corners themselves."""
     fit = calibration.fit
     corners_px = np.asarray(gathered(fit.views).corners_px)[: len(fit.used)][fit.used]
     axes.plot(*corners_px.T, ".", ms=1.5, color=SKY, alpha=0.6)
@@ -86,7 +86,7 @@ def _draw_coverage(axes: Axes, calibration: LensCalibration, seen: Cells) -> Non
 
 
 def _draw_views(axes: Axes, calibration: LensCalibration) -> None:
-    """Each view's error against the others'; crosses are left out."""
+    """Draw the error of every view; crosses mark the views left out."""
     fit = calibration.fit
     names = [view.name for view in fit.views.views]
     place = np.arange(len(names))
@@ -140,6 +140,6 @@ def _draw_parameters(axes: Axes, calibration: LensCalibration) -> None:
 
 
 def _round_down(value: float) -> float:
-    """To one, two or five times a power of ten."""
+    """Round down to one, two or five times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

@@ -1,6 +1,7 @@
-"""Pictures: one function, one Figure. Nothing is shown or saved here.
+"""Draw drives, localised recordings and camera frames.
 
-Colours are Okabe and Ito's, told apart by everybody.
+One function returns one Figure; nothing is shown or saved here. Colours are Okabe and Ito's, which
+everybody can distinguish.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +38,7 @@ class Track:
 
 @dataclass(frozen=True)
 class View:
-    """One camera frame with what was seen in it."""
+    """One camera frame with its detections and candidate poses."""
 
     title: str
     image: np.ndarray  # (H, W) or (H, W, 3) RGB
@@ -55,12 +56,12 @@ def drive_report(
     markers_m: np.ndarray,
     title: str = "",
 ) -> Figure:
-    """The paper's two figures of a drive: x, y, yaw against time, and the X-Y plane.
+    """Draw the paper's two figures of a drive: x, y, yaw against time, and the X-Y plane.
 
     Args:
         times_s: (N,).
         truth: the true trajectory.
-        methods: estimates, at most two: the driving one first.
+        methods: at most two estimates, the driving one first.
         waypoints_m: (W, 2).
         waypoint_radius_m: drawn as circles.
         markers_m: (M, 4, 3) corners in the world.
@@ -104,7 +105,7 @@ def localisation_report(
     title: str = "",
     connected: bool = True,
 ) -> Figure:
-    """A localised recording: the track seen from above and from the side, and errors over time.
+    """Draw a localised recording: the track from above and from the side, and errors over time.
 
     Args:
         times_s: (N,).
@@ -151,7 +152,7 @@ def localisation_report(
 
 
 def camera_mosaic(rows: Sequence[Sequence[View]], title: str = "") -> Figure:
-    """Camera frames in rows, each with its detections and the normals of all candidate poses.
+    """Draw camera frames in rows, each with its detections and all candidates' normals.
 
     Around a small marker the frame shows an enlarged inset.
     """
@@ -174,7 +175,7 @@ def camera_mosaic(rows: Sequence[Sequence[View]], title: str = "") -> Figure:
 
 
 def photo_with_poses(view: View) -> Figure:
-    """A photograph with the detected markers and both poses of each."""
+    """Draw a photograph with the detected markers and both poses of each."""
     height, width = view.image.shape[:2]
     figure = Figure(figsize=(10, 10 * height / width + 0.4), layout="constrained")
     axes = figure.add_subplot()
@@ -190,12 +191,12 @@ def reliability_diagram(
     counts: np.ndarray,
     title: str = "",
 ) -> Figure:
-    """How often what was predicted with a probability came true.
+    """Draw observed frequencies against predicted probabilities.
 
     Args:
         predicted: (B,) mean prediction of each bin.
         observed: (B,) frequency in each bin.
-        intervals: lower and upper end (B,) of what it may be.
+        intervals: lower and upper end (B,) of the frequency's interval.
         counts: (B,) members of each bin, drawn below.
         title: above everything.
     """
@@ -229,21 +230,21 @@ def _yaw_deg(psi_rad: np.ndarray) -> np.ndarray:
 
 
 def _fit_view(axes: Axes, points: np.ndarray) -> None:
-    """Limits around the given points, so that outliers don't shrink what matters."""
+    """Set limits around the given points, so that outliers don't shrink the view."""
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     margin = 0.08 * np.max(high - low) + 0.05
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
 
 
 def draw_markers(axes: Axes, markers_m: np.ndarray) -> None:
-    """Markers on a map, seen from above: (M, 4, 3) corners in the world."""
+    """Draw markers on a map seen from above: (M, 4, 3) corners in the world."""
     for index, corners in enumerate(markers_m):
         label = "marker" if index == 0 else None
         axes.plot(corners[:, 0], corners[:, 1], color=VERMILION, lw=5, label=label)
 
 
 def draw_waypoints(axes: Axes, waypoints_m: np.ndarray, radius_m: float) -> None:
-    """Waypoints (W, 2) on a map, each with the circle within which it is reached."""
+    """Draw waypoints (W, 2) on a map, each with the circle within which it is reached."""
     circle = np.linspace(0, 2 * np.pi, 60)
     for number, (x_m, y_m) in enumerate(waypoints_m, 1):
         axes.plot(x_m + radius_m * np.cos(circle), y_m + radius_m * np.sin(circle), color=GREEN)

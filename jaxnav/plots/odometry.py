@@ -1,4 +1,4 @@
-"""Pictures of odometry's calibration: the drive, what is left unexplained, and the figures."""
+"""Draw a calibration of odometry: the drive, the residuals and the figures."""
 
 import textwrap
 
@@ -9,17 +9,17 @@ from matplotlib.figure import Figure
 from jaxnav.calibration.odometry.calibrate import OdometryCalibration
 from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
 
-_GROUPS = 60  # of views, whose mean and scatter are drawn
+_GROUPS = 60  # groups of views whose means are drawn
 
 
 def odometry_report(
     found: OdometryCalibration, corners_world_m: np.ndarray, figures: str
 ) -> Figure:
-    """The drive on the map, residuals and readings over time, and the figures with advice.
+    """Draw the drive on the map, residuals and readings over time, and the figures with advice.
 
     Args:
-        corners_world_m: (M, 4, 3), of the markers.
-        figures: a table, in lines.
+        corners_world_m: (M, 4, 3) corners of the markers.
+        figures: the lines of a table.
     """
     figure = Figure(figsize=(11, 8), layout="constrained")
     (drive, residuals), (told, readings) = figure.subplots(2, 2)
@@ -45,7 +45,7 @@ def _draw_drive(axes: Axes, found: OdometryCalibration, corners_world_m: np.ndar
 
 
 def _draw_residuals(axes: Axes, found: OdometryCalibration) -> None:
-    """Each view's, and means of many, in which a wrong delay or scale would show."""
+    """Draw each view's residual, and group means, which would show a wrong delay or scale."""
     good, times_s = ~found.outliers, found.view_times_s
     off_px = found.views_px.mean(axis=1)
     for axis, name, colour in ((0, "u", BLUE), (1, "v", ORANGE)):

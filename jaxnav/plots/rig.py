@@ -1,4 +1,4 @@
-"""Pictures of a calibrated rig: the map it drove through, its cameras, and what does not fit."""
+"""Draw a calibrated rig: the map it drove through, its cameras and their residuals."""
 
 from collections.abc import Sequence
 
@@ -27,16 +27,16 @@ def rig_report(
     Ts_vehicle_camera: np.ndarray,
     given: np.ndarray,
 ) -> Figure:
-    """The map from above, the rig from above, and every camera's residuals over its image.
+    """Draw the map and the rig from above, and every camera's residuals over its image.
 
     Args:
         camera: (N,) index of the camera of each sighting.
-        centers_px: (N, 2) where in the image each was.
+        centers_px: (N, 2) centre of each sighting in the image.
         residuals_px: (N, 2) mean of its four corners' residuals.
-        weight: (N,) 1 where it counts in full.
+        weight: (N,) weight of each sighting, 1 for full weight.
         corners_world_m: (M, 4, 3).
-        path_m: (F, 3) of the vehicle in the world.
-        Ts_vehicle_camera, given: (C, 4, 4), found and before.
+        path_m: (F, 3) positions of the vehicle in the world.
+        Ts_vehicle_camera, given: (C, 4, 4), the calibrated and the previous poses.
     """
     columns = max(2, min(4, len(names)))
     rows = -(-len(names) // columns)
@@ -65,11 +65,11 @@ def map_check(
     ids: Sequence[int],
     wrong: Sequence[bool],
 ) -> Figure:
-    """A map and what was found, laid over each other; arrows lead from one to the other.
+    """Draw a given map and the found one over each other, with arrows from one to the other.
 
     Args:
         given, found: (M, 4, 4) T_world_marker.
-        wrong: of each, whether something is the matter with it.
+        wrong: for each marker, whether something is wrong with it.
     """
     figure = Figure(figsize=(7.5, 6.5), layout="constrained")
     axes = figure.subplots()
@@ -96,7 +96,7 @@ def map_check(
 def _draw_map(
     axes: Axes, corners_m: np.ndarray, marker_ids: Sequence[int], path_m: np.ndarray
 ) -> None:
-    # The two directions in which all of it extends most; from above where the world is level.
+    # The two directions of largest extent; seen from above if the world is level.
     flat, labels = _flattened(np.concatenate([corners_m.reshape(-1, 3), path_m]))
     corners, path = flat[: 4 * len(corners_m)].reshape(-1, 4, 2), flat[4 * len(corners_m) :]
     axes.plot(*path.T, color=SKY, linewidth=1, label="path")

@@ -1,7 +1,7 @@
-"""What stood where in a recorded drive, for those who draw it: cameras, markers, waypoints.
+"""Read a recorded drive's cameras, markers and waypoints, for drawing.
 
-It is read from the header of the recording, in the words of the rig, marker and route files. What
-is missing there, or of another form, is left out of the picture.
+The source is the header of the recording, in the words of the rig, marker and route files. Entries
+that are missing or have another form are left out of the picture.
 """
 
 import math
@@ -27,10 +27,10 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 @dataclass(frozen=True)
 class Scenery:
-    """What a drive took place among.
+    """The surroundings of a drive: its rig, markers and waypoints.
 
     Attributes:
-        rig, markers: None where they are not known.
+        rig, markers: None if unknown.
         waypoints_m: (W, 2) in the world.
         waypoint_radius_m: a waypoint is reached within this.
     """
@@ -42,7 +42,7 @@ class Scenery:
 
     @property
     def markers_m(self) -> np.ndarray:
-        """(M, 4, 3) corners in the world."""
+        """The markers' corners (M, 4, 3) in the world."""
         if self.markers is None:
             return np.zeros((0, 4, 3))
         corners_m = points_in_world(self.markers.corners_world_m, self.origin_m)
@@ -50,16 +50,16 @@ class Scenery:
 
     @property
     def origin_m(self) -> Origin:
-        """What the markers count from, see `MarkerMap`."""
+        """The origin of the markers' coordinates, see `MarkerMap`."""
         return ZERO if self.markers is None else self.markers.origin_m
 
     def on_map_m(self, places_m: np.ndarray) -> np.ndarray:
-        """Places (N, 2) in the world, as the markers count."""
+        """Points (N, 2) in the world, in the markers' coordinates."""
         return np.asarray(points_in_world(places_m, opposite(self.origin_m)))
 
     @staticmethod
     def of(header: dict[str, Any]) -> "Scenery":
-        """From the header of a recording."""
+        """The scenery in the header of a recording."""
         rig = _read(RigFile, header.get("rig"))
         markers = _read(MarkerFile, header.get("markers"))
         route = _read(_RouteEntry, header.get("route")) or _RouteEntry()
@@ -72,7 +72,7 @@ class Scenery:
 
 
 class _RouteEntry(BaseModel):
-    """Of a route, what is drawn."""
+    """The part of a route that is drawn."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 

@@ -1,7 +1,7 @@
-"""Pictures of studies: maps over two axes, curves over one, reliability diagrams.
+"""Draw studies: maps over two axes, curves over one, reliability diagrams.
 
-One function, one Figure; nothing is shown or saved here. All of them draw what
-`jaxnav.studies.summary.summarise` gives, labelled from its attributes.
+One function returns one Figure; nothing is shown or saved here. All of them draw the result of
+`jaxnav.studies.summary.summarise`, labelled from its attributes.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ _MAP_WIDTH, _MAP_HEIGHT = 3.9, 3.5  # of one panel, inches
 
 
 def numeric_axes(summary: xr.Dataset) -> list[str]:
-    """The axes that a picture can have: numbers, two values at least; the longest first."""
+    """The axes that can be drawn: numeric, with at least two values; the longest first."""
     found = [
         name
         for name, values in summary.coords.items()
@@ -31,7 +31,7 @@ def numeric_axes(summary: xr.Dataset) -> list[str]:
 
 
 def study_map(summary: xr.Dataset, measure: str, x: str, y: str, panels: str | None) -> Figure:
-    """A measure over two axes, a panel for each value of a third one.
+    """Draw a measure over two axes, with a panel for each value of a third one.
 
     Args:
         summary: no other axis longer than one (select before).
@@ -71,7 +71,7 @@ def study_map(summary: xr.Dataset, measure: str, x: str, y: str, panels: str | N
 
 
 def study_curves(summary: xr.Dataset, measures: Sequence[str], x: str, lines: str | None) -> Figure:
-    """Measures over one axis, a panel each; rates with their 95 % intervals.
+    """Draw measures over one axis, a panel for each; rates have their 95 % intervals.
 
     A `..._median` is drawn with its `..._p95` as a thin line above it.
 
@@ -96,7 +96,7 @@ def study_curves(summary: xr.Dataset, measures: Sequence[str], x: str, lines: st
 
 
 def study_reliability(summary: xr.Dataset) -> Figure:
-    """What the selectors predicted against what happened, and how often they predicted it."""
+    """Draw predicted against observed frequencies of each selector, and their counts."""
     selectors = list(summary["selector"].values) if "selector" in summary.sizes else [None]
     figure = Figure(figsize=(6, 6.4), layout="constrained")
     upper, lower = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
@@ -164,7 +164,7 @@ def _look(number: int) -> tuple[str, str]:
 
 
 def _scale(data: xr.DataArray) -> Normalize:
-    """Rates on a linear scale from zero, what spans decades on a logarithmic one."""
+    """A linear scale from zero for rates, a logarithmic one for values that span decades."""
     finite = data.values[np.isfinite(data.values)]
     if not finite.size:
         return Normalize(0, 1)
@@ -182,7 +182,7 @@ def _is_log(values: np.ndarray) -> bool:
 
 
 def _edges(values: np.ndarray) -> np.ndarray:
-    """Borders of cells around values, whatever their order and spacing."""
+    """The borders of cells around values of any order and spacing."""
     if len(values) == 1:
         return np.array([values[0] - 0.5, values[0] + 0.5])
     if _is_log(values):

@@ -1,4 +1,4 @@
-"""Pictures of a fit: how it went, what it found, and what that is worth."""
+"""Draw a fit: its losses, its parameters and its results on held-out drives."""
 
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
@@ -19,29 +19,29 @@ _LINES = ("-", "--", ":")
 
 @runtime_checkable
 class Judged(Protocol):
-    """An estimator on drives it has never seen."""
+    """The scores of an estimator on drives that the fit has not used."""
 
     @property
     def anees(self) -> tuple[float, float, float]:
-        """With its interval."""
+        """The ANEES with its interval."""
         ...
 
     @property
     def band(self) -> tuple[float, float]:
-        """Where it is consistent."""
+        """The interval in which the ANEES is consistent."""
         ...
 
     @property
     def error_m(self) -> np.ndarray:
-        """Of every frame."""
+        """The position error of every frame."""
         ...
 
 
 def tuning_report(fit: Fit, space: Space, judged: Mapping[str, tuple[Judged, Judged]]) -> Figure:
-    """Loss by step, parameters by step, and below them errors and covariances before and after.
+    """Draw loss and parameters by step, and below them errors and covariances before and after.
 
     Args:
-        judged: name -> before and after; a row each.
+        judged: name -> scores before and after; one row each.
     """
     rows = 1 + len(judged)
     figure = Figure(figsize=(11, 3.8 * rows), layout="constrained")
@@ -56,31 +56,31 @@ def tuning_report(fit: Fit, space: Space, judged: Mapping[str, tuple[Judged, Jud
 
 @runtime_checkable
 class Driven(Protocol):
-    """A controller in one scenario."""
+    """The results of a controller in one scenario."""
 
     @property
     def parts(self) -> dict[str, float]:
-        """Of the loss."""
+        """The parts of the loss."""
         ...
 
     @property
     def poses(self) -> np.ndarray:
-        """(frames, 3) of one drive."""
+        """The poses (frames, 3) of one drive."""
         ...
 
     @property
     def waypoints_m(self) -> np.ndarray:
-        """(W, 2)."""
+        """The waypoints (W, 2)."""
         ...
 
 
 def controller_report(
     fit: Fit, space: Space, driven: Mapping[str, tuple[Driven, Driven]]
 ) -> Figure:
-    """Loss by step, gains by step; below them the parts of the loss, and a drive of each scenario.
+    """Draw loss and gains by step, and below them the loss's parts and a drive of each scenario.
 
     Args:
-        driven: scenario -> before and after.
+        driven: scenario -> results before and after.
     """
     figure = Figure(figsize=(11, 8), layout="constrained")
     grid = figure.add_gridspec(2, 2 * (1 + len(driven)))
@@ -101,7 +101,7 @@ def controller_report(
 
 
 def _draw_parts(axes: Axes, driven: Mapping[str, tuple[Driven, Driven]]) -> None:
-    """Stacked, before and after side by side."""
+    """Draw the parts of the loss as stacked bars, before and after side by side."""
     names = [f"{name}\n{when}" for name in driven for when in ("before", "after")]
     pairs = [one for pair in driven.values() for one in pair]
     foot = np.zeros(len(pairs))
@@ -115,12 +115,12 @@ def _draw_parts(axes: Axes, driven: Mapping[str, tuple[Driven, Driven]]) -> None
 
 
 def draw_losses(axes: Axes, fit: Fit) -> None:
-    """Of the drives learned from, and of those held out."""
+    """Draw the losses on the training drives and on the held-out drives."""
     history = np.array(fit.history)
     steps = np.arange(len(history))
     axes.plot(steps, history[:, 0], color=SKY, label="learned from")
     axes.plot(steps, history[:, 1], color=BLUE, label="held out")
-    # The last stage's: losses of another one are not comparable.
+    # The best of the last stage: losses of other stages are not comparable.
     began = int(np.flatnonzero(np.isnan(history[:, 0]))[-1])
     best = began + int(np.argmin(history[began:, 1]))
     axes.plot(best, history[best, 1], "o", color=VERMILION, label="kept")
@@ -129,7 +129,7 @@ def draw_losses(axes: Axes, fit: Fit) -> None:
 
 
 def draw_parameters(axes: Axes, fit: Fit, space: Space) -> None:
-    """Each in parts of what it was."""
+    """Draw each parameter as a ratio to its initial value."""
     rows = np.array(fit.history)[:, 2:]
     values = jax.device_get(jax.vmap(space.values)(jnp.asarray(rows, space.start.dtype)))
     number = 0

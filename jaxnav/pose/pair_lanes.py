@@ -40,7 +40,7 @@ class Marks(NamedTuple):
     x: tuple[Lane, ...]  # four corners
     y: tuple[Lane, ...]
     mean: tuple[Lane, Lane]
-    unit: Lane  # in which residuals are counted: about half a side in the image
+    unit: Lane  # unit of the residuals: about half a side in the image
     usable: Bool[Array, "*lanes"]
 
 
@@ -57,13 +57,13 @@ class Trace(NamedTuple):
 
     cost: Lane  # sum of squares in units; inf where a corner is behind the camera
     damping: Lane
-    promised: Lane  # by the last step that was accepted
+    promised: Lane  # gain that the model promised for the last accepted step
     done: Bool[Array, "*lanes"]
 
 
 class _State(eqx.Module):
     trace: Trace
-    left: Int[Array, ""]  # steps
+    left: Int[Array, ""]  # number of steps left
 
 
 def marks(corners_n: Float[Array, "4 2 *lanes"]) -> Marks:
@@ -401,8 +401,8 @@ class LaneLM(optx.AbstractLeastSquaresSolver):
 def _improve(
     pose: Poses, seen: Marks, trace: Trace, steps: Int[Array, ""] | int
 ) -> tuple[Poses, Trace]:
-    """At most `steps` steps of Levenberg-Marquardt in every lane."""
-    # A share of the cost and, in hundredths of the marker's spread, as for a single marker.
+    """Take at most `steps` steps of Levenberg-Marquardt in every lane."""
+    # Relative to the cost and, in hundredths of the marker's spread, as for a single marker.
     tolerance = 1e-12 if seen.unit.dtype == jnp.float64 else 1e-6
     solution: optx.Solution = optx.least_squares(
         lambda y, args: residuals(y, args),
@@ -432,15 +432,15 @@ def _begun(start: Poses, seen: Marks) -> tuple[Poses, Trace]:
 
 
 def _stacked_pair(corners: Float[Array, "4 2 *lanes"]) -> tuple[Marks, Poses]:
-    """The closed form with a leading axis of two poses, and of one for the corners."""
+    """The closed form: corners with a leading axis of 1, poses with a leading axis of 2."""
     seen = marks(corners)
     both = jax.tree.map(lambda *poses: jnp.stack(poses), *closed_form(seen))
     return jax.tree.map(lambda leaf: leaf[None], seen), both
 
 
 def _result(pose: Poses, seen: Marks, cost: Lane, size_m: Float[Array, " B"]) -> PosePair:
-    """Sorted by error, with the batch first. The leading axis of `pose` and `cost` is that of the
-    two poses; lanes follow in as many axes as may be."""
+    """The pair sorted by error, with the batch first. The leading axis of `pose` and `cost` is that
+    of the two poses, followed by any number of axes of lanes."""
     usable = seen.usable[0] & jnp.isfinite(size_m)
     nothing = jnp.where(usable, 0, jnp.nan)[None]
     depth = size_m[None] / 2 / pose.scale
@@ -456,14 +456,14 @@ def _result(pose: Poses, seen: Marks, cost: Lane, size_m: Float[Array, " B"]) ->
 
 
 def _in_blocks(corners_n: Float[Array, "B 4 2"], lanes: int) -> Float[Array, "blocks 4 2 lanes"]:
-    """Corners with the lanes last, in blocks; what is missing at the end is zero."""
+    """The corners in blocks with the lanes last, padded with zeros at the end."""
     count = -(-corners_n.shape[0] // lanes)
     padded = jnp.pad(corners_n, ((0, count * lanes - corners_n.shape[0]), (0, 0), (0, 0)))
     return jnp.transpose(padded.reshape(count, lanes, 4, 2), (0, 2, 3, 1))
 
 
 def _block_lanes(batch: int, on_cpu: int, elsewhere: int) -> int:
-    """Number of lanes in a block, a multiple of 16: bounded by the cache or the accelerator."""
+    """The number of lanes in a block, a multiple of 16, bounded by the cache or the accelerator."""
     most = on_cpu if jax.default_backend() == "cpu" else elsewhere
     return min(most, -(-batch // 16) * 16)
 

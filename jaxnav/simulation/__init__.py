@@ -1,1 +1,1 @@
-"""A world to drive in: what cameras, encoders and vehicles would have said."""
+"""Simulate cameras, encoders and vehicles: the measurements they would have delivered."""

@@ -1,7 +1,7 @@
-"""Walls, floor and sky, seen by a moving camera.
+"""Render walls, floor and sky as a moving camera sees them.
 
-Four samples a pixel, more where the picture moves fast. The texture is band-limited by what a
-pixel covers of it: a sample looks into the level of a pyramid whose texels are that large.
+Four samples a pixel, more where the picture moves fast. The texture is band-limited to the area
+that a pixel covers: a sample reads the level of an image pyramid whose texels have that size.
 
 Source: Williams (1983), "Pyramidal parametrics".
 """
@@ -19,10 +19,10 @@ _TINY = np.float32(1e-12)
 
 
 def render_background(scene: Scene, view: View) -> np.ndarray:
-    """Surfaces and sky, (H, W) float32."""
+    """Render surfaces and sky: light (H, W) float32."""
     lens = view.lens
     image = np.full((lens.rows, lens.columns), np.float32(scene.sky_grey))
-    # One metre stands for the distance: here a wrong guess costs a little smoothness only.
+    # The distance is taken as one metre: a wrong guess costs only a little smoothness here.
     blur_px = view.blur_px(1.0)
     groups = int(np.clip(np.ceil(blur_px / 4), 1, 4))
     samples = len(BACKGROUND_PX)
@@ -46,7 +46,7 @@ def render_background(scene: Scene, view: View) -> np.ndarray:
 def _cells_in_sight(
     surfaces: tuple[Surface, ...], view: View, margin_cells: int
 ) -> list[np.ndarray]:
-    """In which cells of the image each surface may be the nearest, (H / 8, W / 8) bool each."""
+    """The cells of the image in which each surface may be nearest, (H / 8, W / 8) bool each."""
     lens = view.lens
     nodes_y, nodes_x = lens.nodes_y, lens.nodes_x
     rays = lens.rays[nodes_y][:, :, nodes_x]
@@ -65,10 +65,10 @@ def _cells_in_sight(
 
 @dataclass(frozen=True)
 class _Plane:
-    """A surface as one group of samples of one camera meets it."""
+    """The intersection of one surface with one group of samples of one camera."""
 
     surface: Surface
-    cells: np.ndarray  # (H / 8, W / 8) bool: where it may be seen
+    cells: np.ndarray  # (H / 8, W / 8) bool: cells in which the surface may be visible
     H: np.ndarray  # (rows, samples, 3, 3)
     height: np.ndarray  # (rows, samples)
     span: np.ndarray  # (rows, samples): texels that a pixel covers, times (n.r)^2
@@ -85,7 +85,7 @@ class _Plane:
 def meet(
     surface: Surface, H: np.ndarray, height: np.ndarray, rays: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where rays (..., 3, W) meet a surface: x, y in m, 1 / n.r, and 1 / distance (0: nowhere)."""
+    """Intersect rays (..., 3, W) with a surface: x, y in m, 1 / n.r, 1 / distance (0: no hit)."""
     hit = H @ rays
     W = hit[..., 2, :]
     inverse = 1 / np.where(np.abs(W) < _TINY, _TINY, W)
@@ -102,7 +102,7 @@ def meet(
 def _shade_band(
     planes: list[_Plane], rays: np.ndarray, rows: slice, sky_grey: float
 ) -> np.ndarray | None:
-    """The mean over one group of samples of some rows, (rows, W); None where all is sky."""
+    """The mean over one group of samples of a band of rows, (rows, W); None if all is sky."""
     cell_rows = slice(rows.start // CELL_PX, -(-rows.stop // CELL_PX))
     shape = (rays.shape[0], rays.shape[1], rays.shape[3])
     grey, nearest = np.full(shape, np.float32(sky_grey)), np.zeros(shape, np.float32)
@@ -126,7 +126,7 @@ def _shade_band(
 def _texture(
     surface: Surface, x_m: np.ndarray, y_m: np.ndarray, span_texels: np.ndarray
 ) -> np.ndarray:
-    """Grey of a surface at places on it, without the detail finer than a span in texels."""
+    """The grey values of a surface at points on it, without detail finer than a span in texels."""
     tile_m = surface.texel_m * TEXTURE_SIZE
     u = x_m * np.float32(1 / tile_m) + np.float32(surface.offset_m[0] / tile_m)
     v = y_m * np.float32(1 / tile_m) + np.float32(surface.offset_m[1] / tile_m)

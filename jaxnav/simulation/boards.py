@@ -1,4 +1,4 @@
-"""A calibration board before a camera, rendered as exactly as markers are."""
+"""Render a calibration board before a camera, as exactly as markers are rendered."""
 
 from collections.abc import Sequence
 
@@ -26,9 +26,9 @@ _WALL_BEHIND_M = 0.5
 
 
 class BoardRenderer:
-    """Images of one board by one camera, a wall behind it.
+    """A renderer of images of one board, with a wall behind it, by one camera.
 
-    The board's frame is the world's: x right, y up, z towards its reader, the origin in the
+    The board's frame is the world frame: x right, y up, z towards the viewer, the origin in the
     middle of the sheet.
     """
 
@@ -44,7 +44,7 @@ class BoardRenderer:
         """Prepare the rays of every pixel.
 
         Args:
-            camera: its lens.
+            camera: the lens model.
             image_size_px: width, height.
             ink: (rows, columns) bool, the modules of the sheet, the top row first.
             module_m: side of a module.
@@ -67,12 +67,12 @@ class BoardRenderer:
         return self._renderer.render_still(_wxyz_xyz(np.linalg.inv(T_camera_board)), rng)[0]
 
     def render_moving(self, T_board_camera_at: PoseAt, rng: np.random.Generator) -> np.ndarray:
-        """The image of a camera that moves: see `Renderer.render`, at the stamp 0."""
+        """The image of a moving camera: see `Renderer.render`, with `stamp_s` = 0."""
         return self._renderer.render(T_board_camera_at, 0.0, rng)[0]
 
 
 def board_print(ink: np.ndarray, module_m: float, T_world_board: np.ndarray) -> Print:
-    """A sheet of modules whose middle is the board's origin, as `Renderer` takes it."""
+    """The `Print`, as `Renderer` takes it, of a sheet of modules centred on the board's origin."""
     rows, columns = ink.shape
     half_width_m, half_height_m = columns * module_m / 2, rows * module_m / 2
     T_board_sheet = np.diag([1.0, -1, -1, 1])
@@ -89,12 +89,12 @@ def board_print(ink: np.ndarray, module_m: float, T_world_board: np.ndarray) -> 
 def facing_pose(
     position_m: Sequence[float], tilt_deg: Sequence[float], roll_deg: float = 0.0
 ) -> np.ndarray:
-    """T_camera_board (4, 4) of a board that is turned away from facing the camera squarely.
+    """T_camera_board (4, 4) of a board rotated from the pose that faces the camera squarely.
 
     Args:
-        position_m: of its middle in the camera's frame.
-        tilt_deg: about its own x (its top comes nearer) and then y.
-        roll_deg: about its normal.
+        position_m: the board's middle in the camera frame.
+        tilt_deg: rotation about the board's own x axis (its top comes nearer) and then y.
+        roll_deg: rotation about the board's normal.
     """
     T_camera_board = np.eye(4)
     turned = Rotation.from_euler("XYZ", [*tilt_deg, roll_deg], degrees=True).as_matrix()

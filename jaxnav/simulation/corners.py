@@ -1,4 +1,4 @@
-"""What cameras see, as corners alone: no image, no detector. Pure, for rollouts under vmap."""
+"""Project markers to corners without images or a detector. Pure, for rollouts under vmap."""
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +15,10 @@ MIN_SIDE_PX = 8.0  # below this no detector reads a marker
 def see(
     rig: CameraRig, markers: MarkerMap, T_world_vehicle: jaxlie.SE3
 ) -> tuple[Float[Array, "C M 4 2"], Bool[Array, "C M"]]:
-    """Exact corners in pixels, and which markers can be read.
+    """Exact corners in pixels, and a mask of the readable markers.
 
-    A marker can be read where all its corners are inside the image, its printed side is towards the
-    camera, and its diagonals span a square of at least `MIN_SIDE_PX`.
+    A marker is readable if all its corners are inside the image, its printed side faces the camera,
+    and its diagonals span a square of at least `MIN_SIDE_PX`.
     """
     T_vehicle_world = T_world_vehicle.inverse()
     corners_px = rig.project(T_vehicle_world, markers.corners_world_m)

@@ -1,7 +1,7 @@
-"""One closed-loop drive: the car moves, cameras look, one navigator steers, others listen.
+"""Run one closed-loop drive: one navigator steers the car, others get the same observations.
 
-The loop is the host's, so that the cameras may be anything: rendered images with a detector, or
-corners with noise. Commands act `latency_s` after the stamp of the frame they stem from.
+The loop runs on the host, so the cameras may be anything: rendered images with a detector, or
+corners with noise. A command acts `latency_s` after the stamp of the frame it was computed from.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -32,7 +32,7 @@ Look = Callable[[PoseAt, float, Output | None], tuple[np.ndarray, np.ndarray, np
 
 @dataclass(frozen=True)
 class DriveSettings:
-    """How a drive is run."""
+    """Settings of a drive: start, timing and odometry."""
 
     start_pose: tuple[float, float, float]  # x_m, y_m, psi_rad; the navigator is not told
     frame_period_s: float = 1 / 15  # the paper's cluster captures and detects at 15 Hz
@@ -44,7 +44,7 @@ class DriveSettings:
 
 @dataclass(frozen=True)
 class Frame:
-    """One step of a drive: the truth, and what every method made of the same observation."""
+    """One step of a drive: the truth, and every method's output for the same observation."""
 
     stamp_s: float
     true_pose: np.ndarray  # (3,)
@@ -54,7 +54,7 @@ class Frame:
 
 
 class Methods:
-    """Navigators under comparison, each compiled once: every one gets the same observations.
+    """A set of navigators under comparison, each compiled once; all get the same observations.
 
     The first one drives.
     """
@@ -69,18 +69,18 @@ class Methods:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything seen, for another drive."""
+        """Reset every navigator to its initial state, for another drive."""
         self._states: dict[str, State] = {n: nav.init() for n, nav in self._navigators.items()}
 
     @property
     def driver(self) -> str:
-        """The name of the one that drives."""
+        """The name of the navigator that drives."""
         return next(iter(self._navigators))
 
     def step(
         self, observation: Observation, true_pose: jax.Array
     ) -> tuple[dict[str, Output], dict[str, Branch]]:
-        """All outputs, on the host, and what the truth says of each choice."""
+        """All outputs, on the host, and each choice judged against the truth."""
         outputs, branches = {}, {}
         for name, step in self._steps.items():
             self._states[name], outputs[name] = step(self._states[name], observation)
@@ -101,14 +101,14 @@ def drive(
     settings: DriveSettings,
     seed: int,
 ) -> Iterator[Frame]:
-    """Run a drive, a frame at a time, until it is done, off the floor or out of time.
+    """Run a drive frame by frame until it is done, off the floor or out of time.
 
     Args:
-        methods: who drives and who listens; starts anew.
+        methods: the navigators, of which the first drives; they are reset.
         vehicle: the true car.
         look: the cameras.
         settings: start, timing and odometry.
-        seed: of the odometry's noise.
+        seed: seed of the odometry noise.
     """
     if not 0 <= settings.latency_s < settings.frame_period_s:
         raise BadInput(
@@ -146,7 +146,7 @@ def drive(
 
 
 def waypoints_passed(true_poses: np.ndarray, waypoints_m: np.ndarray) -> int:
-    """How many waypoints, in their order, the true car came within 0.30 m of."""
+    """The number of waypoints, taken in order, that the true car came within 0.30 m of."""
     passed = 0
     for pose in true_poses:
         while (
@@ -160,7 +160,7 @@ _advance = jax.jit(move_through, static_argnums=4)
 
 
 class _Motion:
-    """The true trajectory so far, dense enough to be interpolated linearly."""
+    """The true trajectory so far, sampled densely enough for linear interpolation."""
 
     def __init__(self, vehicle: Vehicle, start_pose: tuple[float, float, float]):
         zero = jnp.zeros(())
@@ -176,7 +176,7 @@ class _Motion:
         return np.append(np.asarray(state.pose), [state.speed_mps, state.steering_rad])
 
     def run_until(self, time_s: float) -> None:
-        """Let the car move under the present command."""
+        """Move the car under the present command up to a time."""
         begin_s = self._times_s[-1]
         dt_s = time_s - begin_s
         if dt_s <= 0:
@@ -194,14 +194,14 @@ class _Motion:
         return np.column_stack([np.interp(times_s, recent[0], column) for column in recent[1].T])
 
     def state_at(self, time_s: float) -> CarState:
-        """The truth at one instant that has been run through."""
+        """The true state at one instant already simulated."""
         row = self._interpolated(np.asarray([time_s]))[0]
         return CarState(
             jnp.asarray(row[:3], float), jnp.asarray(row[3], float), jnp.asarray(row[4], float)
         )
 
     def poses_at(self, times_s: np.ndarray) -> np.ndarray:
-        """T_world_vehicle (N, 7), wxyz_xyz, at instants that have been run through."""
+        """T_world_vehicle (N, 7), wxyz_xyz, at instants already simulated."""
         x_m, y_m, psi_rad = self._interpolated(np.asarray(times_s))[:, :3].T
         zero = np.zeros_like(x_m)
         return np.column_stack(

@@ -1,4 +1,4 @@
-"""What is kept of many drives that end at different times, as arrays side by side."""
+"""Collect the records of many drives that end at different times into arrays."""
 
 from typing import Any
 
@@ -7,15 +7,15 @@ import numpy as np
 
 
 class Kept:
-    """What was kept of every drive, chunk by chunk as it comes in."""
+    """The records of every drive, collected chunk by chunk as they arrive."""
 
     def __init__(self, count: int, chunk_frames: int):
-        self.chunks = np.zeros(count, int)  # of each drive
+        self.chunks = np.zeros(count, int)  # number of chunks so far, per drive
         self.chunk_frames = chunk_frames
         self.pieces: list[tuple[np.ndarray, np.ndarray, Any]] = []
 
     def take(self, owner: np.ndarray, trace: Any) -> None:
-        """One chunk, leaves (lanes, frames, ...), of the drives that own a lane; -1 owns none."""
+        """Add one chunk, leaves (lanes, frames, ...); `owner` is each lane's drive, -1 for none."""
         taken = np.flatnonzero(owner >= 0)
         drive = owner[taken]
         piece = jax.tree.map(lambda leaf: leaf[taken], trace)
@@ -23,10 +23,10 @@ class Kept:
         self.chunks[drive] += 1
 
     def side_by_side(self) -> tuple[Any, np.ndarray]:
-        """Unequal lengths as one array: what is over stays as it was.
+        """Stack drives of unequal lengths; an ended drive repeats its last frame.
 
         Returns:
-            What was kept, leaves (drives, frames, ...), and which frames a drive has had itself.
+            The records, leaves (drives, frames, ...), and a mask of each drive's own frames.
         """
         count, most, length = len(self.chunks), self.chunks.max(), self.chunk_frames
 

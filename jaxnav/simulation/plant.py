@@ -1,7 +1,7 @@
-"""The simulated car: what really happens when a command is given.
+"""Simulate the car: its true motion under a command.
 
 Speed follows the throttle with a first-order lag, the servo turns at a bounded rate, and the
-bicycle model carries the car along arcs. Pure functions of JAX, so that a rollout can be scanned,
+bicycle model moves the car along arcs. Pure JAX functions, so that a rollout can be scanned,
 vmapped and differentiated.
 """
 
@@ -16,7 +16,7 @@ from jaxnav.models.bicycle import Vehicle
 
 
 class CarState(eqx.Module):
-    """The truth about the car. The heading counts turns: it is not wrapped."""
+    """The true state of the car. The heading is not wrapped: it counts turns."""
 
     pose: Float[Array, "*batch 3"]  # x_m, y_m, psi_rad
     speed_mps: Float[Array, "*batch"]
@@ -24,7 +24,7 @@ class CarState(eqx.Module):
 
 
 class OdometryNoise(eqx.Module):
-    """What the wheel odometer and the steering sensor report besides the truth."""
+    """The errors of the wheel odometer and the steering sensor."""
 
     speed_sigma_mps: float = 0.01
     steering_sigma_rad: float = 0.005
@@ -32,7 +32,7 @@ class OdometryNoise(eqx.Module):
 
 
 def move(vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""]) -> CarState:
-    """The car a short time later (short against the speed's time constant and the turn)."""
+    """The car's state after a time short against the speed's time constant and the turn."""
     turn_limit = vehicle.steering_rate_limit_radps * dt_s
     wanted = jnp.clip(command.steering_rad, -vehicle.steering_limit_rad, vehicle.steering_limit_rad)
     steering = state.steering_rad + jnp.clip(wanted - state.steering_rad, -turn_limit, turn_limit)
@@ -54,7 +54,7 @@ def move(vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array,
 def move_through(
     vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""], substeps: int
 ) -> CarState:
-    """The car at `substeps` evenly spaced instants up to dt, leading axis (substeps,)."""
+    """The car's state at `substeps` evenly spaced instants up to dt, leading axis (substeps,)."""
 
     def one(state: CarState, _: None) -> tuple[CarState, CarState]:
         moved = move(vehicle, state, command, dt_s / substeps)
@@ -69,7 +69,7 @@ def read_odometry(
     key: Array,
     speed_scale: Float[Array, ""] | float | None = None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(speed_mps, steering_rad) as the sensors report them; the scale is the noise's by default."""
+    """(speed_mps, steering_rad) as the sensors report them; the scale is `noise`'s by default."""
     speed_scale = noise.speed_scale if speed_scale is None else speed_scale
     speed_error, steering_error = jax.random.normal(key, (2,), state.speed_mps.dtype)
     return (

@@ -1,9 +1,9 @@
-"""Printed markers, exact to their edges, seen by a moving camera.
+"""Render printed markers, exact to their edges, as a moving camera sees them.
 
 A pixel that may see an edge of the print during its exposure is the mean of 64 samples
 (x, y, t), each an exact look-up of the module it falls on, at the pose of its instant; any other
-pixel of the paper is of one grey. The samples are a lattice, shifted differently in each pixel,
-so that what error remains (0.6 % of the contrast, RMS) does not add up along an edge.
+pixel of the paper has a single grey. The samples form a lattice, shifted differently in each pixel,
+so that the remaining error (0.6 % of the contrast, RMS) does not add up along an edge.
 
 Source: Cranley and Patterson (1976), "Randomization of number theoretic methods".
 """
@@ -18,7 +18,7 @@ from jaxnav.simulation.scene import QUIET_ZONE_MODULES, Scene, Surface
 from jaxnav.simulation.viewing import CELL_PX, View
 
 # 64 points (x, y, t) of a rank-1 lattice: each coordinate takes each of its 64 values once, and
-# so, nearly, do the diagonals. The generator is the best of all for edges, still and moving.
+# so, nearly, do the diagonals. Of all generators this one is best for edges, still and moving.
 _SAMPLES = 64
 _LATTICE = (1, 19, 41)
 _CHUNK = 512  # pixels sampled at a time: few enough for the processor's cache
@@ -27,7 +27,7 @@ _AHEAD = np.float32(1e-6)  # the least cosine between a ray and the normal of wh
 
 @dataclass(frozen=True)
 class Print:
-    """A sheet of paper with a marker, or any other grid of modules, on it."""
+    """A sheet of paper printed with a marker or any other grid of modules."""
 
     T_world_marker: np.ndarray  # (4, 4)
     T_world_sheet: np.ndarray  # (4, 4): x right, y down, z into the paper, from its top left
@@ -37,7 +37,7 @@ class Print:
 
 
 def prints_of(scene: Scene) -> list[Print]:
-    """The markers of a scene as they are rendered, in the map's order."""
+    """The prints of a scene's markers, in the map's order."""
     Ts_world_marker = np.asarray(scene.markers.Ts_world_marker.as_matrix(), float)
     sizes_m = np.asarray(scene.markers.size_m, float)
     markers = []
@@ -62,11 +62,11 @@ def prints_of(scene: Scene) -> list[Print]:
 def render_print(
     marker: Print, surfaces: tuple[Surface, ...], view: View, image: np.ndarray
 ) -> None:
-    """Print one marker into the image of light, (H, W) float32, in place."""
+    """Render one marker into an image of light, (H, W) float32, in place."""
     _, position = view.pose_at(np.zeros(()))
     distance_m = float(np.linalg.norm(marker.T_world_marker[:3, 3] - position))
     blur_px = view.blur_px(max(distance_m - marker.radius_m, 0.05))
-    # Four instants a pixel of blur, and as many as there are samples from 16 px on.
+    # Four instants for each pixel of blur; from 16 px on as many as there are samples.
     count = int(2 ** np.clip(np.ceil(np.log2(max(4 * blur_px, 0.5))), 0, 6))
     instants = (np.arange(count) + 0.5) / count - 0.5
     region = _region_of(marker, view, blur_px)
@@ -76,7 +76,7 @@ def render_print(
 
 
 def _region_of(marker: Print, view: View, blur_px: float) -> tuple[slice, slice] | None:
-    """Rows and columns of the image that hold all of a marker's paper; None out of sight."""
+    """The image rows and columns that contain a marker's whole paper; None if out of sight."""
     lens = view.lens
     nodes_y, nodes_x = lens.nodes_y, lens.nodes_x
     R_world_camera, position = view.pose_at(view.row_times_s[nodes_y])
@@ -84,7 +84,7 @@ def _region_of(marker: Print, view: View, blur_px: float) -> tuple[slice, slice]
     distance_m = np.linalg.norm(to_marker, axis=-1)
     direction = np.einsum("nji,nj->ni", R_world_camera, to_marker) / distance_m[:, None]
     cosine = np.einsum("nc,ncx->nx", direction, lens.rays[nodes_y][:, :, nodes_x])
-    # A node further off than the paper, a cell's diagonal and the blur has none of it near it.
+    # A node farther off than the paper, a cell's diagonal and the blur has no paper near it.
     reach_rad = np.arcsin(np.clip(marker.radius_m / distance_m, 0, 1))
     reach_rad = reach_rad + 1.5 * lens.pixel_rad * (1.5 * CELL_PX + blur_px)
     near = cosine > np.cos(np.minimum(reach_rad, np.pi))[:, None]
@@ -157,7 +157,7 @@ def _print_region(
 def _to_modules(
     marker: Print, view: View, rows: slice | np.ndarray, instants: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`View.homographies` to places on the sheet that are counted in modules."""
+    """`View.homographies` to coordinates on the sheet in modules."""
     H, height = view.homographies(marker.T_world_sheet, rows, instants)
     H[..., :2, :] /= np.float32(marker.module_m)
     return H, height
@@ -166,9 +166,9 @@ def _to_modules(
 def _drift(
     marker: Print, view: View, region: tuple[slice, slice], instants: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How far a pixel's place on the sheet strays from that of mid-exposure, in modules.
+    """The displacement of each pixel's point on the sheet from mid-exposure, in modules.
 
-    Least and greatest, (rows, 2, columns) each. Found on a grid of nodes; a pixel takes the
+    Minimum and maximum, (rows, 2, columns) each. Computed on a grid of nodes; a pixel takes the
     extremes of the nodes around it.
     """
     rows, columns = (np.arange(part.start, part.stop) for part in region)
@@ -194,16 +194,16 @@ def _sample_edges(
     along_x: np.ndarray,
     along_y: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Print and coverage of N pixels from 64 samples each.
+    """The light of the print and its coverage in N pixels, from 64 samples each.
 
     Args:
         sheet: (rows, columns) grey.
-        pixels: (2, N) column and row: they shift the lattice.
-        centre: (3, N, K) homogeneous places on the sheet of the pixels' centres at K instants.
-        along_x, along_y: (3, N) their change a pixel to the right and down.
+        pixels: (2, N) column and row, which shift the lattice.
+        centre: (3, N, K) homogeneous points on the sheet of the pixels' centres at K instants.
+        along_x, along_y: (3, N) the change of those points one pixel to the right and down.
 
     Returns:
-        Light of the print and the part of the pixel that the sheet covers, (N,) each.
+        The light of the print and the fraction of each pixel that the sheet covers, (N,) each.
     """
     samples = np.arange(_SAMPLES)[:, None] * _LATTICE % _SAMPLES
     # Square roots of primes fill the unit square evenly along any line of pixels.
@@ -236,16 +236,16 @@ def _sample_edges(
 def _change_per_pixel(
     axis: int, middle: np.ndarray, along_x: np.ndarray, along_y: np.ndarray
 ) -> np.ndarray:
-    """Length of the gradient, in the image, of one coordinate on the sheet: modules/px, (N,)."""
+    """The norm of the image gradient of one coordinate on the sheet: modules/px, (N,)."""
     W = np.maximum(middle[2], _AHEAD)
     right, down = ((a[axis] - middle[axis] / W * a[2]) / W for a in (along_x, along_y))
     return np.hypot(right, down)
 
 
 def _soft_edges(modules: np.ndarray, change_per_pixel: np.ndarray, count: int) -> np.ndarray:
-    """Where to interpolate linearly in the sheet, for edges as wide as a sample's share of a pixel.
+    """Coordinates for linear interpolation in the sheet: edges as wide as a sample's cell.
 
-    A sample stands for 1 / 64 of the pixel. A linear ramp with the deviation of that cell,
+    A sample's cell is 1 / 64 of the pixel. A linear ramp with that cell's standard deviation,
     instead of a step, halves the error of the mean and leaves no direction worse than others.
     """
     sharpness = np.sqrt(_SAMPLES) / np.maximum(change_per_pixel, np.float32(1e-6))
@@ -271,7 +271,7 @@ def _may_hide(surface: Surface, marker: Print, position: np.ndarray) -> bool:
 def _unhidden(
     marker: Print, before: list[Surface], view: View, region: tuple[slice, slice]
 ) -> np.ndarray:
-    """Where no surface stands before the marker's plane, (rows, columns) bool."""
+    """The pixels where no surface hides the marker's plane, (rows, columns) bool."""
     rows, columns = region
     rays = view.lens.rays[rows, :, columns]
     H, height = view.homographies(marker.T_world_marker, rows, np.zeros(1))

@@ -1,4 +1,4 @@
-"""Lanes that take the next seed where a drive has ended: long drives keep nobody waiting."""
+"""Run many drives in a fixed number of lanes: a lane whose drive has ended takes the next seed."""
 
 import threading
 from collections import deque
@@ -25,22 +25,22 @@ def run_lanes(
     kept: Kept,
     progress: Callable[[int], object] = lambda ended: None,
 ) -> Kept:
-    """Every drive from its start until its world has `ended`.
+    """Run every drive from its start until its world has `ended`; `kept`, filled.
 
     Args:
-        keys: a drive for each; a key's drive does not depend on the others.
-        start: the worlds of as many keys as there are lanes, leading axis (lanes,).
-        advance: the worlds some frames later, and what is to be kept of each, leading axes (lanes,
+        keys: one for each drive; a key's drive does not depend on the others.
+        start: from one key a lane to the worlds, leading axis (lanes,).
+        advance: from worlds to the worlds some frames later and their records, leading axes (lanes,
             entries) with as many entries as `kept` expects of a chunk.
-        threads: that have so many lanes each; where there are several devices, one for each.
-        kept: what takes it.
+        threads: threads of `lanes` lanes each; with several devices, one thread for each device.
+        kept: takes the records.
         progress: called with the number of drives that have ended since the last call.
     """
     devices = jax.local_devices()
     if len(devices) > 1:
-        threads = len(devices)  # every device has one, and runs what another would run
+        threads = len(devices)  # one for each device, all with the same program
     waiting, lock = deque(range(len(keys))), threading.Lock()
-    compiling = threading.Lock()  # one thread does it for all
+    compiling = threading.Lock()  # one thread compiles for all
 
     over_all = threading.Event()
 
@@ -71,7 +71,7 @@ def run_lanes(
     if threads == 1:
         work()
         return kept
-    float64 = jnp.zeros(()).dtype == jnp.float64  # which a thread would not know
+    float64 = jnp.zeros(()).dtype == jnp.float64  # a new thread does not inherit it
 
     def work_alike(number: int) -> None:
         with jax.enable_x64(float64), jax.default_device(devices[number % len(devices)]):
@@ -83,5 +83,5 @@ def run_lanes(
             for one in working:
                 one.result()
         finally:
-            over_all.set()  # an interruption or a failure ends all of them
+            over_all.set()  # an interruption or a failure ends all threads
     return kept

@@ -1,7 +1,7 @@
-"""Random views of one marker in one camera: does the flip probability mean what it says?
+"""Draw random views of one marker in one camera, to check the calibration of flip probabilities.
 
-A frame is a random view of a square marker with Gaussian corner noise. It is flipped when, of its
-two refined poses, the one that was taken is not the one nearer to the truth in angle.
+A frame is a random view of a square marker with Gaussian corner noise. It is flipped if the
+selected one of its two refined poses is not the one nearer to the truth in angle.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ BATCH = 2000
 
 @dataclass(frozen=True)
 class Views:
-    """What is drawn, each uniformly between its ends."""
+    """The ranges of a random view; each quantity is drawn uniformly between its ends."""
 
     side_px: tuple[float, float] = (10.0, 100.0)
     angle_rad: tuple[float, float] = (0.0, float(np.deg2rad(60.0)))  # normal to line of sight
@@ -45,7 +45,7 @@ class Views:
 
 
 class Frames(eqx.Module):
-    """What became of the frames, leading axis (F,)."""
+    """The outcomes of frames, leading axis (F,)."""
 
     flip_probability: Float[Array, "*F"]
     flipped: Bool[Array, "*F"]
@@ -58,10 +58,10 @@ def random_views(
     views: Views | None = None,
     progress: Callable[[int], object] = lambda done: None,
 ) -> Frames:
-    """Independent frames, on the host.
+    """The outcomes of independent random frames, on the host.
 
     Args:
-        progress: called with the number of frames done since the last call.
+        progress: called with the number of frames finished since the last call.
     """
     views = views or Views()
     batch = min(BATCH, count)

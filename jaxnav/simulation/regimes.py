@@ -1,7 +1,7 @@
-"""A navigator that does no more work than an observation asks for: the same up to rounding.
+"""A navigator that skips the work of empty slots: the same results up to rounding.
 
-Branches for one sighting or several, and for one hypothesis, a few or the whole bank: worth it
-where many lanes run side by side, each in its own branch (see `lanes`).
+It branches on one sighting or several, and on one hypothesis, a few or the whole bank. That pays
+if many lanes run side by side, each in its own branch (see `lanes`).
 """
 
 import dataclasses
@@ -17,13 +17,13 @@ from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.consistency import Consistent, Kept, among_all
 from jaxnav.pose.observation import Observation
 
-# Slots of the banks that are kept compiled beside the whole one: nine frames of ten need a single
-# one, and of the others two of three no more than these.
+# Sizes, in slots, of the banks compiled beside the whole one: nine frames of ten need a single
+# slot, and two of three of the others no more than the larger size.
 _BANKS = (1, 8)
 
 
 def step_by_regime(navigator: Navigator) -> Step:
-    """`navigator.step` without the slots that are empty; of a subclass, its own `step`."""
+    """`navigator.step` without the empty slots; a subclass's own `step` is returned unchanged."""
     if type(navigator) is not Navigator:
         return navigator.step
     return _ByRegime.like(navigator).step
@@ -31,7 +31,7 @@ def step_by_regime(navigator: Navigator) -> Step:
 
 class _ByRegime(Navigator):
     def look(self, obs: Observation) -> Consistent:
-        # Nearly all lanes see a marker: to sort out those that don't costs more than it saves.
+        # Nearly all lanes see a marker: sorting out those that don't costs more than it saves.
         snapshot = self.snapshot(obs)
         slots = snapshot.seen.visible.shape[0]
         if slots == 1:

@@ -1,10 +1,10 @@
-"""Images of a scene through the exact lens of every camera of a rig, while it moves.
+"""Render images of a scene through the exact lens of every camera of a moving rig.
 
 A pixel is a square that collects light evenly over its area and over the exposure of its row.
 Its value is the mean over samples (x, y, t) in that box. Every sample follows its own ray: the
 lens model is inverted once for each pixel, and the pose is the true one at that instant, so
-rolling shutter and motion blur need no model of their own. First comes the background, with few
-samples, then the markers are printed onto it with many where it matters.
+rolling shutter and motion blur need no model of their own. The background is rendered first, with
+few samples; then the markers are rendered onto it, with many samples at their edges.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,15 +22,15 @@ from jaxnav.simulation.viewing import Lens, Motion, View
 
 PoseAt = Callable[[np.ndarray], np.ndarray]  # times_s (N,) -> T_world_vehicle (N, 7), wxyz_xyz
 
-_POSES = 33  # instants at which the motion is asked for, over one image
-_MAX_ROTATION_RAD = 0.01  # between two of them: 1.2e-5 rad off when interpolated linearly
+_POSES = 33  # instants at which the motion is sampled, over one image
+_MAX_ROTATION_RAD = 0.01  # between two of them: linear interpolation is then 1.2e-5 rad off
 
 
 class Renderer:
-    """Renders what a rig sees: some 20 ms of one core for an image of 820 x 410 px.
+    """A renderer of a rig's images: some 20 ms of one core for an image of 820 x 410 px.
 
-    Not modelled: occlusion of a marker is decided per pixel, not per sample; a surface that is
-    narrower than 8 px in an image may be missing from it; markers have no back.
+    Limits: occlusion of a marker is decided per pixel, not per sample; a surface that is narrower
+    than 8 px in an image may be missing from it; markers have no back.
     """
 
     def __init__(
@@ -45,12 +45,12 @@ class Renderer:
         """Prepare the rays of every pixel.
 
         Args:
-            scene: what there is to see.
+            scene: markers and surfaces.
             rig: the cameras.
             shutter: exposure and row time; a still, global shutter when left out.
             sensor: noise, gain and so on.
-            threads: how many cameras to render at a time; one a camera when left out.
-            prints: sheets there are beside the scene's markers.
+            threads: number of cameras rendered at a time; by default all of them.
+            prints: further sheets, beside the scene's markers.
         """
         self.scene, self.rig = scene, rig
         self.shutter = Shutter() if shutter is None else shutter
@@ -69,9 +69,9 @@ class Renderer:
 
         Args:
             T_world_vehicle_at: the true motion: times_s (N,) -> poses (N, 7) as w x y z, x y z,
-                in s and m. Asked for instants around `stamp_s` only.
+                in s and m. Called with instants around `stamp_s` only.
             stamp_s: the middle of the exposure of the middle row.
-            rng: source of the noise; its state decides the images completely.
+            rng: source of the noise; given its state the images are deterministic.
 
         Returns:
             (H, W) uint8 for each camera, in the rig's order.
@@ -87,12 +87,12 @@ class Renderer:
         return self.render(_at_rest(T_world_vehicle), 0.0, rng)
 
     def light(self, T_world_vehicle_at: PoseAt, stamp_s: float) -> list[np.ndarray]:
-        """What the sensors receive, before noise, gain and rounding: (H, W) float32 each."""
+        """The light on the sensors, before noise, gain and rounding: (H, W) float32 each."""
         poses = self._poses_around(T_world_vehicle_at, stamp_s)
         return self._for_all(lambda index: self._one_camera(index, poses))
 
     def light_still(self, T_world_vehicle: np.ndarray) -> list[np.ndarray]:
-        """`light` from a vehicle at rest at the pose (7,), wxyz_xyz."""
+        """`light` for a vehicle at rest at the pose (7,), wxyz_xyz."""
         return self.light(_at_rest(T_world_vehicle), 0.0)
 
     def _for_all(self, task: Callable[[int], np.ndarray]) -> list[np.ndarray]:
@@ -125,7 +125,7 @@ class Renderer:
         lens = self._lenses[index]
         view = View(lens, motion, self._Ts_vehicle_camera[index], self.shutter)
         image = render_background(self.scene, view)
-        # Far ones first, should papers overlap.
+        # Farthest first, in case papers overlap.
         _, position = view.pose_at(np.zeros(1))
         for marker in sorted(
             self._prints, key=lambda m: -float(np.linalg.norm(m.T_world_marker[:3, 3] - position))

@@ -1,7 +1,7 @@
-"""Many closed-loop drives at once, at corner level: one scan, vmapped over the seeds.
+"""Run many closed-loop drives at once, at corner level: one scan, batched over the seeds.
 
 The navigator's own `step` is in the loop; plant, odometer and corners are those of `drive.py`
-without its images. Finished drives stand still and are not counted any further.
+without its images. The car of a finished drive stands still, and its frames are not counted.
 """
 
 import dataclasses
@@ -32,12 +32,12 @@ from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.single_frames import directions
 from jaxnav.simulation.world import Spread, World, nominal
 
-_jit = cast(Any, eqx.filter_jit)  # whose types know of no compiler options
-_SUBSTEPS = 4  # of either part of a frame period
+_jit = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
+_SUBSTEPS = 4  # for each of the two parts of a frame period
 
 
 class Trace(eqx.Module):
-    """What is kept of every frame, leading axes (seeds, frames)."""
+    """The record of every frame, leading axes (seeds, frames)."""
 
     true_pose: Float[Array, "*S 3"]
     pose: Float[Array, "*S 3"]
@@ -45,26 +45,26 @@ class Trace(eqx.Module):
     located: Bool[Array, "*S"]
     decided: Bool[Array, "*S"]
     flip_probability: Float[Array, "*S"]
-    lm_steps: Int[Array, "*S"]  # of the slower candidate
+    lm_steps: Int[Array, "*S"]  # the most that any candidate took
     active: Bool[Array, "*S"]  # the drive had not ended before this frame
     on_floor: Bool[Array, "*S"]
-    passed: Int[Array, "*S"]  # waypoints the true car has come near to, in order
-    done: Bool[Array, "*S"]  # the navigator believes so
+    passed: Int[Array, "*S"]  # number of waypoints, in order, that the true car has come near to
+    done: Bool[Array, "*S"]  # in the navigator's belief
 
 
-Keep = Callable[[World, World], Any]  # of a world before and after a frame
+Keep = Callable[[World, World], Any]  # (world before a frame, world after it) -> record
 
 
 def nothing(before: World, after: World) -> None:
-    """Of a frame is kept."""
+    """Keep no record of a frame."""
 
 
 class Rollout(eqx.Module):
-    """Drives of one navigator in one scenario, compiled once for a batch of lanes.
+    """A simulation of drives of one navigator in one scenario, compiled once for a batch of lanes.
 
-    A lane whose drive has ended takes the next seed, so that long drives keep nobody waiting. Many
-    drives run through `over_lanes`, a thread for each core or device: ten times as fast as `vmap`,
-    which compiles ten times as fast and so is for a few.
+    A lane whose drive has ended takes the next seed, so that long drives leave no lane idle. Many
+    drives run through `over_lanes`, one thread per core or device: ten times as fast as `vmap`.
+    Few drives run under `vmap`, which compiles ten times as fast.
     """
 
     navigator: Navigator
@@ -72,23 +72,23 @@ class Rollout(eqx.Module):
     markers: MarkerMap
     scenario: Scenario = eqx.field(static=True)
     corner_noise_px: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    # Of every corner of every camera, in a direction of its own, the same in all frames of a drive.
+    # Each corner of each camera has its own direction, the same in all frames of a drive.
     corner_bias_px: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)
-    start_pose: Float[Array, " 3"] | None = None  # in place of the scenario's
+    start_pose: Float[Array, " 3"] | None = None  # None: the scenario's
     spread: Spread | None = eqx.field(static=True, default=None)  # None: all cars are nominal
     lanes: int = eqx.field(static=True, default=128)
     chunk_frames: int = eqx.field(static=True, default=15)
-    many: int = eqx.field(static=True, default=2048)  # drives for which `over_lanes` pays
-    many_lanes: int = eqx.field(static=True, default=1024)  # a thread
+    many: int = eqx.field(static=True, default=2048)  # least number of drives for `over_lanes`
+    many_lanes: int = eqx.field(static=True, default=1024)  # per thread
     threads: int = eqx.field(static=True, default=max(1, os.cpu_count() or 1))
 
     def run(
         self, keys: Key[Array, " S"], progress: Callable[[int], object] = lambda ended: None
     ) -> Trace:
-        """Every drive, leading axes (S, frames): as many frames as the longest one has.
+        """Run every drive: a trace, leading axes (S, frames), as long as the longest drive.
 
         Args:
-            keys: a drive for each; a key's drive does not depend on the others.
+            keys: one for each drive; a key's drive does not depend on the others.
             progress: called with the number of drives that have ended since the last call.
         """
         return self.run_keeping(keys, nothing, progress)[0]
@@ -99,7 +99,7 @@ class Rollout(eqx.Module):
         keep: Keep,
         progress: Callable[[int], object] = lambda ended: None,
     ) -> tuple[Trace, Any]:
-        """`run`, and what `keep` makes of every frame; of one after the last it is the last's."""
+        """`run`, and `keep`'s record of every frame; after a drive's end its last is repeated."""
         if len(keys) < self.many:
             lanes, threads, advance = min(self.lanes, len(keys)), 1, self._advance
         else:
@@ -119,12 +119,12 @@ class Rollout(eqx.Module):
     @eqx.filter_jit
     def _start(self, keys: Key[Array, " lanes"]) -> World:
         worlds = jax.vmap(self.first)(keys)
-        # Types as `_advance` returns them, or it would be compiled twice.
+        # Strong types, as `_advance` returns them, or it would be compiled twice.
         return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), worlds)
 
     @eqx.filter_jit
     def _advance(self, worlds: World, keep: Keep) -> tuple[World, tuple[Trace, Any]]:
-        """Some frames of every lane."""
+        """Advance every lane by `chunk_frames`, under `vmap`."""
         step = self.navigator.step
         advanced: tuple[World, tuple[Trace, Any]] = jax.vmap(
             lambda world: jax.lax.scan(
@@ -135,7 +135,7 @@ class Rollout(eqx.Module):
 
     @_jit(compiler_options=COMPILER_OPTIONS)
     def _advance_many(self, worlds: World, keep: Keep) -> tuple[World, tuple[Trace, Any]]:
-        """The same for many lanes, each with no more work than it has."""
+        """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
         step = step_by_regime(self.navigator)
         frame = over_lanes(lambda world: self._kept(world, step, keep))
         worlds, kept = jax.lax.scan(
@@ -148,7 +148,7 @@ class Rollout(eqx.Module):
         return after, (trace, keep(world, after))
 
     def first(self, key: Array) -> World:
-        """A drive before its first frame."""
+        """The world of a drive before its first frame."""
         scenario = self.scenario
         key, start_key, rig_key = jax.random.split(key, 3)
         spread = jnp.asarray(scenario.start_spread)
@@ -180,7 +180,7 @@ class Rollout(eqx.Module):
         )
 
     def frame(self, world: World, step: Step) -> tuple[World, Trace]:
-        """Move for a frame period, the command of the last frame after its latency; then look."""
+        """Move for a frame period, the last command acting after its latency; then observe."""
         scenario = self.scenario
         dtype = world.car.pose.dtype
         period_s = jnp.asarray(scenario.frame_period_s, dtype)
@@ -194,7 +194,7 @@ class Rollout(eqx.Module):
         car = scenario.displaced(car, stamp_s, period_s)
         key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, world.frame))
 
-        # A smear shifts the corners to where they were a little earlier.
+        # Smear shifts the corners to their positions a little earlier.
         smear = scenario.corner_lag_s / scenario.frame_period_s
         seen_from = car.pose + smear * (world.car.pose - car.pose)
         corners_px, visible = see(world.rig, self.markers, T_world_vehicle_from_planar(seen_from))
@@ -259,7 +259,7 @@ class Rollout(eqx.Module):
         ), trace
 
     def _moved(self, world: World, period_s: Array) -> CarState:
-        """The car one period later: a command acts `latency_s` after the frame it stems from."""
+        """The car one period later: a command acts `latency_s` after the frame it came from."""
         car, latency_s = world.car, world.truth.latency_s
         for command, dt_s in ((world.acting, latency_s), (world.command, period_s - latency_s)):
             states = move_through(world.truth.vehicle, car, command, dt_s, _SUBSTEPS)

@@ -1,4 +1,4 @@
-"""What can happen to a car: the scenarios of `jaxnav simulate`, by name."""
+"""Define the scenarios of `jaxnav simulate`, by name."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -14,15 +14,15 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.plant import CarState, OdometryNoise
 
-HEADING_SIGMA_RAD = 0.05  # of the compass that `OrientationGiven` is given
+HEADING_SIGMA_RAD = 0.05  # noise of the compass heading given to `OrientationGiven`
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A drive, and what goes wrong in it. The navigator is told nothing of this.
+    """A drive and its disturbances, which the navigator is not told.
 
-    What it is told, `told_...`, is how far the car's cameras may be from level and from their
-    calibration: not at all where they are exact.
+    The `told_...` fields are what it is told: how far the car's cameras may be from level and from
+    their calibration, zero where they are exact.
     """
 
     waypoints_m: tuple[tuple[float, float], ...]
@@ -34,34 +34,34 @@ class Scenario:
     latency_s: float = 0.03  # from the stamp of a frame until its command acts
     floor_m: tuple[float, float, float, float] = (-2.5, 2.5, -2.5, 2.5)  # x_min x_max y_min y_max
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
-    hidden_s: tuple[float, float] = (0.0, 0.0)  # no marker is seen from .. to
-    kidnapped_s: float = np.inf  # the car is carried off
+    hidden_s: tuple[float, float] = (0.0, 0.0)  # begin and end of the time without any marker
+    kidnapped_s: float = np.inf  # when the car is displaced
     kidnapped_by: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad, in the world
-    extrinsics_off: tuple[float, float] = (0.0, 0.0)  # rad, m; in a direction of its own per camera
+    extrinsics_off: tuple[float, float] = (0.0, 0.0)  # rad, m; each camera in its own direction
     told_tilt_sigma_rad: float = 0.0
     told_height_sigma_m: float = 0.0
     corner_lag_s: float = 0.0  # corners lie where they were this long before the stamp
 
     @property
     def frames(self) -> int:
-        """How many frames the longest drive has."""
+        """The number of frames of the longest drive."""
         return int(np.ceil(self.duration_s / self.frame_period_s))
 
     def hidden(self, stamp_s: Float[Array, ""]) -> Bool[Array, ""]:
-        """Whether no marker can be seen."""
+        """Whether all markers are hidden at a time."""
         begin_s, end_s = self.hidden_s
         return (stamp_s >= begin_s) & (stamp_s < end_s)
 
     def displaced(
         self, car: CarState, stamp_s: Float[Array, ""], period_s: Float[Array, ""]
     ) -> CarState:
-        """The car, carried off if this is the frame it happens in."""
+        """The car's state, displaced if the kidnapping falls into this frame."""
         now = (stamp_s >= self.kidnapped_s) & (stamp_s < self.kidnapped_s + period_s)
         shift = jnp.where(now, jnp.asarray(self.kidnapped_by, car.pose.dtype), 0)
         return eqx.tree_at(lambda c: c.pose, car, car.pose + shift)
 
     def true_rig(self, rig: CameraRig, key: Array) -> CameraRig:
-        """Where the cameras really are, when the navigator believes `rig`."""
+        """The true rig, if the navigator believes `rig`."""
         turn_rad, shift_m = self.extrinsics_off
         if turn_rad == 0 and shift_m == 0:
             return rig
@@ -76,7 +76,7 @@ class Scenario:
     def other_sensors(
         self, car: CarState, T_world_vehicle: jaxlie.SE3, key: Array
     ) -> dict[str, Any]:
-        """What `OrientationGiven` and `Oracle` are told; nobody else looks at it."""
+        """The further measurements that only `OrientationGiven` and `Oracle` use."""
         error = jax.random.normal(key, (), car.pose.dtype)
         return {
             "heading_rad": car.pose[2] + HEADING_SIGMA_RAD * error,
@@ -86,7 +86,7 @@ class Scenario:
 
 
 def _paper() -> Scenario:
-    """The paper's experiment: Liu, Schofield, Shan (2023), section III."""
+    """The scenario of the paper's experiment: Liu, Schofield, Shan (2023), section III."""
     return Scenario(
         waypoints_m=((1.30, 0.0), (0.50, 0.65)),
         start_pose=(2.0, -1.0, float(np.deg2rad(125.0))),
@@ -94,7 +94,7 @@ def _paper() -> Scenario:
 
 
 def _orbit() -> Scenario:
-    """Across the front of the marker on an arc of 1.7 m, through the frontal view."""
+    """A drive past the marker on an arc of 1.7 m, through the frontal view."""
     angles = np.deg2rad(np.arange(36.0, -61.0, -24.0))
     waypoints = [(1.7 * np.sin(a), 1.47 - 1.7 * np.cos(a)) for a in angles]
     start = np.deg2rad(60.0)

@@ -1,4 +1,4 @@
-"""What the simulated cameras look at: printed markers on textured walls, and a floor.
+"""Describe the scene before the simulated cameras: printed markers, textured walls and a floor.
 
 Everything is flat. A `Surface` is a rectangle, or a whole plane, that carries a tileable
 texture; a marker is a sheet of paper with a border square of exactly `size_m` and a white
@@ -19,16 +19,16 @@ from jaxnav.models.markers import FAMILY_SIZES, MarkerMap, opencv_dictionary_nam
 PAPER_GREY, INK_GREY = 215.0, 25.0
 QUIET_ZONE_MODULES = 1
 
-# The texture's side in texels; level l of the pyramid has TEXTURE_SIZE / 2**l of them.
+# The texture's side in texels; level l of the pyramid has a side of TEXTURE_SIZE / 2**l texels.
 TEXTURE_LEVELS = 10
 TEXTURE_SIZE = 2 ** (TEXTURE_LEVELS - 1)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A textured part of a plane. Opaque from both sides.
+    """A textured part of a plane, opaque from both sides.
 
-    The frame of a surface is x right, y up, z out of it towards the viewer, as a marker's.
+    Its frame is x right, y up, z out of the plane towards the viewer, as a marker's.
     """
 
     T_world_surface: np.ndarray  # (4, 4)
@@ -42,7 +42,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Scene:
-    """Markers and the surfaces around them. Create it once; it never changes."""
+    """Markers and the surfaces around them. Immutable: create it once."""
 
     markers: MarkerMap
     surfaces: tuple[Surface, ...]
@@ -60,9 +60,9 @@ class Scene:
 
         Args:
             markers: the printed markers.
-            walls: surfaces of your own; by default a wall behind each marker, `walls_behind`.
-            floor: whether the plane z = 0 is tiled.
-            seed: of the textures.
+            walls: surfaces; by default a wall behind each marker, `walls_behind`.
+            floor: whether there is a tiled floor in the plane z = 0.
+            seed: seed of the textures.
 
         Raises:
             BadInput: a family or an id that OpenCV does not know.
@@ -89,16 +89,15 @@ def walls_behind(
     floor: bool = True,
     atlas: np.ndarray | None = None,
 ) -> list[Surface]:
-    """A wall in the plane of each marker; markers in one plane share one.
+    """One wall in the plane of each marker; markers in one plane share a wall.
 
     A wall reaches `margin_m` beyond its markers on both sides, and from the floor up to
-    `height_m`. Where it would stand in front of another marker, and behind a marker that
-    faces up or down, it is a panel that ends 0.1 m beyond the paper; a marker that lies on the
-    floor has none.
+    `height_m`. If it would hide another marker, or its marker faces up or down, it is a panel that
+    ends 0.1 m beyond the paper; a marker that lies on the floor has no wall.
 
     Args:
         markers: the printed markers.
-        margin_m: how far a wall goes on beyond its markers.
+        margin_m: how far a wall extends beyond its markers.
         height_m: height of a wall above the floor, or above the marker without a floor.
         floor: whether the walls begin at z = 0.
         atlas: texture of the walls; plaster when left out.
@@ -136,7 +135,7 @@ def walls_behind(
         )
         if coplanar is None:
             grain = (0.731 * index, 0.377 * index)
-            # A lamp above one corner, so that walls that meet can be told apart.
+            # A lamp above one corner, so that walls that meet can be distinguished.
             grey = 128 + 14 * float(normal @ [0.6, -0.4, 0.7])
             walls.append(Surface(T_world_surface, bounds_m, grey, 9.0, 4e-3, atlas, grain))
         else:
@@ -173,12 +172,12 @@ def _black_and_white(family: str, marker_id: int) -> np.ndarray:
 
 
 def marker_sheet(family: str, marker_id: int) -> np.ndarray:
-    """The printed sheet of a marker, one element a module, quiet zone included, in grey.
+    """The printed sheet of a marker in grey: one element per module, quiet zone included.
 
     Args:
         family: tag16h5, tag25h9, tag36h10, tag36h11, or a dictionary of OpenCV's in lower case
             without DICT_, as in 4x4_50 and aruco_original. AprilTags stand as OpenCV draws them.
-        marker_id: which of the family.
+        marker_id: id within the family.
 
     Raises:
         BadInput: unknown family or id.
@@ -188,16 +187,16 @@ def marker_sheet(family: str, marker_id: int) -> np.ndarray:
 
 
 def plaster(rng: np.random.Generator) -> np.ndarray:
-    """A tileable rough wall: noise with an amplitude of 1 / frequency, (TEXTURE_SIZE,) * 2."""
+    """A tileable texture of a rough wall: 1 / frequency noise, (TEXTURE_SIZE,) * 2."""
     frequency = _frequency_cycles()
     spectrum = np.fft.fft2(rng.standard_normal((TEXTURE_SIZE, TEXTURE_SIZE)))
-    # From half of the tile's side down to four texels, which bilinear interpolation can carry.
+    # From half the tile's side down to four texels, the finest that bilinear interpolation keeps.
     band = (frequency >= 2) & (frequency <= TEXTURE_SIZE / 4)
     return np.fft.ifft2(np.where(band, spectrum / np.maximum(frequency, 1), 0)).real
 
 
 def tiles(rng: np.random.Generator, per_side: int = 4) -> np.ndarray:
-    """A tileable floor of square tiles with dark joints, each tile of its own brightness."""
+    """A tileable texture of square floor tiles with dark joints, each of its own brightness."""
     side = TEXTURE_SIZE // per_side
     tone = np.kron(0.5 * rng.standard_normal((per_side, per_side)), np.ones((side, side)))
     along = np.arange(TEXTURE_SIZE) % side < 4
@@ -208,10 +207,10 @@ def tiles(rng: np.random.Generator, per_side: int = 4) -> np.ndarray:
 
 
 def texture_atlas(texture: np.ndarray) -> np.ndarray:
-    """All levels of a texture below one another in one image, zero mean and unit deviation.
+    """All levels of a texture below one another in one image: zero mean, unit deviation.
 
-    Level l is the texture without what its texels cannot carry. Its texel i stands at i * 2**l,
-    it has one more row and column that repeat the first, and begins at row
+    Level l is the texture without the detail that its texels cannot represent. Its texel i is at
+    i * 2**l, it has one more row and column that repeat the first, and begins at row
     2 * (TEXTURE_SIZE - TEXTURE_SIZE / 2**l) + l. Float32.
     """
     spectrum = np.fft.fft2((texture - texture.mean()) / texture.std())

@@ -1,7 +1,7 @@
-"""What a set of drives amounts to: rates and medians, each with its 95 % interval.
+"""Summarise a set of drives by rates and medians, each with its 95 % interval.
 
-Frames of one drive are not independent, so every interval counts drives: Wilson's for success, and
-for everything else the bootstrap over drives.
+Frames of one drive are not independent, so every interval counts drives: Wilson's for success, the
+bootstrap over drives for everything else.
 """
 
 from collections.abc import Callable
@@ -15,18 +15,18 @@ from jaxnav.simulation.rollout import Trace
 from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.statistics import wilson_interval
 
-WRONG_DEG = 20.0  # a heading this far off is that of the mirror image, or worse
+WRONG_DEG = 20.0  # a larger heading error means the mirrored pose, or worse
 _RESAMPLES = 1000
 _POOLED_RESAMPLES = 100  # of all frames of all drives
 
 
 @dataclass(frozen=True)
 class Drives:
-    """Finished drives of one navigator in one scenario, leading axes (S,) or (S, frames)."""
+    """The scores of finished drives of one navigator in one scenario: (S,) or (S, frames)."""
 
     counted: np.ndarray  # frames that have a pose
-    decided: np.ndarray  # and act upon it
-    late: np.ndarray  # and come after the first two seconds
+    decided: np.ndarray  # counted frames whose branch is decided
+    late: np.ndarray  # counted frames after the first two seconds
     wrong: np.ndarray
     yaw_error_rad: np.ndarray  # not negative
     position_error_m: np.ndarray
@@ -37,7 +37,7 @@ class Drives:
 
     @staticmethod
     def of(drives: Trace, scenario: Scenario) -> "Drives":
-        """Drives, leading axes (S, frames)."""
+        """The scores of traces with leading axes (S, frames)."""
         trace: Any = jax.device_get(drives)
         counted = trace.active & trace.located
         decided = counted & trace.decided
@@ -62,7 +62,7 @@ class Drives:
         )
 
     def summary(self) -> dict[str, Any]:
-        """All measures. Fractions are of frames; errors and NEES of frames that are decided."""
+        """All measures. Fractions count frames; errors and NEES are over the decided frames."""
         count, rate = len(self.success), float(np.mean(self.success))
         return {
             "drives": count,
@@ -87,7 +87,7 @@ class Drives:
         resampled = wrong[picks].sum(axis=1) / np.maximum(counted[picks].sum(axis=1), 1)
         low, high = np.percentile(resampled, [2.5, 97.5])
         if not wrong.any():
-            # No drive was ever wrong: what a drive's rate of being wrong may still be.
+            # No drive was ever wrong: the upper bound on the share of drives that are.
             high = 1 - 0.05 ** (1 / len(wrong))
         return _measure(wrong.sum() / max(int(counted.sum()), 1), (low, high))
 
@@ -104,15 +104,15 @@ class Drives:
 
 
 def _bootstrap(values: np.ndarray, share: float) -> dict[str, Any]:
-    """A quantile of one number a drive."""
+    """A quantile, with its interval, of values that have one entry per drive."""
     resampled = [_quantile(values[picks], share) for picks in _resamples(len(values), _RESAMPLES)]
-    ordered = np.sort(resampled)  # infinite ones included, which a percentile would not bear
+    ordered = np.sort(resampled)  # infinite values included, which `percentile` cannot handle
     low, high = ordered[int(0.025 * _RESAMPLES)], ordered[int(0.975 * _RESAMPLES) - 1]
     return _measure(_quantile(values, share), (low, high))
 
 
 def _resamples(drives: int, count: int) -> np.ndarray:
-    """(count, drives): which drives each resample is made of."""
+    """The drives in each resample, indices (count, drives)."""
     return np.random.default_rng(0).integers(0, drives, (count, drives))
 
 
@@ -121,7 +121,7 @@ def _measure(value: Any, interval: tuple[Any, Any]) -> dict[str, Any]:
 
 
 def _quantile(values: np.ndarray, share: float) -> float:
-    """An order statistic: infinite values stay what they are."""
+    """A quantile as an order statistic, so infinite values stay infinite."""
     if not len(values):
         return float("nan")
     return float(np.partition(values, k := min(int(share * len(values)), len(values) - 1))[k])

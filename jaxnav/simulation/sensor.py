@@ -1,4 +1,4 @@
-"""From light to grey values: noise, gain, saturation, quantisation; and when each row looks."""
+"""Turn light into grey values: noise, gain, saturation, quantisation; and the times of rows."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ from jaxnav.errors import BadInput
 
 @dataclass(frozen=True)
 class Shutter:
-    """When the rows of an image collect light.
+    """The exposure times of the rows of an image.
 
-    Row r is open for `exposure_s` around `stamp_s + (r - (rows - 1) / 2) * row_time_s`: the
-    stamp of an image is the middle of the exposure of its middle row. Zeros are a still, global
-    shutter.
+    Row r is exposed for `exposure_s` around `stamp_s + (r - (rows - 1) / 2) * row_time_s`: the
+    stamp of an image is the middle of the exposure of its middle row. Zeros give a global shutter
+    without motion blur.
     """
 
     exposure_s: float = 0.0
@@ -26,7 +26,7 @@ class Shutter:
                 raise BadInput(f"Shutter.{key}", "must be finite and not negative")
 
     def row_times_s(self, rows: int) -> np.ndarray:
-        """Middle of the exposure of each row, relative to the stamp, (rows,)."""
+        """The middle of each row's exposure, relative to the stamp, (rows,)."""
         return (np.arange(rows) - (rows - 1) / 2) * self.row_time_s
 
 
@@ -45,7 +45,7 @@ class Sensor:
     gain: float = 1.0
     full_well_e: float = 8000.0
     read_noise_grey: float = 1.0
-    vignetting: float = 0.0  # the part of the light that is lost in the farthest corner, 0 to 1
+    vignetting: float = 0.0  # fraction of the light lost in the farthest corner, 0 to 1
     psf_sigma_px: float = 0.0  # a Gaussian lens blur on top of the square pixel
     noise: bool = True
 
@@ -62,7 +62,7 @@ class Sensor:
                 raise BadInput(f"Sensor.{key}", f"must be {wanted}, got {getattr(self, key)}")
 
     def illuminate(self, light: np.ndarray, center_px: np.ndarray) -> np.ndarray:
-        """What the lens lets through of the scene's light: blur and vignetting, (H, W) float32."""
+        """The scene's light after the lens's blur and vignetting, (H, W) float32."""
         if self.psf_sigma_px > 0:
             light = cv2.GaussianBlur(light, (0, 0), self.psf_sigma_px)
         if self.vignetting > 0:
@@ -74,7 +74,7 @@ class Sensor:
         return light
 
     def read_out(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Grey values of an image of light, (H, W) uint8."""
+        """The grey values of an image of light, (H, W) uint8."""
         grey = np.float32(self.gain) * light
         if self.noise:
             variance = np.float32(self.gain * 255 / self.full_well_e) * grey

@@ -1,4 +1,4 @@
-"""What a moving rig sees of markers, as a table of corners: for calibrations, without images."""
+"""Simulate a moving rig's sightings of markers as a table of corners, to test calibrations."""
 
 from functools import partial
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxnav.simulation.corners import see
 
 
 class SimulatedSightings(NamedTuple):
-    """N sightings, ordered by frame, camera and marker."""
+    """A table of N sightings, ordered by frame, camera and marker."""
 
     frame: Int[np.ndarray, " N"]
     camera: Int[np.ndarray, " N"]
@@ -31,11 +31,11 @@ def simulate_sightings(
     rng: np.random.Generator,
     max_obliquity_deg: float = 75.0,
 ) -> SimulatedSightings:
-    """All markers that can be read, their corners spoiled by Gaussian noise.
+    """The sightings of all readable markers, with Gaussian noise on the corners.
 
     Args:
         Ts_world_vehicle: wxyz_xyz, m.
-        max_obliquity_deg: of the line of sight against a marker's normal.
+        max_obliquity_deg: largest angle between the line of sight and a marker's normal.
     """
     corners_px, visible = _seen(rig, markers, jnp.asarray(Ts_world_vehicle), max_obliquity_deg)
     frame, camera, marker = np.nonzero(np.asarray(visible))

@@ -1,4 +1,4 @@
-"""Single frames of one marker: where it stands before the cameras, and what is seen of it."""
+"""Simulate single frames of one marker, from its pose before the cameras to its corners."""
 
 import equinox as eqx
 import jax
@@ -18,29 +18,29 @@ IMAGE_PX = 2048  # side of a pinhole camera's image
 
 
 class View(eqx.Module):
-    """Where one marker stands, seen from the vehicle; scalars, or leading axes throughout."""
+    """The pose of one marker seen from the vehicle; scalars, or leading axes throughout."""
 
     range_m: Float[Array, "*F"]  # from the cameras' mean position to the marker's centre
-    bearing_rad: Float[Array, "*F"]  # of the marker: left of straight ahead
+    bearing_rad: Float[Array, "*F"]  # of the marker, positive to the left
     elevation_rad: Float[Array, "*F"]  # above the horizon
     view_angle_rad: Float[Array, "*F"]  # between the marker's normal and the line of sight
-    azimuth_rad: Float[Array, "*F"]  # where the normal leans to: 0 the reader's right, pi/2 up
+    azimuth_rad: Float[Array, "*F"]  # direction of the normal's lean: 0 viewer's right, pi/2 up
     roll_rad: Float[Array, "*F"]  # of the marker about its normal
 
 
 class CornerErrors(eqx.Module):
-    """How a detector's corners differ from the true ones."""
+    """The errors of a detector's corners."""
 
     noise_px: Float[Array, "*F"]  # standard deviation, independent
-    bias_px: Float[Array, "*F"]  # of every corner, in a direction of its own
-    blur_px: Float[Array, "*F"]  # length of a streak, in which each corner is found anywhere
+    bias_px: Float[Array, "*F"]  # length; each corner has its own direction
+    blur_px: Float[Array, "*F"]  # length of a streak; a corner lies anywhere in it
 
 
 def pinhole_rig(cameras: int, focal_px: float, baseline_m: float) -> CameraRig:
-    """Cameras without distortion that look ahead side by side, the first in the vehicle's origin.
+    """A rig of forward cameras side by side, without distortion, the first at the vehicle's origin.
 
     Args:
-        baseline_m: from each to the next, to the right.
+        baseline_m: distance from each camera to the next, to the right.
     """
     R_camera_vehicle = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     rotation = rotation_from_matrix(jnp.asarray(R_camera_vehicle, float))
@@ -60,18 +60,18 @@ def pinhole_rig(cameras: int, focal_px: float, baseline_m: float) -> CameraRig:
 
 
 def marker_as_world(size_m: Float[Array, ""] | float) -> MarkerMap:
-    """A map of one marker, whose frame is the world's."""
+    """A map of one marker, whose frame is the world frame."""
     identity = jaxlie.SE3.identity()
     return MarkerMap(jaxlie.SE3(identity.wxyz_xyz[None]), jnp.asarray([size_m]), (0,), ("",))
 
 
 def T_vehicle_world_of(view: View, rig: CameraRig) -> jaxlie.SE3:
-    """The pose of the marker, which is the world, that a view describes. Of one view."""
+    """The pose of the marker, whose frame is the world frame, in one view (no batch axis)."""
     cos_up, sin_up = jnp.cos(view.elevation_rad), jnp.sin(view.elevation_rad)
     sight = jnp.stack(
         [cos_up * jnp.cos(view.bearing_rad), cos_up * jnp.sin(view.bearing_rad), sin_up]
     )
-    # A marker that looks at the cameras, upright: x to its reader's right, z along its normal.
+    # An upright marker that faces the cameras: x to the viewer's right, z along its normal.
     x = jnp.stack([jnp.sin(view.bearing_rad), -jnp.cos(view.bearing_rad), jnp.zeros_like(sin_up)])
     facing = rotation_from_matrix(jnp.stack([x, jnp.cross(-sight, x), -sight], axis=1))
     lean = jnp.stack(
@@ -91,7 +91,7 @@ def T_vehicle_world_of(view: View, rig: CameraRig) -> jaxlie.SE3:
 def observe(
     view: View, errors: CornerErrors, rig: CameraRig, markers: MarkerMap, key: Array
 ) -> tuple[Observation, jaxlie.SE3]:
-    """What the cameras see of a marker that is the world, and T_world_vehicle. Of one view."""
+    """The observation of the marker, and T_world_vehicle, of one view (no batch axis)."""
     T_world_vehicle = T_vehicle_world_of(view, rig).inverse()
     corners_px, visible = see(rig, markers, T_world_vehicle)
     corners_px = corners_px + corner_errors_px(errors, corners_px.shape, corners_px.dtype, key)
@@ -101,7 +101,7 @@ def observe(
 def corner_errors_px(
     errors: CornerErrors, shape: tuple[int, ...], dtype: jnp.dtype, key: Array
 ) -> Float[Array, "C M 4 2"]:
-    """What is added to exact corners, shape (C, M, 4, 2)."""
+    """Draw the errors to add to exact corners, shape (C, M, 4, 2)."""
     noise_key, bias_key, blur_key, streak_key = jax.random.split(key, 4)
     noise = jax.random.normal(noise_key, shape, dtype)
     streak = directions(jax.random.uniform(streak_key, shape[:2], dtype))[:, :, None]
@@ -114,5 +114,5 @@ def corner_errors_px(
 
 
 def directions(turn: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
-    """Unit vectors in the image, from a turn in [0, 1)."""
+    """Unit vectors in the image for an angle in turns, [0, 1)."""
     return jnp.stack([jnp.cos(2 * jnp.pi * turn), jnp.sin(2 * jnp.pi * turn)], axis=-1)

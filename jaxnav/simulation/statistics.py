@@ -1,4 +1,4 @@
-"""Rates, and how far they can be trusted."""
+"""Compute rates with confidence intervals, and bounds on the ANEES."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ _Z = 1.959963984540054  # 95 % of a normal distribution lies within
 
 
 def wilson_interval(rate: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the 95 % interval of a proportion that was observed in `count` trials.
+    """The ends of the 95 % interval of a proportion observed in `count` trials.
 
     Source: Wilson (1927).
     """
@@ -20,7 +20,7 @@ def wilson_interval(rate: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np
 
 @dataclass(frozen=True)
 class Reliability:
-    """Predicted against observed frequencies, in bins of equal width."""
+    """Predicted and observed frequencies in bins of equal width."""
 
     predicted: np.ndarray  # mean prediction of each bin
     observed: np.ndarray
@@ -28,7 +28,7 @@ class Reliability:
 
     @staticmethod
     def of(probability: np.ndarray, happened: np.ndarray, bins: int = 20) -> "Reliability":
-        """Bin predictions in [0, 1]; empty bins are left out."""
+        """Bin predictions in [0, 1], without empty bins."""
         index = np.minimum((probability * bins).astype(int), bins - 1)
         counts = np.bincount(index, minlength=bins)
         used = counts > 0
@@ -38,12 +38,12 @@ class Reliability:
 
     @property
     def intervals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Ends of the 95 % interval of every bin's frequency."""
+        """The ends of the 95 % interval of every bin's frequency."""
         return wilson_interval(self.observed, self.counts)
 
     @property
     def expected_calibration_error(self) -> float:
-        """Mean gap between prediction and frequency, weighted by the bins' counts.
+        """The mean gap between prediction and frequency, weighted by the bins' counts.
 
         Source: Naeini, Cooper, Hauskrecht (2015).
         """
@@ -54,10 +54,10 @@ class Reliability:
 def resampled(
     sums: np.ndarray, counts: np.ndarray, draws: int = 1000
 ) -> tuple[float, float, float]:
-    """A mean over the frames of all drives, and its 95 % interval: the bootstrap over drives.
+    """The mean over the frames of all drives, and its 95 % interval by bootstrap over drives.
 
     Args:
-        sums, counts: (S,), of every drive's frames.
+        sums, counts: (S,), the sum over each drive's frames and their number.
     """
     picks = np.random.default_rng(0).integers(0, len(sums), (draws, len(sums)))
     means = sums[picks].sum(axis=1) / np.maximum(counts[picks].sum(axis=1), 1)
@@ -66,7 +66,7 @@ def resampled(
 
 
 def anees_band(drives: int, freedom: int, share: float = 0.999) -> tuple[float, float]:
-    """Where the ANEES of a consistent filter lies, drives counted once each.
+    """The interval in which a consistent filter's ANEES lies, each drive counted once.
 
     Source: Bar-Shalom, Li, Kirubarajan (2001), Eq. 5.4.2-14.
     """

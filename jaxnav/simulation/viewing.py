@@ -1,4 +1,4 @@
-"""Where every pixel looks, and where the camera is while it does.
+"""Compute the ray of every pixel, and the camera's pose during the exposure.
 
 The plane z = 0 of a surface, seen along a ray r of the camera, is a homography in r:
 (x, y, 1) ~ H r with H = [q_x n - q_z a; q_y n - q_z b; n], where q is the camera's position in
@@ -18,34 +18,34 @@ from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
 from jaxnav.simulation.sensor import Shutter
 
-CELL_PX = 8  # the grid on which it is found out what is in sight where
-# Samples of the background: a square grid, turned until rows and columns are all different.
+CELL_PX = 8  # cell of the grid on which visibility is determined
+# Samples of the background: a square grid, rotated until all rows and columns differ.
 BACKGROUND_PX = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Rays of one camera, in layouts that a row of pixels can be multiplied with."""
+    """The rays of one camera, in layouts that suit products over a row of pixels."""
 
     rows: int
     columns: int
     rays: np.ndarray  # (H, 3, W) float32 unit vectors through the pixels' centres
-    rays_dx: np.ndarray  # (H, 3, W) their change a pixel to the right
-    rays_dy: np.ndarray  # (H, 3, W) and a pixel down
+    rays_dx: np.ndarray  # (H, 3, W) their change one pixel to the right
+    rays_dy: np.ndarray  # (H, 3, W) their change one pixel down
     background_rays: np.ndarray  # (H, 4, 3, W) through the samples of the background
-    valid: np.ndarray  # (H, W) bool: pixels that the lens maps a ray to
+    valid: np.ndarray  # (H, W) bool: pixels that have a ray
     center_px: np.ndarray  # (2,) the principal point
-    pixel_rad: float  # the angle between neighbouring pixels, typically
-    finest_rad: float  # and where the lens resolves best
+    pixel_rad: float  # the typical angle between neighbouring pixels
+    finest_rad: float  # that angle where the lens resolves best
 
     @property
     def nodes_y(self) -> np.ndarray:
-        """Rows of a coarse grid that spans the image."""
+        """The rows of a coarse grid that spans the image."""
         return np.minimum(np.arange(0, self.rows + CELL_PX, CELL_PX), self.rows - 1)
 
     @property
     def nodes_x(self) -> np.ndarray:
-        """Columns of a coarse grid that spans the image."""
+        """The columns of a coarse grid that spans the image."""
         return np.minimum(np.arange(0, self.columns + CELL_PX, CELL_PX), self.columns - 1)
 
     @staticmethod
@@ -91,7 +91,7 @@ class Lens:
 
 @jax.jit
 def _unproject_rows(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Rays (H, W, 3) through pixels (H, W, 2), and how far they miss them, (H, W) px."""
+    """The rays (H, W, 3) of pixels (H, W, 2), and their reprojection error (H, W) in px."""
 
     def one_row(row_px: jax.Array) -> tuple[jax.Array, jax.Array]:
         rays = camera.unproject(row_px)
@@ -103,7 +103,7 @@ def _unproject_rows(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.A
 
 @dataclass(frozen=True)
 class Motion:
-    """Poses of the vehicle at a few instants, straight lines between them."""
+    """The poses of the vehicle at a few instants, with linear interpolation between them."""
 
     times_s: np.ndarray  # (N,) relative to the stamp
     Rs_world_vehicle: np.ndarray  # (N, 3, 3)
@@ -111,7 +111,7 @@ class Motion:
 
     @staticmethod
     def create(times_s: np.ndarray, wxyz_xyz: np.ndarray) -> "Motion":
-        """From T_world_vehicle as (N, 7), w x y z, x y z, at evenly spaced times."""
+        """The motion of T_world_vehicle (N, 7), w x y z, x y z, at evenly spaced times."""
         wxyz = wxyz_xyz[:, :4] / np.linalg.norm(wxyz_xyz[:, :4], axis=1, keepdims=True)
         w, v = wxyz[:, 0, None, None], wxyz[:, 1:]
         cross = np.cross(v[:, None, :], np.eye(3)).swapaxes(1, 2)
@@ -120,17 +120,17 @@ class Motion:
 
     @property
     def rotation_steps_rad(self) -> np.ndarray:
-        """Angle between neighbouring poses, (N-1,)."""
+        """The angle between neighbouring poses, (N-1,)."""
         chord = np.linalg.norm(np.diff(self.Rs_world_vehicle, axis=0), axis=(1, 2)) / np.sqrt(8)
         return 2 * np.arcsin(np.clip(chord, 0, 1))
 
     @property
     def travel_steps_m(self) -> np.ndarray:
-        """Distance between neighbouring poses, (N-1,)."""
+        """The distance between neighbouring poses, (N-1,)."""
         return np.linalg.norm(np.diff(self.positions_world_m, axis=0), axis=1)
 
     def at(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (..., 3, 3) and position (..., 3) in the world at any times (...)."""
+        """The rotation (..., 3, 3) and position (..., 3) in the world at any times (...)."""
         if len(self.times_s) == 1:
             shape = np.shape(times_s)
             return (
@@ -149,7 +149,7 @@ class Motion:
 
 
 class View:
-    """One camera during one image: where it is when, and how fast its picture moves."""
+    """One camera during one image: its motion, and the speed of its picture."""
 
     def __init__(self, lens: Lens, motion: Motion, T_vehicle_camera: np.ndarray, shutter: Shutter):
         self.lens, self._motion, self._T_vehicle_camera = lens, motion, T_vehicle_camera
@@ -160,7 +160,7 @@ class View:
         turns_rad, travels_m = motion.rotation_steps_rad, motion.travel_steps_m
         self._turn_rad = self._travel_m = 0.0
         if len(steps_s):
-            # The fastest moment counts for the whole image: it only costs samples.
+            # The fastest moment counts for the whole image: that only costs samples.
             self._turn_rad = float(np.max(turns_rad / steps_s)) * self.exposure_s
             self._travel_m = float(np.max((travels_m + lever_m * turns_rad) / steps_s))
             self._travel_m *= self.exposure_s
@@ -172,18 +172,18 @@ class View:
         return R @ T[:3, :3], R @ T[:3, 3] + p
 
     def blur_px(self, distance_m: float) -> float:
-        """An upper bound of how far a thing at a distance moves in the image in one exposure."""
+        """An upper bound on the image motion, in one exposure, of a point at a distance."""
         return (self._turn_rad + self._travel_m / max(distance_m, 1e-3)) / self.lens.finest_rad
 
     def homographies(
         self, T_world_surface: np.ndarray, rows: slice | np.ndarray, instants: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Camera rays to coordinates on a surface, for each row at each instant.
+        """The homographies from camera rays to a surface, for each row at each instant.
 
         Args:
             T_world_surface: (4, 4).
             rows: the rows.
-            instants: (K,) parts of the exposure, -0.5 to 0.5.
+            instants: (K,) fractions of the exposure, -0.5 to 0.5.
 
         Returns:
             H (rows, K, 3, 3) and the camera's height q_z over the surface in m, (rows, K); float32.

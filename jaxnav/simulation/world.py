@@ -1,4 +1,4 @@
-"""One drive of a rollout: what its seed drew, and where it stands."""
+"""Hold the state of one drive of a rollout, and the true car that its seed drew."""
 
 from dataclasses import dataclass
 
@@ -16,20 +16,19 @@ from jaxnav.simulation.scenarios import Scenario
 
 
 class Truth(eqx.Module):
-    """The car of one drive, as it is: the navigator is not told."""
+    """The true car of one drive, unknown to the navigator."""
 
     vehicle: Vehicle
-    odometer_scale: Float[Array, ""]  # what it reports over what is true
+    odometer_scale: Float[Array, ""]  # reported speed over true speed
     latency_s: Float[Array, ""]  # from the stamp of a frame until its command acts
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How far the cars of different drives are from what is believed: each number is drawn evenly
-    from its range, (low, high).
+    """The ranges (low, high) from which each drive's true car is drawn uniformly.
 
-    The first three are factors of the vehicle's or the scenario's own numbers; the latency is what
-    is added to the scenario's, within 0 and a frame period.
+    The first three are factors on the vehicle's or the scenario's own numbers; the latency is added
+    to the scenario's, and the sum is clipped to between 0 and a frame period.
     """
 
     speed_per_throttle: tuple[float, float] = (0.8, 1.2)
@@ -38,10 +37,10 @@ class Spread:
     latency_s: tuple[float, float] = (-0.02, 0.03)
 
     def draw(self, key: Array, truth: Truth, longest_s: float) -> Truth:
-        """A car of its own, from the nominal one.
+        """Draw a car around the nominal one.
 
         Args:
-            longest_s: that a command can be under way, the frame period.
+            longest_s: upper limit of the latency, the frame period.
         """
         dtype = truth.latency_s.dtype
         ranges = (
@@ -65,7 +64,7 @@ class Spread:
 
 
 class World(eqx.Module):
-    """What one seed drew, and where its drive stands."""
+    """The quantities that one seed drew, and the state of its drive."""
 
     key: Array
     rig: CameraRig  # the true one
@@ -73,17 +72,17 @@ class World(eqx.Module):
     bias: Float[Array, "C M 4 2"]  # directions in the image
     start_pose: Float[Array, " 3"]
     car: CarState
-    acting: Command  # until the latency of the next one is over
+    acting: Command  # in effect until the latency of `command` is over
     command: Command
     state: State
-    frame: Int[Array, ""]  # the next one
+    frame: Int[Array, ""]  # index of the next frame
     passed: Int[Array, ""]
     ended: Bool[Array, ""]
     on_floor: Bool[Array, ""]
 
 
 def nominal(vehicle: Vehicle, scenario: Scenario, dtype: jnp.dtype) -> Truth:
-    """The car that the scenario is about."""
+    """The scenario's car, without any spread."""
     return Truth(
         jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle),
         jnp.asarray(scenario.odometry.speed_scale, dtype),

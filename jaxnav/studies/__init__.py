@@ -1,1 +1,1 @@
-"""Monte-Carlo studies: a labelled grid times trials, what is measured, how it is kept."""
+"""Run Monte-Carlo studies: a labelled grid times trials, its measurements and their store."""

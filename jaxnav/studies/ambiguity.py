@@ -1,7 +1,7 @@
-"""Single frames: which of a marker's two poses each selector takes, and how good it is.
+"""Study single frames: which of a marker's two poses each selector takes, and how good it is.
 
-The corners go through what a car runs: candidates, selector, covariance. A frame is one random
-draw of corner errors at one view.
+The corners go through the car's own code: candidates, selector, covariance. A frame is one random
+draw of corner errors in one view.
 """
 
 import functools
@@ -117,12 +117,12 @@ SCHEMA = Schema(
 
 
 class AmbiguityStudy(Study):
-    """What `jaxnav study ambiguity` runs."""
+    """The study that `jaxnav study ambiguity` runs."""
 
     schema = SCHEMA
 
     def __init__(self, config: Config, rig: CameraRig | None = None):
-        """A study of a rig, or of cameras side by side."""
+        """Study a rig, or pinhole cameras side by side if there is none."""
         super().__init__(config)
         self.rig = None if rig is None else in_precision(rig, config.precision)
 
@@ -167,7 +167,7 @@ class AmbiguityStudy(Study):
 
 
 def _numbers(cell: Cell, rig: CameraRig) -> list[float]:
-    """The values that are traced, in the order of `_NUMBERS`. NaN: random, or none."""
+    """The traced values of a cell, in the order of `_NUMBERS`. NaN: random, or none."""
     filled: dict[str, Any] = dict(cell)
     filled["told_noise_px"] = told_noise_px(filled["told_noise_px"], filled["corner_noise_px"])
     if cell["focal_px"] is None:
@@ -188,7 +188,7 @@ def _frame(
     numbers: Float[Array, " P"],
     trial: Int[Array, ""],
 ) -> dict[str, Array]:
-    """One frame, chosen from by every selector; what is measured once for each has that axis."""
+    """Measure one frame with every selector; variables per selector have a leading axis of them."""
     value = dict(zip(_NUMBERS, numbers, strict=True))
     key = jax.random.fold_in(jax.random.wrap_key_data(key_data), trial)
     view_key, corner_key, prior_key = jax.random.split(key, 3)
@@ -221,7 +221,7 @@ def _frame(
 
 
 def _view(value: Mapping[str, Array], key: Array) -> View:
-    """The view, with what is random drawn."""
+    """The view of a trial, with its random angles drawn."""
     turns = jax.random.uniform(key, (3,), value["range_m"].dtype, -jnp.pi, jnp.pi)
     azimuth, roll, bearing = (
         jnp.where(jnp.isnan(value[name]), turn, jnp.deg2rad(value[name]))
@@ -240,7 +240,7 @@ def _view(value: Mapping[str, Array], key: Array) -> View:
 def _prior(
     T_world_vehicle: jaxlie.SE3, value: Mapping[str, Array], hypotheses: int, key: Array
 ) -> PoseBelief:
-    """A prediction with the errors it says it has, in the first slot; or none at all."""
+    """A prediction in the first slot, with errors drawn from its covariance; or no prediction."""
     sigma_m, sigma_rad = (
         value["prior_position_sigma_m"],
         jnp.deg2rad(value["prior_angle_sigma_deg"]),
@@ -264,7 +264,7 @@ def _prior(
 def _judged(
     candidates: Candidates, selected: Array, T_true: jaxlie.SE3, visible: Array
 ) -> dict[str, Array]:
-    """What the truth says of one choice."""
+    """The outcome and the errors of one choice, judged against the truth."""
     branch = judge_branch(candidates, selected, T_true)
     index = jnp.maximum(selected, 0)
     T = jaxlie.SE3(candidates.T_vehicle_world.wxyz_xyz[index]).inverse()
@@ -278,7 +278,7 @@ def _judged(
     outcome = jnp.where(branch.wrong, FLIPPED, RIGHT)
     outcome = jnp.where(branch.outlier, OUTLIER, outcome)
     outcome = jnp.where(finite, outcome, INVALID)
-    # A marker in view that has no finite candidate is a failure of ours and not a refusal.
+    # A marker in view without a finite candidate is a failure of the solver and not a refusal.
     no_pose = jnp.where(jnp.any(candidates.valid), DECLINED, INVALID)
     outcome = jnp.where(selected >= 0, outcome, no_pose)
     outcome = jnp.where(jnp.any(visible), outcome, UNSEEN)

@@ -1,4 +1,4 @@
-"""What a study is: its grid, its trials and its seed, checked before anything runs."""
+"""Parse and check a study's config, its grid, trials and seed, before anything runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ _MAX_TRIALS = 2**31 - 1  # `fold_in` counts in 32 bits
 
 @dataclass(frozen=True)
 class Config:
-    """A study, checked and complete: every parameter lies on an axis or is fixed."""
+    """A checked and complete study: every parameter is an axis or is fixed."""
 
     kind: str
     axes: Mapping[str, Sequence[Value]]  # in the order of the result's dimensions
@@ -21,7 +21,7 @@ class Config:
     trials: int  # of every cell
     seed: int = 0
     precision: str = "float32"
-    files: Mapping[str, str] = field(default_factory=dict)  # what else it is made of: digests
+    files: Mapping[str, str] = field(default_factory=dict)  # name -> digest of calibration files
 
     @staticmethod
     def parse(
@@ -31,11 +31,11 @@ class Config:
         where: object,
         files: Mapping[str, str] | None = None,
     ) -> "Config":
-        """A config file's content.
+        """Parse and check a config file's content.
 
         Args:
             kind: the kind of study.
-            parameters: what this kind can vary.
+            parameters: the parameters that this kind can vary.
             data: the file's mapping.
             where: the file, for messages.
             files: name -> digest of the calibration files that the study uses.
@@ -83,7 +83,7 @@ class Config:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain data: equal for equal studies."""
+        """The config as plain data, equal for equal studies."""
         return {
             "kind": self.kind,
             "axes": {name: list(values) for name, values in self.axes.items()},
@@ -96,7 +96,7 @@ class Config:
 
 
 def difference(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Where two studies differ, as `key: here, there`."""
+    """The differences between two studies, as lines `key: here, there`."""
     differing = []
     for key in sorted(set(wanted) | set(found)):
         here, there = wanted.get(key), found.get(key)

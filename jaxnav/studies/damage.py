@@ -1,4 +1,4 @@
-"""Is a store still what was written: damaged bytes, and parts that do not fit together, named."""
+"""Check a store for damaged bytes and for parts that do not fit together, and name them."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -14,34 +14,34 @@ from jaxnav.files import limits
 from jaxnav.studies.layout import Layout
 from jaxnav.studies.study import Grid
 
-_LONGEST = 200  # characters of what a library says about broken bytes; it may quote them all
+_LONGEST = 200  # characters kept of a library's message on broken bytes; it may quote them all
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """What the block reads of a store.
+    """Turn any error of a block that reads a store into `BadInput`.
 
     Raises:
-        BadInput: what was to be read is damaged.
+        BadInput: the data read are damaged.
     """
     try:
         yield
     except BadInput:
         raise
     except Exception as error:
-        # Zarr, its codecs and xarray meet whatever bytes the files hold.
+        # Zarr, its codecs and xarray may raise anything on the bytes they find.
         said = f"{type(error).__name__}: {error}"
         shown = said if len(said) <= _LONGEST else f"{said[:_LONGEST]}..."
         raise BadInput(path, f"is damaged ({shown})") from None
 
 
 def check_sizes(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Whether what is read of a store at once, as its arrays declare it, is not too much.
+    """Check that no part of a store that is read at once is too large, as its arrays declare.
 
-    That is a chunk of any, and of an axis and of which boxes are done all.
+    Such a part is one chunk of any array, and the whole of an axis and of `done`.
 
     Raises:
-        BadInput: it is.
+        BadInput: a part is too large.
     """
     for name, array in arrays.items():
         is_whole = name == "done" or tuple(array.metadata.dimension_names or ()) == (name,)
@@ -52,14 +52,14 @@ def check_sizes(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def layout_of(path: Path, attributes: Mapping[str, Any], counts: tuple[int, ...]) -> Layout:
-    """How a store says that it is cut.
+    """The layout that a store declares.
 
     Args:
-        attributes: of the array that says which boxes are done.
-        counts: its shape.
+        attributes: attributes of the array `done`, which marks the finished boxes.
+        counts: shape of `done`.
 
     Raises:
-        BadInput: that can't be.
+        BadInput: the layout is impossible.
     """
     sizes: dict[str, tuple[int, ...]] = {}
     for key in ("shape", "box"):
@@ -77,10 +77,10 @@ def layout_of(path: Path, attributes: Mapping[str, Any], counts: tuple[int, ...]
 
 
 def check_layout(path: Path, layout: Layout, grid: Grid) -> None:
-    """Whether a store is cut from the grid of its config.
+    """Check that a store's layout fits the grid of its config.
 
     Raises:
-        BadInput: it isn't.
+        BadInput: it does not.
     """
     expected = (*map(len, grid.outer_axes.values()), grid.config.trials)
     if layout.shape != expected:
@@ -89,10 +89,10 @@ def check_layout(path: Path, layout: Layout, grid: Grid) -> None:
 
 
 def check_trials(path: Path, trials: xr.Dataset, grid: Grid) -> None:
-    """Whether a store holds what its config says: axes and variables, not yet their numbers.
+    """Check a store's axes and variables, not yet their numbers, against its config.
 
     Raises:
-        BadInput: naming what does not fit.
+        BadInput: an axis or a variable, which it names, does not fit.
     """
     axes = grid.config.axes
     for name, values in axes.items():

@@ -1,4 +1,4 @@
-"""Closed-loop drives: whether the car arrives, how long it takes, how well it knows its pose.
+"""Study closed-loop drives: whether and when the car arrives, and how well it knows its pose.
 
 A trial is one drive of `Rollout`: the navigator's own step, plant, odometer and corners.
 """
@@ -91,7 +91,7 @@ SCHEMA = Schema(
 
 
 class DriveStudy(Study):
-    """What `jaxnav study drive` runs."""
+    """The study that `jaxnav study drive` runs."""
 
     schema = SCHEMA
 
@@ -102,12 +102,12 @@ class DriveStudy(Study):
 
     @property
     def box_trials(self) -> int:
-        """Few enough to see it move; as many as fill the lanes where it takes the fast path."""
+        """Trials in a box: few, to show progress; enough to fill all lanes on the fast path."""
         return _MANY_TRIALS if self._many else self.schema.box_trials
 
     @property
     def _many(self) -> bool:
-        """By the study, not by the box: few drives and many are computed in different ways."""
+        """Whether the study takes the fast path: by its trials and not by those of a box."""
         return self.config.trials >= Rollout.many
 
     def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
@@ -116,10 +116,10 @@ class DriveStudy(Study):
         return {name: np.stack([one[name] for one in scored]) for name in SCHEMA.variables}
 
     def _cell(self, cell: Cell, trials: range) -> dict[str, np.ndarray]:
-        """The drives of one cell."""
+        """Run the drives of one cell: their scores (trials,) by name."""
         scenario = self.scenario(cell)
         rollout = self.rollout(cell, scenario)
-        # The same shapes, and so the same bits, however many drives are asked for.
+        # The same shapes, and so the same bits, for any number of drives.
         lanes = 0 if self._many else rollout.lanes
         numbers = np.resize(np.asarray(trials), max(len(trials), lanes))
         key = jax.random.key(self.config.seed)
@@ -129,7 +129,7 @@ class DriveStudy(Study):
 
     @staticmethod
     def scenario(cell: Cell) -> Scenario:
-        """What happens in a cell."""
+        """The scenario of a cell."""
         value: dict[str, Any] = dict(cell)
         scenario = scenarios()[value["scenario"]]
         if value["odometer_scale"] is not None:
@@ -202,7 +202,7 @@ class DriveStudy(Study):
 
 
 def _scores(trace: Trace, scenario: Scenario) -> dict[str, np.ndarray]:
-    """One number of every drive for each variable."""
+    """The scores of drives: one number per drive for each variable."""
     drives = Drives.of(trace, scenario)
     on_floor = np.asarray(trace.on_floor).all(axis=1)
     outcome = np.where(drives.success, ARRIVED, np.where(on_floor, FAILED, LEFT_FLOOR))
@@ -236,8 +236,8 @@ def _fraction(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
 
 
 def _over(statistic: Any, values: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """A statistic of the chosen frames of every drive; NaN where there are none."""
+    """A statistic over the selected frames of every drive; NaN for a drive without any."""
     some = frames.any(axis=1)
     chosen = np.where(frames, values, np.nan)
-    chosen[~some, 0] = 0.0  # nothing to warn of
+    chosen[~some, 0] = 0.0  # so that NumPy does not warn
     return np.where(some, statistic(chosen, axis=1), np.nan).astype(np.float32)

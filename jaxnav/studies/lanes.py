@@ -1,7 +1,7 @@
-"""One function over many lanes: fixed batches, every local device, the same bits whoever runs it.
+"""Run one function over many lanes, in fixed batches on all local devices, reproducible bit by bit.
 
-The batches all have one shape, so that a lane is computed by the same machine code wherever it
-lies. Several devices take a batch each.
+All batches have one shape, so that every lane is computed by the same machine code in any place.
+Several devices take one batch each.
 """
 
 import functools
@@ -22,12 +22,12 @@ def run_lanes(
     lanes: tuple[np.ndarray, ...],
     precision: str,
 ) -> dict[str, np.ndarray]:
-    """program(*shared, *lane) -> dict of arrays, for every lane, on the host.
+    """Run program(*shared, *lane) -> dict of arrays for every lane; the results are on the host.
 
     Args:
-        program: a function of one lane; the same object for the same program, or it is compiled
-            again.
-        shared: what all lanes have in common.
+        program: a function of one lane; pass the same object for the same program, or it is
+            compiled again.
+        shared: arguments common to all lanes.
         lanes: arrays with a common leading axis, floats in any precision.
         precision: "float32" or "float64".
     """
@@ -47,7 +47,7 @@ def run_lanes(
 
 
 def in_precision(tree: Tree, precision: str) -> Tree:
-    """Arrays of numbers on the host, its floats as the study computes with them."""
+    """The tree as NumPy arrays, with floats in the study's precision."""
 
     def one(leaf: Any) -> np.ndarray:
         array = np.asarray(leaf)

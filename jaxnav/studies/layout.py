@@ -1,4 +1,4 @@
-"""How a grid is cut into chunks: boxes of cells and trials that are run and written as one."""
+"""Cut a grid into boxes of cells and trials, each run and written as one chunk."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -9,14 +9,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Layout:
-    """A grid of cells and trials, in boxes of one size; those at the ends may be smaller."""
+    """A grid of cells and trials cut into boxes of one size; those at the ends may be smaller."""
 
     shape: tuple[int, ...]  # of the outer axes, then the trials
     box: tuple[int, ...]
 
     @staticmethod
     def of(shape: Sequence[int], most: int) -> "Layout":
-        """Boxes of at most `most` trials: all trials of a cell first, then its neighbours'."""
+        """A layout of boxes of at most `most` trials: first one cell's, then its neighbours'."""
         room, box = max(most, 1), []
         for length in reversed(shape):
             box.append(min(length, max(room, 1)))
@@ -25,27 +25,27 @@ class Layout:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """How many boxes lie along each axis."""
+        """The number of boxes along each axis."""
         return tuple(-(-n // b) for n, b in zip(self.shape, self.box, strict=True))
 
     @property
     def trials(self) -> int:
-        """Of all cells together."""
+        """The number of trials in all cells."""
         return math.prod(self.shape)
 
     def region(self, index: Sequence[int]) -> tuple[slice, ...]:
-        """The box at a place."""
+        """The slices of the box at an index."""
         return tuple(
             slice(i * b, min((i + 1) * b, n))
             for i, b, n in zip(index, self.box, self.shape, strict=True)
         )
 
     def size(self, index: Sequence[int]) -> int:
-        """How many trials the box at a place holds."""
+        """The number of trials in the box at an index."""
         return math.prod(part.stop - part.start for part in self.region(index))
 
     def cells(self, index: Sequence[int]) -> Iterator[tuple[int, ...]]:
-        """The cells of the box at a place, the last axis fastest."""
+        """The cells of the box at an index, the last axis fastest."""
         *outer, _ = self.region(index)
         origin = np.array([part.start for part in outer], int)
         for offset in np.ndindex(*[part.stop - part.start for part in outer]):

@@ -1,4 +1,4 @@
-"""What a study can vary: parameters with a unit, a default and bounds, and values of an axis."""
+"""Define a study's parameters, with unit, default and bounds, and parse the values of an axis."""
 
 import math
 import sys
@@ -18,7 +18,7 @@ _LEAST_TOLD_PX = 0.1
 
 @dataclass(frozen=True)
 class Parameter:
-    """One thing that an axis may vary, or that a study holds fixed."""
+    """A parameter that an axis may vary or a study may hold fixed."""
 
     description: str
     unit: str
@@ -28,14 +28,14 @@ class Parameter:
     open_low: bool = False  # `low` itself is excluded
     whole: bool = False  # whole numbers only
     choices: tuple[str, ...] = ()  # words instead of numbers
-    words: tuple[str, ...] = ()  # words beside numbers, for a fixed value
-    static: bool = False  # another value is another compiled program
+    words: tuple[str, ...] = ()  # words besides numbers, for a fixed value
+    static: bool = False  # another value needs another compiled program
 
     def check(self, value: Any, where: str) -> Value:
-        """The value as it is kept.
+        """The checked value.
 
         Raises:
-            BadInput: it is not one this parameter can have.
+            BadInput: this parameter cannot have the value.
         """
         if self.choices:
             if value not in self.choices:
@@ -85,22 +85,22 @@ class Parameter:
 
 
 def positive(description: str, unit: str, default: float | None) -> Parameter:
-    """A number above zero."""
+    """A parameter whose values are numbers above zero."""
     return Parameter(description, unit, default, low=0.0, open_low=True)
 
 
 def cameras(description: str) -> Parameter:
-    """How many cameras there are."""
+    """A parameter for the number of cameras."""
     return Parameter(description, "", None, low=1, high=64, whole=True, static=True)
 
 
 def told_noise_px(told_px: float | None, noise_px: float) -> float:
-    """The sigma an estimator is told: the noise, if nothing is said; never that all is exact."""
+    """The sigma given to an estimator: by default the true noise, but at least a small number."""
     return max(noise_px, _LEAST_TOLD_PX) if told_px is None else told_px
 
 
 def _is_finite(value: float) -> bool:
-    """Whether a float can hold it: whole numbers of a file may be larger."""
+    """Whether a value is finite as a float: integers in a file may be too large."""
     return abs(value) <= sys.float_info.max
 
 
@@ -135,5 +135,5 @@ def _spaced(given: Mapping[str, Any], where: str) -> list[float]:
         spaced = np.geomspace(begin, end, int(count))
     else:
         spaced = np.linspace(begin, end, int(count))
-    # As a person would have typed them: 0.3 and not 0.30000000000000004.
+    # Rounded as a person would type them: 0.3 and not 0.30000000000000004.
     return [float(f"{x:.12g}") for x in spaced]

@@ -1,7 +1,7 @@
-"""Runs the boxes of a study that are not done: in this process, or on a Dask cluster.
+"""Run the unfinished boxes of a study in this process or on a Dask cluster.
 
-Whoever runs a box, this process writes it. On a cluster Dask carries tasks and results, restarts
-what a dead worker had, and shows its dashboard.
+This process writes every box, wherever it ran. On a cluster Dask carries tasks and results,
+restarts the tasks of a dead worker, and shows its dashboard.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -18,13 +18,13 @@ from jaxnav.studies.study import Cell, Study
 if TYPE_CHECKING:
     from distributed import Client
 
-_IN_FLIGHT = 2  # boxes for each worker, so that none waits for the next one
+_IN_FLIGHT = 2  # boxes for each worker, so that no worker waits for its next one
 _PATIENCE_S = 30.0  # for a cluster without workers
 Progress = Callable[[int], object]
 
 
 def run_here(store: StudyStore, progress: Progress = lambda done: None) -> None:
-    """Run what is missing in this process, on all its devices; write while the next one runs.
+    """Run the missing boxes in this process, on all its devices; write each while the next runs.
 
     Raises:
         BadInput: the store can't be written to.
@@ -50,7 +50,7 @@ def run_here(store: StudyStore, progress: Progress = lambda done: None) -> None:
 def run_on_cluster(
     store: StudyStore, client: "Client", where: str, progress: Progress = lambda done: None
 ) -> None:
-    """Run what is missing on a cluster's workers.
+    """Run the missing boxes on a cluster's workers.
 
     Args:
         where: the flag that named the cluster, for messages.
@@ -104,19 +104,19 @@ _KEPT = "what is done is kept, the same command goes on"
 
 
 class OtherVersions(RuntimeError):
-    """A worker would compute other bits."""
+    """Raised if a worker's versions differ, so that it would compute other bits."""
 
 
 def run_box(
     study: Study, cells: list[Cell], trials: range, wanted: Mapping[str, str] | None = None
 ) -> dict[str, np.ndarray]:
-    """The trials of one box.
+    """Run the trials of one box: every variable's values by name.
 
     Args:
-        wanted: versions without which it is not run.
+        wanted: versions that this process must have; None: any.
 
     Raises:
-        OtherVersions: these are not they.
+        OtherVersions: this process has other versions.
     """
     if wanted is not None and (here := versions()) != wanted:
         other = ", ".join(f"{n} {here[n]} and not {v}" for n, v in wanted.items() if here[n] != v)
@@ -131,7 +131,7 @@ def _task(store: StudyStore, box: Box) -> tuple[list[Cell], range]:
 
 @contextmanager
 def local_cluster(workers: int) -> Iterator["Client"]:
-    """Worker processes on this machine, one box each at a time."""
+    """A cluster of worker processes on this machine, each with one box at a time."""
     import logging
 
     from distributed import Client, LocalCluster
@@ -153,14 +153,14 @@ def local_cluster(workers: int) -> Iterator["Client"]:
 def remote_cluster(
     address: str, prepare: Callable[[], Any], timeout_s: float = 10.0
 ) -> Iterator["Client"]:
-    """A cluster that is there already.
+    """A client of a cluster that is already running.
 
     Args:
-        prepare: called in every worker, also in later ones, before it runs anything.
-        timeout_s: how long the scheduler is waited for.
+        prepare: called in every worker, later ones included, before it runs anything.
+        timeout_s: longest wait for the scheduler.
 
     Raises:
-        BadInput: nobody answers at the address.
+        BadInput: the address does not answer.
     """
     import logging
 

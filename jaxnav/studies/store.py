@@ -1,7 +1,7 @@
-"""Results on disk: one Zarr store a study, which xarray opens.
+"""Keep results on disk, one Zarr store per study, which xarray can open.
 
-Boxes are written whole, and only then marked as done, so a study that was killed goes on where it
-was. A store belongs to one config and to one set of versions; others are refused.
+A box is written whole and only then marked as done, so a killed study continues where it stopped.
+A store belongs to one config and to one set of versions; others are refused.
 """
 
 import glob
@@ -29,14 +29,14 @@ from jaxnav.studies.layout import Layout
 from jaxnav.studies.study import Study, Variable
 
 _DONE = "done"
-# Both with checksums: a number that a disk has changed is not to be taken for a result.
+# Both with checksums, so that a number changed by the disk is not taken for a result.
 _CHECKED, _COMPRESSED = Crc32cCodec(), ZstdCodec(level=0, checksum=True)
 _PACKAGES = ("jaxnav", "jax", "jaxlib", "equinox", "optimistix", "numpy")
 Box = tuple[int, ...]
 
 
 def versions() -> dict[str, str]:
-    """What the bits of a result depend on besides its config."""
+    """The versions on which the bits of a result depend besides its config."""
     return {name: version(name) for name in _PACKAGES} | {"backend": jax.default_backend()}
 
 
@@ -44,7 +44,7 @@ class StudyStore:
     """The store of one study."""
 
     def __init__(self, path: Path, study: Study):
-        """Opened by `open_store`."""
+        """Use `open_store`."""
         self.path = path
         self.study = study
         self._group = _open_group(path, "r+")
@@ -60,7 +60,7 @@ class StudyStore:
         """The boxes that are not done, in order.
 
         Raises:
-            BadInput: which are done is damaged.
+            BadInput: the record of finished boxes is damaged.
         """
         with reading(self.path):
             done = np.asarray(self._arrays[_DONE][...])
@@ -68,7 +68,7 @@ class StudyStore:
             yield tuple(int(i) for i in index)
 
     def write(self, box: Box, found: Mapping[str, np.ndarray]) -> None:
-        """Keep the results of one box.
+        """Write the results of one box, and mark it as done.
 
         Raises:
             BadInput: the disk is full, or the store can't be written to.
@@ -91,10 +91,10 @@ class StudyStore:
 
 
 def open_store(path: Path, study: Study, box_trials: int | None = None) -> StudyStore:
-    """The store of a study: a new one, or the one that was begun.
+    """Open the store of a study, or create it.
 
     Raises:
-        BadInput: it is not a study's, belongs to another, or can't be made.
+        BadInput: it is not a study's store, belongs to another study, or can't be made.
     """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         _create(path, study, box_trials or study.box_trials)
@@ -112,16 +112,16 @@ def open_store(path: Path, study: Study, box_trials: int | None = None) -> Study
 
 
 def sweep_unfinished(path: Path) -> None:
-    """Remove what was left by a process that was killed while it made this store.
+    """Remove the remains of a process that was killed while it created this store.
 
-    Only for those who know that no other process is at it, see `sole_writer`.
+    Only for a caller that knows that no other process works on it, see `sole_writer`.
     """
     for left in path.parent.glob(f"{glob.escape(_unfinished(path))}*"):
         shutil.rmtree(left, ignore_errors=True)
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
-    """Config and versions of a store.
+    """The config and versions of a store.
 
     Raises:
         BadInput: it is not a store of a study.
@@ -139,7 +139,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
 
 
 def read_dataset(path: Path) -> xr.Dataset:
-    """All trials of a store, lazily: nothing is loaded before it is asked for.
+    """All trials of a store as a lazy dataset: values are loaded on access.
 
     Raises:
         BadInput: it is not a store of a study.
@@ -151,7 +151,7 @@ def read_dataset(path: Path) -> xr.Dataset:
 
 
 def read_layout(path: Path) -> Layout:
-    """How the store is cut.
+    """The layout of a store.
 
     Raises:
         BadInput: it is not a store of a study.
@@ -162,7 +162,7 @@ def read_layout(path: Path) -> Layout:
 
 
 def count_done(path: Path) -> int:
-    """How many trials of all cells are in a store.
+    """The number of finished trials in a store, over all cells.
 
     Raises:
         BadInput: it is not a store of a study.
@@ -184,7 +184,7 @@ def _open_group(path: Path, mode: Any) -> zarr.Group:
             check_sizes(path, dict(group.arrays()))
     except BadInput:
         raise
-    except Exception as error:  # of whatever bytes it holds
+    except Exception as error:  # damaged bytes may raise anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadInput(path, f"is not a store of jaxnav study ({reason})") from None
     if not is_ours:
@@ -193,7 +193,7 @@ def _open_group(path: Path, mode: Any) -> zarr.Group:
 
 
 def _create(path: Path, study: Study, most: int) -> None:
-    """A new store, whole or not at all."""
+    """Create a new store, whole or not at all."""
     config = study.config
     axes = study.grid.outer_axes
     layout = Layout.of([*map(len, axes.values()), config.trials], most)
@@ -236,7 +236,7 @@ def _create(path: Path, study: Study, most: int) -> None:
 
 
 def _unfinished(path: Path) -> str:
-    """How the name of a store begins that is being made."""
+    """The prefix of the name of a store that is being created."""
     return f".jaxnav-{path.name}-"
 
 

@@ -1,4 +1,4 @@
-"""What all kinds of study have in common: cells times trials in, named variables out."""
+"""Define the interface of all kinds of study: cells times trials in, named variables out."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -10,24 +10,24 @@ import numpy as np
 from jaxnav.studies.config import Config
 from jaxnav.studies.parameters import Parameter, Value
 
-Cell = Mapping[str, Value]  # a value of every parameter
+Cell = Mapping[str, Value]  # parameter name -> value, for every parameter
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One thing that is measured in every trial."""
+    """A quantity that is measured in every trial."""
 
     description: str
     unit: str = ""
-    dtype: str = "float32"  # a missing one is NaN, or the largest int
-    of_selector: bool = False  # measured once for each selector of the axis of that name
-    outcomes: tuple[str, ...] = ()  # what the numbers of an int8 mean
-    among: tuple[str, ...] = ()  # the outcomes it is summed up over; all by default
+    dtype: str = "float32"  # a missing value is NaN, or the largest int
+    of_selector: bool = False  # measured once for each selector of that axis
+    outcomes: tuple[str, ...] = ()  # meaning of an int8's numbers
+    among: tuple[str, ...] = ()  # outcomes over which it is summarised; all by default
 
 
 @dataclass(frozen=True)
 class Rate:
-    """A proportion: trials with one of some outcomes among those with one of others."""
+    """A proportion: the trials with some outcomes among the trials with other outcomes."""
 
     description: str
     variable: str
@@ -37,14 +37,14 @@ class Rate:
 
 @dataclass(frozen=True)
 class Schema:
-    """A kind of study: what it can vary and what it measures."""
+    """A kind of study: its parameters, variables and rates."""
 
     kind: str
     parameters: Mapping[str, Parameter]
     variables: Mapping[str, Variable]
     rates: Mapping[str, Rate]
     box_trials: int  # of a study, as a rule
-    inner: tuple[str, ...] = ()  # axes that every trial runs through by itself
+    inner: tuple[str, ...] = ()  # axes over which every trial loops by itself
     predicted: str | None = None  # the variable that is the probability of `flip_rate`
 
 
@@ -57,7 +57,7 @@ class Grid:
 
     @property
     def outer_axes(self) -> dict[str, Sequence[Value]]:
-        """The axes that are not `inner`."""
+        """The axes other than `inner`."""
         return {n: v for n, v in self.config.axes.items() if n not in self.schema.inner}
 
     def dimensions(self, variable: Variable) -> tuple[str, ...]:
@@ -66,14 +66,14 @@ class Grid:
         return (*self.outer_axes, *(n for n in inner if n in self.config.axes), "trial")
 
     def cell(self, index: Sequence[int]) -> Cell:
-        """The cell at a place of the outer axes."""
+        """The cell at an index of the outer axes."""
         axes = self.outer_axes.items()
         varied = {name: values[i] for (name, values), i in zip(axes, index, strict=True)}
         return {**self.config.fixed, **varied}
 
 
 class Study(abc.ABC):
-    """A study that can run any part of itself. It can be pickled, and holds no device arrays."""
+    """A study, any part of which can be run. It can be pickled and holds no device arrays."""
 
     schema: ClassVar[Schema]
 
@@ -82,16 +82,16 @@ class Study(abc.ABC):
 
     @property
     def config(self) -> Config:
-        """What the study is."""
+        """The config that defines the study."""
         return self.grid.config
 
     @property
     def box_trials(self) -> int:
-        """How many trials are run and written together, unless a person says otherwise."""
+        """The default number of trials that are run and written together."""
         return self.schema.box_trials
 
     @abc.abstractmethod
     def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
-        """Every variable of these trials of these cells, (cells, trials) or (cells, selectors,
-        trials). A trial's bits depend on its cell and its number alone.
+        """Run trials of cells: variables (cells, trials) or (cells, selectors, trials). A trial's
+        bits depend on its cell and its number alone.
         """

@@ -1,7 +1,7 @@
-"""What the trials of every cell amount to: rates with intervals, medians, 95 % quantiles.
+"""Summarise the trials of every cell: rates with intervals, medians, 95 % quantiles.
 
-The trials are read box by box, so memory is bounded by a box whatever the study's size. Quantiles
-are exact order statistics. A number that is missing enters none of them, and is counted.
+The trials are read box by box, so memory is bounded by a box for a study of any size. Quantiles
+are exact order statistics. Missing numbers are left out of them, and counted.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,13 +25,13 @@ def summarise(
     layout: Layout,
     progress: Callable[[int], object] = lambda done: None,
 ) -> xr.Dataset:
-    """All measures of every cell. Cells without trials have counts of zero and no numbers.
+    """All measures of every cell. A cell without trials has counts of zero and no numbers.
 
     Args:
         trials: the store's dataset.
-        grid: what they are the trials of.
-        layout: how they are cut.
-        progress: called with the number of trials done since the last call.
+        grid: the grid of the trials.
+        layout: the layout of the store.
+        progress: called with the number of trials read since the last call.
     """
     summary = xr.Dataset(
         coords={name: trials.coords[name] for name in grid.config.axes}, attrs=trials.attrs
@@ -68,7 +68,7 @@ def summarise(
 
 
 def _measures(name: str, variable: Variable) -> dict[str, tuple[dict[str, Any], str, Any]]:
-    """name -> further dimensions with their labels, unit and dtype of what a variable gives."""
+    """The measures of a variable: name -> further dimensions with labels, unit and dtype."""
     if variable.outcomes:
         return {f"{name}_count": ({name: list(variable.outcomes)}, "", np.int64)}
     found: dict[str, tuple[dict[str, Any], str, Any]] = {
@@ -120,22 +120,22 @@ def _summed(
 
 
 def _rows(array: xr.DataArray, index: tuple[slice, ...], span: slice) -> np.ndarray:
-    """Some trials of a box of cells, (cells, trials)."""
+    """The values of some trials of a box of cells, (cells, trials)."""
     values = array[(*index, span)].values
     return values.reshape(-1, values.shape[-1])
 
 
 def order_statistic(blocks: Blocks, share: float, counted: np.ndarray, passes: int) -> np.ndarray:
-    """The value below which a share of the numbers lies, one of them; NaN where there are none.
+    """The number of each row below which a share of its numbers lies; NaN for a row of none.
 
-    Numbers that come in several blocks are never held together: two passes count the upper and
-    then the lower halves of their bits, whose order is that of the numbers.
+    Several blocks are never held together: two passes count the upper and then the lower halves of
+    the numbers' bits, whose order is that of the numbers.
 
     Args:
-        blocks: makes the blocks anew for every pass.
+        blocks: returns an iterator over the blocks, anew for every pass.
         share: 0.5 for the median.
-        counted: how many numbers each row has.
-        passes: how many blocks there are.
+        counted: count of numbers in each row.
+        passes: number of blocks.
     """
     rank = np.minimum((share * counted).astype(np.int64), np.maximum(counted - 1, 0))
     if passes == 1:
@@ -161,13 +161,13 @@ def order_statistic(blocks: Blocks, share: float, counted: np.ndarray, passes: i
 
 
 def _ordered_bits(values: np.ndarray) -> np.ndarray:
-    """Unsigned integers in the order of the finite numbers among these float32."""
+    """Unsigned integers with the order of the finite float32 values."""
     bits = values[np.isfinite(values)].view(np.uint32)
     return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(0x80000000))
 
 
 class _Reliability:
-    """What was predicted, and how often it happened, over all cells, for each selector."""
+    """The predicted probabilities and observed frequencies, over all cells, per selector."""
 
     def __init__(self, grid: Grid, trials: xr.Dataset):
         self._schema, self._trials = grid.schema, trials
@@ -176,7 +176,7 @@ class _Reliability:
         self._sums = np.zeros((3, selectors, RELIABILITY_BINS))  # count, predicted, happened
 
     def add(self, layout: Layout, region: tuple[slice, ...]) -> None:
-        """One box of cells."""
+        """Add one box of cells."""
         if self._schema.predicted is None:
             return
         rate, selectors = self._schema.rates["flip_rate"], self._sums.shape[1]
@@ -196,7 +196,7 @@ class _Reliability:
                     self._sums[row, s] += np.bincount(bins, weights, RELIABILITY_BINS)
 
     def table(self) -> xr.Dataset:
-        """Counts, mean prediction and frequency of every bin, with its interval."""
+        """The count, mean prediction, frequency and its interval of every bin."""
         if self._schema.predicted is None:
             return xr.Dataset()
         count, predicted, happened = self._sums if self._by_selector else self._sums[:, 0]
@@ -214,7 +214,7 @@ class _Reliability:
 
 
 def _spans(layout: Layout) -> list[slice]:
-    """The trials of every box of a cell."""
+    """The trials, as slices, of every box of a cell."""
     first_cell = (0,) * (len(layout.shape) - 1)
     return [layout.region((*first_cell, t))[-1] for t in range(layout.counts[-1])]
 

@@ -1,1 +1,1 @@
-"""The estimator and the controller tuned by gradient, through the step that runs on the car."""
+"""Tune the estimator and the controller by gradient, through the step that runs on the car."""

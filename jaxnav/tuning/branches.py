@@ -1,9 +1,9 @@
-"""Which of a marker's poses was true, told in hindsight: the discrete choice made before a descent.
+"""Choose in hindsight which of a marker's poses was true: a discrete choice before a descent.
 
-The whole estimator runs over a recording, from a cold start. Where it has decided, it knows which
-pose the vehicle had all the time before: carried back to the first frame by odometry, that pose is
-so wide a prior for one hypothesis that it says no more than which valley is the true one. From
-there the filter is smooth in its noise parameters.
+The whole estimator runs over a recording, from a cold start. Once it has decided, it knows the
+vehicle's earlier poses too: the decided pose, carried back to the first frame by odometry, is the
+prior of one hypothesis, so wide that it only says which local minimum is the true one. From there
+the filter is smooth in its noise parameters.
 """
 
 import equinox as eqx
@@ -24,14 +24,14 @@ from jaxnav.navigator import Navigator, State
 from jaxnav.pose.observation import Observation
 from jaxnav.tuning.recorded import Recorded
 
-# How far off a pose may be that was carried back: m and rad, a third of what lies between the two
-# poses of a marker where they can be mistaken for each other.
+# Standard deviation of a pose that was carried back, m and rad: a third of the difference between
+# the two poses of a marker where they can be mistaken for each other.
 _CARRIED_SIGMA = 0.3
-_LEAST_SHARE = 1e-4  # of the variances, in any direction
+_LEAST_SHARE = 1e-4  # added to the diagonal of the correlation matrix
 
 
 class Estimated(eqx.Module):
-    """What the whole estimator said of every frame of B sequences."""
+    """The output of the whole estimator in every frame of B sequences."""
 
     T_world_vehicle: Float[Array, "*B T 7"]
     square_m2: Float[Array, "*B T"]  # squared position error
@@ -41,7 +41,7 @@ class Estimated(eqx.Module):
 
 @eqx.filter_jit
 def estimated(navigator: Navigator, recorded: Recorded) -> Estimated:
-    """Cold starts, all sequences side by side. What was not used or judged means nothing."""
+    """Estimate all sequences from cold starts. Frames not used or judged hold no valid values."""
 
     def one(recorded: Recorded) -> Estimated:
         local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
@@ -67,7 +67,7 @@ def estimated(navigator: Navigator, recorded: Recorded) -> Estimated:
 
 
 def error_of(motion: Motion, mean: Float[Array, " n"], T_true: jaxlie.SE3) -> Float[Array, " d"]:
-    """Of a state's pose, as its covariance counts it: (3,) of a car, (6,) of a free body."""
+    """The error of a state's pose in its covariance's coordinates: (3,) car, (6,) free body."""
     planar = isinstance(motion, BicycleKalman)
     pose = planar_from_T_world_vehicle(T_true) if planar else T_true.wxyz_xyz
     true = jnp.concatenate([pose, mean[pose.shape[0] :]])
@@ -75,10 +75,10 @@ def error_of(motion: Motion, mean: Float[Array, " n"], T_true: jaxlie.SE3) -> Fl
 
 
 def nees(error: Float[Array, " d"], P: Float[Array, "d d"]) -> Float[Array, ""]:
-    """Normalised error squared, through the correlations: variances may differ by any order.
+    """The normalised error squared, by the correlations: variances may differ by any order.
 
-    Seen from afar a turn and a shift can hardly be told apart: what float32 leaves of such a
-    correlation is kept positive definite by a hundredth of a sigma.
+    From afar a rotation and a translation are hardly distinguishable: their correlation, as rounded
+    to float32, is kept positive definite by a hundredth of a sigma.
     """
     sigma = jnp.sqrt(jnp.diagonal(P))
     correlation = P / (sigma[:, None] * sigma[None])
@@ -86,19 +86,19 @@ def nees(error: Float[Array, " d"], P: Float[Array, "d d"]) -> Float[Array, ""]:
 
 
 def position_states(pose_states: int) -> int:
-    """How many of a pose's error states are lengths."""
+    """The number of a pose's error states that are lengths."""
     return 2 if pose_states == 3 else 3
 
 
 class Started(eqx.Module):
-    """Where each of B sequences begins: one hypothesis, in the valley that was found to be true."""
+    """The start of each of B sequences: one hypothesis, in the local minimum chosen as true."""
 
     bank: Bank
-    chosen: Bool[Array, "*B"]  # False: nothing was ever decided, the sequence tells nothing
+    chosen: Bool[Array, "*B"]  # False: never decided, so the sequence carries no information
 
 
 def started(navigator: Navigator, recorded: Recorded) -> Started:
-    """The choice for every sequence, by this navigator."""
+    """The start of every sequence, as this navigator decided."""
     seen = estimated(navigator, recorded)
     chosen = jnp.any(seen.decided, axis=1)
     first = jnp.argmax(seen.decided, axis=1)
@@ -111,9 +111,9 @@ def started(navigator: Navigator, recorded: Recorded) -> Started:
 def _carried_back(
     navigator: Navigator, obs: Observation, T_world_vehicle: Array, frames: Array
 ) -> Float[Array, "B 7"]:
-    """Where each vehicle was in its first frame, if it was there in a later one.
+    """The pose of each vehicle in its first frame, from its pose in a later frame.
 
-    A body without odometry is taken to have stood still: it decides within a few frames.
+    A body without odometry is assumed at rest: the estimator decides within a few frames.
     """
     if not isinstance(navigator.motion, BicycleKalman):
         return T_world_vehicle
@@ -137,7 +137,7 @@ def _carried_back(
 
 @eqx.filter_jit
 def _around(navigator: Navigator, T_world_vehicle: Float[Array, "B 7"]) -> Bank:
-    """One hypothesis each, wide about a pose and at rest."""
+    """A bank of one hypothesis for each pose, at rest, with a wide covariance."""
     motion = navigator.motion
     empty = motion.init(1)
     velocity_sigma = motion.initial_velocity_sigma  # type: ignore[attr-defined]

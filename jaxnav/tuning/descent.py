@@ -1,13 +1,13 @@
-"""One step of an optimiser at a time, so that a person can look on, stop it, and go on.
+"""Run an optimiser one step at a time, so that a person can watch, stop and resume it.
 
     descent = Smooth(loss) or Noisy(evaluate, learning_rate)
     state = descent.init(x)
     state = descent.step(state, batch, softness)       # until state.over
 
-`loss(x, batch, softness)` is a number; x is a flat vector. `Smooth` is optimistix's BFGS, for a
-loss that is the same function in every step; `Noisy` is optax's Adam, for one that is drawn anew.
+`loss(x, batch, softness)` is a scalar; x is a flat vector. `Smooth` is optimistix's BFGS, for a
+loss that is the same function in every step; `Noisy` is optax's Adam, for a loss drawn anew.
 
-A loss or a gradient that is not a finite number is never stepped on: the state says so and stays.
+No step is taken on a loss or gradient that is not finite: the state stays, with `finite` False.
 """
 
 from collections.abc import Callable
@@ -24,19 +24,19 @@ Loss = Callable[[Float[Array, " n"], Any, Float[Array, ""]], Float[Array, ""]]
 
 
 class Descent(eqx.Module):
-    """Where an optimiser stands."""
+    """The state of an optimiser."""
 
     x: Float[Array, " n"]
-    asked_x: Float[Array, " n"]  # where the last loss and gradient are, also if they are no number
+    asked_x: Float[Array, " n"]  # where loss and gradient were last evaluated, finite or not
     loss: Float[Array, ""]  # at x, or of the batch that led to it; inf before the first step
     gradient: Float[Array, " n"]  # likewise
-    finite: Bool[Array, ""]  # False: loss or gradient was no number, and nothing moved
-    over: Bool[Array, ""]  # no step is worth taking any more
+    finite: Bool[Array, ""]  # False: loss or gradient was not finite, and nothing moved
+    over: Bool[Array, ""]  # no further step is worthwhile
     inner: PyTree  # the optimiser's own
 
 
 class Smooth(eqx.Module):
-    """BFGS with a backtracking line search; a step is one evaluation.
+    """BFGS with a backtracking line search; one step is one evaluation.
 
     Source: Nocedal, Wright (2006), "Numerical optimization", algorithm 6.1.
     """
@@ -50,16 +50,16 @@ class Smooth(eqx.Module):
         return optx.BFGS(self.rtol, self.atol)
 
     def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
-        """At x, nothing known."""
+        """The state at x, before any evaluation."""
         return _smooth_init(self, x, batch, softness)
 
     def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
-        """One more evaluation, at a point that is kept where it lowers the loss enough."""
+        """Evaluate once more; the point is kept if it lowers the loss enough."""
         return _smooth_step(self, state, batch, softness)
 
 
 class Noisy(eqx.Module):
-    """Adam, its steps bounded by clipping the gradient's norm, shorter from step to step.
+    """Adam with a clipped gradient norm and a decaying learning rate.
 
     Source: Kingma, Ba (2015), "Adam: a method for stochastic optimization", algorithm 1.
     """
@@ -67,8 +67,8 @@ class Noisy(eqx.Module):
     # (x, batch, softness) -> loss and gradient; not compiled here.
     evaluate: Callable[[Array, Any, Array], tuple[Array, Array]]
     learning_rate: float = 0.05
-    steps: int = 100  # after which the learning rate is a tenth
-    longest: float = 1.0  # norm of a gradient, above which it is shortened
+    steps: int = 100  # the learning rate is a tenth after so many
+    longest: float = 1.0  # the norm to which a longer gradient is clipped
 
     @property
     def _solver(self) -> optax.GradientTransformation:
@@ -76,11 +76,11 @@ class Noisy(eqx.Module):
         return optax.chain(optax.clip_by_global_norm(self.longest), optax.adam(rate, b2=0.99))
 
     def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
-        """At x, nothing known."""
+        """The state at x, before any evaluation."""
         return _unknown(x, self._solver.init(x))
 
     def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
-        """Along the gradient of this batch."""
+        """Take one step along the gradient of this batch."""
         loss, gradient = self.evaluate(state.x, batch, softness)
         return _moved(self._solver, state, loss, gradient)
 

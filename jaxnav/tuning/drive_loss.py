@@ -1,4 +1,4 @@
-"""What a drive costs: time, distance from the straight lines, effort, and jerky commands."""
+"""Compute the loss of a drive: time, distance from the straight lines, effort, jerky commands."""
 
 from dataclasses import dataclass
 
@@ -13,13 +13,13 @@ from jaxnav.tuning.soft_switch import SoftState
 
 
 class Costs(eqx.Module):
-    """What is summed over the frames of a drive while it is under way."""
+    """The sums over a drive's frames while it is under way."""
 
-    time_s: Float[Array, "*S"]  # to the last waypoint; without arrival as long as a drive may last
+    time_s: Float[Array, "*S"]  # to the last waypoint; without arrival the longest duration
     under_way_s: Float[Array, "*S"]
     off_line_m2s: Float[Array, "*S"]  # squared distance of the true car from its leg, over time
-    effort_s: Float[Array, "*S"]  # squared commands, in parts of their limits, over time
-    change: Float[Array, "*S"]  # squared difference of successive commands, in the same parts
+    effort_s: Float[Array, "*S"]  # squared commands, as fractions of their limits, over time
+    change: Float[Array, "*S"]  # squared differences of successive such fractions
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class DriveLoss:
     shipped gains in the paper's scenario.
 
     Attributes:
-        time: of the time to the last waypoint, 1/s. A drive that leaves the floor, or whose true
-            car has not passed every waypoint, pays for as long as it might have lasted.
-        cross_track: of the root mean square distance of the true car from the leg, 1/m: the line
-            from where the leg began, the start or the waypoint before, to the waypoint ahead.
-        effort: of throttle^2 + steering^2, each in parts of its limit, over time, 1/s.
-        smoothness: of the squared differences from frame to frame of the same, summed up.
+        time: weight of the time to the last waypoint, 1/s. A drive that leaves the floor, or whose
+            true car has not passed every waypoint, is charged the longest duration.
+        cross_track: weight of the RMS distance of the true car from the leg, 1/m: the line from
+            the start or the waypoint before to the waypoint ahead.
+        effort: weight of throttle^2 + steering^2, as fractions of their limits, over time, 1/s.
+        smoothness: weight of the summed squared differences of those fractions between frames.
     """
 
     time: float = 0.03
@@ -42,11 +42,11 @@ class DriveLoss:
     smoothness: float = 0.045
 
     def __call__(self, costs: Costs) -> Float[Array, "*S"]:
-        """One number of a whole drive."""
+        """The loss of each drive."""
         return sum(self.parts(costs).values(), jnp.zeros_like(costs.time_s))
 
     def parts(self, costs: Costs) -> dict[str, Float[Array, "*S"]]:
-        """The four of them, weighed."""
+        """The four weighted parts of the loss, by name."""
         under_way_s = jnp.where(costs.under_way_s > 0, costs.under_way_s, 1)
         return {
             "time": self.time * costs.time_s,
@@ -57,15 +57,16 @@ class DriveLoss:
 
 
 def no_costs(dtype: jnp.dtype) -> Costs:
-    """Before the first frame."""
+    """The costs before the first frame: zero."""
     return Costs(*(jnp.zeros((), dtype),) * 5)
 
 
 @dataclass(frozen=True)
 class CostsOfFrame:
-    """What a frame adds, the controller soft or hard; nothing once the drive is over.
+    """A function that returns the costs of one frame, zero once the drive has ended.
 
-    Compares by value, so that `Rollout.run_keeping` compiles once for it.
+    It takes a soft or a hard controller. Instances compare by value, so that
+    `Rollout.run_keeping` compiles once for them.
     """
 
     scenario: Scenario
@@ -93,15 +94,15 @@ class CostsOfFrame:
 
 
 class _Course(eqx.Module):
-    """Where a car heads, and the squares of its commands in parts of their limits.
+    """The waypoints a car heads for, and its squared commands as fractions of their limits.
 
-    A soft one is the expectation over cars that switch at random: each share's own command and own
-    jump, whether it stays at its waypoint or comes from the one before. Those of the mean command
-    would be less the softer the switch.
+    For a soft controller the squares are expectations over cars that switch at random: each share
+    has its own command and its own jump, whether it stays at its waypoint or comes from the one
+    before. The squares of the mean command would shrink as the switch gets softer.
     """
 
     shares: Float[Array, " W1"]  # for each waypoint, and done
-    going: Float[Array, " n"]  # shares of whoever does the following
+    going: Float[Array, " n"]  # the share to which each of the following belongs
     effort: Float[Array, " n"]
     change: Float[Array, " n"]
 
@@ -135,7 +136,7 @@ def _course(before: World, after: World, count: int) -> _Course:
 def _off_line_m2(
     point_m: Float[Array, " 2"], start_m: Float[Array, " 2"], waypoints_m: Float[Array, "W 2"]
 ) -> Float[Array, " W"]:
-    """Squared distance from the line of every leg; from the waypoint where a leg has no length."""
+    """The squared distance from every leg's line, or from the waypoint if a leg has no length."""
     begins_m = jnp.concatenate([start_m[None], waypoints_m[:-1]])
     along = waypoints_m - begins_m
     length_m = safe_norm(along)

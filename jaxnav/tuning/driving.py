@@ -1,16 +1,16 @@
-"""The loss of a drive, and how it changes with the gains.
+"""Compute the loss of closed-loop drives and its gradient with respect to the gains.
 
     drives = ClosedLoop(rollout, DriveLoss(), softness_m=0.03)
     losses, gradients = drives.value_and_grad(x, space, keys)         # (B,), (B, n)
     losses, costs, trace = drives.value(values, keys)                 # as the car would drive
 
-A drive is a rollout's own: the same plant, cameras and `Navigator.step`. What is hard in it (which
-poses are possible, whether the bank has decided) stays hard, and no derivative flows through it;
+A drive is a rollout's own: the same plant, cameras and `Navigator.step`. Its hard decisions (which
+poses are possible, whether the bank has decided) stay hard, and no derivative flows through them;
 only the switch from waypoint to waypoint is soft (`soft_switch.py`).
 
-Derivatives go forward with the drive: with each world goes how it changes with every gain. For a
-handful of gains that is cheaper than going back: nothing is remembered, however long the drive, and
-a lane whose drive has ended takes the next one.
+Differentiation is in forward mode: each world carries its derivatives with respect to every gain.
+For a handful of gains that is cheaper than reverse mode: nothing is stored, however long the drive,
+and a lane whose drive has ended takes the next one.
 """
 
 import dataclasses
@@ -35,15 +35,15 @@ from jaxnav.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss, no_costs
 from jaxnav.tuning.soft_switch import softened
 from jaxnav.tuning.unconstrained import Space
 
-_jit = cast(Any, eqx.filter_jit)  # whose types know of no compiler options
+_jit = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
 
 
 class Sensitive(eqx.Module):
-    """A drive, and how it changes with P numbers."""
+    """A drive and its derivatives with respect to P numbers."""
 
     world: World
     costs: Costs
-    slopes: Any  # leaves (P, ...): of what moves in the world, and of the costs
+    slopes: Any  # leaves (P, ...): derivatives of the world's moving part, and of the costs
 
     @property
     def ended(self) -> Bool[Array, ""]:
@@ -57,8 +57,8 @@ class ClosedLoop(eqx.Module):
     rollout: Rollout
     loss: DriveLoss = eqx.field(static=True, default=DriveLoss())
     softness_m: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.03)
-    many: int = eqx.field(static=True, default=256)  # drives for which `over_lanes` pays
-    many_lanes: int = eqx.field(static=True, default=256)  # a thread
+    many: int = eqx.field(static=True, default=256)  # least number of drives for `over_lanes`
+    many_lanes: int = eqx.field(static=True, default=256)  # per thread
 
     def value(
         self,
@@ -66,11 +66,11 @@ class ClosedLoop(eqx.Module):
         keys: Key[Array, " B"],
         progress: Callable[[int], object] = lambda ended: None,
     ) -> tuple[np.ndarray, Costs, Trace]:
-        """The drives as they are, the controller hard: losses (B,), costs (B,), the traces.
+        """Drive with the hard controller, as the car does: losses (B,), costs (B,), the traces.
 
         Args:
             values: parameters by name, as `with_parameters` takes them.
-            keys: a drive for each.
+            keys: one for each drive.
         """
         navigator = with_parameters(self.rollout.navigator, values)
         rollout = dataclasses.replace(self.rollout, navigator=navigator)
@@ -86,11 +86,11 @@ class ClosedLoop(eqx.Module):
         keys: Key[Array, " B"],
         progress: Callable[[int], object] = lambda ended: None,
     ) -> tuple[Float[Array, " B"], Float[Array, "B n"]]:
-        """The loss of every drive with the soft switch, and its derivatives.
+        """The loss (B,) of every drive with the soft switch, and its gradients (B, n).
 
         Args:
-            x: unconstrained parameters, of `space`.
-            keys: a drive for each.
+            x: unconstrained parameters in `space`.
+            keys: one for each drive.
         """
         lanes, threads, advance = min(self.rollout.lanes, len(keys)), 1, self._advance
         if len(keys) >= self.many:
@@ -111,7 +111,7 @@ class ClosedLoop(eqx.Module):
     def first_not_finite(
         self, x: Float[Array, " n"], space: Space, key: Key[Array, ""]
     ) -> int | None:
-        """The frame of one drive from which on a derivative is no number; None where all are."""
+        """The first frame of a drive after which a derivative is not finite, or None."""
         rollout = dataclasses.replace(self.rollout, chunk_frames=1)
         one = dataclasses.replace(self, rollout=rollout)
         drives = one._start(x, space, key[None])
@@ -145,7 +145,7 @@ class ClosedLoop(eqx.Module):
 
     @eqx.filter_jit
     def _advance(self, x: Array, space: Space, drives: Sensitive) -> tuple[Sensitive, Any]:
-        """Some frames of every lane, and what the drives have cost so far."""
+        """Advance every lane by `chunk_frames`: the drives, and their costs so far."""
 
         def frame(drive: Sensitive) -> Sensitive:
             return self._frame(x, space, drive, lambda rollout: rollout.navigator.step)
@@ -157,7 +157,7 @@ class ClosedLoop(eqx.Module):
 
     @_jit(compiler_options=COMPILER_OPTIONS)
     def _advance_many(self, x: Array, space: Space, drives: Sensitive) -> tuple[Sensitive, Any]:
-        """The same for many lanes, each with no more work than it has."""
+        """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
 
         def frame(drive: Sensitive) -> Sensitive:
             return self._frame(x, space, drive, lambda r: step_by_regime(r.navigator))
@@ -180,7 +180,7 @@ class ClosedLoop(eqx.Module):
             rollout = self._softened(x, space)
             world = eqx.combine(moving, still)
             after = _strong(rollout.frame(world, step(rollout))[0])
-            # Chosen, not multiplied by 0: what goes on after the end must not spoil derivatives.
+            # Selected, not multiplied by 0: values after the end must not spoil the derivatives.
             costs = jax.tree.map(
                 lambda cost, more: jnp.where(before.ended, cost, cost + more),
                 costs,
@@ -205,7 +205,7 @@ def without_gradient(gradients: Float[Array, "B n"], labels: list[str]) -> list[
 
 
 def _moving(world: World) -> tuple[World, World]:
-    """What changes with the gains, and the rest of a world: each without the other."""
+    """Partition a world into the part that changes with the gains, and the rest."""
     spec = jax.tree.map(lambda _: False, world)
     spec = dataclasses.replace(
         spec,
@@ -219,19 +219,19 @@ def _moving(world: World) -> tuple[World, World]:
 
 
 def _pushed(fn: Callable[..., tuple[Any, World]], primals: Any, tangents: Any) -> Any:
-    """fn's value, its derivatives along P directions at once, and what it has besides."""
+    """The value of fn, its derivatives along P directions at once, and its auxiliary output."""
     return jax.vmap(
         lambda along: jax.jvp(fn, primals, along, has_aux=True), out_axes=(None, 0, None)
     )(tangents)
 
 
 def _basis(x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Each of the numbers by itself."""
+    """The unit vectors of the parameter space."""
     return jnp.eye(x.shape[0], dtype=x.dtype)
 
 
 def _sums(drives: Sensitive) -> tuple[Costs, Costs]:
-    """The costs and their slopes, as the one entry of a chunk."""
+    """The costs and their slopes, as the single entry of a chunk."""
     sums: tuple[Costs, Costs] = jax.tree.map(
         lambda leaf: leaf[:, None], (drives.costs, drives.slopes[1])
     )
@@ -239,6 +239,6 @@ def _sums(drives: Sensitive) -> tuple[Costs, Costs]:
 
 
 def _strong(world: World) -> World:
-    """Types as they are declared, or the next frame would be compiled for others."""
+    """The world with strong types, so that the next frame is not compiled for other types."""
     strong: World = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), world)
     return strong

@@ -1,4 +1,4 @@
-"""The filter's noise as something to tune: by what the cameras see, or by where the vehicle was."""
+"""Define the cost by which the filter's noise is tuned: corner likelihood, or true poses."""
 
 from typing import NamedTuple
 
@@ -25,18 +25,18 @@ _CM2_PER_M2 = 1e4
 
 
 class Item(NamedTuple):
-    """One sequence; or many, leaves leading with (B,)."""
+    """One sequence, or many with leading axis (B,)."""
 
     start: Bank
     recorded: Recorded
 
 
 class FilterCost(eqx.Module):
-    """What each frame of a sequence costs, at any noise parameters.
+    """The cost of each frame of a sequence as a function of the noise parameters.
 
-    The likelihood is that of the corners alone, each frame's given all frames before and its own
-    odometry. That of the odometry itself is left out: how a car speeds up and turns is no white
-    noise, and a filter that explains it best is too sure of everything else (see
+    The likelihood is that of the corners alone, each frame's given all earlier frames and its own
+    odometry. The likelihood of the odometry is left out: a car's acceleration and turning is not
+    white noise, and a filter that explains it best is too sure of everything else (see
     benchmarks/README-tuning.md).
     """
 
@@ -57,7 +57,7 @@ class FilterCost(eqx.Module):
         return _CM2_PER_M2 * followed.square_m2
 
     def batch(self, x: Float[Array, " n"], recorded: Recorded) -> Batch:
-        """What the recordings say of branches at these parameters, fixed from here on."""
+        """The batch of recordings, their branches chosen at these parameters and then fixed."""
         navigator = with_parameters(self.navigator, self.space.values(x))
         start = started(navigator, recorded)
         usable = eqx.tree_at(
@@ -70,7 +70,7 @@ class FilterCost(eqx.Module):
         return Batch(Item(start.bank, usable), frames)
 
     def mean(self, x: Float[Array, " n"], batch: Batch) -> Float[Array, ""]:
-        """The mean cost of a frame."""
+        """The mean cost of a frame in a batch."""
         return _mean(self, x, batch)
 
 

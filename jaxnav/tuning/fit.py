@@ -1,13 +1,12 @@
-"""A descent from its beginning to its end, and what is kept so that it can go on after a break.
+"""Run a descent from beginning to end, with a state that can be saved and resumed.
 
     fit = Fit.begin(x, problem)
     while not fit.over:
         fit = advanced(fit, problem)       # one step; `fit` is all there is to save
 
-Stages: a problem may be posed anew where a descent has ended (branches chosen again, by the
-parameters that were found), until that changes nothing. What counts is the loss on held-out
-drives: the best x by that is what a fit has found, and it ends when `patience` steps found none
-better.
+Stages: after a descent has ended the problem may be posed anew (branches chosen again, by the
+parameters found), until that changes nothing. The result of a fit is the x with the lowest loss on
+held-out drives; the fit ends when `patience` steps have found no better one.
 """
 
 import dataclasses
@@ -27,17 +26,17 @@ _SAME = 1e-3  # a loss that differs by less is the same, of its size and of 1
 
 @dataclass(frozen=True)
 class Problem:
-    """What is asked of a fit.
+    """The definition of a fit: its optimiser, its data and its limits.
 
     Attributes:
         optimiser: makes the steps.
-        batch: (x at which the stage began, stage, step in all) -> what the next step is made on.
-        held_out: (x, x at which the stage began, stage) -> loss on drives that no step is made on.
-        softness: (step) -> of the discrete choices.
+        batch: (x at which the stage began, stage, step in all) -> the batch of the next step.
+        held_out: (x, x at which the stage began, stage) -> loss on drives that no step uses.
+        softness: (step) -> softness of the discrete choices.
         explain: (x, batch, softness) -> where a gradient is not finite.
-        steps, stages: at most so many.
-        patience: steps without a better held-out loss, after which it is over.
-        same_batch: the batch is the same throughout a stage.
+        steps, stages: the most of each.
+        patience: number of steps without a better held-out loss after which the fit ends.
+        same_batch: whether the batch is the same throughout a stage.
     """
 
     optimiser: Smooth | Noisy
@@ -53,10 +52,10 @@ class Problem:
 
 @dataclass(frozen=True)
 class Fit:
-    """Where a fit stands.
+    """The state of a fit.
 
-    `history` has a row for the beginning of every stage, its loss NaN, and one for every step that
-    was made: loss, held-out loss, and x.
+    `history` has a row for the beginning of every stage, with loss NaN, and one for every step
+    taken: loss, held-out loss, and x.
     """
 
     descent: Descent
@@ -67,14 +66,14 @@ class Fit:
     step: int = 0
     stage: int = 0
     stale: int = 0
-    refused: int = 0  # steps not made since a gradient was not finite
+    refused: int = 0  # steps not taken because a gradient was not finite
     over: bool = False
-    ended: str = ""  # why
+    ended: str = ""  # the reason
     history: tuple[np.ndarray, ...] = field(default=())
 
     @staticmethod
     def begin(x: Float[Array, " n"], problem: Problem) -> "Fit":
-        """At x, nothing known."""
+        """The state at x, before any evaluation."""
         batch, softness = problem.batch(x, 0, 0), jnp.asarray(problem.softness(0), x.dtype)
         loss = _known(problem.held_out(x, x, 0))
         descent = problem.optimiser.init(x, batch, softness)
@@ -82,7 +81,7 @@ class Fit:
 
 
 def advanced(fit: Fit, problem: Problem) -> Fit:
-    """One step more."""
+    """The fit after one more step."""
     x = fit.descent.x
     softness = jnp.asarray(problem.softness(fit.step), x.dtype)
     batch = problem.batch(fit.stage_x, fit.stage, fit.step)
@@ -128,7 +127,7 @@ def _next_stage(fit: Fit, problem: Problem) -> Fit:
     stage, x = fit.stage + 1, fit.best_x
     softness = jnp.asarray(problem.softness(fit.step), x.dtype)
     descent = problem.optimiser.init(x, problem.batch(x, stage, fit.step), softness)
-    # Other branches, another loss: what was best by the old one is not comparable.
+    # Other branches make another loss: the best by the old one is not comparable.
     loss = _known(problem.held_out(x, x, stage))
     return dataclasses.replace(
         fit,
@@ -147,12 +146,12 @@ def _row(loss: float, held_out: float, x: Array) -> np.ndarray:
 
 
 def _known(loss: float) -> float:
-    """A loss that is no number is worse than any other."""
+    """The loss, with infinity for NaN, so that NaN is worse than any other."""
     return np.inf if np.isnan(loss) else float(loss)
 
 
 def arrays_of(fit: Fit) -> dict[str, np.ndarray]:
-    """All of it, as a file of arrays holds it."""
+    """A fit as named arrays, to be written to a file."""
     leaves = jax.tree.leaves(fit.descent)
     inner = {f"descent_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     plain = {
@@ -164,7 +163,7 @@ def arrays_of(fit: Fit) -> dict[str, np.ndarray]:
 
 
 def fit_of(arrays: dict[str, np.ndarray], like: Fit) -> Fit:
-    """What `arrays_of` was made of.
+    """The fit from which `arrays_of` made these arrays.
 
     Args:
         like: a fit of the same problem.

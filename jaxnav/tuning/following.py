@@ -1,8 +1,8 @@
-"""The filter along a sequence from a start that is chosen: smooth in its noise parameters.
+"""Run the filter along a sequence from a chosen start: it is smooth in its noise parameters.
 
-The estimator is the car's, `Navigator.sense`, frame by frame, with one hypothesis: of the poses
-that a marker admits the other ones are left out, for good (`branches.py` says which). Selectors
-that choose anew in every frame do so, and no gradient flows through that choice.
+The estimator is the car's, `Navigator.sense`, frame by frame, with one hypothesis: the other poses
+that a marker admits are left out for good (`branches.py` chooses). Selectors that choose anew in
+every frame still do so, and no gradient flows through that choice.
 """
 
 import functools
@@ -28,20 +28,20 @@ from jaxnav.tuning.recorded import Recorded
 
 
 class Followed(eqx.Module):
-    """What is known of every frame; 0 where nothing was used, or nothing judged.
+    """The filter's scores in every frame; 0 if the frame was not used, or not judged.
 
-    Where numbers have overflowed and the hypothesis is lost, there is nothing worse: parameters
-    that break the filter are none to step to.
+    After an overflow has lost the hypothesis the scores are infinitely bad, so that no step goes to
+    parameters that break the filter.
     """
 
-    log_likelihood: Float[Array, "*B T"]  # of the corners given what was predicted
-    log_score: Float[Array, "*B T"]  # log density of the true pose under what is believed
+    log_likelihood: Float[Array, "*B T"]  # of the corners given the prediction
+    log_score: Float[Array, "*B T"]  # log density of the true pose under the belief
     square_m2: Float[Array, "*B T"]  # squared position error
     nees: Float[Array, "*B T"]
 
 
 def trusting(navigator: Navigator) -> Navigator:
-    """The same without its guards against outliers, which hide what is wrong with Q and R."""
+    """The navigator without its guards against outliers, which would hide a wrong Q or R."""
     motion, selector = navigator.motion, navigator.selector
     navigator = eqx.tree_at(lambda n: n.motion.gate_nis, navigator, float("inf"))
     if isinstance(motion, ConstantVelocity):
@@ -55,7 +55,7 @@ def trusting(navigator: Navigator) -> Navigator:
 
 
 def follow(navigator: Navigator, start: Bank, recorded: Recorded) -> Followed:
-    """One sequence (no batch axis), frame by frame."""
+    """Run the filter frame by frame along one sequence (no batch axis)."""
     local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
 
     @functools.partial(jax.checkpoint, policy=KEEP_FOUND)
@@ -86,7 +86,7 @@ def follow(navigator: Navigator, start: Bank, recorded: Recorded) -> Followed:
 
 
 class _Trusts(Navigator):
-    """Takes all corners for those of markers."""
+    """A navigator that takes all corners for those of markers."""
 
     def look(self, obs: Observation) -> Consistent:
         snapshot = self.snapshot(obs)
@@ -95,7 +95,7 @@ class _Trusts(Navigator):
 
 
 class _GoesOn(_Trusts):
-    """Looks for no candidate: a hypothesis that goes on asks none."""
+    """A navigator that searches no candidates: a continued hypothesis needs none."""
 
     def find_candidates(self, snapshot: Snapshot, own: jaxlie.SE3 | None = None) -> Candidates:
         return self.no_candidates()

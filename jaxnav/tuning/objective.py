@@ -1,7 +1,7 @@
-"""A loss over many drives: the mean of what every frame of them costs.
+"""Compute a loss over many drives: the mean cost of their frames.
 
 A cost is a function of the unconstrained vector x and one item, a recorded sequence or the key of a
-drive; its items run side by side, shared out over the devices of the process.
+drive; the items are batched, and split over the devices of the process.
 """
 
 from collections.abc import Callable
@@ -14,22 +14,22 @@ import numpy as np
 from jax.sharding import AxisType, PartitionSpec
 from jaxtyping import Array, Float
 
-# x, one item, how soft its discrete choices are -> what each of its T frames costs.
+# (x, one item, softness of its discrete choices) -> cost of each of its T frames.
 Cost = Callable[[Float[Array, " n"], Any, Float[Array, ""]], Float[Array, " T"]]
 
 
 class Batch(NamedTuple):
-    """Items, leading axis (B,), and the number of frames that their sum is divided by."""
+    """Items, leading axis (B,), and the number of frames by which the sum is divided."""
 
     items: Any
     frames: Float[Array, ""]
 
 
 class Objective(eqx.Module):
-    """The mean cost of a frame, and how far x may go where no frame says anything.
+    """The mean cost of a frame, with a prior on x.
 
-    x has zero mean and the standard deviation `prior_sigma`, before any frame is seen: numbers
-    start at what is typical, and one that nothing depends on stays there.
+    The prior has zero mean and the standard deviation `prior_sigma`: parameters start at typical
+    values, and one on which no frame depends stays there.
     """
 
     cost: Cost
@@ -42,7 +42,7 @@ class Objective(eqx.Module):
         return (self.total(x, batch.items, softness) + prior) / batch.frames
 
     def total(self, x: Float[Array, " n"], items: Any, softness: Float[Array, ""]) -> Array:
-        """The sum over all frames of all items."""
+        """The sum of the costs over all frames of all items."""
         devices = jax.devices()
         count = jax.tree.leaves(items)[0].shape[0]
 
@@ -51,8 +51,8 @@ class Objective(eqx.Module):
 
         if len(devices) == 1 or count % len(devices):
             return over(x, items, softness)
-        # Loops run until the slowest lane ends: every device goes through its own.
-        kind = (AxisType.Auto,)  # what is shared out is known here alone, not by its type
+        # Loops run until the slowest lane ends: every device loops over its own items.
+        kind = (AxisType.Auto,)  # the split is known only here, not in the arrays' types
         mesh = jax.make_mesh((len(devices),), ("items",), kind, devices=devices)
         shared, split = PartitionSpec(), PartitionSpec("items")
         total: Array = jax.shard_map(
@@ -66,14 +66,14 @@ class Objective(eqx.Module):
 
 
 class NotFinite(NamedTuple):
-    """Where a gradient is no number."""
+    """The place at which a gradient is not finite."""
 
     entry: int  # of x
     item: int
-    frame: int | None  # the first one, None: only the way back from the frames is broken
+    frame: int | None  # the first one; None: only the reverse pass is not finite
 
     def told(self, labels: list[str], step: int) -> str:
-        """One line for a person."""
+        """A one-line message for a person."""
         where = "" if self.frame is None else f" from frame {self.frame} on"
         return (
             f"step {step}: the gradient with respect to {labels[self.entry]} is not finite in "
@@ -84,7 +84,7 @@ class NotFinite(NamedTuple):
 def where_not_finite(
     cost: Cost, x: Float[Array, " n"], items: Any, softness: Float[Array, ""]
 ) -> NotFinite | None:
-    """The first entry and item whose gradient is no number; None where there is none."""
+    """The first entry and item whose gradient is not finite, or None."""
 
     @jax.jit
     def gradients(x: Array, items: Any) -> Array:

@@ -1,4 +1,4 @@
-"""What was sensed on many drives: what a filter is tuned on, and held against afterwards."""
+"""Hold the measurements of many drives, on which a filter is tuned and then judged."""
 
 import dataclasses
 from typing import Any
@@ -17,32 +17,32 @@ from jaxnav.simulation.rollout import Rollout
 
 
 class Recorded(eqx.Module):
-    """B sequences of T frames; every leaf leads with (B,)."""
+    """B sequences of T frames; every leaf has the leading axis (B,)."""
 
     markers: MarkerMap
     obs: Observation  # (B, T, ...)
-    used: Bool[Array, "*B T"]  # False: there was no such frame
+    used: Bool[Array, "*B T"]  # False: padding
     T_world_vehicle_true: Float[Array, "*B T 7"]
-    judged: Bool[Array, "*B T"]  # the true pose is known, and an estimate is held against it
+    judged: Bool[Array, "*B T"]  # the true pose is known, and the estimate is compared with it
 
     def __len__(self) -> int:
         return len(self.used)
 
     def rows(self, rows: slice | np.ndarray) -> "Recorded":
-        """Some of them."""
+        """Some of the sequences."""
         some: Recorded = jax.tree.map(lambda leaf: leaf[rows], self)
         return some
 
     @staticmethod
     def together(parts: "list[Recorded]") -> "Recorded":
-        """One after the other; shorter ones are padded with frames that are not used."""
+        """Concatenate the sequences; shorter ones are padded with unused frames."""
         length = max(part.used.shape[1] for part in parts)
         padded = [part.padded(length) for part in parts]
         joined: Recorded = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *padded)
         return joined
 
     def padded(self, length: int) -> "Recorded":
-        """So many frames, the last one repeated, blind and not used."""
+        """Pad to `length` frames: the last one repeated, without markers and unused."""
         more = length - self.used.shape[1]
         frames = (self.obs, self.used, self.T_world_vehicle_true, self.judged)
         obs, used, truth, judged = jax.tree.map(
@@ -57,8 +57,8 @@ class Recorded(eqx.Module):
 
 
 def simulated(rollout: Rollout, keys: Key[Array, " B"]) -> Recorded:
-    """Closed-loop drives from a cold start, judged from the frame on in which the navigator that
-    drove had decided where it was."""
+    """Simulate closed-loop drives from a cold start, judged from the frame on in which the
+    navigator that drove had decided its branch."""
     obs, true_poses, decided, active = jax.device_get(_drives(rollout, keys))
     count, length = len(active), int(active.sum(axis=1).max())
     judged = np.maximum.accumulate(decided & active, axis=1) & active
@@ -77,7 +77,7 @@ def simulated(rollout: Rollout, keys: Key[Array, " B"]) -> Recorded:
 
 @eqx.filter_jit
 def _drives(rollout: Rollout, keys: Key[Array, " B"]) -> tuple[Observation, Array, Array, Array]:
-    """Observations, true poses, what was decided and what was still under way; (B, frames)."""
+    """The observations, true poses, and masks of decided and of active frames; (B, frames)."""
 
     def drive(key: Array) -> tuple[Observation, Array, Array, Array]:
         def frame(world: Any, _: None) -> tuple[Any, tuple[Observation, Array, Array, Array]]:

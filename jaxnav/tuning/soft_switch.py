@@ -1,9 +1,9 @@
-"""The controller with waypoints that are left little by little: a drive that has derivatives.
+"""Soften the controller's switch from waypoint to waypoint, so that a drive has derivatives.
 
-The controller heads for one waypoint, then for the next. When it does so depends on its gains, but
-no derivative of the commands says so: a number of frames has none. Here it heads for several at
-once, each by its share, and a share moves on the more surely the nearer the waypoint is. As the
-softness goes to 0 this becomes the controller itself.
+The controller heads for one waypoint, then for the next. The frame of the switch depends on the
+gains, but a number of frames has no derivative. The soft controller heads for several waypoints at
+once, each with a share; the nearer the waypoint, the larger the part of its share that moves on. As
+the softness goes to 0 this becomes the controller itself.
 """
 
 from typing import cast
@@ -17,30 +17,30 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.navigator import Navigator
 
-DONE = 0.999  # of the shares past the last waypoint: the drive is over
+DONE = 0.999  # with this share past the last waypoint the drive is over
 
 
 class SoftState(ControlState):
-    """What the soft controller remembers: for whoever asks, the waypoint of the largest share."""
+    """The state of the soft controller; `waypoint_index` is the waypoint of the largest share."""
 
-    shares: Float[Array, " W1"]  # heading for each waypoint, the last: for none, done
-    moved: Float[Array, " W"]  # what each has just handed on
+    shares: Float[Array, " W1"]  # heading for each waypoint; the last: done
+    moved: Float[Array, " W"]  # the share that each waypoint has just passed on
     integrals_ms: Float[Array, " W"]  # one for each waypoint
     commands: Float[Array, "2 W"]  # throttle and steering towards each
 
 
 class SoftController(eqx.Module):
-    """In place of a navigator's `Controller`, whose law it applies to every waypoint.
+    """A replacement for a navigator's `Controller` that applies its law to every waypoint.
 
-    In a frame the part sigmoid((radius - distance) / softness) of a share moves on. Commands are
-    those towards each waypoint, weighed by the shares; so is what each integral takes in.
+    In each frame the part sigmoid((radius - distance) / softness) of a share moves on. The shares
+    weight the commands towards the waypoints, which are summed, and the integrals' increments.
     """
 
     controller: Controller
     softness_m: Float[Array, ""]  # 0: hard
 
     def init(self) -> SoftState:
-        """All of it at the first waypoint."""
+        """The state with the whole share at the first waypoint."""
         hard = self.controller.init()
         count = self.controller.waypoints_m.shape[0]
         zero = jnp.zeros_like(hard.integral_ms)
@@ -60,7 +60,7 @@ class SoftController(eqx.Module):
         to_marker_m: Float[Array, " 2"] | None = None,
         speed_mps: Float[Array, ""] | float = np.nan,
     ) -> tuple[SoftState, Command, Bool[Array, ""], ControlLog]:
-        """As `Controller`; the log is that of the waypoint with the largest share."""
+        """Control as `Controller` does; the log is that of the waypoint with the largest share."""
         control = self.controller
         waypoints = jnp.arange(control.waypoints_m.shape[0])
         short_m = jax.vmap(lambda index: control.short_of(index, pose))(waypoints)
@@ -84,7 +84,7 @@ class SoftController(eqx.Module):
         state = SoftState(
             waypoint_index=jnp.where(done, heading.shape[0], most),
             integral_ms=integrals_ms[most],
-            explored_s=after.explored_s[0],  # alike for all waypoints, as is the side
+            explored_s=after.explored_s[0],  # the same for all waypoints, as is the side
             side=after.side[0],
             shares=shares,
             moved=moved,
@@ -110,7 +110,7 @@ def softened(navigator: Navigator, softness_m: float | Float[Array, ""]) -> Navi
 
 
 def _beyond(value: Array, softness: Array) -> Array:
-    """A step from 0 to 1 at 0, as wide as the softness."""
+    """A step from 0 to 1 at 0, with the width `softness`."""
     soft = softness > 0
     sigmoid = jax.nn.sigmoid(value / jnp.where(soft, softness, 1))
     return jnp.where(soft, sigmoid, (value >= 0).astype(sigmoid.dtype))

@@ -1,12 +1,11 @@
-"""Parameters as numbers that may be anything: what an optimiser moves.
+"""Map a navigator's parameters to unconstrained numbers, which an optimiser moves.
 
     space = Space.of(navigator, trainable={"motion.odometry_sigma": True, ...})
     navigator = with_parameters(navigator, space.values(x))    # at any vector x, as space.start is
 
-Numbers that are positive each by itself are a softplus, in units of what is typical of them. A
-covariance is log-Cholesky: L with exp on its diagonal, L L' scaled; where it is diagonal, the
-logarithms of the diagonal alone. So no step leads out of what is allowed. What is 0 or infinite
-starts at what is typical of it.
+A positive scalar is a softplus, in units of its typical value. A covariance is log-Cholesky: L with
+exp on its diagonal, L L' scaled; a diagonal covariance only the logarithms of its diagonal. So no
+step leaves the allowed values. A parameter that is 0 or infinite starts at its typical value.
 
 Source: Pinheiro, Bates (1996), "Unconstrained parametrizations for variance-covariance matrices",
 section 2.2.
@@ -25,14 +24,14 @@ from jaxnav.navigator import Navigator
 from jaxnav.numerics.small_matrices import product
 from jaxnav.parameters import TUNABLES, Tunable, parameters_of
 
-# A logarithm of a ratio to what is typical stays within this, and what is no logarithm within as
-# much: e^20 either way. Squares of that are numbers in float32.
+# Bound on a logarithm of a ratio to the typical value; other numbers stay within e^20 likewise.
+# The squares of such numbers are finite in float32.
 _FARTHEST = 20.0
 _MOST = float(np.exp(_FARTHEST))
 
 
 class Space(eqx.Module):
-    """Some parameters of a navigator, unconstrained."""
+    """The unconstrained space of some parameters of a navigator."""
 
     free: dict[str, Float[Array, "*shape"]]  # name -> where tuning starts
     full: frozenset[str] = eqx.field(static=True)  # those that are whole matrices
@@ -41,11 +40,11 @@ class Space(eqx.Module):
     def of(
         navigator: Navigator, trainable: Mapping[str, bool], full: frozenset[str] = frozenset()
     ) -> "Space":
-        """Where a navigator stands.
+        """The space that starts at a navigator's own parameters.
 
         Args:
-            trainable: which of its parameters may move, by name; those left out may not.
-            full: which of them are whole matrices, the others diagonal where they can be either.
+            trainable: parameter name -> whether it may move; names left out may not.
+            full: names of the covariances that are full matrices; the others are diagonal.
 
         Raises:
             ValueError: a name that the navigator does not have, or that can't be a matrix.
@@ -63,16 +62,16 @@ class Space(eqx.Module):
 
     @property
     def start(self) -> Float[Array, " n"]:
-        """All of them as one vector, where tuning starts."""
+        """The vector at which tuning starts."""
         return ravel_pytree(self.free)[0]
 
     @property
     def labels(self) -> list[str]:
-        """The name that each entry of the vector belongs to."""
+        """The parameter name of each entry of the vector."""
         return [name for name in sorted(self.free) for _ in range(self.free[name].size)]
 
     def values(self, x: Float[Array, " n"]) -> dict[str, Float[Array, "*shape"]]:
-        """What a navigator takes, from a vector that may be anything."""
+        """The navigator's parameter values at any vector x."""
         free = ravel_pytree(self.free)[1](x)
         return {
             name: _bound(TUNABLES[name], leaf, name in self.full) for name, leaf in free.items()
@@ -87,7 +86,7 @@ def _free(tunable: Tunable, value: Array, full: bool) -> Array:
         known = jnp.isfinite(value) & (value > 0)
         ratio = jnp.where(known, value / tunable.typical, 1)
         if tunable.matrix is None:
-            # The inverse of softplus, exact for small and for large ones.
+            # The inverse of softplus, exact for small and for large ratios.
             ratio = ratio * np.log(2)
             return jnp.clip(ratio + jnp.log(-jnp.expm1(-ratio)), -_FARTHEST, _MOST)
         if not full:
@@ -117,5 +116,5 @@ def _exp(free: Array) -> Array:
 
 
 def _unit(tunable: Tunable) -> float:
-    """Of a covariance's factor."""
+    """The unit of a covariance's Cholesky factor."""
     return tunable.typical if tunable.matrix == "sigma" else float(np.sqrt(tunable.typical))

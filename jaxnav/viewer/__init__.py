@@ -1,1 +1,1 @@
-"""A drive in the Rerun viewer."""
+"""Show a drive in the Rerun viewer."""

@@ -1,4 +1,4 @@
-"""Of an outcome of the pilot, what is shown: of one just made, or of one that was recorded."""
+"""Convert an outcome of the pilot, live or recorded, to the values that a viewer shows."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ from jaxnav.recording.drive_log import Outcomes
 
 @dataclass(frozen=True)
 class Shown:
-    """Of an outcome, what is shown; see `Outcomes`. Poses and candidates are NumPy's, and count
-    from the origin of the map."""
+    """The values of an outcome that are shown; see `Outcomes`. Poses and candidates are NumPy
+    arrays in coordinates from the map's origin."""
 
     now_ns: int
     health: Health
@@ -34,7 +34,7 @@ class Shown:
 
     @staticmethod
     def of(outcome: Outcome) -> "Shown":
-        """What the pilot gave."""
+        """The shown values of the pilot's outcome."""
         output, bank = outcome.output, outcome.belief.bank
         alive, valid = np.asarray(bank.initialised), np.asarray(output.candidates.valid)
         selected = int(output.selected)
@@ -58,10 +58,10 @@ class Shown:
 
     @staticmethod
     def of_row(outcomes: Outcomes, index: int, origin_m: Origin = ZERO) -> "Shown":
-        """One outcome of a recorded drive.
+        """The shown values of one outcome of a recorded drive.
 
         Args:
-            origin_m: of the map that it is shown with.
+            origin_m: origin of the map with which it is shown.
         """
         away_m = opposite(origin_m)
         return Shown(

@@ -1,4 +1,4 @@
-"""A drive looked at in Rerun while it is driven, or afterwards.
+"""Show a drive in Rerun while it is driven, or afterwards.
 
     view = RerunView(rig, markers, waypoints_m, live=True, save=None)
     view.show(outcome)
@@ -36,16 +36,16 @@ APPLICATION = "jaxnav"
 _IDLE_S = 0.02  # between looks at an empty queue
 _START_S = 20.0  # for the viewer's window to be there
 _FLUSH_S = 5.0
-# To draw an outcome takes 4 ms of the interpreter, which the driving thread needs as well.
+# Drawing an outcome takes 4 ms of the interpreter, which the driving thread needs as well.
 _PERIOD_NS = 100_000_000
 
 
 class RerunView:
-    """A window of Rerun, a file for it, or both. `show` and `image` are for any thread.
+    """A window of Rerun, a file for it, or both. Any thread may call `show` and `image`.
 
-    While a car drives nobody waits for it: a thread of its own draws what is in a queue, and what
-    does not fit is left out and counted. Then ten outcomes with corners, ten without, and ten
-    frames of each camera are shown in a second, and a new health at once.
+    While a car drives, no caller waits: a thread of its own draws from a queue, and items that do
+    not fit are dropped and counted. It then shows ten outcomes with corners, ten without, and ten
+    frames of each camera in a second, and a new health at once.
     """
 
     def __init__(
@@ -59,13 +59,13 @@ class RerunView:
         queue_items: int = 200,
     ):
         """Args:
-        rig: None where it is not known.
-        markers: None where they are not known.
+        rig: None if unknown.
+        markers: None if unknown.
         waypoints_m: (W, 2).
         live: open a window.
         save: an .rrd file to write.
-        waits: of a recorded drive nothing is left out: whoever shows it waits until it is drawn.
-        queue_items: how many outcomes and images may wait.
+        waits: whether `show` and `image` wait for the drawing, so that nothing is dropped.
+        queue_items: the most outcomes and images in the queue.
 
         Raises:
             BadInput: Rerun is not installed, its window does not open, the file can't be written.
@@ -97,16 +97,16 @@ class RerunView:
 
     @property
     def dropped(self) -> int:
-        """Outcomes and images that were left out so far."""
+        """The number of outcomes and images dropped so far."""
         return self._dropped
 
     @property
     def failed(self) -> str | None:
-        """Why nothing is shown any more, None while it is."""
+        """The reason why nothing is shown any more, or None."""
         return self._failed
 
     def show(self, outcome: Outcome | Shown) -> None:
-        """Show what the pilot made of an event. Never raises."""
+        """Show the pilot's outcome of an event. Never raises."""
         has_corners = isinstance(outcome, Outcome) and _has_corners(outcome)
         if self._is_due((outcome.health, has_corners), outcome.now_ns):
             self._offer(lambda scene: scene.show(_shown(outcome)))
@@ -121,25 +121,25 @@ class RerunView:
         """Show a frame of a camera. Never raises.
 
         Args:
-            image: a JPEG, or (H, W) or (H, W, 3) BGR pixels; None: it stays as it is.
-            corners_px: (N, 4, 2) as they were detected; None: they stay as they are.
+            image: a JPEG, or (H, W) or (H, W, 3) BGR pixels; None: unchanged.
+            corners_px: (N, 4, 2) detected corners; None: unchanged.
         """
         if self._is_due(camera_name, stamp_ns):
             self._offer(lambda scene: scene.image(camera_name, stamp_ns, image, corners_px))
 
     def close(self) -> None:
-        """Draw what waits and let go; the window stays. Any number of times."""
+        """Draw the queue and stop; the window stays open. May be called repeatedly."""
         if self._closing.is_set():
             return
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join(_FLUSH_S)
-        with suppress(Exception):  # a window that was closed meanwhile
+        with suppress(Exception):  # the window may be closed by now
             self._stream.flush(timeout_sec=_FLUSH_S)
         self._stream.disconnect()
 
     def _is_due(self, kind: object, stamp_ns: int) -> bool:
-        """Whether the last of its kind was shown long enough ago."""
+        """Whether the last item of a kind was shown long enough ago."""
         if self._waits:
             return True
         last_ns = self._shown_ns.get(kind)
@@ -176,13 +176,13 @@ class RerunView:
     def _draw(self, draw: Callable[[Scene], None]) -> None:
         try:
             draw(self._scene)
-        except Exception:  # of whatever a picture was asked for: the vehicle drives on
+        except Exception:  # whatever fails in drawing, the vehicle drives on
             with self._lock:
                 self._dropped += 1
 
 
 def import_rerun() -> ModuleType:
-    """Rerun's module.
+    """Import Rerun: its module.
 
     Raises:
         ModuleNotFoundError: it is not installed.
@@ -210,24 +210,24 @@ def _file_sink(rerun: ModuleType, path: Path) -> Any:
 
 
 def viewer_command(port: int) -> list[str]:
-    """What opens a window of Rerun that listens on a port of this machine."""
+    """The command that opens a window of Rerun listening on a port of this machine."""
     own = ["--port", str(port), "--bind", "127.0.0.1", "--hide-welcome-screen"]
     return [sys.executable, "-m", "rerun_cli", *own, "--memory-limit", "2GB"]
 
 
 def _open_viewer() -> tuple[subprocess.Popen[bytes], str]:
-    """A window of its own, and where it listens."""
+    """Open a new window: its process, and the address at which it listens."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = int(free.getsockname()[1])
     viewer = subprocess.Popen(
         viewer_command(port),
-        # Rerun sends no usage data where it believes to be in continuous integration; the only
+        # Rerun sends no usage data if it believes to run in continuous integration; the only
         # other switch is a file in the user's home.
         env=os.environ | {"CI": "true", "FORCE_RERUN_ANALYTICS": "0"},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # an interrupt of the drive is none of the window
+        start_new_session=True,  # an interrupt of the drive must not reach the window
     )
     end_s = time.monotonic() + _START_S
     while viewer.poll() is None and time.monotonic() < end_s:

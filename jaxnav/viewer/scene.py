@@ -1,14 +1,14 @@
-"""A drive in the words of Rerun: what stands still, outcomes of the pilot, camera frames.
+"""Log a drive to Rerun: the static scene, outcomes of the pilot, camera frames.
 
     world                     markers, waypoints, track, ellipse, hypotheses, candidates
     world/vehicle             moves; below it its cameras with their images and detections
     plots/...                 numbers over time
     health                    a line where health, faults or rejects change
 
-Rerun holds places in float32: they count from the origin of the map, which `health` tells where it
-is not the world's zero.
+Rerun stores positions in float32, so they count from the origin of the map; `health` tells the
+origin if it is not the world's zero.
 
-The images of a wide lens are shown as if it were none: they bend where Rerun draws straight lines.
+Images of a wide lens are shown as a pinhole's: they are curved where Rerun draws straight lines.
 """
 
 import math
@@ -28,11 +28,11 @@ from jaxnav.viewer.outcomes import Shown
 TIMELINE = "drive"  # seconds since the first event
 _CHI2_2DOF_95 = 5.991
 _ARROW_M = 0.15
-_IMAGE_PLANE_M = 0.12  # before its camera an image is drawn
+_IMAGE_PLANE_M = 0.12  # distance of a drawn image from its camera
 
 
 class Scene:
-    """A stream of Rerun, and what was last said to it. For one thread."""
+    """A stream of Rerun and the last values sent to it. For one thread."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Scene:
         stream.send_blueprint(self._blueprint())
 
     def show(self, shown: Shown) -> None:
-        """What the pilot made of an event."""
+        """Log the pilot's outcome of an event."""
         self._at(shown.now_ns)
         if shown.located and np.isfinite(shown.pose).all():
             self._show_vehicle(shown.pose, shown.covariance)
@@ -95,8 +95,8 @@ class Scene:
         image: bytes | np.ndarray | None,
         corners_px: np.ndarray | None,
     ) -> None:
-        """A frame of a camera: JPEG or BGR or grey pixels, and detected corners (N, 4, 2). What is
-        None stays as it is."""
+        """Log a camera's frame: JPEG or BGR or grey pixels, and detected corners (N, 4, 2). None
+        leaves either unchanged."""
         rerun = self._rerun
         self._at(stamp_ns)
         entity = f"world/vehicle/{camera}"
@@ -257,6 +257,6 @@ def _ahead(psi_rad: np.ndarray) -> np.ndarray:
 
 
 def _x_axis(wxyz: np.ndarray) -> np.ndarray:
-    """Where a rotation turns the x axis."""
+    """The x axis of a rotated frame."""
     w, x, y, z = wxyz
     return np.array([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)])
