@@ -10,11 +10,12 @@ BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format benchmark fuzz docs clean
+.PHONY: help demo test test-fast lint format benchmark fuzz docs clean
 
 help:
 	@echo "make demo       the main job: a simulated drive, its report in demo/"
 	@echo "make test       lint, types, tests"
+	@echo "make test-fast  the core and most commands, some minutes: tests/fast.txt"
 	@echo "make lint       ruff and mypy alone"
 	@echo "make format     let ruff rewrite what it can"
 	@echo "make benchmark  timings against OpenCV and NumPy"
@@ -27,6 +28,9 @@ demo: $(VENV)/.installed
 
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+test-fast: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile @tests/fast.txt
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
