@@ -42,9 +42,11 @@ OdometryParameter = Literal[
 _RecordedFile = Annotated[Path | None, optional("FILE", "(default: the recording's)")]
 
 
-def _require_recordings(recordings: tuple[Path, ...]) -> None:
-    """Raise BadInput where there is none."""
+def _require_recordings(recordings: tuple[Path, ...], marker_size_m: float | None = None) -> None:
+    """Raise BadInput where there is none, or where markers are of no size."""
     require(len(recordings) > 0, "RECORDING", "missing: what has the rig seen?")
+    if marker_size_m is not None:
+        require_within("--marker-size-m", marker_size_m, "size_m")
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,7 @@ class CalibrateRig:
     out: ResultsFolder = Path("calibrated")
 
     def __post_init__(self) -> None:
-        _require_recordings(self.recordings)
-        if self.marker_size_m is not None:
-            require_within("--marker-size-m", self.marker_size_m, "size_m")
+        _require_recordings(self.recordings, self.marker_size_m)
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,7 @@ class CalibrateMarkers:
     out: ResultsFolder = Path("calibrated")
 
     def __post_init__(self) -> None:
-        _require_recordings(self.recordings)
-        if self.marker_size_m is not None:
-            require_within("--marker-size-m", self.marker_size_m, "size_m")
+        _require_recordings(self.recordings, self.marker_size_m)
 
 
 @dataclass(frozen=True)
