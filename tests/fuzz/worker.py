@@ -7,7 +7,6 @@ one it was when it is silent for too long.
 import contextlib
 import json
 import os
-import resource
 import sys
 import tempfile
 from pathlib import Path
@@ -55,11 +54,23 @@ def main() -> None:
         case = drawn(seed, number, made, scratch, wanted, command_every)
         if case is not None:
             place = [str(case.folder), str(case.file), case.renamed]
-            _say(said, number=number, target=case.target, place=place)
-            problem = case.problem()
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+            _forget_peak()
+            _say(said, number=number, target=case.target, place=place, held=_bytes("VmRSS"))
+            problem, peak = case.problem(), _bytes("VmHWM")
             _say(said, number=number, target=case.target, problem=problem, done=True, peak=peak)
         number += step
+
+
+def _forget_peak() -> None:
+    """Count the peak of the memory from now on."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _bytes(field: str) -> int:
+    """The memory held now (VmRSS), or at most since `_forget_peak` (VmHWM)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(f"{field}:")).split()[1]) * 1024
 
 
 def _say(said: Any, **what: Any) -> None:
