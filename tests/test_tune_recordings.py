@@ -12,7 +12,7 @@ import pytest
 
 from jaxnav.commands.tune.drives import Event, driven, drives, sensed
 from jaxnav.commands.tune.recordings import GAP_S, navigator_of, tracks
-from jaxnav.commands.tune.sequences import Named, joined
+from jaxnav.commands.tune.sequences import NamedSequences, joined
 from jaxnav.datasets.recording import Recording
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
@@ -172,7 +172,7 @@ def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
 def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_px):
     navigator = navigator_of(test_7, True, "multi-hypothesis", corner_sigma_px)
     parts = [tracks(test_7, True, HALVES[0], 20), tracks(test_7, True, HALVES[1], 32)]
-    both = joined([Named(f"part {k}", navigator, part) for k, part in enumerate(parts)])
+    both = joined([NamedSequences(f"part {k}", navigator, part) for k, part in enumerate(parts)])
     assert both.used.shape == (sum(map(len, parts)), 32)
     assert int(both.used.sum()) == sum(int(part.used.sum()) for part in parts)
     for first, part in ((0, parts[0]), (len(parts[0]), parts[1])):
@@ -188,8 +188,8 @@ def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_
 def test_recordings_that_do_not_go_together_are_named(test_7, corner_sigma_px):
     alone = tracks(test_7, True, (0, 1))
     navigator = navigator_of(test_7, True, "multi-hypothesis", corner_sigma_px)
-    one = Named("one", navigator, alone)
-    all_markers = Named("other", navigator, tracks(test_7, False, (0, 1)))
+    one = NamedSequences("one", navigator, alone)
+    all_markers = NamedSequences("other", navigator, tracks(test_7, False, (0, 1)))
     with pytest.raises(BadInput, match=r"^one, other: must have as many markers .* 1 and 9$"):
         joined([one, all_markers])
     visible = alone.obs.visible[:, :, :2]
@@ -204,7 +204,7 @@ def test_recordings_that_do_not_go_together_are_named(test_7, corner_sigma_px):
         dataclasses.replace(test_7, rig=rig), True, "multi-hypothesis", corner_sigma_px
     )
     with pytest.raises(BadInput, match=r"^one, other: must have the same rig"):
-        joined([one, Named("other", moved, alone)])
+        joined([one, NamedSequences("other", moved, alone)])
 
 
 @pytest.fixture(scope="module")
@@ -264,7 +264,7 @@ def test_a_drive_is_its_events_one_by_one(setup, drive):
                 np.testing.assert_array_equal(obs.corner_sigma_px[row, index], told.sigma_px)
     halves = [drives(log, setup, part) for part in HALVES]
     assert sum(int(half.used.sum()) for half in halves) == len(events)
-    both = joined([Named("drive", setup.navigator(), half) for half in halves])
+    both = joined([NamedSequences("drive", setup.navigator(), half) for half in halves])
     assert len(both) == 2
 
 

@@ -59,19 +59,19 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
         found.append(onlooker)
 
     if args.record is not None:
-        add(Recording(args.record, setup, args.record_images))
+        add(DriveRecorder(args.record, setup, args.record_images))
     if args.view:
         from jaxnav.viewer.rerun_view import RerunView  # imports all that draws
 
         waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
-        add(View(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
+        add(LiveView(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
     add(DelayWatch(setup, warns=not args.headless))
     if not args.headless:
         add(StatusLine())
     return found
 
 
-class Recording:
+class DriveRecorder:
     """An observer that records the loop's inputs and outcomes into a file."""
 
     def __init__(self, path: Path, setup: DriveSetup, images: bool):
@@ -118,7 +118,7 @@ class Recording:
         return f"{text}; {self._recorder.failed}" if self._recorder.failed else text
 
 
-class View:
+class LiveView:
     """An observer that shows outcomes in Rerun's window; a closed window is no fault."""
 
     faults = Fault(0)

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from jaxnav.commands.drive.arguments import Replay as Arguments
-from jaxnav.commands.drive.track import Row, Track
+from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
+from jaxnav.commands.drive.track import Track, TrackRow
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.commands.reading import read_shown
@@ -193,7 +193,7 @@ def _replayed(
         bar.set_postfix_str("compiling")
         for given, outcome in zip(inputs, outcomes, strict=True):
             bar.set_postfix_str("", refresh=False)
-            rows.append(Row.of(outcome))
+            rows.append(TrackRow.of(outcome))
             if comparison is not None:
                 comparison.look(outcome)
             if recorder is not None:

@@ -12,7 +12,7 @@ from jaxnav.loop.pilot import Outcome
 from jaxnav.recording.drive_log import Outcomes
 
 
-class Row(NamedTuple):
+class TrackRow(NamedTuple):
     """The kept part of one outcome, without its bank of hypotheses."""
 
     now_ns: int
@@ -27,10 +27,10 @@ class Row(NamedTuple):
     restart_reason: str
 
     @staticmethod
-    def of(outcome: Outcome) -> "Row":
+    def of(outcome: Outcome) -> "TrackRow":
         """The kept part of an outcome."""
         output = outcome.output
-        return Row(
+        return TrackRow(
             outcome.now_ns,
             np.asarray(outcome.pose, float),
             np.asarray(outcome.T_world_vehicle, float),
@@ -48,7 +48,7 @@ class Row(NamedTuple):
 class Track:
     """A track of N rows in the order of their outcomes."""
 
-    rows: Sequence[Row]
+    rows: Sequence[TrackRow]
 
     @property
     def now_ns(self) -> np.ndarray:

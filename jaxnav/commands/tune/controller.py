@@ -114,7 +114,7 @@ def gains_of(args: Arguments, navigator: Navigator) -> Space:
 
 
 @dataclass(frozen=True)
-class Tested:
+class ControllerTest:
     """Results of a controller in one scenario, on seeds never trained on."""
 
     loss: tuple[float, float, float]  # mean with its 95 % interval
@@ -147,7 +147,7 @@ class Gains:
             same_batch=False,
         )
 
-    def tested(self, fit: Fit) -> dict[str, tuple[Tested, Tested]]:
+    def tested(self, fit: Fit) -> dict[str, tuple[ControllerTest, ControllerTest]]:
         """Test results before and after the fit, by scenario."""
         count = self._args.test_seeds
         with tqdm(
@@ -194,7 +194,7 @@ class Gains:
 
     def _test(
         self, loop: ClosedLoop, values: Mapping[str, Array], progress: Callable[[int], object]
-    ) -> Tested:
+    ) -> ControllerTest:
         """Drive with the scenario's own car: only what the seed draws is random."""
         nominal = dataclasses.replace(loop, rollout=dataclasses.replace(loop.rollout, spread=None))
         keys = _keys(_TEST_SEED, self._args.test_seeds)
@@ -204,7 +204,7 @@ class Gains:
         rate = float(np.mean(success))
         low, high = wilson_interval(np.array(rate), np.array(len(success)))
         own = np.asarray(trace.active)[0]
-        return Tested(
+        return ControllerTest(
             loss=resampled(losses, once),
             parts={name: float(np.mean(p)) for name, p in loop.loss.parts(costs).items()},
             time_s=resampled(np.asarray(costs.time_s), once),
@@ -219,7 +219,7 @@ def _keys(first: int, count: int) -> Key[Array, " S"]:
     return keys
 
 
-def _told(tested: Tested) -> dict[str, Any]:
+def _told(tested: ControllerTest) -> dict[str, Any]:
     return {
         "loss": measure(tested.loss),
         "parts": tested.parts,

@@ -16,7 +16,7 @@ from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
 from jaxnav.commands.tune.drives import drives
 from jaxnav.commands.tune.recordings import navigator_of, tracks
-from jaxnav.commands.tune.sequences import Named, joined
+from jaxnav.commands.tune.sequences import NamedSequences, joined
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
@@ -35,7 +35,7 @@ Progress = Callable[[int], object]
 
 
 @dataclass(frozen=True)
-class Test:
+class TuningTest:
     """Sequences that have no part in the tuning, and the navigator that goes with them."""
 
     name: str
@@ -45,16 +45,16 @@ class Test:
 
 
 @dataclass(frozen=True)
-class Data:
+class TuningData:
     """A navigator before tuning, and the sequences to learn from, to stop by and to test on."""
 
     navigator: Navigator
     learned: Recorded
     held_out: Recorded
-    tests: tuple[Test, ...]
+    tests: tuple[TuningTest, ...]
 
 
-def read_data(args: Arguments) -> Data:
+def read_data(args: Arguments) -> TuningData:
     """Read all data before any work is done; simulated tests are driven only when called for.
 
     Raises:
@@ -63,7 +63,7 @@ def read_data(args: Arguments) -> Data:
     return _recorded(args) if args.recordings else _simulated(args)
 
 
-def _simulated(args: Arguments) -> Data:
+def _simulated(args: Arguments) -> TuningData:
     car, scenario = ScenarioCar.load(args), scenarios()[args.scenario]
     # The drives are the same whichever estimator is tuned.
     driver = car.navigator(scenario, MultiHypothesis())
@@ -84,12 +84,12 @@ def _simulated(args: Arguments) -> Data:
     with tqdm(total=count, unit="drive", desc="drive", disable=args.headless, leave=False) as bar:
         known = drive(args.seed, count, bar.update)
     own = car.navigator(scenario, make_selector(args.selector))
-    return Data(
+    return TuningData(
         navigator=own,
         learned=known.rows(slice(0, args.seeds)),
         held_out=known.rows(slice(args.seeds, None)),
         tests=(
-            Test(
+            TuningTest(
                 f"{args.test_seeds} drives, {args.scenario}",
                 own,
                 args.test_seeds,
@@ -99,7 +99,7 @@ def _simulated(args: Arguments) -> Data:
     )
 
 
-def _recorded(args: Arguments) -> Data:
+def _recorded(args: Arguments) -> TuningData:
     learned = [_sequences(args, path, args.part) for path in args.recordings]
     together = joined(learned)
     rows = np.arange(len(together))
@@ -112,7 +112,7 @@ def _recorded(args: Arguments) -> Data:
     rest = [(0.0, begin)] * (begin > 0) + [(end, 1.0)] * (end < 1)
     tests = [(path, part) for path in args.recordings for part in rest]
     tests += [(path, (0.0, 1.0)) for path in args.test]
-    return Data(
+    return TuningData(
         navigator=learned[0].navigator,
         learned=together.rows(rows[~held_out]),
         held_out=together.rows(rows[held_out]),
@@ -120,14 +120,18 @@ def _recorded(args: Arguments) -> Data:
     )
 
 
-def _judging(args: Arguments, tests: Sequence[tuple[Path, tuple[float, float]]]) -> list[Test]:
+def _judging(
+    args: Arguments, tests: Sequence[tuple[Path, tuple[float, float]]]
+) -> list[TuningTest]:
     """The tests with a known pose of the vehicle in some frame."""
     found = []
     for path, part in tests:
         named = _sequences(args, path, part)
         if bool(jnp.any(named.recorded.judged)):
             name = named.name if part == (0.0, 1.0) else f"{named.name}, {part[0]:g} to {part[1]:g}"
-            found.append(Test(name, named.navigator, len(named.recorded), _known(named.recorded)))
+            found.append(
+                TuningTest(name, named.navigator, len(named.recorded), _known(named.recorded))
+            )
     return found
 
 
@@ -135,15 +139,15 @@ def _known(recorded: Recorded) -> Callable[[Progress], Recorded]:
     return lambda progress: recorded
 
 
-def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> Named:
+def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> NamedSequences:
     if path.suffix == _DRIVE:
         log = read_shown(path, args.headless)
         setup = DriveSetup.of_header(log.header, path)
-        return Named(str(path), setup.navigator(), drives(log, setup, part))
+        return NamedSequences(str(path), setup.navigator(), drives(log, setup, part))
     recording = read_recording(
         path,
         None if args.rig is None else load_rig(args.rig),
         None if args.markers is None else load_markers(args.markers),
     )
     navigator = navigator_of(recording, True, args.selector)
-    return Named(str(path), navigator, tracks(recording, True, part))
+    return NamedSequences(str(path), navigator, tracks(recording, True, part))

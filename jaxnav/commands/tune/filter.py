@@ -14,7 +14,7 @@ from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
-from jaxnav.commands.tune.data import AT_A_TIME, Data, read_data
+from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, summary_of
 from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
 from jaxnav.files import Params, apply_params, load_params, output_folder, write_json
@@ -98,7 +98,7 @@ def _by_default(navigator: Navigator, learned: Recorded) -> tuple[str, ...]:
     return (*names, "motion.odometry_sigma", *floors, corners)
 
 
-def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: Data) -> Problem:
+def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: TuningData) -> Problem:
     made: dict[int, tuple[Batch, Batch]] = {}
 
     def of_stage(x: Array, stage: int) -> tuple[Batch, Batch]:
@@ -118,7 +118,7 @@ def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: Data
 
 
 @dataclass(frozen=True)
-class Tested:
+class FilterTest:
     """Results of an estimator on drives that had no part in the tuning."""
 
     rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
@@ -129,8 +129,8 @@ class Tested:
 
 
 def _tested(
-    args: Arguments, data: Data, params: Params | None, space: Space, fit: Fit
-) -> dict[str, tuple[Tested, Tested]]:
+    args: Arguments, data: TuningData, params: Params | None, space: Space, fit: Fit
+) -> dict[str, tuple[FilterTest, FilterTest]]:
     """Results before and after the fit, by the name of the test."""
     found = {}
     for test in data.tests:
@@ -147,7 +147,7 @@ def _tested(
     return found
 
 
-def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object]) -> Tested:
+def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object]) -> FilterTest:
     size, parts = min(len(test), AT_A_TIME), []
     for begin in range(0, len(test), size):
         rows = np.minimum(np.arange(begin, begin + size), len(test) - 1)
@@ -164,7 +164,7 @@ def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object
 
     rmse_m = tuple(float(np.sqrt(value)) for value in mean(square_m2, judged))
     freedom = 3 if isinstance(navigator.motion, BicycleKalman) else 6
-    return Tested(
+    return FilterTest(
         rmse_m=(rmse_m[0], rmse_m[1], rmse_m[2]),
         anees=mean(nees, definite),
         band=anees_band(len(test), freedom),
@@ -173,7 +173,7 @@ def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object
     )
 
 
-def _told(tested: Tested) -> dict[str, Any]:
+def _told(tested: FilterTest) -> dict[str, Any]:
     return {
         "position_median_m": float(np.median(tested.error_m)),
         "position_rmse_m": measure(tested.rmse_m),

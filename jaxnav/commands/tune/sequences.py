@@ -17,7 +17,7 @@ from jaxnav.tuning.recorded import Recorded
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # wxyz xyz
 
 
-class Named(NamedTuple):
+class NamedSequences(NamedTuple):
     """The sequences of one recording, with its name and navigator."""
 
     name: str  # of the file, for messages
@@ -69,7 +69,7 @@ def maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
     return found
 
 
-def joined(recordings: Sequence[Named]) -> Recorded:
+def joined(recordings: Sequence[NamedSequences]) -> Recorded:
     """The sequences of all recordings, padded to the longest.
 
     Raises:
@@ -82,7 +82,7 @@ def joined(recordings: Sequence[Named]) -> Recorded:
     return Recorded.together([named.recorded for named in recordings])
 
 
-def _apart(one: Named, other: Named) -> str | None:
+def _apart(one: NamedSequences, other: NamedSequences) -> str | None:
     """The reason why one estimator can't take two recordings together; None without one."""
     lanes, lanes_other = (named.recorded.obs.visible.shape[2:] for named in (one, other))
     for what, here, there in zip(("cameras", "markers"), lanes, lanes_other, strict=True):
