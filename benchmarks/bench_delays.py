@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.loop.camera_delays import CameraDelays
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.simulation.corners import see
 from jaxnav.testing.faults import WAYPOINTS_M
@@ -128,7 +128,7 @@ def driven(kind: Kind, track: np.ndarray, delays: CameraDelays, world: Any, seed
     frame = 0
     for when_s, reading, pose in zip(readings_s, read, poses, strict=True):
         while frame < len(frames_s) and frames_s[frame] + 0.03 <= when_s:
-            seen = Told(None, corners_px[frame], visible[frame], sigma_px)
+            seen = EventData(None, corners_px[frame], visible[frame], sigma_px)
             if visible[frame].any():
                 delays.seen(_ns(frames_s[frame]), seen)
             frame += 1

@@ -31,7 +31,7 @@ from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.candidates import Candidates, find_candidates
-from jaxnav.pose.consistency import Consistent, consistent
+from jaxnav.pose.consistency import ConsistentSnapshot, consistent
 from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
 
 
@@ -146,7 +146,7 @@ class Navigator(eqx.Module):
         """Fuse an observation: the next belief, and the estimate that is reported of it."""
         return self.fuse(belief, self.look(obs.usable()))
 
-    def fuse(self, belief: Belief, seen: Consistent) -> tuple[Belief, Estimate]:
+    def fuse(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Estimate]:
         """Predict a belief, then correct it by the markers in view, if there are any."""
         predicted = self.predict(belief, seen.snapshot.obs)
         belief, evidence = jax.lax.cond(
@@ -156,7 +156,7 @@ class Navigator(eqx.Module):
         )
         return belief, Estimate.of(self.motion, belief, evidence)
 
-    def look(self, obs: Observation) -> Consistent:
+    def look(self, obs: Observation) -> ConsistentSnapshot:
         """The candidate poses of an observation, without sightings that can be no marker."""
         return consistent(self.snapshot(obs), self.find_candidates, self.no_candidates())
 
@@ -164,7 +164,7 @@ class Navigator(eqx.Module):
         """The belief `obs.dt_s` later (Eq. 9), with the odometry fused where there is any."""
         return belief.predicted(self._sound(self.motion.predict(belief.bank, obs)))
 
-    def correct(self, belief: Belief, seen: Consistent) -> tuple[Belief, Evidence]:
+    def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
         motion, obs = self.motion, seen.snapshot.obs
         prior = numbered_anew_where_empty(belief.bank)

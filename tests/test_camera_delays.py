@@ -17,8 +17,8 @@ from jaxnav.commands.drive.delay_watch import DelayWatch, delays_of, warnings
 from jaxnav.detection import Detections
 from jaxnav.loop.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
-from jaxnav.loop.history import Told
+from jaxnav.loop.frames import FrameDetections
+from jaxnav.loop.history import EventData
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.models.geometry import T_world_vehicle_from_planar
@@ -92,7 +92,7 @@ class Drive:
                     np.ones(len(which), bool),
                     tuple(MARKERS.families[m] for m in which),
                 )
-                seen.append(Sighted(camera, _ns(when_s), found))
+                seen.append(FrameDetections(camera, _ns(when_s), found))
             events.append((when_s + 0.03, tuple(seen)))
         off = rng.normal(0, 0.02, 3)
         told = []
@@ -209,7 +209,7 @@ def test_stretches_that_contradict_each_other_widen_sigma():
 
 def test_nothing_grows_however_long_it_drives():
     delays = CameraDelays(RIG, MARKERS, VEHICLE)
-    told = Told(None, np.zeros((4, 1, 4, 2)), np.ones((4, 1), bool), np.ones((4, 1, 4)))
+    told = EventData(None, np.zeros((4, 1, 4, 2)), np.ones((4, 1), bool), np.ones((4, 1, 4)))
     for count in range(5000):
         delays.read(count * 10**7, 0.1, 0.0)
         delays.seen(count * 10**7, told)
@@ -224,7 +224,7 @@ def outcome_of(given: Input, pose: np.ndarray):
     stamp_ns, told = given.now_ns, None
     if given.odometry is not None:
         read = given.odometry
-        stamp_ns, told = read.stamp_ns, Told((read.speed_mps, read.steering_rad))
+        stamp_ns, told = read.stamp_ns, EventData((read.speed_mps, read.steering_rad))
     elif any(frame.detections for frame in given.frames):
         corners_px, visible = np.zeros((4, 1, 4, 2)), np.zeros((4, 1), bool)
         for frame in given.frames:
@@ -233,7 +233,7 @@ def outcome_of(given: Input, pose: np.ndarray):
                 visible[frame.camera] = True
         stamp_ns, told = (
             given.frames[0].stamp_ns,
-            Told(None, corners_px, visible, np.ones((4, 1, 4))),
+            EventData(None, corners_px, visible, np.ones((4, 1, 4))),
         )
     return dataclasses.replace(
         outcome, now_ns=given.now_ns, stamp_ns=stamp_ns, told=told, output=output

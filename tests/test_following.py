@@ -23,10 +23,10 @@ from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.tuning import branches
 from jaxnav.tuning import filter as tuned_filter
-from jaxnav.tuning.branches import Started, started
+from jaxnav.tuning.branches import SequenceStarts, started
 from jaxnav.tuning.filter import FilterCost
-from jaxnav.tuning.following import Followed, follow, trusting
-from jaxnav.tuning.recorded import Recorded, simulated
+from jaxnav.tuning.following import FilterScores, follow, trusting
+from jaxnav.tuning.recorded import FrameSequences, simulated
 from jaxnav.tuning.unconstrained import Space
 from tests import worlds
 
@@ -72,7 +72,7 @@ class Drives:
 
 
 @functools.cache
-def recorded() -> Recorded:
+def recorded() -> FrameSequences:
     """Three drives past the marker: it leaves the view after seven frames."""
     scenario = dataclasses.replace(
         scenarios()["paper"], start_pose=(0.9, -0.6, 2.2), start_spread=(0.0,) * 3,
@@ -83,7 +83,7 @@ def recorded() -> Recorded:
 
 
 @functools.cache
-def starts() -> Started:
+def starts() -> SequenceStarts:
     return started(NAVIGATOR, recorded())
 
 
@@ -91,13 +91,13 @@ def first_of(tree):
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
-def likely(start, recorded, step, navigator=NAVIGATOR, space=SPACE) -> Followed:
+def likely(start, recorded, step, navigator=NAVIGATOR, space=SPACE) -> FilterScores:
     """One drive, the parameters a step away from where they start."""
     navigator = trusting(with_parameters(navigator, space.values(space.start + step)))
     return follow(navigator, start, recorded)
 
 
-def sums(told: Followed, axis=None):
+def sums(told: FilterScores, axis=None):
     """Of what losses are made of; position errors in cm."""
     leaves = told.log_likelihood, told.log_score, 1e4 * told.square_m2
     return jnp.stack([jnp.sum(leaf, axis=axis) for leaf in leaves])
@@ -108,11 +108,11 @@ def weighed(step, weights, start, recorded, navigator=NAVIGATOR, space=SPACE):
 
 
 @jax.jit
-def steps_of(start, recorded, steps) -> Followed:
+def steps_of(start, recorded, steps) -> FilterScores:
     return jax.lax.map(lambda step: likely(start, recorded, step), steps)
 
 
-def at_start(start, recorded) -> Followed:
+def at_start(start, recorded) -> FilterScores:
     """In the same program as all other steps."""
     return first_of(steps_of(start, recorded, jnp.zeros((2 * SPACE.start.size, SPACE.start.size))))
 
@@ -159,7 +159,7 @@ def mirrored(pose: np.ndarray) -> np.ndarray:
     return np.array([*(marker_m + other), pose[2] + turn])
 
 
-def true_poses(recorded: Recorded) -> np.ndarray:
+def true_poses(recorded: FrameSequences) -> np.ndarray:
     return np.asarray(planar_from_T_world_vehicle(jaxlie.SE3(recorded.T_world_vehicle_true)))
 
 
@@ -187,14 +187,14 @@ def test_what_is_recorded_is_what_was_sensed():
 
 def test_shorter_recordings_are_filled_with_frames_that_are_not_used():
     drives = recorded()
-    short = Recorded(
+    short = FrameSequences(
         drives.markers,
         *jax.tree.map(
             lambda leaf: leaf[:, :5],
             (drives.obs, drives.used, drives.T_world_vehicle_true, drives.judged),
         ),
     ).rows(slice(0, 2))
-    both = Recorded.together([drives, short])
+    both = FrameSequences.together([drives, short])
     assert both.used.shape == (5, FRAMES)
     np.testing.assert_array_equal(both.used.sum(axis=1), [12, 12, 12, 5, 5])
     np.testing.assert_array_equal(both.judged.sum(axis=1), [9, 9, 9, 2, 2])
@@ -309,7 +309,7 @@ def test_a_thousand_frames_need_little_memory():
     assert program.memory_analysis().temp_size_in_bytes < 1024 * LONG
 
 
-def standing(drive: Recorded, pose, visible=True) -> Recorded:
+def standing(drive: FrameSequences, pose, visible=True) -> FrameSequences:
     """A car that does not move, and corners without noise."""
     obs = worlds.observe(RIG, MARKERS, worlds.planar(*pose))
     frames = drive.used.shape[0]
@@ -417,19 +417,21 @@ def test_the_implicit_gradient_is_that_of_all_steps():
 def test_a_cost_is_what_its_loss_says(monkeypatch):
     """Signs and units, and which frames are counted."""
     drives = recorded()
-    told = Followed(*(jnp.full(FRAMES, value) for value in (3.0, 5.0, 0.02, 1.0)))
+    told = FilterScores(*(jnp.full(FRAMES, value) for value in (3.0, 5.0, 0.02, 1.0)))
     seen = []
 
     def stub(navigator, start, recorded):
         seen.append(navigator)
         used, judged = (jnp.sum(mask) / FRAMES for mask in (recorded.used, recorded.judged))
-        return Followed(
+        return FilterScores(
             told.log_likelihood * used, told.log_score * judged, told.square_m2, told.nees
         )
 
     decided = jnp.asarray([True, False, True])
     monkeypatch.setattr(tuned_filter, "follow", stub)
-    monkeypatch.setattr(tuned_filter, "started", lambda n, r: Started(starts().bank, decided))
+    monkeypatch.setattr(
+        tuned_filter, "started", lambda n, r: SequenceStarts(starts().bank, decided)
+    )
     for loss, cost, frames in (("likelihood", -3.0, 24), ("score", -5.0 * 9 / 12, 18)):
         of = FilterCost(NAVIGATOR, SPACE, loss)
         batch = of.batch(SPACE.start, drives)

@@ -16,7 +16,7 @@ from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.interfaces import Frame
-from jaxnav.loop.pilot import Sighted
+from jaxnav.loop.pilot import FrameDetections
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_setup import DriveSetup
 from tests.helpers.drives import make_input, make_outcome, make_picture
@@ -54,8 +54,8 @@ def look_on(onlooker, count: int = 6) -> None:
     for index in range(count):
         onlooker.handled(make_input(index), make_outcome(index))
     image = make_picture(0)
-    onlooker.seen("front", Frame(5, image), Sighted(0, 5, FOUND))
-    onlooker.seen("rear", Frame(6, None), Sighted(2, 6, None, Fault.FRAME_UNUSABLE))
+    onlooker.seen("front", Frame(5, image), FrameDetections(0, 5, FOUND))
+    onlooker.seen("rear", Frame(6, None), FrameDetections(2, 6, None, Fault.FRAME_UNUSABLE))
 
 
 def test_the_view_is_told_every_outcome_and_frame():

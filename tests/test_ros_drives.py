@@ -10,7 +10,7 @@ import pytest
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.datasets.ros_drives import TOGETHER_NS, read_ros_drive, together
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.models.rig import CameraRig
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import (
@@ -132,8 +132,8 @@ def test_a_real_bag_is_frames_of_four_cameras(tmp_path, data_dir):
 # --- frames that belong together ------------------------------------------------------------------
 
 
-def frame(camera: int, stamp_ns: int) -> Sighted:
-    return Sighted(camera, stamp_ns, None)
+def frame(camera: int, stamp_ns: int) -> FrameDetections:
+    return FrameDetections(camera, stamp_ns, None)
 
 
 def test_frames_with_one_stamp_are_one_input():

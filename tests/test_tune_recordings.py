@@ -17,7 +17,7 @@ from jaxnav.datasets.recording import Recording
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
 from jaxnav.loop.flags import Reject
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.geometry import rotation_error_rad
@@ -25,7 +25,7 @@ from jaxnav.recording.drive_log import DriveLog, read_drive
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.testing.lockstep import Rates
 from jaxnav.tuning.branches import estimated, started
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 from tests.helpers.simulated import make_setup, record, simulated
 
 HALVES = [(0, 0.5), (0.5, 1)]
@@ -49,7 +49,7 @@ def places(recording: Recording) -> dict[bytes, tuple[int, int, int]]:
     return places
 
 
-def detections(recorded: Recorded) -> list[list[tuple[int, bytes]]]:
+def detections(recorded: FrameSequences) -> list[list[tuple[int, bytes]]]:
     """Of each sequence: frame of the sequence and corners."""
     corners_px, visible = np.asarray(recorded.obs.corners_px), np.asarray(recorded.obs.visible)
     return [
@@ -291,7 +291,7 @@ def test_what_cameras_see_at_one_instant_is_one_event(setup, drive):
     seen = next(x for x in log.inputs if x.frames and len(x.frames[0].detections))
     frame = seen.frames[0]
     cameras = [frame.camera, (frame.camera + 1) % 4]
-    shown = [Sighted(camera, frame.stamp_ns, frame.detections) for camera in cameras]
+    shown = [FrameDetections(camera, frame.stamp_ns, frame.detections) for camera in cameras]
     apart = [Input(seen.now_ns + k, frames=(one,)) for k, one in enumerate(shown)]
     (event,) = sensed(apart, setup)
     assert event.told.visible.sum() == 2

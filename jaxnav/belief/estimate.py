@@ -40,7 +40,7 @@ class Belief(eqx.Module):
         return Belief(bank, decided, flip_probability, self.restarts)
 
 
-class Believed(eqx.Module):
+class BeliefReport(eqx.Module):
     """The reported part of a belief: pose and covariance of its heaviest hypothesis."""
 
     pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
@@ -55,12 +55,12 @@ class Believed(eqx.Module):
     decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
 
     @staticmethod
-    def of(motion: Motion, belief: Belief) -> "Believed":
+    def of(motion: Motion, belief: Belief) -> "BeliefReport":
         """The heaviest hypothesis; its covariance is the bank's second moment about its mean."""
         bank, best = belief.bank, heaviest(belief.bank)
         Ts_world_vehicle = motion.poses(bank).T_world_vehicle
         covariance = motion.error_covariance(bank, best)
-        return Believed(
+        return BeliefReport(
             **motion.planar(bank.mean[best], covariance)._asdict(),
             covariance=covariance,
             T_world_vehicle=jax.tree.map(lambda leaf: leaf[best], Ts_world_vehicle),
@@ -106,13 +106,13 @@ class Evidence(eqx.Module):
         )
 
 
-class Estimate(Believed, Evidence):
+class Estimate(BeliefReport, Evidence):
     """All that is known after one observation: the belief's report and the corners' evidence."""
 
     @staticmethod
     def of(motion: Motion, belief: Belief, evidence: Evidence) -> "Estimate":  # type: ignore[override]
         """The estimate of a belief and of the evidence that led to it."""
-        return Estimate(**vars(Believed.of(motion, belief)), **vars(evidence))
+        return Estimate(**vars(BeliefReport.of(motion, belief)), **vars(evidence))
 
     @property
     def evidence(self) -> Evidence:

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
 from jaxnav.belief.fan import CANDIDATES, fan, normalised
-from jaxnav.belief.map_fit import Fit, fit
+from jaxnav.belief.map_fit import PoseFit, fit
 from jaxnav.models.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
 from jaxnav.numerics.levenberg_marquardt import found
 from jaxnav.numerics.small_matrices import applied, cholesky, product, ranks, sandwich, solve_lower
@@ -157,7 +157,7 @@ class MultiHypothesis(eqx.Module):
         return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, seen.sigma_px * scale)
 
     def _inflation(
-        self, fits: Fit, alive: Bool[Array, " K"], starts: Array, freedom: int
+        self, fits: PoseFit, alive: Bool[Array, " K"], starts: Array, freedom: int
     ) -> Float[Array, ""]:
         """Factor, at least 1, by which the covariances of prediction and corners are too small.
 
@@ -172,7 +172,7 @@ class MultiHypothesis(eqx.Module):
 
     def _evidence(
         self,
-        fits: Fit,
+        fits: PoseFit,
         inflation: Float[Array, ""],
         alive: Bool[Array, " K"],
         candidates: Candidates,

@@ -39,7 +39,7 @@ from jaxnav.pose.linearised import crossed, reprojection_rows, turned, wrench
 from jaxnav.pose.observation import Snapshot, log_sigmas
 
 
-class Fit(eqx.Module):
+class PoseFit(eqx.Module):
     """The minimum of e next to each of K predictions."""
 
     posterior: PosePosterior
@@ -55,7 +55,7 @@ def fit(
     snapshot: Snapshot,
     floor: Float[Array, " 6"],
     max_steps: int,
-) -> Fit:
+) -> PoseFit:
     """Minimise e over u, in units of the prediction's own sigma: xi = freedom L u, P = L L'.
 
         e(u) = |r(T_prior cay(freedom L u))|^2 / sigma^2 + |u|^2
@@ -101,7 +101,7 @@ def fit(
         throw=False,
     )
     r, normal = linearised(solution.value)
-    fused: Fit = jax.vmap(
+    fused: PoseFit = jax.vmap(
         partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 5)
     )(
         T_world_prior,
@@ -202,7 +202,7 @@ def _fused(
     *,
     freedom: Float[Array, "6 d"],
     floor: Float[Array, " 6"],
-) -> Fit:
+) -> PoseFit:
     """Posterior and evidence of one hypothesis at its minimum u.
 
     With A = J'J of the corners in units of the prediction's sigma, N the floor in the same units,
@@ -235,7 +235,7 @@ def _fused(
     posterior_covariance = sandwich(carry, C)
     numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], contradiction]
     finite = usable & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
-    return Fit(
+    return PoseFit(
         posterior=PosePosterior(
             jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, T_world_prior.wxyz_xyz)),
             jnp.where(finite, posterior_covariance, jnp.eye(6, dtype=dtype)),

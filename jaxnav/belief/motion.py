@@ -63,7 +63,7 @@ class Bank(eqx.Module):
     number: Int[Array, "*K"]  # identity of a hypothesis, kept when it changes its slot
 
 
-class Updated(NamedTuple):
+class BankUpdate(NamedTuple):
     """A bank after an observation, and the outcome of the gate for each hypothesis."""
 
     bank: Bank
@@ -143,7 +143,7 @@ class Motion(eqx.Module):
         (pose, velocity), (J_pose, J_velocity) = self.on_ground(mean), slopes
         return Planar(pose, sandwich(J_pose, P), velocity, sandwich(J_velocity, P))
 
-    def update(self, bank: Bank, selection: Selection, obs: Observation) -> Updated:
+    def update(self, bank: Bank, selection: Selection, obs: Observation) -> BankUpdate:
         """The posterior of every hypothesis (Eqs. 10 and 11), with those of one heir merged.
 
         A measured pose starts a hypothesis that is not initialised. Otherwise it is fused where its
@@ -160,13 +160,13 @@ class Motion(eqx.Module):
         measured = selection.measured
         offer = self.follow if isinstance(measured, PosePosterior) else self.measure
 
-        def one(before: Bank, measured: Any) -> Updated:
+        def one(before: Bank, measured: Any) -> BankUpdate:
             offered = offer(before, measured, obs)
             after, nis, accepted = gated(before, offered, measured.taken)
             compared = measured.taken & before.initialised
-            return Updated(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
+            return BankUpdate(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
 
-        updated: Updated = jax.vmap(one)(bank, measured)
+        updated: BankUpdate = jax.vmap(one)(bank, measured)
         bank = merged(updated.bank, selection.heir, self.difference, self.moved)
         return updated._replace(bank=bank)
 

@@ -25,7 +25,7 @@ _TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
 
 
 @dataclass
-class Detections:
+class TopicDetections:
     """Detections by one camera: every message's stamp, and a row for each detection."""
 
     message_stamps_ns: list[int] = field(default_factory=list)
@@ -39,7 +39,7 @@ class Bag:
     """The topics, detections and transforms of a bag."""
 
     topics: dict[str, str] = field(default_factory=dict)  # every topic -> its message type
-    detections: dict[str, Detections] = field(default_factory=dict)  # by topic
+    detections: dict[str, TopicDetections] = field(default_factory=dict)  # by topic
     # (parent, child) -> stamp in ns -> (7,) wxyz xyz, the pose of the child in the parent
     transforms: dict[tuple[str, str], dict[int, tuple[float, ...]]] = field(default_factory=dict)
 
@@ -93,13 +93,15 @@ def _read(path: Path) -> Bag:
         wanted = [c for c in reader.connections if c.msgtype in kinds]
         for connection, _, message in messages(reader, wanted, {}):
             if connection.msgtype == DETECTIONS_TYPE:
-                _add_detections(bag.detections.setdefault(connection.topic, Detections()), message)
+                _add_detections(
+                    bag.detections.setdefault(connection.topic, TopicDetections()), message
+                )
             else:
                 _add_transforms(bag.transforms, message)
     return bag
 
 
-def _add_detections(detections: Detections, message: Any) -> None:
+def _add_detections(detections: TopicDetections, message: Any) -> None:
     stamp_ns = _nanoseconds(message.header)
     if len(message.apriltags) > limits.IN_VIEW:
         raise ValueError(f"a frame of more than {limits.IN_VIEW} detections")
@@ -138,7 +140,7 @@ def topics_found(recorded: Sequence[Bag]) -> str:
     return f"topics found: {', '.join(topics) or 'none'}"
 
 
-def rows_of_topics(topics: Sequence[Detections]) -> Rows:
+def rows_of_topics(topics: Sequence[TopicDetections]) -> Rows:
     """One table of the detections by all cameras, which are in the order of the rig."""
     frame_stamps = [stamp for topic in topics for stamp in topic.message_stamps_ns]
     return Rows(

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.compiling.executables import kept
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.bicycle import Vehicle, advance
 from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
@@ -148,7 +148,7 @@ class CameraDelays:
         if not self._readings or stamp_ns > self._readings[-1][0]:
             self._readings.append((stamp_ns, speed_mps, steering_rad))
 
-    def seen(self, stamp_ns: int, told: Told) -> None:
+    def seen(self, stamp_ns: int, told: EventData) -> None:
         """Keep corners and their corrected stamp."""
         assert told.corners_px is not None
         assert told.visible is not None

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the guard's process corrects without JAX and OpenCV
-    from jaxnav.loop.frames import Sighted
+    from jaxnav.loop.frames import FrameDetections
     from jaxnav.loop.interfaces import Odometry
     from jaxnav.models.bicycle import Vehicle
 
@@ -72,7 +72,7 @@ class Corrections:
         angle_rad = (steering_rad - self.steering_offset_rad) / self.steering_gain
         return speed_mps / self.speed_scale, angle_rad
 
-    def frame(self, seen: Sighted) -> Sighted:
+    def frame(self, seen: FrameDetections) -> FrameDetections:
         """A frame with its stamp corrected to the odometer's clock."""
         late_ns = self.frame_late_ns
         return replace(seen, stamp_ns=seen.stamp_ns - late_ns) if late_ns else seen

@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxnav.belief.estimate import Belief, Evidence
-from jaxnav.compiling.packing import Layout, Packed
+from jaxnav.compiling.packing import Packed, PackedLayout
 from jaxnav.compiling.step import compiled
-from jaxnav.loop.history import Entry, History, Told
+from jaxnav.loop.history import EventData, History, HistoryEntry
 from jaxnav.navigator import Navigator, Output
 from jaxnav.timeline import Corners, Events, advance
 
 EVENTS = 64  # fused by one call: 800 ms of odometry at 50 Hz and of frames at 30 Hz
 
-_NOTHING = Told()
+_NOTHING = EventData()
 
 # (belief, control, events, numbers) -> (belief, then, control, output), see `advance_packed`
 Program = Callable[..., tuple[Packed, Packed, Packed, Packed]]
@@ -39,18 +39,20 @@ def advance_packed(
     """
     given = (part.unpacked() for part in (belief, control, events))
     returned = advance(navigator, *given, *numbers)
-    belief, then, control, output = (Layout.of(part).pack(part) for part in returned)
+    belief, then, control, output = (PackedLayout.of(part).pack(part) for part in returned)
     return belief, then, control, output
 
 
 def _beginning(navigator: Navigator) -> tuple[Packed, Packed]:
     """The belief and control state at the start of a drive."""
     state = navigator.init()
-    return Layout.of(state.belief).pack(state.belief), Layout.of(state.control).pack(state.control)
+    return PackedLayout.of(state.belief).pack(state.belief), PackedLayout.of(state.control).pack(
+        state.control
+    )
 
 
 @dataclass(frozen=True)
-class Fused:
+class FusionResult:
     """The result of one event. The leaves of `output` and `belief` are NumPy arrays."""
 
     output: Output
@@ -90,7 +92,9 @@ class Estimator:
             numbers = np.zeros(4, np.int32)
             self._program(self._first, self._control, self._events([], 0, seeing), numbers)
 
-    def fuse(self, told: Told | None, stamp_ns: int, now_ns: int, elapsed_ns: int) -> Fused:
+    def fuse(
+        self, told: EventData | None, stamp_ns: int, now_ns: int, elapsed_ns: int
+    ) -> FusionResult:
         """Fuse an event, or only predict to the present.
 
         Args:
@@ -110,17 +114,22 @@ class Estimator:
             base_ns = self._belief_ns if self._history is not None else now_ns
             belief, _, output = self._call(self._belief, [], base_ns, 0, now_ns, elapsed_ns)
             believed = belief.fetched().unpacked()
-            return Fused(output.fetched().unpacked(), believed, told is not None, 0)
+            return FusionResult(output.fetched().unpacked(), believed, told is not None, 0)
         base, entries = placed
         assert self._history is not None
         new = next(index for index, entry in enumerate(entries) if entry.told is told)
         belief, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
         self._belief, self._belief_ns = belief, entries[-1].stamp_ns
         self._history.fused(belief, entries[new], then)
-        return Fused(known, belief.fetched().unpacked(), False, len(entries))
+        return FusionResult(known, belief.fetched().unpacked(), False, len(entries))
 
     def _fused(
-        self, base: Entry, entries: list[Entry], new: int, now_ns: int, elapsed_ns: int
+        self,
+        base: HistoryEntry,
+        entries: list[HistoryEntry],
+        new: int,
+        now_ns: int,
+        elapsed_ns: int,
     ) -> tuple[Packed, Packed, Output]:
         """The belief after all entries, the belief after the new one, and the output. Takes one
         call nearly always, several where a frame is late and the cameras are many."""
@@ -149,7 +158,7 @@ class Estimator:
     def _call(
         self,
         belief: Packed,
-        rows: Sequence[tuple[int, Told]],
+        rows: Sequence[tuple[int, EventData]],
         base_ns: int,
         new: int,
         now_ns: int,
@@ -162,14 +171,14 @@ class Estimator:
         belief, then, self._control, output = self._program(belief, self._control, events, numbers)
         return belief, then, output
 
-    def _events(self, rows: Sequence[tuple[int, Told]], base_ns: int, seeing: bool) -> Packed:
+    def _events(self, rows: Sequence[tuple[int, EventData]], base_ns: int, seeing: bool) -> Packed:
         packed, events = self._layouts[seeing].room()
         # Numbers that float32 can't hold become infinite, and the filter leaves them out.
         with np.errstate(over="ignore"):
             self._fill(events, rows, base_ns)
         return packed
 
-    def _fill(self, events: Events, rows: Sequence[tuple[int, Told]], base_ns: int) -> None:
+    def _fill(self, events: Events, rows: Sequence[tuple[int, EventData]], base_ns: int) -> None:
         into = vars(events)  # reading an attribute of an equinox module takes 1 us
         speed_mps, steering_rad = into["speed_mps"], into["steering_rad"]
         speed_mps[:], steering_rad[:] = self._odometry
@@ -195,7 +204,7 @@ def _with_evidence(output: Output, of_new: Output) -> Output:
     return told
 
 
-def _layout(navigator: Navigator, seeing: bool) -> Layout:
+def _layout(navigator: Navigator, seeing: bool) -> PackedLayout:
     """The layout of `EVENTS` events, with or without room for corners."""
     lanes = EVENTS, len(navigator.rig), len(navigator.markers.ids)
     dtype = navigator.corner_sigma_px.dtype
@@ -214,7 +223,7 @@ def _layout(navigator: Navigator, seeing: bool) -> Layout:
             corners=corners if seeing else None,
         )
 
-    return Layout.of(jax.eval_shape(events))
+    return PackedLayout.of(jax.eval_shape(events))
 
 
 def _us_between(earlier_ns: int, later_ns: int) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxnav.loop.expect import Expected, expected
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import Ending, Frame, Vehicle
 from jaxnav.loop.pilot import Input, Outcome, Pilot
@@ -37,7 +37,7 @@ class Observer(Protocol):
         """Take an input that the pilot has handled, and its outcome."""
         ...
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def seen(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """Take a camera's frame after the search for markers, and the markers found."""
         ...
 
@@ -101,7 +101,9 @@ class Loop:
         self._now_ns = now_ns
         self._outcome: Outcome | None = None
         self._odometry_ns: int | None = None
-        self._blank: tuple[Sighted, ...] = ()  # frames without markers, kept for the next tick
+        self._blank: tuple[
+            FrameDetections, ...
+        ] = ()  # frames without markers, kept for the next tick
         self._belief: tuple[np.ndarray, np.ndarray] | None = None
         self._expectation: tuple[tuple[np.ndarray, np.ndarray], Expected] | None = None  # of it
         dtype = np.asarray(pilot.navigator.corner_sigma_px).dtype
@@ -163,7 +165,7 @@ class Loop:
             self._odometry_ns = reading.stamp_ns
         self._handle(Input(self._now_ns(), reading, frames, faults))
 
-    def _sighted(self) -> list[tuple[Sighted, ...]]:
+    def _sighted(self) -> list[tuple[FrameDetections, ...]]:
         """The frames that show markers, in groups; the other frames wait for the next tick."""
         seen = self._eyes.take()
         for one in seen:

@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.pose.consistency import LEAST_MARKERS
 
 _OFTEN = 10  # frames with a contradiction by the others minus frames without one
 
 
-class Outvoted:
+class MarkerVotes:
     """The votes against each marker in one drive. Only frames with enough markers to vote count."""
 
     def __init__(self, ids: tuple[int, ...]):
@@ -20,7 +20,7 @@ class Outvoted:
         self._ids = ids
         self._times = np.zeros(len(ids), int)
 
-    def count(self, told: Told, outvoted: np.ndarray) -> tuple[int, ...]:
+    def count(self, told: EventData, outvoted: np.ndarray) -> tuple[int, ...]:
         """Count the votes of a frame; return the ids of the markers outvoted in it.
 
         Args:
@@ -35,7 +35,7 @@ class Outvoted:
         self._times = np.clip(times, 0, 2 * _OFTEN)
         return self._named(outvoted)
 
-    def without(self, told: Told) -> tuple[Told | None, tuple[int, ...]]:
+    def without(self, told: EventData) -> tuple[EventData | None, tuple[int, ...]]:
         """The data without markers that were often outvoted, if too few can vote, and their ids."""
         if len(self._ids) < LEAST_MARKERS or told.visible is None:
             return told, ()

@@ -23,13 +23,13 @@ from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.due import due_px
 from jaxnav.loop.estimator import Estimator, Program
 from jaxnav.loop.flags import Fault, Health, Reject
-from jaxnav.loop.frames import Frames, Sighted
+from jaxnav.loop.frames import FrameDetections, FrameIntake
 from jaxnav.loop.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.limits import Limits
 from jaxnav.loop.odometer import Odometer
-from jaxnav.loop.outvoted import Outvoted
+from jaxnav.loop.outvoted import MarkerVotes
 from jaxnav.loop.stamps import Stamps
 from jaxnav.loop.standstill import Standstill
 from jaxnav.loop.support import Support
@@ -54,7 +54,7 @@ class Input:
 
     now_ns: int
     odometry: Odometry | None = None
-    frames: tuple[Sighted, ...] = ()
+    frames: tuple[FrameDetections, ...] = ()
     faults: Fault = _NO_FAULT
 
 
@@ -70,7 +70,7 @@ class Outcome:
     throttle: float
     output: Output  # its leaves, and those of `belief`, are NumPy arrays
     belief: Belief
-    told: Told | None  # the data that were fused, and their timestamp
+    told: EventData | None  # the data that were fused, and their timestamp
     stamp_ns: int
     restarts: int  # so far, and the reason of the last one
     restart_reason: str
@@ -164,7 +164,7 @@ class Pilot:
         self.limits = Limits.of(navigator.controller.vehicle)
         self._corrections = Corrections.of(navigator.controller.vehicle)
         self._estimator = Estimator(navigator, program)
-        self._frames = Frames(len(navigator.rig), navigator.markers, corner_sigma_px)
+        self._frames = FrameIntake(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
         self._odometry_stamps = Stamps()
         self._odometer = Odometer.of(navigator.controller.vehicle)
@@ -175,7 +175,7 @@ class Pilot:
         )
         self._frozen = partial(self._standstill.frozen, due=self._due_px)
         self._support = Support(navigator.controller.vehicle, relocate)
-        self._outvoted = Outvoted(navigator.markers.ids)
+        self._outvoted = MarkerVotes(navigator.markers.ids)
         self._hidden: tuple[int, ...] = ()  # marker ids left out of the last frames
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
@@ -249,14 +249,14 @@ class Pilot:
             )
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
         self._standstill.went(stamp_ns, now_ns, reading.speed_mps, reading.steering_rad)
-        told = Told(odometry=(reading.speed_mps, reading.steering_rad))
+        told = EventData(odometry=(reading.speed_mps, reading.steering_rad))
         return self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
 
     def _tick(self, now_ns: int, faults: Fault, rejects: Reject = _NO_REJECT) -> Outcome:
         return self._fuse(None, now_ns, now_ns, faults, rejects)
 
     def _fuse(
-        self, told: Told | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
+        self, told: EventData | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
     ) -> Outcome:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
         fused = self._estimator.fuse(told, stamp_ns, now_ns, elapsed_ns)

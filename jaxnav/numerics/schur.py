@@ -31,7 +31,7 @@ class Blocks(eqx.Module):
     shared_gradient: Float[Array, " R"]
 
 
-class Reduced(eqx.Module):
+class ReducedSystem(eqx.Module):
     """The system of the shared unknowns after all blocks were eliminated.
 
         (S - sum_f C_f' B_f^-1 C_f) dx = -(g - sum_f C_f' B_f^-1 g_f)
@@ -50,7 +50,7 @@ class Reduced(eqx.Module):
         return jax.vmap(solve_upper)(self.factor, -self.own - self.carried @ shared)
 
 
-def reduce(blocks: Blocks, free: Bool[Array, " R"], damping: Float[Array, ""]) -> Reduced:
+def reduce(blocks: Blocks, free: Bool[Array, " R"], damping: Float[Array, ""]) -> ReducedSystem:
     """Eliminate the blocks by Schur's complement.
 
     Args:
@@ -66,7 +66,7 @@ def reduce(blocks: Blocks, free: Bool[Array, " R"], damping: Float[Array, ""]) -
     gradient = blocks.shared_gradient - flat.T @ own.reshape(-1)
     both = free[:, None] & free[None]
     eye = jnp.eye(free.shape[0], dtype=system.dtype)
-    return Reduced(
+    return ReducedSystem(
         system=jnp.where(both, system, eye),
         gradient=jnp.where(free, gradient, 0),
         factor=factor,

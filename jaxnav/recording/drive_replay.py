@@ -21,7 +21,7 @@ from jaxnav.detection.image_search import ImageSearch, size_problem
 from jaxnav.errors import BadInput
 from jaxnav.files.images import decoded_image
 from jaxnav.loop.flags import Fault, Health, Reject, names
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import opposite, planar_in_world
 from jaxnav.recording.drive_log import DriveLog, Outcomes
@@ -203,7 +203,7 @@ def inputs_from_images(
         raise BadInput(log.path, f"holds no image on {', '.join(camera_of)}")
     searched = 0
 
-    def anew(frame: Sighted) -> Sighted:
+    def anew(frame: FrameDetections) -> FrameDetections:
         nonlocal searched
         seen: Detections | None = found.get((frame.camera, frame.stamp_ns))
         if seen is None or frame.detections is None:

@@ -14,7 +14,7 @@ from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.motion import followed_by, leading, survivors_first
 from jaxnav.navigator import Navigator, Step
-from jaxnav.pose.consistency import Consistent, Kept, among_all
+from jaxnav.pose.consistency import ConsistentSnapshot, Inliers, among_all
 from jaxnav.pose.observation import Observation
 
 # Sizes, in slots, of the banks compiled beside the whole one: nine frames of ten need a single
@@ -30,26 +30,26 @@ def step_by_regime(navigator: Navigator) -> Step:
 
 
 class _ByRegime(Navigator):
-    def look(self, obs: Observation) -> Consistent:
+    def look(self, obs: Observation) -> ConsistentSnapshot:
         # Nearly all lanes see a marker: sorting out those that don't costs more than it saves.
         snapshot = self.snapshot(obs)
         slots = snapshot.seen.visible.shape[0]
         if slots == 1:
             return among_all(snapshot, self.find_candidates).of(snapshot)
 
-        def one() -> Kept:
+        def one() -> Inliers:
             kept = among_all(snapshot.largest(1), self.find_candidates)
             visible = jnp.zeros(slots, bool).at[0].set(kept.visible[0])
             count = min(self.max_candidates, 2 * slots)
-            return Kept(visible, kept.candidates.padded(count), kept.outvoted)
+            return Inliers(visible, kept.candidates.padded(count), kept.outvoted)
 
         any_further = jnp.any(snapshot.seen.visible[1:])
-        kept: Kept = jax.lax.cond(
+        kept: Inliers = jax.lax.cond(
             any_further, lambda: among_all(snapshot, self.find_candidates), one
         )
         return kept.of(snapshot)
 
-    def fuse(self, belief: Belief, seen: Consistent) -> tuple[Belief, Estimate]:
+    def fuse(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Estimate]:
         bank, count = belief.bank, belief.bank.initialised.shape[0]
         if count == 1 or not isinstance(self.selector, MultiHypothesis):
             return super().fuse(belief, seen)

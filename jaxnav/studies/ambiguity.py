@@ -25,7 +25,7 @@ from jaxnav.pose.candidates import Candidates, find_candidates
 from jaxnav.pose.observation import Snapshot
 from jaxnav.simulation.single_frames import (
     CornerErrors,
-    View,
+    MarkerView,
     marker_as_world,
     observe,
     pinhole_rig,
@@ -220,14 +220,14 @@ def _frame(
     }
 
 
-def _view(value: Mapping[str, Array], key: Array) -> View:
+def _view(value: Mapping[str, Array], key: Array) -> MarkerView:
     """The view of a trial, with its random angles drawn."""
     turns = jax.random.uniform(key, (3,), value["range_m"].dtype, -jnp.pi, jnp.pi)
     azimuth, roll, bearing = (
         jnp.where(jnp.isnan(value[name]), turn, jnp.deg2rad(value[name]))
         for name, turn in zip(("azimuth_deg", "roll_deg", "bearing_deg"), turns, strict=True)
     )
-    return View(
+    return MarkerView(
         range_m=value["range_m"],
         bearing_rad=bearing,
         elevation_rad=jnp.deg2rad(value["elevation_deg"]),

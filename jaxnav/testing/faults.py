@@ -31,7 +31,7 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
 from jaxnav.testing.injections import between
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates, Step, drive
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 
 BEGIN_S, END_S = 2.5, 4.0  # of most faults
 ALL_CAMERAS = range(4)  # of the trial's rig
@@ -42,7 +42,7 @@ WAYPOINTS_M = (
 )  # fmt: skip
 _RADIUS_M = 0.15
 
-Happens = Callable[[int, World], None]
+Happens = Callable[[int, SimWorld], None]
 
 
 def lasting(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
@@ -59,7 +59,7 @@ def _nothing_happens() -> Happens:
 
 
 @dataclass(frozen=True)
-class Row:
+class FaultRow:
     """One fault, and the requirements on a drive with it.
 
     Attributes:
@@ -103,7 +103,7 @@ class Row:
 class Result:
     """The result of a drive with a fault."""
 
-    row: Row
+    row: FaultRow
     faults: Fault
     rejects: Reject
     worst: Health
@@ -126,7 +126,7 @@ class Trial:
     program: Callable[[Navigator], Program] | None = None  # see `Pilot`; by default by `jax.jit`
 
 
-def run_trial(row: Row, trial: Trial) -> Result:
+def run_trial(row: FaultRow, trial: Trial) -> Result:
     """Drive with a row's fault, and judge the drive."""
     trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
     markers, route = written_down(trial, row.shift_m)
@@ -139,7 +139,7 @@ def run_trial(row: Row, trial: Trial) -> Result:
     )
     program = trial.program and trial.program(bare(navigator))
     pilot = Pilot(navigator, program=program, relocate=row.relocate)
-    world = World(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
+    world = SimWorld(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
     delays = None
     if Fault.CAMERA_LATE in row.faults:
         delays = CameraDelays(navigator.rig, markers, trial.vehicle)
@@ -179,7 +179,7 @@ def told_rig(rig: CameraRig, telling: str) -> CameraRig:
     return rig
 
 
-def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
+def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
     """Compare a drive with the requirements of its row."""
     times_s = np.array([(step.input.now_ns - BEGIN_NS) / 1e9 for step in steps])
     outcomes = [step.outcome for step in steps]

@@ -13,7 +13,7 @@ from jaxnav.parameters import with_parameters
 from jaxnav.tuning.branches import started
 from jaxnav.tuning.following import follow, trusting
 from jaxnav.tuning.objective import Batch
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 from jaxnav.tuning.unconstrained import Space
 
 LOSSES = {
@@ -28,7 +28,7 @@ class Item(NamedTuple):
     """One sequence, or many with leading axis (B,)."""
 
     start: Bank
-    recorded: Recorded
+    recorded: FrameSequences
 
 
 class FilterCost(eqx.Module):
@@ -56,7 +56,7 @@ class FilterCost(eqx.Module):
             return -followed.log_score
         return _CM2_PER_M2 * followed.square_m2
 
-    def batch(self, x: Float[Array, " n"], recorded: Recorded) -> Batch:
+    def batch(self, x: Float[Array, " n"], recorded: FrameSequences) -> Batch:
         """The batch of recordings, their branches chosen at these parameters and then fixed."""
         navigator = with_parameters(self.navigator, self.space.values(x))
         start = started(navigator, recorded)

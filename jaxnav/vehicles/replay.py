@@ -22,7 +22,7 @@ from jaxnav.detection.image_search import size_problem
 from jaxnav.errors import BadInput
 from jaxnav.files.images import decoded_image
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Camera, Frame, Odometry, OwnFiles, Setup, Vehicle
 from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_log import DriveLog, read_drive
@@ -163,7 +163,7 @@ class ReplayCamera:
         self,
         name: str,
         clock: Clock,
-        frames: Sequence[tuple[int, Sighted]],
+        frames: Sequence[tuple[int, FrameDetections]],
         jpegs: Mapping[int, bytes],
     ):
         """Args:
@@ -215,7 +215,9 @@ def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
         if name not in vehicle.camera_names:
             problem = f"{log.path} has no camera {name!r}: it has {', '.join(vehicle.camera_names)}"
             raise BadInput("--rig", problem)
-    frames: dict[str, list[tuple[int, Sighted]]] = {name: [] for name in vehicle.camera_names}
+    frames: dict[str, list[tuple[int, FrameDetections]]] = {
+        name: [] for name in vehicle.camera_names
+    }
     for given in log.inputs:
         for sighted in given.frames:
             frames[vehicle.camera_names[sighted.camera]].append((given.now_ns, sighted))

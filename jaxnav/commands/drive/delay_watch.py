@@ -10,7 +10,7 @@ import numpy as np
 from jaxnav.loop.camera_delays import CameraDelays, Delay
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Frames, Sighted
+from jaxnav.loop.frames import FrameDetections, FrameIntake
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import opposite, planar_in_world
@@ -49,7 +49,7 @@ class DelayWatch:
         if self._delays.due:
             self._wake.set()
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def seen(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
 
     def close(self) -> None:
@@ -112,7 +112,7 @@ def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
     """The delays of the cameras in a recorded drive."""
     delays = CameraDelays(setup.rig, setup.markers, setup.vehicle)
     corrections = Corrections.of(setup.vehicle)
-    frames = Frames(len(setup.rig), setup.markers, setup.corner_sigma_px)
+    frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     outcomes = log.outcomes
     poses = planar_in_world(outcomes.pose, opposite(setup.markers.origin_m))
     known = outcomes.decided & np.isfinite(poses).all(axis=1)

@@ -14,7 +14,7 @@ from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.status import notice, status_line
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.loop import Observer
 from jaxnav.loop.pilot import Input, Outcome
@@ -100,7 +100,7 @@ class DriveRecorder:
         message = outcome_message(outcome, digest(outcome))
         self._recorder.put(OUTCOME, given.now_ns, message)
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def seen(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
         if self._images and frame.image is not None:
             self._recorder.image(f"/camera/{name}", frame.stamp_ns, frame.image)
@@ -133,7 +133,7 @@ class LiveView:
         """See `Observer`."""
         self._view.show(outcome)
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def seen(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
         detections = sighted.detections
         corners_px = None if detections is None else detections.corners_px
@@ -184,7 +184,7 @@ class StatusLine:
         sys.stderr.flush()
         self._last_ns, self._count = given.now_ns, 0
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def seen(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
 
     def close(self) -> None:

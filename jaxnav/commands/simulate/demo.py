@@ -26,10 +26,10 @@ from jaxnav.files import (
 )
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.origin import planar_in_world, points_in_world, poses_in_world
-from jaxnav.plots.localisation import Track, camera_mosaic, drive_report
+from jaxnav.plots.localisation import Trajectory, camera_mosaic, drive_report
 from jaxnav.simulation.drive import (
+    DriveFrame,
     DriveSettings,
-    Frame,
     Methods,
     drive,
     waypoints_passed,
@@ -75,7 +75,7 @@ def run(args: Demo) -> int:
 class Record:
     """A finished drive: its N frames, and the images that were kept."""
 
-    frames: list[Frame]
+    frames: list[DriveFrame]
     kept: dict[int, list[np.ndarray]]  # frame number -> images
 
     @property
@@ -98,7 +98,7 @@ def _drive(args: Demo, world: RenderedWorld, methods: Methods, seed: int) -> Rec
         floor_m=world.floor_m(),
     )
     cameras = RenderedCameras(world, rng, args.corner_noise_px)
-    frames: list[Frame] = []
+    frames: list[DriveFrame] = []
     kept: dict[int, list[np.ndarray]] = {}
     with tqdm(
         total=round(args.duration_s, 1),
@@ -184,8 +184,8 @@ def _write(folder: Path, world: RenderedWorld, record: Record, summary: dict[str
     poses = {name: planar_in_world(rows, origin_m) for name, rows in poses.items()}
     report = drive_report(
         times_s,
-        Track("truth", poses["truth"]),
-        [Track(LABELS[name], poses[name]) for name in (OURS, METHOD_A)],
+        Trajectory("truth", poses["truth"]),
+        [Trajectory(LABELS[name], poses[name]) for name in (OURS, METHOD_A)],
         np.asarray(points_in_world(world.route.waypoints_m, origin_m)),
         world.route.waypoint_radius_m,
         corners_in_world(world.markers),

@@ -30,7 +30,7 @@ from jaxnav.simulation.world import Spread
 from jaxnav.tuning.descent import Noisy
 from jaxnav.tuning.drive_loss import DriveLoss
 from jaxnav.tuning.driving import ClosedLoop
-from jaxnav.tuning.fit import Fit, Problem
+from jaxnav.tuning.fit import Problem, TuningFit
 from jaxnav.tuning.objective import Batch, NotFinite
 from jaxnav.tuning.unconstrained import Space
 
@@ -147,7 +147,7 @@ class Gains:
             same_batch=False,
         )
 
-    def tested(self, fit: Fit) -> dict[str, tuple[ControllerTest, ControllerTest]]:
+    def tested(self, fit: TuningFit) -> dict[str, tuple[ControllerTest, ControllerTest]]:
         """Test results before and after the fit, by scenario."""
         count = self._args.test_seeds
         with tqdm(

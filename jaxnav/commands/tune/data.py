@@ -24,7 +24,7 @@ from jaxnav.navigator import Navigator
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
-from jaxnav.tuning.recorded import Recorded, simulated
+from jaxnav.tuning.recorded import FrameSequences, simulated
 
 AT_A_TIME = 64  # sequences in a batch, where nothing is to be differentiated
 _TEST_SEED = 10**6
@@ -41,7 +41,7 @@ class TuningTest:
     name: str
     navigator: Navigator
     size: int  # how many there are
-    recorded: Callable[[Progress], Recorded]
+    recorded: Callable[[Progress], FrameSequences]
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class TuningData:
     """A navigator before tuning, and the sequences to learn from, to stop by and to test on."""
 
     navigator: Navigator
-    learned: Recorded
-    held_out: Recorded
+    learned: FrameSequences
+    held_out: FrameSequences
     tests: tuple[TuningTest, ...]
 
 
@@ -70,7 +70,7 @@ def _simulated(args: Arguments) -> TuningData:
     noise_px = jnp.asarray(args.corner_noise_px)
     rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px)
 
-    def drive(first: int, count: int, progress: Progress) -> Recorded:
+    def drive(first: int, count: int, progress: Progress) -> FrameSequences:
         """Simulate drives in batches of one size; the last batch repeats its last drive."""
         size, parts = min(count, AT_A_TIME), []
         for begin in range(0, count, size):
@@ -78,7 +78,7 @@ def _simulated(args: Arguments) -> TuningData:
             part = simulated(rollout, jax.vmap(jax.random.key)(jnp.asarray(seeds)))
             parts.append(part.rows(slice(0, min(size, count - begin))))
             progress(len(parts[-1]))
-        return Recorded.together(parts)
+        return FrameSequences.together(parts)
 
     count = args.seeds + args.held_out_seeds
     with tqdm(total=count, unit="drive", desc="drive", disable=args.headless, leave=False) as bar:
@@ -135,7 +135,7 @@ def _judging(
     return found
 
 
-def _known(recorded: Recorded) -> Callable[[Progress], Recorded]:
+def _known(recorded: FrameSequences) -> Callable[[Progress], FrameSequences]:
     return lambda progress: recorded
 
 

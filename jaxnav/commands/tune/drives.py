@@ -17,15 +17,15 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.commands.tune.sequences import IDENTITY, bounds, cut, maps, side_by_side
 from jaxnav.errors import BadInput
 from jaxnav.loop.flags import Reject
-from jaxnav.loop.frames import Frames
-from jaxnav.loop.history import Told
+from jaxnav.loop.frames import FrameIntake
+from jaxnav.loop.history import EventData
 from jaxnav.loop.pilot import Input
 from jaxnav.loop.stamps import Stamps
 from jaxnav.pose.observation import Observation
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_replay import check_inputs
 from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 
 _NS_PER_US = 1000
 
@@ -34,12 +34,12 @@ class Event(NamedTuple):
     """A reading of the odometry or a sighting of markers, with its stamp."""
 
     stamp_ns: int
-    told: Told  # odometry, or corners of some cameras
+    told: EventData  # odometry, or corners of some cameras
 
 
 def drives(
     log: DriveLog, setup: DriveSetup, part: tuple[float, float], length: int = 400
-) -> Recorded:
+) -> FrameSequences:
     """Sequences of a drive. The car's true pose is unknown, so that no frame is judged.
 
     Odometry that the pilot refused on the way is left out.
@@ -68,7 +68,7 @@ def driven(
     part: tuple[float, float],
     length: int = 400,
     refused_ns: Collection[int] = (),
-) -> Recorded:
+) -> FrameSequences:
     """`drives` for inputs of a pilot, which may come from a ROS bag.
 
     Args:
@@ -94,7 +94,7 @@ def driven(
         jnp.asarray(rows.has_odometry[indices] & used),
         jnp.asarray(dt_s, float),
     )
-    return Recorded(
+    return FrameSequences(
         markers=maps(setup.markers, lanes),
         obs=obs,
         used=jnp.asarray(used),
@@ -124,7 +124,7 @@ def _told(
     inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int]
 ) -> Iterator[Event]:
     """Events of the inputs that `Pilot.handle` would believe, without an estimate."""
-    frames = Frames(len(setup.rig), setup.markers, setup.corner_sigma_px)
+    frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     stamps = Stamps()
     for given in inputs:
         told, told_ns, _ = frames.told(given.frames, given.now_ns)
@@ -137,7 +137,7 @@ def _told(
         odometry = (reading.speed_mps, reading.steering_rad)
         believed = reading.valid and all(map(math.isfinite, odometry))
         if stamp_ns is not None and believed and given.now_ns not in refused_ns:
-            yield Event(stamp_ns, Told(odometry=odometry))
+            yield Event(stamp_ns, EventData(odometry=odometry))
 
 
 def _order(event: Event) -> tuple[int, bool]:
@@ -157,7 +157,7 @@ def _both(one: Event, other: Event) -> Event | None:
     assert a.sigma_px is not None
     assert b.sigma_px is not None
     there = np.any(b.visible, axis=1)[:, None]
-    told = Told(
+    told = EventData(
         corners_px=np.where(there[..., None, None], b.corners_px, a.corners_px),
         visible=a.visible | b.visible,
         sigma_px=np.where(there[..., None], b.sigma_px, a.sigma_px),

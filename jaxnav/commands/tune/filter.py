@@ -25,9 +25,9 @@ from jaxnav.simulation.statistics import anees_band, resampled
 from jaxnav.tuning.branches import estimated
 from jaxnav.tuning.descent import Smooth
 from jaxnav.tuning.filter import FilterCost
-from jaxnav.tuning.fit import Fit, Problem
+from jaxnav.tuning.fit import Problem, TuningFit
 from jaxnav.tuning.objective import Batch, Objective, where_not_finite
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 from jaxnav.tuning.unconstrained import Space
 
 _STAGES = 4
@@ -66,7 +66,7 @@ def run(args: Arguments) -> int:
     return 0
 
 
-def space_of(args: Arguments, navigator: Navigator, learned: Recorded) -> Space:
+def space_of(args: Arguments, navigator: Navigator, learned: FrameSequences) -> Space:
     """The space of the parameters to be learned, starting at a navigator's values.
 
     Raises:
@@ -85,7 +85,7 @@ def space_of(args: Arguments, navigator: Navigator, learned: Recorded) -> Space:
         raise BadInput("--full", str(error)) from None
 
 
-def _by_default(navigator: Navigator, learned: Recorded) -> tuple[str, ...]:
+def _by_default(navigator: Navigator, learned: FrameSequences) -> tuple[str, ...]:
     """The default names: Q and all of R that the estimator uses for a car; Q alone for a free body,
     whose recordings tell by themselves how far its corners scatter."""
     names = ("motion.acceleration_density",)
@@ -129,7 +129,7 @@ class FilterTest:
 
 
 def _tested(
-    args: Arguments, data: TuningData, params: Params | None, space: Space, fit: Fit
+    args: Arguments, data: TuningData, params: Params | None, space: Space, fit: TuningFit
 ) -> dict[str, tuple[FilterTest, FilterTest]]:
     """Results before and after the fit, by the name of the test."""
     found = {}
@@ -147,7 +147,9 @@ def _tested(
     return found
 
 
-def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object]) -> FilterTest:
+def _test(
+    navigator: Navigator, test: FrameSequences, progress: Callable[[int], object]
+) -> FilterTest:
     size, parts = min(len(test), AT_A_TIME), []
     for begin in range(0, len(test), size):
         rows = np.minimum(np.arange(begin, begin + size), len(test) - 1)

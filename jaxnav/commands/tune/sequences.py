@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Navigator
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # wxyz xyz
 
@@ -22,7 +22,7 @@ class NamedSequences(NamedTuple):
 
     name: str  # of the file, for messages
     navigator: Navigator  # that goes with the sequences
-    recorded: Recorded
+    recorded: FrameSequences
 
 
 def bounds(count: int, part: tuple[float, float]) -> tuple[int, int]:
@@ -69,7 +69,7 @@ def maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
     return found
 
 
-def joined(recordings: Sequence[NamedSequences]) -> Recorded:
+def joined(recordings: Sequence[NamedSequences]) -> FrameSequences:
     """The sequences of all recordings, padded to the longest.
 
     Raises:
@@ -79,7 +79,7 @@ def joined(recordings: Sequence[NamedSequences]) -> Recorded:
     for other in recordings[1:]:
         if problem := _apart(first, other):
             raise BadInput(f"{first.name}, {other.name}", problem)
-    return Recorded.together([named.recorded for named in recordings])
+    return FrameSequences.together([named.recorded for named in recordings])
 
 
 def _apart(one: NamedSequences, other: NamedSequences) -> str | None:

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 
-class Kept:
+class DriveTraces:
     """The records of every drive, collected chunk by chunk as they arrive."""
 
     def __init__(self, count: int, chunk_frames: int):
