@@ -162,7 +162,7 @@ class Navigator(eqx.Module):
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
         """The belief `obs.dt_s` later (Eq. 9), with the odometry fused where there is any."""
-        return belief.predicted(self._sound(self.motion.predict(belief.bank, obs)))
+        return belief.with_prediction(self._sound(self.motion.predict(belief.bank, obs)))
 
     def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""

@@ -300,9 +300,9 @@ def test_where_a_gradient_is_not_finite_is_found():
 
 
 def test_what_is_told_of_it():
-    told = NotFinite(1, 2, 7).told(["selector.floor_m", "corner_sigma_px"], 5)
+    told = NotFinite(1, 2, 7).describe(["selector.floor_m", "corner_sigma_px"], 5)
     assert told == (
         "step 5: the gradient with respect to corner_sigma_px is not finite in drive 2 from frame "
         "7 on; not stepped on"
     )
-    assert "drive 2; not" in NotFinite(0, 2, None).told(["selector.floor_m"], 5)
+    assert "drive 2; not" in NotFinite(0, 2, None).describe(["selector.floor_m"], 5)

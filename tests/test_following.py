@@ -138,7 +138,7 @@ LONG = 1000
 @functools.cache
 def long_gradient():
     """Of a thousand frames, in float32."""
-    start, drive = first_of((starts().bank, recorded().padded(LONG)))
+    start, drive = first_of((starts().bank, recorded().pad_to(LONG)))
     with jax.enable_x64(False):
         start, drive, navigator, space = in_float32((start, drive, NAVIGATOR, SPACE))
 
@@ -194,7 +194,7 @@ def test_shorter_recordings_are_filled_with_frames_that_are_not_used():
             (drives.obs, drives.used, drives.T_world_vehicle_true, drives.judged),
         ),
     ).rows(slice(0, 2))
-    both = FrameSequences.together([drives, short])
+    both = FrameSequences.concatenate([drives, short])
     assert both.used.shape == (5, FRAMES)
     np.testing.assert_array_equal(both.used.sum(axis=1), [12, 12, 12, 5, 5])
     np.testing.assert_array_equal(both.judged.sum(axis=1), [9, 9, 9, 2, 2])
@@ -335,7 +335,7 @@ def test_gradients_are_finite(kind):
     program, (step, start, drive) = long_gradient()
     if kind != "padded":
         pose = (0.9, -0.6, 2.2) if kind == "oblique" else (0.0, -0.4, np.pi / 2)
-        start, drive = first_of((starts().bank, recorded().padded(LONG)))
+        start, drive = first_of((starts().bank, recorded().pad_to(LONG)))
         drive = standing(drive, pose, visible=kind != "nothing seen")
         start = eqx.tree_at(lambda b: b.mean, start, start.mean.at[0, :3].set(jnp.asarray(pose)))
         used = jnp.ones_like(drive.used)

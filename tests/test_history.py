@@ -31,10 +31,10 @@ def fuse(history: History, stamp_ns: int, number: int, made=told) -> tuple | Non
     stamps_ns = [entry.stamp_ns for entry in entries]
     assert [base.stamp_ns, *stamps_ns] == sorted([base.stamp_ns, *stamps_ns])
     assert len(entries) <= KEPT + 1
-    numbers = [number_of(entry.told) for entry in entries]
+    numbers = [number_of(entry.data) for entry in entries]
     new = numbers.index(number)
     moment = (*base.belief, *numbers)
-    history.fused(moment, entries[new], (*base.belief, *numbers[: new + 1]))
+    history.store(moment, entries[new], (*base.belief, *numbers[: new + 1]))
     return moment
 
 
@@ -59,8 +59,8 @@ def test_events_in_order_are_fused_once():
         placed = history.place(BEGIN_NS + 10 * MS * number, told(number))
         assert placed is not None
         base, entries = placed
-        assert [number_of(entry.told) for entry in entries] == [number]
-        history.fused((*base.belief, number), entries[0], (*base.belief, number))
+        assert [number_of(entry.data) for entry in entries] == [number]
+        history.store((*base.belief, number), entries[0], (*base.belief, number))
         assert history.newest_ns == BEGIN_NS + 10 * MS * number
 
 
@@ -72,7 +72,7 @@ def test_a_late_event_undoes_those_after_it_alone():
     assert placed is not None
     base, entries = placed
     assert base.stamp_ns == BEGIN_NS + 60 * MS
-    assert [number_of(entry.told) for entry in entries] == [99, 7, 8, 9]
+    assert [number_of(entry.data) for entry in entries] == [99, 7, 8, 9]
 
 
 def test_cameras_that_are_always_late_cost_little():
@@ -85,8 +85,8 @@ def test_cameras_that_are_always_late_cost_little():
         assert placed is not None
         _, entries = placed
         longest = max(longest, len(entries))
-        new = [number_of(entry.told) for entry in entries].index(number)
-        history.fused((), entries[new], ())
+        new = [number_of(entry.data) for entry in entries].index(number)
+        history.store((), entries[new], ())
     assert longest <= 10
 
 
@@ -125,8 +125,8 @@ def test_all_that_stamps_let_in_has_its_place_whatever_the_rates(rate_hz, late_m
         placed = history.place(int(stamp_ms * MS), of)
         assert placed is not None
         _, entries = placed
-        new = next(entry for entry in entries if entry.told is of)
-        history.fused((), new, ())
+        new = next(entry for entry in entries if entry.data is of)
+        history.store((), new, ())
         most = max(most, len(entries))
     # Of the odometer no more than one each THIN_NS, and two beside each frame.
     fastest_hz = min(rate_hz, 1e9 / THIN_NS)
@@ -151,6 +151,6 @@ def test_there_is_an_end_to_what_is_kept():
     history = History((), BEGIN_NS)
     for number in range(2 * KEPT):
         placed = history.place(BEGIN_NS + number, EventData(corners_px=np.zeros(1)))
-        history.fused((), placed[1][0], ())
+        history.store((), placed[1][0], ())
     assert history.place(BEGIN_NS + KEPT - 2, told(0)) is None
     assert history.place(BEGIN_NS + KEPT + 2, told(0)) is not None

@@ -230,7 +230,7 @@ class Drive:
         self.now_ns += PERIOD_NS
         frame = FrameDetections(0, self.now_ns, sighted.detections, sighted.faults)
         outcome = self.pilot.handle(Input(self.now_ns, frames=(frame,)))
-        return outcome.faults & OF_FRAMES, outcome.told is not None
+        return outcome.faults & OF_FRAMES, outcome.data is not None
 
 
 @pytest.fixture

@@ -52,10 +52,10 @@ def setup() -> DriveSetup:
 
 def look_on(onlooker, count: int = 6) -> None:
     for index in range(count):
-        onlooker.handled(make_input(index), make_outcome(index))
+        onlooker.on_outcome(make_input(index), make_outcome(index))
     image = make_picture(0)
-    onlooker.seen("front", Frame(5, image), FrameDetections(0, 5, FOUND))
-    onlooker.seen("rear", Frame(6, None), FrameDetections(2, 6, None, Fault.FRAME_UNUSABLE))
+    onlooker.on_frame("front", Frame(5, image), FrameDetections(0, 5, FOUND))
+    onlooker.on_frame("rear", Frame(6, None), FrameDetections(2, 6, None, Fault.FRAME_UNUSABLE))
 
 
 def test_the_view_is_told_every_outcome_and_frame():
@@ -73,13 +73,13 @@ def test_the_view_is_told_every_outcome_and_frame():
 def test_a_view_that_is_gone_is_no_fault_and_is_told_in_the_end():
     fake = FakeView()
     view = LiveView(fake)
-    assert view.told is None
+    assert view.closing_note is None
     fake.dropped = 3
-    assert view.told == "view: 3 outcomes and images left out"
+    assert view.closing_note == "view: 3 outcomes and images left out"
     fake.failed = "the viewer was closed"
     look_on(view)
     assert view.faults == Fault(0)
-    assert view.told == "view: the viewer was closed"
+    assert view.closing_note == "view: the viewer was closed"
 
 
 def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monkeypatch):
@@ -93,7 +93,7 @@ def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monk
         assert (rig, markers, fake.how) == (setup.rig, setup.markers, {"live": True, "save": None})
         np.testing.assert_array_equal(waypoints_m, setup.route.waypoints_m)
         assert fake.closed == 0
-        found[0].handled(make_input(0), make_outcome(0))
+        found[0].on_outcome(make_input(0), make_outcome(0))
     assert fake.closed == 1
     assert not read_drive(path).truncated
     with ExitStack() as closing:
@@ -133,7 +133,7 @@ def test_a_recording_holds_what_was_handled_and_the_images_if_asked_to(setup, tm
     assert len(log.outcomes.now_ns) == 6
     assert [image.stamp_ns for image in log.images()] == ([5] if images else [])
     count = 12 + images
-    assert recording.told == f"recorded {count} messages in {tmp_path / 'drive.mcap'}"
+    assert recording.closing_note == f"recorded {count} messages in {tmp_path / 'drive.mcap'}"
     assert recording.faults == Fault(0)
 
 
@@ -143,7 +143,7 @@ def test_a_recording_that_can_not_keep_up_or_go_on_is_a_fault(setup, tmp_path):
     look_on(recording, 1)
     assert recording.faults == Fault.RECORDER_BEHIND
     assert recording.faults == Fault(0)  # told once for each loss
-    assert recording.told.endswith(", 2 left out")
+    assert recording.closing_note.endswith(", 2 left out")
     with pytest.raises(BadInput, match="can't be written: no such file or directory"):
         DriveRecorder(tmp_path / "nowhere" / "drive.mcap", setup, images=False)
     with pytest.raises(BadInput, match="can't be written: no space left on device"):

@@ -31,7 +31,7 @@ def test_a_tree_is_found_again_bit_for_bit(tree):
     packed = layout.pack(tree)
     assert packed.floats.dtype == np.float32
     assert packed.integers.dtype == np.int32
-    for found in (packed.unpacked(), packed.fetched().unpacked()):
+    for found in (packed.unpack(), packed.fetch().unpack()):
         assert jax.tree.structure(found) == jax.tree.structure(tree)
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
             assert (one.shape, one.dtype) == (other.shape, other.dtype)
@@ -44,7 +44,7 @@ def test_what_is_written_to_the_room_is_in_the_vectors(tree):
     packed, views = PackedLayout.of(tree).room()
     for view, leaf in zip(jax.tree.leaves(views), jax.tree.leaves(tree), strict=True):
         view[...] = leaf
-    found = packed.unpacked()
+    found = packed.unpack()
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
         assert one.dtype == other.dtype
         np.testing.assert_array_equal(one, other)
@@ -58,7 +58,7 @@ def test_a_compiled_call_takes_and_returns_them(dtype):
     @jax.jit
     def moved(packed: Packed) -> Packed:
         traces.append(packed)
-        T, count = packed.unpacked()
+        T, count = packed.unpack()
         tree = jaxlie.SE3(T.wxyz_xyz.at[4].add(1)), count + 1
         return PackedLayout.of(tree).pack(tree)
 
@@ -66,7 +66,7 @@ def test_a_compiled_call_takes_and_returns_them(dtype):
     packed = PackedLayout.of(jax.eval_shape(lambda: tree)).pack(tree)
     for _ in range(3):
         packed = moved(packed)
-    T, count = packed.fetched().unpacked()
+    T, count = packed.fetch().unpack()
     assert T.wxyz_xyz.dtype == dtype
     np.testing.assert_array_equal(T.translation(), [3, 2, 3])
     np.testing.assert_array_equal(count, [[3], [3]])

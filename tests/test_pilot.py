@@ -185,7 +185,7 @@ def test_stamps_that_come_twice_are_refused(setup, inputs):
         again = dataclasses.replace(given, now_ns=inputs[-1].now_ns)
         outcome = pilot.handle(again)
         assert Fault.STAMP_INVALID in outcome.faults
-        assert outcome.told is None
+        assert outcome.data is None
 
 
 @pytest.mark.parametrize("stamp_ns", [0, -1, -(2**80), 2**80])
@@ -195,7 +195,7 @@ def test_stamps_that_no_clock_has_are_refused(setup, inputs, stamp_ns):
         off = _changed(given, lambda part: dataclasses.replace(part, stamp_ns=stamp_ns))
         outcome = pilot.handle(off)
         assert Fault.STAMP_INVALID in outcome.faults
-        assert outcome.told is None
+        assert outcome.data is None
 
 
 def _frame_with(**changes):
@@ -317,7 +317,7 @@ def test_numbers_beyond_float32_are_left_out_by_the_filter():
     given = []
 
     def program(belief, control, events, numbers):
-        given.append(events.unpacked())
+        given.append(events.unpack())
         return belief, belief, control, belief
 
     with jax.enable_x64(False):

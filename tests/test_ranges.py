@@ -208,6 +208,6 @@ def test_a_corner_that_is_nowhere_is_as_good_as_infinite():
         refined=found.refined,
         families=markers.families[:1],
     )
-    told, _, faults = FrameIntake(1, markers).told([FrameDetections(0, 10**9, seen)], 10**9)
+    told, _, faults = FrameIntake(1, markers).check([FrameDetections(0, 10**9, seen)], 10**9)
     assert told is None
     assert Fault.CORNERS_NOT_FINITE in faults

@@ -223,16 +223,16 @@ def drive(setup, tmp_path_factory) -> tuple[DriveLog, list[Outcome]]:
 
 def test_events_of_a_drive_are_what_the_pilot_fused(setup, drive):
     log, outcomes = drive
-    fused = [Event(o.stamp_ns, o.told) for o in outcomes if o.told is not None]
+    fused = [Event(o.stamp_ns, o.data) for o in outcomes if o.data is not None]
     assert any(b.stamp_ns < a.stamp_ns for a, b in itertools.pairwise(fused))
-    fused.sort(key=lambda event: (event.stamp_ns, event.told.odometry is not None))
+    fused.sort(key=lambda event: (event.stamp_ns, event.data.odometry is not None))
     events = sensed(log.inputs, setup)
     assert len(events) == len(fused) > 70
     for event, expected in zip(events, fused, strict=True):
         assert event.stamp_ns == expected.stamp_ns
-        assert event.told.odometry == expected.told.odometry
+        assert event.data.odometry == expected.data.odometry
         for name in ("corners_px", "visible", "sigma_px"):
-            now, then = getattr(event.told, name), getattr(expected.told, name)
+            now, then = getattr(event.data, name), getattr(expected.data, name)
             assert (now is None) == (then is None)
             np.testing.assert_array_equal(now, then)
 
@@ -294,9 +294,9 @@ def test_what_cameras_see_at_one_instant_is_one_event(setup, drive):
     shown = [FrameDetections(camera, frame.stamp_ns, frame.detections) for camera in cameras]
     apart = [Input(seen.now_ns + k, frames=(one,)) for k, one in enumerate(shown)]
     (event,) = sensed(apart, setup)
-    assert event.told.visible.sum() == 2
+    assert event.data.visible.sum() == 2
     np.testing.assert_array_equal(
-        event.told.corners_px[cameras[0]], event.told.corners_px[cameras[1]]
+        event.data.corners_px[cameras[0]], event.data.corners_px[cameras[1]]
     )
 
 

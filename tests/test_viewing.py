@@ -110,7 +110,7 @@ def test_live_outcomes_come_ten_in_a_second_and_changes_of_health_at_once(tmp_pa
     for index in range(100):  # of 10 ms each
         outcome = dataclasses.replace(
             make_outcome(index),
-            told=seen if index % 2 else None,
+            data=seen if index % 2 else None,
             health=Health.STOP if index == 55 else Health.OK,
         )
         view.show(outcome)

@@ -27,7 +27,7 @@ class Belief(eqx.Module):
         nothing = jnp.zeros((), bank.mean.dtype)
         return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32))
 
-    def predicted(self, bank: Bank) -> "Belief":
+    def with_prediction(self, bank: Bank) -> "Belief":
         """The belief with its bank predicted; a restart is counted where no hypothesis is left."""
         given_up = jnp.any(self.bank.initialised) & ~jnp.any(bank.initialised)
         return replace(self, bank=bank, restarts=self.restarts + given_up)

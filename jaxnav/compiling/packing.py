@@ -1,7 +1,7 @@
 """Pack trees of arrays into two vectors, since each array passed to a compiled call costs some us.
 
-packed = Layout.of(tree).pack(tree)
-tree = packed.unpacked()
+packed = PackedLayout.of(tree).pack(tree)
+tree = packed.unpack()
 """
 
 import math
@@ -130,10 +130,10 @@ class Packed:
     integers: Any  # (m,) int32
     layout: PackedLayout
 
-    def unpacked(self) -> Any:
+    def unpack(self) -> Any:
         """The tree of these numbers."""
         return self.layout.unpack(self.floats, self.integers)
 
-    def fetched(self) -> "Packed":
+    def fetch(self) -> "Packed":
         """The same numbers in NumPy arrays."""
         return Packed(np.asarray(self.floats), np.asarray(self.integers), self.layout)

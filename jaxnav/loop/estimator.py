@@ -37,7 +37,7 @@ def advance_packed(
     Args:
         numbers: count, new, now_us, elapsed_us.
     """
-    given = (part.unpacked() for part in (belief, control, events))
+    given = (part.unpack() for part in (belief, control, events))
     returned = advance(navigator, *given, *numbers)
     belief, then, control, output = (PackedLayout.of(part).pack(part) for part in returned)
     return belief, then, control, output
@@ -113,15 +113,15 @@ class Estimator:
         if placed is None:
             base_ns = self._belief_ns if self._history is not None else now_ns
             belief, _, output = self._call(self._belief, [], base_ns, 0, now_ns, elapsed_ns)
-            believed = belief.fetched().unpacked()
-            return FusionResult(output.fetched().unpacked(), believed, told is not None, 0)
+            believed = belief.fetch().unpack()
+            return FusionResult(output.fetch().unpack(), believed, told is not None, 0)
         base, entries = placed
         assert self._history is not None
-        new = next(index for index, entry in enumerate(entries) if entry.told is told)
+        new = next(index for index, entry in enumerate(entries) if entry.data is told)
         belief, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
         self._belief, self._belief_ns = belief, entries[-1].stamp_ns
-        self._history.fused(belief, entries[new], then)
-        return FusionResult(known, belief.fetched().unpacked(), False, len(entries))
+        self._history.store(belief, entries[new], then)
+        return FusionResult(known, belief.fetch().unpack(), False, len(entries))
 
     def _fused(
         self,
@@ -134,11 +134,11 @@ class Estimator:
         """The belief after all entries, the belief after the new one, and the output. Takes one
         call nearly always, several where a frame is late and the cameras are many."""
         assert base.belief is not None
-        rows = [(entry.stamp_ns, entry.told or _NOTHING) for entry in entries]
+        rows = [(entry.stamp_ns, entry.data or _NOTHING) for entry in entries]
         belief, base_ns = base.belief, base.stamp_ns
         if len(rows) <= EVENTS:
             belief, then, output = self._call(belief, rows, base_ns, new, now_ns, elapsed_ns)
-            return belief, then, output.fetched().unpacked()
+            return belief, then, output.fetch().unpack()
         # One less: the free place is the value of `new` where the new event is in another part.
         size, control = EVENTS - 1, self._control
         for first in range(0, len(rows), size):
@@ -152,7 +152,7 @@ class Estimator:
         return (
             belief,
             then,
-            _with_evidence(output.fetched().unpacked(), of_new.fetched().unpacked()),
+            _with_evidence(output.fetch().unpack(), of_new.fetch().unpack()),
         )
 
     def _call(

@@ -19,7 +19,7 @@ _MOST_PX = RANGES["corner_px"].most  # beyond, a corner is as good as infinite
 _NONE = Detections.concatenate([])
 
 # Whether a camera shows an old picture. Arguments: camera, stamp_ns, now_ns, corners_px
-# (M, 4, 2), visible (M,), their sigma_px; see `Standstill.frozen`.
+# (M, 4, 2), visible (M,), their sigma_px; see `Standstill.is_frozen`.
 Frozen = Callable[[int, int, int, np.ndarray, np.ndarray, float], bool]
 
 
@@ -57,11 +57,11 @@ class FrameIntake:
         self._stamps = [Stamps() for _ in range(cameras)]
         self._corners: list[tuple[bytes, int]] = [(b"", 0)] * cameras  # last, and its repetitions
 
-    def refused(self) -> None:
+    def forget_last(self) -> None:
         """Treat the last frames, which came too late for the filter, as if they had not come."""
         self.newest_ns = list(self._newest_before_ns)
 
-    def told(
+    def check(
         self, frames: Sequence[FrameDetections], now_ns: int, frozen: Frozen | None = None
     ) -> tuple[EventData | None, int, Fault]:
         """The data of frames, their stamp, and the faults found in them.

@@ -35,7 +35,7 @@ class HistoryEntry:
     """One event and the belief after it, None where a late event has invalidated it."""
 
     stamp_ns: int
-    told: EventData | None  # None: the beginning
+    data: EventData | None  # None: the beginning
     belief: Packed | None
 
 
@@ -47,7 +47,7 @@ class History:
         self._entries = [HistoryEntry(begin_ns, None, belief)]
 
     def place(
-        self, stamp_ns: int, told: EventData
+        self, stamp_ns: int, data: EventData
     ) -> tuple[HistoryEntry, list[HistoryEntry]] | None:
         """Insert an event.
 
@@ -64,12 +64,12 @@ class History:
             base -= 1
         if base < 0:
             return None
-        entries.insert(index, HistoryEntry(stamp_ns, told, None))
+        entries.insert(index, HistoryEntry(stamp_ns, data, None))
         for entry in entries[index:]:
             entry.belief = None
         return entries[base], entries[base + 1 :]
 
-    def fused(self, belief: Packed, new: HistoryEntry, then: Packed) -> None:
+    def store(self, belief: Packed, new: HistoryEntry, then: Packed) -> None:
         """Keep the new beliefs, and drop events that are no longer needed.
 
         Args:
@@ -85,7 +85,7 @@ class History:
     def _thin(self) -> None:
         """Drop the reading before the newest if it follows its predecessor too soon."""
         last = self._entries[-3:]
-        if len(last) == 3 and all(entry.told and entry.told.corners_px is None for entry in last):
+        if len(last) == 3 and all(entry.data and entry.data.corners_px is None for entry in last):
             before, middle, _ = last
             if middle.stamp_ns - before.stamp_ns < THIN_NS:
                 del self._entries[-2]

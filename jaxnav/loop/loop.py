@@ -33,11 +33,11 @@ _MIN_COVARIANCE = np.diag([0.01**2, 0.01**2, np.deg2rad(0.5) ** 2])
 class Observer(Protocol):
     """An observer of the loop: a recorder, a view, a status line. It neither waits nor raises."""
 
-    def handled(self, given: Input, outcome: Outcome) -> None:
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """Take an input that the pilot has handled, and its outcome."""
         ...
 
-    def seen(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """Take a camera's frame after the search for markers, and the markers found."""
         ...
 
@@ -170,7 +170,7 @@ class Loop:
         seen = self._eyes.take()
         for one in seen:
             for observer in self._observers:
-                observer.seen(one.camera_name, one.frame, one.sighted)
+                observer.on_frame(one.camera_name, one.frame, one.sighted)
         shows, blank = groups(seen)
         self._blank += blank
         return shows
@@ -199,7 +199,7 @@ class Loop:
             else None
         )
         for observer in self._observers:
-            observer.handled(given, outcome)
+            observer.on_outcome(given, outcome)
 
     def _failures(self) -> Fault:
         faults = Fault(0)

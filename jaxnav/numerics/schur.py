@@ -45,7 +45,7 @@ class ReducedSystem(eqx.Module):
     carried: Float[Array, "F n R"]  # factor^-1 cross
     own: Float[Array, "F n"]  # factor^-1 own_gradient
 
-    def back(self, shared: Float[Array, " R"]) -> Float[Array, "F n"]:
+    def back_substitute(self, shared: Float[Array, " R"]) -> Float[Array, "F n"]:
         """The move (F, n) of the blocks that belongs to a move (R,) of the shared unknowns."""
         return jax.vmap(solve_upper)(self.factor, -self.own - self.carried @ shared)
 
@@ -148,7 +148,7 @@ class SchurLM(optx.AbstractLeastSquaresSolver):
         factor = jax.scipy.linalg.cho_factor(reduced.system, lower=True)
         shared = -jax.scipy.linalg.cho_solve(factor, reduced.gradient)
         shared = jnp.where(self.free, shared, 0)
-        own = reduced.back(shared)
+        own = reduced.back_substitute(shared)
         sound = jnp.all(jnp.isfinite(shared)) & jnp.all(jnp.isfinite(own))
         shared, own = jnp.where(sound, shared, 0), jnp.where(sound, own, 0)
         raised = damping * jnp.diagonal(blocks.own, axis1=1, axis2=2) * own**2

@@ -50,7 +50,7 @@ class Inliers(NamedTuple):
     candidates: Candidates
     outvoted: Bool[Array, " M"]
 
-    def of(self, snapshot: Snapshot) -> ConsistentSnapshot:
+    def apply_to(self, snapshot: Snapshot) -> ConsistentSnapshot:
         """`ConsistentSnapshot` for the snapshot in which this was found."""
         return ConsistentSnapshot(_among(snapshot, self.visible), self.candidates, self.outvoted)
 
@@ -73,7 +73,7 @@ def consistent(snapshot: Snapshot, find: Find, none: Candidates) -> ConsistentSn
 
     any_seen = jnp.any(snapshot.seen.visible)
     kept: Inliers = jax.lax.cond(any_seen, lambda: among_all(snapshot, find), nothing)
-    return kept.of(snapshot)
+    return kept.apply_to(snapshot)
 
 
 def among_all(snapshot: Snapshot, find: Find) -> Inliers:

@@ -64,7 +64,7 @@ def run_lanes(
             chunk, ended = jax.device_get((chunk, worlds.ended))
             over = ended & (owner >= 0)
             with lock:
-                kept.take(owner, chunk)
+                kept.add(owner, chunk)
                 progress(int(over.sum()))
 
     threads = max(1, min(threads, -(-len(keys) // lanes)))

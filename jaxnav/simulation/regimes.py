@@ -35,7 +35,7 @@ class _ByRegime(Navigator):
         snapshot = self.snapshot(obs)
         slots = snapshot.seen.visible.shape[0]
         if slots == 1:
-            return among_all(snapshot, self.find_candidates).of(snapshot)
+            return among_all(snapshot, self.find_candidates).apply_to(snapshot)
 
         def one() -> Inliers:
             kept = among_all(snapshot.largest(1), self.find_candidates)
@@ -47,7 +47,7 @@ class _ByRegime(Navigator):
         kept: Inliers = jax.lax.cond(
             any_further, lambda: among_all(snapshot, self.find_candidates), one
         )
-        return kept.of(snapshot)
+        return kept.apply_to(snapshot)
 
     def fuse(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Estimate]:
         bank, count = belief.bank, belief.bank.initialised.shape[0]

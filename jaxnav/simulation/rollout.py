@@ -113,7 +113,7 @@ class Rollout(eqx.Module):
             DriveTraces(len(keys), self.chunk_frames),
             progress,
         )
-        (trace, further), own = kept.side_by_side()
+        (trace, further), own = kept.stack()
         return eqx.tree_at(lambda t: t.active, trace, trace.active & own), further
 
     @eqx.filter_jit

@@ -77,7 +77,7 @@ def drive(
             given = dataclasses.replace(given, faults=given.faults | Fault.CAMERA_LATE)
         outcome = pilot.handle(given)
         if delays is not None:
-            delays.take(outcome)
+            delays.add_outcome(outcome)
             while delays.due:
                 delays.solve()
         world.write(outcome.steering_rad, outcome.throttle, given.now_ns)

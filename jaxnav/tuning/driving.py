@@ -104,7 +104,7 @@ class ClosedLoop(eqx.Module):
             DriveTraces(len(keys), 1),
             progress,
         )
-        sums, _ = kept.side_by_side()
+        sums, _ = kept.stack()
         costs, slopes = jax.tree.map(lambda leaf: jnp.asarray(leaf[:, -1]), sums)
         return self._losses(costs, slopes)
 

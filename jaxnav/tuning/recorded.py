@@ -34,14 +34,14 @@ class FrameSequences(eqx.Module):
         return some
 
     @staticmethod
-    def together(parts: "list[FrameSequences]") -> "FrameSequences":
+    def concatenate(parts: "list[FrameSequences]") -> "FrameSequences":
         """Concatenate the sequences; shorter ones are padded with unused frames."""
         length = max(part.used.shape[1] for part in parts)
-        padded = [part.padded(length) for part in parts]
+        padded = [part.pad_to(length) for part in parts]
         joined: FrameSequences = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *padded)
         return joined
 
-    def padded(self, length: int) -> "FrameSequences":
+    def pad_to(self, length: int) -> "FrameSequences":
         """Pad to `length` frames: the last one repeated, without markers and unused."""
         more = length - self.used.shape[1]
         frames = (self.obs, self.used, self.T_world_vehicle_true, self.judged)

@@ -193,7 +193,7 @@ def import_rerun() -> ModuleType:
 
 
 def _has_corners(outcome: Outcome) -> bool:
-    return outcome.told is not None and outcome.told.corners_px is not None
+    return outcome.data is not None and outcome.data.corners_px is not None
 
 
 def _shown(outcome: Outcome | ShownOutcome) -> ShownOutcome:

@@ -140,7 +140,7 @@ def make_outcome(index: int, seed: int = 0, dtype: type = float) -> Outcome:
         throttle=-0.1 / (index + 1),
         output=output,
         belief=belief,
-        told=None,
+        data=None,
         stamp_ns=now_ns - 3,
         restarts=2,
         restart_reason="the loop was away",

@@ -24,7 +24,7 @@ def stamps(path: Path) -> Iterator[Finding]:
     for text in warnings(delays, setup):
         what, _, do = text.partition(": ")
         yield Finding("stamps", "warning", what, do)
-    for name, one in zip(setup.rig.names, delays.found, strict=True):
+    for name, one in zip(setup.rig.names, delays.delays, strict=True):
         if not one.known:
             text = f"camera {name!r}: {path.name} does not tell how late it is"
             yield Finding("stamps", "note", text, _DRIVE_EIGHTS)

@@ -52,7 +52,7 @@ def run(args: Arguments) -> int:
         apply_params(Navigator(recording.rig, recording.markers), params)
     out = output_folder(args.out)
     if params is not None:
-        print(params.told())
+        print(params.describe())
     with tqdm(total=len(recording), unit="frame", disable=args.headless) as bar:
         bar.set_postfix_str("compiling")
 

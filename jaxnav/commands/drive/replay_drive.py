@@ -89,7 +89,7 @@ def run(args: Arguments) -> int:
     comparison = Comparison(log) if log is not None and not changed else None
     out = output_folder(args.out)
     if params is not None:
-        print(params.told())
+        print(params.describe())
     track = _replayed(args, setup, inputs, comparison)
     summary: dict[str, Any] = {
         "recording": str(args.recording),
@@ -101,7 +101,7 @@ def run(args: Arguments) -> int:
     if log is not None:
         summary |= {"changed": changed, "missing": log.missing, "truncated": log.truncated}
         recorded = plausible(log.outcomes)[0]
-        summary |= track.against(recorded)
+        summary |= track.rms_differences(recorded)
     if comparison is not None:
         summary |= {
             "compared": comparison.compared,
@@ -211,7 +211,7 @@ def _replayed(
 def _picture(setup: DriveSetup, track: Track, recorded: Outcomes | None, title: str) -> Figure:
     recorded_m, drawn = None, {}
     if recorded is not None:
-        shift_m, turn_rad = track.off(recorded)
+        shift_m, turn_rad = track.distances_to(recorded)
         # A logarithmic axis shows no zero: 1e-9 stands for it.
         drawn = {
             "position off (m)": np.maximum(shift_m, 1e-9),

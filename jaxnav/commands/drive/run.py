@@ -57,7 +57,7 @@ def run(args: Run, signals: Signals) -> int:
     if args.params is not None:
         params = load_params(args.params)
         setup = setup.with_params(params)
-        _say(args, params.told())
+        _say(args, params.describe())
     told = Setup(
         setup.rig, setup.markers, setup.vehicle, setup.route_on_map.start_pose, args.seed, options
     )
@@ -76,8 +76,8 @@ def run(args: Run, signals: Signals) -> int:
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
     for onlooker in onlookers:
-        if onlooker.told is not None:
-            print(onlooker.told)
+        if onlooker.closing_note is not None:
+            print(onlooker.closing_note)
     if drive.unheard is not None:
         print(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {drive.unheard}")
     return EXIT_STOPPED if drive.loop.stopped or drive.unheard is not None else 0

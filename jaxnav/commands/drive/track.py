@@ -92,7 +92,7 @@ class Track:
             "restart_reason": last.restart_reason,
         }
 
-    def off(self, recorded: Outcomes) -> tuple[np.ndarray, np.ndarray]:
+    def distances_to(self, recorded: Outcomes) -> tuple[np.ndarray, np.ndarray]:
         """Distances (N,) m and (N,) rad to the recorded track, NaN where either has no pose."""
         index = np.searchsorted(recorded.now_ns, self.now_ns)
         known = index < len(recorded.now_ns)
@@ -105,9 +105,9 @@ class Track:
         shift_m = np.hypot(difference[:, 0], difference[:, 1])
         return np.where(known, shift_m, np.nan), np.where(known, turn, np.nan)
 
-    def against(self, recorded: Outcomes) -> dict[str, Any]:
+    def rms_differences(self, recorded: Outcomes) -> dict[str, Any]:
         """Root mean square differences from the recorded track."""
-        shift_m, turn_rad = self.off(recorded)
+        shift_m, turn_rad = self.distances_to(recorded)
         return {
             "rms_position_difference_m": _rms(shift_m),
             "rms_heading_difference_deg": np.rad2deg(_rms(turn_rad)),

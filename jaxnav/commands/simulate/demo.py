@@ -53,7 +53,7 @@ def run(args: Demo) -> int:
     }
     out = output_folder(args.out)
     if world.params is not None:
-        print(world.params.told())
+        print(world.params.describe())
     methods = Methods(navigators, lambda navigator: compiled_step(navigator, step_folder()))
     summaries = []
     for seed in range(args.seed, args.seed + args.seeds):

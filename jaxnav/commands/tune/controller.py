@@ -60,7 +60,7 @@ def run(args: Arguments) -> int:
     fitting = Fitting(out, key, gains.problem(), space, named=args.train)
     try:
         fit = fitting.run(args.headless)
-        found = gains.tested(fit)
+        found = gains.test(fit)
     except KeyboardInterrupt:
         print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
         return EXIT_INTERRUPTED
@@ -147,7 +147,7 @@ class Gains:
             same_batch=False,
         )
 
-    def tested(self, fit: TuningFit) -> dict[str, tuple[ControllerTest, ControllerTest]]:
+    def test(self, fit: TuningFit) -> dict[str, tuple[ControllerTest, ControllerTest]]:
         """Test results before and after the fit, by scenario."""
         count = self._args.test_seeds
         with tqdm(

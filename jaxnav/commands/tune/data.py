@@ -78,7 +78,7 @@ def _simulated(args: Arguments) -> TuningData:
             part = simulated(rollout, jax.vmap(jax.random.key)(jnp.asarray(seeds)))
             parts.append(part.rows(slice(0, min(size, count - begin))))
             progress(len(parts[-1]))
-        return FrameSequences.together(parts)
+        return FrameSequences.concatenate(parts)
 
     count = args.seeds + args.held_out_seeds
     with tqdm(total=count, unit="drive", desc="drive", disable=args.headless, leave=False) as bar:

@@ -34,7 +34,7 @@ class Event(NamedTuple):
     """A reading of the odometry or a sighting of markers, with its stamp."""
 
     stamp_ns: int
-    told: EventData  # odometry, or corners of some cameras
+    data: EventData  # odometry, or corners of some cameras
 
 
 def drives(
@@ -78,7 +78,7 @@ def driven(
     check_inputs(inputs, setup, where)
     events = sensed(inputs, setup, refused_ns)
     begin, end = bounds(len(events), part)
-    if not any(event.told.corners_px is not None for event in events[begin:end]):
+    if not any(event.data.corners_px is not None for event in events[begin:end]):
         problem = f"{end - begin} of its {len(events)} events, and none shows a marker of the map"
         raise BadInput(where, problem)
     rows = _Rows.of(events, len(setup.rig), len(setup.markers.ids))
@@ -127,7 +127,7 @@ def _told(
     frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     stamps = Stamps()
     for given in inputs:
-        told, told_ns, _ = frames.told(given.frames, given.now_ns)
+        told, told_ns, _ = frames.check(given.frames, given.now_ns)
         if told is not None:
             yield Event(told_ns, told)
         reading = given.odometry
@@ -142,12 +142,12 @@ def _told(
 
 def _order(event: Event) -> tuple[int, bool]:
     """A sort key: by stamp, corners first."""
-    return event.stamp_ns, event.told.corners_px is None
+    return event.stamp_ns, event.data.corners_px is None
 
 
 def _both(one: Event, other: Event) -> Event | None:
     """Two events merged into one; None for different instants or the same camera."""
-    a, b = one.told, other.told
+    a, b = one.data, other.data
     if one.stamp_ns != other.stamp_ns or a.visible is None or b.visible is None:
         return None
     if np.any(np.any(a.visible, axis=1) & np.any(b.visible, axis=1)):
@@ -182,7 +182,7 @@ class _Rows(NamedTuple):
         rows = _Rows(
             stamps_us=np.array([event.stamp_ns // _NS_PER_US for event in events], np.int64),
             odometry=np.zeros((len(events), 2)),
-            has_odometry=np.array([event.told.odometry is not None for event in events], bool),
+            has_odometry=np.array([event.data.odometry is not None for event in events], bool),
             corners_px=np.zeros((*lanes, 4, 2)),
             visible=np.zeros(lanes, bool),
             sigma_px=np.ones((*lanes, 4)),

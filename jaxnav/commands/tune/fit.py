@@ -161,7 +161,7 @@ class Fitting:
         found = self._problem.explain(x, batch, softness)
         if found is None:
             return f"step {step + 1}: the loss is not finite; not stepped on"
-        return found.told(self._space.labels, step + 1)
+        return found.describe(self._space.labels, step + 1)
 
     def _refuse_without_gradient(self, fit: TuningFit) -> None:
         """Raise BadInput where the loss does not depend on a parameter at all."""

@@ -79,7 +79,7 @@ def joined(recordings: Sequence[NamedSequences]) -> FrameSequences:
     for other in recordings[1:]:
         if problem := _apart(first, other):
             raise BadInput(f"{first.name}, {other.name}", problem)
-    return FrameSequences.together([named.recorded for named in recordings])
+    return FrameSequences.concatenate([named.recorded for named in recordings])
 
 
 def _apart(one: NamedSequences, other: NamedSequences) -> str | None:
