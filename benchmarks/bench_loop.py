@@ -31,7 +31,7 @@ import pytest  # noqa: E402
 from jaxnav.commands.simulate.rendered_world import SENSOR  # noqa: E402
 from jaxnav.detection import make_detector  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
-from jaxnav.loop.expect import expected  # noqa: E402
+from jaxnav.loop.expect import expect_corners  # noqa: E402
 from jaxnav.loop.flags import Health  # noqa: E402
 from jaxnav.loop.interfaces import Frame  # noqa: E402
 from jaxnav.loop.pilot import Input  # noqa: E402
@@ -89,7 +89,7 @@ class Views:
         ]
         self.searches[0].warm_up()
         quads_px, visible, radius_px = jax.device_get(
-            expected(rig, markers, pose.astype(np.float32), COVARIANCE)
+            expect_corners(rig, markers, pose.astype(np.float32), COVARIANCE)
         )
         self.regions = [
             Region(quads_px[c][visible[c]], radius_px[c][visible[c]]) for c in range(len(rig))

@@ -22,16 +22,16 @@ from jaxnav.belief.motion import (
     Bank,
     Motion,
     heaviest,
-    numbered_anew_where_empty,
-    of_mixture,
-    restarted_where_broken,
+    mixture_log_mean,
+    renumber_if_empty,
+    restart_broken,
 )
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.candidates import Candidates, find_candidates
-from jaxnav.pose.consistency import ConsistentSnapshot, consistent
+from jaxnav.pose.consistency import ConsistentSnapshot, remove_outliers
 from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
 
 
@@ -158,7 +158,7 @@ class Navigator(eqx.Module):
 
     def look(self, obs: Observation) -> ConsistentSnapshot:
         """The candidate poses of an observation, without sightings that can be no marker."""
-        return consistent(self.snapshot(obs), self.find_candidates, self.no_candidates())
+        return remove_outliers(self.snapshot(obs), self.find_candidates, self.no_candidates())
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
         """The belief `obs.dt_s` later (Eq. 9), with the odometry fused where there is any."""
@@ -167,7 +167,7 @@ class Navigator(eqx.Module):
     def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
         motion, obs = self.motion, seen.snapshot.obs
-        prior = numbered_anew_where_empty(belief.bank)
+        prior = renumber_if_empty(belief.bank)
         predicted = motion.poses(prior)
         selection = self.selector(predicted, seen.candidates, seen.snapshot)
         updated = motion.update(prior, selection, obs)
@@ -183,7 +183,7 @@ class Navigator(eqx.Module):
             nis=jnp.where(bank.initialised[best], updated.nis[best], 0),
             gate_nis=jnp.asarray(predicted.gate_nis, bank.mean.dtype),
             outvoted=seen.outvoted,
-            log_likelihood=of_mixture(prior, updated.log_likelihood),
+            log_likelihood=mixture_log_mean(prior, updated.log_likelihood),
         )
         return belief, evidence
 
@@ -234,7 +234,7 @@ class Navigator(eqx.Module):
         return Evidence.none(self.no_candidates(), len(self.markers.ids), belief.bank.mean.dtype)
 
     def _sound(self, bank: Bank) -> Bank:
-        return restarted_where_broken(bank, self.motion.init(bank.initialised.shape[0]))
+        return restart_broken(bank, self.motion.init(bank.initialised.shape[0]))
 
     # Bound methods hash their owner: by identity, so that `jax.jit(navigator.step)` works.
     __hash__ = object.__hash__

@@ -276,4 +276,7 @@ def test_the_doctor_tells_it_of_a_recorded_drive(monkeypatch):
     assert {finding.level for finding in fine} <= {"ok", "note"}
     assert fine[0].level == "ok"
     assert any("does not tell" in finding.what for finding in fine)  # who saw no marker
-    assert delay_watch.told(Delay(-0.0304, 0.0004, 2)) == "30 +- 1 ms earlier than stamps say"
+    assert (
+        delay_watch.describe_delay(Delay(-0.0304, 0.0004, 2))
+        == "30 +- 1 ms earlier than stamps say"
+    )

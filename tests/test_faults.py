@@ -11,7 +11,7 @@ import pytest
 from jaxnav.cli import main
 from jaxnav.detection import make_detector
 from jaxnav.loop.estimator import advance_packed
-from jaxnav.loop.expect import expected
+from jaxnav.loop.expect import expect_corners
 from jaxnav.loop.flags import Fault, Health
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
@@ -82,7 +82,7 @@ class FrozenPicture:
         image[:8, :8] = np.frombuffer(frame.stamp_ns.to_bytes(8), np.uint8)
         rig, markers = self.navigator.rig, self.navigator.markers
         wxyz_xyz = np.asarray(self.output.T_world_vehicle.wxyz_xyz)
-        found = expected(rig, markers, wxyz_xyz, np.asarray(self.output.covariance[:3, :3]))
+        found = expect_corners(rig, markers, wxyz_xyz, np.asarray(self.output.covariance[:3, :3]))
         quads_px, visible, radius_px = (np.asarray(part)[0] for part in found)
         region = Region(quads_px[visible], radius_px[visible])
         return self.search.look(Frame(frame.stamp_ns, image), region)

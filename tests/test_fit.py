@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxnav.tuning.descent import Noisy, Smooth
-from jaxnav.tuning.fit import Problem, TuningFit, advanced, arrays_of, fit_of
+from jaxnav.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
 from jaxnav.tuning.objective import Batch, NotFinite, Objective, where_not_finite
 
 ITEMS = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
@@ -49,7 +49,7 @@ def problem(**changes) -> Problem:
 def fitted(problem: Problem, x=BEGIN) -> TuningFit:
     fit = TuningFit.begin(x, problem)
     while not fit.over:
-        fit = advanced(fit, problem)
+        fit = take_step(fit, problem)
     return fit
 
 
@@ -243,7 +243,7 @@ def test_what_goes_on_ends_at_the_same_bits(asked):
             whole, fit = fitted(asked, begin), TuningFit.begin(begin, asked)
             while not fit.over:
                 fit = fit_of(saved(fit), TuningFit.begin(begin, asked))
-                fit = advanced(fit, asked)
+                fit = take_step(fit, asked)
             fit = fit_of(saved(fit), TuningFit.begin(begin, asked))
         assert fit.best_x.dtype == dtype
         one, other = arrays_of(fit), arrays_of(whole)
@@ -256,7 +256,7 @@ def test_what_goes_on_ends_at_the_same_bits(asked):
 
 def test_arrays_of_something_else_are_refused():
     asked = problem()
-    fit = advanced(TuningFit.begin(BEGIN, asked), asked)
+    fit = take_step(TuningFit.begin(BEGIN, asked), asked)
     arrays = arrays_of(fit)
     with pytest.raises(ValueError, match=r"\(3,\) float64 became \(2,\) float64"):
         fit_of(arrays_of(TuningFit.begin(BEGIN[:2], problem(held_out=lambda *_: 0.0))), fit)

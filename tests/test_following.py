@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.map_fit import fit
+from jaxnav.belief.map_fit import fit_poses
 from jaxnav.control import Command
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import cayley, planar_from_T_world_vehicle
@@ -23,10 +23,10 @@ from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.tuning import branches
 from jaxnav.tuning import filter as tuned_filter
-from jaxnav.tuning.branches import SequenceStarts, started
+from jaxnav.tuning.branches import SequenceStarts, find_starts
 from jaxnav.tuning.filter import FilterCost
-from jaxnav.tuning.following import FilterScores, follow, trusting
-from jaxnav.tuning.recorded import FrameSequences, simulated
+from jaxnav.tuning.following import FilterScores, follow, trust_corners
+from jaxnav.tuning.recorded import FrameSequences, simulate_sequences
 from jaxnav.tuning.unconstrained import Space
 from tests import worlds
 
@@ -79,12 +79,12 @@ def recorded() -> FrameSequences:
         frame_period_s=0.2, duration_s=0.2 * FRAMES - 0.1,
     )  # fmt: skip
     rollout = Rollout(Drives(), CAR, MARKERS, scenario, SIGMA_PX)
-    return simulated(rollout, jax.vmap(jax.random.key)(jnp.arange(3)))
+    return simulate_sequences(rollout, jax.vmap(jax.random.key)(jnp.arange(3)))
 
 
 @functools.cache
 def starts() -> SequenceStarts:
-    return started(NAVIGATOR, recorded())
+    return find_starts(NAVIGATOR, recorded())
 
 
 def first_of(tree):
@@ -93,7 +93,7 @@ def first_of(tree):
 
 def likely(start, recorded, step, navigator=NAVIGATOR, space=SPACE) -> FilterScores:
     """One drive, the parameters a step away from where they start."""
-    navigator = trusting(with_parameters(navigator, space.values(space.start + step)))
+    navigator = trust_corners(with_parameters(navigator, space.values(space.start + step)))
     return follow(navigator, start, recorded)
 
 
@@ -375,7 +375,9 @@ def test_the_implicit_gradient_is_that_of_all_steps():
         now = dataclasses.replace(obs, corners_px=corners_px)
         snapshot = Snapshot.create(RIG, MARKERS, now, sigma_px)
         prior = prior_of(logs)
-        found = fit(prior.T_world_vehicle, prior.covariance, prior, snapshot, jnp.zeros(6), 20)
+        found = fit_poses(
+            prior.T_world_vehicle, prior.covariance, prior, snapshot, jnp.zeros(6), 20
+        )
         return found.posterior.T_world_vehicle.wxyz_xyz[0]
 
     def unrolled(corners_px, logs):
@@ -444,7 +446,7 @@ def test_a_cost_is_what_its_loss_says(monkeypatch):
     error = FilterCost(NAVIGATOR, SPACE, "error")
     np.testing.assert_allclose(error(SPACE.start, item, jnp.zeros(())), 200.0)
     nobody = SimpleNamespace(bank=starts().bank, chosen=jnp.zeros(3, bool))
-    monkeypatch.setattr(tuned_filter, "started", lambda n, r: nobody)
+    monkeypatch.setattr(tuned_filter, "find_starts", lambda n, r: nobody)
     assert float(error.batch(SPACE.start, drives).frames) == 1
     assert seen[0].selector.max_inflation == seen[0].selector.max_misfit == 1
     assert np.isinf(seen[0].motion.gate_nis)

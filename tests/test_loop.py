@@ -15,7 +15,7 @@ from jaxnav.loop.guard import TIMEOUT_S, Guard
 from jaxnav.loop.interfaces import Frame, Odometry
 from jaxnav.loop.loop import Loop
 from jaxnav.loop.pilot import Input, Pilot
-from jaxnav.loop.seeing import Eyes, Region, Search, SearchedFrame, groups, image_fault
+from jaxnav.loop.seeing import Eyes, Region, Search, SearchedFrame, group_frames, image_fault
 from jaxnav.navigator import Navigator
 from tests import worlds
 
@@ -243,10 +243,10 @@ def seen(camera, stamp_ns, count):
 
 
 def test_sightings_of_one_instant_go_together_and_the_empty_ones_apart():
-    shows, blank = groups([seen(0, 5, 1), seen(1, 5, 1), seen(2, 5, 0), seen(0, 9, 2)])
+    shows, blank = group_frames([seen(0, 5, 1), seen(1, 5, 1), seen(2, 5, 0), seen(0, 9, 2)])
     assert [[s.camera for s in group] for group in shows] == [[0, 1], [0]]
     assert [s.camera for s in blank] == [2]
-    assert groups([]) == ([], ())
+    assert group_frames([]) == ([], ())
 
 
 @pytest.mark.parametrize(

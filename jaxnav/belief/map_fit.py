@@ -24,18 +24,18 @@ from jaxnav.belief.ambiguity import PoseBelief, PosePosterior
 from jaxnav.models.geometry import cayley, cayley_jacobian, rotation_matrix
 from jaxnav.numerics.levenberg_marquardt import ImplicitGradient, NormalEquations, NormalEquationsLM
 from jaxnav.numerics.small_matrices import (
-    applied,
     cho_solve,
     cholesky,
     gram,
     log_det,
+    matvec,
     product,
     sandwich,
     solve_lower,
     solve_positive,
     solve_upper,
 )
-from jaxnav.pose.linearised import crossed, reprojection_rows, turned, wrench
+from jaxnav.pose.linearised import cross_product, reprojection_rows, turn_arms, wrench
 from jaxnav.pose.observation import Snapshot, log_sigmas
 
 
@@ -48,7 +48,7 @@ class PoseFit(eqx.Module):
     finite: Bool[Array, "*K"]
 
 
-def fit(
+def fit_poses(
     T_world_prior: jaxlie.SE3,
     covariance: Float[Array, "K 6 6"],
     prior: PoseBelief,
@@ -152,10 +152,10 @@ def _linearised(
         half, shift = xi[3:] / 2, xi[:3]
         per_norm = 1 / (1 + jnp.sum(half**2, axis=0))
         # cay(-xi) moves the corners; d cay(xi) = cay(xi) cay(J d), see `cayley_jacobian`.
-        moved = turned(-half, corners) - (shift + _swung(-half, shift))[:, None]
-        turn = (spread[3:] - crossed(half[:, None], spread[3:])) * per_norm[None, None]
+        moved = turn_arms(-half, corners) - (shift + _swung(-half, shift))[:, None]
+        turn = (spread[3:] - cross_product(half[:, None], spread[3:])) * per_norm[None, None]
         along = spread[:3] + _swung(-half[:, None], spread[:3])
-        along = along - crossed(shift[:, None] / 2, turn)
+        along = along - cross_product(shift[:, None] / 2, turn)
         twist = jnp.concatenate([along, turn])
         residual, slope = rows(moved)
         J = -jnp.sum(_answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
@@ -179,13 +179,13 @@ def _linearised(
 
 def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
     """cay(xi) shifts by more than `shift`, since it turns meanwhile: the difference, (3, ...)."""
-    swing = crossed(half, shift)
-    return (swing + crossed(half, swing)) / (1 + jnp.sum(half**2, axis=0))[None]
+    swing = cross_product(half, shift)
+    return (swing + cross_product(half, swing)) / (1 + jnp.sum(half**2, axis=0))[None]
 
 
 def _answers(slope: Float[Array, "3 2 P K"], points: Float[Array, "3 P K"]) -> Array:
     """Derivative (6, 2 P, K) of residuals by a shift and a turn of all corners about the origin."""
-    answers = jnp.concatenate([slope, crossed(points[:, None], slope)])
+    answers = jnp.concatenate([slope, cross_product(points[:, None], slope)])
     return answers.reshape(6, -1, answers.shape[-1])
 
 
@@ -229,7 +229,7 @@ def _fused(
     log_likelihood = (
         log_scale - (misfit + log_det(alone) + jnp.sum(contradiction**2) + log_det(sigma)) / 2
     )
-    xi = applied(spread, u_fused)
+    xi = matvec(spread, u_fused)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, C)

@@ -55,7 +55,7 @@ def read_bag(path: Path) -> Bag:
     Raises:
         BadInput: the file is no bag, or ends too early.
     """
-    with decompressed(path) as plain:
+    with decompress_bag(path) as plain:
         try:
             return _read(plain)
         except Exception as error:
@@ -65,7 +65,7 @@ def read_bag(path: Path) -> Bag:
 
 
 @contextmanager
-def decompressed(path: Path) -> Iterator[Path]:
+def decompress_bag(path: Path) -> Iterator[Path]:
     """The path of the bag, or of a decompressed copy that is removed after the block."""
     try:
         with path.open("rb"):
@@ -134,7 +134,7 @@ def _nanoseconds(header: Any) -> int:
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
-def topics_found(recorded: Sequence[Bag]) -> str:
+def list_topics(recorded: Sequence[Bag]) -> str:
     """A list of the topics of some bags, for a message."""
     topics = sorted({f"{topic} ({kind})" for bag in recorded for topic, kind in bag.topics.items()})
     return f"topics found: {', '.join(topics) or 'none'}"

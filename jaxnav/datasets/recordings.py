@@ -30,12 +30,12 @@ def read_recording(
     path = Path(path)
     if rig is not None and markers is None and bags.is_bag(path) and path.is_file():
         _no_markers(path)  # before all of it is read
-    found = find(path, rig)
+    found = read_source(path, rig)
     reference = found.reference()
     return assemble(found.name, found.rows, found.rig, markers or found.markers(), reference)
 
 
-def find(path: Path, rig: CameraRig | None, also: str = "") -> RecordingSource:
+def read_source(path: Path, rig: CameraRig | None, also: str = "") -> RecordingSource:
     """Read all detections of a recording, of markers in any map or none.
 
     Args:
@@ -79,4 +79,4 @@ def _topic_of(path: Path, bag: bags.Bag, camera: str) -> str:
     problem = f"no topic of {bags.DETECTIONS_TYPE} belongs to the camera {camera!r}"
     if candidates:
         problem = f"several topics belong to the camera {camera!r}"
-    raise BadInput(path, f"{problem}; {bags.topics_found([bag])}")
+    raise BadInput(path, f"{problem}; {bags.list_topics([bag])}")

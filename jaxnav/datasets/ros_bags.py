@@ -77,7 +77,7 @@ def read_messages(path: Path, choose: Choose) -> Generator[ReceivedMessage, None
     elif path.suffix in _ROS2_FILES and path.exists():
         yield from _read(path, path, Ros2Reader, choose)
     elif bags.is_bag(path):
-        with bags.decompressed(path) as plain:
+        with bags.decompress_bag(path) as plain:
             yield from _read(path, plain, Ros1Reader, choose)
     elif not path.exists():
         raise BadInput(path, "there is no such file or folder")

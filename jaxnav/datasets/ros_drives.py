@@ -74,10 +74,10 @@ def read_ros_drive(
                 # A definition in the bag may differ from the one that its name promises.
                 problem = f"{received.topic}: a message can't be understood ({one_line(error)})"
                 raise BadInput(path, problem) from None
-    return sorted([*inputs, *together(frames)], key=lambda given: given.now_ns)
+    return sorted([*inputs, *join_frames(frames)], key=lambda given: given.now_ns)
 
 
-def together(frames: Iterable[tuple[int, FrameDetections]]) -> list[Input]:
+def join_frames(frames: Iterable[tuple[int, FrameDetections]]) -> list[Input]:
     """Join frames of several cameras with the same stamp into one input.
 
     Args:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnav.datasets.recording import TO_OURS, Rows
-from jaxnav.datasets.recordings import find
+from jaxnav.datasets.recordings import read_source
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
 from jaxnav.loop.interfaces import Odometry
@@ -57,7 +57,7 @@ def read_sightings(path: str | Path, rig: CameraRig | None = None) -> RecordedSi
     path = Path(path)
     if path.suffix == ".mcap" and path.exists() and not path.is_dir():
         return _of_drive(path, rig)
-    found = find(path, rig, also="a .mcap, ")
+    found = read_source(path, rig, also="a .mcap, ")
     return _of_rows(found.rows, found.rig)
 
 

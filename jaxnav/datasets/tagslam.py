@@ -128,7 +128,7 @@ def _detections(
     found = [bag.detections[entry.tagtopic] for bag in recorded if entry.tagtopic in bag.detections]
     if len(found) != 1:
         problem = f"{len(found) or 'no'} bags have {entry.tagtopic} of {bags.DETECTIONS_TYPE}"
-        raise BadInput(where, f"{problem}; {bags.topics_found(recorded)}")
+        raise BadInput(where, f"{problem}; {bags.list_topics(recorded)}")
     return found[0]
 
 

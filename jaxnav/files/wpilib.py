@@ -19,7 +19,7 @@ from pydantic import Field, field_validator, model_validator
 
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import MarkerFigures, unread
+from jaxnav.files.figures import MarkerFigures, unread_keys
 from jaxnav.files.ranges import within
 from jaxnav.files.validation import (
     Count,
@@ -135,12 +135,12 @@ def layout_figures(
 
 def layout_left_out(data: dict[str, Any]) -> list[str]:
     """The keys that are not read and not empty, with the size of the field among them."""
-    told = unread(data, ["tags", "field"])
+    told = unread_keys(data, ["tags", "field"])
     if data.get("field"):
         size = data["field"]
         told.append(f"field ({size['length']} x {size['width']} m, --field-size-m on the way back)")
     for index, tag in enumerate(data["tags"]):
-        told += unread(tag, ["ID", "pose"], f"tags[{index}].")
+        told += unread_keys(tag, ["ID", "pose"], f"tags[{index}].")
     return told
 
 

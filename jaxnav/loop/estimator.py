@@ -12,7 +12,7 @@ from jaxtyping import Array, Int
 
 from jaxnav.belief.estimate import Belief, Evidence
 from jaxnav.compiling.packing import Packed, PackedLayout
-from jaxnav.compiling.step import compiled
+from jaxnav.compiling.step import compile_or_load
 from jaxnav.loop.history import EventData, History, HistoryEntry
 from jaxnav.navigator import Navigator, Output
 from jaxnav.timeline import Corners, Events, advance
@@ -68,10 +68,10 @@ class Estimator:
         """Args:
         navigator: the navigator to run.
         program: compiled `advance_packed` of the navigator; by default compiled by `jax.jit`, see
-            `compiled`.
+            `compile_or_load`.
         """
-        self._program = program or compiled(advance_packed, navigator, None)
-        self._first, self._control = compiled(_beginning, navigator, None)()
+        self._program = program or compile_or_load(advance_packed, navigator, None)
+        self._first, self._control = compile_or_load(_beginning, navigator, None)()
         self._layouts = {seeing: _layout(navigator, seeing) for seeing in (False, True)}
         self._odometry = (np.nan, np.nan)  # the last speed_mps, steering_rad
         self.reset()

@@ -15,14 +15,14 @@ from typing import Protocol
 import jax
 import numpy as np
 
-from jaxnav.loop.expect import Expected, expected
+from jaxnav.loop.expect import Expected, expect_corners
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import Ending, Frame, Vehicle
 from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.loop.priority import before_siblings
-from jaxnav.loop.seeing import Eyes, Region, groups
+from jaxnav.loop.seeing import Eyes, Region, group_frames
 
 _THREAD = "the loop"
 _STAYS_S = 0.5  # the drive ends this long after the last waypoint is reached
@@ -171,7 +171,7 @@ class Loop:
         for one in seen:
             for observer in self._observers:
                 observer.on_frame(one.camera_name, one.frame, one.sighted)
-        shows, blank = groups(seen)
+        shows, blank = group_frames(seen)
         self._blank += blank
         return shows
 
@@ -220,5 +220,5 @@ class Loop:
 
     def _expected(self, wxyz_xyz: np.ndarray, covariance: np.ndarray) -> Expected:
         navigator = self.pilot.navigator
-        found = expected(navigator.rig, navigator.markers, wxyz_xyz, covariance)
+        found = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, covariance)
         return Expected(*jax.device_get(found))

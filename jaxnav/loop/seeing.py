@@ -271,7 +271,7 @@ def _told(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def groups(
+def group_frames(
     seen: Sequence[SearchedFrame],
 ) -> tuple[list[tuple[FrameDetections, ...]], tuple[FrameDetections, ...]]:
     """Group sightings for the pilot: those with markers, one group per instant, and those without,

@@ -55,7 +55,7 @@ class Inliers(NamedTuple):
         return ConsistentSnapshot(_among(snapshot, self.visible), self.candidates, self.outvoted)
 
 
-def consistent(snapshot: Snapshot, find: Find, none: Candidates) -> ConsistentSnapshot:
+def remove_outliers(snapshot: Snapshot, find: Find, none: Candidates) -> ConsistentSnapshot:
     """The snapshot without sightings that are not squares and without an outvoted marker.
 
     With three markers and more in view, the one without which the joint misfit falls below a
@@ -72,12 +72,12 @@ def consistent(snapshot: Snapshot, find: Find, none: Candidates) -> ConsistentSn
         return Inliers(jnp.zeros_like(snapshot.seen.visible), none, nobody)
 
     any_seen = jnp.any(snapshot.seen.visible)
-    kept: Inliers = jax.lax.cond(any_seen, lambda: among_all(snapshot, find), nothing)
+    kept: Inliers = jax.lax.cond(any_seen, lambda: find_inliers(snapshot, find), nothing)
     return kept.apply_to(snapshot)
 
 
-def among_all(snapshot: Snapshot, find: Find) -> Inliers:
-    """As `consistent`, but calls `find` also where no marker is in view."""
+def find_inliers(snapshot: Snapshot, find: Find) -> Inliers:
+    """As `remove_outliers`, but calls `find` also where no marker is in view."""
     own = both_poses(snapshot)
     snapshot = _among(snapshot, _can_be_markers(snapshot, own))
     seen, candidates = snapshot.seen, find(snapshot, own)

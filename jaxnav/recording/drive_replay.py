@@ -19,7 +19,7 @@ import numpy as np
 from jaxnav.detection import Detections
 from jaxnav.detection.image_search import ImageSearch, size_problem
 from jaxnav.errors import BadInput
-from jaxnav.files.images import decoded_image
+from jaxnav.files.images import decode_image
 from jaxnav.loop.flags import Fault, Health, Reject, names
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.pilot import Input, Outcome
@@ -71,7 +71,7 @@ def replay_drive(
     """The outcomes of a new pilot for recorded inputs, one after the other.
 
     Args:
-        folder: folder of executables, see `compiled`.
+        folder: folder of executables, see `compile_or_load`.
     """
     pilot = setup.pilot(folder)
     for given in inputs:
@@ -193,7 +193,7 @@ def inputs_from_images(
         if image.topic not in camera_of:
             continue
         camera = camera_of[image.topic]
-        pixels = decoded_image(image.jpeg)
+        pixels = decode_image(image.jpeg)
         if pixels is None:
             raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
         if problem := size_problem(setup.rig, camera, pixels):

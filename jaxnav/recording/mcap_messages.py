@@ -28,7 +28,7 @@ from mcap.stream_reader import StreamReader
 
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
-from jaxnav.files.unpacking import Budget, unpacked
+from jaxnav.files.unpacking import Budget, unpack_chunk
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # opcode, length
@@ -175,7 +175,7 @@ def _opened(chunk: Chunk, budget: Budget) -> Iterator[McapRecord]:
         raise ValueError(f"compressed by {chunk.compression[:20]!r}, only zstd is read")
     if chunk.uncompressed_size > limits.CHUNK_BYTES:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-    data = unpacked(chunk.compression, chunk.data, budget, most=chunk.uncompressed_size)
+    data = unpack_chunk(chunk.compression, chunk.data, budget, most=chunk.uncompressed_size)
     if len(data) != chunk.uncompressed_size:
         raise ValueError("a chunk that is not as large as it says")
     if chunk.uncompressed_crc not in (0, zlib.crc32(data)):

@@ -24,8 +24,8 @@ from jaxnav.simulation.single_frames import (
     CornerErrors,
     MarkerView,
     marker_as_world,
-    observe,
     pinhole_rig,
+    simulate_observation,
 )
 
 SIZE_M = 0.172
@@ -91,7 +91,7 @@ def _frame(key: Array, views: ViewRanges, rig: CameraRig, markers: MarkerMap) ->
         roll_rad=between(5, (0.0, 2 * np.pi)),
     )
     noise_px, zero = between(6, views.noise_px), jnp.zeros_like(draws[0])
-    obs, T_world_vehicle = observe(
+    obs, T_world_vehicle = simulate_observation(
         view, CornerErrors(noise_px, zero, zero), rig, markers, jax.random.fold_in(key, 0)
     )
     obs = eqx.tree_at(lambda o: o.visible, obs, jnp.ones_like(obs.visible))

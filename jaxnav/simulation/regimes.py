@@ -12,9 +12,9 @@ import jax.numpy as jnp
 
 from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.motion import followed_by, leading, survivors_first
+from jaxnav.belief.motion import fill_slots, first_hypotheses, survivors_first
 from jaxnav.navigator import Navigator, Step
-from jaxnav.pose.consistency import ConsistentSnapshot, Inliers, among_all
+from jaxnav.pose.consistency import ConsistentSnapshot, Inliers, find_inliers
 from jaxnav.pose.observation import Observation
 
 # Sizes, in slots, of the banks compiled beside the whole one: nine frames of ten need a single
@@ -35,17 +35,17 @@ class _ByRegime(Navigator):
         snapshot = self.snapshot(obs)
         slots = snapshot.seen.visible.shape[0]
         if slots == 1:
-            return among_all(snapshot, self.find_candidates).apply_to(snapshot)
+            return find_inliers(snapshot, self.find_candidates).apply_to(snapshot)
 
         def one() -> Inliers:
-            kept = among_all(snapshot.largest(1), self.find_candidates)
+            kept = find_inliers(snapshot.largest(1), self.find_candidates)
             visible = jnp.zeros(slots, bool).at[0].set(kept.visible[0])
             count = min(self.max_candidates, 2 * slots)
             return Inliers(visible, kept.candidates.padded(count), kept.outvoted)
 
         any_further = jnp.any(snapshot.seen.visible[1:])
         kept: Inliers = jax.lax.cond(
-            any_further, lambda: among_all(snapshot, self.find_candidates), one
+            any_further, lambda: find_inliers(snapshot, self.find_candidates), one
         )
         return kept.apply_to(snapshot)
 
@@ -57,11 +57,11 @@ class _ByRegime(Navigator):
 
         def within(size: int, sees: bool) -> Callable[[Belief], tuple[Belief, Estimate]]:
             def fuse(belief: Belief) -> tuple[Belief, Estimate]:
-                few = dataclasses.replace(belief, bank=leading(belief.bank, size))
+                few = dataclasses.replace(belief, bank=first_hypotheses(belief.bank, size))
                 predicted = self.predict(few, seen.snapshot.obs)
                 after, evidence = self.correct(predicted, seen) if sees else self.coast(predicted)
                 estimate = Estimate.of(self.motion, after, evidence)
-                whole = followed_by(survivors_first(after.bank), empty)
+                whole = fill_slots(survivors_first(after.bank), empty)
                 return dataclasses.replace(after, bank=whole), estimate
 
             return fuse

@@ -88,7 +88,7 @@ def T_vehicle_world_of(view: MarkerView, rig: CameraRig) -> jaxlie.SE3:
     )
 
 
-def observe(
+def simulate_observation(
     view: MarkerView, errors: CornerErrors, rig: CameraRig, markers: MarkerMap, key: Array
 ) -> tuple[Observation, jaxlie.SE3]:
     """The observation of the marker, and T_world_vehicle, of one view (no batch axis)."""

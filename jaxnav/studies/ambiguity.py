@@ -27,8 +27,8 @@ from jaxnav.simulation.single_frames import (
     CornerErrors,
     MarkerView,
     marker_as_world,
-    observe,
     pinhole_rig,
+    simulate_observation,
 )
 from jaxnav.studies.config import Config
 from jaxnav.studies.lanes import in_precision, run_lanes
@@ -195,7 +195,9 @@ def _frame(
     rig = rig.with_focal_px(value["focal_px"])
     markers = marker_as_world(value["marker_size_m"])
     errors = CornerErrors(value["corner_noise_px"], value["corner_bias_px"], value["blur_px"])
-    obs, T_world_vehicle = observe(_view(value, view_key), errors, rig, markers, corner_key)
+    obs, T_world_vehicle = simulate_observation(
+        _view(value, view_key), errors, rig, markers, corner_key
+    )
     snapshot = Snapshot.create(rig, markers, obs, value["told_noise_px"])
     candidates = find_candidates(snapshot, max_steps=max_steps)
 

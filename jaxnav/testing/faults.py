@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.compiling.step import bare
+from jaxnav.compiling.step import strip_static
 from jaxnav.files.markers import MarkerFile, marker_data
 from jaxnav.files.vehicles import Route
 from jaxnav.loop.camera_delays import CameraDelays
@@ -72,7 +72,7 @@ class FaultRow:
         error_after_m: largest error after that.
         begins_s, ends_s: of the fault; inf: it lasts.
         drive_s: duration of the whole drive.
-        telling: how the navigator's rig differs from the true one, see `told_rig`.
+        telling: how the navigator's rig differs from the true one, see `navigator_rig`.
         markers: makes the drive's markers from the trial's.
         relocate: see `Pilot`.
         well: the worst health at which the car has recovered.
@@ -129,15 +129,15 @@ class Trial:
 def run_trial(row: FaultRow, trial: Trial) -> Result:
     """Drive with a row's fault, and judge the drive."""
     trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
-    markers, route = written_down(trial, row.shift_m)
+    markers, route = shift_origin(trial, row.shift_m)
     navigator = Navigator(
-        rig=told_rig(trial.rig, row.telling),
+        rig=navigator_rig(trial.rig, row.telling),
         markers=markers,
         vehicle=trial.vehicle,
         waypoints_m=route.waypoints_m,
         waypoint_radius_m=route.waypoint_radius_m,
     )
-    program = trial.program and trial.program(bare(navigator))
+    program = trial.program and trial.program(strip_static(navigator))
     pilot = Pilot(navigator, program=program, relocate=row.relocate)
     world = SimWorld(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
     delays = None
@@ -147,7 +147,7 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
     return judge(row, steps, pilot)
 
 
-def written_down(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
+def shift_origin(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
     """The map and route of a drive whose files have a shifted origin.
 
     The trial's own coordinates count from the origin of its map.
@@ -162,7 +162,7 @@ def written_down(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
     return markers, Route(waypoints_m, _RADIUS_M, start_pose).relative_to(markers.origin_m)
 
 
-def told_rig(rig: CameraRig, telling: str) -> CameraRig:
+def navigator_rig(rig: CameraRig, telling: str) -> CameraRig:
     """The rig that the navigator gets: the true calibration, or a wrong one."""
     Ts = rig.Ts_camera_vehicle
     if telling == "focal":

@@ -40,7 +40,7 @@ class SequenceEstimates(eqx.Module):
 
 
 @eqx.filter_jit
-def estimated(navigator: Navigator, recorded: FrameSequences) -> SequenceEstimates:
+def estimate_sequences(navigator: Navigator, recorded: FrameSequences) -> SequenceEstimates:
     """Estimate all sequences from cold starts. Frames not used or judged hold no valid values."""
 
     def one(recorded: FrameSequences) -> SequenceEstimates:
@@ -99,9 +99,9 @@ class SequenceStarts(eqx.Module):
     chosen: Bool[Array, "*B"]  # False: never decided, so the sequence carries no information
 
 
-def started(navigator: Navigator, recorded: FrameSequences) -> SequenceStarts:
+def find_starts(navigator: Navigator, recorded: FrameSequences) -> SequenceStarts:
     """The start of every sequence, as this navigator decided."""
-    seen = estimated(navigator, recorded)
+    seen = estimate_sequences(navigator, recorded)
     chosen = jnp.any(seen.decided, axis=1)
     first = jnp.argmax(seen.decided, axis=1)
     rows = jnp.arange(len(recorded))

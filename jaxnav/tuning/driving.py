@@ -32,7 +32,7 @@ from jaxnav.simulation.rollout import Rollout, Trace
 from jaxnav.simulation.traces import DriveTraces
 from jaxnav.simulation.world import DriveState
 from jaxnav.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss, no_costs
-from jaxnav.tuning.soft_switch import softened
+from jaxnav.tuning.soft_switch import soften_switch
 from jaxnav.tuning.unconstrained import Space
 
 _jit = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
@@ -194,7 +194,9 @@ class ClosedLoop(eqx.Module):
 
     def _softened(self, x: Array, space: Space) -> Rollout:
         navigator = with_parameters(self.rollout.navigator, space.values(x))
-        return dataclasses.replace(self.rollout, navigator=softened(navigator, self.softness_m))
+        return dataclasses.replace(
+            self.rollout, navigator=soften_switch(navigator, self.softness_m)
+        )
 
 
 def without_gradient(gradients: Float[Array, "B n"], labels: list[str]) -> list[str]:

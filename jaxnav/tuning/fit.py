@@ -2,7 +2,7 @@
 
     fit = Fit.begin(x, problem)
     while not fit.over:
-        fit = advanced(fit, problem)       # one step; `fit` is all there is to save
+        fit = take_step(fit, problem)      # one step; `fit` is all there is to save
 
 Stages: after a descent has ended the problem may be posed anew (branches chosen again, by the
 parameters found), until that changes nothing. The result of a fit is the x with the lowest loss on
@@ -80,7 +80,7 @@ class TuningFit:
         return TuningFit(descent, x, x, loss, loss, history=(_row(np.nan, loss, x),))
 
 
-def advanced(fit: TuningFit, problem: Problem) -> TuningFit:
+def take_step(fit: TuningFit, problem: Problem) -> TuningFit:
     """The fit after one more step."""
     x = fit.descent.x
     softness = jnp.asarray(problem.softness(fit.step), x.dtype)

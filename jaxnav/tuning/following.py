@@ -40,7 +40,7 @@ class FilterScores(eqx.Module):
     nees: Float[Array, "*B T"]
 
 
-def trusting(navigator: Navigator) -> Navigator:
+def trust_corners(navigator: Navigator) -> Navigator:
     """The navigator without its guards against outliers, which would hide a wrong Q or R."""
     motion, selector = navigator.motion, navigator.selector
     navigator = eqx.tree_at(lambda n: n.motion.gate_nis, navigator, float("inf"))

@@ -56,7 +56,7 @@ class FrameSequences(eqx.Module):
         return FrameSequences(self.markers, obs, used & known, truth, judged & known)
 
 
-def simulated(rollout: Rollout, keys: Key[Array, " B"]) -> FrameSequences:
+def simulate_sequences(rollout: Rollout, keys: Key[Array, " B"]) -> FrameSequences:
     """Simulate closed-loop drives from a cold start, judged from the frame on in which the
     navigator that drove had decided its branch."""
     obs, true_poses, decided, active = jax.device_get(_drives(rollout, keys))

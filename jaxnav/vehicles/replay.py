@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxnav.detection.image_search import size_problem
 from jaxnav.errors import BadInput
-from jaxnav.files.images import decoded_image
+from jaxnav.files.images import decode_image
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Camera, Frame, Odometry, OwnFiles, Setup, Vehicle
@@ -191,7 +191,7 @@ class ReplayCamera:
         self._next += 1
         stamp_ns = self._clock.present_ns(sighted.stamp_ns)
         if sighted.stamp_ns in self._jpegs:
-            return Frame(stamp_ns, decoded_image(self._jpegs[sighted.stamp_ns]))
+            return Frame(stamp_ns, decode_image(self._jpegs[sighted.stamp_ns]))
         return Frame(stamp_ns, None, sighted.detections)
 
     def close(self) -> None:
@@ -262,7 +262,7 @@ def _jpegs(log: DriveLog, rig: CameraRig) -> dict[str, dict[int, bytes]]:
         if name not in found:
             continue
         if not found[name]:
-            pixels = decoded_image(image.jpeg)
+            pixels = decode_image(image.jpeg)
             if pixels is None:
                 raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
             if problem := size_problem(rig, rig.names.index(name), pixels):

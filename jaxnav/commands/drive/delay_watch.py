@@ -84,19 +84,20 @@ def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
     if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
         delay_s = setup.vehicle.camera_delay_s + together.delay_s
         do = f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
-        yield f"the cameras are {told(together)}: {do}"
+        yield f"the cameras are {describe_delay(together)}: {do}"
         return
     for name, one in zip(setup.rig.names, found, strict=True):
         if not one.late:
             continue
         delay_s = setup.vehicle.camera_delay_s + one.delay_s
         yield (
-            f"camera {name!r} is {told(one)}: raise its latency_ms by {one.delay_s * 1e3:.0f}, or "
+            f"camera {name!r} is {describe_delay(one)}: "
+            f"raise its latency_ms by {one.delay_s * 1e3:.0f}, or "
             f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml where all cameras are like it"
         )
 
 
-def told(delay: Delay) -> str:
+def describe_delay(delay: Delay) -> str:
     """A delay as text: `48 +- 6 ms later than stamps say`."""
     way = "later" if delay.delay_s > 0 else "earlier"
     off_ms, sigma_ms = abs(delay.delay_s) * 1e3, max(delay.sigma_s * 1e3, 1.0)

@@ -44,7 +44,7 @@ from jaxnav.recording.drive_setup import DriveSetup, needs_float64
 from jaxnav.recording.mcap_messages import profile_of
 from jaxnav.recording.message_schemas import OUTCOME
 from jaxnav.recording.messages import digest, input_message, outcome_message
-from jaxnav.recording.plausible import plausible
+from jaxnav.recording.plausible import keep_plausible
 from jaxnav.recording.recorder import Recorder
 
 EXIT_DIFFERS = 1
@@ -100,7 +100,7 @@ def run(args: Arguments) -> int:
     recorded = None
     if log is not None:
         summary |= {"changed": changed, "missing": log.missing, "truncated": log.truncated}
-        recorded = plausible(log.outcomes)[0]
+        recorded = keep_plausible(log.outcomes)[0]
         summary |= track.rms_differences(recorded)
     if comparison is not None:
         summary |= {

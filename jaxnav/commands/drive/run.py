@@ -98,8 +98,8 @@ def _options(given: Sequence[str]) -> dict[str, str]:
 def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     """Read all files and find all plug-ins before anything is compiled or moves, so that bad input
     is found first."""
-    factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
-    plugins.find("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
+    factory = plugins.load_factory("--vehicle", plugins.VEHICLES, args.vehicle)
+    plugins.load_factory("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
     own = factory.own_files(options) if isinstance(factory, HasOwnFiles) else None
     qcar = calib_dir() / "qcar"
 
@@ -121,7 +121,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
 
 def _guarding(args: Run) -> GuardProcess | None:
     """The process that will own the vehicle; None where its plug-in must stay in this one."""
-    factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
+    factory = plugins.load_factory("--vehicle", plugins.VEHICLES, args.vehicle)
     if isinstance(factory, SharesProcess) and factory.shares_process:
         return None
     try:

@@ -10,7 +10,7 @@ from jaxnav.errors import visible
 from jaxnav.files import atomic_path, output_folder
 from jaxnav.plots.scenery import Scenery
 from jaxnav.recording.drive_log import DriveLog
-from jaxnav.recording.plausible import left_out, plausible
+from jaxnav.recording.plausible import keep_plausible, left_out_note
 from jaxnav.viewer.outcomes import ShownOutcome
 from jaxnav.viewer.rerun_view import RerunView, import_rerun
 
@@ -43,9 +43,9 @@ def run(args: Arguments) -> int:
 
 def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool) -> None:
     """Show all outcomes, all frames and all images of a drive in a view."""
-    outcomes, odd = plausible(log.outcomes)
+    outcomes, odd = keep_plausible(log.outcomes)
     if odd:
-        print(left_out(odd))
+        print(left_out_note(odd))
     names = () if scenery.rig is None else scenery.rig.names
     for index in tqdm(range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False):
         view.show(ShownOutcome.of_row(outcomes, index, scenery.origin_m))

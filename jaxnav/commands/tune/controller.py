@@ -25,7 +25,7 @@ from jaxnav.plots.tuning import controller_report
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
-from jaxnav.simulation.statistics import resampled, wilson_interval
+from jaxnav.simulation.statistics import bootstrap_mean, wilson_interval
 from jaxnav.simulation.world import Spread
 from jaxnav.tuning.descent import Noisy
 from jaxnav.tuning.drive_loss import DriveLoss
@@ -205,9 +205,9 @@ class Gains:
         low, high = wilson_interval(np.array(rate), np.array(len(success)))
         own = np.asarray(trace.active)[0]
         return ControllerTest(
-            loss=resampled(losses, once),
+            loss=bootstrap_mean(losses, once),
             parts={name: float(np.mean(p)) for name, p in loop.loss.parts(costs).items()},
-            time_s=resampled(np.asarray(costs.time_s), once),
+            time_s=bootstrap_mean(np.asarray(costs.time_s), once),
             success=(rate, float(low), float(high)),
             poses=np.asarray(trace.true_pose)[0][own],
             waypoints_m=np.asarray(loop.rollout.scenario.waypoints_m),

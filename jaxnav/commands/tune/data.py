@@ -14,9 +14,9 @@ from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.reading import read_shown
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
-from jaxnav.commands.tune.drives import drives
-from jaxnav.commands.tune.recordings import navigator_of, tracks
-from jaxnav.commands.tune.sequences import NamedSequences, joined
+from jaxnav.commands.tune.drives import sequences_of_drive
+from jaxnav.commands.tune.recordings import navigator_of, sequences_of_recording
+from jaxnav.commands.tune.sequences import NamedSequences, join_sequences
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
@@ -24,7 +24,7 @@ from jaxnav.navigator import Navigator
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
-from jaxnav.tuning.recorded import FrameSequences, simulated
+from jaxnav.tuning.recorded import FrameSequences, simulate_sequences
 
 AT_A_TIME = 64  # sequences in a batch, where nothing is to be differentiated
 _TEST_SEED = 10**6
@@ -75,7 +75,7 @@ def _simulated(args: Arguments) -> TuningData:
         size, parts = min(count, AT_A_TIME), []
         for begin in range(0, count, size):
             seeds = first + np.minimum(np.arange(begin, begin + size), count - 1)
-            part = simulated(rollout, jax.vmap(jax.random.key)(jnp.asarray(seeds)))
+            part = simulate_sequences(rollout, jax.vmap(jax.random.key)(jnp.asarray(seeds)))
             parts.append(part.rows(slice(0, min(size, count - begin))))
             progress(len(parts[-1]))
         return FrameSequences.concatenate(parts)
@@ -101,7 +101,7 @@ def _simulated(args: Arguments) -> TuningData:
 
 def _recorded(args: Arguments) -> TuningData:
     learned = [_sequences(args, path, args.part) for path in args.recordings]
-    together = joined(learned)
+    together = join_sequences(learned)
     rows = np.arange(len(together))
     held_out = rows % _HELD_OUT == _HELD_OUT - 1
     if not held_out.any():
@@ -143,11 +143,11 @@ def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> NamedS
     if path.suffix == _DRIVE:
         log = read_shown(path, args.headless)
         setup = DriveSetup.of_header(log.header, path)
-        return NamedSequences(str(path), setup.navigator(), drives(log, setup, part))
+        return NamedSequences(str(path), setup.navigator(), sequences_of_drive(log, setup, part))
     recording = read_recording(
         path,
         None if args.rig is None else load_rig(args.rig),
         None if args.markers is None else load_markers(args.markers),
     )
     navigator = navigator_of(recording, True, args.selector)
-    return NamedSequences(str(path), navigator, tracks(recording, True, part))
+    return NamedSequences(str(path), navigator, sequences_of_recording(recording, True, part))

@@ -37,7 +37,7 @@ class Event(NamedTuple):
     data: EventData  # odometry, or corners of some cameras
 
 
-def drives(
+def sequences_of_drive(
     log: DriveLog, setup: DriveSetup, part: tuple[float, float], length: int = 400
 ) -> FrameSequences:
     """Sequences of a drive. The car's true pose is unknown, so that no frame is judged.
@@ -58,10 +58,10 @@ def drives(
         for now_ns, rejects in zip(outcomes.now_ns, outcomes.rejects, strict=True)
         if rejects & Reject.ODOMETRY
     }
-    return driven(log.inputs, setup, log.path, part, length, refused_ns)
+    return sequences_of_inputs(log.inputs, setup, log.path, part, length, refused_ns)
 
 
-def driven(
+def sequences_of_inputs(
     inputs: Sequence[Input],
     setup: DriveSetup,
     where: Path,
@@ -69,14 +69,14 @@ def driven(
     length: int = 400,
     refused_ns: Collection[int] = (),
 ) -> FrameSequences:
-    """`drives` for inputs of a pilot, which may come from a ROS bag.
+    """`sequences_of_drive` for inputs of a pilot, which may come from a ROS bag.
 
     Args:
         where: the file that the inputs are of.
         refused_ns: `now_ns` of inputs whose odometry is left out.
     """
     check_inputs(inputs, setup, where)
-    events = sensed(inputs, setup, refused_ns)
+    events = believed_events(inputs, setup, refused_ns)
     begin, end = bounds(len(events), part)
     if not any(event.data.corners_px is not None for event in events[begin:end]):
         problem = f"{end - begin} of its {len(events)} events, and none shows a marker of the map"
@@ -103,7 +103,7 @@ def driven(
     )
 
 
-def sensed(
+def believed_events(
     inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int] = ()
 ) -> list[Event]:
     """Events that a pilot would believe of its inputs, in the order of the stamps.

@@ -21,8 +21,8 @@ from jaxnav.files import Params, apply_params, load_params, output_folder, write
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of, with_parameters
 from jaxnav.plots.tuning import tuning_report
-from jaxnav.simulation.statistics import anees_band, resampled
-from jaxnav.tuning.branches import estimated
+from jaxnav.simulation.statistics import anees_band, bootstrap_mean
+from jaxnav.tuning.branches import estimate_sequences
 from jaxnav.tuning.descent import Smooth
 from jaxnav.tuning.filter import FilterCost
 from jaxnav.tuning.fit import Problem, TuningFit
@@ -153,7 +153,7 @@ def _test(
     size, parts = min(len(test), AT_A_TIME), []
     for begin in range(0, len(test), size):
         rows = np.minimum(np.arange(begin, begin + size), len(test) - 1)
-        some = jax.device_get(estimated(navigator, test.rows(rows)))
+        some = jax.device_get(estimate_sequences(navigator, test.rows(rows)))
         kept = min(size, len(test) - begin)
         parts.append((np.asarray(some.square_m2)[:kept], np.asarray(some.nees)[:kept]))
         progress(kept)
@@ -162,7 +162,7 @@ def _test(
     definite = judged & ~np.isnan(nees)
 
     def mean(values: np.ndarray, counted: np.ndarray) -> tuple[float, float, float]:
-        return resampled(np.where(counted, values, 0).sum(axis=1), counted.sum(axis=1))
+        return bootstrap_mean(np.where(counted, values, 0).sum(axis=1), counted.sum(axis=1))
 
     rmse_m = tuple(float(np.sqrt(value)) for value in mean(square_m2, judged))
     freedom = 3 if isinstance(navigator.motion, BicycleKalman) else 6

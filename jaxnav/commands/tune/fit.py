@@ -22,7 +22,7 @@ from jaxnav.files import write_params
 from jaxnav.files.locking import sole_writer
 from jaxnav.files.npz import read_npz
 from jaxnav.files.writing import atomic_write, plain_data
-from jaxnav.tuning.fit import Problem, TuningFit, advanced, arrays_of, fit_of
+from jaxnav.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
 from jaxnav.tuning.unconstrained import Space
 
 # Arguments on which a fit doesn't depend.
@@ -127,7 +127,7 @@ class Fitting:
         ) as bar:
             bar.set_postfix_str("compiling")
             while not fit.over:
-                before, fit = fit, advanced(fit, self._problem)
+                before, fit = fit, take_step(fit, self._problem)
                 if fit.step == 1:
                     self._refuse_without_gradient(fit)
                 if not bool(fit.descent.finite):

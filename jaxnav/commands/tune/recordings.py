@@ -26,7 +26,7 @@ def navigator_of(
     selector: str,
     corner_sigma_px: float | None = None,
 ) -> Navigator:
-    """The navigator that localises the rig of a recording by its `tracks`.
+    """The navigator that localises the rig of a recording by its `sequences_of_recording`.
 
     Args:
         selector: one of `SELECTORS`.
@@ -44,7 +44,7 @@ def navigator_of(
     )
 
 
-def tracks(
+def sequences_of_recording(
     recording: Recording,
     one_at_a_time: bool,
     part: tuple[float, float],

@@ -69,7 +69,7 @@ def maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
     return found
 
 
-def joined(recordings: Sequence[NamedSequences]) -> FrameSequences:
+def join_sequences(recordings: Sequence[NamedSequences]) -> FrameSequences:
     """The sequences of all recordings, padded to the longest.
 
     Raises:
