@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.loop.camera_delays import CameraDelays
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.simulation.corners import see
 from jaxnav.testing.faults import WAYPOINTS_M
@@ -128,13 +128,13 @@ def driven(kind: Kind, track: np.ndarray, delays: CameraDelays, world: Any, seed
     frame = 0
     for when_s, reading, pose in zip(readings_s, read, poses, strict=True):
         while frame < len(frames_s) and frames_s[frame] + 0.03 <= when_s:
-            seen = Told(None, corners_px[frame], visible[frame], sigma_px)
+            seen = EventData(None, corners_px[frame], visible[frame], sigma_px)
             if visible[frame].any():
-                delays.seen(_ns(frames_s[frame]), seen)
+                delays.add_corners(_ns(frames_s[frame]), seen)
             frame += 1
-        delays.read(_ns(when_s), *reading.tolist())
+        delays.add_reading(_ns(when_s), *reading.tolist())
         if when_s > 0.8:
-            delays.at(_ns(when_s), pose)
+            delays.add_pose(_ns(when_s), pose)
         while delays.due:
             delays.solve()
             told_s = min(told_s, when_s) if delays.late else told_s
@@ -173,7 +173,7 @@ def main() -> None:
         for n in range(args.drives):
             delays = CameraDelays(*world)
             told.append(driven(kind, paths[:, n], delays, world, n))
-            for camera, one in enumerate(delays.found):
+            for camera, one in enumerate(delays.delays):
                 late_s = kind.late_s if camera in kind.cameras_late else 0.0
                 if one.known:
                     off.append(abs(one.delay_s - late_s))

@@ -31,7 +31,7 @@ import pytest  # noqa: E402
 from jaxnav.commands.simulate.rendered_world import SENSOR  # noqa: E402
 from jaxnav.detection import make_detector  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
-from jaxnav.loop.expect import expected  # noqa: E402
+from jaxnav.loop.expect import expect_corners  # noqa: E402
 from jaxnav.loop.flags import Health  # noqa: E402
 from jaxnav.loop.interfaces import Frame  # noqa: E402
 from jaxnav.loop.pilot import Input  # noqa: E402
@@ -42,7 +42,7 @@ from jaxnav.simulation.rendering import Renderer  # noqa: E402
 from jaxnav.simulation.scene import Scene  # noqa: E402
 from jaxnav.testing.faults import WAYPOINTS_M  # noqa: E402
 from jaxnav.testing.lockstep import BEGIN_NS, Rates, drive  # noqa: E402
-from jaxnav.vehicles.world import World  # noqa: E402
+from jaxnav.vehicles.world import SimWorld  # noqa: E402
 
 DISTANCES_M = (1.0, 2.0, 3.0)  # from the front camera's lens
 WORKERS = 2
@@ -89,7 +89,7 @@ class Views:
         ]
         self.searches[0].warm_up()
         quads_px, visible, radius_px = jax.device_get(
-            expected(rig, markers, pose.astype(np.float32), COVARIANCE)
+            expect_corners(rig, markers, pose.astype(np.float32), COVARIANCE)
         )
         self.regions = [
             Region(quads_px[c][visible[c]], radius_px[c][visible[c]]) for c in range(len(rig))
@@ -143,7 +143,7 @@ def print_frame_sets() -> None:
 
 def recorded(made: DriveSetup, delay_s: float) -> list[Input]:
     """What the pilot is told in a drive whose frames come so late."""
-    world = World(made.rig, made.markers, made.vehicle, START, BEGIN_NS)
+    world = SimWorld(made.rig, made.markers, made.vehicle, START, BEGIN_NS)
     rates = Rates(frame_delay_s=delay_s)
     return [step.input for step in drive(made.pilot(step_folder()), world, DRIVE_S, rates=rates)]
 

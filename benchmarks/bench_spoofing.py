@@ -18,13 +18,13 @@ from jaxnav.loop.flags import Fault, Health, names
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.testing.faults import WAYPOINTS_M
 from jaxnav.testing.lockstep import BEGIN_NS, Step, drive
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 
 BEGIN_S, DRIVE_S = 4.0, 14.0
 START = (2.0, -1.0, np.deg2rad(125.0))
 WRONG_M = 0.3
 TOLD = Fault.RELOCATED | Fault.WAYS_DISPUTED
-Moves = Callable[[World, float], None]  # the world, s since the last time, 0 at the first
+Moves = Callable[[SimWorld, float], None]  # the world, s since the last time, 0 at the first
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ SPOOFS = [
 ]
 
 
-def spoofed(spoof: Spoof) -> Callable[[int, World], None]:
+def spoofed(spoof: Spoof) -> Callable[[int, SimWorld], None]:
     """What happens to the world."""
     last_ns: int | None = None
 
-    def happens(now_ns: int, world: World) -> None:
+    def happens(now_ns: int, world: SimWorld) -> None:
         nonlocal last_ns
         if (now_ns - BEGIN_NS) / 1e9 < BEGIN_S:
             return
@@ -117,7 +117,7 @@ def main() -> None:
             list(
                 drive(
                     setup.pilot(step_folder()),
-                    World(rig, markers, vehicle, START, BEGIN_NS, seed=seed),
+                    SimWorld(rig, markers, vehicle, START, BEGIN_NS, seed=seed),
                     DRIVE_S,
                     happens=spoofed(spoof),
                 )

@@ -26,7 +26,7 @@ from jaxnav.loop.pilot import Input, Pilot
 from jaxnav.navigator import Navigator
 from jaxnav.testing.faults import WAYPOINTS_M
 from jaxnav.testing.lockstep import BEGIN_NS, drive
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 
 RECORDED_S = 20.0
 
@@ -66,7 +66,7 @@ def main() -> None:
         traces += 1
         return advance_packed(navigator, *told)
 
-    world = World(rig, markers, vehicle, (2.0, -1.0, np.deg2rad(125.0)), BEGIN_NS)
+    world = SimWorld(rig, markers, vehicle, (2.0, -1.0, np.deg2rad(125.0)), BEGIN_NS)
     recorder = Pilot(navigator, program=program)
     inputs = [step.input for step in drive(recorder, world, RECORDED_S)]
     span_ns = inputs[-1].now_ns - inputs[0].now_ns + 20_000_000

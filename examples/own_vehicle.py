@@ -16,7 +16,7 @@ from drive import QCAR, make_navigator  # examples/drive.py
 
 import jaxnav as jn
 from jaxnav.detection.types import Detections
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame, Odometry, Setup
 from jaxnav.loop.pilot import Input, Pilot
 from jaxnav.models.geometry import T_world_vehicle_from_planar
@@ -113,7 +113,7 @@ def main(duration_s: float = 1.0, selector: jn.Selector | None = None) -> dict[s
     cameras, pilot = open_cameras(setup, car), Pilot(navigator)
     for time_ns in range(time_ns, time_ns + int(duration_s * 1e9), 20_000_000):  # noqa: B020
         frames = [camera.read(0.0) for camera in cameras]
-        sighted = [Sighted(c, f.stamp_ns, f.detections) for c, f in enumerate(frames) if f]
+        sighted = [FrameDetections(c, f.stamp_ns, f.detections) for c, f in enumerate(frames) if f]
         outcome = pilot.handle(Input(time_ns, car.read(), tuple(sighted)))
         car.write(outcome.steering_rad, outcome.throttle)
     moved_m, error_m = (float(np.hypot(*(car.pose - p)[:2])) for p in (start_pose, outcome.pose))

@@ -22,16 +22,16 @@ from jaxnav.belief.motion import (
     Bank,
     Motion,
     heaviest,
-    numbered_anew_where_empty,
-    of_mixture,
-    restarted_where_broken,
+    mixture_log_mean,
+    renumber_if_empty,
+    restart_broken,
 )
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.candidates import Candidates, find_candidates
-from jaxnav.pose.consistency import Consistent, consistent
+from jaxnav.pose.consistency import ConsistentSnapshot, remove_outliers
 from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
 
 
@@ -146,7 +146,7 @@ class Navigator(eqx.Module):
         """Fuse an observation: the next belief, and the estimate that is reported of it."""
         return self.fuse(belief, self.look(obs.usable()))
 
-    def fuse(self, belief: Belief, seen: Consistent) -> tuple[Belief, Estimate]:
+    def fuse(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Estimate]:
         """Predict a belief, then correct it by the markers in view, if there are any."""
         predicted = self.predict(belief, seen.snapshot.obs)
         belief, evidence = jax.lax.cond(
@@ -156,18 +156,18 @@ class Navigator(eqx.Module):
         )
         return belief, Estimate.of(self.motion, belief, evidence)
 
-    def look(self, obs: Observation) -> Consistent:
+    def look(self, obs: Observation) -> ConsistentSnapshot:
         """The candidate poses of an observation, without sightings that can be no marker."""
-        return consistent(self.snapshot(obs), self.find_candidates, self.no_candidates())
+        return remove_outliers(self.snapshot(obs), self.find_candidates, self.no_candidates())
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
         """The belief `obs.dt_s` later (Eq. 9), with the odometry fused where there is any."""
-        return belief.predicted(self._sound(self.motion.predict(belief.bank, obs)))
+        return belief.with_prediction(self._sound(self.motion.predict(belief.bank, obs)))
 
-    def correct(self, belief: Belief, seen: Consistent) -> tuple[Belief, Evidence]:
+    def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
         motion, obs = self.motion, seen.snapshot.obs
-        prior = numbered_anew_where_empty(belief.bank)
+        prior = renumber_if_empty(belief.bank)
         predicted = motion.poses(prior)
         selection = self.selector(predicted, seen.candidates, seen.snapshot)
         updated = motion.update(prior, selection, obs)
@@ -183,7 +183,7 @@ class Navigator(eqx.Module):
             nis=jnp.where(bank.initialised[best], updated.nis[best], 0),
             gate_nis=jnp.asarray(predicted.gate_nis, bank.mean.dtype),
             outvoted=seen.outvoted,
-            log_likelihood=of_mixture(prior, updated.log_likelihood),
+            log_likelihood=mixture_log_mean(prior, updated.log_likelihood),
         )
         return belief, evidence
 
@@ -234,7 +234,7 @@ class Navigator(eqx.Module):
         return Evidence.none(self.no_candidates(), len(self.markers.ids), belief.bank.mean.dtype)
 
     def _sound(self, bank: Bank) -> Bank:
-        return restarted_where_broken(bank, self.motion.init(bank.initialised.shape[0]))
+        return restart_broken(bank, self.motion.init(bank.initialised.shape[0]))
 
     # Bound methods hash their owner: by identity, so that `jax.jit(navigator.step)` works.
     __hash__ = object.__hash__

@@ -13,17 +13,17 @@ import pytest
 import zarr
 
 from jaxnav.datasets import bag_readers
-from jaxnav.datasets.bags import decompressed, read_bag
+from jaxnav.datasets.bags import decompress_bag, read_bag
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.detection import make_detector
 from jaxnav.detection.aruco import _CLOSER_LOOK_PX, _worth_a_look
-from jaxnav.detection.crowd import thinned
+from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import all_cells
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
-from jaxnav.files.images import decoded_image, image_problem, read_image
+from jaxnav.files.images import decode_image, image_problem, read_image
 from jaxnav.files.npz import read_npz
 from jaxnav.files.reading import read_mapping
 from jaxnav.recording.drive_log import read_drive
@@ -63,7 +63,7 @@ def problem(load, path: Path) -> str:
 def test_a_picture_is_as_large_as_its_header_says(name, tmp_path):
     path = bombs.PICTURES[name](tmp_path / name)
     assert image_problem(path.read_bytes()) is not None
-    assert decoded_image(path.read_bytes()) is None
+    assert decode_image(path.read_bytes()) is None
     problem(read_image, path)
 
 
@@ -79,7 +79,7 @@ def test_the_size_of_a_picture_is_read_as_opencv_reads_it():
     for extension, options in ways:
         raw = cv2.imencode(extension, image, options)[1].tobytes()
         assert image_size_px(raw) == (37, 24), extension
-        decoded = decoded_image(raw)
+        decoded = decode_image(raw)
         assert decoded is not None
         assert decoded.shape == image.shape
     deep = cv2.imencode(".png", image.astype(np.uint16))[1].tobytes()
@@ -132,7 +132,7 @@ def test_a_compressed_bag_does_not_fill_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
 
     def load(path: Path) -> None:
-        with decompressed(path):
+        with decompress_bag(path):
             pass
 
     assert "far more than any recording" in problem(load, path)
@@ -248,7 +248,7 @@ def test_a_picture_full_of_squares_is_thinned_out(name):
     image = CROWDS[name]
     detector = make_detector("aruco")
     whole = detector._decoder(0.0)
-    left = thinned(image, "tag36h11", 25.0)
+    left = thin_crowd(image, "tag36h11", 25.0)
     assert left is not image
     assert len(whole.detectMarkers(left)[2]) < 400
 
@@ -266,7 +266,7 @@ def test_a_marker_in_a_crowd_is_found():
 def test_an_ordinary_picture_is_left_as_it_is():
     rng = np.random.default_rng(0)
     for image in (rng.integers(0, 256, (410, 820), np.uint8), grille(160, 100)):
-        assert thinned(image, "tag36h11", 25.0) is image
+        assert thin_crowd(image, "tag36h11", 25.0) is image
 
 
 def test_what_is_worth_a_look_is_what_it_was():

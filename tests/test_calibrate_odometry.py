@@ -14,7 +14,7 @@ from jaxnav.cli import main
 from jaxnav.commands.calibrate.odometry_recordings import drive_of
 from jaxnav.detection import Detections
 from jaxnav.files import load_vehicle, save_markers
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.messages import input_message
@@ -51,7 +51,7 @@ def inputs_of(drive: Drive) -> list[Input]:
             refined=np.array([True]),
             families=("tag36h11",),
         )
-        frame = Sighted(int(drive.camera[row]), int(stamp_ns), found)
+        frame = FrameDetections(int(drive.camera[row]), int(stamp_ns), found)
         inputs.append(Input(int(stamp_ns) + 30_000_000, frames=(frame,)))
     return sorted(inputs, key=lambda given: given.now_ns)
 

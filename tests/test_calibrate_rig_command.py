@@ -18,7 +18,7 @@ from jaxnav.commands.calibrate.report import coverage
 from jaxnav.datasets.sightings import read_sightings
 from jaxnav.detection.types import Detections
 from jaxnav.files import load_markers, load_rig, save_markers, save_rig
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_setup import DriveSetup
@@ -68,7 +68,7 @@ def drive(tmp_path_factory, room) -> Path:
                 refined=np.ones(len(rows), bool),
                 families=("tag36h11",) * len(rows),
             )
-            frames.append(Sighted(camera, now_ns, found))
+            frames.append(FrameDetections(camera, now_ns, found))
         recorder.put(*input_message(Input(now_ns, frames=tuple(frames))))
     recorder.close()
     assert recorder.failed is None

@@ -17,8 +17,8 @@ from jaxnav.commands.drive.delay_watch import DelayWatch, delays_of, warnings
 from jaxnav.detection import Detections
 from jaxnav.loop.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
-from jaxnav.loop.history import Told
+from jaxnav.loop.frames import FrameDetections
+from jaxnav.loop.history import EventData
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.models.geometry import T_world_vehicle_from_planar
@@ -92,7 +92,7 @@ class Drive:
                     np.ones(len(which), bool),
                     tuple(MARKERS.families[m] for m in which),
                 )
-                seen.append(Sighted(camera, _ns(when_s), found))
+                seen.append(FrameDetections(camera, _ns(when_s), found))
             events.append((when_s + 0.03, tuple(seen)))
         off = rng.normal(0, 0.02, 3)
         told = []
@@ -129,7 +129,7 @@ def found_on(drive: Drive, setup=SETUP) -> CameraDelays:
 @pytest.mark.parametrize("late_s", [-0.05, 0.0, 0.05, 0.1, 0.15])
 def test_a_delay_is_found_to_its_sigma(late_s):
     delays = found_on(Drive(late_s))
-    front = delays.found[0]
+    front = delays.delays[0]
     assert front.known
     assert abs(front.delay_s - late_s) < 4 * front.sigma_s
     assert abs(front.delay_s - late_s) < 0.02
@@ -149,7 +149,7 @@ def test_what_is_harmless_or_no_delay_is_not_told_as_one(wrong, seed):
 
 def test_one_camera_alone_is_told_by_its_name():
     delays = found_on(Drive(0.06, cameras=(0,)))
-    assert delays.found[0].late
+    assert delays.delays[0].late
     lines = list(warnings(delays, SETUP))
     assert len(lines) == 1
     assert lines[0].startswith(f"camera {RIG.names[0]!r} is ")
@@ -161,7 +161,7 @@ def test_one_camera_alone_is_told_by_its_name():
 )
 def test_a_drive_that_does_not_tell_says_so(drive):
     """Straight on and standing: the same whatever the delay."""
-    front = found_on(dataclasses.replace(drive, duration_s=3.4)).found[0]
+    front = found_on(dataclasses.replace(drive, duration_s=3.4)).delays[0]
     assert not front.known
     assert not front.late
 
@@ -172,7 +172,7 @@ def test_what_is_corrected_already_is_not_found_again():
     setup = dataclasses.replace(SETUP, vehicle=vehicle)
     right = found_on(Drive(0.05), setup)
     assert not right.late
-    assert abs(right.found[0].delay_s) < HARMLESS_S
+    assert abs(right.delays[0].delay_s) < HARMLESS_S
     twice = found_on(Drive(0.12), setup)
     (line,) = warnings(twice, setup)
     number = float(line.split("camera_delay_s to ")[1].split()[0])
@@ -184,7 +184,7 @@ def test_far_from_zero_it_is_the_same():
     setup = dataclasses.replace(SETUP, markers=far)
     log = Drive(0.05).log(setup)
     log.outcomes.pose[:, :2] += [1e7, -1e7]
-    moved, here = delays_of(log, setup).found[0], found_on(Drive(0.05)).found[0]
+    moved, here = delays_of(log, setup).delays[0], found_on(Drive(0.05)).delays[0]
     assert moved.delay_s == pytest.approx(here.delay_s, abs=1e-4)
 
 
@@ -203,17 +203,17 @@ def test_stretches_that_contradict_each_other_widen_sigma():
     for delay_s in (0.0, 0.1):
         delays._sums[0] += information * np.array([1.0, delay_s, delay_s**2])
         delays._counts[0] += 1
-    assert delays.found[0].delay_s == pytest.approx(0.05)
-    assert not delays.found[0].known
+    assert delays.delays[0].delay_s == pytest.approx(0.05)
+    assert not delays.delays[0].known
 
 
 def test_nothing_grows_however_long_it_drives():
     delays = CameraDelays(RIG, MARKERS, VEHICLE)
-    told = Told(None, np.zeros((4, 1, 4, 2)), np.ones((4, 1), bool), np.ones((4, 1, 4)))
+    told = EventData(None, np.zeros((4, 1, 4, 2)), np.ones((4, 1), bool), np.ones((4, 1, 4)))
     for count in range(5000):
-        delays.read(count * 10**7, 0.1, 0.0)
-        delays.seen(count * 10**7, told)
-        delays.at(count * 10**7, np.zeros(3))
+        delays.add_reading(count * 10**7, 0.1, 0.0)
+        delays.add_corners(count * 10**7, told)
+        delays.add_pose(count * 10**7, np.zeros(3))
     assert max(map(len, (delays._readings, delays._views, delays._open))) <= 1024
 
 
@@ -224,7 +224,7 @@ def outcome_of(given: Input, pose: np.ndarray):
     stamp_ns, told = given.now_ns, None
     if given.odometry is not None:
         read = given.odometry
-        stamp_ns, told = read.stamp_ns, Told((read.speed_mps, read.steering_rad))
+        stamp_ns, told = read.stamp_ns, EventData((read.speed_mps, read.steering_rad))
     elif any(frame.detections for frame in given.frames):
         corners_px, visible = np.zeros((4, 1, 4, 2)), np.zeros((4, 1), bool)
         for frame in given.frames:
@@ -233,34 +233,34 @@ def outcome_of(given: Input, pose: np.ndarray):
                 visible[frame.camera] = True
         stamp_ns, told = (
             given.frames[0].stamp_ns,
-            Told(None, corners_px, visible, np.ones((4, 1, 4))),
+            EventData(None, corners_px, visible, np.ones((4, 1, 4))),
         )
     return dataclasses.replace(
-        outcome, now_ns=given.now_ns, stamp_ns=stamp_ns, told=told, output=output
+        outcome, now_ns=given.now_ns, stamp_ns=stamp_ns, data=told, output=output
     )
 
 
 def test_while_it_drives_one_warning_is_given(capsys):
     watch = DelayWatch(SETUP, warns=True)
     for given, pose in Drive(0.06).inputs():
-        watch.handled(given, outcome_of(given, pose))
+        watch.on_outcome(given, outcome_of(given, pose))
     for _ in range(3000):
         if watch.faults:
             break
         watch._thread.join(0.02)
     watch.close()
     assert watch.faults == Fault.CAMERA_LATE
-    assert "ms later than stamps say" in (watch.told or "")
+    assert "ms later than stamps say" in (watch.closing_note or "")
     assert capsys.readouterr().err.count("later than stamps say") == 1
 
 
 def test_of_cameras_in_time_nothing_is_said(capsys):
     watch = DelayWatch(SETUP, warns=True)
     for index in range(20):
-        watch.handled(make_input(index), make_outcome(index))
+        watch.on_outcome(make_input(index), make_outcome(index))
     watch.close()
     assert watch.faults == Fault(0)
-    assert watch.told is None
+    assert watch.closing_note is None
     assert capsys.readouterr().err == ""
 
 
@@ -276,4 +276,7 @@ def test_the_doctor_tells_it_of_a_recorded_drive(monkeypatch):
     assert {finding.level for finding in fine} <= {"ok", "note"}
     assert fine[0].level == "ok"
     assert any("does not tell" in finding.what for finding in fine)  # who saw no marker
-    assert delay_watch.told(Delay(-0.0304, 0.0004, 2)) == "30 +- 1 ms earlier than stamps say"
+    assert (
+        delay_watch.describe_delay(Delay(-0.0304, 0.0004, 2))
+        == "30 +- 1 ms earlier than stamps say"
+    )

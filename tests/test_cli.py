@@ -13,7 +13,7 @@ import pytest
 
 from jaxnav import cli, configuration
 from jaxnav.commands import COMMANDS, names
-from jaxnav.commands.drive.arguments import Locate, Replay
+from jaxnav.commands.drive.arguments import Locate, ReplayRecording
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.errors import BadInput
 
@@ -56,7 +56,7 @@ def test_arguments_reach_the_command(command) -> None:
             out=Path("x"),
             params=Path("p.yaml"),
         ),
-        Replay(Path("bag"), limit=5, markers="one-at-a-time", markers_file=Path("m.yaml")),
+        ReplayRecording(Path("bag"), limit=5, markers="one-at-a-time", markers_file=Path("m.yaml")),
         Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, json=True),
     ]
 

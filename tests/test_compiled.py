@@ -183,7 +183,13 @@ def test_nothing_that_a_file_holds_is_run_as_python(tmp_path):
         packed(len(head)) + head + pickled,
         packed(len(pickled)) + pickled + code,
     ]
-    named = ["os:system", "jaxnav.cli:main", "jaxnav.loop.plugins:find", "builtins:type", "no"]
+    named = [
+        "os:system",
+        "jaxnav.cli:main",
+        "jaxnav.loop.plugins:load_factory",
+        "builtins:type",
+        "no",
+    ]
     for name in named:
         other = head.replace(b'"tree": ["list", 0]', f'"tree": ["{name}", {{}}]'.encode())
         assert other != head

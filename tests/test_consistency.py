@@ -8,7 +8,7 @@ import pytest
 
 from jaxnav.navigator import Navigator
 from jaxnav.pose.candidates import both_poses, own_errors_px
-from jaxnav.pose.consistency import consistent
+from jaxnav.pose.consistency import remove_outliers
 from jaxnav.pose.observation import Observation
 from tests import worlds
 
@@ -27,7 +27,7 @@ def told():
     @jax.jit
     def told(navigator, obs):
         snapshot = navigator.snapshot(obs)
-        found = consistent(snapshot, navigator.find_candidates, navigator.no_candidates())
+        found = remove_outliers(snapshot, navigator.find_candidates, navigator.no_candidates())
         return snapshot, found, own_errors_px(snapshot, both_poses(snapshot))
 
     return told

@@ -16,7 +16,7 @@ from jaxnav.files import load_vehicle, save_vehicle
 from jaxnav.files.provenance import calibrated_now
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.estimator import advance_packed
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.limits import Limits
@@ -24,7 +24,7 @@ from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.testing.lockstep import BEGIN_NS
 from jaxnav.vehicles.sim import SimVehicle
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 from tests.helpers.simulated import make_setup, simulated
 
@@ -51,11 +51,11 @@ corrections = st.builds(
 def test_what_is_read_is_corrected_back(corrections, speed_mps, steering_rad, true_ns):
     stamp_ns = true_ns + corrections.reading_late_ns
     read = Odometry(stamp_ns, *corrections.read(speed_mps, steering_rad))
-    true = corrections.reading(read)
+    true = corrections.correct_reading(read)
     assert true.speed_mps == pytest.approx(speed_mps, rel=1e-12, abs=1e-12)
     assert true.steering_rad == pytest.approx(steering_rad, rel=1e-12, abs=1e-12)
     assert true.stamp_ns == true_ns
-    seen = corrections.frame(Sighted(0, true_ns + corrections.frame_late_ns, None))
+    seen = corrections.correct_frame(FrameDetections(0, true_ns + corrections.frame_late_ns, None))
     assert seen.stamp_ns == true_ns
     assert corrections.true_rad(corrections.servo_rad(steering_rad)) == pytest.approx(
         steering_rad, rel=1e-12, abs=1e-12
@@ -64,8 +64,8 @@ def test_what_is_read_is_corrected_back(corrections, speed_mps, steering_rad, tr
 
 @given(corrections, st.integers(0, 2**62), st.integers(0, 2**62))
 def test_stamps_differ_by_the_delay_and_none_is_moved_ahead(corrections, frame_ns, reading_ns):
-    frame = corrections.frame(Sighted(0, frame_ns, None)).stamp_ns
-    reading = corrections.reading(Odometry(reading_ns, 1.0, 0.0)).stamp_ns
+    frame = corrections.correct_frame(FrameDetections(0, frame_ns, None)).stamp_ns
+    reading = corrections.correct_reading(Odometry(reading_ns, 1.0, 0.0)).stamp_ns
     assert frame <= frame_ns
     assert reading <= reading_ns
     moved_ns = (frame - frame_ns) - (reading - reading_ns)
@@ -76,9 +76,9 @@ def test_stamps_differ_by_the_delay_and_none_is_moved_ahead(corrections, frame_n
 def test_without_a_calibration_nothing_is_touched(speed_mps, steering_rad, stamp_ns):
     neutral = Corrections.of(worlds.qcar())
     read = Odometry(stamp_ns, speed_mps, steering_rad)
-    seen = Sighted(0, stamp_ns, None)
-    assert neutral.reading(read) is read
-    assert neutral.frame(seen) is seen
+    seen = FrameDetections(0, stamp_ns, None)
+    assert neutral.correct_reading(read) is read
+    assert neutral.correct_frame(seen) is seen
     told = neutral.servo_rad(steering_rad)
     assert told is steering_rad
     assert neutral.read(speed_mps, steering_rad)[1] is steering_rad
@@ -151,7 +151,9 @@ def _as_sensed(given: Input, corrections: Corrections) -> Input:
 
 
 def test_the_simulated_car_is_off_as_its_file_says():
-    world = World(worlds.qcar_rig(), worlds.paper_markers(), vehicle(), worlds.FRONT_VIEW, BEGIN_NS)
+    world = SimWorld(
+        worlds.qcar_rig(), worlds.paper_markers(), vehicle(), worlds.FRONT_VIEW, BEGIN_NS
+    )
     told = []
     world.write = lambda *command: told.append(command)
     world.odometry = lambda at_ns: (1.0, 0.2)

@@ -9,7 +9,7 @@ import pytest
 from jaxnav.commands.doctor.fits import Sighted
 from jaxnav.commands.doctor.orders import in_their_order
 from jaxnav.commands.doctor.photographs import examine_pictures
-from jaxnav.detection import Observed
+from jaxnav.detection import CornerLanes
 from jaxnav.files import Route
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -197,7 +197,7 @@ def test_corners_of_curled_paper_are_those_of_no_square(bent_px, level):
     seen = observe(RIG, markers, planar(*POSE))
     corners_px = np.array(seen.corners_px)
     corners_px[:, :, 0] += bent_px
-    told = Observed(corners_px, np.asarray(seen.visible), np.full((4, 1, 4), 0.1), 0, 0)
+    told = CornerLanes(corners_px, np.asarray(seen.visible), np.full((4, 1, 4), 0.1), 0, 0)
     _, (pose,), findings = in_their_order(Sighted.of(RIG, markers, told, 6), ROUTE)
     assert findings[-1].level == level
     assert ("off those of any square" in findings[-1].what) == (level == "warning")

@@ -16,7 +16,7 @@ from jaxnav.detection import marker_cells
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, write_params
 from jaxnav.loop.flags import Fault, Health
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.recording.drive_log import DriveLog, read_drive
 from jaxnav.recording.drive_replay import (
@@ -163,7 +163,7 @@ def test_outcomes_that_were_lost_are_passed_over(drive, setup, outcomes, tmp_pat
 
 
 def test_frames_of_cameras_that_are_not_there_are_refused(setup):
-    frame = Sighted(4, BEGIN_NS, None)
+    frame = FrameDetections(4, BEGIN_NS, None)
     with pytest.raises(BadInput, match=r"^a.mcap: /frames.camera: must be from 0 to 3, got 4$"):
         check_inputs([Input(BEGIN_NS, frames=(frame,))], setup, Path("a.mcap"))
     with pytest.raises(BadInput, match=r"now_ns\[1\]: is less than that of the input before"):
@@ -173,7 +173,7 @@ def test_frames_of_cameras_that_are_not_there_are_refused(setup):
 # --- images ---------------------------------------------------------------------------------------
 
 
-def picture(frame: Sighted, size_px: tuple[int, int]) -> np.ndarray:
+def picture(frame: FrameDetections, size_px: tuple[int, int]) -> np.ndarray:
     """A grey wall with the frame's markers on it, as sharp as it gets."""
     width, height = size_px
     image = np.full((height, width), 160, np.uint8)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxnav.loop.expect import Expected, expected
+from jaxnav.loop.expect import Expected, expect_corners
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from tests.worlds import observe, qcar_rig, room_markers
 
@@ -51,7 +51,7 @@ def expect_from(
 ) -> Expected:
     """As numpy. Always called alike, so that it is compiled once."""
     arguments = T_world_vehicle, jnp.asarray(covariance), jnp.asarray(margin_px)
-    return jax.device_get(expected(RIG, MARKERS, *arguments))
+    return jax.device_get(expect_corners(RIG, MARKERS, *arguments))
 
 
 @pytest.mark.parametrize("mean", MEANS)
@@ -122,8 +122,8 @@ def test_any_covariance_gives_an_answer():
 
 
 def test_it_is_compiled_once():
-    before = expected.jitted._cache_size()
+    before = expect_corners.jitted._cache_size()
     for mean in MEANS:
         for belief in BELIEFS.values():
             expect(mean, covariance_of(*belief), 2.0)
-    assert expected.jitted._cache_size() - before <= 1
+    assert expect_corners.jitted._cache_size() - before <= 1

@@ -11,9 +11,9 @@ import pytest
 from jaxnav.cli import main
 from jaxnav.detection import make_detector
 from jaxnav.loop.estimator import advance_packed
-from jaxnav.loop.expect import expected
+from jaxnav.loop.expect import expect_corners
 from jaxnav.loop.flags import Fault, Health
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.pilot import Pilot
 from jaxnav.loop.seeing import Region, Search
@@ -22,10 +22,10 @@ from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor
 from jaxnav.testing import injections as inject
-from jaxnav.testing.faults import WAYPOINTS_M, Row, Trial, line, run_trial
+from jaxnav.testing.faults import WAYPOINTS_M, FaultRow, Trial, line, run_trial
 from jaxnav.testing.lockstep import BEGIN_NS, drive
 from jaxnav.testing.matrix import matrix
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 
 
@@ -62,7 +62,7 @@ def test_every_fault_comes_to_what_it_must(trial, row):
 class FrozenPicture:
     """From an instant on the front camera shows one picture, with a clock in its corner."""
 
-    def __init__(self, trial: Trial, world: World, navigator: Navigator, begin_s: float):
+    def __init__(self, trial: Trial, world: SimWorld, navigator: Navigator, begin_s: float):
         self.world, self.navigator, self.begin_ns = world, navigator, BEGIN_NS + int(begin_s * 1e9)
         scene = Scene.create(trial.markers, seed=0)
         self.renderer = Renderer(scene, trial.rig, sensor=Sensor(), threads=1)
@@ -71,7 +71,7 @@ class FrozenPicture:
         self.picture: np.ndarray | None = None
         self.output: Output | None = None
 
-    def edit(self, frame: Sighted) -> Sighted:
+    def edit(self, frame: FrameDetections) -> FrameDetections:
         """As whoever looks at pictures: near where the marker is expected, or everywhere."""
         if frame.camera != 0 or frame.stamp_ns < self.begin_ns:
             return frame
@@ -82,7 +82,7 @@ class FrozenPicture:
         image[:8, :8] = np.frombuffer(frame.stamp_ns.to_bytes(8), np.uint8)
         rig, markers = self.navigator.rig, self.navigator.markers
         wxyz_xyz = np.asarray(self.output.T_world_vehicle.wxyz_xyz)
-        found = expected(rig, markers, wxyz_xyz, np.asarray(self.output.covariance[:3, :3]))
+        found = expect_corners(rig, markers, wxyz_xyz, np.asarray(self.output.covariance[:3, :3]))
         quads_px, visible, radius_px = (np.asarray(part)[0] for part in found)
         region = Region(quads_px[visible], radius_px[visible])
         return self.search.look(Frame(frame.stamp_ns, image), region)
@@ -95,7 +95,7 @@ def test_a_picture_that_freezes_does_not_lead_the_car_astray(trial):
         trial.rig, trial.markers, trial.vehicle, WAYPOINTS_M, waypoint_radius_m=0.15
     )
     pilot = Pilot(navigator, program=trial.program(navigator))
-    world = World(trial.rig, trial.markers, trial.vehicle, trial.start_pose, BEGIN_NS)
+    world = SimWorld(trial.rig, trial.markers, trial.vehicle, trial.start_pose, BEGIN_NS)
     frozen = FrozenPicture(trial, world, navigator, begin_s)
     steps = []
     for step in drive(pilot, world, begin_s + 4.0, inject.frames(frozen.edit)):
@@ -128,7 +128,7 @@ def test_what_is_asked_of_a_fault_can_be_missed(trial):
 def test_rows_have_names_of_their_own():
     names = [row.name for row in matrix()]
     assert len(set(names)) == len(names)
-    assert all(isinstance(row, Row) and np.isfinite(row.drive_s) for row in matrix())
+    assert all(isinstance(row, FaultRow) and np.isfinite(row.drive_s) for row in matrix())
 
 
 def test_a_fault_that_is_not_there_is_one_line(capsys, monkeypatch):

@@ -17,7 +17,7 @@ import yaml
 from jaxnav import files
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.images import decoded_image
+from jaxnav.files.images import decode_image
 
 QCAR = files.calib_dir() / "qcar"
 LOADERS: dict[str, Callable[[Path], Any]] = {
@@ -119,7 +119,7 @@ def test_a_saved_rig_reads_back_bit_for_bit(precision, tmp_path):
 
 
 def test_a_saved_map_reads_back_bit_for_bit(precision, tmp_path):
-    tilted = poses.looking(20.0, 30.0, 40.0)
+    tilted = poses.rotation_towards(20.0, 30.0, 40.0)
     corners = (np.array([1.0, 2.0, 3.0]) + 0.1 * _SQUARE @ tilted.T).tolist()
     entry = {"id": 5, "family": "4x4_50", "size_m": 0.2, "corners_world_m": corners}
     entries = [entry, *yaml.safe_load((QCAR / "markers.yaml").read_text())["markers"]]
@@ -138,7 +138,7 @@ _SQUARE = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
 
 def test_the_three_ways_to_place_a_camera_agree(tmp_path):
     T_vehicle_camera = np.eye(4)
-    T_vehicle_camera[:3, :3] = poses.looking(90.0, 30.0, 10.0)
+    T_vehicle_camera[:3, :3] = poses.rotation_towards(90.0, 30.0, 10.0)
     T_vehicle_camera[:3, 3] = [0.1, 0.2, 0.3]
     pose = poses.pose_from_matrix(T_vehicle_camera)
     places = [
@@ -160,13 +160,13 @@ def test_the_three_ways_to_place_a_camera_agree(tmp_path):
 
 def test_small_rounding_in_a_rotation_is_repaired(tmp_path):
     T = np.eye(4)
-    T[:3, :3] = np.round(poses.looking(33.0, 0.0, 0.0), 4)
+    T[:3, :3] = np.round(poses.rotation_towards(33.0, 0.0, 0.0), 4)
     rig = files.load_rig(
         write(tmp_path, {"cameras": [one_camera("c") | {"T_vehicle_camera": T.tolist()}]})
     )
     R = np.asarray(rig.Ts_camera_vehicle.rotation().as_matrix())[0]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(R.T, poses.looking(33.0, 0.0, 0.0), atol=1e-4)
+    np.testing.assert_allclose(R.T, poses.rotation_towards(33.0, 0.0, 0.0), atol=1e-4)
 
 
 # --- what a person gets for bad input ------------------------------------------------
@@ -599,14 +599,14 @@ def test_tum_is_translation_then_quaternion_with_w_last(tmp_path):
 
 @pytest.mark.parametrize("raw", [b"", b"no picture", np.zeros(0, np.uint8)])
 def test_bytes_that_are_no_image_are_none(raw):
-    assert decoded_image(raw) is None
+    assert decode_image(raw) is None
 
 
 def test_an_image_is_decoded_unless_nobody_has_memory_for_it():
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
     raw = bytearray(cv2.imencode(".png", pixels)[1].tobytes())
-    np.testing.assert_array_equal(decoded_image(bytes(raw)), pixels)
-    assert decoded_image(np.frombuffer(raw, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (24, 32)
+    np.testing.assert_array_equal(decode_image(bytes(raw)), pixels)
+    assert decode_image(np.frombuffer(raw, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (24, 32)
     raw[16:24] = struct.pack(">II", 60_000, 60_000)  # its size, as its header says
     raw[29:33] = struct.pack(">I", zlib.crc32(raw[12:29]))
-    assert decoded_image(bytes(raw)) is None
+    assert decode_image(bytes(raw)) is None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxnav.tuning.descent import Noisy, Smooth
-from jaxnav.tuning.fit import Fit, Problem, advanced, arrays_of, fit_of
+from jaxnav.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
 from jaxnav.tuning.objective import Batch, NotFinite, Objective, where_not_finite
 
 ITEMS = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
@@ -46,10 +46,10 @@ def problem(**changes) -> Problem:
     return Problem(**asked | changes)
 
 
-def fitted(problem: Problem, x=BEGIN) -> Fit:
-    fit = Fit.begin(x, problem)
+def fitted(problem: Problem, x=BEGIN) -> TuningFit:
+    fit = TuningFit.begin(x, problem)
     while not fit.over:
-        fit = advanced(fit, problem)
+        fit = take_step(fit, problem)
     return fit
 
 
@@ -210,7 +210,7 @@ def test_but_not_for_ever(steps, patience):
     np.testing.assert_array_equal(fit.descent.x, BEGIN)
 
 
-def saved(fit: Fit) -> dict[str, np.ndarray]:
+def saved(fit: TuningFit) -> dict[str, np.ndarray]:
     """By way of a file."""
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays_of(fit))
@@ -240,11 +240,11 @@ def test_what_goes_on_ends_at_the_same_bits(asked):
     for dtype in (np.float64, np.float32):
         with jax.enable_x64(dtype == np.float64):
             begin = jnp.asarray(BEGIN, dtype)
-            whole, fit = fitted(asked, begin), Fit.begin(begin, asked)
+            whole, fit = fitted(asked, begin), TuningFit.begin(begin, asked)
             while not fit.over:
-                fit = fit_of(saved(fit), Fit.begin(begin, asked))
-                fit = advanced(fit, asked)
-            fit = fit_of(saved(fit), Fit.begin(begin, asked))
+                fit = fit_of(saved(fit), TuningFit.begin(begin, asked))
+                fit = take_step(fit, asked)
+            fit = fit_of(saved(fit), TuningFit.begin(begin, asked))
         assert fit.best_x.dtype == dtype
         one, other = arrays_of(fit), arrays_of(whole)
         assert one.keys() == other.keys()
@@ -256,10 +256,10 @@ def test_what_goes_on_ends_at_the_same_bits(asked):
 
 def test_arrays_of_something_else_are_refused():
     asked = problem()
-    fit = advanced(Fit.begin(BEGIN, asked), asked)
+    fit = take_step(TuningFit.begin(BEGIN, asked), asked)
     arrays = arrays_of(fit)
     with pytest.raises(ValueError, match=r"\(3,\) float64 became \(2,\) float64"):
-        fit_of(arrays_of(Fit.begin(BEGIN[:2], problem(held_out=lambda *_: 0.0))), fit)
+        fit_of(arrays_of(TuningFit.begin(BEGIN[:2], problem(held_out=lambda *_: 0.0))), fit)
     with pytest.raises(ValueError, match=r"float64 became .* float32"):
         fit_of(arrays | {"descent_0": arrays["descent_0"].astype(np.float32)}, fit)
     with pytest.raises(KeyError, match="best_x"):
@@ -270,7 +270,7 @@ def test_arrays_of_something_else_are_refused():
         with pytest.raises(ValueError, match="another number of parameters"):
             fit_of(arrays | {name: arrays[name][:2]}, fit)
     with pytest.raises((ValueError, KeyError)):
-        fit_of(arrays_of(fit), Fit.begin(BEGIN, problem(optimiser=NOISY)))
+        fit_of(arrays_of(fit), TuningFit.begin(BEGIN, problem(optimiser=NOISY)))
 
 
 def planted(x, item, softness):
@@ -300,9 +300,9 @@ def test_where_a_gradient_is_not_finite_is_found():
 
 
 def test_what_is_told_of_it():
-    told = NotFinite(1, 2, 7).told(["selector.floor_m", "corner_sigma_px"], 5)
+    told = NotFinite(1, 2, 7).describe(["selector.floor_m", "corner_sigma_px"], 5)
     assert told == (
         "step 5: the gradient with respect to corner_sigma_px is not finite in drive 2 from frame "
         "7 on; not stepped on"
     )
-    assert "drive 2; not" in NotFinite(0, 2, None).told(["selector.floor_m"], 5)
+    assert "drive 2; not" in NotFinite(0, 2, None).describe(["selector.floor_m"], 5)

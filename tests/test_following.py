@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.map_fit import fit
+from jaxnav.belief.map_fit import fit_poses
 from jaxnav.control import Command
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import cayley, planar_from_T_world_vehicle
@@ -23,10 +23,10 @@ from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.tuning import branches
 from jaxnav.tuning import filter as tuned_filter
-from jaxnav.tuning.branches import Started, started
+from jaxnav.tuning.branches import SequenceStarts, find_starts
 from jaxnav.tuning.filter import FilterCost
-from jaxnav.tuning.following import Followed, follow, trusting
-from jaxnav.tuning.recorded import Recorded, simulated
+from jaxnav.tuning.following import FilterScores, follow, trust_corners
+from jaxnav.tuning.recorded import FrameSequences, simulate_sequences
 from jaxnav.tuning.unconstrained import Space
 from tests import worlds
 
@@ -72,32 +72,32 @@ class Drives:
 
 
 @functools.cache
-def recorded() -> Recorded:
+def recorded() -> FrameSequences:
     """Three drives past the marker: it leaves the view after seven frames."""
     scenario = dataclasses.replace(
         scenarios()["paper"], start_pose=(0.9, -0.6, 2.2), start_spread=(0.0,) * 3,
         frame_period_s=0.2, duration_s=0.2 * FRAMES - 0.1,
     )  # fmt: skip
     rollout = Rollout(Drives(), CAR, MARKERS, scenario, SIGMA_PX)
-    return simulated(rollout, jax.vmap(jax.random.key)(jnp.arange(3)))
+    return simulate_sequences(rollout, jax.vmap(jax.random.key)(jnp.arange(3)))
 
 
 @functools.cache
-def starts() -> Started:
-    return started(NAVIGATOR, recorded())
+def starts() -> SequenceStarts:
+    return find_starts(NAVIGATOR, recorded())
 
 
 def first_of(tree):
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
-def likely(start, recorded, step, navigator=NAVIGATOR, space=SPACE) -> Followed:
+def likely(start, recorded, step, navigator=NAVIGATOR, space=SPACE) -> FilterScores:
     """One drive, the parameters a step away from where they start."""
-    navigator = trusting(with_parameters(navigator, space.values(space.start + step)))
+    navigator = trust_corners(with_parameters(navigator, space.values(space.start + step)))
     return follow(navigator, start, recorded)
 
 
-def sums(told: Followed, axis=None):
+def sums(told: FilterScores, axis=None):
     """Of what losses are made of; position errors in cm."""
     leaves = told.log_likelihood, told.log_score, 1e4 * told.square_m2
     return jnp.stack([jnp.sum(leaf, axis=axis) for leaf in leaves])
@@ -108,11 +108,11 @@ def weighed(step, weights, start, recorded, navigator=NAVIGATOR, space=SPACE):
 
 
 @jax.jit
-def steps_of(start, recorded, steps) -> Followed:
+def steps_of(start, recorded, steps) -> FilterScores:
     return jax.lax.map(lambda step: likely(start, recorded, step), steps)
 
 
-def at_start(start, recorded) -> Followed:
+def at_start(start, recorded) -> FilterScores:
     """In the same program as all other steps."""
     return first_of(steps_of(start, recorded, jnp.zeros((2 * SPACE.start.size, SPACE.start.size))))
 
@@ -138,7 +138,7 @@ LONG = 1000
 @functools.cache
 def long_gradient():
     """Of a thousand frames, in float32."""
-    start, drive = first_of((starts().bank, recorded().padded(LONG)))
+    start, drive = first_of((starts().bank, recorded().pad_to(LONG)))
     with jax.enable_x64(False):
         start, drive, navigator, space = in_float32((start, drive, NAVIGATOR, SPACE))
 
@@ -159,7 +159,7 @@ def mirrored(pose: np.ndarray) -> np.ndarray:
     return np.array([*(marker_m + other), pose[2] + turn])
 
 
-def true_poses(recorded: Recorded) -> np.ndarray:
+def true_poses(recorded: FrameSequences) -> np.ndarray:
     return np.asarray(planar_from_T_world_vehicle(jaxlie.SE3(recorded.T_world_vehicle_true)))
 
 
@@ -187,14 +187,14 @@ def test_what_is_recorded_is_what_was_sensed():
 
 def test_shorter_recordings_are_filled_with_frames_that_are_not_used():
     drives = recorded()
-    short = Recorded(
+    short = FrameSequences(
         drives.markers,
         *jax.tree.map(
             lambda leaf: leaf[:, :5],
             (drives.obs, drives.used, drives.T_world_vehicle_true, drives.judged),
         ),
     ).rows(slice(0, 2))
-    both = Recorded.together([drives, short])
+    both = FrameSequences.concatenate([drives, short])
     assert both.used.shape == (5, FRAMES)
     np.testing.assert_array_equal(both.used.sum(axis=1), [12, 12, 12, 5, 5])
     np.testing.assert_array_equal(both.judged.sum(axis=1), [9, 9, 9, 2, 2])
@@ -309,7 +309,7 @@ def test_a_thousand_frames_need_little_memory():
     assert program.memory_analysis().temp_size_in_bytes < 1024 * LONG
 
 
-def standing(drive: Recorded, pose, visible=True) -> Recorded:
+def standing(drive: FrameSequences, pose, visible=True) -> FrameSequences:
     """A car that does not move, and corners without noise."""
     obs = worlds.observe(RIG, MARKERS, worlds.planar(*pose))
     frames = drive.used.shape[0]
@@ -335,7 +335,7 @@ def test_gradients_are_finite(kind):
     program, (step, start, drive) = long_gradient()
     if kind != "padded":
         pose = (0.9, -0.6, 2.2) if kind == "oblique" else (0.0, -0.4, np.pi / 2)
-        start, drive = first_of((starts().bank, recorded().padded(LONG)))
+        start, drive = first_of((starts().bank, recorded().pad_to(LONG)))
         drive = standing(drive, pose, visible=kind != "nothing seen")
         start = eqx.tree_at(lambda b: b.mean, start, start.mean.at[0, :3].set(jnp.asarray(pose)))
         used = jnp.ones_like(drive.used)
@@ -375,7 +375,9 @@ def test_the_implicit_gradient_is_that_of_all_steps():
         now = dataclasses.replace(obs, corners_px=corners_px)
         snapshot = Snapshot.create(RIG, MARKERS, now, sigma_px)
         prior = prior_of(logs)
-        found = fit(prior.T_world_vehicle, prior.covariance, prior, snapshot, jnp.zeros(6), 20)
+        found = fit_poses(
+            prior.T_world_vehicle, prior.covariance, prior, snapshot, jnp.zeros(6), 20
+        )
         return found.posterior.T_world_vehicle.wxyz_xyz[0]
 
     def unrolled(corners_px, logs):
@@ -417,19 +419,21 @@ def test_the_implicit_gradient_is_that_of_all_steps():
 def test_a_cost_is_what_its_loss_says(monkeypatch):
     """Signs and units, and which frames are counted."""
     drives = recorded()
-    told = Followed(*(jnp.full(FRAMES, value) for value in (3.0, 5.0, 0.02, 1.0)))
+    told = FilterScores(*(jnp.full(FRAMES, value) for value in (3.0, 5.0, 0.02, 1.0)))
     seen = []
 
     def stub(navigator, start, recorded):
         seen.append(navigator)
         used, judged = (jnp.sum(mask) / FRAMES for mask in (recorded.used, recorded.judged))
-        return Followed(
+        return FilterScores(
             told.log_likelihood * used, told.log_score * judged, told.square_m2, told.nees
         )
 
     decided = jnp.asarray([True, False, True])
     monkeypatch.setattr(tuned_filter, "follow", stub)
-    monkeypatch.setattr(tuned_filter, "started", lambda n, r: Started(starts().bank, decided))
+    monkeypatch.setattr(
+        tuned_filter, "started", lambda n, r: SequenceStarts(starts().bank, decided)
+    )
     for loss, cost, frames in (("likelihood", -3.0, 24), ("score", -5.0 * 9 / 12, 18)):
         of = FilterCost(NAVIGATOR, SPACE, loss)
         batch = of.batch(SPACE.start, drives)
@@ -442,7 +446,7 @@ def test_a_cost_is_what_its_loss_says(monkeypatch):
     error = FilterCost(NAVIGATOR, SPACE, "error")
     np.testing.assert_allclose(error(SPACE.start, item, jnp.zeros(())), 200.0)
     nobody = SimpleNamespace(bank=starts().bank, chosen=jnp.zeros(3, bool))
-    monkeypatch.setattr(tuned_filter, "started", lambda n, r: nobody)
+    monkeypatch.setattr(tuned_filter, "find_starts", lambda n, r: nobody)
     assert float(error.batch(SPACE.start, drives).frames) == 1
     assert seen[0].selector.max_inflation == seen[0].selector.max_misfit == 1
     assert np.isinf(seen[0].motion.gate_nis)

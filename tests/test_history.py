@@ -4,19 +4,19 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.loop.history import KEPT, THIN_NS, History, Told
+from jaxnav.loop.history import KEPT, THIN_NS, EventData, History
 from jaxnav.loop.stamps import OLD_NS
 
 BEGIN_NS = 10**12
 MS = 1_000_000
 
 
-def told(number: int) -> Told:
+def told(number: int) -> EventData:
     """Of a camera too: such events are never left out."""
-    return Told(odometry=(float(number), 0.0), corners_px=np.zeros(1))
+    return EventData(odometry=(float(number), 0.0), corners_px=np.zeros(1))
 
 
-def number_of(of: Told | None) -> int:
+def number_of(of: EventData | None) -> int:
     assert of is not None
     assert of.odometry is not None
     return int(of.odometry[0])
@@ -31,10 +31,10 @@ def fuse(history: History, stamp_ns: int, number: int, made=told) -> tuple | Non
     stamps_ns = [entry.stamp_ns for entry in entries]
     assert [base.stamp_ns, *stamps_ns] == sorted([base.stamp_ns, *stamps_ns])
     assert len(entries) <= KEPT + 1
-    numbers = [number_of(entry.told) for entry in entries]
+    numbers = [number_of(entry.data) for entry in entries]
     new = numbers.index(number)
     moment = (*base.belief, *numbers)
-    history.fused(moment, entries[new], (*base.belief, *numbers[: new + 1]))
+    history.store(moment, entries[new], (*base.belief, *numbers[: new + 1]))
     return moment
 
 
@@ -59,8 +59,8 @@ def test_events_in_order_are_fused_once():
         placed = history.place(BEGIN_NS + 10 * MS * number, told(number))
         assert placed is not None
         base, entries = placed
-        assert [number_of(entry.told) for entry in entries] == [number]
-        history.fused((*base.belief, number), entries[0], (*base.belief, number))
+        assert [number_of(entry.data) for entry in entries] == [number]
+        history.store((*base.belief, number), entries[0], (*base.belief, number))
         assert history.newest_ns == BEGIN_NS + 10 * MS * number
 
 
@@ -72,7 +72,7 @@ def test_a_late_event_undoes_those_after_it_alone():
     assert placed is not None
     base, entries = placed
     assert base.stamp_ns == BEGIN_NS + 60 * MS
-    assert [number_of(entry.told) for entry in entries] == [99, 7, 8, 9]
+    assert [number_of(entry.data) for entry in entries] == [99, 7, 8, 9]
 
 
 def test_cameras_that_are_always_late_cost_little():
@@ -85,8 +85,8 @@ def test_cameras_that_are_always_late_cost_little():
         assert placed is not None
         _, entries = placed
         longest = max(longest, len(entries))
-        new = [number_of(entry.told) for entry in entries].index(number)
-        history.fused((), entries[new], ())
+        new = [number_of(entry.data) for entry in entries].index(number)
+        history.store((), entries[new], ())
     assert longest <= 10
 
 
@@ -121,12 +121,12 @@ def test_all_that_stamps_let_in_has_its_place_whatever_the_rates(rate_hz, late_m
         for c in range(cameras)
     ]
     for _, stamp_ms, corners_px in sorted(events, key=lambda event: event[:2]):
-        of = Told(odometry=(0.0, 0.0), corners_px=corners_px)
+        of = EventData(odometry=(0.0, 0.0), corners_px=corners_px)
         placed = history.place(int(stamp_ms * MS), of)
         assert placed is not None
         _, entries = placed
-        new = next(entry for entry in entries if entry.told is of)
-        history.fused((), new, ())
+        new = next(entry for entry in entries if entry.data is of)
+        history.store((), new, ())
         most = max(most, len(entries))
     # Of the odometer no more than one each THIN_NS, and two beside each frame.
     fastest_hz = min(rate_hz, 1e9 / THIN_NS)
@@ -136,7 +136,12 @@ def test_all_that_stamps_let_in_has_its_place_whatever_the_rates(rate_hz, late_m
 def test_of_a_fast_odometer_no_more_than_needed_is_fused_once_more():
     history = History((), BEGIN_NS)
     for number in range(1000):  # 500 Hz
-        fuse(history, BEGIN_NS + 2 * MS * number, number, lambda n: Told(odometry=(float(n), 0.0)))
+        fuse(
+            history,
+            BEGIN_NS + 2 * MS * number,
+            number,
+            lambda n: EventData(odometry=(float(n), 0.0)),
+        )
     placed = history.place(BEGIN_NS + 1800 * MS, told(5000))
     assert placed is not None
     assert len(placed[1]) <= 200 * MS / THIN_NS + 2
@@ -145,7 +150,7 @@ def test_of_a_fast_odometer_no_more_than_needed_is_fused_once_more():
 def test_there_is_an_end_to_what_is_kept():
     history = History((), BEGIN_NS)
     for number in range(2 * KEPT):
-        placed = history.place(BEGIN_NS + number, Told(corners_px=np.zeros(1)))
-        history.fused((), placed[1][0], ())
+        placed = history.place(BEGIN_NS + number, EventData(corners_px=np.zeros(1)))
+        history.store((), placed[1][0], ())
     assert history.place(BEGIN_NS + KEPT - 2, told(0)) is None
     assert history.place(BEGIN_NS + KEPT + 2, told(0)) is not None

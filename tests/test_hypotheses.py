@@ -17,8 +17,8 @@ from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.fan import fan
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.map_fit import fit
-from jaxnav.belief.motion import Bank, followed, merged, unstarted
+from jaxnav.belief.map_fit import fit_poses
+from jaxnav.belief.motion import Bank, empty_bank, follow_pose, merge_heirs
 from jaxnav.models.geometry import on_ground
 from jaxnav.navigator import Navigator
 from jaxnav.pose.candidates import Candidates, find_candidates
@@ -173,7 +173,7 @@ def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(f
     floors = jnp.full(6, floor)
 
     def covariance(here, prior, snapshot, floors):
-        found = fit(jaxlie.SE3(here), prior.covariance, prior, snapshot, floors, 20)
+        found = fit_poses(jaxlie.SE3(here), prior.covariance, prior, snapshot, floors, 20)
         return found.posterior.covariance
 
     exact = correlations(jit_to_run(covariance)(here, prior, snapshot, floors), freedom)
@@ -364,14 +364,14 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     heir = np.array([0, 0, 2, 0, 2, 2])
     belief = Bank(
         jnp.asarray(means), jnp.asarray(covariances), jnp.log(weights), jnp.asarray(alive),
-        unstarted(jnp.zeros(n), n, 3, count).rejections, jnp.arange(count),
+        empty_bank(jnp.zeros(n), n, 3, count).rejections, jnp.arange(count),
     )  # fmt: skip
 
     def difference(mean, base):
         apart = mean - base
         return apart.at[2].set(jnp.arctan2(jnp.sin(apart[2]), jnp.cos(apart[2])))
 
-    after = merged(belief, jnp.asarray(heir), difference, lambda mean, error: mean + error)
+    after = merge_heirs(belief, jnp.asarray(heir), difference, lambda mean, error: mean + error)
     assert after.initialised.tolist() == [True, False, True, False, False, False]
     for receiver in (0, 2):
         who = np.flatnonzero((heir == receiver) & alive)
@@ -430,10 +430,10 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
 def test_nobody_merges_with_itself():
     motionless = Bank(
         jnp.ones((3, 2)), jnp.tile(jnp.eye(2), (3, 1, 1)), jnp.log(jnp.asarray([0.2, 0.3, 0.5])),
-        jnp.asarray([True, False, True]), unstarted(jnp.zeros(2), 2, 1, 3).rejections,
+        jnp.asarray([True, False, True]), empty_bank(jnp.zeros(2), 2, 1, 3).rejections,
         jnp.arange(3),
     )  # fmt: skip
-    after = merged(motionless, jnp.arange(3), lambda m, b: m - b, lambda m, e: m + e)
+    after = merge_heirs(motionless, jnp.arange(3), lambda m, b: m - b, lambda m, e: m + e)
     for one, other in zip(jax.tree.leaves(after), jax.tree.leaves(motionless), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-15)
 
@@ -441,7 +441,7 @@ def test_nobody_merges_with_itself():
 @pytest.mark.parametrize(("n", "freedom"), [(6, PLANAR), (12, EYE)])
 def test_the_rest_of_the_state_follows_as_a_gaussian_does(n, freedom):
     """A measured pose, taken by the textbook's joint update, and by the pose first and then
-    `followed`."""
+    `follow_pose`."""
     rng = np.random.default_rng(3)
     d = freedom.shape[1]
     root = 0.1 * rng.normal(size=(n, n))
@@ -453,7 +453,7 @@ def test_the_rest_of_the_state_follows_as_a_gaussian_does(n, freedom):
     T_prior = worlds.planar(0.3, -0.2, 2.0)
     T = T_prior @ jaxlie.SE3.exp(jnp.asarray(freedom @ expected[:d]))
     covariance = jnp.asarray(freedom @ P_expected[:d, :d] @ freedom.T)
-    correction, after = followed(jnp.asarray(P), T_prior, T, covariance, jnp.asarray(freedom))
+    correction, after = follow_pose(jnp.asarray(P), T_prior, T, covariance, jnp.asarray(freedom))
     np.testing.assert_allclose(correction, expected, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(after, P_expected, atol=1e-6 * np.max(P_expected))
     assert np.all(np.linalg.eigvalsh(np.asarray(after)) > 0)

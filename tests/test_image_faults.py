@@ -11,12 +11,12 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxnav.compiling.packing import Layout
+from jaxnav.compiling.packing import PackedLayout
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.interfaces import Frame
-from jaxnav.loop.pilot import Input, Pilot, Sighted
+from jaxnav.loop.pilot import FrameDetections, Input, Pilot
 from jaxnav.loop.seeing import Region, Search
 from jaxnav.models.camera import Camera
 from jaxnav.models.rig import CameraRig
@@ -67,7 +67,9 @@ def new_search(camera: Camera) -> Search:
     return Search(0, SIZE_PX, camera, [make_detector("aruco", FAMILY)])
 
 
-def looked(camera: Camera, image: np.ndarray | None, region: Region | None = None) -> Sighted:
+def looked(
+    camera: Camera, image: np.ndarray | None, region: Region | None = None
+) -> FrameDetections:
     return new_search(camera).look(Frame(BEGIN_NS, image), region)
 
 
@@ -217,18 +219,18 @@ class Drive:
         output = eqx.tree_at(
             lambda o: (o.pose_covariance, o.velocity_covariance), made, (1e-4 * np.eye(3),) * 2
         )
-        packed = Layout.of(output).pack(output)
+        packed = PackedLayout.of(output).pack(output)
         self.pilot = Pilot(
             navigator, program=lambda belief, control, *_: (belief, belief, control, packed)
         )
         self.now_ns = BEGIN_NS
 
-    def handle(self, sighted: Sighted) -> tuple[Fault, bool]:
+    def handle(self, sighted: FrameDetections) -> tuple[Fault, bool]:
         """What is wrong with a frame, and whether its corners were used."""
         self.now_ns += PERIOD_NS
-        frame = Sighted(0, self.now_ns, sighted.detections, sighted.faults)
+        frame = FrameDetections(0, self.now_ns, sighted.detections, sighted.faults)
         outcome = self.pilot.handle(Input(self.now_ns, frames=(frame,)))
-        return outcome.faults & OF_FRAMES, outcome.told is not None
+        return outcome.faults & OF_FRAMES, outcome.data is not None
 
 
 @pytest.fixture

@@ -17,12 +17,12 @@ from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.estimate import Belief
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.kalman import white_acceleration
-from jaxnav.belief.map_fit import fit
+from jaxnav.belief.map_fit import fit_poses
 from jaxnav.belief.motion import Bank
 from jaxnav.models.geometry import OFF_GROUND, T_world_vehicle_from_planar
 from jaxnav.navigator import Navigator
 from jaxnav.pose.observation import Observation, Snapshot, log_sigmas
-from jaxnav.tuning.following import trusting
+from jaxnav.tuning.following import trust_corners
 from tests import worlds
 from tests.reference import kalman as textbook
 
@@ -35,7 +35,7 @@ TINY = 1e-9
 def navigator(selector, ground_plane=False, tilt_sigma_rad=TINY, height_sigma_m=TINY, **motion):
     motion = {"vision_floor": jnp.full(3, TINY)} | motion
     car = BicycleKalman(CAR, tilt_sigma_rad=tilt_sigma_rad, height_sigma_m=height_sigma_m, **motion)
-    return trusting(
+    return trust_corners(
         Navigator(RIG, MARKERS, CAR, selector=selector, motion=car, ground_plane=ground_plane)
     )
 
@@ -217,7 +217,7 @@ def test_without_a_floor_it_is_laplace_s_evidence(tilt_sigma_rad):
 
 @jax.jit
 def fits(prior, snapshot):
-    return fit(prior.T_world_vehicle, prior.covariance, prior, snapshot, jnp.zeros(6), 20)
+    return fit_poses(prior.T_world_vehicle, prior.covariance, prior, snapshot, jnp.zeros(6), 20)
 
 
 def turned(angle_rad: float) -> jaxlie.SE3:

@@ -10,7 +10,7 @@ import pytest
 
 from jaxnav.models.camera import Camera
 from jaxnav.models.rig import CameraRig
-from jaxnav.pose.linearised import crossed, pinhole_rows, reprojection_rows, turned
+from jaxnav.pose.linearised import cross_product, pinhole_rows, reprojection_rows, turn_arms
 from jaxnav.pose.observation import Sightings, cameras_of
 from tests.derivatives import check_derivatives
 
@@ -129,12 +129,12 @@ def test_a_pinhole_of_focal_length_one_looks_the_same():
 def test_arms_turn_as_by_the_quaternion():
     rng = np.random.default_rng(2)
     half, arms = rng.normal(size=(3, 5)), rng.normal(size=(3, 4, 5))
-    actual = turned(jnp.asarray(half), jnp.asarray(arms))
+    actual = turn_arms(jnp.asarray(half), jnp.asarray(arms))
     for lane in range(5):
         rotation = jaxlie.SO3(jnp.asarray([1.0, *half[:, lane]])).normalize()
         np.testing.assert_allclose(
             actual[..., lane], rotation.as_matrix() @ arms[..., lane], atol=1e-12
         )
     np.testing.assert_allclose(
-        crossed(jnp.asarray(half), jnp.asarray(arms[:, 0])), np.cross(half.T, arms[:, 0].T).T
+        cross_product(jnp.asarray(half), jnp.asarray(arms[:, 0])), np.cross(half.T, arms[:, 0].T).T
     )

@@ -10,12 +10,12 @@ import pytest
 
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import TIMEOUT_S, Guard
 from jaxnav.loop.interfaces import Frame, Odometry
 from jaxnav.loop.loop import Loop
 from jaxnav.loop.pilot import Input, Pilot
-from jaxnav.loop.seeing import Eyes, Region, Search, Seen, groups, image_fault
+from jaxnav.loop.seeing import Eyes, Region, Search, SearchedFrame, group_frames, image_fault
 from jaxnav.navigator import Navigator
 from tests import worlds
 
@@ -75,7 +75,7 @@ class Look:
 
     def look(self, frame, region):
         self.act()
-        return Sighted(0, frame.stamp_ns, frame.detections)
+        return FrameDetections(0, frame.stamp_ns, frame.detections)
 
 
 class Throttle:
@@ -238,15 +238,15 @@ def found(count, shift=0.0):
 
 
 def seen(camera, stamp_ns, count):
-    sighted = Sighted(camera, stamp_ns, found(count))
-    return Seen(sighted, Frame(stamp_ns, None, sighted.detections), str(camera))
+    sighted = FrameDetections(camera, stamp_ns, found(count))
+    return SearchedFrame(sighted, Frame(stamp_ns, None, sighted.detections), str(camera))
 
 
 def test_sightings_of_one_instant_go_together_and_the_empty_ones_apart():
-    shows, blank = groups([seen(0, 5, 1), seen(1, 5, 1), seen(2, 5, 0), seen(0, 9, 2)])
+    shows, blank = group_frames([seen(0, 5, 1), seen(1, 5, 1), seen(2, 5, 0), seen(0, 9, 2)])
     assert [[s.camera for s in group] for group in shows] == [[0, 1], [0]]
     assert [s.camera for s in blank] == [2]
-    assert groups([]) == ([], ())
+    assert group_frames([]) == ([], ())
 
 
 @pytest.mark.parametrize(

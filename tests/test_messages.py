@@ -17,7 +17,7 @@ from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.files.validation import validate
 from jaxnav.loop.flags import Fault, Health, Reject
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_format import decode, encode, header_metadata, header_of
@@ -101,7 +101,7 @@ def test_what_is_no_message_is_refused(raw):
         decode(raw)
 
 
-def _sighted(seed: int) -> Sighted:
+def _sighted(seed: int) -> FrameDetections:
     """Any bits at all as numbers: NaN, infinite, tiny and ordinary ones."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(0, 4))
@@ -119,7 +119,7 @@ def _sighted(seed: int) -> Sighted:
         families=("tag36h11", "nan", "\u00fc")[:count],
     )
     faults = Fault(int(rng.integers(2 ** len(Fault))))
-    return Sighted(count, seed - 1000, found if rng.random() < 0.8 else None, faults)
+    return FrameDetections(count, seed - 1000, found if rng.random() < 0.8 else None, faults)
 
 
 MOST_NS = 2**62 - 1
@@ -190,7 +190,7 @@ def _examples():
     blurred = Detections(
         np.array([3]), np.full((1, 4, 2), np.nan), np.ones((1, 4)), np.array([True]), ("a",)
     )
-    yield input_message(Input(1, frames=(Sighted(0, 1, blurred),)))[::2]
+    yield input_message(Input(1, frames=(FrameDetections(0, 1, blurred),)))[::2]
     message = outcome_message(make_outcome(1))
     yield "/outcome", message
     yield "/outcome", {key: value for key, value in message.items() if key not in NOT_REPORTED}
@@ -269,7 +269,7 @@ def test_a_wrong_outcome_is_named(change, problem):
     ],
 )
 def test_a_wrong_frame_is_named(change, problem):
-    empty = Input(1, frames=(Sighted(0, 1, Detections.concatenate([])),))
+    empty = Input(1, frames=(FrameDetections(0, 1, Detections.concatenate([])),))
     message = json.loads(encode(input_message(empty)[2]))
     message["frames"][0] |= change
     with pytest.raises(BadInput, match=problem):

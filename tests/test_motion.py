@@ -13,7 +13,7 @@ from scipy import stats
 from jaxnav.belief.ambiguity import PoseMeasurement, Selection
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
-from jaxnav.belief.motion import Bank, Motion, Offer, gated, restarted_where_broken
+from jaxnav.belief.motion import Bank, Motion, Offer, apply_gate, restart_broken
 from jaxnav.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import in_float32
@@ -455,7 +455,7 @@ def test_broken_hypotheses_start_anew():
     starts = BicycleKalman(worlds.qcar()).init(3)
     broken = eqx.tree_at(lambda b: b.mean, stack, stack.mean.at[1, 4].set(jnp.nan))
     broken = eqx.tree_at(lambda b: b.covariance, broken, broken.covariance.at[2, 0, 5].set(jnp.inf))
-    kept = restarted_where_broken(broken, starts)
+    kept = restart_broken(broken, starts)
     assert kept.initialised.tolist() == [True, False, False]
     np.testing.assert_array_equal(kept.mean[0], stack.mean[0])
     np.testing.assert_array_equal(kept.mean[1:], 0)
@@ -473,7 +473,7 @@ def test_what_the_gate_accepts_is_told(nis, inflation, taken):
     offer = Offer(
         jnp.asarray([np.sqrt(nis), 0, 0]), posterior, posterior, 21.1, jnp.zeros(()), inflation
     )
-    after, own, accepted = gated(bank, offer, jnp.asarray(True))
+    after, own, accepted = apply_gate(bank, offer, jnp.asarray(True))
     assert (float(own), bool(accepted)) == (pytest.approx(nis), taken)
     assert bool(jnp.all(after.mean == bank.mean + taken))
     assert int(after.rejections.count) == (nis > 21.1)

@@ -10,13 +10,13 @@ import pytest
 from jaxnav import cli
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
-from jaxnav.commands.drive.observers import Recording, StatusLine, View, open_onlookers
+from jaxnav.commands.drive.observers import DriveRecorder, LiveView, StatusLine, open_onlookers
 from jaxnav.commands.drive.status import WIDTH
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.interfaces import Frame
-from jaxnav.loop.pilot import Sighted
+from jaxnav.loop.pilot import FrameDetections
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_setup import DriveSetup
 from tests.helpers.drives import make_input, make_outcome, make_picture
@@ -52,15 +52,15 @@ def setup() -> DriveSetup:
 
 def look_on(onlooker, count: int = 6) -> None:
     for index in range(count):
-        onlooker.handled(make_input(index), make_outcome(index))
+        onlooker.on_outcome(make_input(index), make_outcome(index))
     image = make_picture(0)
-    onlooker.seen("front", Frame(5, image), Sighted(0, 5, FOUND))
-    onlooker.seen("rear", Frame(6, None), Sighted(2, 6, None, Fault.FRAME_UNUSABLE))
+    onlooker.on_frame("front", Frame(5, image), FrameDetections(0, 5, FOUND))
+    onlooker.on_frame("rear", Frame(6, None), FrameDetections(2, 6, None, Fault.FRAME_UNUSABLE))
 
 
 def test_the_view_is_told_every_outcome_and_frame():
     fake = FakeView()
-    view = View(fake)
+    view = LiveView(fake)
     look_on(view)
     assert [outcome.now_ns for outcome in fake.shown] == [make_outcome(i).now_ns for i in range(6)]
     (name, stamp_ns, image, corners_px), unusable = fake.images
@@ -72,14 +72,14 @@ def test_the_view_is_told_every_outcome_and_frame():
 
 def test_a_view_that_is_gone_is_no_fault_and_is_told_in_the_end():
     fake = FakeView()
-    view = View(fake)
-    assert view.told is None
+    view = LiveView(fake)
+    assert view.closing_note is None
     fake.dropped = 3
-    assert view.told == "view: 3 outcomes and images left out"
+    assert view.closing_note == "view: 3 outcomes and images left out"
     fake.failed = "the viewer was closed"
     look_on(view)
     assert view.faults == Fault(0)
-    assert view.told == "view: the viewer was closed"
+    assert view.closing_note == "view: the viewer was closed"
 
 
 def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monkeypatch):
@@ -87,13 +87,13 @@ def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monk
     path = tmp_path / "drive.mcap"
     with ExitStack() as closing:
         found = open_onlookers(Run(record=path, view=True), setup, closing)
-        assert [type(one) for one in found] == [Recording, View, DelayWatch, StatusLine]
+        assert [type(one) for one in found] == [DriveRecorder, LiveView, DelayWatch, StatusLine]
         fake = found[1]._view
         rig, markers, waypoints_m = fake.where
         assert (rig, markers, fake.how) == (setup.rig, setup.markers, {"live": True, "save": None})
         np.testing.assert_array_equal(waypoints_m, setup.route.waypoints_m)
         assert fake.closed == 0
-        found[0].handled(make_input(0), make_outcome(0))
+        found[0].on_outcome(make_input(0), make_outcome(0))
     assert fake.closed == 1
     assert not read_drive(path).truncated
     with ExitStack() as closing:
@@ -125,7 +125,7 @@ def test_a_missing_rerun_gets_one_line_before_anything_is_compiled(monkeypatch, 
 
 @pytest.mark.parametrize("images", [False, True])
 def test_a_recording_holds_what_was_handled_and_the_images_if_asked_to(setup, tmp_path, images):
-    recording = Recording(tmp_path / "drive.mcap", setup, images)
+    recording = DriveRecorder(tmp_path / "drive.mcap", setup, images)
     look_on(recording)
     recording.close()
     log = read_drive(tmp_path / "drive.mcap")
@@ -133,21 +133,21 @@ def test_a_recording_holds_what_was_handled_and_the_images_if_asked_to(setup, tm
     assert len(log.outcomes.now_ns) == 6
     assert [image.stamp_ns for image in log.images()] == ([5] if images else [])
     count = 12 + images
-    assert recording.told == f"recorded {count} messages in {tmp_path / 'drive.mcap'}"
+    assert recording.closing_note == f"recorded {count} messages in {tmp_path / 'drive.mcap'}"
     assert recording.faults == Fault(0)
 
 
 def test_a_recording_that_can_not_keep_up_or_go_on_is_a_fault(setup, tmp_path):
-    recording = Recording(tmp_path / "drive.mcap", setup, images=False)
+    recording = DriveRecorder(tmp_path / "drive.mcap", setup, images=False)
     recording.close()
     look_on(recording, 1)
     assert recording.faults == Fault.RECORDER_BEHIND
     assert recording.faults == Fault(0)  # told once for each loss
-    assert recording.told.endswith(", 2 left out")
+    assert recording.closing_note.endswith(", 2 left out")
     with pytest.raises(BadInput, match="can't be written: no such file or directory"):
-        Recording(tmp_path / "nowhere" / "drive.mcap", setup, images=False)
+        DriveRecorder(tmp_path / "nowhere" / "drive.mcap", setup, images=False)
     with pytest.raises(BadInput, match="can't be written: no space left on device"):
-        Recording(Path("/dev/full"), setup, images=False)
+        DriveRecorder(Path("/dev/full"), setup, images=False)
 
 
 def test_the_status_line_is_written_five_times_a_second_and_ended(capsys):

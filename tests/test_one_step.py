@@ -11,7 +11,7 @@ import pytest
 
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.loop.estimator import Estimator
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.navigator import Navigator
 from jaxnav.pose.observation import Observation
 from tests import worlds
@@ -87,7 +87,7 @@ def by_the_car(nav: Navigator, seen: Observation) -> list:
     for index in range(STEPS):
         shown = np.any(seen.visible[index])
         corners = (seen.corners_px[index], seen.visible[index], seen.corner_sigma_px[index])
-        told = Told((SPEED_MPS, STEERING_RAD), *(corners if shown else ()))
+        told = EventData((SPEED_MPS, STEERING_RAD), *(corners if shown else ()))
         stamp_ns = BEGIN_NS + index * PERIOD_US * 1000
         elapsed_ns = PERIOD_US * 1000 if index else 0
         known.append(estimator.fuse(told, stamp_ns, stamp_ns, elapsed_ns))

@@ -34,7 +34,7 @@ from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_replay import Comparison, replay_drive
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.testing.faults import WAYPOINTS_M
-from jaxnav.viewer.outcomes import Shown
+from jaxnav.viewer.outcomes import ShownOutcome
 from tests import worlds
 from tests.helpers.simulated import record, simulated
 
@@ -229,8 +229,8 @@ def test_what_is_drawn_of_a_recording_lies_among_its_markers(away, tmp_path):
     T = poses.inverse(log.outcomes.Ts_vehicle_world[index][taken])
     assert np.linalg.norm(T[4:6] - pose_m) < 0.1
     # What Rerun is told, which has float32 alone, is near zero, and the same.
-    shown = Shown.of_row(log.outcomes, index, scenery.origin_m)
-    live = Shown.of(away.steps[index].outcome)
+    shown = ShownOutcome.of_row(log.outcomes, index, scenery.origin_m)
+    live = ShownOutcome.of(away.steps[index].outcome)
     assert np.abs(live.pose[:2]).max() < 60
     np.testing.assert_allclose(shown.pose, live.pose, atol=0.01 * MM)
     np.testing.assert_allclose(shown.hypotheses, live.hypotheses, atol=0.01 * MM)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from jaxnav.compiling.packing import Layout, Packed
+from jaxnav.compiling.packing import Packed, PackedLayout
 
 shapes = hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3)
 
@@ -27,11 +27,11 @@ def trees(draw):
 @settings(max_examples=20, deadline=None)
 @given(trees())
 def test_a_tree_is_found_again_bit_for_bit(tree):
-    layout = Layout.of(tree)
+    layout = PackedLayout.of(tree)
     packed = layout.pack(tree)
     assert packed.floats.dtype == np.float32
     assert packed.integers.dtype == np.int32
-    for found in (packed.unpacked(), packed.fetched().unpacked()):
+    for found in (packed.unpack(), packed.fetch().unpack()):
         assert jax.tree.structure(found) == jax.tree.structure(tree)
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
             assert (one.shape, one.dtype) == (other.shape, other.dtype)
@@ -41,10 +41,10 @@ def test_a_tree_is_found_again_bit_for_bit(tree):
 @settings(max_examples=20, deadline=None)
 @given(trees())
 def test_what_is_written_to_the_room_is_in_the_vectors(tree):
-    packed, views = Layout.of(tree).room()
+    packed, views = PackedLayout.of(tree).room()
     for view, leaf in zip(jax.tree.leaves(views), jax.tree.leaves(tree), strict=True):
         view[...] = leaf
-    found = packed.unpacked()
+    found = packed.unpack()
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
         assert one.dtype == other.dtype
         np.testing.assert_array_equal(one, other)
@@ -58,15 +58,15 @@ def test_a_compiled_call_takes_and_returns_them(dtype):
     @jax.jit
     def moved(packed: Packed) -> Packed:
         traces.append(packed)
-        T, count = packed.unpacked()
+        T, count = packed.unpack()
         tree = jaxlie.SE3(T.wxyz_xyz.at[4].add(1)), count + 1
-        return Layout.of(tree).pack(tree)
+        return PackedLayout.of(tree).pack(tree)
 
     tree = jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 2, 3], dtype)), jnp.zeros((2, 1), jnp.int32)
-    packed = Layout.of(jax.eval_shape(lambda: tree)).pack(tree)
+    packed = PackedLayout.of(jax.eval_shape(lambda: tree)).pack(tree)
     for _ in range(3):
         packed = moved(packed)
-    T, count = packed.fetched().unpacked()
+    T, count = packed.fetch().unpack()
     assert T.wxyz_xyz.dtype == dtype
     np.testing.assert_array_equal(T.translation(), [3, 2, 3])
     np.testing.assert_array_equal(count, [[3], [3]])
@@ -82,6 +82,6 @@ def test_layouts_differ_where_shapes_types_or_structures_do():
         (zeros, zeros.astype(np.float64)),
         (zeros, zeros > 0),
     ]
-    layouts = [Layout.of(tree) for tree in trees]
+    layouts = [PackedLayout.of(tree) for tree in trees]
     assert len(set(layouts)) == len(layouts)
-    assert Layout.of((zeros + 1, zeros)) == layouts[0]
+    assert PackedLayout.of((zeros + 1, zeros)) == layouts[0]

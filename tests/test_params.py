@@ -122,7 +122,7 @@ def test_a_file_as_a_person_writes_it(tmp_path):
     assert params.values["motion.vision_floor"][2, 2] == 1e-8
     assert {value.dtype for value in params.values.values()} == {np.dtype(np.float64)}
     assert (params.provenance, params.path) == ({}, tmp_path / "p.yaml")
-    assert params.told() == f"3 parameters from {tmp_path / 'p.yaml'}"
+    assert params.describe() == f"3 parameters from {tmp_path / 'p.yaml'}"
 
 
 def test_what_is_written_says_what_it_means(tmp_path):
@@ -167,7 +167,7 @@ def test_provenance_is_kept_and_shown(tmp_path):
         write_params(path, values, provenance)
         params = load_params(path)
         assert params.provenance == provenance
-        assert params.told().isprintable()
+        assert params.describe().isprintable()
         # Another reader of YAML sees the same names at least.
         assert yaml.safe_load(path.read_text())["parameters"] == values
 
@@ -177,7 +177,7 @@ def test_provenance_is_kept_and_shown(tmp_path):
     provenance = {"a": ["1.0"], "b": ["1.0"], "c": None, "d": "x", "5": 1}
     assert load_params(path).provenance == provenance
     write_params(path, values, {"command": "tune \x1b[2J", "seed": 1, "log": "x" * 999})
-    told = load_params(path).told()
+    told = load_params(path).describe()
     assert told.startswith(f'1 parameter from {path} (command: "tune \\u001b[2J"; seed: 1; log: "x')
     assert len(told) < 400 + len(str(path))
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from jaxnav.detection.types import Detections
 from jaxnav.loop.estimator import Estimator
 from jaxnav.loop.flags import Fault, Health, Reject
-from jaxnav.loop.frames import Sighted
-from jaxnav.loop.history import Told
+from jaxnav.loop.frames import FrameDetections
+from jaxnav.loop.history import EventData
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.navigator import Navigator
@@ -185,7 +185,7 @@ def test_stamps_that_come_twice_are_refused(setup, inputs):
         again = dataclasses.replace(given, now_ns=inputs[-1].now_ns)
         outcome = pilot.handle(again)
         assert Fault.STAMP_INVALID in outcome.faults
-        assert outcome.told is None
+        assert outcome.data is None
 
 
 @pytest.mark.parametrize("stamp_ns", [0, -1, -(2**80), 2**80])
@@ -195,13 +195,13 @@ def test_stamps_that_no_clock_has_are_refused(setup, inputs, stamp_ns):
         off = _changed(given, lambda part: dataclasses.replace(part, stamp_ns=stamp_ns))
         outcome = pilot.handle(off)
         assert Fault.STAMP_INVALID in outcome.faults
-        assert outcome.told is None
+        assert outcome.data is None
 
 
 def _frame_with(**changes):
     """Frames whose detections have something else; at most four of every marker's numbers."""
 
-    def change(part: Odometry | Sighted):
+    def change(part: Odometry | FrameDetections):
         if isinstance(part, Odometry) or part.detections is None:
             return part
         arrays = {
@@ -214,7 +214,7 @@ def _frame_with(**changes):
 
 
 def _odometry_with(**changes):
-    def change(part: Odometry | Sighted):
+    def change(part: Odometry | FrameDetections):
         return dataclasses.replace(part, **changes) if isinstance(part, Odometry) else part
 
     return change
@@ -305,7 +305,7 @@ def test_a_clock_of_the_odometer_that_jumped_is_told_once(setup, inputs):
 def test_data_may_come_after_an_hour_of_silence(setup):
     """It does not fit into the filter's clock."""
     estimator, hour_ns = Estimator(setup.navigator()), 3600 * 10**9
-    told = Told(odometry=(0.1, 0.0))
+    told = EventData(odometry=(0.1, 0.0))
     estimator.fuse(told, BEGIN_NS, BEGIN_NS, 0)
     fused = estimator.fuse(told, BEGIN_NS + hour_ns, BEGIN_NS + hour_ns, hour_ns)
     assert (fused.refused, fused.events) == (False, 1)
@@ -317,12 +317,12 @@ def test_numbers_beyond_float32_are_left_out_by_the_filter():
     given = []
 
     def program(belief, control, events, numbers):
-        given.append(events.unpacked())
+        given.append(events.unpack())
         return belief, belief, control, belief
 
     with jax.enable_x64(False):
         estimator = Estimator(make_setup().navigator(), program)
-        told = Told((0.1, 1e300), np.full((4, 1, 4, 2), -1e300), *np.ones((2, 4, 1), bool))
+        told = EventData((0.1, 1e300), np.full((4, 1, 4, 2), -1e300), *np.ones((2, 4, 1), bool))
         told = dataclasses.replace(told, sigma_px=np.full((4, 1, 4), 1e300))
         assert not estimator.fuse(told, BEGIN_NS, BEGIN_NS, 0).refused
     corners_px = given[0].corners.corners_px
@@ -356,7 +356,7 @@ def fuzzed(draw) -> Input:
         ("tag36h11",) * count,
     )
     camera = draw(st.integers(0, 3))
-    return Input(now_ns, frames=(Sighted(camera, now_ns + draw(stamps), found),))
+    return Input(now_ns, frames=(FrameDetections(camera, now_ns + draw(stamps), found),))
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)

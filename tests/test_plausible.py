@@ -9,7 +9,7 @@ import pytest
 from jaxnav.cli import main
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.message_schemas import OUTCOME
-from jaxnav.recording.plausible import plausible
+from jaxnav.recording.plausible import keep_plausible
 from tests.fuzz.seeds import drive_parts, write_drive
 from tests.test_regression import FOLDER
 
@@ -29,7 +29,7 @@ def outcomes():
 
 
 def test_of_a_sound_drive_nothing_is_left_out(outcomes):
-    shown, odd = plausible(outcomes)
+    shown, odd = keep_plausible(outcomes)
     assert odd == 0
     for field in dataclasses.fields(outcomes):
         before, after = getattr(outcomes, field.name), getattr(shown, field.name)
@@ -41,7 +41,7 @@ def test_of_a_sound_drive_nothing_is_left_out(outcomes):
 def test_an_outcome_that_is_nowhere_is_not_located(outcomes, value):
     pose = outcomes.pose.copy()
     pose[-1, 1] = value
-    shown, odd = plausible(dataclasses.replace(outcomes, pose=pose))
+    shown, odd = keep_plausible(dataclasses.replace(outcomes, pose=pose))
     assert odd == 1
     assert not shown.located[-1]
     assert np.isnan(shown.pose[-1]).all()

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxnav.plots.localisation import (
-    Track,
-    View,
+    AnnotatedFrame,
+    Trajectory,
     camera_mosaic,
     drive_report,
     localisation_report,
@@ -25,9 +25,9 @@ def rendered(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def view(corners_px: np.ndarray) -> View:
+def view(corners_px: np.ndarray) -> AnnotatedFrame:
     stick = corners_px.mean(axis=1, keepdims=True) + np.array([[[0.0, 0.0], [8.0, -4.0]]])
-    return View("front", np.full((60, 90), 120, np.uint8), corners_px, stick, stick - 2)
+    return AnnotatedFrame("front", np.full((60, 90), 120, np.uint8), corners_px, stick, stick - 2)
 
 
 SQUARE_PX = np.array([[[40.0, 20.0], [50.0, 20.0], [50.0, 30.0], [40.0, 30.0]]])
@@ -38,8 +38,8 @@ def test_a_drive_report_names_what_it_shows():
     lost[:7] = np.nan
     figure = drive_report(
         TIMES_S,
-        Track("truth", POSES),
-        [Track("our method", lost), Track("Method A + KF", POSES + 0.1)],
+        Trajectory("truth", POSES),
+        [Trajectory("our method", lost), Trajectory("Method A + KF", POSES + 0.1)],
         np.array([[1.3, 0.0], [0.5, 0.65]]),
         0.15,
         MARKERS_M,
@@ -87,7 +87,9 @@ def test_outliers_leave_the_view_to_the_reference():
 
 def test_a_mosaic_enlarges_small_markers():
     nothing = np.zeros((0, 4, 2))
-    empty = View("rear", np.zeros((60, 90), np.uint8), nothing, nothing[:, :2], nothing[:, :2])
+    empty = AnnotatedFrame(
+        "rear", np.zeros((60, 90), np.uint8), nothing, nothing[:, :2], nothing[:, :2]
+    )
     figure = camera_mosaic([[view(SQUARE_PX), empty], [empty, view(SQUARE_PX * 0 + 5)]])
     small, blank = figure.axes[0], figure.axes[1]
     assert len(small.child_axes) == 1

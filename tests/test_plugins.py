@@ -12,7 +12,7 @@ import pytest
 from jaxnav.errors import BadInput
 from jaxnav.loop import plugins
 from jaxnav.loop.interfaces import Camera, Vehicle
-from jaxnav.loop.plugins import CAMERAS, VEHICLES, find, open_cameras, open_vehicle
+from jaxnav.loop.plugins import CAMERAS, VEHICLES, load_factory, open_cameras, open_vehicle
 from tests.helpers.setups import GoodCamera, GoodVehicle, good_cameras, setup_with
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -207,4 +207,4 @@ def declared():
 @pytest.mark.parametrize(("group", "target"), list(declared()))
 def test_what_jaxnav_declares_is_there(group, target):
     """Without the makers' software: it is imported when something is opened."""
-    assert find("--vehicle", group, target).__name__ == target.partition(":")[2]
+    assert load_factory("--vehicle", group, target).__name__ == target.partition(":")[2]

@@ -22,7 +22,7 @@ class Car:
         for _ in range(round(seconds / GAP_S)):
             target = self.gain * throttle * PER_THROTTLE
             self.speed_mps += (target - self.speed_mps) * (1 - math.exp(-GAP_S / self.lag_s))
-            self.propulsion.look(lie(self.speed_mps), throttle, GAP_S, seeing, disputed)
+            self.propulsion.add_reading(lie(self.speed_mps), throttle, GAP_S, seeing, disputed)
         return self.propulsion.doubtful
 
 
@@ -50,7 +50,7 @@ def test_what_the_throttle_contradicts_is_doubted_until_corners_confirm(by):
     assert off_m > DOUBT_M
     assert car.drive(0.04, 2.0)  # it does not tell by itself whether it was right
     assert car.propulsion.off_m == pytest.approx(off_m, abs=0.02)
-    car.propulsion.confirmed()
+    car.propulsion.confirm()
     assert not car.drive(0.04, 2.0)
 
 
@@ -65,15 +65,15 @@ def test_a_throttle_that_moves_nothing_while_corners_agree_says_nothing():
     """A recorded drive, a car that is pushed."""
     car = Car()
     car.drive(0.0, 1.0, lie=lambda v: 0.5, seeing=True)
-    car.propulsion.confirmed()
+    car.propulsion.confirm()
     assert not car.drive(0.0, 3.0, lie=lambda v: 0.5)
     car.drive(0.04, 2.0, seeing=True)
-    car.propulsion.confirmed()
+    car.propulsion.confirm()
     assert car.drive(0.04, 1.0, lie=lambda v: 0.0)
 
 
 def test_an_odometer_that_the_corners_dispute_does_not_discredit_the_throttle():
     car = Car()
     car.drive(0.04, 2.0, lie=lambda v: 0.0, seeing=True, disputed=True)
-    car.propulsion.confirmed()
+    car.propulsion.confirm()
     assert car.drive(0.04, 1.0, lie=lambda v: 0.0)

@@ -13,7 +13,7 @@ from jaxnav.files.ranges import RANGES, is_within, pinhole_problem, problem_of, 
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import validate
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Frames, Sighted
+from jaxnav.loop.frames import FrameDetections, FrameIntake
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.loop.stamps import MOST_NS, Stamps
@@ -208,6 +208,6 @@ def test_a_corner_that_is_nowhere_is_as_good_as_infinite():
         refined=found.refined,
         families=markers.families[:1],
     )
-    told, _, faults = Frames(1, markers).told([Sighted(0, 10**9, seen)], 10**9)
+    told, _, faults = FrameIntake(1, markers).check([FrameDetections(0, 10**9, seen)], 10**9)
     assert told is None
     assert Fault.CORNERS_NOT_FINITE in faults

@@ -12,7 +12,7 @@ from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.files import save_rig
 from jaxnav.loop.flags import Fault, Health
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Ending, HasOwnFiles, Odometry, Vehicle
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_log import Outcomes, read_drive
@@ -43,8 +43,8 @@ def keep_the_compile_cache(monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
 
 
-def seen(camera: int, stamp_ns: int, count: int = 1) -> Sighted:
-    return Sighted(camera, stamp_ns, make_detections(np.random.default_rng(camera), count))
+def seen(camera: int, stamp_ns: int, count: int = 1) -> FrameDetections:
+    return FrameDetections(camera, stamp_ns, make_detections(np.random.default_rng(camera), count))
 
 
 def at(after_ms: int) -> int:
@@ -55,7 +55,9 @@ INPUTS = (
     Input(at(0), Odometry(at(-3), 0.1, 0.2)),
     Input(at(40), frames=(seen(FRONT, at(10)), seen(REAR, at(10)))),
     Input(at(60), Odometry(at(55), float("nan"), -0.3, valid=False)),
-    Input(at(80), Odometry(0, 0.4, 0.0), (Sighted(FRONT, at(50), None, Fault.FRAME_UNUSABLE),)),
+    Input(
+        at(80), Odometry(0, 0.4, 0.0), (FrameDetections(FRONT, at(50), None, Fault.FRAME_UNUSABLE),)
+    ),
     Input(at(100), faults=Fault.VEHICLE_FAILED),
     Input(at(110), frames=(seen(FRONT, at(90)),)),
     Input(at(120), Odometry(at(119), 0.5, 0.1)),

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxnav.datasets.recordings import read_recording
-from jaxnav.datasets.ros_drives import TOGETHER_NS, read_ros_drive, together
+from jaxnav.datasets.ros_drives import TOGETHER_NS, join_frames, read_ros_drive
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.models.rig import CameraRig
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import (
@@ -132,8 +132,8 @@ def test_a_real_bag_is_frames_of_four_cameras(tmp_path, data_dir):
 # --- frames that belong together ------------------------------------------------------------------
 
 
-def frame(camera: int, stamp_ns: int) -> Sighted:
-    return Sighted(camera, stamp_ns, None)
+def frame(camera: int, stamp_ns: int) -> FrameDetections:
+    return FrameDetections(camera, stamp_ns, None)
 
 
 def test_frames_with_one_stamp_are_one_input():
@@ -145,5 +145,5 @@ def test_frames_with_one_stamp_are_one_input():
         (14, frame(1, 5)),  # the same camera again: a repeated stamp, for the pilot to refuse
         (15 + TOGETHER_NS, frame(3, 5)),  # far too late
     ]
-    grouped = [(g.now_ns, [f.camera for f in g.frames]) for g in together(frames)]
+    grouped = [(g.now_ns, [f.camera for f in g.frames]) for g in join_frames(frames)]
     assert grouped == [(13, [0, 1, 2]), (12, [2]), (14, [1]), (15 + TOGETHER_NS, [3])]

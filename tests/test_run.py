@@ -19,7 +19,7 @@ from jaxnav.cli import EXIT_BAD_INPUT, main
 from jaxnav.files import write_params
 from jaxnav.loop.flags import Health
 from jaxnav.recording.drive_log import read_drive
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle
 from tests.helpers.recorded_vehicle import Word, words
@@ -306,7 +306,7 @@ def test_of_a_drive_that_is_killed_the_recording_lacks_less_than_the_last_second
 
 def test_a_vehicle_that_nobody_writes_to_any_more_stands():
     begin_ns, ms = 1_000_000_000, 1_000_000
-    world = World(
+    world = SimWorld(
         worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), worlds.START_VIEW, begin_ns
     )
     for number in range(50):

@@ -44,18 +44,18 @@ class Drive:
             self.now_ns += 20 * MS
             self.x_m += 0.02 * true_mps
             if "odometry" not in silent:
-                contradicted.append(self.standstill.read(self.now_ns, self.now_ns, told_mps))
+                contradicted.append(self.standstill.add_reading(self.now_ns, self.now_ns, told_mps))
                 if not contradicted[-1] and "refused" not in silent:
-                    self.standstill.went(self.now_ns, self.now_ns, told_mps, 0.0)
+                    self.standstill.add_believed(self.now_ns, self.now_ns, told_mps, 0.0)
             if count % 2 == 0 and "frames" not in silent:
                 noise = noise_px * self.rng.standard_normal(QUAD_PX.shape)
                 corners_px = of((self.x_m, 0.0, 0.0))[1][0] + noise
                 frozen.append(
-                    self.standstill.frozen(
+                    self.standstill.is_frozen(
                         0, self.now_ns, self.now_ns, corners_px, VISIBLE, SIGMA_PX, of
                     )
                 )
-            self.standstill.commanded(throttle, self.now_ns)
+            self.standstill.add_command(throttle, self.now_ns)
         return frozen, contradicted
 
 
@@ -154,13 +154,13 @@ def test_whatever_is_told_nothing_raises(events):
     drive = Drive()
     for speed_mps, off_ns, corners_px, sigma_px, throttle in events:
         drive.now_ns += 10 * MS
-        drive.standstill.read(drive.now_ns + off_ns, drive.now_ns, speed_mps)
+        drive.standstill.add_reading(drive.now_ns + off_ns, drive.now_ns, speed_mps)
         if abs(speed_mps) < 10:
-            drive.standstill.went(drive.now_ns + off_ns, drive.now_ns, speed_mps, 0.1)
+            drive.standstill.add_believed(drive.now_ns + off_ns, drive.now_ns, speed_mps, 0.1)
         quad_px = np.array(corners_px).reshape(1, 4, 2)
         told = drive.now_ns + off_ns, drive.now_ns, quad_px, VISIBLE, sigma_px, due
-        assert drive.standstill.frozen(0, *told) in (False, True)
-        drive.standstill.commanded(throttle, drive.now_ns)
+        assert drive.standstill.is_frozen(0, *told) in (False, True)
+        drive.standstill.add_command(throttle, drive.now_ns)
 
 
 def test_the_way_of_an_odometer_is_that_of_the_bicycle():

@@ -22,7 +22,7 @@ from jaxnav.files.locking import sole_writer
 from jaxnav.simulation.statistics import wilson_interval
 from jaxnav.studies import store as store_module
 from jaxnav.studies.config import Config
-from jaxnav.studies.layout import Layout
+from jaxnav.studies.layout import BoxLayout
 from jaxnav.studies.parameters import Parameter
 from jaxnav.studies.running import local_cluster, remote_cluster, run_here, run_on_cluster
 from jaxnav.studies.store import count_done, open_store, read_dataset, read_layout
@@ -142,7 +142,7 @@ def test_a_config_is_complete_and_reads_back() -> None:
 
 @given(st.lists(st.integers(1, 6), min_size=1, max_size=4), st.integers(1, 50))
 def test_every_trial_lies_in_one_box(shape: list[int], most: int) -> None:
-    layout = Layout.of(shape, most)
+    layout = BoxLayout.of(shape, most)
     seen = np.zeros(shape, int)
     for box in np.ndindex(*layout.counts):
         region = layout.region(box)
@@ -291,7 +291,7 @@ def test_a_summary_does_not_depend_on_the_boxes(
     summed: tuple[xr.Dataset, xr.Dataset, Grid],
 ) -> None:
     trials, summary, grid = summed
-    cut = summarise(trials, grid, Layout((3, 2, 300), (1, 1, 77)))
+    cut = summarise(trials, grid, BoxLayout((3, 2, 300), (1, 1, 77)))
     xr.testing.assert_allclose(cut, summary, rtol=1e-12)
 
 

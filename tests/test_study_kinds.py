@@ -21,7 +21,7 @@ from jaxnav.simulation.scores import Drives
 from jaxnav.studies import lanes
 from jaxnav.studies.ambiguity import FLIPPED, INVALID, RIGHT, SCHEMA, UNSEEN
 from jaxnav.studies.drives import DriveStudy
-from jaxnav.studies.layout import Layout
+from jaxnav.studies.layout import BoxLayout
 from jaxnav.studies.running import run_here
 from jaxnav.studies.store import count_done, open_store, read_dataset, read_layout
 from jaxnav.studies.summary import summarise
@@ -270,7 +270,7 @@ def test_the_shipped_configs_are_studies(kind: str, capsys: pytest.CaptureFixtur
     for name in names:
         study = load_study(kind, Path(name))
         lengths = [len(values) for values in study.grid.outer_axes.values()]
-        assert Layout.of([*lengths, study.config.trials], 100).trials > 1000
+        assert BoxLayout.of([*lengths, study.config.trials], 100).trials > 1000
     assert main(["study", kind, "list"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in [*names, *study.schema.parameters])

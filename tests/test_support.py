@@ -22,12 +22,12 @@ class Seeing:
         for _ in range(count):
             self.now_ns += 33_000_000
             told = believed, believed and agrees, self.now_ns, fix
-            taken.append(self.support.corners(*told, lambda: possible))
+            taken.append(self.support.add_corners(*told, lambda: possible))
         return taken
 
     def drives(self, way_m: float) -> None:
         for _ in range(50):
-            self.support.drove(way_m, 0.0, 0.0, 0.02, way_m / 10, True)
+            self.support.add_odometry(way_m, 0.0, 0.0, 0.02, way_m / 10, True)
 
 
 def test_no_single_frame_confirms():
@@ -60,7 +60,7 @@ def test_what_the_filter_accepts_beyond_its_gate_is_a_fix_and_confirms_nothing()
     assert seeing.support.doubt(contradicted=False).is_doubted
     seeing.frames(CONFIRMED)
     assert seeing.frames(20, agrees=False) == [True] * 20
-    seeing.support.restarted()
+    seeing.support.note_restart()
     assert not any(seeing.frames(CONFIRMED - 1))
     assert not any(seeing.frames(1, agrees=False))
     assert not any(seeing.frames(CONFIRMED - 1))
@@ -69,7 +69,7 @@ def test_what_the_filter_accepts_beyond_its_gate_is_a_fix_and_confirms_nothing()
 def test_a_relocation_is_slow_until_some_way_was_driven():
     seeing = Seeing()
     seeing.frames(10)
-    seeing.support.restarted()
+    seeing.support.note_restart()
     assert seeing.frames(CONFIRMED, AWAY)[-1]
     assert (seeing.support.relocated, seeing.support.relocations) == (True, 1)
     assert not seeing.support.refused
@@ -82,7 +82,7 @@ def test_a_relocation_is_slow_until_some_way_was_driven():
 def test_a_restart_nearby_is_no_relocation():
     seeing = Seeing()
     seeing.frames(10)
-    seeing.support.restarted()
+    seeing.support.note_restart()
     assert seeing.frames(CONFIRMED, Fix(0.05, 0.05, 0.1, 0.01, 0.01))[-1]
     assert not seeing.support.relocated
 
@@ -92,18 +92,18 @@ def test_every_further_relocation_asks_for_twice_as_many_frames():
     seeing.frames(10)
     needed, at = [], [AWAY, HERE]
     for lap in range(9):
-        seeing.support.restarted()
+        seeing.support.note_restart()
         needed.append(seeing.frames(200, at[lap % 2]).index(True) + 1)
     assert needed == [2, 4, 8, 16, 32, 64, 96, 96, 96]
     seeing.drives(1.1 * SLOW_M)
-    seeing.support.restarted()
+    seeing.support.note_restart()
     assert seeing.frames(10).index(True) + 1 == CONFIRMED
 
 
 def test_who_must_not_relocate_refuses_and_goes_on_where_it_was():
     seeing = Seeing(relocate=False)
     seeing.frames(10)
-    seeing.support.restarted()
+    seeing.support.note_restart()
     assert not any(seeing.frames(30, AWAY))
     assert seeing.support.refused
     assert seeing.support.relocated
@@ -117,7 +117,7 @@ def test_who_must_not_relocate_refuses_and_goes_on_where_it_was():
 def test_while_several_poses_are_possible_one_within_reach_suffices(possible, refused):
     seeing = Seeing(relocate=False)
     seeing.frames(10)
-    seeing.support.restarted()
+    seeing.support.note_restart()
     taken = seeing.frames(5, None, possible=possible)
     assert seeing.support.refused == refused
     assert taken[-1] != refused

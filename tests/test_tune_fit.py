@@ -14,7 +14,7 @@ from jaxnav.files.locking import sole_writer
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import with_parameters
 from jaxnav.tuning.descent import Noisy, Smooth
-from jaxnav.tuning.fit import Fit, Problem, arrays_of
+from jaxnav.tuning.fit import Problem, TuningFit, arrays_of
 from jaxnav.tuning.objective import Batch, Objective, where_not_finite
 from jaxnav.tuning.unconstrained import Space
 from tests import worlds
@@ -71,7 +71,7 @@ class Run:
         self.fitting = Fitting(folder, key, problem, space, sigma, self.lines.append)
         self.params = folder / "params.yaml"
 
-    def __call__(self) -> Fit:
+    def __call__(self) -> TuningFit:
         return self.fitting.run(headless=True)
 
 
@@ -79,7 +79,7 @@ def written(run: Run) -> dict[str, np.ndarray]:
     return load_params(run.params).values
 
 
-def assert_written(run: Run, fit: Fit) -> None:
+def assert_written(run: Run, fit: TuningFit) -> None:
     expected = SPACE.values(fit.best_x)
     assert written(run).keys() == expected.keys()
     for name, value in written(run).items():
@@ -201,7 +201,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
         arrays = dict(np.load(checkpoint, allow_pickle=False)) | {name: array}
         np.savez(tmp_path / "changed.npz", allow_pickle=False, **arrays)
         damaged.append((tmp_path / "changed.npz").read_bytes())
-    fresh = Fit.begin(SPACE.start, asked(steps=3))
+    fresh = TuningFit.begin(SPACE.start, asked(steps=3))
     refused = 0
     for raw in damaged:
         checkpoint.write_bytes(raw)

@@ -10,22 +10,27 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.commands.tune.drives import Event, driven, drives, sensed
-from jaxnav.commands.tune.recordings import GAP_S, navigator_of, tracks
-from jaxnav.commands.tune.sequences import Named, joined
+from jaxnav.commands.tune.drives import (
+    Event,
+    believed_events,
+    sequences_of_drive,
+    sequences_of_inputs,
+)
+from jaxnav.commands.tune.recordings import GAP_S, navigator_of, sequences_of_recording
+from jaxnav.commands.tune.sequences import NamedSequences, join_sequences
 from jaxnav.datasets.recording import Recording
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
 from jaxnav.loop.flags import Reject
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.geometry import rotation_error_rad
 from jaxnav.recording.drive_log import DriveLog, read_drive
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.testing.lockstep import Rates
-from jaxnav.tuning.branches import estimated, started
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.branches import estimate_sequences, find_starts
+from jaxnav.tuning.recorded import FrameSequences
 from tests.helpers.simulated import make_setup, record, simulated
 
 HALVES = [(0, 0.5), (0.5, 1)]
@@ -49,7 +54,7 @@ def places(recording: Recording) -> dict[bytes, tuple[int, int, int]]:
     return places
 
 
-def detections(recorded: Recorded) -> list[list[tuple[int, bytes]]]:
+def detections(recorded: FrameSequences) -> list[list[tuple[int, bytes]]]:
     """Of each sequence: frame of the sequence and corners."""
     corners_px, visible = np.asarray(recorded.obs.corners_px), np.asarray(recorded.obs.visible)
     return [
@@ -83,7 +88,7 @@ def long_enough(recording: Recording, begin: int, end: int, shortest: int) -> se
 
 @pytest.mark.parametrize("part", [*HALVES, (0.25, 0.7)])
 def test_every_detection_is_in_one_appearance_of_its_marker(test_7, part):
-    recorded, place_of = tracks(test_7, True, part), places(test_7)
+    recorded, place_of = sequences_of_recording(test_7, True, part), places(test_7)
     begin, end = (round(share * len(test_7)) for share in part)
     assert recorded.obs.visible.shape[2:] == (4, 1)
     assert recorded.used.shape[1] <= 64
@@ -120,13 +125,13 @@ def test_every_detection_is_in_one_appearance_of_its_marker(test_7, part):
 def test_parts_that_adjoin_share_no_frame(test_7):
     place_of, frames = places(test_7), []
     for part in HALVES:
-        found = detections(tracks(test_7, True, part))
+        found = detections(sequences_of_recording(test_7, True, part))
         frames.append({place_of[corners][0] for row in found for _, corners in row})
     assert max(frames[0]) < round(len(test_7) / 2) <= min(frames[1])
 
 
 def test_all_markers_together_are_frame_after_frame(test_7):
-    recorded, place_of = tracks(test_7, False, (0, 1), length=40), places(test_7)
+    recorded, place_of = sequences_of_recording(test_7, False, (0, 1), length=40), places(test_7)
     assert recorded.obs.visible.shape[2:] == test_7.visible.shape[1:]
     assert recorded.markers.size_m.shape == (len(recorded), len(test_7.markers.ids))
     found = [[place_of[corners] for _, corners in row] for row in detections(recorded)]
@@ -143,7 +148,9 @@ def test_a_frame_without_a_reference_is_not_judged(test_7):
     valid = np.zeros(len(test_7), bool)
     known = dataclasses.replace(test_7.reference, valid=valid)
     for reference in (known, None):
-        recorded = tracks(dataclasses.replace(test_7, reference=reference), True, (0, 0.5))
+        recorded = sequences_of_recording(
+            dataclasses.replace(test_7, reference=reference), True, (0, 0.5)
+        )
         assert not recorded.judged.any()
         np.testing.assert_array_equal(recorded.T_world_vehicle_true[0, 0], [1, 0, 0, 0, 0, 0, 0])
 
@@ -151,17 +158,17 @@ def test_a_frame_without_a_reference_is_not_judged(test_7):
 def test_too_short_a_recording_says_what_is_needed(test_7):
     short = test_7.first(30)
     with pytest.raises(BadInput, match=r"^test_7: 15 of its 30 frames give 1 seq.* 4 are needed$"):
-        tracks(short, False, (0, 0.5))
+        sequences_of_recording(short, False, (0, 0.5))
 
 
 def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
-    recorded = tracks(test_7, True, (0, 1), length=12, shortest=6)
+    recorded = sequences_of_recording(test_7, True, (0, 1), length=12, shortest=6)
     rows = np.linspace(0, len(recorded) - 1, 20).astype(int)
     recorded = recorded.rows(rows)
     navigator = navigator_of(test_7, True, "multi-hypothesis", corner_sigma_px)
-    start = started(navigator, recorded)
+    start = find_starts(navigator, recorded)
     assert start.chosen.mean() >= 0.95
-    first = jnp.argmax(estimated(navigator, recorded).decided, axis=1)
+    first = jnp.argmax(estimate_sequences(navigator, recorded).decided, axis=1)
     truth = recorded.T_world_vehicle_true[np.arange(len(rows)), first]
     off_rad = jax.vmap(lambda a, b: rotation_error_rad(jaxlie.SE3(a), jaxlie.SE3(b)))(
         start.bank.mean[:, 0, :7], truth
@@ -171,8 +178,13 @@ def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
 
 def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_px):
     navigator = navigator_of(test_7, True, "multi-hypothesis", corner_sigma_px)
-    parts = [tracks(test_7, True, HALVES[0], 20), tracks(test_7, True, HALVES[1], 32)]
-    both = joined([Named(f"part {k}", navigator, part) for k, part in enumerate(parts)])
+    parts = [
+        sequences_of_recording(test_7, True, HALVES[0], 20),
+        sequences_of_recording(test_7, True, HALVES[1], 32),
+    ]
+    both = join_sequences(
+        [NamedSequences(f"part {k}", navigator, part) for k, part in enumerate(parts)]
+    )
     assert both.used.shape == (sum(map(len, parts)), 32)
     assert int(both.used.sum()) == sum(int(part.used.sum()) for part in parts)
     for first, part in ((0, parts[0]), (len(parts[0]), parts[1])):
@@ -186,16 +198,16 @@ def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_
 
 
 def test_recordings_that_do_not_go_together_are_named(test_7, corner_sigma_px):
-    alone = tracks(test_7, True, (0, 1))
+    alone = sequences_of_recording(test_7, True, (0, 1))
     navigator = navigator_of(test_7, True, "multi-hypothesis", corner_sigma_px)
-    one = Named("one", navigator, alone)
-    all_markers = Named("other", navigator, tracks(test_7, False, (0, 1)))
+    one = NamedSequences("one", navigator, alone)
+    all_markers = NamedSequences("other", navigator, sequences_of_recording(test_7, False, (0, 1)))
     with pytest.raises(BadInput, match=r"^one, other: must have as many markers .* 1 and 9$"):
-        joined([one, all_markers])
+        join_sequences([one, all_markers])
     visible = alone.obs.visible[:, :, :2]
     two_cameras = eqx.tree_at(lambda r: r.obs.visible, alone, visible)
     with pytest.raises(BadInput, match=r"^one, other: must have as many cameras .* 4 and 2$"):
-        joined([one, one._replace(name="other", recorded=two_cameras)])
+        join_sequences([one, one._replace(name="other", recorded=two_cameras)])
     rig = dataclasses.replace(
         test_7.rig,
         Ts_camera_vehicle=jaxlie.SE3(test_7.rig.Ts_camera_vehicle.wxyz_xyz.at[0, 4].add(1e-3)),
@@ -204,7 +216,7 @@ def test_recordings_that_do_not_go_together_are_named(test_7, corner_sigma_px):
         dataclasses.replace(test_7, rig=rig), True, "multi-hypothesis", corner_sigma_px
     )
     with pytest.raises(BadInput, match=r"^one, other: must have the same rig"):
-        joined([one, Named("other", moved, alone)])
+        join_sequences([one, NamedSequences("other", moved, alone)])
 
 
 @pytest.fixture(scope="module")
@@ -223,24 +235,24 @@ def drive(setup, tmp_path_factory) -> tuple[DriveLog, list[Outcome]]:
 
 def test_events_of_a_drive_are_what_the_pilot_fused(setup, drive):
     log, outcomes = drive
-    fused = [Event(o.stamp_ns, o.told) for o in outcomes if o.told is not None]
+    fused = [Event(o.stamp_ns, o.data) for o in outcomes if o.data is not None]
     assert any(b.stamp_ns < a.stamp_ns for a, b in itertools.pairwise(fused))
-    fused.sort(key=lambda event: (event.stamp_ns, event.told.odometry is not None))
-    events = sensed(log.inputs, setup)
+    fused.sort(key=lambda event: (event.stamp_ns, event.data.odometry is not None))
+    events = believed_events(log.inputs, setup)
     assert len(events) == len(fused) > 70
     for event, expected in zip(events, fused, strict=True):
         assert event.stamp_ns == expected.stamp_ns
-        assert event.told.odometry == expected.told.odometry
+        assert event.data.odometry == expected.data.odometry
         for name in ("corners_px", "visible", "sigma_px"):
-            now, then = getattr(event.told, name), getattr(expected.told, name)
+            now, then = getattr(event.data, name), getattr(expected.data, name)
             assert (now is None) == (then is None)
             np.testing.assert_array_equal(now, then)
 
 
 def test_a_drive_is_its_events_one_by_one(setup, drive):
     log, _ = drive
-    events = sensed(log.inputs, setup)
-    recorded = drives(log, setup, (0, 1), length=30)
+    events = believed_events(log.inputs, setup)
+    recorded = sequences_of_drive(log, setup, (0, 1), length=30)
     used, obs = np.asarray(recorded.used), recorded.obs
     assert used.shape[1] <= 30
     assert int(used.sum()) == len(events)
@@ -262,9 +274,9 @@ def test_a_drive_is_its_events_one_by_one(setup, drive):
                 np.testing.assert_array_equal(obs.corners_px[row, index], told.corners_px)
                 np.testing.assert_array_equal(obs.visible[row, index], told.visible)
                 np.testing.assert_array_equal(obs.corner_sigma_px[row, index], told.sigma_px)
-    halves = [drives(log, setup, part) for part in HALVES]
+    halves = [sequences_of_drive(log, setup, part) for part in HALVES]
     assert sum(int(half.used.sum()) for half in halves) == len(events)
-    both = joined([Named("drive", setup.navigator(), half) for half in halves])
+    both = join_sequences([NamedSequences("drive", setup.navigator(), half) for half in halves])
     assert len(both) == 2
 
 
@@ -274,7 +286,7 @@ def test_odometry_that_was_refused_is_left_out(setup, drive):
     now_ns = log.outcomes.now_ns
     rejects = np.where(now_ns == bad.now_ns, Reject.ODOMETRY, Reject(0)).astype(int)
     told = dataclasses.replace(log, outcomes=dataclasses.replace(log.outcomes, rejects=rejects))
-    counts = [int(drives(x, setup, (0, 1)).obs.has_odometry.sum()) for x in (log, told)]
+    counts = [int(sequences_of_drive(x, setup, (0, 1)).obs.has_odometry.sum()) for x in (log, told)]
     assert counts[1] == counts[0] - 1
     for broken in (
         Odometry(bad.odometry.stamp_ns, np.nan, 0.0),
@@ -282,7 +294,7 @@ def test_odometry_that_was_refused_is_left_out(setup, drive):
         Odometry(0, 0.1, 0.0),
     ):
         inputs = [dataclasses.replace(x, odometry=broken) if x is bad else x for x in log.inputs]
-        recorded = driven(inputs, setup, log.path, (0, 1))
+        recorded = sequences_of_inputs(inputs, setup, log.path, (0, 1))
         assert int(recorded.obs.has_odometry.sum()) == counts[1]
 
 
@@ -291,12 +303,12 @@ def test_what_cameras_see_at_one_instant_is_one_event(setup, drive):
     seen = next(x for x in log.inputs if x.frames and len(x.frames[0].detections))
     frame = seen.frames[0]
     cameras = [frame.camera, (frame.camera + 1) % 4]
-    shown = [Sighted(camera, frame.stamp_ns, frame.detections) for camera in cameras]
+    shown = [FrameDetections(camera, frame.stamp_ns, frame.detections) for camera in cameras]
     apart = [Input(seen.now_ns + k, frames=(one,)) for k, one in enumerate(shown)]
-    (event,) = sensed(apart, setup)
-    assert event.told.visible.sum() == 2
+    (event,) = believed_events(apart, setup)
+    assert event.data.visible.sum() == 2
     np.testing.assert_array_equal(
-        event.told.corners_px[cameras[0]], event.told.corners_px[cameras[1]]
+        event.data.corners_px[cameras[0]], event.data.corners_px[cameras[1]]
     )
 
 
@@ -304,4 +316,4 @@ def test_a_drive_that_shows_no_marker_is_refused(setup, drive):
     log, _ = drive
     blind = [dataclasses.replace(x, frames=()) for x in log.inputs]
     with pytest.raises(BadInput, match=r"drive\.mcap: .* none shows a marker of the map"):
-        driven(blind, setup, log.path, (0, 1))
+        sequences_of_inputs(blind, setup, log.path, (0, 1))

@@ -20,7 +20,7 @@ from jaxnav.simulation.scenarios import Scenario, scenarios
 from jaxnav.simulation.world import Spread, nominal
 from jaxnav.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss
 from jaxnav.tuning.driving import ClosedLoop, without_gradient
-from jaxnav.tuning.soft_switch import SoftController, SoftState, softened
+from jaxnav.tuning.soft_switch import SoftController, SoftState, soften_switch
 from jaxnav.tuning.unconstrained import Space
 from tests import worlds
 
@@ -319,7 +319,7 @@ def test_the_soft_switch_has_finite_derivatives_wherever_the_car_is(precision):
 
 def test_a_navigator_without_a_route_has_nothing_to_tune():
     with pytest.raises(ValueError, match="without waypoints"):
-        softened(Navigator(RIG, MARKERS), 0.1)
+        soften_switch(Navigator(RIG, MARKERS), 0.1)
 
 
 def test_each_drive_has_a_car_of_its_own():

@@ -21,12 +21,12 @@ from jaxnav import cli
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
 from jaxnav.loop.flags import Health
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.plots.scenery import Scenery
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.recorder import Recorder
 from jaxnav.viewer import rerun_view as viewing
-from jaxnav.viewer.outcomes import Shown
+from jaxnav.viewer.outcomes import ShownOutcome
 from jaxnav.viewer.rerun_view import RerunView
 from tests.helpers.drives import PERIOD_NS, make_outcome, make_picture, record_drive
 
@@ -99,18 +99,18 @@ def test_a_drive_of_which_nothing_is_known_is_shown_too(tmp_path, capsys):
 
 def test_an_outcome_and_its_record_show_the_same(recorded):
     outcome = make_outcome(4)
-    made, read = Shown.of(outcome), Shown.of_row(read_drive(recorded).outcomes, 4)
-    for field in dataclasses.fields(Shown):
+    made, read = ShownOutcome.of(outcome), ShownOutcome.of_row(read_drive(recorded).outcomes, 4)
+    for field in dataclasses.fields(ShownOutcome):
         np.testing.assert_array_equal(getattr(made, field.name), getattr(read, field.name))
 
 
 def test_live_outcomes_come_ten_in_a_second_and_changes_of_health_at_once(tmp_path):
     view = opened(tmp_path / "drive.rrd")
-    seen = Told(corners_px=np.zeros((4, 1, 4, 2)))
+    seen = EventData(corners_px=np.zeros((4, 1, 4, 2)))
     for index in range(100):  # of 10 ms each
         outcome = dataclasses.replace(
             make_outcome(index),
-            told=seen if index % 2 else None,
+            data=seen if index % 2 else None,
             health=Health.STOP if index == 55 else Health.OK,
         )
         view.show(outcome)
@@ -130,7 +130,7 @@ def test_nobody_waits_and_what_does_not_fit_is_counted(tmp_path, monkeypatch):
         begun.set()
         go_on.wait(10)
 
-    monkeypatch.setattr(viewing.Scene, "show", slow)
+    monkeypatch.setattr(viewing.RerunScene, "show", slow)
     view = opened(tmp_path / "drive.rrd", queue_items=3)
     far_apart = range(0, 400, 20)
     view.show(make_outcome(0))
@@ -153,7 +153,7 @@ def test_what_can_not_be_drawn_is_left_out(tmp_path):
     view.show(dataclasses.replace(make_outcome(0), output=None))
     assert view.dropped == 2
     nowhere = dataclasses.replace(
-        Shown.of(make_outcome(1)),
+        ShownOutcome.of(make_outcome(1)),
         pose=np.full(3, np.nan),
         covariance=np.full((6, 6), np.nan),
         hypotheses=np.full((2, 3), np.nan),

@@ -11,7 +11,7 @@ from jaxnav.calibration.boards.images import source_files
 from jaxnav.cli import main, nothing_hidden
 from jaxnav.commands.pictures import save_figure
 from jaxnav.errors import BadInput, visible
-from jaxnav.files.images import decoded_image
+from jaxnav.files.images import decode_image
 from jaxnav.vehicles.opencv_cameras import _device
 from tests.helpers.seed_texts import OPENCV
 
@@ -77,7 +77,7 @@ def test_a_picture_shows_any_name(name, tmp_path):
     axes.legend(title=name)
     figure.suptitle(name)
     save_figure(figure, tmp_path / "a.png")
-    assert decoded_image((tmp_path / "a.png").read_bytes()) is not None
+    assert decode_image((tmp_path / "a.png").read_bytes()) is not None
     assert axes.get_title().replace("\n", "").isprintable()
 
 

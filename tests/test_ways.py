@@ -25,10 +25,10 @@ class Drive:
         self.now_ns += 20 * MS
         self.x_m += 0.02 * self.speed_mps
         self.off_m += 0.02 * drag_mps
-        self.ways.drove(self.scale * self.speed_mps, 0.0, 0.0, 0.02)
+        self.ways.add_odometry(self.scale * self.speed_mps, 0.0, 0.0, 0.02)
         if looks:
-            self.ways.glimpse(self.now_ns)
-            self.ways.look(self.now_ns, self.fix())
+            self.ways.note_corners(self.now_ns)
+            self.ways.add_fix(self.now_ns, self.fix())
         return self.ways.disputed
 
     def fix(self, by_m: float = 0.0, turn_rad: float = 0.0) -> Fix:
@@ -111,9 +111,9 @@ def test_before_the_first_pose_and_after_forgetting_everything_is_in_reach():
 
 def test_a_turn_is_the_bicycles():
     ways = Ways(WHEELBASE_M)
-    ways.look(0, Fix(0.0, 0.0, 0.0, 0.0, 0.0))
+    ways.add_fix(0, Fix(0.0, 0.0, 0.0, 0.0, 0.0))
     for _ in range(50):
-        ways.drove(-0.5, 0.4, 0.0, 0.02)
+        ways.add_odometry(-0.5, 0.4, 0.0, 0.02)
     curvature_per_m = math.cos(math.atan(math.tan(0.4) / 2)) * math.tan(0.4) / WHEELBASE_M
     assert ways._turned_rad == pytest.approx(0.5 * curvature_per_m)
 
@@ -122,6 +122,6 @@ def test_a_silent_odometer_disputes_nothing_when_it_is_back():
     drive = Drive(0.4)
     drive.seconds(3)
     assert drive.seconds(3, drag_mps=0.5)[-1]
-    drive.ways.drove(0.4, 0.0, 0.0, 0.2)
+    drive.ways.add_odometry(0.4, 0.0, 0.0, 0.2)
     assert not drive.ways.disputed
     assert not drive.step()

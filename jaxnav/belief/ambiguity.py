@@ -59,7 +59,7 @@ class PoseMeasurement(eqx.Module):
 class PosePosterior(eqx.Module):
     """The corrected pose of each hypothesis: prediction and corners fused by the selector.
 
-    The filter adopts it and corrects the rest of its state by regression (`motion.followed`).
+    The filter adopts it and corrects the rest of its state by regression (`motion.follow_pose`).
     Lanes where `taken` is False hold finite numbers.
     """
 

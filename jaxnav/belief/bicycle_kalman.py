@@ -14,9 +14,9 @@ from jaxnav.belief.motion import (
     Offer,
     Planar,
     contradicted,
-    followed,
-    forgotten,
-    unstarted,
+    empty_bank,
+    follow_pose,
+    forget_lost,
 )
 from jaxnav.models import bicycle
 from jaxnav.models.bicycle import Vehicle
@@ -73,7 +73,7 @@ class BicycleKalman(Motion):
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
-        return unstarted(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, 3, hypotheses)
+        return empty_bank(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, 3, hypotheses)
 
     def predict(self, bank: Bank, obs: Observation) -> Bank:
         """x = A x, P = A P A' + Q (Eq. 9), then the odometry (Eqs. 10 and 11).
@@ -84,7 +84,7 @@ class BicycleKalman(Motion):
             bank.mean, bank.covariance
         )
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, (mean, covariance))
-        return forgotten(predicted, self.lost(bank), obs.dt_s)
+        return forget_lost(predicted, self.lost(bank), obs.dt_s)
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Whether the gate has contradicted a hypothesis too often or too long."""
@@ -124,7 +124,7 @@ class BicycleKalman(Motion):
         innovation = self.difference(pose, bank.mean[:3])
         correction, posterior, S = kalman.update(P, innovation, jnp.eye(3, 6, dtype=P.dtype), R)
         return Offer(
-            kalman.whitened(innovation, S),
+            kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
             first=self._first(pose, R, obs),
@@ -138,7 +138,7 @@ class BicycleKalman(Motion):
         eye = jnp.eye(6, dtype=bank.mean.dtype)
         to_body = eye.at[:3, :3].set(_turn(-bank.mean[2]))
         to_world = eye.at[:3, :3].set(_turn(pose[2]))
-        correction, P = followed(
+        correction, P = follow_pose(
             jnp.where(bank.initialised, sandwich(to_body, bank.covariance), eye),
             T_world_vehicle_from_planar(bank.mean[:3]),
             T,

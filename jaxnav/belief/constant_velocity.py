@@ -8,14 +8,22 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
-from jaxnav.belief.motion import Bank, Motion, Offer, contradicted, followed, forgotten, unstarted
+from jaxnav.belief.motion import (
+    Bank,
+    Motion,
+    Offer,
+    contradicted,
+    empty_bank,
+    follow_pose,
+    forget_lost,
+)
 from jaxnav.models.geometry import (
     cayley,
     inverse_cayley,
     planar_from_T_world_vehicle,
     rotation_matrix,
 )
-from jaxnav.numerics.small_matrices import applied, cholesky, log_det
+from jaxnav.numerics.small_matrices import cholesky, log_det, matvec
 from jaxnav.pose.observation import Observation
 
 
@@ -46,7 +54,7 @@ class ConstantVelocity(Motion):
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
         mean = jnp.zeros(13, self.acceleration_density.dtype).at[0].set(1)
-        return unstarted(mean, 12, 6, hypotheses)
+        return empty_bank(mean, 12, 6, hypotheses)
 
     def predict(self, bank: Bank, obs: Observation) -> Bank:
         """T = T exp(twist dt), P = F P F' + Q with F = [Ad(exp(-twist dt)), dt I; 0, I].
@@ -72,7 +80,7 @@ class ConstantVelocity(Motion):
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, (mean, covariance))
         wrong = self.lost(bank)
         lost = wrong | ~(variance_m2 < self.lost_sigma_m**2)
-        return forgotten(predicted, lost, dt_s)
+        return forget_lost(predicted, lost, dt_s)
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Whether the gate has contradicted a hypothesis too often or too long."""
@@ -99,7 +107,7 @@ class ConstantVelocity(Motion):
         innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
         correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, 12, dtype=P.dtype), R)
         return Offer(
-            kalman.whitened(innovation, S),
+            kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
             first=self._first(wxyz_xyz, R),
@@ -109,7 +117,7 @@ class ConstantVelocity(Motion):
     def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has corrected its pose, in 6 dof."""
         T = measured.T_world_vehicle
-        correction, P = followed(
+        correction, P = follow_pose(
             bank.covariance,
             jaxlie.SE3(bank.mean[:7]),
             T,
@@ -139,7 +147,7 @@ class ConstantVelocity(Motion):
         """(x, y, psi) and (v_x, v_y, psi_dot) in the world: pose and motion seen from above."""
         T_world_vehicle = jaxlie.SE3(mean[:7])
         R_world_vehicle = rotation_matrix(T_world_vehicle.rotation())
-        v_mps, w_radps = applied(R_world_vehicle, mean[7:10]), applied(R_world_vehicle, mean[10:])
+        v_mps, w_radps = matvec(R_world_vehicle, mean[7:10]), matvec(R_world_vehicle, mean[10:])
         # psi is the direction of the x axis, which moves by w x (R e_x).
         x, y, up = R_world_vehicle[:, 0]
         level = jnp.maximum(x**2 + y**2, jnp.finfo(mean.dtype).eps)

@@ -27,7 +27,7 @@ class Belief(eqx.Module):
         nothing = jnp.zeros((), bank.mean.dtype)
         return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32))
 
-    def predicted(self, bank: Bank) -> "Belief":
+    def with_prediction(self, bank: Bank) -> "Belief":
         """The belief with its bank predicted; a restart is counted where no hypothesis is left."""
         given_up = jnp.any(self.bank.initialised) & ~jnp.any(bank.initialised)
         return replace(self, bank=bank, restarts=self.restarts + given_up)
@@ -40,7 +40,7 @@ class Belief(eqx.Module):
         return Belief(bank, decided, flip_probability, self.restarts)
 
 
-class Believed(eqx.Module):
+class BeliefReport(eqx.Module):
     """The reported part of a belief: pose and covariance of its heaviest hypothesis."""
 
     pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
@@ -55,12 +55,12 @@ class Believed(eqx.Module):
     decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
 
     @staticmethod
-    def of(motion: Motion, belief: Belief) -> "Believed":
+    def of(motion: Motion, belief: Belief) -> "BeliefReport":
         """The heaviest hypothesis; its covariance is the bank's second moment about its mean."""
         bank, best = belief.bank, heaviest(belief.bank)
         Ts_world_vehicle = motion.poses(bank).T_world_vehicle
         covariance = motion.error_covariance(bank, best)
-        return Believed(
+        return BeliefReport(
             **motion.planar(bank.mean[best], covariance)._asdict(),
             covariance=covariance,
             T_world_vehicle=jax.tree.map(lambda leaf: leaf[best], Ts_world_vehicle),
@@ -106,13 +106,13 @@ class Evidence(eqx.Module):
         )
 
 
-class Estimate(Believed, Evidence):
+class Estimate(BeliefReport, Evidence):
     """All that is known after one observation: the belief's report and the corners' evidence."""
 
     @staticmethod
     def of(motion: Motion, belief: Belief, evidence: Evidence) -> "Estimate":  # type: ignore[override]
         """The estimate of a belief and of the evidence that led to it."""
-        return Estimate(**vars(Believed.of(motion, belief)), **vars(evidence))
+        return Estimate(**vars(BeliefReport.of(motion, belief)), **vars(evidence))
 
     @property
     def evidence(self) -> Evidence:

@@ -89,7 +89,7 @@ def fan(
     return PoseBelief(
         T_world_vehicle=Ts_world_vehicle,
         covariance=jax.vmap(covariance)(Ts_world_vehicle, axes),
-        log_weight=normalised(jnp.where(alive, light.astype(range_m.dtype), -jnp.inf)),
+        log_weight=normalise(jnp.where(alive, light.astype(range_m.dtype), -jnp.inf)),
         initialised=alive,
         freedom=prior.freedom,
         nuisance=prior.nuisance,
@@ -154,7 +154,7 @@ def _shortest_turn(direction: Float[Array, " 3"]) -> jaxlie.SO3:
     return jaxlie.SO3(wxyz).normalize()
 
 
-def normalised(log_weight: Float[Array, " K"]) -> Float[Array, " K"]:
+def normalise(log_weight: Float[Array, " K"]) -> Float[Array, " K"]:
     """Log-weights shifted so that the weights sum to 1; unchanged where none is finite."""
     highest = jnp.max(log_weight)
     any_finite = jnp.isfinite(highest)

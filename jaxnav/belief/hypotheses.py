@@ -24,11 +24,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
-from jaxnav.belief.fan import CANDIDATES, fan, normalised
-from jaxnav.belief.map_fit import Fit, fit
+from jaxnav.belief.fan import CANDIDATES, fan, normalise
+from jaxnav.belief.map_fit import PoseFit, fit_poses
 from jaxnav.models.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
-from jaxnav.numerics.levenberg_marquardt import found
-from jaxnav.numerics.small_matrices import applied, cholesky, product, ranks, sandwich, solve_lower
+from jaxnav.numerics.levenberg_marquardt import mark_found
+from jaxnav.numerics.small_matrices import cholesky, matvec, product, ranks, sandwich, solve_lower
 from jaxnav.numerics.trees import where
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Snapshot
@@ -98,14 +98,14 @@ class MultiHypothesis(eqx.Module):
         heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
         does_as = jnp.where(bank.initialised, jnp.arange(count), heaviest)
         starts_at = _at(_poses(bank), does_as)
-        fits = fit(
+        fits = fit_poses(
             starts_at.T_world_vehicle, starts_at.covariance, prior, snapshot, floor, self.max_steps
         )
         alive = bank.initialised & fits.finite
         inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
         posteriors = _inflated(fits.posterior, inflation)
         evidence = self._evidence(fits, inflation, alive, candidates, starts)
-        log_weight = normalised(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
+        log_weight = normalise(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
         alive = alive & (log_weight > self.forget_log_weight)
 
         # A hypothesis whose pose the gate rejects stays where it was predicted.
@@ -134,7 +134,7 @@ class MultiHypothesis(eqx.Module):
             measured=eqx.tree_at(lambda m: m.taken, posteriors, alive & any_seen),
             kept=alive & ~starts,
             log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
-            heir=found(heir),
+            heir=mark_found(heir),
             costs=costs,
             selected=jnp.where(jnp.any(candidates.valid) & located, jnp.argmin(costs), -1),
             flip_probability=jnp.where(located, flip_probability, 0),
@@ -157,7 +157,7 @@ class MultiHypothesis(eqx.Module):
         return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, seen.sigma_px * scale)
 
     def _inflation(
-        self, fits: Fit, alive: Bool[Array, " K"], starts: Array, freedom: int
+        self, fits: PoseFit, alive: Bool[Array, " K"], starts: Array, freedom: int
     ) -> Float[Array, ""]:
         """Factor, at least 1, by which the covariances of prediction and corners are too small.
 
@@ -172,7 +172,7 @@ class MultiHypothesis(eqx.Module):
 
     def _evidence(
         self,
-        fits: Fit,
+        fits: PoseFit,
         inflation: Float[Array, ""],
         alive: Bool[Array, " K"],
         candidates: Candidates,
@@ -292,7 +292,7 @@ def _apart(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, 
     (w, v), (w_other, v_other) = (base[0], base[1:4]), (other[0], other[1:4])
     cosine = w * w_other + jnp.sum(v * v_other)
     sine = w * v_other - w_other * v - jnp.cross(v, v_other)
-    shift = applied(rotation_matrix(jaxlie.SO3(base[:4])).T, other[4:] - base[4:])
+    shift = matvec(rotation_matrix(jaxlie.SO3(base[:4])).T, other[4:] - base[4:])
     return jnp.append(shift, 2 * jnp.where(cosine < 0, -1, 1) * sine)
 
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnav.numerics.small_matrices import (
-    applied,
     cho_solve,
     cholesky,
     log_det,
+    matvec,
     product,
     sandwich,
     solve_lower,
@@ -51,7 +51,7 @@ def update(
     K = cho_solve(cholesky(S), HP).T
     I_KH = jnp.eye(P.shape[0], dtype=P.dtype) - product(K, H)
     posterior = symmetrise(sandwich(I_KH, P) + sandwich(K, R))
-    return applied(K, innovation), floored(posterior, P), S
+    return matvec(K, innovation), add_floor(posterior, P), S
 
 
 def hide_rows(
@@ -65,14 +65,14 @@ def hide_rows(
     return present * innovation, present[:, None] * H, kept * R + jnp.diag(1 - present)
 
 
-def whitened(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, " m"]:
+def whiten(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, " m"]:
     """L^-1 innovation with S = L L': uncorrelated entries of variance 1."""
     return solve_lower(cholesky(S), innovation)
 
 
 def nis(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
     """Normalised innovation squared, innovation' S^-1 innovation: chi-square with m dof."""
-    return jnp.sum(whitened(innovation, S) ** 2)
+    return jnp.sum(whiten(innovation, S) ** 2)
 
 
 def log_likelihood(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Float[Array, ""]:
@@ -81,7 +81,7 @@ def log_likelihood(innovation: Float[Array, " m"], S: Float[Array, "m m"]) -> Fl
     return -(jnp.sum(solve_lower(factor, innovation) ** 2) + log_det(factor)) / 2
 
 
-def floored(posterior: Float[Array, "n n"], prior: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def add_floor(posterior: Float[Array, "n n"], prior: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The posterior plus a floor, 1e-12 of the prior's largest variance, on its diagonal."""
     floor = _RELATIVE_FLOOR * jnp.max(jnp.diagonal(prior))
     return posterior + floor * jnp.eye(prior.shape[0], dtype=prior.dtype)

@@ -24,22 +24,22 @@ from jaxnav.belief.ambiguity import PoseBelief, PosePosterior
 from jaxnav.models.geometry import cayley, cayley_jacobian, rotation_matrix
 from jaxnav.numerics.levenberg_marquardt import ImplicitGradient, NormalEquations, NormalEquationsLM
 from jaxnav.numerics.small_matrices import (
-    applied,
     cho_solve,
     cholesky,
     gram,
     log_det,
+    matvec,
     product,
     sandwich,
     solve_lower,
     solve_positive,
     solve_upper,
 )
-from jaxnav.pose.linearised import crossed, reprojection_rows, turned, wrench
+from jaxnav.pose.linearised import cross_product, reprojection_rows, turn_arms, wrench
 from jaxnav.pose.observation import Snapshot, log_sigmas
 
 
-class Fit(eqx.Module):
+class PoseFit(eqx.Module):
     """The minimum of e next to each of K predictions."""
 
     posterior: PosePosterior
@@ -48,14 +48,14 @@ class Fit(eqx.Module):
     finite: Bool[Array, "*K"]
 
 
-def fit(
+def fit_poses(
     T_world_prior: jaxlie.SE3,
     covariance: Float[Array, "K 6 6"],
     prior: PoseBelief,
     snapshot: Snapshot,
     floor: Float[Array, " 6"],
     max_steps: int,
-) -> Fit:
+) -> PoseFit:
     """Minimise e over u, in units of the prediction's own sigma: xi = freedom L u, P = L L'.
 
         e(u) = |r(T_prior cay(freedom L u))|^2 / sigma^2 + |u|^2
@@ -101,7 +101,7 @@ def fit(
         throw=False,
     )
     r, normal = linearised(solution.value)
-    fused: Fit = jax.vmap(
+    fused: PoseFit = jax.vmap(
         partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 5)
     )(
         T_world_prior,
@@ -152,10 +152,10 @@ def _linearised(
         half, shift = xi[3:] / 2, xi[:3]
         per_norm = 1 / (1 + jnp.sum(half**2, axis=0))
         # cay(-xi) moves the corners; d cay(xi) = cay(xi) cay(J d), see `cayley_jacobian`.
-        moved = turned(-half, corners) - (shift + _swung(-half, shift))[:, None]
-        turn = (spread[3:] - crossed(half[:, None], spread[3:])) * per_norm[None, None]
+        moved = turn_arms(-half, corners) - (shift + _swung(-half, shift))[:, None]
+        turn = (spread[3:] - cross_product(half[:, None], spread[3:])) * per_norm[None, None]
         along = spread[:3] + _swung(-half[:, None], spread[:3])
-        along = along - crossed(shift[:, None] / 2, turn)
+        along = along - cross_product(shift[:, None] / 2, turn)
         twist = jnp.concatenate([along, turn])
         residual, slope = rows(moved)
         J = -jnp.sum(_answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
@@ -179,13 +179,13 @@ def _linearised(
 
 def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
     """cay(xi) shifts by more than `shift`, since it turns meanwhile: the difference, (3, ...)."""
-    swing = crossed(half, shift)
-    return (swing + crossed(half, swing)) / (1 + jnp.sum(half**2, axis=0))[None]
+    swing = cross_product(half, shift)
+    return (swing + cross_product(half, swing)) / (1 + jnp.sum(half**2, axis=0))[None]
 
 
 def _answers(slope: Float[Array, "3 2 P K"], points: Float[Array, "3 P K"]) -> Array:
     """Derivative (6, 2 P, K) of residuals by a shift and a turn of all corners about the origin."""
-    answers = jnp.concatenate([slope, crossed(points[:, None], slope)])
+    answers = jnp.concatenate([slope, cross_product(points[:, None], slope)])
     return answers.reshape(6, -1, answers.shape[-1])
 
 
@@ -202,7 +202,7 @@ def _fused(
     *,
     freedom: Float[Array, "6 d"],
     floor: Float[Array, " 6"],
-) -> Fit:
+) -> PoseFit:
     """Posterior and evidence of one hypothesis at its minimum u.
 
     With A = J'J of the corners in units of the prediction's sigma, N the floor in the same units,
@@ -229,13 +229,13 @@ def _fused(
     log_likelihood = (
         log_scale - (misfit + log_det(alone) + jnp.sum(contradiction**2) + log_det(sigma)) / 2
     )
-    xi = applied(spread, u_fused)
+    xi = matvec(spread, u_fused)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, C)
     numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], contradiction]
     finite = usable & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
-    return Fit(
+    return PoseFit(
         posterior=PosePosterior(
             jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, T_world_prior.wxyz_xyz)),
             jnp.where(finite, posterior_covariance, jnp.eye(6, dtype=dtype)),

@@ -27,10 +27,10 @@ from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
 from jaxnav.models.geometry import inverse_cayley, inverse_cayley_jacobian
 from jaxnav.numerics.small_matrices import (
-    applied,
     cho_solve,
     cholesky,
     gram,
+    matvec,
     product,
     sandwich,
     solve_lower,
@@ -63,7 +63,7 @@ class Bank(eqx.Module):
     number: Int[Array, "*K"]  # identity of a hypothesis, kept when it changes its slot
 
 
-class Updated(NamedTuple):
+class BankUpdate(NamedTuple):
     """A bank after an observation, and the outcome of the gate for each hypothesis."""
 
     bank: Bank
@@ -82,7 +82,7 @@ class Planar(NamedTuple):
 
 
 class Offer(NamedTuple):
-    """One hypothesis as a measured pose would start or correct it, for `gated` to choose from."""
+    """One hypothesis as a measured pose would start or correct it; `apply_gate` chooses."""
 
     innovation: Float[Array, " m"]  # of the pose, whitened
     first: tuple[Array, Array]  # mean and covariance where the pose starts the hypothesis
@@ -143,7 +143,7 @@ class Motion(eqx.Module):
         (pose, velocity), (J_pose, J_velocity) = self.on_ground(mean), slopes
         return Planar(pose, sandwich(J_pose, P), velocity, sandwich(J_velocity, P))
 
-    def update(self, bank: Bank, selection: Selection, obs: Observation) -> Updated:
+    def update(self, bank: Bank, selection: Selection, obs: Observation) -> BankUpdate:
         """The posterior of every hypothesis (Eqs. 10 and 11), with those of one heir merged.
 
         A measured pose starts a hypothesis that is not initialised. Otherwise it is fused where its
@@ -160,14 +160,14 @@ class Motion(eqx.Module):
         measured = selection.measured
         offer = self.follow if isinstance(measured, PosePosterior) else self.measure
 
-        def one(before: Bank, measured: Any) -> Updated:
+        def one(before: Bank, measured: Any) -> BankUpdate:
             offered = offer(before, measured, obs)
-            after, nis, accepted = gated(before, offered, measured.taken)
+            after, nis, accepted = apply_gate(before, offered, measured.taken)
             compared = measured.taken & before.initialised
-            return Updated(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
+            return BankUpdate(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
 
-        updated: Updated = jax.vmap(one)(bank, measured)
-        bank = merged(updated.bank, selection.heir, self.difference, self.moved)
+        updated: BankUpdate = jax.vmap(one)(bank, measured)
+        bank = merge_heirs(updated.bank, selection.heir, self.difference, self.moved)
         return updated._replace(bank=bank)
 
     def error_covariance(self, bank: Bank, index: Int[Array, ""]) -> Float[Array, "d d"]:
@@ -187,7 +187,7 @@ class Motion(eqx.Module):
         return jnp.sum(share[:, None, None] * (bank.covariance + squared), axis=0)
 
 
-def unstarted(
+def empty_bank(
     mean: Float[Array, " n"], error_states: int, pose_states: int, hypotheses: int
 ) -> Bank:
     """K hypotheses that have seen nothing."""
@@ -206,7 +206,7 @@ def unstarted(
     )
 
 
-def forgotten(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Bank:
+def forget_lost(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Bank:
     """The bank with the hypotheses that are `lost` no longer initialised: a pose starts them anew.
 
     Args:
@@ -229,7 +229,7 @@ def contradicted(
     return (rejections.count >= max_count) | (rejections.duration_s >= max_duration_s)
 
 
-def gated(
+def apply_gate(
     bank: Bank,
     offer: Offer,
     taken: Bool[Array, ""],
@@ -286,7 +286,7 @@ def _cleared(rejections: Rejections, over: Bool[Array, "*K"]) -> Rejections:
     return where(over, jax.tree.map(jnp.zeros_like, rejections), rejections)
 
 
-def followed(
+def follow_pose(
     P: Float[Array, "n n"],
     T_world_prior: jaxlie.SE3,
     T_world_vehicle: jaxlie.SE3,
@@ -314,7 +314,7 @@ def followed(
     """
     d = freedom.shape[1]
     away = inverse_cayley(T_world_prior.inverse() @ T_world_vehicle)
-    xi = applied(freedom.T, away)
+    xi = matvec(freedom.T, away)
     # Error at the corrected pose -> at the prediction.
     back = sandwich(freedom.T, inverse_cayley_jacobian(away))
     posterior = sandwich(freedom.T, covariance)
@@ -327,10 +327,10 @@ def followed(
     cross = product(moves, posterior)
     rest = P[d:, d:] - explained + sandwich(moves, posterior)
     after = kalman.symmetrise(jnp.block([[posterior, cross.T], [cross, rest]]))
-    return jnp.append(xi, applied(gain, xi)), kalman.floored(after, P)
+    return jnp.append(xi, matvec(gain, xi)), kalman.add_floor(after, P)
 
 
-def merged(
+def merge_heirs(
     bank: Bank,
     heir: Int[Array, " K"],
     difference: Callable[[Array, Array], Array],
@@ -380,7 +380,7 @@ def heaviest(bank: Bank) -> Int[Array, ""]:
     return jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
 
 
-def of_mixture(bank: Bank, log_values: Float[Array, " K"]) -> Float[Array, ""]:
+def mixture_log_mean(bank: Bank, log_values: Float[Array, " K"]) -> Float[Array, ""]:
     """log (sum_k w_k exp(log_value_k) / sum_k w_k) over initialised hypotheses; 0 without any."""
     lives = bank.initialised
     log_weight = jnp.where(lives, bank.log_weight, 0)
@@ -390,20 +390,20 @@ def of_mixture(bank: Bank, log_values: Float[Array, " K"]) -> Float[Array, ""]:
     return jnp.where(any_lives, value, 0) - jnp.where(any_lives, total, 0)
 
 
-def leading(bank: Bank, count: int) -> Bank:
+def first_hypotheses(bank: Bank, count: int) -> Bank:
     """The bank cut to its first `count` hypotheses."""
     first: Bank = jax.tree.map(lambda leaf: leaf[:count], bank)
     return first
 
 
-def followed_by(first: Bank, empty: Bank) -> Bank:
+def fill_slots(first: Bank, empty: Bank) -> Bank:
     """The bank `empty` with its first slots replaced by the hypotheses of `first`."""
     kept = first.initialised.shape[0]
     bank: Bank = jax.tree.map(lambda a, b: jnp.concatenate([a, b[kept:]]), first, empty)
     return bank
 
 
-def numbered_anew_where_empty(bank: Bank) -> Bank:
+def renumber_if_empty(bank: Bank) -> Bank:
     """The bank with numbers 0 to K - 1 where no hypothesis is initialised; else unchanged."""
     anew = jnp.arange(bank.number.shape[0])
     number = jnp.where(jnp.any(bank.initialised), bank.number, anew)
@@ -426,7 +426,7 @@ def survivors_first(bank: Bank) -> Bank:
     return sorted_bank
 
 
-def restarted_where_broken(bank: Bank, start: Bank) -> Bank:
+def restart_broken(bank: Bank, start: Bank) -> Bank:
     """The bank with `start` in place of hypotheses whose mean or covariance is not finite."""
     hypotheses = (bank.mean, bank.covariance.reshape(*bank.mean.shape[:1], -1))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(hypotheses, axis=1)), axis=1)

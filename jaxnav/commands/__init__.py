@@ -53,18 +53,18 @@ COMMANDS = {
         in_folder=(*_DROVE, *(f"seed_*/{name}" for name in _DROVE)),
     ),
     "replay": Registered(
-        "drive.arguments:Replay",
+        "drive.arguments:ReplayRecording",
         "drive.replay",
         in_folder=("*.tum", "report.png", "summary.json"),
     ),
     "locate": Registered("drive.arguments:Locate", "drive.locate", file="out"),
     "simulate": Registered("simulate.arguments:Simulate", "simulate.simulate", file="json"),
     "reliability": Registered(
-        "study.arguments:Reliability",
+        "study.arguments:StudyReliability",
         "study.reliability",
         in_folder=("reliability.png", "summary.json"),
     ),
-    "study": Registered("study.arguments:Study", "study.study", made="out"),
+    "study": Registered("study.arguments:RunStudy", "study.study", made="out"),
     "plot": Registered(
         "study.arguments:Plot",
         "study.plot",
@@ -72,7 +72,7 @@ COMMANDS = {
     ),
     "run": Registered("drive.arguments:Run", "drive.run", made="record"),
     "faults": Registered("drive.arguments:Faults", "drive.faults", file="json"),
-    "view": Registered("drive.arguments:View", "drive.view", made="out"),
+    "view": Registered("drive.arguments:ViewDrive", "drive.view", made="out"),
     "doctor": Registered("doctor.arguments:Doctor", "doctor.doctor", file="json"),
     "tune filter": Registered("tune.arguments:TuneFilter", "tune.filter", in_folder=_TUNED),
     "tune controller": Registered(

@@ -20,7 +20,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import points_in_world
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Output
-from jaxnav.plots.localisation import View
+from jaxnav.plots.localisation import AnnotatedFrame
 
 PNG_DPI = 110
 _NORMAL_SIDES = 0.8  # length of a drawn normal, in sides of the marker
@@ -72,7 +72,7 @@ def views_of(
     visible: np.ndarray,
     output: Output,
     stamp_s: float,
-) -> list[View]:
+) -> list[AnnotatedFrame]:
     """Views of every camera's frame, with the markers seen and the poses the navigator weighed.
 
     Args:
@@ -101,7 +101,7 @@ def views_of(
                 )
                 sticks[n == output.selected].append(stick[0])
         views.append(
-            View(
+            AnnotatedFrame(
                 title=f"{rig.names[c]}, t = {stamp_s:.2f} s",
                 image=image,
                 detected_px=corners_px[c][visible[c]],

@@ -1,7 +1,7 @@
 """Pack trees of arrays into two vectors, since each array passed to a compiled call costs some us.
 
-packed = Layout.of(tree).pack(tree)
-tree = packed.unpacked()
+packed = PackedLayout.of(tree).pack(tree)
+tree = packed.unpack()
 """
 
 import math
@@ -15,7 +15,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Place:
+class LeafPlace:
     """The place of a tree's leaf in one of the vectors."""
 
     begin: int
@@ -30,7 +30,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class PackedLayout:
     """A tree with places as leaves. Layouts are equal if structure, shapes and types are."""
 
     places: Any
@@ -38,16 +38,18 @@ class Layout:
     key: str = field(repr=False)
 
     @staticmethod
-    def of(tree: Any) -> "Layout":
+    def of(tree: Any) -> "PackedLayout":
         """The layout of a tree of floats of one precision, integers in int32's range, and bools."""
         leaves, structure = jax.tree.flatten(tree)
         places, ends, precision = [], [0, 0], "float32"
         for leaf in leaves:
             is_float = bool(jnp.issubdtype(leaf.dtype, jnp.floating))
             precision = str(leaf.dtype) if is_float else precision
-            places.append(Place(ends[is_float], leaf.shape, str(leaf.dtype), is_float))
+            places.append(LeafPlace(ends[is_float], leaf.shape, str(leaf.dtype), is_float))
             ends[is_float] += math.prod(leaf.shape)
-        return Layout(jax.tree.unflatten(structure, places), precision, f"{structure} {places}")
+        return PackedLayout(
+            jax.tree.unflatten(structure, places), precision, f"{structure} {places}"
+        )
 
     def pack(self, tree: Any) -> "Packed":
         """Pack a tree of this layout."""
@@ -109,7 +111,7 @@ class Layout:
         return jax.tree.structure(self.places)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Layout) and self.key == other.key
+        return isinstance(other, PackedLayout) and self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -126,12 +128,12 @@ class Packed:
 
     floats: Any  # (n,)
     integers: Any  # (m,) int32
-    layout: Layout
+    layout: PackedLayout
 
-    def unpacked(self) -> Any:
+    def unpack(self) -> Any:
         """The tree of these numbers."""
         return self.layout.unpack(self.floats, self.integers)
 
-    def fetched(self) -> "Packed":
+    def fetch(self) -> "Packed":
         """The same numbers in NumPy arrays."""
         return Packed(np.asarray(self.floats), np.asarray(self.integers), self.layout)

@@ -20,14 +20,14 @@ from jaxnav.navigator import Navigator, Step, jitted_step
 def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
     """`jax.jit(navigator.step)`, whose first call loads what another process has compiled.
 
-    See `compiled`.
+    See `compile_or_load`.
     """
     if folder is None:
         return partial(jitted_step, navigator)
-    return compiled(Navigator.step, navigator, folder)
+    return compile_or_load(Navigator.step, navigator, folder)
 
 
-def compiled(
+def compile_or_load(
     function: Callable[..., Any], navigator: Navigator, folder: Path | None
 ) -> Callable[..., Any]:
     """`jax.jit(function)` of a navigator, whose first call loads what another process has compiled.
@@ -44,7 +44,7 @@ def compiled(
     Returns:
         The function of the further trees, with the navigator bound.
     """
-    navigator = bare(navigator)
+    navigator = strip_static(navigator)
     if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
         return partial(_jitted(function), navigator)
     numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
@@ -63,11 +63,11 @@ def compiled(
 def is_compiled(
     function: Callable[..., Any], navigator: Navigator, folder: Path, *told: Any
 ) -> bool:
-    """Whether `compiled(function, navigator, folder)(*told)` finds its executable in the folder."""
-    return executables.is_kept(function, (bare(navigator), *told), folder)
+    """Whether `compile_or_load(function, navigator, folder)(*told)` finds its executable."""
+    return executables.is_kept(function, (strip_static(navigator), *told), folder)
 
 
-def bare(navigator: Navigator) -> Navigator:
+def strip_static(navigator: Navigator) -> Navigator:
     """The navigator without its vehicle's sensor corrections and its map's origin: these numbers
     are static fields, not leaves, and nothing is computed with them."""
 

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import storage_mcap as _mcap
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from jaxnav.files import limits
-from jaxnav.files.unpacking import Budget, unpacked, zstd_pieces
+from jaxnav.files.unpacking import Budget, unpack_chunk, zstd_pieces
 
 _RULE = "=" * 80 + "\n"  # between the definitions of a message's parts
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -71,7 +71,7 @@ class Ros1Reader(_Ros1Reader):
             raise ValueError(f"an index of more than {limits.INDEX_ENTRIES} entries")
 
     def _unpacked(self, kind: str, data: bytes) -> bytes:
-        return unpacked(kind, data, self._budget)
+        return unpack_chunk(kind, data, self._budget)
 
 
 class Ros2Reader(_Ros2Reader):
@@ -202,7 +202,7 @@ def _spending(budget: Budget) -> Iterator[None]:
 
 
 def _bounded(kind: str) -> Callable[..., bytes]:
-    return lambda data, *_: unpacked(kind, data, getattr(_now, "budget", None) or Budget(0))
+    return lambda data, *_: unpack_chunk(kind, data, getattr(_now, "budget", None) or Budget(0))
 
 
 class _Zstd:

@@ -25,7 +25,7 @@ _TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
 
 
 @dataclass
-class Detections:
+class TopicDetections:
     """Detections by one camera: every message's stamp, and a row for each detection."""
 
     message_stamps_ns: list[int] = field(default_factory=list)
@@ -39,7 +39,7 @@ class Bag:
     """The topics, detections and transforms of a bag."""
 
     topics: dict[str, str] = field(default_factory=dict)  # every topic -> its message type
-    detections: dict[str, Detections] = field(default_factory=dict)  # by topic
+    detections: dict[str, TopicDetections] = field(default_factory=dict)  # by topic
     # (parent, child) -> stamp in ns -> (7,) wxyz xyz, the pose of the child in the parent
     transforms: dict[tuple[str, str], dict[int, tuple[float, ...]]] = field(default_factory=dict)
 
@@ -55,7 +55,7 @@ def read_bag(path: Path) -> Bag:
     Raises:
         BadInput: the file is no bag, or ends too early.
     """
-    with decompressed(path) as plain:
+    with decompress_bag(path) as plain:
         try:
             return _read(plain)
         except Exception as error:
@@ -65,7 +65,7 @@ def read_bag(path: Path) -> Bag:
 
 
 @contextmanager
-def decompressed(path: Path) -> Iterator[Path]:
+def decompress_bag(path: Path) -> Iterator[Path]:
     """The path of the bag, or of a decompressed copy that is removed after the block."""
     try:
         with path.open("rb"):
@@ -93,13 +93,15 @@ def _read(path: Path) -> Bag:
         wanted = [c for c in reader.connections if c.msgtype in kinds]
         for connection, _, message in messages(reader, wanted, {}):
             if connection.msgtype == DETECTIONS_TYPE:
-                _add_detections(bag.detections.setdefault(connection.topic, Detections()), message)
+                _add_detections(
+                    bag.detections.setdefault(connection.topic, TopicDetections()), message
+                )
             else:
                 _add_transforms(bag.transforms, message)
     return bag
 
 
-def _add_detections(detections: Detections, message: Any) -> None:
+def _add_detections(detections: TopicDetections, message: Any) -> None:
     stamp_ns = _nanoseconds(message.header)
     if len(message.apriltags) > limits.IN_VIEW:
         raise ValueError(f"a frame of more than {limits.IN_VIEW} detections")
@@ -132,13 +134,13 @@ def _nanoseconds(header: Any) -> int:
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
-def topics_found(recorded: Sequence[Bag]) -> str:
+def list_topics(recorded: Sequence[Bag]) -> str:
     """A list of the topics of some bags, for a message."""
     topics = sorted({f"{topic} ({kind})" for bag in recorded for topic, kind in bag.topics.items()})
     return f"topics found: {', '.join(topics) or 'none'}"
 
 
-def rows_of_topics(topics: Sequence[Detections]) -> Rows:
+def rows_of_topics(topics: Sequence[TopicDetections]) -> Rows:
     """One table of the detections by all cameras, which are in the order of the rig."""
     frame_stamps = [stamp for topic in topics for stamp in topic.message_stamps_ns]
     return Rows(

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.datasets.recording import Found, Rows
+from jaxnav.datasets.recording import RecordingSource, Rows
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import to_se3
@@ -38,7 +38,7 @@ _REFERENCE_KEYS: dict[str, tuple[tuple[str | int, ...], str]] = {
 }
 
 
-def read_decoded(path: Path, rig: CameraRig | None) -> Found:
+def read_decoded(path: Path, rig: CameraRig | None) -> RecordingSource:
     """Read an .npz, which may have no reference.
 
     The file does not hold the sizes of the images: they are taken as twice the principal point,
@@ -50,7 +50,9 @@ def read_decoded(path: Path, rig: CameraRig | None) -> Found:
     stored = _checked(path)
     rows, rig = _rows(path, stored, rig)
     name = path.stem if path.stem != "decoded" else path.resolve().parent.name
-    return Found(name, rows, rig, lambda: _markers(path, stored), lambda: _reference(path, stored))
+    return RecordingSource(
+        name, rows, rig, lambda: _markers(path, stored), lambda: _reference(path, stored)
+    )
 
 
 def _reference(path: Path, stored: dict[str, np.ndarray]) -> dict[int, np.ndarray] | None:

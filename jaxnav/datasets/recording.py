@@ -121,7 +121,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Found:
+class RecordingSource:
     """The content of a file: detections and cameras, with functions that read map and reference.
 
     Attributes:

@@ -5,7 +5,7 @@ from typing import NoReturn
 
 from jaxnav.datasets import bags
 from jaxnav.datasets.decoded import read_decoded
-from jaxnav.datasets.recording import Found, Recording, Reference, assemble
+from jaxnav.datasets.recording import Recording, RecordingSource, Reference, assemble
 from jaxnav.datasets.tagslam import read_tagslam
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
@@ -30,12 +30,12 @@ def read_recording(
     path = Path(path)
     if rig is not None and markers is None and bags.is_bag(path) and path.is_file():
         _no_markers(path)  # before all of it is read
-    found = find(path, rig)
+    found = read_source(path, rig)
     reference = found.reference()
     return assemble(found.name, found.rows, found.rig, markers or found.markers(), reference)
 
 
-def find(path: Path, rig: CameraRig | None, also: str = "") -> Found:
+def read_source(path: Path, rig: CameraRig | None, also: str = "") -> RecordingSource:
     """Read all detections of a recording, of markers in any map or none.
 
     Args:
@@ -56,14 +56,14 @@ def find(path: Path, rig: CameraRig | None, also: str = "") -> Found:
     raise BadInput(path, problem)
 
 
-def _read_single_bag(path: Path, rig: CameraRig | None) -> Found:
+def _read_single_bag(path: Path, rig: CameraRig | None) -> RecordingSource:
     """Read a bag of detections, in which a rig's cameras are named like the topics."""
     if rig is None:
         raise BadInput("--rig", f"missing: {path} alone does not say what its cameras are")
     bag = bags.read_bag(path)
     topics = [_topic_of(path, bag, name) for name in rig.names]
     rows = bags.rows_of_topics([bag.detections[t] for t in topics])
-    return Found(path.name, rows, rig, lambda: _no_markers(path))
+    return RecordingSource(path.name, rows, rig, lambda: _no_markers(path))
 
 
 def _no_markers(path: Path) -> NoReturn:
@@ -79,4 +79,4 @@ def _topic_of(path: Path, bag: bags.Bag, camera: str) -> str:
     problem = f"no topic of {bags.DETECTIONS_TYPE} belongs to the camera {camera!r}"
     if candidates:
         problem = f"several topics belong to the camera {camera!r}"
-    raise BadInput(path, f"{problem}; {bags.topics_found([bag])}")
+    raise BadInput(path, f"{problem}; {bags.list_topics([bag])}")

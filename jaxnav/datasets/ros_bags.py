@@ -51,7 +51,7 @@ float32 jerk
 
 
 @dataclass(frozen=True)
-class Received:
+class ReceivedMessage:
     """A message, with its topic, its type, and the time at which the recorder received it."""
 
     topic: str
@@ -64,7 +64,7 @@ class Received:
 Choose = Callable[[Mapping[str, str]], Collection[str]]
 
 
-def read_messages(path: Path, choose: Choose) -> Generator[Received, None, None]:
+def read_messages(path: Path, choose: Choose) -> Generator[ReceivedMessage, None, None]:
     """Read the messages of some topics of a bag.
 
     Raises:
@@ -77,7 +77,7 @@ def read_messages(path: Path, choose: Choose) -> Generator[Received, None, None]
     elif path.suffix in _ROS2_FILES and path.exists():
         yield from _read(path, path, Ros2Reader, choose)
     elif bags.is_bag(path):
-        with bags.decompressed(path) as plain:
+        with bags.decompress_bag(path) as plain:
             yield from _read(path, plain, Ros1Reader, choose)
     elif not path.exists():
         raise BadInput(path, "there is no such file or folder")
@@ -96,7 +96,7 @@ def one_line(error: Exception) -> str:
 
 def _read(
     path: Path, plain: Path, reader_class: type[Ros1Reader | Ros2Reader], choose: Choose
-) -> Generator[Received, None, None]:
+) -> Generator[ReceivedMessage, None, None]:
     try:
         with reader_class(plain) as reader:
             chosen = choose({c.topic: c.msgtype for c in reader.connections})
@@ -106,7 +106,7 @@ def _read(
                     raise ValueError(f"a message of {connection.topic} has no time")
                 if problem := problem_of("stamp_ns", received_ns):
                     raise ValueError(f"the time of a message of {connection.topic} {problem}")
-                yield Received(connection.topic, connection.msgtype, received_ns, message)
+                yield ReceivedMessage(connection.topic, connection.msgtype, received_ns, message)
     except BadInput:
         raise
     except Exception as error:

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jaxnav.datasets import ros_messages
-from jaxnav.datasets.ros_bags import Received, one_line, read_messages
+from jaxnav.datasets.ros_bags import ReceivedMessage, one_line, read_messages
 from jaxnav.detection import Detections
 from jaxnav.detection.image_search import ImageSearch, size_problem
 from jaxnav.errors import BadInput
 from jaxnav.files.topics import TopicMap
 from jaxnav.files.validation import at
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.pilot import Input
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
@@ -59,7 +59,7 @@ def read_ros_drive(
     reader = _Reader(path, topics, rig, markers, corner_backend)
     twists = TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
     inputs: list[Input] = []
-    frames: list[tuple[int, Sighted]] = []
+    frames: list[tuple[int, FrameDetections]] = []
     with closing(read_messages(path, reader.choose)) as messages:
         for received in messages:
             try:
@@ -74,17 +74,17 @@ def read_ros_drive(
                 # A definition in the bag may differ from the one that its name promises.
                 problem = f"{received.topic}: a message can't be understood ({one_line(error)})"
                 raise BadInput(path, problem) from None
-    return sorted([*inputs, *together(frames)], key=lambda given: given.now_ns)
+    return sorted([*inputs, *join_frames(frames)], key=lambda given: given.now_ns)
 
 
-def together(frames: Iterable[tuple[int, Sighted]]) -> list[Input]:
+def join_frames(frames: Iterable[tuple[int, FrameDetections]]) -> list[Input]:
     """Join frames of several cameras with the same stamp into one input.
 
     Args:
         frames: each with the time at which it was received, ns, in the order of these times.
     """
-    groups: list[list[tuple[int, Sighted]]] = []
-    open_groups: dict[int, list[tuple[int, Sighted]]] = {}  # by stamp
+    groups: list[list[tuple[int, FrameDetections]]] = []
+    open_groups: dict[int, list[tuple[int, FrameDetections]]] = {}  # by stamp
     for received_ns, frame in frames:
         group = open_groups.get(frame.stamp_ns)
         if (
@@ -103,7 +103,7 @@ def together(frames: Iterable[tuple[int, Sighted]]) -> list[Input]:
 
 @dataclass
 class _Reader:
-    """A reader that turns the messages of the cameras' topics into `Sighted` frames."""
+    """A reader that turns the messages of the cameras' topics into `FrameDetections`."""
 
     path: Path
     topics: TopicMap
@@ -148,14 +148,14 @@ class _Reader:
             raise BadInput(where, f"{problem} {', '.join(expected)}")
         return found[0]
 
-    def sighted(self, received: Received) -> Sighted:
+    def sighted(self, received: ReceivedMessage) -> FrameDetections:
         """The sightings in a message of detections or of an image."""
         camera = self._camera_of[received.topic.strip("/")]
         stamp_ns = ros_messages.stamp_ns(received.message)
         if received.kind in (ros_messages.IMAGE, ros_messages.COMPRESSED):
             found = self._search(camera, received)
             faults = Fault.FRAME_UNUSABLE if found is None else Fault(0)
-            return Sighted(camera, stamp_ns, found, faults)
+            return FrameDetections(camera, stamp_ns, found, faults)
         found = ros_messages.detections(
             received.kind,
             received.message,
@@ -163,9 +163,9 @@ class _Reader:
             self.topics.corner_sigma_px,
             self._families,
         )
-        return Sighted(camera, stamp_ns, found)
+        return FrameDetections(camera, stamp_ns, found)
 
-    def _search(self, camera: int, received: Received) -> Detections | None:
+    def _search(self, camera: int, received: ReceivedMessage) -> Detections | None:
         image = ros_messages.grey_image(received.kind, received.message)
         if image is None:
             return None

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from jaxnav.detection.types import Detections
-from jaxnav.files.images import decoded_image
+from jaxnav.files.images import decode_image
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL, FirstCorner
 from jaxnav.models.twists import TwistReader
@@ -110,7 +110,7 @@ def grey_image(kind: str, message: Any) -> np.ndarray | None:
     """
     data = np.asarray(message.data, np.uint8)
     if kind == COMPRESSED:
-        return decoded_image(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        return decode_image(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if message.encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
         raise ValueError(f"the encoding {message.encoding!r} is none of {known}")

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnav.datasets.recording import TO_OURS, Rows
-from jaxnav.datasets.recordings import find
+from jaxnav.datasets.recordings import read_source
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
 from jaxnav.loop.interfaces import Odometry
@@ -19,7 +19,7 @@ from jaxnav.recording.drive_setup import DriveSetup
 
 
 @dataclass(frozen=True)
-class Sightings:
+class RecordedSightings:
     """N sightings of markers in the order of their frames.
 
     Attributes:
@@ -43,7 +43,7 @@ class Sightings:
     odometry: tuple[Odometry, ...]
 
 
-def read_sightings(path: str | Path, rig: CameraRig | None = None) -> Sightings:
+def read_sightings(path: str | Path, rig: CameraRig | None = None) -> RecordedSightings:
     """Read a drive (.mcap), a TagSLAM folder, a .bag of detections or an .npz.
 
     A marker that a camera reports twice in a frame is left out there: one of the two is false.
@@ -57,11 +57,11 @@ def read_sightings(path: str | Path, rig: CameraRig | None = None) -> Sightings:
     path = Path(path)
     if path.suffix == ".mcap" and path.exists() and not path.is_dir():
         return _of_drive(path, rig)
-    found = find(path, rig, also="a .mcap, ")
+    found = read_source(path, rig, also="a .mcap, ")
     return _of_rows(found.rows, found.rig)
 
 
-def _of_rows(rows: Rows, rig: CameraRig) -> Sightings:
+def _of_rows(rows: Rows, rig: CameraRig) -> RecordedSightings:
     stamps_ns, frame = np.unique(rows.stamps_ns, return_inverse=True)
     return _ordered(
         rig, None, stamps_ns, frame, rows.cameras, rows.ids,
@@ -69,7 +69,7 @@ def _of_rows(rows: Rows, rig: CameraRig) -> Sightings:
     )  # fmt: skip
 
 
-def _of_drive(path: Path, rig: CameraRig | None) -> Sightings:
+def _of_drive(path: Path, rig: CameraRig | None) -> RecordedSightings:
     log = read_drive(path)
     setup = DriveSetup.of_header(log.header, path)
     check_inputs(log.inputs, setup, path)
@@ -109,14 +109,14 @@ def _ordered(
     corners_px: np.ndarray,
     families: tuple[str, ...] | None,
     odometry: tuple[Odometry, ...],
-) -> Sightings:
+) -> RecordedSightings:
     named = np.array(families if families is not None else [""] * len(ids), str)
     keys = np.rec.fromarrays([frame, camera, ids, named])
     _, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
     once = (count[inverse] == 1) & is_within("corner_px", corners_px).all(axis=(1, 2))
     kept = np.flatnonzero(once)
     kept = kept[np.lexsort([ids[kept], camera[kept], frame[kept]])]
-    return Sightings(
+    return RecordedSightings(
         rig=rig,
         markers=markers,
         stamps_ns=stamps_ns,

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from jaxnav.datasets import bags
-from jaxnav.datasets.recording import Found
+from jaxnav.datasets.recording import RecordingSource
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import to_se3
@@ -80,7 +80,7 @@ class CameraPoseEntry(ForeignEntry):
     pose: PoseEntry
 
 
-def read_tagslam(path: Path, rig: CameraRig | None) -> Found:
+def read_tagslam(path: Path, rig: CameraRig | None) -> RecordingSource:
     """Read a TagSLAM folder.
 
     Raises:
@@ -102,7 +102,7 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> Found:
     if len(rig) != len(chain):
         problem = f"has {len(rig)} cameras, but {path / 'cameras.yaml'} has {len(chain)}"
         raise BadInput("--rig", problem)
-    return Found(
+    return RecordingSource(
         path.name, rows, rig, lambda: _markers(path, edges), lambda: _reference(edges, body)
     )
 
@@ -121,14 +121,14 @@ def _reference(edges: Edges, body: str) -> dict[int, np.ndarray] | None:
 
 def _detections(
     path: Path, key: str, entry: kalibr.KalibrCamera, recorded: list[bags.Bag]
-) -> bags.Detections:
+) -> bags.TopicDetections:
     where = at(path / "cameras.yaml", key, "tagtopic")
     if entry.tagtopic is None:
         raise BadInput(where, "missing: on which topic are this camera's detections?")
     found = [bag.detections[entry.tagtopic] for bag in recorded if entry.tagtopic in bag.detections]
     if len(found) != 1:
         problem = f"{len(found) or 'no'} bags have {entry.tagtopic} of {bags.DETECTIONS_TYPE}"
-        raise BadInput(where, f"{problem}; {bags.topics_found(recorded)}")
+        raise BadInput(where, f"{problem}; {bags.list_topics(recorded)}")
     return found[0]
 
 

@@ -11,7 +11,7 @@ then fits the corners, in the same way for both.
 from jaxnav.detection.apriltag import AprilTagDetector
 from jaxnav.detection.aruco import ArucoDetector
 from jaxnav.detection.families import marker_cells
-from jaxnav.detection.observe import Observed, observe
+from jaxnav.detection.observe import CornerLanes, observe
 from jaxnav.detection.types import Detections, Detector
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
@@ -19,9 +19,9 @@ from jaxnav.models.markers import MarkerMap
 __all__ = [
     "AprilTagDetector",
     "ArucoDetector",
+    "CornerLanes",
     "Detections",
     "Detector",
-    "Observed",
     "make_detector",
     "make_detectors",
     "marker_cells",

@@ -5,7 +5,7 @@ import importlib
 import numpy as np
 
 from jaxnav.detection.families import dictionary
-from jaxnav.detection.types import Detections, grey, refined_detections
+from jaxnav.detection.types import Detections, grey, refine_detections
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
 from jaxnav.models.conventions import (
@@ -54,4 +54,4 @@ class AprilTagDetector:
             for tag in self._decoder.detect(np.ascontiguousarray(image))
             if tag.decision_margin > _MIN_DECISION_MARGIN
         ]
-        return refined_detections(image, found, self.family, camera)
+        return refine_detections(image, found, self.family, camera)

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 
-from jaxnav.detection.crowd import thinned
+from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import dictionary
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.read import frames_first, read_marker
 from jaxnav.detection.refine import mean_side_px
-from jaxnav.detection.types import Detections, grey, refined_detections
+from jaxnav.detection.types import Detections, grey, refine_detections
 from jaxnav.models.camera import Camera
 
 # Quadrilaterals with sides in this range get a closer look.
@@ -68,7 +68,7 @@ class ArucoDetector:
             if read is not None:
                 found.append((read[0], read[1].corners_px))
                 looked_at.append(read[1].corners_px)
-        return refined_detections(image, found, self.family, camera)
+        return refine_detections(image, found, self.family, camera)
 
     def detect_near(
         self,
@@ -94,7 +94,7 @@ class ArucoDetector:
                 if code is not None:
                     found.append((code[0], code[1].corners_px))
                     break
-        return refined_detections(image, found, self.family, camera)
+        return refine_detections(image, found, self.family, camera)
 
     def _decoder(self, perimeter_rate: float) -> cv2.aruco.ArucoDetector:
         """The decoder whose least perimeter is this part of the image's longer side."""
@@ -114,7 +114,7 @@ class ArucoDetector:
     ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
         """Decode by OpenCV: (id, corners) of each marker, and the quadrilaterals it can't read."""
         least_px = max(perimeter_rate, _PERIMETER_RATE) * max(image.shape)
-        left = thinned(image, self.family, least_px)
+        left = thin_crowd(image, self.family, least_px)
         quads, ids, unread = self._decoder(perimeter_rate).detectMarkers(left)
         found_ids = [] if ids is None else [int(i) for i in ids.ravel()]
         found = [

@@ -26,7 +26,7 @@ _HALF_WINDOW_PX, _SPECK, _OUTLINE_PX = 11, np.ones((2, 2), np.uint8), 8
 _MARGIN_SIDES, _MARGIN_PX = 0.25, 4
 
 
-def thinned(image: np.ndarray, family: str, least_perimeter_px: float) -> np.ndarray:
+def thin_crowd(image: np.ndarray, family: str, least_perimeter_px: float) -> np.ndarray:
     """The image; if it is crowded, a copy that shows nothing but the likeliest markers.
 
     Args:

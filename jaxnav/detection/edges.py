@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.compiling.executables import kept
 from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
-from jaxnav.numerics.small_matrices import eliminated
+from jaxnav.numerics.small_matrices import eliminate
 
 PIXELS = 1024  # of one fit; unused ones are masked
 _STEPS = 20
@@ -114,7 +114,7 @@ def fit_edges(
     def attempt(s: _State) -> _State:
         diagonal = jnp.diagonal(s.hessian)
         ridge = jnp.diag(s.damping * diagonal + 1e-6 * jnp.max(diagonal[:8]))
-        step = eliminated(s.hessian + ridge, s.gradient[:, None])[:, 0]
+        step = eliminate(s.hessian + ridge, s.gradient[:, None])[:, 0]
         size = jnp.max(jnp.abs(_CORNER_MOTION @ step[:8]))
         step = step * jnp.minimum(1, _MAX_STEP / jnp.maximum(size, 1e-9))
         M, blur = _moved(s.M, s.blur, step)
@@ -137,7 +137,7 @@ def fit_edges(
     noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
     ridge = jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(s.hessian), 1e-6 * jnp.max(s.hessian)))
     units = jnp.eye(s.hessian.shape[0], dtype=one.dtype)
-    covariance = eliminated(s.hessian + ridge, units)[:8, :8] * noise**2
+    covariance = eliminate(s.hessian + ridge, units)[:8, :8] * noise**2
     return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, s.residual, s.converged)
 
 
@@ -164,7 +164,7 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     weighted = light * weight[None]
     prior = jnp.zeros((5, 5), dark.dtype).at[4, 4].set(_FAR_PRIOR)
     gram = weighted @ light.T + prior
-    solved = eliminated(
+    solved = eliminate(
         gram,
         jnp.concatenate([(weighted @ patch.levels)[:, None], weighted @ jacobian.T], axis=1),
     )

@@ -12,7 +12,7 @@ from jaxnav.models.markers import MarkerMap
 SAME_PX = 1.0  # two detections nearer to each other than this count as one
 
 
-class Observed(NamedTuple):
+class CornerLanes(NamedTuple):
     """The corners of M markers in C cameras. Lanes that are not visible hold zeros (sigma: ones).
 
     Attributes:
@@ -30,7 +30,7 @@ class Observed(NamedTuple):
     duplicates: int
 
 
-def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
+def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes:
     """The observation of one instant from one `Detections` a camera, in the rig's order.
 
     A marker found at two places in one image is dropped: the map has it once, so one of the two
@@ -61,7 +61,7 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> Observed:
                 corners_px[camera, marker] = found.corners_px[k]
                 sigma_px[camera, marker] = found.sigma_px[k]
                 visible[camera, marker] = True
-    return Observed(corners_px, visible, sigma_px, unknown, duplicates)
+    return CornerLanes(corners_px, visible, sigma_px, unknown, duplicates)
 
 
 def _told_once(keys: Sequence[tuple[int, str]], corners_px: np.ndarray) -> list[int]:

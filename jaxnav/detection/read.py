@@ -15,7 +15,7 @@ from jaxnav.detection.families import all_cells
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import blur_on_paper, on_paper
 from jaxnav.detection.refine import (
-    Fitted,
+    MarkerFit,
     RefinedMarker,
     corners_of,
     fit_marker,
@@ -72,7 +72,7 @@ def codes_of(family: str) -> np.ndarray:
 
 
 def _most_likely(
-    image: np.ndarray, fitted: Fitted, family: str, lens: Lens
+    image: np.ndarray, fitted: MarkerFit, family: str, lens: Lens
 ) -> tuple[int, int] | None:
     """(id, turns) of the code that explains the pixels best; None if another comes near."""
     codes = codes_of(family)
@@ -97,7 +97,7 @@ def _most_likely(
     return divmod(best, 4)
 
 
-def _worst_cell(fitted: Fitted, n: int, lens: Lens) -> float:
+def _worst_cell(fitted: MarkerFit, n: int, lens: Lens) -> float:
     """The largest error of ink over all cells: 1 if a black cell should be white or the reverse."""
     ink = _cells_in_image(fitted, n, lens)
     residual = fitted.edges.residual[: len(fitted.pixels)]
@@ -105,7 +105,7 @@ def _worst_cell(fitted: Fitted, n: int, lens: Lens) -> float:
     return float(np.max(np.abs(ink @ residual) / seen) / float(fitted.edges.contrast))
 
 
-def _cells_in_image(fitted: Fitted, n: int, lens: Lens) -> np.ndarray:
+def _cells_in_image(fitted: MarkerFit, n: int, lens: Lens) -> np.ndarray:
     """The share of each pixel's light that comes from each cell, (n * n, N)."""
     xy, xy_px = on_paper(fitted.M, *lens.rays(fitted.pixels))
     pixel_px2 = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])

@@ -23,7 +23,7 @@ _MODEL_SIGMA_PX = 0.006
 
 
 @dataclass(frozen=True)
-class Fitted:
+class MarkerFit:
     """A fit and its pixels. M takes the lens's rays to the paper."""
 
     M: np.ndarray
@@ -47,7 +47,7 @@ class RefinedMarker:
     sigma_px: np.ndarray
     noise: float
     good: bool
-    fitted: Fitted | None
+    fitted: MarkerFit | None
 
 
 def refine_corners(
@@ -93,7 +93,7 @@ def refine_corners(
 
 def fit_marker(
     image: np.ndarray, corners_px: np.ndarray, cells: np.ndarray, lens: Lens, whole: bool
-) -> Fitted | None:
+) -> MarkerFit | None:
     """Fit the marker and return the fit, good or not; None if the image shows too little of it."""
     M = homography(lens.rays(corners_px)[0].T)
     side_px = mean_side_px(corners_px)
@@ -109,7 +109,7 @@ def fit_marker(
     known = (M @ rays)[:, lanes], (M @ rays_px)[:, :, lanes], levels[lanes], step_corners(cells)
     fit = fit_edges(*(np.asarray(a, np.float32) for a in known), np.arange(PIXELS) < count)
     fit = jax.device_get(fit)
-    return Fitted(np.asarray(fit.M, float) @ M, pixels, fit)
+    return MarkerFit(np.asarray(fit.M, float) @ M, pixels, fit)
 
 
 def mean_side_px(corners_px: np.ndarray) -> float:

@@ -110,7 +110,7 @@ def grey(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def refined_detections(
+def refine_detections(
     image: np.ndarray,
     found: Sequence[tuple[int, np.ndarray]],
     family: str,

@@ -121,7 +121,7 @@ def to_se3(pose: np.ndarray) -> jaxlie.SE3:
     return jaxlie.SE3(jnp.asarray(pose, float))
 
 
-def unread(data: Mapping[str, Any], known: Sequence[str], prefix: str = "") -> list[str]:
+def unread_keys(data: Mapping[str, Any], known: Sequence[str], prefix: str = "") -> list[str]:
     """The keys of a file, except the known ones, whose values are not empty, zero or false."""
     told = []
     for key, value in data.items():

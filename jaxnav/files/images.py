@@ -14,7 +14,7 @@ from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
 
 
-def decoded_image(raw: bytes | np.ndarray, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | None:
+def decode_image(raw: bytes | np.ndarray, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | None:
     """Decode an image to uint8, by default (H, W, 3) in BGR order; None where that fails.
 
     Args:
@@ -32,7 +32,7 @@ def decoded_image(raw: bytes | np.ndarray, flags: int = cv2.IMREAD_COLOR) -> np.
 
 
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
-    """Read the image in a file; see `decoded_image`.
+    """Read the image in a file; see `decode_image`.
 
     Raises:
         BadInput: the file is missing, unreadable, too large, or not an image.
@@ -43,7 +43,7 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
     except OSError as error:
         raise BadInput(path, f"can't be read: {(error.strerror or str(error)).lower()}") from None
     with libraries_silenced():
-        image = decoded_image(raw, flags)
+        image = decode_image(raw, flags)
     if image is None:
         raise BadInput(path, image_problem(raw) or "is not an image that OpenCV can read")
     return image

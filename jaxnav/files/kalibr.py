@@ -15,7 +15,7 @@ from pydantic import Field, field_validator, model_validator
 
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import CameraFigures, Lens, unread
+from jaxnav.files.figures import CameraFigures, Lens, unread_keys
 from jaxnav.files.ranges import pinhole_problem, placed_within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import (
@@ -178,12 +178,12 @@ def names_by_topic(chain: dict[str, KalibrCamera]) -> list[str]:
 
 
 def camchain_left_out(data: dict[str, Any], chain: dict[str, KalibrCamera]) -> list[str]:
-    """The keys that are not read and not empty, see `unread`."""
-    told = unread(data, list(chain))
+    """The keys that are not read and not empty, see `unread_keys`."""
+    told = unread_keys(data, list(chain))
     read = set(KalibrCamera.model_fields) - {"tagtopic", "rig_body"}
     for key, camera in zip(chain, camchain_figures(chain), strict=True):
         unplaced = {"T_cn_cnm1"} if camera.T_camera_vehicle is None else set()
-        told += unread(data[key], sorted(read - unplaced), f"{key}.")
+        told += unread_keys(data[key], sorted(read - unplaced), f"{key}.")
     return told
 
 

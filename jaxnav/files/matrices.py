@@ -8,7 +8,7 @@ from pydantic import Field, field_validator, model_validator
 from jaxnav.errors import BadInput
 from jaxnav.files.figures import CameraFigures, Lens
 from jaxnav.files.ranges import pinhole_problem, problem_of
-from jaxnav.files.validation import Count, ForeignEntry, Number, shown
+from jaxnav.files.validation import Count, ForeignEntry, Number, show_value
 from jaxnav.models.camera import LENS_COEFFICIENTS
 
 
@@ -28,7 +28,7 @@ class MatrixEntry(ForeignEntry):
         if isinstance(entry, dict) and "rows" not in entry and "sizes" in entry:
             sizes = entry["sizes"]
             if not isinstance(sizes, list) or len(sizes) != 1:
-                raise ValueError(f"sizes: must be one number, got {shown(sizes)}")
+                raise ValueError(f"sizes: must be one number, got {show_value(sizes)}")
             return {**entry, "rows": sizes[0], "cols": 1}
         return entry
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import AliasChoices, Field
 
 from jaxnav.errors import BadInput
-from jaxnav.files.figures import CameraFigures, unread
+from jaxnav.files.figures import CameraFigures, unread_keys
 from jaxnav.files.matrices import MatrixEntry, coefficients, figures_from_matrices, pinhole_matrix
 from jaxnav.files.validation import ForeignEntry, ImageSize, Pixels, at, validate
 
@@ -61,8 +61,8 @@ def opencv_figures(path: Path, data: dict[str, Any], name: str) -> CameraFigures
 
 
 def opencv_left_out(data: dict[str, Any]) -> list[str]:
-    """The keys that are not read and not empty, see `unread`."""
-    return unread(data, [*_MATRIX, *_DISTORTION, *_SIZE, "fisheye_model", "camera_name"])
+    """The keys that are not read and not empty, see `unread_keys`."""
+    return unread_keys(data, [*_MATRIX, *_DISTORTION, *_SIZE, "fisheye_model", "camera_name"])
 
 
 def opencv_text(camera: CameraFigures) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.errors import BadInput
-from jaxnav.files.validation import shown
+from jaxnav.files.validation import show_value
 
 _LEAST, _MOST = 1e-18, 1e9  # bounds of a number, so that float32 holds its square
 _MOST_ENTRIES = 64  # of a list, and rows of a matrix
@@ -42,7 +42,7 @@ def param_array(value: Any, where: str, may_be_matrix: bool) -> np.ndarray:
         raise BadInput(where, "can't be a matrix: it is a number, or a list of them")
     for i, row in enumerate(value):
         if not isinstance(row, list) or len(row) != len(value):
-            got = f"{len(row)} numbers" if isinstance(row, list) else shown(row)
+            got = f"{len(row)} numbers" if isinstance(row, list) else show_value(row)
             count = len(value)
             problem = f"must have {count} numbers, as the matrix has {count} rows, got {got}"
             raise BadInput(f"{where}[{i}]", problem)
@@ -61,11 +61,11 @@ def _plain(value: Any) -> Any:
 
 def _number(value: Any, where: str, most: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise BadInput(where, f"must be a number, got {shown(value)}")
+        raise BadInput(where, f"must be a number, got {show_value(value)}")
     if isinstance(value, float) and not math.isfinite(value):
         raise BadInput(where, f"must be finite, got {value}")
     if not -most <= value <= most:
-        raise BadInput(where, f"must be from {-most:g} to {most:g}, got {shown(value)}")
+        raise BadInput(where, f"must be from {-most:g} to {most:g}, got {show_value(value)}")
     return float(value)
 
 

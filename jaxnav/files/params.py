@@ -95,7 +95,7 @@ class Params:
         """The values as numbers and nested lists, bit for bit, of which `of` makes the same."""
         return {name: value.tolist() for name, value in self.values.items()}
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """One line for a person: the file, how many there are, and where they come from."""
         # As JSON, for a terminal obeys some of the characters that a file may hold.
         origin = "; ".join(

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import AliasChoices, Field, field_validator
 
 from jaxnav.errors import BadInput
-from jaxnav.files.figures import CameraFigures, unread
+from jaxnav.files.figures import CameraFigures, unread_keys
 from jaxnav.files.matrices import MatrixEntry, coefficients, figures_from_matrices, pinhole_matrix
 from jaxnav.files.validation import ForeignEntry, Text, at, validate
 
@@ -68,8 +68,8 @@ def photonvision_figures(path: Path, data: dict[str, Any], name: str) -> CameraF
 
 
 def photonvision_left_out(data: dict[str, Any]) -> list[str]:
-    """The keys that are not read and not empty, see `unread`."""
-    return unread(data, ["resolution", "cameraIntrinsics", "lensmodel", *_DISTORTION])
+    """The keys that are not read and not empty, see `unread_keys`."""
+    return unread_keys(data, ["resolution", "cameraIntrinsics", "lensmodel", *_DISTORTION])
 
 
 def photonvision_text(camera: CameraFigures) -> str:

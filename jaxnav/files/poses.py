@@ -141,7 +141,7 @@ def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
     return pose_from_matrix(matrix(T_a_b) @ matrix(T_b_c))
 
 
-def looking(yaw_deg: float, elevation_deg: float, roll_deg: float) -> np.ndarray:
+def rotation_towards(yaw_deg: float, elevation_deg: float, roll_deg: float) -> np.ndarray:
     """The rotation R_vehicle_camera (3, 3) of a camera that looks in a direction.
 
     Args:

@@ -266,10 +266,10 @@ def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> np.ndarra
 
     Args:
         position_m: of the camera in the vehicle.
-        angles_deg: yaw, elevation and roll, see `poses.looking`.
+        angles_deg: yaw, elevation and roll, see `poses.rotation_towards`.
     """
     T_vehicle_camera = np.eye(4)
-    T_vehicle_camera[:3, :3] = poses.looking(*angles_deg)
+    T_vehicle_camera[:3, :3] = poses.rotation_towards(*angles_deg)
     T_vehicle_camera[:3, 3] = position_m
     return poses.inverse(poses.pose_from_matrix(T_vehicle_camera))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.errors import BadInput
-from jaxnav.files.figures import CameraFigures, Lens, unread
+from jaxnav.files.figures import CameraFigures, Lens, unread_keys
 from jaxnav.files.matrices import MatrixEntry, coefficients, figures_from_matrices, pinhole_matrix
 from jaxnav.files.validation import ForeignEntry, Pixels, Text, at, validate
 from jaxnav.files.writing import Quoted, yaml_text
@@ -74,7 +74,7 @@ def camera_info_left_out(data: dict[str, Any]) -> list[str]:
         for key, expected in rectified.items()
         if isinstance(data.get(key), dict) and data[key].get("data") == expected
     ]
-    return unread(data, [*CameraInfo.model_fields, "camera_name", *plain])
+    return unread_keys(data, [*CameraInfo.model_fields, "camera_name", *plain])
 
 
 def camera_info_text(camera: CameraFigures) -> str:

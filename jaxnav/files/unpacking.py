@@ -40,7 +40,7 @@ class Budget:
             raise ValueError("it unpacks to far more than any recording does")
 
 
-def unpacked(kind: str, data: bytes, budget: Budget, most: int = limits.CHUNK_BYTES) -> bytes:
+def unpack_chunk(kind: str, data: bytes, budget: Budget, most: int = limits.CHUNK_BYTES) -> bytes:
     """Unpack one chunk of a recording.
 
     Args:

@@ -138,7 +138,7 @@ def _key(location: tuple[int | str, ...], data: Any) -> str:
 
 
 def _problem(error: Any, model: type[BaseModel]) -> str:
-    kind, context, got = error["type"], error.get("ctx", {}), shown(error["input"])
+    kind, context, got = error["type"], error.get("ctx", {}), show_value(error["input"])
     if kind == "missing":
         return "missing"
     if kind == "extra_forbidden":
@@ -183,7 +183,7 @@ _BOUNDS = {
 }
 
 
-def shown(value: Any) -> str:
+def show_value(value: Any) -> str:
     """A value as text, short enough for a line."""
     text = repr(value) if not isinstance(value, str) else f"the text {value!r}"
     return text if len(text) <= 60 else f"{text[:57]}..."

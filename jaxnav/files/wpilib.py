@@ -19,7 +19,7 @@ from pydantic import Field, field_validator, model_validator
 
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import MarkerFigures, unread
+from jaxnav.files.figures import MarkerFigures, unread_keys
 from jaxnav.files.ranges import within
 from jaxnav.files.validation import (
     Count,
@@ -72,7 +72,7 @@ class TagPose(ForeignEntry):
     rotation: Rotation
 
 
-class Tag(ForeignEntry):
+class FieldTag(ForeignEntry):
     """One tag of a layout."""
 
     ID: Count
@@ -86,15 +86,15 @@ class FieldSize(ForeignEntry):
     width: Annotated[Positive, within("position_m")]
 
 
-class Layout(ForeignEntry):
+class FieldLayout(ForeignEntry):
     """A field layout."""
 
-    tags: Annotated[list[Tag], Field(min_length=1, max_length=4096)]
+    tags: Annotated[list[FieldTag], Field(min_length=1, max_length=4096)]
     field: FieldSize | None = None
 
     @field_validator("tags")
     @classmethod
-    def _each_once(cls, tags: list[Tag]) -> list[Tag]:
+    def _each_once(cls, tags: list[FieldTag]) -> list[FieldTag]:
         ids = [tag.ID for tag in tags]
         if len(set(ids)) < len(ids):
             raise ValueError(f"tag {next(i for i in ids if ids.count(i) > 1)} is there twice")
@@ -118,7 +118,7 @@ def layout_figures(
     Raises:
         BadInput: one line naming file and key.
     """
-    layout = validate(Layout, data, path)
+    layout = validate(FieldLayout, data, path)
     last_id = FAMILY_SIZES[family] - 1
     markers = []
     for index, tag in enumerate(layout.tags):
@@ -135,12 +135,12 @@ def layout_figures(
 
 def layout_left_out(data: dict[str, Any]) -> list[str]:
     """The keys that are not read and not empty, with the size of the field among them."""
-    told = unread(data, ["tags", "field"])
+    told = unread_keys(data, ["tags", "field"])
     if data.get("field"):
         size = data["field"]
         told.append(f"field ({size['length']} x {size['width']} m, --field-size-m on the way back)")
     for index, tag in enumerate(data["tags"]):
-        told += unread(tag, ["ID", "pose"], f"tags[{index}].")
+        told += unread_keys(tag, ["ID", "pose"], f"tags[{index}].")
     return told
 
 

@@ -22,7 +22,7 @@ from jax.extend import core
 
 from jaxnav.lanes.rules import ELEMENTWISE, NUMPY, RULES, VIEWS, elementwise
 from jaxnav.lanes.strips import CALLS, STRIP, by_itself, in_strips
-from jaxnav.lanes.values import CHEAP, DEAR, Lane, Value, known, rows_of, scanned, written
+from jaxnav.lanes.values import CHEAP, DEAR, Lane, Value, known, rows_of, scan_rows, write_out
 
 # Without barriers XLA for the CPU computes anew, at every use, the values that `over_lanes` writes
 # to memory once. Its costly passes double the compile time and buy nothing.
@@ -95,7 +95,7 @@ class _Evaluation(NamedTuple):
         env: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
 
         def keep(var: Any, value: Value) -> None:
-            env[var] = written(value, CHEAP if uses[var] > 1 else DEAR)
+            env[var] = write_out(value, CHEAP if uses[var] > 1 else DEAR)
 
         for var, value in zip(jaxpr.invars, args, strict=True):
             keep(var, value)
@@ -138,7 +138,7 @@ class _Evaluation(NamedTuple):
         if name in ELEMENTWISE and name not in RULES:
             return [elementwise(eqn.primitive, args, params, self.lanes)]
         if name not in VIEWS:  # a sum reads every term once
-            args = [written(arg, CHEAP if name == "reduce_sum" else 0) for arg in args]
+            args = [write_out(arg, CHEAP if name == "reduce_sum" else 0) for arg in args]
         rule = RULES.get(name)
         outs = rule(args, params, self.lanes) if rule else None
         return self._generic(eqn.primitive, args, params) if outs is None else outs
@@ -251,7 +251,7 @@ def _sorted_switch(
     """Run each branch over blocks of the lanes that chose it; the last block repeats a lane."""
     lanes, count = chosen.shape[0], len(branches)
     is_in = chosen[None] == jnp.arange(count)[:, None]
-    running = scanned(is_in.astype(jnp.int32), 1, lax.add, 0, False)
+    running = scan_rows(is_in.astype(jnp.int32), 1, lax.add, 0, False)
     members = running[:, -1]
     blocks = -(-members // block)
     first_block = jnp.cumsum(blocks) - blocks

@@ -20,10 +20,10 @@ from jaxnav.lanes.values import (
     Lane,
     Value,
     at_place,
-    joined,
+    join_rows,
     rows_of,
-    scanned,
-    written,
+    scan_rows,
+    write_out,
 )
 
 
@@ -41,7 +41,7 @@ def elementwise(primitive: Any, args: list[Any], params: dict[str, Any], lanes: 
         return lax.broadcast_in_dim(arg, full, tuple(range(arg.ndim)))
 
     args = [
-        written(arg, 0) if isinstance(arg, Lane) and arg.shape != shape else arg for arg in args
+        write_out(arg, 0) if isinstance(arg, Lane) and arg.shape != shape else arg for arg in args
     ]
     work = sum(arg.work for arg in args if isinstance(arg, Lane))
     own = 0 if primitive.name in _FREE else 1 if primitive.name not in _SLOW else 8
@@ -82,7 +82,7 @@ def _any_lane(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value
 def _broadcast_in_dim(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
     shape, dims = params["shape"], params["broadcast_dimensions"]
     expands = math.prod(shape) > math.prod(args[0].shape)
-    arg: Any = written(args[0], 0) if expands else args[0]
+    arg: Any = write_out(args[0], 0) if expands else args[0]
     return [Lane(lax.broadcast_in_dim(arg.rows, (*shape, lanes), (*dims, len(shape))), arg.work)]
 
 
@@ -122,13 +122,13 @@ def _slice(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
 
 
 def _concatenate(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
-    return [joined([rows_of(arg, lanes) for arg in args], params["dimension"])]
+    return [join_rows([rows_of(arg, lanes) for arg in args], params["dimension"])]
 
 
 def _stack(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
     axis = params["axis"]
     rows = [lax.expand_dims(rows_of(arg, lanes), (axis,)) for arg in args]
-    return [joined(rows, axis)]
+    return [join_rows(rows, axis)]
 
 
 def _split(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
@@ -170,7 +170,7 @@ def _running(combine: Callable[[Any, Any], Any], neutral: int) -> Callable[..., 
 
     def rule(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
         axis, rows = params["axis"], args[0].rows
-        return [Lane(scanned(rows, axis, combine, neutral, params["reverse"]))]
+        return [Lane(scan_rows(rows, axis, combine, neutral, params["reverse"]))]
 
     return rule
 

@@ -44,7 +44,7 @@ def _same(rows: jax.Array) -> jax.Array:
     return rows
 
 
-def joined(rows: list[jax.Array], axis: int) -> "Lane":
+def join_rows(rows: list[jax.Array], axis: int) -> "Lane":
     """Concatenate rows along an existing axis.
 
     Inside a kernel it is kept unfused: fused, it would look up the source of every single number.
@@ -82,7 +82,7 @@ class Lane:
 Value = Lane | jax.Array | np.ndarray
 
 
-def written(value: Value, cheap: int) -> Value:
+def write_out(value: Value, cheap: int) -> Value:
     """The value written to memory, for its users to read, if it cost more than `cheap`."""
     if not isinstance(value, Lane) or value.work <= cheap:
         return value
@@ -113,7 +113,7 @@ def at_place(rows: jax.Array, index: dict[Any, Any]) -> jax.Array:
     return lax.squeeze(lax.slice(rows, start, stop), tuple(index))
 
 
-def scanned(
+def scan_rows(
     rows: jax.Array, axis: int, combine: Callable[[Any, Any], Any], neutral: int, reverse: bool
 ) -> jax.Array:
     size, step = rows.shape[axis], 1

@@ -1,10 +1,10 @@
 """Estimate how late each camera's images are against their stamps, from a few seconds of driving.
 
     delays = CameraDelays(rig, markers, vehicle)
-    delays.take(outcome)                 # every outcome of a pilot: some microseconds
+    delays.add_outcome(outcome)          # every outcome of a pilot: some microseconds
     while delays.due:                    # in a thread that may wait: tens of milliseconds
         delays.solve()
-    delays.found                         # one `Delay` per camera
+    delays.delays                        # one `Delay` per camera
 
 The odometer gives the car's motion over a stretch of `STRETCH_S`; the corners that a camera sees
 on it fit the pose that the car had one delay before their stamps. Beside the delay these are
@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.compiling.executables import kept
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.bicycle import Vehicle, advance
 from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
@@ -117,7 +117,7 @@ class _View(NamedTuple):
 
 
 class CameraDelays:
-    """The delays of a rig on one drive. One thread calls `take`, one may call `solve`."""
+    """The delays of a rig on one drive. One thread calls `add_outcome`, one may call `solve`."""
 
     def __init__(self, rig: CameraRig, markers: MarkerMap, vehicle: Vehicle):
         """Take the drive's rig, map and vehicle. Delays come beside the vehicle's corrections."""
@@ -132,23 +132,23 @@ class CameraDelays:
         self._sums = np.zeros((len(rig), 3))
         self._counts = np.zeros(len(rig), int)
 
-    def take(self, outcome: Outcome) -> None:
+    def add_outcome(self, outcome: Outcome) -> None:
         """Keep the data of an outcome and its estimated pose."""
-        told = outcome.told
+        told = outcome.data
         if told is not None and told.odometry is not None:
-            self.read(outcome.stamp_ns, *told.odometry)
+            self.add_reading(outcome.stamp_ns, *told.odometry)
         if told is not None and told.corners_px is not None:
-            self.seen(outcome.stamp_ns, told)
+            self.add_corners(outcome.stamp_ns, told)
         output = outcome.output
         if outcome.now_ns >= self._next_ns and bool(output.decided):
-            self.at(outcome.now_ns, np.asarray(output.pose, float))
+            self.add_pose(outcome.now_ns, np.asarray(output.pose, float))
 
-    def read(self, stamp_ns: int, speed_mps: float, steering_rad: float) -> None:
+    def add_reading(self, stamp_ns: int, speed_mps: float, steering_rad: float) -> None:
         """Keep a corrected reading; one that is not newer than the last is left out."""
         if not self._readings or stamp_ns > self._readings[-1][0]:
             self._readings.append((stamp_ns, speed_mps, steering_rad))
 
-    def seen(self, stamp_ns: int, told: Told) -> None:
+    def add_corners(self, stamp_ns: int, told: EventData) -> None:
         """Keep corners and their corrected stamp."""
         assert told.corners_px is not None
         assert told.visible is not None
@@ -157,7 +157,7 @@ class CameraDelays:
         corners_px, sigma_px = told.corners_px[camera, marker], told.sigma_px[camera, marker]
         self._views.append(_View(stamp_ns, camera, marker, corners_px, sigma_px))
 
-    def at(self, now_ns: int, pose: np.ndarray) -> None:
+    def add_pose(self, now_ns: int, pose: np.ndarray) -> None:
         """Begin a stretch at the car's approximate pose, if it is time for one."""
         if now_ns >= self._next_ns:
             self._open.append((now_ns, pose))
@@ -199,19 +199,19 @@ class CameraDelays:
                 self._counts[camera] += 1
 
     @property
-    def found(self) -> list[Delay]:
+    def delays(self) -> list[Delay]:
         """The delay of each camera so far."""
         return list(map(_of_stretches, self._sums, self._counts))
 
     @property
-    def together(self) -> Delay:
+    def common_delay(self) -> Delay:
         """The common delay of all cameras so far."""
         return _of_stretches(self._sums.sum(axis=0), self._counts.sum())
 
     @property
     def late(self) -> bool:
         """Whether a camera, or all together, are surely later or earlier than is harmless."""
-        return self.together.late or any(one.late for one in self.found)
+        return self.common_delay.late or any(one.late for one in self.delays)
 
     def _solved(self, stretch: Stretch) -> tuple[float, float]:
         """The delay in s and its information in 1/s^2, 0 where it can't be determined."""

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the guard's process corrects without JAX and OpenCV
-    from jaxnav.loop.frames import Sighted
+    from jaxnav.loop.frames import FrameDetections
     from jaxnav.loop.interfaces import Odometry
     from jaxnav.models.bicycle import Vehicle
 
@@ -54,7 +54,7 @@ class Corrections:
     def _is_neutral(self) -> bool:
         return (self.speed_scale, self.steering_gain, self.steering_offset_rad) == (1, 1, 0)
 
-    def reading(self, read: Odometry) -> Odometry:
+    def correct_reading(self, read: Odometry) -> Odometry:
         """A reading in true units, its stamp corrected."""
         if self._is_neutral and not self.reading_late_ns:
             return read
@@ -66,13 +66,14 @@ class Corrections:
         )
 
     def read(self, speed_mps: float, steering_rad: float) -> tuple[float, float]:
-        """The sensor values of a true speed and steering angle: the inverse of `reading`."""
+        """The sensor values of a true speed and steering angle: the inverse of
+        `correct_reading`."""
         if self._is_neutral:
             return speed_mps, steering_rad
         angle_rad = (steering_rad - self.steering_offset_rad) / self.steering_gain
         return speed_mps / self.speed_scale, angle_rad
 
-    def frame(self, seen: Sighted) -> Sighted:
+    def correct_frame(self, seen: FrameDetections) -> FrameDetections:
         """A frame with its stamp corrected to the odometer's clock."""
         late_ns = self.frame_late_ns
         return replace(seen, stamp_ns=seen.stamp_ns - late_ns) if late_ns else seen

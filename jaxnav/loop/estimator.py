@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxnav.belief.estimate import Belief, Evidence
-from jaxnav.compiling.packing import Layout, Packed
-from jaxnav.compiling.step import compiled
-from jaxnav.loop.history import Entry, History, Told
+from jaxnav.compiling.packing import Packed, PackedLayout
+from jaxnav.compiling.step import compile_or_load
+from jaxnav.loop.history import EventData, History, HistoryEntry
 from jaxnav.navigator import Navigator, Output
 from jaxnav.timeline import Corners, Events, advance
 
 EVENTS = 64  # fused by one call: 800 ms of odometry at 50 Hz and of frames at 30 Hz
 
-_NOTHING = Told()
+_NOTHING = EventData()
 
 # (belief, control, events, numbers) -> (belief, then, control, output), see `advance_packed`
 Program = Callable[..., tuple[Packed, Packed, Packed, Packed]]
@@ -37,20 +37,22 @@ def advance_packed(
     Args:
         numbers: count, new, now_us, elapsed_us.
     """
-    given = (part.unpacked() for part in (belief, control, events))
+    given = (part.unpack() for part in (belief, control, events))
     returned = advance(navigator, *given, *numbers)
-    belief, then, control, output = (Layout.of(part).pack(part) for part in returned)
+    belief, then, control, output = (PackedLayout.of(part).pack(part) for part in returned)
     return belief, then, control, output
 
 
 def _beginning(navigator: Navigator) -> tuple[Packed, Packed]:
     """The belief and control state at the start of a drive."""
     state = navigator.init()
-    return Layout.of(state.belief).pack(state.belief), Layout.of(state.control).pack(state.control)
+    return PackedLayout.of(state.belief).pack(state.belief), PackedLayout.of(state.control).pack(
+        state.control
+    )
 
 
 @dataclass(frozen=True)
-class Fused:
+class FusionResult:
     """The result of one event. The leaves of `output` and `belief` are NumPy arrays."""
 
     output: Output
@@ -66,10 +68,10 @@ class Estimator:
         """Args:
         navigator: the navigator to run.
         program: compiled `advance_packed` of the navigator; by default compiled by `jax.jit`, see
-            `compiled`.
+            `compile_or_load`.
         """
-        self._program = program or compiled(advance_packed, navigator, None)
-        self._first, self._control = compiled(_beginning, navigator, None)()
+        self._program = program or compile_or_load(advance_packed, navigator, None)
+        self._first, self._control = compile_or_load(_beginning, navigator, None)()
         self._layouts = {seeing: _layout(navigator, seeing) for seeing in (False, True)}
         self._odometry = (np.nan, np.nan)  # the last speed_mps, steering_rad
         self.reset()
@@ -90,7 +92,9 @@ class Estimator:
             numbers = np.zeros(4, np.int32)
             self._program(self._first, self._control, self._events([], 0, seeing), numbers)
 
-    def fuse(self, told: Told | None, stamp_ns: int, now_ns: int, elapsed_ns: int) -> Fused:
+    def fuse(
+        self, told: EventData | None, stamp_ns: int, now_ns: int, elapsed_ns: int
+    ) -> FusionResult:
         """Fuse an event, or only predict to the present.
 
         Args:
@@ -109,27 +113,32 @@ class Estimator:
         if placed is None:
             base_ns = self._belief_ns if self._history is not None else now_ns
             belief, _, output = self._call(self._belief, [], base_ns, 0, now_ns, elapsed_ns)
-            believed = belief.fetched().unpacked()
-            return Fused(output.fetched().unpacked(), believed, told is not None, 0)
+            believed = belief.fetch().unpack()
+            return FusionResult(output.fetch().unpack(), believed, told is not None, 0)
         base, entries = placed
         assert self._history is not None
-        new = next(index for index, entry in enumerate(entries) if entry.told is told)
+        new = next(index for index, entry in enumerate(entries) if entry.data is told)
         belief, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
         self._belief, self._belief_ns = belief, entries[-1].stamp_ns
-        self._history.fused(belief, entries[new], then)
-        return Fused(known, belief.fetched().unpacked(), False, len(entries))
+        self._history.store(belief, entries[new], then)
+        return FusionResult(known, belief.fetch().unpack(), False, len(entries))
 
     def _fused(
-        self, base: Entry, entries: list[Entry], new: int, now_ns: int, elapsed_ns: int
+        self,
+        base: HistoryEntry,
+        entries: list[HistoryEntry],
+        new: int,
+        now_ns: int,
+        elapsed_ns: int,
     ) -> tuple[Packed, Packed, Output]:
         """The belief after all entries, the belief after the new one, and the output. Takes one
         call nearly always, several where a frame is late and the cameras are many."""
         assert base.belief is not None
-        rows = [(entry.stamp_ns, entry.told or _NOTHING) for entry in entries]
+        rows = [(entry.stamp_ns, entry.data or _NOTHING) for entry in entries]
         belief, base_ns = base.belief, base.stamp_ns
         if len(rows) <= EVENTS:
             belief, then, output = self._call(belief, rows, base_ns, new, now_ns, elapsed_ns)
-            return belief, then, output.fetched().unpacked()
+            return belief, then, output.fetch().unpack()
         # One less: the free place is the value of `new` where the new event is in another part.
         size, control = EVENTS - 1, self._control
         for first in range(0, len(rows), size):
@@ -143,13 +152,13 @@ class Estimator:
         return (
             belief,
             then,
-            _with_evidence(output.fetched().unpacked(), of_new.fetched().unpacked()),
+            _with_evidence(output.fetch().unpack(), of_new.fetch().unpack()),
         )
 
     def _call(
         self,
         belief: Packed,
-        rows: Sequence[tuple[int, Told]],
+        rows: Sequence[tuple[int, EventData]],
         base_ns: int,
         new: int,
         now_ns: int,
@@ -162,14 +171,14 @@ class Estimator:
         belief, then, self._control, output = self._program(belief, self._control, events, numbers)
         return belief, then, output
 
-    def _events(self, rows: Sequence[tuple[int, Told]], base_ns: int, seeing: bool) -> Packed:
+    def _events(self, rows: Sequence[tuple[int, EventData]], base_ns: int, seeing: bool) -> Packed:
         packed, events = self._layouts[seeing].room()
         # Numbers that float32 can't hold become infinite, and the filter leaves them out.
         with np.errstate(over="ignore"):
             self._fill(events, rows, base_ns)
         return packed
 
-    def _fill(self, events: Events, rows: Sequence[tuple[int, Told]], base_ns: int) -> None:
+    def _fill(self, events: Events, rows: Sequence[tuple[int, EventData]], base_ns: int) -> None:
         into = vars(events)  # reading an attribute of an equinox module takes 1 us
         speed_mps, steering_rad = into["speed_mps"], into["steering_rad"]
         speed_mps[:], steering_rad[:] = self._odometry
@@ -195,7 +204,7 @@ def _with_evidence(output: Output, of_new: Output) -> Output:
     return told
 
 
-def _layout(navigator: Navigator, seeing: bool) -> Layout:
+def _layout(navigator: Navigator, seeing: bool) -> PackedLayout:
     """The layout of `EVENTS` events, with or without room for corners."""
     lanes = EVENTS, len(navigator.rig), len(navigator.markers.ids)
     dtype = navigator.corner_sigma_px.dtype
@@ -214,7 +223,7 @@ def _layout(navigator: Navigator, seeing: bool) -> Layout:
             corners=corners if seeing else None,
         )
 
-    return Layout.of(jax.eval_shape(events))
+    return PackedLayout.of(jax.eval_shape(events))
 
 
 def _us_between(earlier_ns: int, later_ns: int) -> int:

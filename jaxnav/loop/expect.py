@@ -45,7 +45,7 @@ class Expected(NamedTuple):
 
 
 @kept
-def expected(
+def expect_corners(
     rig: CameraRig,
     markers: MarkerMap,
     T_world_vehicle: Float[Array, " 7"],

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxnav.detection.observe import Observed, observe
+from jaxnav.detection.observe import CornerLanes, observe
 from jaxnav.detection.types import Detections
 from jaxnav.files.ranges import RANGES
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.loop.stamps import Stamps
 from jaxnav.models.markers import MarkerMap
 
@@ -19,12 +19,12 @@ _MOST_PX = RANGES["corner_px"].most  # beyond, a corner is as good as infinite
 _NONE = Detections.concatenate([])
 
 # Whether a camera shows an old picture. Arguments: camera, stamp_ns, now_ns, corners_px
-# (M, 4, 2), visible (M,), their sigma_px; see `Standstill.frozen`.
+# (M, 4, 2), visible (M,), their sigma_px; see `Standstill.is_frozen`.
 Frozen = Callable[[int, int, int, np.ndarray, np.ndarray, float], bool]
 
 
 @dataclass(frozen=True)
-class Sighted:
+class FrameDetections:
     """The detections in one camera's frame.
 
     Attributes:
@@ -40,7 +40,7 @@ class Sighted:
     faults: Fault = _NO_FAULT
 
 
-class Frames:
+class FrameIntake:
     """The frames of a drive, camera by camera.
 
     Attributes:
@@ -57,13 +57,13 @@ class Frames:
         self._stamps = [Stamps() for _ in range(cameras)]
         self._corners: list[tuple[bytes, int]] = [(b"", 0)] * cameras  # last, and its repetitions
 
-    def refused(self) -> None:
+    def forget_last(self) -> None:
         """Treat the last frames, which came too late for the filter, as if they had not come."""
         self.newest_ns = list(self._newest_before_ns)
 
-    def told(
-        self, frames: Sequence[Sighted], now_ns: int, frozen: Frozen | None = None
-    ) -> tuple[Told | None, int, Fault]:
+    def check(
+        self, frames: Sequence[FrameDetections], now_ns: int, frozen: Frozen | None = None
+    ) -> tuple[EventData | None, int, Fault]:
         """The data of frames, their stamp, and the faults found in them.
 
         Args:
@@ -111,10 +111,10 @@ class Frames:
             return None, now_ns, faults
         if self._corner_sigma_px is not None:
             seen.sigma_px[seen.visible] = self._corner_sigma_px
-        return Told(None, seen.corners_px, seen.visible, seen.sigma_px), taken_ns, faults
+        return EventData(None, seen.corners_px, seen.visible, seen.sigma_px), taken_ns, faults
 
     def _leave_out_frozen(
-        self, seen: Observed, stamps_ns: dict[int, int], now_ns: int, frozen: Frozen | None
+        self, seen: CornerLanes, stamps_ns: dict[int, int], now_ns: int, frozen: Frozen | None
     ) -> tuple[int | None, bool]:
         """Hide frozen cameras; return the stamp of the others, and whether one was hidden."""
         taken_ns, left_out = None, False
@@ -146,6 +146,6 @@ def _are_finite(corners_px: np.ndarray, sigma_px: np.ndarray) -> bool:
     return bool(near and sigma_px.min() > 0 and sigma_px.max() < np.inf)
 
 
-def _hide(seen: Observed, lane: tuple[int, ...]) -> None:
+def _hide(seen: CornerLanes, lane: tuple[int, ...]) -> None:
     """Make a lane of the observation empty."""
     seen.visible[lane], seen.corners_px[lane], seen.sigma_px[lane] = False, 0, 1

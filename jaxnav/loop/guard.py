@@ -123,7 +123,7 @@ class Guard:
             if self.tripped or (deadline_ns is not None and deadline_ns <= now_ns):
                 return False
             elapsed_s = (now_ns - self._written_ns) / 1e9
-            steering_rad, throttle = self._limits.applied(
+            steering_rad, throttle = self._limits.apply(
                 steering_rad, throttle if self._armed else 0.0, self._steering_rad, elapsed_s
             )
             try:

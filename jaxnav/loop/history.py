@@ -21,7 +21,7 @@ KEPT = 420
 
 
 @dataclass(frozen=True)
-class Told:
+class EventData:
     """The data of an event: odometry, corners of some cameras, or both."""
 
     odometry: tuple[float, float] | None = None  # speed_mps, steering_rad
@@ -31,11 +31,11 @@ class Told:
 
 
 @dataclass
-class Entry:
+class HistoryEntry:
     """One event and the belief after it, None where a late event has invalidated it."""
 
     stamp_ns: int
-    told: Told | None  # None: the beginning
+    data: EventData | None  # None: the beginning
     belief: Packed | None
 
 
@@ -44,9 +44,11 @@ class History:
 
     def __init__(self, belief: Packed, begin_ns: int):
         """Begin with a belief at some instant, before any event."""
-        self._entries = [Entry(begin_ns, None, belief)]
+        self._entries = [HistoryEntry(begin_ns, None, belief)]
 
-    def place(self, stamp_ns: int, told: Told) -> tuple[Entry, list[Entry]] | None:
+    def place(
+        self, stamp_ns: int, data: EventData
+    ) -> tuple[HistoryEntry, list[HistoryEntry]] | None:
         """Insert an event.
 
         Returns:
@@ -62,12 +64,12 @@ class History:
             base -= 1
         if base < 0:
             return None
-        entries.insert(index, Entry(stamp_ns, told, None))
+        entries.insert(index, HistoryEntry(stamp_ns, data, None))
         for entry in entries[index:]:
             entry.belief = None
         return entries[base], entries[base + 1 :]
 
-    def fused(self, belief: Packed, new: Entry, then: Packed) -> None:
+    def store(self, belief: Packed, new: HistoryEntry, then: Packed) -> None:
         """Keep the new beliefs, and drop events that are no longer needed.
 
         Args:
@@ -83,7 +85,7 @@ class History:
     def _thin(self) -> None:
         """Drop the reading before the newest if it follows its predecessor too soon."""
         last = self._entries[-3:]
-        if len(last) == 3 and all(entry.told and entry.told.corners_px is None for entry in last):
+        if len(last) == 3 and all(entry.data and entry.data.corners_px is None for entry in last):
             before, middle, _ = last
             if middle.stamp_ns - before.stamp_ns < THIN_NS:
                 del self._entries[-2]

@@ -27,7 +27,7 @@ class Limits:
             float(vehicle.throttle_limit),
         )
 
-    def applied(
+    def apply(
         self, steering_rad: float, throttle: float, last_steering_rad: float, elapsed_s: float
     ) -> tuple[float, float]:
         """Steering and throttle inside the limits.

@@ -15,14 +15,14 @@ from typing import Protocol
 import jax
 import numpy as np
 
-from jaxnav.loop.expect import Expected, expected
+from jaxnav.loop.expect import Expected, expect_corners
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import Ending, Frame, Vehicle
 from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.loop.priority import before_siblings
-from jaxnav.loop.seeing import Eyes, Region, groups
+from jaxnav.loop.seeing import Eyes, Region, group_frames
 
 _THREAD = "the loop"
 _STAYS_S = 0.5  # the drive ends this long after the last waypoint is reached
@@ -33,11 +33,11 @@ _MIN_COVARIANCE = np.diag([0.01**2, 0.01**2, np.deg2rad(0.5) ** 2])
 class Observer(Protocol):
     """An observer of the loop: a recorder, a view, a status line. It neither waits nor raises."""
 
-    def handled(self, given: Input, outcome: Outcome) -> None:
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """Take an input that the pilot has handled, and its outcome."""
         ...
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """Take a camera's frame after the search for markers, and the markers found."""
         ...
 
@@ -101,7 +101,9 @@ class Loop:
         self._now_ns = now_ns
         self._outcome: Outcome | None = None
         self._odometry_ns: int | None = None
-        self._blank: tuple[Sighted, ...] = ()  # frames without markers, kept for the next tick
+        self._blank: tuple[
+            FrameDetections, ...
+        ] = ()  # frames without markers, kept for the next tick
         self._belief: tuple[np.ndarray, np.ndarray] | None = None
         self._expectation: tuple[tuple[np.ndarray, np.ndarray], Expected] | None = None  # of it
         dtype = np.asarray(pilot.navigator.corner_sigma_px).dtype
@@ -163,13 +165,13 @@ class Loop:
             self._odometry_ns = reading.stamp_ns
         self._handle(Input(self._now_ns(), reading, frames, faults))
 
-    def _sighted(self) -> list[tuple[Sighted, ...]]:
+    def _sighted(self) -> list[tuple[FrameDetections, ...]]:
         """The frames that show markers, in groups; the other frames wait for the next tick."""
         seen = self._eyes.take()
         for one in seen:
             for observer in self._observers:
-                observer.seen(one.camera_name, one.frame, one.sighted)
-        shows, blank = groups(seen)
+                observer.on_frame(one.camera_name, one.frame, one.sighted)
+        shows, blank = group_frames(seen)
         self._blank += blank
         return shows
 
@@ -197,7 +199,7 @@ class Loop:
             else None
         )
         for observer in self._observers:
-            observer.handled(given, outcome)
+            observer.on_outcome(given, outcome)
 
     def _failures(self) -> Fault:
         faults = Fault(0)
@@ -218,5 +220,5 @@ class Loop:
 
     def _expected(self, wxyz_xyz: np.ndarray, covariance: np.ndarray) -> Expected:
         navigator = self.pilot.navigator
-        found = expected(navigator.rig, navigator.markers, wxyz_xyz, covariance)
+        found = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, covariance)
         return Expected(*jax.device_get(found))

@@ -51,7 +51,7 @@ class GuardProcess:
         """Start the process.
 
         Args:
-            name: name of the vehicle, as `plugins.find` takes it.
+            name: name of the vehicle, as `plugins.load_factory` takes it.
 
         Raises:
             OSError: the machine has no room for another process.

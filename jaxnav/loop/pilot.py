@@ -23,13 +23,13 @@ from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.due import due_px
 from jaxnav.loop.estimator import Estimator, Program
 from jaxnav.loop.flags import Fault, Health, Reject
-from jaxnav.loop.frames import Frames, Sighted
+from jaxnav.loop.frames import FrameDetections, FrameIntake
 from jaxnav.loop.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
-from jaxnav.loop.history import Told
+from jaxnav.loop.history import EventData
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.limits import Limits
 from jaxnav.loop.odometer import Odometer
-from jaxnav.loop.outvoted import Outvoted
+from jaxnav.loop.outvoted import MarkerVotes
 from jaxnav.loop.stamps import Stamps
 from jaxnav.loop.standstill import Standstill
 from jaxnav.loop.support import Support
@@ -54,7 +54,7 @@ class Input:
 
     now_ns: int
     odometry: Odometry | None = None
-    frames: tuple[Sighted, ...] = ()
+    frames: tuple[FrameDetections, ...] = ()
     faults: Fault = _NO_FAULT
 
 
@@ -70,7 +70,7 @@ class Outcome:
     throttle: float
     output: Output  # its leaves, and those of `belief`, are NumPy arrays
     belief: Belief
-    told: Told | None  # the data that were fused, and their timestamp
+    data: EventData | None  # the data that were fused, and their timestamp
     stamp_ns: int
     restarts: int  # so far, and the reason of the last one
     restart_reason: str
@@ -164,7 +164,7 @@ class Pilot:
         self.limits = Limits.of(navigator.controller.vehicle)
         self._corrections = Corrections.of(navigator.controller.vehicle)
         self._estimator = Estimator(navigator, program)
-        self._frames = Frames(len(navigator.rig), navigator.markers, corner_sigma_px)
+        self._frames = FrameIntake(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
         self._odometry_stamps = Stamps()
         self._odometer = Odometer.of(navigator.controller.vehicle)
@@ -173,9 +173,9 @@ class Pilot:
             self._odometer.speed_per_throttle_mps,
             self._odometer.time_constant_s,
         )
-        self._frozen = partial(self._standstill.frozen, due=self._due_px)
+        self._frozen = partial(self._standstill.is_frozen, due=self._due_px)
         self._support = Support(navigator.controller.vehicle, relocate)
-        self._outvoted = Outvoted(navigator.markers.ids)
+        self._outvoted = MarkerVotes(navigator.markers.ids)
         self._hidden: tuple[int, ...] = ()  # marker ids left out of the last frames
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
@@ -198,17 +198,17 @@ class Pilot:
     def handle(self, given: Input) -> Outcome:
         """Fuse an input, frames first. `now_ns` must not be less than in the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
-        frames = [self._corrections.frame(frame) for frame in given.frames]
-        told, stamp_ns, seen_faults = self._frames.told(frames, now_ns, self._frozen)
+        frames = [self._corrections.correct_frame(frame) for frame in given.frames]
+        told, stamp_ns, seen_faults = self._frames.check(frames, now_ns, self._frozen)
         faults |= seen_faults
         if told is not None:
-            told, self._hidden = self._outvoted.without(told)
+            told, self._hidden = self._outvoted.remove_outvoted(told)
             if self._hidden:
                 faults |= Fault.MARKER_OUTVOTED
         if told is not None:
             outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
         if given.odometry is not None:
-            return self._odometry(self._corrections.reading(given.odometry), now_ns, faults)
+            return self._odometry(self._corrections.correct_reading(given.odometry), now_ns, faults)
         return outcome if told is not None else self._tick(now_ns, faults)
 
     def _odometry(self, reading: Odometry, now_ns: int, faults: Fault) -> Outcome:
@@ -229,7 +229,7 @@ class Pilot:
             self._speed(),
             self._seeing(now_ns),
             self._command[1],
-            self._standstill.read(stamp_ns, now_ns, reading.speed_mps),
+            self._standstill.add_reading(stamp_ns, now_ns, reading.speed_mps),
         )
         faults |= faults_seen
         if Fault.ODOMETRY_STUCK in faults_seen:
@@ -239,7 +239,7 @@ class Pilot:
         if self._odometer_ns is not None:
             gap_s = min(max(stamp_ns - self._odometer_ns, 0), SLEPT_NS) / 1e9
             self._distance_m += abs(reading.speed_mps) * gap_s
-            self._support.drove(
+            self._support.add_odometry(
                 reading.speed_mps,
                 reading.steering_rad,
                 0.0 if self._known is None else float(self._known.pose[2]),
@@ -248,15 +248,15 @@ class Pilot:
                 self._seeing(now_ns),
             )
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
-        self._standstill.went(stamp_ns, now_ns, reading.speed_mps, reading.steering_rad)
-        told = Told(odometry=(reading.speed_mps, reading.steering_rad))
+        self._standstill.add_believed(stamp_ns, now_ns, reading.speed_mps, reading.steering_rad)
+        told = EventData(odometry=(reading.speed_mps, reading.steering_rad))
         return self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
 
     def _tick(self, now_ns: int, faults: Fault, rejects: Reject = _NO_REJECT) -> Outcome:
         return self._fuse(None, now_ns, now_ns, faults, rejects)
 
     def _fuse(
-        self, told: Told | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
+        self, told: EventData | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
     ) -> Outcome:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
         fused = self._estimator.fuse(told, stamp_ns, now_ns, elapsed_ns)
@@ -268,14 +268,14 @@ class Pilot:
         if fused.refused:
             rejects |= Reject.TOO_LATE
         if told is not None and told.corners_px is not None and fused.refused:
-            self._frames.refused()
+            self._frames.forget_last()
         restarts = self._restarts_before + int(fused.belief.restarts)
         if finite and restarts > self._restarts:
             self._restarts, self._restart_reason = restarts, "contradicted by the corners"
             faults |= Fault.RESTARTED
             self._left = self._known
             self._restarts_ns.append(now_ns)
-            self._support.restarted()
+            self._support.note_restart()
         outvoted: tuple[int, ...] = ()
         if told is not None and told.corners_px is not None and not fused.refused:
             outvoted = self._outvoted.count(told, np.asarray(fused.output.outvoted))
@@ -318,7 +318,7 @@ class Pilot:
         alive = zip(*planar_poses(bank), bank.initialised, strict=True)
         support = self._support
         before = support.relocations, support.refused
-        if support.corners(
+        if support.add_corners(
             known.accepted,
             agrees,
             now_ns,
@@ -366,14 +366,14 @@ class Pilot:
     def _limited(
         self, known: _Known, health: Health, now_ns: int, elapsed_ns: int
     ) -> tuple[float, float]:
-        self._command = self.limits.applied(
+        self._command = self.limits.apply(
             known.steering_rad,
             known.throttle * SPEED_FACTOR[health],
             self._command[0],
             elapsed_ns / 1e9,
         )
         self._commanded_ns = now_ns
-        self._standstill.commanded(self._command[1], now_ns)
+        self._standstill.add_command(self._command[1], now_ns)
         return self._command
 
     def _senses(self, known: _Known, now_ns: int, faults: Fault) -> Senses:

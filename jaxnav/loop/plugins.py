@@ -48,7 +48,7 @@ def open_vehicle(name: str, setup: Setup) -> Vehicle:
         BadInput: there is none of that name, it can't be imported or opened, or it does not return
             a vehicle.
     """
-    return opened_vehicle(name, find("--vehicle", VEHICLES, name), setup)
+    return opened_vehicle(name, load_factory("--vehicle", VEHICLES, name), setup)
 
 
 def opened_vehicle(name: str, factory: Callable[..., Any], setup: Setup) -> Vehicle:
@@ -72,7 +72,7 @@ def open_cameras(name: str, setup: Setup, vehicle: Vehicle) -> tuple[Camera, ...
             the rig's cameras.
     """
     flag = "--cameras"
-    found = _opened(flag, name, find(flag, CAMERAS, name), setup, vehicle)
+    found = _opened(flag, name, load_factory(flag, CAMERAS, name), setup, vehicle)
     if not isinstance(found, Sequence) or isinstance(found, str | bytes):
         _close([found])
         raise BadInput(flag, f"{name} gives {_what(found)}, expected a sequence of cameras")
@@ -83,7 +83,7 @@ def open_cameras(name: str, setup: Setup, vehicle: Vehicle) -> tuple[Camera, ...
     return cameras
 
 
-def find(flag: str, group: str, name: str) -> Callable[..., Any]:
+def load_factory(flag: str, group: str, name: str) -> Callable[..., Any]:
     """Find the factory of a plug-in.
 
     Args:

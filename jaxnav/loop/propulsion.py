@@ -1,6 +1,6 @@
 """Compare the odometer with the throttle, the only check of it while no marker is in view.
 
-    propulsion.look(speed_mps, throttle, gap_s, seeing, disputed)
+    propulsion.add_reading(speed_mps, throttle, gap_s, seeing, disputed)
     propulsion.doubtful, propulsion.off_m
 
 With nominal parameters, a low battery or a slope, the throttle tells the speed within a factor of
@@ -24,7 +24,7 @@ class Propulsion:
     """The speed range expected from the throttle, and the odometer's deviation from it.
 
     Attributes:
-        off_m: difference of the ways by odometer and by throttle since the last `confirmed`, summed
+        off_m: difference of the ways by odometer and by throttle since the last `confirm`, summed
             while they contradict each other.
     """
 
@@ -48,7 +48,7 @@ class Propulsion:
         """Whether the throttle contradicts the odometer, and nothing has confirmed it since."""
         return self.off_m > DOUBT_M
 
-    def look(
+    def add_reading(
         self, speed_mps: float, throttle: float, gap_s: float, seeing: bool, disputed: bool
     ) -> None:
         """Take a reading that was believed.
@@ -78,6 +78,6 @@ class Propulsion:
         if contradicts and self._untrue < _UNTRUE:
             self.off_m += abs(speed_mps - self._nominal_mps) * gap_s
 
-    def confirmed(self) -> None:
+    def confirm(self) -> None:
         """Forget the deviation, since corners tell where the car is."""
         self.off_m = 0.0

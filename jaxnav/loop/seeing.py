@@ -15,7 +15,7 @@ import numpy as np
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.types import Detections, Detector, RegionDetector
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import FROZEN_AFTER, Sighted
+from jaxnav.loop.frames import FROZEN_AFTER, FrameDetections
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import Camera, Frame
 from jaxnav.models.camera import Camera as CameraModel
@@ -31,10 +31,10 @@ _NONE = Detections.concatenate([])
 
 
 @dataclass(frozen=True)
-class Seen:
+class SearchedFrame:
     """A frame and the detections in it."""
 
-    sighted: Sighted
+    sighted: FrameDetections
     frame: Frame
     camera_name: str
 
@@ -81,29 +81,29 @@ class Search:
         self._near(image, region)
         self._everywhere(image, region)
 
-    def look(self, frame: Frame, region: Region | None) -> Sighted:
+    def look(self, frame: Frame, region: Region | None) -> FrameDetections:
         """Search a frame for markers.
 
         Args:
             region: where markers should be, possibly nowhere; None where that is not known.
         """
         if frame.detections is not None:
-            return Sighted(self._camera, frame.stamp_ns, frame.detections)
+            return FrameDetections(self._camera, frame.stamp_ns, frame.detections)
         fault = image_fault(frame.image, self._size_px)
         if fault or frame.image is None:
-            return Sighted(self._camera, frame.stamp_ns, None, fault)
+            return FrameDetections(self._camera, frame.stamp_ns, None, fault)
         if self._repeats(frame.image):
-            return Sighted(self._camera, frame.stamp_ns, None, Fault.FRAME_FROZEN)
+            return FrameDetections(self._camera, frame.stamp_ns, None, Fault.FRAME_FROZEN)
         self._since_whole += 1
         found = _NONE
         if region is not None and self._since_whole < WHOLE_EVERY:
             if not len(region.quads_px):
-                return Sighted(self._camera, frame.stamp_ns, _NONE)
+                return FrameDetections(self._camera, frame.stamp_ns, _NONE)
             found = self._near(frame.image, region)
         if not len(found):
             self._since_whole = 0
             found = self._everywhere(frame.image, region)
-        return Sighted(self._camera, frame.stamp_ns, found)
+        return FrameDetections(self._camera, frame.stamp_ns, found)
 
     def _repeats(self, image: np.ndarray) -> bool:
         """Whether a picture has come FROZEN_AFTER times in a row: every sensor has noise. Bytes are
@@ -161,7 +161,7 @@ class Eyes:
         self._busy = [False] * len(cameras)
         self._turn = 0
         self._waiting = threading.Condition()
-        self._seen: list[Seen] = []
+        self._seen: list[SearchedFrame] = []
         self._over = threading.Event()
         self.dropped = 0  # frames replaced by newer ones before a search
         self.errors = [0] * len(cameras)  # failed reads
@@ -181,7 +181,7 @@ class Eyes:
         for thread in self._threads:
             thread.start()
 
-    def take(self) -> list[Seen]:
+    def take(self) -> list[SearchedFrame]:
         """The frames searched since the last call, in the order of their stamps."""
         with self._woken:
             seen, self._seen = self._seen, []
@@ -242,7 +242,7 @@ class Eyes:
                     sighted = self._searches[index].look(frame, region)
                 finally:
                     self._busy[index] = False
-                seen = Seen(sighted, frame, self._cameras[index].name)
+                seen = SearchedFrame(sighted, frame, self._cameras[index].name)
                 with self._woken:
                     self._seen.append(seen)
                     self._woken.notify()
@@ -271,11 +271,13 @@ def _told(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def groups(seen: Sequence[Seen]) -> tuple[list[tuple[Sighted, ...]], tuple[Sighted, ...]]:
+def group_frames(
+    seen: Sequence[SearchedFrame],
+) -> tuple[list[tuple[FrameDetections, ...]], tuple[FrameDetections, ...]]:
     """Group sightings for the pilot: those with markers, one group per instant, and those without,
     which need no call of their own."""
-    by_stamp: dict[int, list[Sighted]] = {}
-    empty: list[Sighted] = []
+    by_stamp: dict[int, list[FrameDetections]] = {}
+    empty: list[FrameDetections] = []
     for one in seen:
         sighted = one.sighted
         shows = sighted.detections is not None and len(sighted.detections) > 0

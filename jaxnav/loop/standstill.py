@@ -86,7 +86,7 @@ class Standstill:
     _commanded_ns: int | None = None
     _claimed_ns: int | None = None  # time of the last data from any sensor
 
-    def read(self, stamp_ns: int, now_ns: int, speed_mps: float) -> bool:
+    def add_reading(self, stamp_ns: int, now_ns: int, speed_mps: float) -> bool:
         """Take any reading; return whether corners move while the odometer says it stands."""
         self._claimed_ns = now_ns
         self._told_ns = max(stamp_ns, self._told_ns)
@@ -97,7 +97,9 @@ class Standstill:
         since_ns = self._contradicted_ns
         return since_ns is not None and stamp_ns - since_ns < _PAUSE_NS
 
-    def went(self, stamp_ns: int, now_ns: int, speed_mps: float, steering_rad: float) -> None:
+    def add_believed(
+        self, stamp_ns: int, now_ns: int, speed_mps: float, steering_rad: float
+    ) -> None:
         """Take a reading that is believed and not stuck."""
         self.way.go(stamp_ns, speed_mps, steering_rad)
         goes_mps = _GOES_MPS
@@ -106,7 +108,7 @@ class Standstill:
         if abs(speed_mps) >= goes_mps:
             self._moves(now_ns)
 
-    def commanded(self, throttle: float, now_ns: int) -> None:
+    def add_command(self, throttle: float, now_ns: int) -> None:
         """Take a throttle command, and update the speed and way expected from all commands."""
         before_ns = now_ns if self._commanded_ns is None else self._commanded_ns
         self._commanded_ns = now_ns
@@ -121,7 +123,7 @@ class Standstill:
         if self._pulled_m >= _PULLS_M and now_ns - self._moved_ns >= _PULLS_NS:
             self.nothing_moves = True
 
-    def frozen(
+    def is_frozen(
         self,
         camera: int,
         stamp_ns: int,

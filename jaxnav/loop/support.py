@@ -1,7 +1,8 @@
 """Check what supports an estimate, and so decide whether to act on it.
 
-    support.drove(speed_mps, steering_rad, heading_rad, gap_s, throttle, seeing)  # each reading
-    is_fix = support.corners(accepted, agrees, now_ns, fix, possible)  # with every frame
+    # With each reading:
+    support.add_odometry(speed_mps, steering_rad, heading_rad, gap_s, throttle, seeing)
+    is_fix = support.add_corners(accepted, agrees, now_ns, fix, possible)  # with every frame
     support.doubt(contradicted)
 
 The filter can't know that its pose is wrong: all data were fused into it. So a pose is trusted only
@@ -73,7 +74,7 @@ class Support:
         """Whether the odometer contradicts the throttle, and no marker has confirmed it since."""
         return self._propulsion.doubtful
 
-    def drove(
+    def add_odometry(
         self,
         speed_mps: float,
         steering_rad: float,
@@ -83,10 +84,10 @@ class Support:
         seeing: bool,
     ) -> None:
         """Take a reading of the odometer that was believed; see `Ways` and `Propulsion`."""
-        self._ways.drove(speed_mps, steering_rad, heading_rad, gap_s)
-        self._propulsion.look(speed_mps, throttle, gap_s, seeing, self._ways.disputed)
+        self._ways.add_odometry(speed_mps, steering_rad, heading_rad, gap_s)
+        self._propulsion.add_reading(speed_mps, throttle, gap_s, seeing, self._ways.disputed)
 
-    def restarted(self) -> None:
+    def note_restart(self) -> None:
         """The filter has restarted: confirm the pose anew, and check it against the last fix."""
         self._needed = min(2 * self._needed, _MOST_CONFIRMED) if self.relocated else CONFIRMED
         self._confirmations, self._restarted = 0, True
@@ -97,7 +98,7 @@ class Support:
         self._restarted = self.refused = False
         self._ways.forget()
 
-    def corners(
+    def add_corners(
         self,
         accepted: bool,
         agrees: bool,
@@ -114,7 +115,7 @@ class Support:
             fix: the estimated pose; None: several poses are possible.
             possible: returns these poses.
         """
-        self._ways.glimpse(now_ns)
+        self._ways.note_corners(now_ns)
         if not agrees and not self.confirmed:
             self._confirmations = 0
         if not accepted:
@@ -135,8 +136,8 @@ class Support:
             self._slow_until_m = self._ways.way_m + SLOW_M
             self._ways.forget()
         self._restarted = self.refused = False
-        self._propulsion.confirmed()
-        self._ways.look(now_ns, fix)
+        self._propulsion.confirm()
+        self._ways.add_fix(now_ns, fix)
         return True
 
     def doubt(self, contradicted: bool) -> Doubt:

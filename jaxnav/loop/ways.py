@@ -1,9 +1,9 @@
 """Compare the vehicle's way by the corners with its way by the odometer.
 
-    ways.drove(speed_mps, steering_rad, heading_rad, gap_s)    # with every odometry
-    ways.glimpse(now_ns)                                       # with every frame that shows markers
-    ways.look(now_ns, fix)                                     # with every pose to be trusted
-    ways.out_of_reach(fix)                                     # before that
+    ways.add_odometry(speed_mps, steering_rad, heading_rad, gap_s)  # with every odometry
+    ways.note_corners(now_ns)                             # with every frame that shows markers
+    ways.add_fix(now_ns, fix)                             # with every pose to be trusted
+    ways.out_of_reach(fix)                                # before that
 
 A marker that is carried along, or a copy of it elsewhere, fits its own corners as well as the true
 one does. It can't imitate the odometer: the car has not gone where the corners say. There are two
@@ -78,7 +78,7 @@ class Ways:
     _last: _Anchor | None = None
     _window: deque[_Anchor] = field(default_factory=deque)
 
-    def drove(
+    def add_odometry(
         self, speed_mps: float, steering_rad: float, heading_rad: float, gap_s: float
     ) -> None:
         """Take a reading of the odometer.
@@ -99,13 +99,13 @@ class Ways:
         self.way_m += abs(step_m)
         self._turned_rad += abs(step_m * math.sin(beta_rad)) * 2 / self.wheelbase_m
 
-    def glimpse(self, now_ns: int) -> None:
+    def note_corners(self, now_ns: int) -> None:
         """Note that corners were seen, believed or not."""
         if not 0 <= now_ns - self._seen_ns <= _GAP_NS:
             self._window.clear()
         self._seen_ns = now_ns
 
-    def look(self, now_ns: int, fix: Fix) -> None:
+    def add_fix(self, now_ns: int, fix: Fix) -> None:
         """Compare a pose measured by the corners with the way by odometry."""
         here = _Anchor(
             now_ns, fix, fix.x_m - self._x_m, fix.y_m - self._y_m, self.way_m, self._turned_rad

@@ -11,7 +11,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from jaxnav.numerics.small_matrices import applied, product, sandwich
+from jaxnav.numerics.small_matrices import matvec, product, sandwich
 
 # Columns of the identity for vectors ordered (translation, rotation), such as xi: on level ground a
 # vehicle shifts along its x and y and turns about its z.
@@ -116,7 +116,7 @@ def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "3 3"]:
 
 def skew(a: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """The matrix of the cross product: skew(a) @ b = a x b."""
-    return applied(jnp.asarray(_SKEW, a.dtype), a).reshape(3, 3)
+    return matvec(jnp.asarray(_SKEW, a.dtype), a).reshape(3, 3)
 
 
 def on_ground(T_world_vehicle: jaxlie.SE3) -> jaxlie.SE3:

@@ -26,7 +26,7 @@ _LEAST_DENOMINATOR = 1e-3  # bound for a rational lens far outside of its fitted
 Image = tuple[Float[Array, "2 ..."], Float[Array, "3 2 ..."]]
 
 
-class Lens(NamedTuple):
+class LensModel(NamedTuple):
     """A kind of lens: its coefficients, its projection and the inverse."""
 
     coefficients: tuple[str, ...]
@@ -216,10 +216,10 @@ def _invert(profile: Callable[[Array], Array], target: Array, table: np.ndarray)
 
 _BROWN = ("k1", "k2", "p1", "p2", "k3")
 LENSES = {
-    "none": Lens((), _pinhole, _pinhole_bearing, MIN_DEPTH_RATIO),
-    "radtan": Lens(_BROWN, _radtan, _radtan_bearing, MIN_DEPTH_RATIO),
-    "rational": Lens((*_BROWN, "k4", "k5", "k6"), _radtan, _radtan_bearing, MIN_DEPTH_RATIO),
-    "equidistant": Lens(("k1", "k2", "k3", "k4"), _equidistant, _equidistant_bearing, -0.99),
+    "none": LensModel((), _pinhole, _pinhole_bearing, MIN_DEPTH_RATIO),
+    "radtan": LensModel(_BROWN, _radtan, _radtan_bearing, MIN_DEPTH_RATIO),
+    "rational": LensModel((*_BROWN, "k4", "k5", "k6"), _radtan, _radtan_bearing, MIN_DEPTH_RATIO),
+    "equidistant": LensModel(("k1", "k2", "k3", "k4"), _equidistant, _equidistant_bearing, -0.99),
 }
 MOST_COEFFICIENTS = max(len(lens.coefficients) for lens in LENSES.values())
 

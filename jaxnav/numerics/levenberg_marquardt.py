@@ -25,7 +25,7 @@ _FOUND = "found"
 KEEP_FOUND = jax.checkpoint_policies.save_only_these_names(_FOUND)
 
 
-def found(tree: PyTree) -> PyTree:
+def mark_found(tree: PyTree) -> PyTree:
     """The tree with its arrays named as the result of a search, which `KEEP_FOUND` stores."""
     return jax.tree.map(
         lambda leaf: checkpoint_name(leaf, _FOUND) if eqx.is_array(leaf) else leaf, tree
@@ -188,7 +188,9 @@ class ImplicitGradient(optx.AbstractAdjoint):
         fixed = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, inputs
         )
-        root, residual = found(optx.ImplicitAdjoint().apply(primal_fn, rewrite_fn, fixed, tags))
+        root, residual = mark_found(
+            optx.ImplicitAdjoint().apply(primal_fn, rewrite_fn, fixed, tags)
+        )
         return moving_with(root, inputs, gradient=_gradient, residual=residual), residual
 
 

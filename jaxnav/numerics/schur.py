@@ -31,7 +31,7 @@ class Blocks(eqx.Module):
     shared_gradient: Float[Array, " R"]
 
 
-class Reduced(eqx.Module):
+class ReducedSystem(eqx.Module):
     """The system of the shared unknowns after all blocks were eliminated.
 
         (S - sum_f C_f' B_f^-1 C_f) dx = -(g - sum_f C_f' B_f^-1 g_f)
@@ -45,12 +45,12 @@ class Reduced(eqx.Module):
     carried: Float[Array, "F n R"]  # factor^-1 cross
     own: Float[Array, "F n"]  # factor^-1 own_gradient
 
-    def back(self, shared: Float[Array, " R"]) -> Float[Array, "F n"]:
+    def back_substitute(self, shared: Float[Array, " R"]) -> Float[Array, "F n"]:
         """The move (F, n) of the blocks that belongs to a move (R,) of the shared unknowns."""
         return jax.vmap(solve_upper)(self.factor, -self.own - self.carried @ shared)
 
 
-def reduce(blocks: Blocks, free: Bool[Array, " R"], damping: Float[Array, ""]) -> Reduced:
+def reduce(blocks: Blocks, free: Bool[Array, " R"], damping: Float[Array, ""]) -> ReducedSystem:
     """Eliminate the blocks by Schur's complement.
 
     Args:
@@ -66,7 +66,7 @@ def reduce(blocks: Blocks, free: Bool[Array, " R"], damping: Float[Array, ""]) -
     gradient = blocks.shared_gradient - flat.T @ own.reshape(-1)
     both = free[:, None] & free[None]
     eye = jnp.eye(free.shape[0], dtype=system.dtype)
-    return Reduced(
+    return ReducedSystem(
         system=jnp.where(both, system, eye),
         gradient=jnp.where(free, gradient, 0),
         factor=factor,
@@ -148,7 +148,7 @@ class SchurLM(optx.AbstractLeastSquaresSolver):
         factor = jax.scipy.linalg.cho_factor(reduced.system, lower=True)
         shared = -jax.scipy.linalg.cho_solve(factor, reduced.gradient)
         shared = jnp.where(self.free, shared, 0)
-        own = reduced.back(shared)
+        own = reduced.back_substitute(shared)
         sound = jnp.all(jnp.isfinite(shared)) & jnp.all(jnp.isfinite(own))
         shared, own = jnp.where(sound, shared, 0), jnp.where(sound, own, 0)
         raised = damping * jnp.diagonal(blocks.own, axis1=1, axis2=2) * own**2

@@ -20,7 +20,7 @@ def product(A: Float[Array, "n k"], B: Float[Array, "k m"]) -> Float[Array, "n m
     return jnp.sum(A[:, :, None] * B[None], axis=1)
 
 
-def applied(A: Float[Array, "n k"], x: Float[Array, " k"]) -> Float[Array, " n"]:
+def matvec(A: Float[Array, "n k"], x: Float[Array, " k"]) -> Float[Array, " n"]:
     """The product A x, (n,), as a sum over an axis."""
     return jnp.sum(A * x[None], axis=1)
 
@@ -126,7 +126,7 @@ def solve_positive(
     return jnp.stack(x)
 
 
-def eliminated(A: Float[Array, "n n"], B: Float[Array, "n m"]) -> Float[Array, "n m"]:
+def eliminate(A: Float[Array, "n n"], B: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """A^-1 B for a positive definite A; NaN or inf where a pivot is 0.
 
     For more unknowns than are worth unrolling: a loop with one kernel for each pivot.

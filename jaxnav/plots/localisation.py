@@ -29,7 +29,7 @@ SELECTED, OTHER = BLUE, ORANGE
 
 
 @dataclass(frozen=True)
-class Track:
+class Trajectory:
     """A trajectory to draw: poses (N, 3) of x_m, y_m, psi_rad; NaN where unknown."""
 
     label: str
@@ -37,7 +37,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class View:
+class AnnotatedFrame:
     """One camera frame with its detections and candidate poses."""
 
     title: str
@@ -49,8 +49,8 @@ class View:
 
 def drive_report(
     times_s: np.ndarray,
-    truth: Track,
-    methods: Sequence[Track],
+    truth: Trajectory,
+    methods: Sequence[Trajectory],
     waypoints_m: np.ndarray,
     waypoint_radius_m: float,
     markers_m: np.ndarray,
@@ -151,7 +151,7 @@ def localisation_report(
     return figure
 
 
-def camera_mosaic(rows: Sequence[Sequence[View]], title: str = "") -> Figure:
+def camera_mosaic(rows: Sequence[Sequence[AnnotatedFrame]], title: str = "") -> Figure:
     """Draw camera frames in rows, each with its detections and all candidates' normals.
 
     Around a small marker the frame shows an enlarged inset.
@@ -174,7 +174,7 @@ def camera_mosaic(rows: Sequence[Sequence[View]], title: str = "") -> Figure:
     return figure
 
 
-def photo_with_poses(view: View) -> Figure:
+def photo_with_poses(view: AnnotatedFrame) -> Figure:
     """Draw a photograph with the detected markers and both poses of each."""
     height, width = view.image.shape[:2]
     figure = Figure(figsize=(10, 10 * height / width + 0.4), layout="constrained")
@@ -215,7 +215,9 @@ def reliability_diagram(
     return figure
 
 
-def _styled(truth: Track, methods: Sequence[Track]) -> list[tuple[Track, dict[str, Any]]]:
+def _styled(
+    truth: Trajectory, methods: Sequence[Trajectory]
+) -> list[tuple[Trajectory, dict[str, Any]]]:
     return [
         (truth, {"color": BLACK, "lw": 2.2, "alpha": 0.75}),
         *zip(methods, METHOD_STYLES, strict=False),
@@ -253,7 +255,7 @@ def draw_waypoints(axes: Axes, waypoints_m: np.ndarray, radius_m: float) -> None
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
-def _show(axes: Axes, view: View) -> None:
+def _show(axes: Axes, view: AnnotatedFrame) -> None:
     axes.imshow(view.image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     for corners in view.detected_px:
         closed = np.vstack([corners, corners[:1]])
@@ -267,7 +269,7 @@ def _show(axes: Axes, view: View) -> None:
     axes.set_axis_off()
 
 
-def _enlarge(axes: Axes, view: View) -> None:
+def _enlarge(axes: Axes, view: AnnotatedFrame) -> None:
     corners = view.detected_px[np.argmax([_side_px(corners) for corners in view.detected_px])]
     center, half = corners.mean(axis=0), max(1.6 * _side_px(corners), 4.0)
     height, width = view.image.shape[:2]

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxnav.plots.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
-from jaxnav.tuning.fit import Fit
+from jaxnav.tuning.fit import TuningFit
 from jaxnav.tuning.unconstrained import Space
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)
@@ -18,7 +18,7 @@ _LINES = ("-", "--", ":")
 
 
 @runtime_checkable
-class Judged(Protocol):
+class EstimatorScores(Protocol):
     """The scores of an estimator on drives that the fit has not used."""
 
     @property
@@ -37,7 +37,9 @@ class Judged(Protocol):
         ...
 
 
-def tuning_report(fit: Fit, space: Space, judged: Mapping[str, tuple[Judged, Judged]]) -> Figure:
+def tuning_report(
+    fit: TuningFit, space: Space, judged: Mapping[str, tuple[EstimatorScores, EstimatorScores]]
+) -> Figure:
     """Draw loss and parameters by step, and below them errors and covariances before and after.
 
     Args:
@@ -55,7 +57,7 @@ def tuning_report(fit: Fit, space: Space, judged: Mapping[str, tuple[Judged, Jud
 
 
 @runtime_checkable
-class Driven(Protocol):
+class ControllerScores(Protocol):
     """The results of a controller in one scenario."""
 
     @property
@@ -75,7 +77,7 @@ class Driven(Protocol):
 
 
 def controller_report(
-    fit: Fit, space: Space, driven: Mapping[str, tuple[Driven, Driven]]
+    fit: TuningFit, space: Space, driven: Mapping[str, tuple[ControllerScores, ControllerScores]]
 ) -> Figure:
     """Draw loss and gains by step, and below them the loss's parts and a drive of each scenario.
 
@@ -100,7 +102,9 @@ def controller_report(
     return figure
 
 
-def _draw_parts(axes: Axes, driven: Mapping[str, tuple[Driven, Driven]]) -> None:
+def _draw_parts(
+    axes: Axes, driven: Mapping[str, tuple[ControllerScores, ControllerScores]]
+) -> None:
     """Draw the parts of the loss as stacked bars, before and after side by side."""
     names = [f"{name}\n{when}" for name in driven for when in ("before", "after")]
     pairs = [one for pair in driven.values() for one in pair]
@@ -114,7 +118,7 @@ def _draw_parts(axes: Axes, driven: Mapping[str, tuple[Driven, Driven]]) -> None
     axes.legend(fontsize="x-small", ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
 
-def draw_losses(axes: Axes, fit: Fit) -> None:
+def draw_losses(axes: Axes, fit: TuningFit) -> None:
     """Draw the losses on the training drives and on the held-out drives."""
     history = np.array(fit.history)
     steps = np.arange(len(history))
@@ -128,7 +132,7 @@ def draw_losses(axes: Axes, fit: Fit) -> None:
     axes.legend()
 
 
-def draw_parameters(axes: Axes, fit: Fit, space: Space) -> None:
+def draw_parameters(axes: Axes, fit: TuningFit, space: Space) -> None:
     """Draw each parameter as a ratio to its initial value."""
     rows = np.array(fit.history)[:, 2:]
     values = jax.device_get(jax.vmap(space.values)(jnp.asarray(rows, space.start.dtype)))
@@ -150,7 +154,7 @@ def draw_parameters(axes: Axes, fit: Fit, space: Space) -> None:
     axes.legend(fontsize="x-small", loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _draw_errors(axes: Axes, name: str, before: Judged, after: Judged) -> None:
+def _draw_errors(axes: Axes, name: str, before: EstimatorScores, after: EstimatorScores) -> None:
     for tested, colour, label in ((before, VERMILION, "before"), (after, BLUE, "after")):
         errors_cm = 100 * np.sort(tested.error_m)
         axes.plot(errors_cm, np.linspace(0, 1, len(errors_cm)), color=colour, label=label)
@@ -163,7 +167,7 @@ def _draw_errors(axes: Axes, name: str, before: Judged, after: Judged) -> None:
     axes.legend()
 
 
-def _draw_anees(axes: Axes, before: Judged, after: Judged) -> None:
+def _draw_anees(axes: Axes, before: EstimatorScores, after: EstimatorScores) -> None:
     low, high = after.band
     axes.axhspan(low, high, color=GREEN, alpha=0.25, label="consistent (99.9 %)")
     for x, tested, colour in ((0, before, VERMILION), (1, after, BLUE)):

@@ -35,7 +35,7 @@ LEAST_MARKERS = 3  # two can't outvote each other
 Find = Callable[[Snapshot, jaxlie.SE3], Candidates]
 
 
-class Consistent(NamedTuple):
+class ConsistentSnapshot(NamedTuple):
     """A snapshot without inconsistent sightings, its candidates, and the markers outvoted."""
 
     snapshot: Snapshot
@@ -43,19 +43,19 @@ class Consistent(NamedTuple):
     outvoted: Bool[Array, " M"]
 
 
-class Kept(NamedTuple):
-    """The parts of `Consistent` that depend on the rejection: visibility, not the snapshot."""
+class Inliers(NamedTuple):
+    """What the rejection determines of a `ConsistentSnapshot`: visibility, not the snapshot."""
 
     visible: Bool[Array, " D"]
     candidates: Candidates
     outvoted: Bool[Array, " M"]
 
-    def of(self, snapshot: Snapshot) -> Consistent:
-        """`Consistent` for the snapshot in which this was found."""
-        return Consistent(_among(snapshot, self.visible), self.candidates, self.outvoted)
+    def apply_to(self, snapshot: Snapshot) -> ConsistentSnapshot:
+        """`ConsistentSnapshot` for the snapshot in which this was found."""
+        return ConsistentSnapshot(_among(snapshot, self.visible), self.candidates, self.outvoted)
 
 
-def consistent(snapshot: Snapshot, find: Find, none: Candidates) -> Consistent:
+def remove_outliers(snapshot: Snapshot, find: Find, none: Candidates) -> ConsistentSnapshot:
     """The snapshot without sightings that are not squares and without an outvoted marker.
 
     With three markers and more in view, the one without which the joint misfit falls below a
@@ -67,23 +67,23 @@ def consistent(snapshot: Snapshot, find: Find, none: Candidates) -> Consistent:
         none: the result without a marker in view, where `find` is not called.
     """
 
-    def nothing() -> Kept:
+    def nothing() -> Inliers:
         nobody = jnp.zeros(len(snapshot.markers.ids), bool)
-        return Kept(jnp.zeros_like(snapshot.seen.visible), none, nobody)
+        return Inliers(jnp.zeros_like(snapshot.seen.visible), none, nobody)
 
     any_seen = jnp.any(snapshot.seen.visible)
-    kept: Kept = jax.lax.cond(any_seen, lambda: among_all(snapshot, find), nothing)
-    return kept.of(snapshot)
+    kept: Inliers = jax.lax.cond(any_seen, lambda: find_inliers(snapshot, find), nothing)
+    return kept.apply_to(snapshot)
 
 
-def among_all(snapshot: Snapshot, find: Find) -> Kept:
-    """As `consistent`, but calls `find` also where no marker is in view."""
+def find_inliers(snapshot: Snapshot, find: Find) -> Inliers:
+    """As `remove_outliers`, but calls `find` also where no marker is in view."""
     own = both_poses(snapshot)
     snapshot = _among(snapshot, _can_be_markers(snapshot, own))
     seen, candidates = snapshot.seen, find(snapshot, own)
     nobody = jnp.zeros(len(snapshot.markers.ids), bool)
     if nobody.shape[0] < LEAST_MARKERS or seen.visible.shape[0] < LEAST_MARKERS:
-        return Kept(seen.visible, candidates, nobody)
+        return Inliers(seen.visible, candidates, nobody)
     in_view = jnp.sum(_in_view(seen, nobody.shape[0]))
     all_of_them = _excess(candidates, seen)
 
@@ -112,7 +112,7 @@ def among_all(snapshot: Snapshot, find: Find) -> Kept:
         lambda: (jnp.ones_like(seen.visible), candidates),
     )
     outvoted = _in_view(_among(snapshot, ~kept).seen, nobody.shape[0])
-    return Kept(seen.visible & kept, candidates, outvoted)
+    return Inliers(seen.visible & kept, candidates, outvoted)
 
 
 def _can_be_markers(snapshot: Snapshot, own: jaxlie.SE3) -> Bool[Array, " D"]:

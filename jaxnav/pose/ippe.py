@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxnav.models.geometry import rotation_from_matrix, safe_norm, safe_sqrt
 from jaxnav.models.markers import CORNER_SIGNS
-from jaxnav.numerics.small_matrices import applied, product
+from jaxnav.numerics.small_matrices import matvec, product
 
 
 class PosePair(eqx.Module):
@@ -142,7 +142,7 @@ def _pose(
     """One pose as (wxyz, xyz), and its RMS reprojection error."""
     x_axis = jnp.concatenate([R22[:, 0], tilt[:1]])
     y_axis = jnp.concatenate([R22[:, 1], tilt[1:]])
-    x_axis, y_axis = applied(R_camera_sight, x_axis), applied(R_camera_sight, y_axis)
+    x_axis, y_axis = matvec(R_camera_sight, x_axis), matvec(R_camera_sight, y_axis)
     R_camera_marker = jnp.stack([x_axis, y_axis, jnp.cross(x_axis, y_axis)], axis=1)
     rotation = rotation_from_matrix(R_camera_marker)
 

@@ -93,18 +93,18 @@ def wrench(
     """
     residual, slope = rows
     force = jnp.sum(slope * residual[None], axis=1)
-    return jnp.sum(force, axis=1), jnp.sum(crossed(points, force), axis=1)
+    return jnp.sum(force, axis=1), jnp.sum(cross_product(points, force), axis=1)
 
 
-def crossed(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Array:
+def cross_product(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Array:
     """a x b, coordinates first."""
     return jnp.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
 
 
-def turned(half: Float[Array, "3 N"], arms: Float[Array, "3 P N"]) -> Float[Array, "3 P N"]:
+def turn_arms(half: Float[Array, "3 N"], arms: Float[Array, "3 P N"]) -> Float[Array, "3 P N"]:
     """Arms turned by the quaternion (1, half), normalised."""
-    swing = 2 * crossed(half[:, None], arms)
+    swing = 2 * cross_product(half[:, None], arms)
     per_norm = 1 / (1 + jnp.sum(half**2, axis=0))
-    return arms + (swing + crossed(half[:, None], swing)) * per_norm[None, None]
+    return arms + (swing + cross_product(half[:, None], swing)) * per_norm[None, None]

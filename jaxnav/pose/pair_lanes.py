@@ -52,7 +52,7 @@ class Poses(NamedTuple):
     scale: Lane  # half a side over the centre's depth
 
 
-class Trace(NamedTuple):
+class SolverState(NamedTuple):
     """The state of Levenberg-Marquardt in every lane."""
 
     cost: Lane  # sum of squares in units; inf where a corner is behind the camera
@@ -62,7 +62,7 @@ class Trace(NamedTuple):
 
 
 class _State(eqx.Module):
-    trace: Trace
+    trace: SolverState
     left: Int[Array, ""]  # number of steps left
 
 
@@ -361,7 +361,7 @@ class LaneLM(optx.AbstractLeastSquaresSolver):
         fraction = jnp.minimum(promised / before, 0.99)
         to_come = jnp.where(accept, promised * fraction / (1 - fraction), promised)
         exhausted = (to_come <= self.rtol * cost + self.atol) | (damping > 1e9)
-        trace = Trace(
+        trace = SolverState(
             cost=jnp.where(accept, trial_cost, cost),
             damping=jnp.where(accept, jnp.maximum(calmer, least), stiffer),
             promised=jnp.where(accept, promised, before),
@@ -399,8 +399,8 @@ class LaneLM(optx.AbstractLeastSquaresSolver):
 
 
 def _improve(
-    pose: Poses, seen: Marks, trace: Trace, steps: Int[Array, ""] | int
-) -> tuple[Poses, Trace]:
+    pose: Poses, seen: Marks, trace: SolverState, steps: Int[Array, ""] | int
+) -> tuple[Poses, SolverState]:
     """Take at most `steps` steps of Levenberg-Marquardt in every lane."""
     # Relative to the cost and, in hundredths of the marker's spread, as for a single marker.
     tolerance = 1e-12 if seen.unit.dtype == jnp.float64 else 1e-6
@@ -416,7 +416,7 @@ def _improve(
     return solution.value, solution.state.trace
 
 
-def _begun(start: Poses, seen: Marks) -> tuple[Poses, Trace]:
+def _begun(start: Poses, seen: Marks) -> tuple[Poses, SolverState]:
     """A start that is finite and in front of the camera, and its trace."""
     finite = seen.usable
     for number in jax.tree.leaves(start):
@@ -428,7 +428,7 @@ def _begun(start: Poses, seen: Marks) -> tuple[Poses, Trace]:
     scale = jnp.minimum(start.scale, 0.9 / jnp.maximum(reach, 0.1))
     start = start._replace(scale=scale)
     cost = _cost(start, seen)
-    return start, Trace(cost, jnp.full_like(cost, 1e-4), jnp.full_like(cost, 1e-30), ~finite)
+    return start, SolverState(cost, jnp.full_like(cost, 1e-4), jnp.full_like(cost, 1e-30), ~finite)
 
 
 def _stacked_pair(corners: Float[Array, "4 2 *lanes"]) -> tuple[Marks, Poses]:
@@ -493,7 +493,7 @@ def solve_pairs(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) ->
         return _empty(corners_n.dtype)
     lanes = _block_lanes(batch, 2064, 2**18)
 
-    def begin(corners: Array) -> tuple[Marks, Poses, Trace]:
+    def begin(corners: Array) -> tuple[Marks, Poses, SolverState]:
         seen, start = _stacked_pair(corners)
         start, trace = _begun(start, seen)
         return seen, *_improve(start, seen, trace, _FIRST_STEPS)
@@ -508,7 +508,7 @@ def solve_pairs(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) ->
     )
 
 
-def _finished(pose: Poses, seen: Marks, trace: Trace) -> tuple[Poses, Trace]:
+def _finished(pose: Poses, seen: Marks, trace: SolverState) -> tuple[Poses, SolverState]:
     """Gather the lanes that are not done into blocks of their own, and refine them to the end.
 
     Args:
@@ -521,13 +521,13 @@ def _finished(pose: Poses, seen: Marks, trace: Trace) -> tuple[Poses, Trace]:
     flat_seen = jax.tree.map(lambda leaf: leaf.reshape(-1), seen)
     room = -(-total // size) * size
 
-    def one_round(carry: tuple[Poses, Trace, Array]) -> tuple[Poses, Trace, Array]:
+    def one_round(carry: tuple[Poses, SolverState, Array]) -> tuple[Poses, SolverState, Array]:
         pose, trace, number = carry
         (left,) = jnp.nonzero(~trace.done, size=room, fill_value=total)
         count = jnp.sum(~trace.done)
         steps = _FIRST_ROUND * 2**number
 
-        def one_block(carry: tuple[Array, Poses, Trace]) -> tuple[Array, Poses, Trace]:
+        def one_block(carry: tuple[Array, Poses, SolverState]) -> tuple[Array, Poses, SolverState]:
             first, pose, trace = carry
             index = jax.lax.dynamic_slice(left, (first,), (size,))
             of_marker = index // (2 * lanes) * lanes + index % lanes
@@ -547,7 +547,7 @@ def _finished(pose: Poses, seen: Marks, trace: Trace) -> tuple[Poses, Trace]:
         )
         return pose, trace, number + 1
 
-    def unfinished(carry: tuple[Poses, Trace, Array]) -> Array:
+    def unfinished(carry: tuple[Poses, SolverState, Array]) -> Array:
         return (carry[2] < _ROUNDS) & ~jnp.all(carry[1].done)
 
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1), (pose, trace))

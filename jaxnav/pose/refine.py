@@ -31,7 +31,14 @@ from jaxnav.numerics.levenberg_marquardt import (
 )
 from jaxnav.numerics.small_matrices import cholesky, gram, product, solve_lower
 from jaxnav.pose.ippe import PosePair, ippe_square
-from jaxnav.pose.linearised import Rows, crossed, pinhole_rows, reprojection_rows, turned, wrench
+from jaxnav.pose.linearised import (
+    Rows,
+    cross_product,
+    pinhole_rows,
+    reprojection_rows,
+    turn_arms,
+    wrench,
+)
 from jaxnav.pose.observation import Sightings, sightings
 from jaxnav.pose.pair_lanes import solve_pairs
 
@@ -166,9 +173,9 @@ class _Chart(eqx.Module):
         def at(y: Array) -> tuple[Array, NormalEquations]:
             y = jnp.sum(free[:, :, None] * y[None], axis=1)
             half = y[3:] / 2
-            arms = turned(half, self.arms)
+            arms = turn_arms(half, self.arms)
             residual, slope = rows(arms + (self.pivot + self.scale[None] * y[:3])[:, None])
-            about = in_chart(crossed(arms[:, None], slope), half[:, None, None])
+            about = in_chart(cross_product(arms[:, None], slope), half[:, None, None])
             J = jnp.concatenate([self.scale[None, None, None] * slope, about])
             J = J.reshape(6, -1, J.shape[-1])
             force, torque = wrench((residual, slope), arms)
@@ -180,7 +187,7 @@ class _Chart(eqx.Module):
 
         def in_chart(about: Array, half: Array) -> Array:
             """Derivatives by a turn from here on, converted to derivatives by `half`."""
-            return (about + crossed(about, half)) / (1 + jnp.sum(half**2, axis=0))[None]
+            return (about + cross_product(about, half)) / (1 + jnp.sum(half**2, axis=0))[None]
 
         return at
 

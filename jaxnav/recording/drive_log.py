@@ -15,7 +15,7 @@ from jaxnav.files import limits
 from jaxnav.files.validation import Model, validate
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_format import HEADER, decode, header_of
-from jaxnav.recording.mcap_messages import McapMessages, Recorded
+from jaxnav.recording.mcap_messages import McapMessages, RecordedMessage
 from jaxnav.recording.message_schemas import (
     IMAGE_SCHEMA,
     MESSAGES,
@@ -106,7 +106,7 @@ class DriveLog:
             BadInput: an image is damaged.
         """
         for record in McapMessages(self.path):
-            if isinstance(record, Recorded) and record.schema == IMAGE_SCHEMA:
+            if isinstance(record, RecordedMessage) and record.schema == IMAGE_SCHEMA:
                 if topic in (None, record.topic):
                     message = _checked(ImageMessage, record, self.path, record.topic)
                     yield RecordedImage(record.topic, record.stamp_ns, message.data)
@@ -178,14 +178,14 @@ class _Gaps:
     missing: dict[str, int] = field(default_factory=dict)
     _last: dict[str, int] = field(default_factory=dict)
 
-    def count(self, record: Recorded) -> None:
+    def count(self, record: RecordedMessage) -> None:
         gap = record.sequence - self._last.get(record.topic, -1) - 1
         if gap > 0:
             self.missing[record.topic] = self.missing.get(record.topic, 0) + gap
         self._last[record.topic] = record.sequence
 
 
-def _message(record: Recorded, path: Path, index: int) -> AnyMessage:
+def _message(record: RecordedMessage, path: Path, index: int) -> AnyMessage:
     name, model = MESSAGES[record.topic]
     if (record.schema, record.encoding) != (name, "json"):
         problem = f"expected {name} in json, got {record.schema!r} in {record.encoding!r}"
@@ -195,7 +195,7 @@ def _message(record: Recorded, path: Path, index: int) -> AnyMessage:
     return _checked(model, record, path, f"{record.topic}[{index}]")
 
 
-def _checked(model: type[Model], record: Recorded, path: Path, key: str) -> Model:
+def _checked(model: type[Model], record: RecordedMessage, path: Path, key: str) -> Model:
     try:
         data = decode(record.data)
     except ValueError as error:

@@ -19,9 +19,9 @@ import numpy as np
 from jaxnav.detection import Detections
 from jaxnav.detection.image_search import ImageSearch, size_problem
 from jaxnav.errors import BadInput
-from jaxnav.files.images import decoded_image
+from jaxnav.files.images import decode_image
 from jaxnav.loop.flags import Fault, Health, Reject, names
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import opposite, planar_in_world
 from jaxnav.recording.drive_log import DriveLog, Outcomes
@@ -71,7 +71,7 @@ def replay_drive(
     """The outcomes of a new pilot for recorded inputs, one after the other.
 
     Args:
-        folder: folder of executables, see `compiled`.
+        folder: folder of executables, see `compile_or_load`.
     """
     pilot = setup.pilot(folder)
     for given in inputs:
@@ -193,7 +193,7 @@ def inputs_from_images(
         if image.topic not in camera_of:
             continue
         camera = camera_of[image.topic]
-        pixels = decoded_image(image.jpeg)
+        pixels = decode_image(image.jpeg)
         if pixels is None:
             raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
         if problem := size_problem(setup.rig, camera, pixels):
@@ -203,7 +203,7 @@ def inputs_from_images(
         raise BadInput(log.path, f"holds no image on {', '.join(camera_of)}")
     searched = 0
 
-    def anew(frame: Sighted) -> Sighted:
+    def anew(frame: FrameDetections) -> FrameDetections:
         nonlocal searched
         seen: Detections | None = found.get((frame.camera, frame.stamp_ns))
         if seen is None or frame.detections is None:

@@ -23,7 +23,7 @@ from pydantic import Field, create_model, field_validator
 
 from jaxnav.belief.selectors import SELECTORS, make_selector
 from jaxnav.compiling.executables import PACKAGE, sources_digest
-from jaxnav.compiling.step import compiled
+from jaxnav.compiling.step import compile_or_load
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, Route, apply_params
 from jaxnav.files.markers import MarkerFile, marker_data
@@ -176,10 +176,10 @@ class DriveSetup:
         """A pilot at the beginning of a drive.
 
         Args:
-            folder: folder of executables, see `compiled`.
+            folder: folder of executables, see `compile_or_load`.
         """
         navigator = self.navigator()
-        program = compiled(advance_packed, navigator, folder)
+        program = compile_or_load(advance_packed, navigator, folder)
         return Pilot(navigator, self.timeouts, program, self.corner_sigma_px, self.relocate)
 
     def header(self) -> dict[str, Any]:

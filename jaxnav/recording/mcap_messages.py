@@ -28,7 +28,7 @@ from mcap.stream_reader import StreamReader
 
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
-from jaxnav.files.unpacking import Budget, unpacked
+from jaxnav.files.unpacking import Budget, unpack_chunk
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # opcode, length
@@ -49,7 +49,7 @@ def profile_of(path: Path) -> str | None:
     return head[21 : 21 + size].decode(errors="replace")
 
 
-class Recorded(NamedTuple):
+class RecordedMessage(NamedTuple):
     """One message as it is in the file."""
 
     topic: str
@@ -80,7 +80,7 @@ class McapMessages:
         self._channels: dict[int, Channel] = {}
         self._messages = 0
 
-    def __iter__(self) -> Iterator[Metadata | Recorded]:
+    def __iter__(self) -> Iterator[Metadata | RecordedMessage]:
         try:
             with self.path.open("rb") as file:
                 yield from self._read(file)
@@ -99,7 +99,7 @@ class McapMessages:
             problem = f"is damaged ({type(error).__name__}: {error})"
             raise BadInput(self.path, problem) from None
 
-    def _read(self, file: IO[bytes]) -> Iterator[Metadata | Recorded]:
+    def _read(self, file: IO[bytes]) -> Iterator[Metadata | RecordedMessage]:
         bounded = cast(IO[bytes], _Bounded(file, self._told))
         reader = _Reader(
             bounded, emit_chunks=True, validate_crcs=True, record_size_limit=limits.CHUNK_BYTES
@@ -114,7 +114,7 @@ class McapMessages:
                     yield found
         self.truncated = False
 
-    def _found(self, record: McapRecord) -> Metadata | Recorded | None:
+    def _found(self, record: McapRecord) -> Metadata | RecordedMessage | None:
         if isinstance(record, Message):
             self._messages += 1
             if self._messages > limits.MCAP_MESSAGES:
@@ -125,7 +125,7 @@ class McapMessages:
             schema = self._schemas[channel.schema_id].name if channel.schema_id else ""
             encoding, data = channel.message_encoding, record.data
             stamp_ns = record.publish_time
-            return Recorded(channel.topic, schema, encoding, record.sequence, stamp_ns, data)
+            return RecordedMessage(channel.topic, schema, encoding, record.sequence, stamp_ns, data)
         if isinstance(record, Metadata):
             return record
         if isinstance(record, Schema):
@@ -175,7 +175,7 @@ def _opened(chunk: Chunk, budget: Budget) -> Iterator[McapRecord]:
         raise ValueError(f"compressed by {chunk.compression[:20]!r}, only zstd is read")
     if chunk.uncompressed_size > limits.CHUNK_BYTES:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-    data = unpacked(chunk.compression, chunk.data, budget, most=chunk.uncompressed_size)
+    data = unpack_chunk(chunk.compression, chunk.data, budget, most=chunk.uncompressed_size)
     if len(data) != chunk.uncompressed_size:
         raise ValueError("a chunk that is not as large as it says")
     if chunk.uncompressed_crc not in (0, zlib.crc32(data)):

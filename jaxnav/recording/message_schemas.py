@@ -39,7 +39,7 @@ IMAGE_SCHEMA = "foxglove.CompressedImage"
 
 
 class SightedMessage(Entry):
-    """A `Sighted` with N detections; N = 0 where the frame was not usable."""
+    """A `FrameDetections` with N detections; N = 0 where the frame was not usable."""
 
     camera: Count
     stamp_ns: Stamp

@@ -17,7 +17,7 @@ from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.belief.motion import Bank
 from jaxnav.detection.types import Detections
 from jaxnav.files.ranges import RANGES
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import Origin, inverses_in_world, planar_in_world
@@ -132,7 +132,7 @@ def _reported(output: Output, bank: Bank, origin_m: Origin) -> dict[str, Any]:
     }
 
 
-def _sighted_message(frame: Sighted) -> dict[str, Any]:
+def _sighted_message(frame: FrameDetections) -> dict[str, Any]:
     found = _NONE if frame.detections is None else frame.detections
     return {
         "camera": frame.camera,
@@ -151,7 +151,7 @@ def _recordable(stamp_ns: int) -> int:
     return min(max(stamp_ns, _LEAST_NS), _MOST_NS)
 
 
-def _sighted(message: SightedMessage) -> Sighted:
+def _sighted(message: SightedMessage) -> FrameDetections:
     found = Detections(
         ids=message.ids,
         corners_px=message.corners_px,
@@ -160,7 +160,7 @@ def _sighted(message: SightedMessage) -> Sighted:
         families=tuple(message.families),
     )
     detections = found if message.usable else None
-    return Sighted(message.camera, message.stamp_ns, detections, message.faults)
+    return FrameDetections(message.camera, message.stamp_ns, detections, message.faults)
 
 
 def digest(outcome: Outcome) -> str:

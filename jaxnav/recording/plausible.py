@@ -15,7 +15,7 @@ _MOST = RANGES["pose"].most
 _UNIT = 1e-3  # a quaternion's length may be off by this
 
 
-def plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
+def keep_plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
     """The outcomes with NaN for implausible numbers, and the number of outcomes that had one.
 
     An outcome without a plausible pose is not located; such hypotheses and candidates are left out.
@@ -49,7 +49,7 @@ def plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
     return shown, int(odd.sum())
 
 
-def left_out(count: int) -> str:
+def left_out_note(count: int) -> str:
     """The message to a person about outcomes with implausible numbers."""
     return f"left out: what {count} outcomes report that is not finite, or out of this world"
 

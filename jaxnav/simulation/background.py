@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 
 from jaxnav.simulation.scene import TEXTURE_LEVELS, TEXTURE_SIZE, Scene, Surface
-from jaxnav.simulation.viewing import BACKGROUND_PX, CELL_PX, View
+from jaxnav.simulation.viewing import BACKGROUND_PX, CELL_PX, MovingCamera
 
 _BAND_PX = 32  # rows shaded at a time: few enough for the processor's cache
 _TINY = np.float32(1e-12)
 
 
-def render_background(scene: Scene, view: View) -> np.ndarray:
+def render_background(scene: Scene, view: MovingCamera) -> np.ndarray:
     """Render surfaces and sky: light (H, W) float32."""
     lens = view.lens
     image = np.full((lens.rows, lens.columns), np.float32(scene.sky_grey))
@@ -44,7 +44,7 @@ def render_background(scene: Scene, view: View) -> np.ndarray:
 
 
 def _cells_in_sight(
-    surfaces: tuple[Surface, ...], view: View, margin_cells: int
+    surfaces: tuple[Surface, ...], view: MovingCamera, margin_cells: int
 ) -> list[np.ndarray]:
     """The cells of the image in which each surface may be nearest, (H / 8, W / 8) bool each."""
     lens = view.lens
@@ -74,7 +74,9 @@ class _Plane:
     span: np.ndarray  # (rows, samples): texels that a pixel covers, times (n.r)^2
 
     @staticmethod
-    def create(surface: Surface, cells: np.ndarray, view: View, fractions: np.ndarray) -> "_Plane":
+    def create(
+        surface: Surface, cells: np.ndarray, view: MovingCamera, fractions: np.ndarray
+    ) -> "_Plane":
         H, height = view.homographies(surface.T_world_surface, np.s_[:], fractions - 0.5)
         # A pixel covers |q_z| * angle / (n.r)^2 along the slope; four samples share it. Levels
         # of the pyramid are rounded differently in each sample, which blends them.

@@ -43,7 +43,7 @@ class DriveSettings:
 
 
 @dataclass(frozen=True)
-class Frame:
+class DriveFrame:
     """One step of a drive: the truth, and every method's output for the same observation."""
 
     stamp_s: float
@@ -100,7 +100,7 @@ def drive(
     look: Look,
     settings: DriveSettings,
     seed: int,
-) -> Iterator[Frame]:
+) -> Iterator[DriveFrame]:
     """Run a drive frame by frame until it is done, off the floor or out of time.
 
     Args:
@@ -137,7 +137,7 @@ def drive(
         outputs, branches = methods.step(observation, true.pose)
         believed = outputs[methods.driver]
         assert believed.command is not None
-        yield Frame(stamp_s, np.asarray(true.pose), observation, outputs, branches)
+        yield DriveFrame(stamp_s, np.asarray(true.pose), observation, outputs, branches)
         x_min, x_max, y_min, y_max = settings.floor_m
         x_m, y_m, _ = np.asarray(true.pose)
         if bool(believed.done) or not (x_min <= x_m <= x_max and y_min <= y_m <= y_max):

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxnav.simulation.background import meet
 from jaxnav.simulation.scene import QUIET_ZONE_MODULES, Scene, Surface
-from jaxnav.simulation.viewing import CELL_PX, View
+from jaxnav.simulation.viewing import CELL_PX, MovingCamera
 
 # 64 points (x, y, t) of a rank-1 lattice: each coordinate takes each of its 64 values once, and
 # so, nearly, do the diagonals. Of all generators this one is best for edges, still and moving.
@@ -60,7 +60,7 @@ def prints_of(scene: Scene) -> list[Print]:
 
 
 def render_print(
-    marker: Print, surfaces: tuple[Surface, ...], view: View, image: np.ndarray
+    marker: Print, surfaces: tuple[Surface, ...], view: MovingCamera, image: np.ndarray
 ) -> None:
     """Render one marker into an image of light, (H, W) float32, in place."""
     _, position = view.pose_at(np.zeros(()))
@@ -75,7 +75,7 @@ def render_print(
         _print_region(marker, before, view, image, region, instants)
 
 
-def _region_of(marker: Print, view: View, blur_px: float) -> tuple[slice, slice] | None:
+def _region_of(marker: Print, view: MovingCamera, blur_px: float) -> tuple[slice, slice] | None:
     """The image rows and columns that contain a marker's whole paper; None if out of sight."""
     lens = view.lens
     nodes_y, nodes_x = lens.nodes_y, lens.nodes_x
@@ -102,7 +102,7 @@ def _region_of(marker: Print, view: View, blur_px: float) -> tuple[slice, slice]
 def _print_region(
     marker: Print,
     before: list[Surface],
-    view: View,
+    view: MovingCamera,
     image: np.ndarray,
     region: tuple[slice, slice],
     instants: np.ndarray,
@@ -155,16 +155,16 @@ def _print_region(
 
 
 def _to_modules(
-    marker: Print, view: View, rows: slice | np.ndarray, instants: np.ndarray
+    marker: Print, view: MovingCamera, rows: slice | np.ndarray, instants: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`View.homographies` to coordinates on the sheet in modules."""
+    """`MovingCamera.homographies` to coordinates on the sheet in modules."""
     H, height = view.homographies(marker.T_world_sheet, rows, instants)
     H[..., :2, :] /= np.float32(marker.module_m)
     return H, height
 
 
 def _drift(
-    marker: Print, view: View, region: tuple[slice, slice], instants: np.ndarray
+    marker: Print, view: MovingCamera, region: tuple[slice, slice], instants: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The displacement of each pixel's point on the sheet from mid-exposure, in modules.
 
@@ -269,7 +269,7 @@ def _may_hide(surface: Surface, marker: Print, position: np.ndarray) -> bool:
 
 
 def _unhidden(
-    marker: Print, before: list[Surface], view: View, region: tuple[slice, slice]
+    marker: Print, before: list[Surface], view: MovingCamera, region: tuple[slice, slice]
 ) -> np.ndarray:
     """The pixels where no surface hides the marker's plane, (rows, columns) bool."""
     rows, columns = region

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from jaxnav.numerics.trees import where
-from jaxnav.simulation.kept import Kept
+from jaxnav.simulation.traces import DriveTraces
 
 
 def run_lanes(
@@ -22,9 +22,9 @@ def run_lanes(
     advance: Callable[[Any], tuple[Any, Any]],
     lanes: int,
     threads: int,
-    kept: Kept,
+    kept: DriveTraces,
     progress: Callable[[int], object] = lambda ended: None,
-) -> Kept:
+) -> DriveTraces:
     """Run every drive from its start until its world has `ended`; `kept`, filled.
 
     Args:
@@ -64,7 +64,7 @@ def run_lanes(
             chunk, ended = jax.device_get((chunk, worlds.ended))
             over = ended & (owner >= 0)
             with lock:
-                kept.take(owner, chunk)
+                kept.add(owner, chunk)
                 progress(int(over.sum()))
 
     threads = max(1, min(threads, -(-len(keys) // lanes)))

@@ -22,10 +22,10 @@ from jaxnav.pose.candidates import find_candidates
 from jaxnav.pose.observation import Snapshot
 from jaxnav.simulation.single_frames import (
     CornerErrors,
-    View,
+    MarkerView,
     marker_as_world,
-    observe,
     pinhole_rig,
+    simulate_observation,
 )
 
 SIZE_M = 0.172
@@ -34,7 +34,7 @@ BATCH = 2000
 
 
 @dataclass(frozen=True)
-class Views:
+class ViewRanges:
     """The ranges of a random view; each quantity is drawn uniformly between its ends."""
 
     side_px: tuple[float, float] = (10.0, 100.0)
@@ -44,7 +44,7 @@ class Views:
     elevation_rad: tuple[float, float] = (-0.38, 0.38)
 
 
-class Frames(eqx.Module):
+class ViewOutcomes(eqx.Module):
     """The outcomes of frames, leading axis (F,)."""
 
     flip_probability: Float[Array, "*F"]
@@ -55,15 +55,15 @@ class Frames(eqx.Module):
 def random_views(
     count: int,
     seed: int,
-    views: Views | None = None,
+    views: ViewRanges | None = None,
     progress: Callable[[int], object] = lambda done: None,
-) -> Frames:
+) -> ViewOutcomes:
     """The outcomes of independent random frames, on the host.
 
     Args:
         progress: called with the number of frames finished since the last call.
     """
-    views = views or Views()
+    views = views or ViewRanges()
     batch = min(BATCH, count)
     rig, markers = pinhole_rig(1, FOCAL_PX, 0.0), marker_as_world(SIZE_M)
     run = jax.jit(jax.vmap(lambda key: _frame(key, views, rig, markers)))
@@ -72,17 +72,17 @@ def random_views(
     for begin in range(0, len(keys), batch):
         parts.append(jax.device_get(run(keys[begin : begin + batch])))
         progress(min(batch, count - begin))
-    frames: Frames = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
+    frames: ViewOutcomes = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
     return frames
 
 
-def _frame(key: Array, views: Views, rig: CameraRig, markers: MarkerMap) -> Frames:
+def _frame(key: Array, views: ViewRanges, rig: CameraRig, markers: MarkerMap) -> ViewOutcomes:
     draws = jax.random.uniform(key, (7,))
 
     def between(index: int, ends: tuple[float, float]) -> Array:
         return ends[0] + (ends[1] - ends[0]) * draws[index]
 
-    view = View(
+    view = MarkerView(
         range_m=FOCAL_PX * SIZE_M / between(0, views.side_px),
         bearing_rad=between(1, views.bearing_rad),
         elevation_rad=between(2, views.elevation_rad),
@@ -91,7 +91,7 @@ def _frame(key: Array, views: Views, rig: CameraRig, markers: MarkerMap) -> Fram
         roll_rad=between(5, (0.0, 2 * np.pi)),
     )
     noise_px, zero = between(6, views.noise_px), jnp.zeros_like(draws[0])
-    obs, T_world_vehicle = observe(
+    obs, T_world_vehicle = simulate_observation(
         view, CornerErrors(noise_px, zero, zero), rig, markers, jax.random.fold_in(key, 0)
     )
     obs = eqx.tree_at(lambda o: o.visible, obs, jnp.ones_like(obs.visible))
@@ -100,4 +100,6 @@ def _frame(key: Array, views: Views, rig: CameraRig, markers: MarkerMap) -> Fram
     nothing_known = ConstantVelocity().poses(ConstantVelocity().init())
     selection = LowestReprojection()(nothing_known, candidates, snapshot)
     branch = judge_branch(candidates, selection.selected, T_world_vehicle)
-    return Frames(selection.flip_probability, branch.wrong, branch.ambiguous & ~branch.outlier)
+    return ViewOutcomes(
+        selection.flip_probability, branch.wrong, branch.ambiguous & ~branch.outlier
+    )

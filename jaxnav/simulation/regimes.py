@@ -12,9 +12,9 @@ import jax.numpy as jnp
 
 from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.motion import followed_by, leading, survivors_first
+from jaxnav.belief.motion import fill_slots, first_hypotheses, survivors_first
 from jaxnav.navigator import Navigator, Step
-from jaxnav.pose.consistency import Consistent, Kept, among_all
+from jaxnav.pose.consistency import ConsistentSnapshot, Inliers, find_inliers
 from jaxnav.pose.observation import Observation
 
 # Sizes, in slots, of the banks compiled beside the whole one: nine frames of ten need a single
@@ -30,26 +30,26 @@ def step_by_regime(navigator: Navigator) -> Step:
 
 
 class _ByRegime(Navigator):
-    def look(self, obs: Observation) -> Consistent:
+    def look(self, obs: Observation) -> ConsistentSnapshot:
         # Nearly all lanes see a marker: sorting out those that don't costs more than it saves.
         snapshot = self.snapshot(obs)
         slots = snapshot.seen.visible.shape[0]
         if slots == 1:
-            return among_all(snapshot, self.find_candidates).of(snapshot)
+            return find_inliers(snapshot, self.find_candidates).apply_to(snapshot)
 
-        def one() -> Kept:
-            kept = among_all(snapshot.largest(1), self.find_candidates)
+        def one() -> Inliers:
+            kept = find_inliers(snapshot.largest(1), self.find_candidates)
             visible = jnp.zeros(slots, bool).at[0].set(kept.visible[0])
             count = min(self.max_candidates, 2 * slots)
-            return Kept(visible, kept.candidates.padded(count), kept.outvoted)
+            return Inliers(visible, kept.candidates.padded(count), kept.outvoted)
 
         any_further = jnp.any(snapshot.seen.visible[1:])
-        kept: Kept = jax.lax.cond(
-            any_further, lambda: among_all(snapshot, self.find_candidates), one
+        kept: Inliers = jax.lax.cond(
+            any_further, lambda: find_inliers(snapshot, self.find_candidates), one
         )
-        return kept.of(snapshot)
+        return kept.apply_to(snapshot)
 
-    def fuse(self, belief: Belief, seen: Consistent) -> tuple[Belief, Estimate]:
+    def fuse(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Estimate]:
         bank, count = belief.bank, belief.bank.initialised.shape[0]
         if count == 1 or not isinstance(self.selector, MultiHypothesis):
             return super().fuse(belief, seen)
@@ -57,11 +57,11 @@ class _ByRegime(Navigator):
 
         def within(size: int, sees: bool) -> Callable[[Belief], tuple[Belief, Estimate]]:
             def fuse(belief: Belief) -> tuple[Belief, Estimate]:
-                few = dataclasses.replace(belief, bank=leading(belief.bank, size))
+                few = dataclasses.replace(belief, bank=first_hypotheses(belief.bank, size))
                 predicted = self.predict(few, seen.snapshot.obs)
                 after, evidence = self.correct(predicted, seen) if sees else self.coast(predicted)
                 estimate = Estimate.of(self.motion, after, evidence)
-                whole = followed_by(survivors_first(after.bank), empty)
+                whole = fill_slots(survivors_first(after.bank), empty)
                 return dataclasses.replace(after, bank=whole), estimate
 
             return fuse

@@ -18,7 +18,7 @@ from jaxnav.simulation.background import render_background
 from jaxnav.simulation.prints import Print, prints_of, render_print
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor, Shutter
-from jaxnav.simulation.viewing import Lens, Motion, View
+from jaxnav.simulation.viewing import MovingCamera, PixelRays, PosePath
 
 PoseAt = Callable[[np.ndarray], np.ndarray]  # times_s (N,) -> T_world_vehicle (N, 7), wxyz_xyz
 
@@ -56,7 +56,9 @@ class Renderer:
         self.shutter = Shutter() if shutter is None else shutter
         self.sensor = Sensor() if sensor is None else sensor
         self._threads = max(1, min(len(rig), threads or len(rig)))
-        self._lenses = [Lens.create(rig.camera(i), *rig.image_sizes_px[i]) for i in range(len(rig))]
+        self._lenses = [
+            PixelRays.create(rig.camera(i), *rig.image_sizes_px[i]) for i in range(len(rig))
+        ]
         self._Ts_vehicle_camera = np.linalg.inv(
             np.asarray(rig.Ts_camera_vehicle.as_matrix(), float)
         )
@@ -102,7 +104,7 @@ class Renderer:
         with ThreadPoolExecutor(self._threads) as pool:
             return list(pool.map(task, indices))
 
-    def _poses_around(self, T_world_vehicle_at: PoseAt, stamp_s: float) -> Motion:
+    def _poses_around(self, T_world_vehicle_at: PoseAt, stamp_s: float) -> PosePath:
         rows = max(lens.rows for lens in self._lenses)
         half_s = (rows - 1) / 2 * self.shutter.row_time_s + self.shutter.exposure_s / 2
         count = _POSES if half_s > 0 else 1
@@ -115,15 +117,15 @@ class Renderer:
                     f"must return finite poses of shape ({count}, 7) for {count} times, "
                     f"got shape {wxyz_xyz.shape}",
                 )
-            motion = Motion.create(times_s, wxyz_xyz)
+            motion = PosePath.create(times_s, wxyz_xyz)
             steps = motion.rotation_steps_rad
             if not len(steps) or steps.max() <= _MAX_ROTATION_RAD or count > 4096:
                 return motion
             count = 2 * count - 1
 
-    def _one_camera(self, index: int, motion: Motion) -> np.ndarray:
+    def _one_camera(self, index: int, motion: PosePath) -> np.ndarray:
         lens = self._lenses[index]
-        view = View(lens, motion, self._Ts_vehicle_camera[index], self.shutter)
+        view = MovingCamera(lens, motion, self._Ts_vehicle_camera[index], self.shutter)
         image = render_background(self.scene, view)
         # Farthest first, in case papers overlap.
         _, position = view.pose_at(np.zeros(1))

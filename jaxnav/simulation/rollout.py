@@ -24,13 +24,13 @@ from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.observation import Observation
 from jaxnav.simulation.corners import see
 from jaxnav.simulation.drive import PASSED_M
-from jaxnav.simulation.kept import Kept
 from jaxnav.simulation.plant import CarState, move_through, read_odometry
 from jaxnav.simulation.queue import run_lanes
 from jaxnav.simulation.regimes import step_by_regime
 from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.single_frames import directions
-from jaxnav.simulation.world import Spread, World, nominal
+from jaxnav.simulation.traces import DriveTraces
+from jaxnav.simulation.world import DriveState, Spread, nominal
 
 _jit = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
 _SUBSTEPS = 4  # for each of the two parts of a frame period
@@ -52,10 +52,10 @@ class Trace(eqx.Module):
     done: Bool[Array, "*S"]  # in the navigator's belief
 
 
-Keep = Callable[[World, World], Any]  # (world before a frame, world after it) -> record
+Keep = Callable[[DriveState, DriveState], Any]  # (world before a frame, world after it) -> record
 
 
-def nothing(before: World, after: World) -> None:
+def nothing(before: DriveState, after: DriveState) -> None:
     """Keep no record of a frame."""
 
 
@@ -110,23 +110,23 @@ class Rollout(eqx.Module):
             lambda worlds: advance(worlds, keep),
             lanes,
             threads,
-            Kept(len(keys), self.chunk_frames),
+            DriveTraces(len(keys), self.chunk_frames),
             progress,
         )
-        (trace, further), own = kept.side_by_side()
+        (trace, further), own = kept.stack()
         return eqx.tree_at(lambda t: t.active, trace, trace.active & own), further
 
     @eqx.filter_jit
-    def _start(self, keys: Key[Array, " lanes"]) -> World:
+    def _start(self, keys: Key[Array, " lanes"]) -> DriveState:
         worlds = jax.vmap(self.first)(keys)
         # Strong types, as `_advance` returns them, or it would be compiled twice.
         return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), worlds)
 
     @eqx.filter_jit
-    def _advance(self, worlds: World, keep: Keep) -> tuple[World, tuple[Trace, Any]]:
+    def _advance(self, worlds: DriveState, keep: Keep) -> tuple[DriveState, tuple[Trace, Any]]:
         """Advance every lane by `chunk_frames`, under `vmap`."""
         step = self.navigator.step
-        advanced: tuple[World, tuple[Trace, Any]] = jax.vmap(
+        advanced: tuple[DriveState, tuple[Trace, Any]] = jax.vmap(
             lambda world: jax.lax.scan(
                 lambda w, _: self._kept(w, step, keep), world, length=self.chunk_frames
             )
@@ -134,7 +134,7 @@ class Rollout(eqx.Module):
         return advanced
 
     @_jit(compiler_options=COMPILER_OPTIONS)
-    def _advance_many(self, worlds: World, keep: Keep) -> tuple[World, tuple[Trace, Any]]:
+    def _advance_many(self, worlds: DriveState, keep: Keep) -> tuple[DriveState, tuple[Trace, Any]]:
         """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
         step = step_by_regime(self.navigator)
         frame = over_lanes(lambda world: self._kept(world, step, keep))
@@ -143,11 +143,13 @@ class Rollout(eqx.Module):
         )
         return lanes_first(worlds), lanes_first(kept)
 
-    def _kept(self, world: World, step: Step, keep: Keep) -> tuple[World, tuple[Trace, Any]]:
+    def _kept(
+        self, world: DriveState, step: Step, keep: Keep
+    ) -> tuple[DriveState, tuple[Trace, Any]]:
         after, trace = self.frame(world, step)
         return after, (trace, keep(world, after))
 
-    def first(self, key: Array) -> World:
+    def first(self, key: Array) -> DriveState:
         """The world of a drive before its first frame."""
         scenario = self.scenario
         key, start_key, rig_key = jax.random.split(key, 3)
@@ -163,7 +165,7 @@ class Rollout(eqx.Module):
         if self.spread is not None:
             truth_key = jax.random.fold_in(rig_key, 2)
             truth = self.spread.draw(truth_key, truth, scenario.frame_period_s)
-        return World(
+        return DriveState(
             key=key,
             rig=scenario.true_rig(self.navigator.rig, rig_key),
             truth=truth,
@@ -179,7 +181,7 @@ class Rollout(eqx.Module):
             on_floor=jnp.asarray(True),
         )
 
-    def frame(self, world: World, step: Step) -> tuple[World, Trace]:
+    def frame(self, world: DriveState, step: Step) -> tuple[DriveState, Trace]:
         """Move for a frame period, the last command acting after its latency; then observe."""
         scenario = self.scenario
         dtype = world.car.pose.dtype
@@ -258,7 +260,7 @@ class Rollout(eqx.Module):
             on_floor=on_floor,
         ), trace
 
-    def _moved(self, world: World, period_s: Array) -> CarState:
+    def _moved(self, world: DriveState, period_s: Array) -> CarState:
         """The car one period later: a command acts `latency_s` after the frame it came from."""
         car, latency_s = world.car, world.truth.latency_s
         for command, dt_s in ((world.acting, latency_s), (world.command, period_s - latency_s)):

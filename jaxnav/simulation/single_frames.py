@@ -17,7 +17,7 @@ from jaxnav.simulation.corners import see
 IMAGE_PX = 2048  # side of a pinhole camera's image
 
 
-class View(eqx.Module):
+class MarkerView(eqx.Module):
     """The pose of one marker seen from the vehicle; scalars, or leading axes throughout."""
 
     range_m: Float[Array, "*F"]  # from the cameras' mean position to the marker's centre
@@ -65,7 +65,7 @@ def marker_as_world(size_m: Float[Array, ""] | float) -> MarkerMap:
     return MarkerMap(jaxlie.SE3(identity.wxyz_xyz[None]), jnp.asarray([size_m]), (0,), ("",))
 
 
-def T_vehicle_world_of(view: View, rig: CameraRig) -> jaxlie.SE3:
+def T_vehicle_world_of(view: MarkerView, rig: CameraRig) -> jaxlie.SE3:
     """The pose of the marker, whose frame is the world frame, in one view (no batch axis)."""
     cos_up, sin_up = jnp.cos(view.elevation_rad), jnp.sin(view.elevation_rad)
     sight = jnp.stack(
@@ -88,8 +88,8 @@ def T_vehicle_world_of(view: View, rig: CameraRig) -> jaxlie.SE3:
     )
 
 
-def observe(
-    view: View, errors: CornerErrors, rig: CameraRig, markers: MarkerMap, key: Array
+def simulate_observation(
+    view: MarkerView, errors: CornerErrors, rig: CameraRig, markers: MarkerMap, key: Array
 ) -> tuple[Observation, jaxlie.SE3]:
     """The observation of the marker, and T_world_vehicle, of one view (no batch axis)."""
     T_world_vehicle = T_vehicle_world_of(view, rig).inverse()

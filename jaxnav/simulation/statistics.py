@@ -51,7 +51,7 @@ class Reliability:
         return float(np.sum(self.counts * gaps) / np.sum(self.counts))
 
 
-def resampled(
+def bootstrap_mean(
     sums: np.ndarray, counts: np.ndarray, draws: int = 1000
 ) -> tuple[float, float, float]:
     """The mean over the frames of all drives, and its 95 % interval by bootstrap over drives.

@@ -24,7 +24,7 @@ BACKGROUND_PX = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8
 
 
 @dataclass(frozen=True)
-class Lens:
+class PixelRays:
     """The rays of one camera, in layouts that suit products over a row of pixels."""
 
     rows: int
@@ -49,7 +49,7 @@ class Lens:
         return np.minimum(np.arange(0, self.columns + CELL_PX, CELL_PX), self.columns - 1)
 
     @staticmethod
-    def create(camera: Camera, columns: int, rows: int) -> "Lens":
+    def create(camera: Camera, columns: int, rows: int) -> "PixelRays":
         """Invert the lens of one camera for every pixel.
 
         Raises:
@@ -75,7 +75,7 @@ class Lens:
         def pack(array: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(array, np.float32)
 
-        return Lens(
+        return PixelRays(
             rows=rows,
             columns=columns,
             rays=pack(centre),
@@ -102,7 +102,7 @@ def _unproject_rows(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.A
 
 
 @dataclass(frozen=True)
-class Motion:
+class PosePath:
     """The poses of the vehicle at a few instants, with linear interpolation between them."""
 
     times_s: np.ndarray  # (N,) relative to the stamp
@@ -110,13 +110,13 @@ class Motion:
     positions_world_m: np.ndarray  # (N, 3)
 
     @staticmethod
-    def create(times_s: np.ndarray, wxyz_xyz: np.ndarray) -> "Motion":
+    def create(times_s: np.ndarray, wxyz_xyz: np.ndarray) -> "PosePath":
         """The motion of T_world_vehicle (N, 7), w x y z, x y z, at evenly spaced times."""
         wxyz = wxyz_xyz[:, :4] / np.linalg.norm(wxyz_xyz[:, :4], axis=1, keepdims=True)
         w, v = wxyz[:, 0, None, None], wxyz[:, 1:]
         cross = np.cross(v[:, None, :], np.eye(3)).swapaxes(1, 2)
         R = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-        return Motion(times_s, R, wxyz_xyz[:, 4:])
+        return PosePath(times_s, R, wxyz_xyz[:, 4:])
 
     @property
     def rotation_steps_rad(self) -> np.ndarray:
@@ -148,10 +148,12 @@ class Motion:
         )
 
 
-class View:
+class MovingCamera:
     """One camera during one image: its motion, and the speed of its picture."""
 
-    def __init__(self, lens: Lens, motion: Motion, T_vehicle_camera: np.ndarray, shutter: Shutter):
+    def __init__(
+        self, lens: PixelRays, motion: PosePath, T_vehicle_camera: np.ndarray, shutter: Shutter
+    ):
         self.lens, self._motion, self._T_vehicle_camera = lens, motion, T_vehicle_camera
         self.exposure_s = shutter.exposure_s
         self.row_times_s = shutter.row_times_s(lens.rows)

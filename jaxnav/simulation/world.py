@@ -63,7 +63,7 @@ class Spread:
         return Truth(vehicle, truth.odometer_scale * scale, latency_s)
 
 
-class World(eqx.Module):
+class DriveState(eqx.Module):
     """The quantities that one seed drew, and the state of its drive."""
 
     key: Array

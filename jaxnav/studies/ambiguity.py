@@ -25,10 +25,10 @@ from jaxnav.pose.candidates import Candidates, find_candidates
 from jaxnav.pose.observation import Snapshot
 from jaxnav.simulation.single_frames import (
     CornerErrors,
-    View,
+    MarkerView,
     marker_as_world,
-    observe,
     pinhole_rig,
+    simulate_observation,
 )
 from jaxnav.studies.config import Config
 from jaxnav.studies.lanes import in_precision, run_lanes
@@ -195,7 +195,9 @@ def _frame(
     rig = rig.with_focal_px(value["focal_px"])
     markers = marker_as_world(value["marker_size_m"])
     errors = CornerErrors(value["corner_noise_px"], value["corner_bias_px"], value["blur_px"])
-    obs, T_world_vehicle = observe(_view(value, view_key), errors, rig, markers, corner_key)
+    obs, T_world_vehicle = simulate_observation(
+        _view(value, view_key), errors, rig, markers, corner_key
+    )
     snapshot = Snapshot.create(rig, markers, obs, value["told_noise_px"])
     candidates = find_candidates(snapshot, max_steps=max_steps)
 
@@ -220,14 +222,14 @@ def _frame(
     }
 
 
-def _view(value: Mapping[str, Array], key: Array) -> View:
+def _view(value: Mapping[str, Array], key: Array) -> MarkerView:
     """The view of a trial, with its random angles drawn."""
     turns = jax.random.uniform(key, (3,), value["range_m"].dtype, -jnp.pi, jnp.pi)
     azimuth, roll, bearing = (
         jnp.where(jnp.isnan(value[name]), turn, jnp.deg2rad(value[name]))
         for name, turn in zip(("azimuth_deg", "roll_deg", "bearing_deg"), turns, strict=True)
     )
-    return View(
+    return MarkerView(
         range_m=value["range_m"],
         bearing_rad=bearing,
         elevation_rad=jnp.deg2rad(value["elevation_deg"]),

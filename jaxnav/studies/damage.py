@@ -11,7 +11,7 @@ import xarray as xr
 
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
-from jaxnav.studies.layout import Layout
+from jaxnav.studies.layout import BoxLayout
 from jaxnav.studies.study import Grid
 
 _LONGEST = 200  # characters kept of a library's message on broken bytes; it may quote them all
@@ -51,7 +51,7 @@ def check_sizes(path: Path, arrays: Mapping[str, Any]) -> None:
             raise BadInput(f"{path}: {name}", f"is too large: {array.shape} by {array.chunks}")
 
 
-def layout_of(path: Path, attributes: Mapping[str, Any], counts: tuple[int, ...]) -> Layout:
+def layout_of(path: Path, attributes: Mapping[str, Any], counts: tuple[int, ...]) -> BoxLayout:
     """The layout that a store declares.
 
     Args:
@@ -69,14 +69,14 @@ def layout_of(path: Path, attributes: Mapping[str, Any], counts: tuple[int, ...]
             problem = f"must be {len(counts)} whole numbers above 0, got {given!r}"
             raise BadInput(f"{path}: done.{key}", problem)
         sizes[key] = tuple(given)
-    layout = Layout(**sizes)
+    layout = BoxLayout(**sizes)
     if layout.counts != counts:
         problem = f"does not fit its attributes, which make {layout.counts}: it has {counts}"
         raise BadInput(f"{path}: done", problem)
     return layout
 
 
-def check_layout(path: Path, layout: Layout, grid: Grid) -> None:
+def check_layout(path: Path, layout: BoxLayout, grid: Grid) -> None:
     """Check that a store's layout fits the grid of its config.
 
     Raises:

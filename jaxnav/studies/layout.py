@@ -8,20 +8,20 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Layout:
+class BoxLayout:
     """A grid of cells and trials cut into boxes of one size; those at the ends may be smaller."""
 
     shape: tuple[int, ...]  # of the outer axes, then the trials
     box: tuple[int, ...]
 
     @staticmethod
-    def of(shape: Sequence[int], most: int) -> "Layout":
+    def of(shape: Sequence[int], most: int) -> "BoxLayout":
         """A layout of boxes of at most `most` trials: first one cell's, then its neighbours'."""
         room, box = max(most, 1), []
         for length in reversed(shape):
             box.append(min(length, max(room, 1)))
             room //= box[-1]
-        return Layout(tuple(shape), tuple(reversed(box)))
+        return BoxLayout(tuple(shape), tuple(reversed(box)))
 
     @property
     def counts(self) -> tuple[int, ...]:

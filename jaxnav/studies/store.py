@@ -25,7 +25,7 @@ from zarr.errors import ZarrUserWarning
 from jaxnav.errors import BadInput
 from jaxnav.studies.config import difference
 from jaxnav.studies.damage import check_layout, check_sizes, layout_of, reading
-from jaxnav.studies.layout import Layout
+from jaxnav.studies.layout import BoxLayout
 from jaxnav.studies.study import Study, Variable
 
 _DONE = "done"
@@ -150,7 +150,7 @@ def read_dataset(path: Path) -> xr.Dataset:
         return whole.drop_vars(_DONE)
 
 
-def read_layout(path: Path) -> Layout:
+def read_layout(path: Path) -> BoxLayout:
     """The layout of a store.
 
     Raises:
@@ -196,7 +196,7 @@ def _create(path: Path, study: Study, most: int) -> None:
     """Create a new store, whole or not at all."""
     config = study.config
     axes = study.grid.outer_axes
-    layout = Layout.of([*map(len, axes.values()), config.trials], most)
+    layout = BoxLayout.of([*map(len, axes.values()), config.trials], most)
     beside = path.with_name(_unfinished(path) + secrets.token_hex(4))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -256,7 +256,9 @@ def _coordinate(
     array.attrs.update({"units": unit or "1", "long_name": description})
 
 
-def _empty(group: zarr.Group, name: str, variable: Variable, study: Study, layout: Layout) -> None:
+def _empty(
+    group: zarr.Group, name: str, variable: Variable, study: Study, layout: BoxLayout
+) -> None:
     dimensions = study.grid.dimensions(variable)
     places = dict(zip((*study.grid.outer_axes, "trial"), range(len(layout.shape)), strict=True))
     shape, box = [], []

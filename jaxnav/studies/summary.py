@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from jaxnav.simulation.statistics import wilson_interval
-from jaxnav.studies.layout import Layout
+from jaxnav.studies.layout import BoxLayout
 from jaxnav.studies.study import Grid, Variable
 
 SHARES = {"median": 0.5, "p95": 0.95}
@@ -22,7 +22,7 @@ Blocks = Callable[[], Iterator[np.ndarray]]  # float32 (cells, trials), NaN wher
 def summarise(
     trials: xr.Dataset,
     grid: Grid,
-    layout: Layout,
+    layout: BoxLayout,
     progress: Callable[[int], object] = lambda done: None,
 ) -> xr.Dataset:
     """All measures of every cell. A cell without trials has counts of zero and no numbers.
@@ -78,7 +78,7 @@ def _measures(name: str, variable: Variable) -> dict[str, tuple[dict[str, Any], 
 
 
 def _summed(
-    trials: xr.Dataset, grid: Grid, layout: Layout, name: str, index: tuple[slice, ...]
+    trials: xr.Dataset, grid: Grid, layout: BoxLayout, name: str, index: tuple[slice, ...]
 ) -> dict[str, np.ndarray]:
     """The measures of one variable in one box of cells."""
     variable = grid.schema.variables[name]
@@ -175,7 +175,7 @@ class _Reliability:
         selectors = len(grid.config.axes["selector"]) if self._by_selector else 1
         self._sums = np.zeros((3, selectors, RELIABILITY_BINS))  # count, predicted, happened
 
-    def add(self, layout: Layout, region: tuple[slice, ...]) -> None:
+    def add(self, layout: BoxLayout, region: tuple[slice, ...]) -> None:
         """Add one box of cells."""
         if self._schema.predicted is None:
             return
@@ -213,7 +213,7 @@ class _Reliability:
         return xr.Dataset({f"reliability_{n}": (dims, values) for n, values in columns.items()})
 
 
-def _spans(layout: Layout) -> list[slice]:
+def _spans(layout: BoxLayout) -> list[slice]:
     """The trials, as slices, of every box of a cell."""
     first_cell = (0,) * (len(layout.shape) - 1)
     return [layout.region((*first_cell, t))[-1] for t in range(layout.counts[-1])]

@@ -63,7 +63,7 @@ class Worker:
                 future.set_exception(error)
 
 
-def started(function: Callable[[], Any]) -> Finish:
+def start_call(function: Callable[[], Any]) -> Finish:
     """Begin a call in a thread of its own; see `Worker.begin`."""
     worker = Worker()
     finish = worker.begin(function)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxnav.detection.types import Detections
 from jaxnav.loop.interfaces import Camera, Frame, Odometry, OpenCameras, Setup, Vehicle
 from jaxnav.loop.plugins import missing_members
-from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, started
+from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, start_call
 
 _PATIENCE_S = 3.0  # time within which the first frames must come
 _FRAMES = 5
@@ -40,7 +40,7 @@ def check_cameras(factory: OpenCameras, setup: Setup, vehicle: Vehicle | None = 
             f"the cameras are {', '.join(names)}, those of the rig {', '.join(setup.rig.names)}"
         )
         looks = [
-            started(partial(_check_camera, camera, size_px))
+            start_call(partial(_check_camera, camera, size_px))
             for camera, size_px in zip(cameras, setup.rig.image_sizes_px, strict=True)
         ]
         for name, look in zip(names, looks, strict=True):
@@ -48,7 +48,7 @@ def check_cameras(factory: OpenCameras, setup: Setup, vehicle: Vehicle | None = 
     finally:
         for camera in cameras:
             with contextlib.suppress(Exception):  # an error here would hide the one found
-                started(camera.close)("close()", HANGS_S)
+                start_call(camera.close)("close()", HANGS_S)
 
 
 class Parked:
@@ -153,9 +153,9 @@ def _check_closing(camera: Any, reader: Worker) -> None:
     reading = reader.begin(read_on)
     time.sleep(0.02)
     try:
-        started(camera.close)(f"close() of the camera {camera.name}", HANGS_S)
+        start_call(camera.close)(f"close() of the camera {camera.name}", HANGS_S)
     finally:
         closed.set()
     reading(f"a read() of the camera {camera.name} that waits while close() is called", 1.0)
-    started(camera.close)(f"a second close() of the camera {camera.name}", HANGS_S)
+    start_call(camera.close)(f"a second close() of the camera {camera.name}", HANGS_S)
     _read_in_time(camera, reader, 0.0)

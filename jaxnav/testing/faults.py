@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.compiling.step import bare
+from jaxnav.compiling.step import strip_static
 from jaxnav.files.markers import MarkerFile, marker_data
 from jaxnav.files.vehicles import Route
 from jaxnav.loop.camera_delays import CameraDelays
@@ -31,7 +31,7 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
 from jaxnav.testing.injections import between
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates, Step, drive
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 
 BEGIN_S, END_S = 2.5, 4.0  # of most faults
 ALL_CAMERAS = range(4)  # of the trial's rig
@@ -42,7 +42,7 @@ WAYPOINTS_M = (
 )  # fmt: skip
 _RADIUS_M = 0.15
 
-Happens = Callable[[int, World], None]
+Happens = Callable[[int, SimWorld], None]
 
 
 def lasting(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
@@ -59,7 +59,7 @@ def _nothing_happens() -> Happens:
 
 
 @dataclass(frozen=True)
-class Row:
+class FaultRow:
     """One fault, and the requirements on a drive with it.
 
     Attributes:
@@ -72,7 +72,7 @@ class Row:
         error_after_m: largest error after that.
         begins_s, ends_s: of the fault; inf: it lasts.
         drive_s: duration of the whole drive.
-        telling: how the navigator's rig differs from the true one, see `told_rig`.
+        telling: how the navigator's rig differs from the true one, see `navigator_rig`.
         markers: makes the drive's markers from the trial's.
         relocate: see `Pilot`.
         well: the worst health at which the car has recovered.
@@ -103,7 +103,7 @@ class Row:
 class Result:
     """The result of a drive with a fault."""
 
-    row: Row
+    row: FaultRow
     faults: Fault
     rejects: Reject
     worst: Health
@@ -126,20 +126,20 @@ class Trial:
     program: Callable[[Navigator], Program] | None = None  # see `Pilot`; by default by `jax.jit`
 
 
-def run_trial(row: Row, trial: Trial) -> Result:
+def run_trial(row: FaultRow, trial: Trial) -> Result:
     """Drive with a row's fault, and judge the drive."""
     trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
-    markers, route = written_down(trial, row.shift_m)
+    markers, route = shift_origin(trial, row.shift_m)
     navigator = Navigator(
-        rig=told_rig(trial.rig, row.telling),
+        rig=navigator_rig(trial.rig, row.telling),
         markers=markers,
         vehicle=trial.vehicle,
         waypoints_m=route.waypoints_m,
         waypoint_radius_m=route.waypoint_radius_m,
     )
-    program = trial.program and trial.program(bare(navigator))
+    program = trial.program and trial.program(strip_static(navigator))
     pilot = Pilot(navigator, program=program, relocate=row.relocate)
-    world = World(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
+    world = SimWorld(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
     delays = None
     if Fault.CAMERA_LATE in row.faults:
         delays = CameraDelays(navigator.rig, markers, trial.vehicle)
@@ -147,7 +147,7 @@ def run_trial(row: Row, trial: Trial) -> Result:
     return judge(row, steps, pilot)
 
 
-def written_down(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
+def shift_origin(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
     """The map and route of a drive whose files have a shifted origin.
 
     The trial's own coordinates count from the origin of its map.
@@ -162,7 +162,7 @@ def written_down(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
     return markers, Route(waypoints_m, _RADIUS_M, start_pose).relative_to(markers.origin_m)
 
 
-def told_rig(rig: CameraRig, telling: str) -> CameraRig:
+def navigator_rig(rig: CameraRig, telling: str) -> CameraRig:
     """The rig that the navigator gets: the true calibration, or a wrong one."""
     Ts = rig.Ts_camera_vehicle
     if telling == "focal":
@@ -179,7 +179,7 @@ def told_rig(rig: CameraRig, telling: str) -> CameraRig:
     return rig
 
 
-def judge(row: Row, steps: list[Step], pilot: Pilot) -> Result:
+def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
     """Compare a drive with the requirements of its row."""
     times_s = np.array([(step.input.now_ns - BEGIN_NS) / 1e9 for step in steps])
     outcomes = [step.outcome for step in steps]

@@ -8,11 +8,11 @@ import numpy as np
 
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Input
 
-EditFrame = Callable[[Sighted], Sighted | None]  # None: the frame is lost
+EditFrame = Callable[[FrameDetections], FrameDetections | None]  # None: the frame is lost
 EditOdometry = Callable[[Odometry], Odometry | None]
 
 
@@ -69,12 +69,12 @@ def stamps(edit: Callable[[int], int]) -> EditFrame:
     return lambda frame: dataclasses.replace(frame, stamp_ns=edit(frame.stamp_ns))
 
 
-def nothing_seen(frame: Sighted) -> Sighted:
+def nothing_seen(frame: FrameDetections) -> FrameDetections:
     """Make a frame show no marker: a tunnel, a black or a white image."""
     return dataclasses.replace(frame, detections=Detections.concatenate([]))
 
 
-def unusable(frame: Sighted) -> Sighted:
+def unusable(frame: FrameDetections) -> FrameDetections:
     """Make a frame unusable: no image, or one of a wrong size."""
     return dataclasses.replace(frame, detections=None, faults=Fault.FRAME_UNUSABLE)
 
@@ -123,7 +123,7 @@ def frozen(cameras: Iterable[int], jitter_px: float, seed: int = 0) -> EditFrame
     kept: dict[int, Detections] = {}
     of, rng = set(cameras), np.random.default_rng(seed)
 
-    def edit(frame: Sighted) -> Sighted:
+    def edit(frame: FrameDetections) -> FrameDetections:
         if frame.camera not in of:
             return frame
         if frame.detections is not None:

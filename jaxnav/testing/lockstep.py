@@ -12,10 +12,10 @@ import numpy as np
 
 from jaxnav.loop.camera_delays import CameraDelays
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome, Pilot
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 
 BEGIN_NS = 1_000_000_000
 
@@ -45,11 +45,11 @@ Change = Callable[[Input], list[Input]]
 
 def drive(
     pilot: Pilot,
-    world: World,
+    world: SimWorld,
     duration_s: float,
     change: Change = lambda given: [given],
     rates: Rates | None = None,
-    happens: Callable[[int, World], None] = lambda now_ns, world: None,
+    happens: Callable[[int, SimWorld], None] = lambda now_ns, world: None,
     delays: CameraDelays | None = None,
 ) -> Iterator[Step]:
     """Drive event by event until the time is over.
@@ -77,7 +77,7 @@ def drive(
             given = dataclasses.replace(given, faults=given.faults | Fault.CAMERA_LATE)
         outcome = pilot.handle(given)
         if delays is not None:
-            delays.take(outcome)
+            delays.add_outcome(outcome)
             while delays.due:
                 delays.solve()
         world.write(outcome.steering_rad, outcome.throttle, given.now_ns)
@@ -85,7 +85,7 @@ def drive(
 
 
 def _inputs(
-    world: World, rates: Rates, end_ns: int, happens: Callable[[int, World], None]
+    world: SimWorld, rates: Rates, end_ns: int, happens: Callable[[int, SimWorld], None]
 ) -> Iterator[tuple[int, Callable[[], Input]]]:
     """Yield the time of each input and the function that makes it, in order of time."""
     odometry_ns = int(rates.odometry_period_s * 1e9)
@@ -109,7 +109,7 @@ def _inputs(
             stamp_ns = now_ns - delay_ns
             found = world.detections(stamp_ns)
             return Input(
-                now_ns, frames=tuple(Sighted(c, stamp_ns, found[c]) for c in groups[number])
+                now_ns, frames=tuple(FrameDetections(c, stamp_ns, found[c]) for c in groups[number])
             )
 
         yield now_ns, made

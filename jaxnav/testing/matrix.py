@@ -14,20 +14,20 @@ from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.models.markers import MarkerMap
 from jaxnav.testing import injections as inject
-from jaxnav.testing.faults import ALL_CAMERAS, BEGIN_S, Happens, Row, lasting
+from jaxnav.testing.faults import ALL_CAMERAS, BEGIN_S, FaultRow, Happens, lasting
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates
 from jaxnav.testing.matrix_standstill import rates, standstill
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 
 _LATEST = np.inf  # to the end of the drive
 _SLOW = Health.DEGRADED
 _BLIND_S = (0.2, 1.0, 5.0, 20.0)
 
 
-def matrix() -> list[Row]:
+def matrix() -> list[FaultRow]:
     """All rows of the matrix."""
     return [
-        Row("none"),
+        FaultRow("none"),
         *_cameras(),
         *_frames(),
         *_markers(),
@@ -46,9 +46,9 @@ def matrix() -> list[Row]:
     ]
 
 
-def _cameras() -> list[Row]:
+def _cameras() -> list[FaultRow]:
     rows = [
-        Row(
+        FaultRow(
             f"camera {camera} out",
             lasting(partial(_frames_of, camera)),
             faults=Fault.CAMERA_STALE,
@@ -65,7 +65,7 @@ def _cameras() -> list[Row]:
         ):
             stale = flag if duration_s > 1 or (duration_s > 0.2 and "all" in name) else Fault(0)
             rows.append(
-                Row(
+                FaultRow(
                     f"{name}, {duration_s:g} s",
                     lasting(partial(inject.frames, edit), BEGIN_S + duration_s),
                     faults=stale,
@@ -91,30 +91,30 @@ def _cost(blind_s: float) -> Health:
     return Health.OK
 
 
-def _frames() -> list[Row]:
+def _frames() -> list[FaultRow]:
     return [
-        Row(
+        FaultRow(
             "None or wrong-size frames",
             lasting(lambda: inject.frames(inject.unusable)),
             faults=Fault.FRAME_UNUSABLE,
             at_most=_SLOW,
             error_m=0.15,
         ),
-        Row(
+        FaultRow(
             "frozen images, new stamps",
             lasting(lambda: inject.frames(inject.frozen(ALL_CAMERAS, 0.0))),
             faults=Fault.FRAME_FROZEN,
             at_most=_SLOW,
             error_m=0.15,
         ),
-        Row(
+        FaultRow(
             "NaN in corners",
             lasting(lambda: inject.frames(inject.corners(lambda c: c * np.nan))),
             faults=Fault.CORNERS_NOT_FINITE,
             at_most=_SLOW,
             error_m=0.15,
         ),
-        Row(
+        FaultRow(
             "inf in corners",
             lasting(lambda: inject.frames(inject.corners(lambda c: c + np.inf))),
             faults=Fault.CORNERS_NOT_FINITE,
@@ -124,7 +124,7 @@ def _frames() -> list[Row]:
     ]
 
 
-def _markers() -> list[Row]:
+def _markers() -> list[FaultRow]:
     def renamed(found: Detections) -> Detections:
         return dataclasses.replace(found, ids=found.ids + 7)
 
@@ -140,32 +140,32 @@ def _markers() -> list[Row]:
         return np.stack([2 * center[..., 0] - c[..., 0], c[..., 1]], axis=-1)[:, [1, 0, 3, 2]]
 
     return [
-        Row(
+        FaultRow(
             "unknown id",
             lasting(lambda: inject.frames(inject.detections(renamed))),
             faults=Fault.UNKNOWN_MARKER,
             at_most=_SLOW,
             error_m=0.15,
         ),
-        Row(
+        FaultRow(
             "two markers of one id",
             lasting(lambda: inject.frames(inject.detections(doubled(60.0)))),
             faults=Fault.DUPLICATE_MARKER,
             at_most=_SLOW,
             error_m=0.15,
         ),
-        Row(
+        FaultRow(
             "duplicate detection",
             lasting(lambda: inject.frames(inject.detections(doubled(0.0)))),
         ),
-        Row(
+        FaultRow(
             "mirrored corners, 5 frames",
             lasting(lambda: inject.frames(inject.corners(mirrored)), BEGIN_S + 0.17),
             at_most=_SLOW,
             error_m=0.10,
             ends_s=BEGIN_S + 0.17,
         ),
-        Row(
+        FaultRow(
             "corners turned by 90 deg, 5 frames",
             lasting(
                 lambda: inject.frames(inject.corners(lambda c: np.roll(c, 1, axis=1))),
@@ -179,7 +179,7 @@ def _markers() -> list[Row]:
     ]
 
 
-def _stamps() -> list[Row]:
+def _stamps() -> list[FaultRow]:
     def shifted(by_s: float) -> Callable[[], Change]:
         return lambda: inject.frames(inject.stamps(lambda ns: ns + int(by_s * 1e9)))
 
@@ -198,15 +198,17 @@ def _stamps() -> list[Row]:
 
     refused: dict[str, Any] = {"faults": Fault.STAMP_INVALID, "at_most": _SLOW, "error_m": 0.15}
     return [
-        Row("stamps jump by +1 s", lasting(shifted(1.0)), **refused),
-        Row("stamps jump by -1 s", lasting(shifted(-1.0)), **refused),
-        Row("frames 50 ms late, each other", lasting(lambda: inject.late(0.05, 2))),
-        Row("frames 500 ms late, each third", lasting(lambda: inject.late(0.5, 3)), at_most=_SLOW),
-        Row("equal stamps", lasting(constant(BEGIN_NS + 1)), **refused),
-        Row("zero stamps", lasting(constant(0)), **refused),
-        Row("negative stamps", lasting(constant(-5)), **refused),
-        Row("clocks that drift by 100 ppm", lambda: both, begins_s=2.0, ends_s=_LATEST),
-        Row(
+        FaultRow("stamps jump by +1 s", lasting(shifted(1.0)), **refused),
+        FaultRow("stamps jump by -1 s", lasting(shifted(-1.0)), **refused),
+        FaultRow("frames 50 ms late, each other", lasting(lambda: inject.late(0.05, 2))),
+        FaultRow(
+            "frames 500 ms late, each third", lasting(lambda: inject.late(0.5, 3)), at_most=_SLOW
+        ),
+        FaultRow("equal stamps", lasting(constant(BEGIN_NS + 1)), **refused),
+        FaultRow("zero stamps", lasting(constant(0)), **refused),
+        FaultRow("negative stamps", lasting(constant(-5)), **refused),
+        FaultRow("clocks that drift by 100 ppm", lambda: both, begins_s=2.0, ends_s=_LATEST),
+        FaultRow(
             "cameras skewed by 30 ms",
             rates=Rates(camera_skew_s=0.03),
             begins_s=2.0,
@@ -215,7 +217,7 @@ def _stamps() -> list[Row]:
     ]
 
 
-def _odometry() -> list[Row]:
+def _odometry() -> list[FaultRow]:
     def scaled(by: float) -> Callable[[], Change]:
         return lambda: inject.odometry(
             lambda reading: dataclasses.replace(reading, speed_mps=by * reading.speed_mps)
@@ -240,23 +242,23 @@ def _odometry() -> list[Row]:
         return dataclasses.replace(reading, valid=False)
 
     return [
-        Row("odometry x10, each fifth", lasting(spikes), rejects=Reject.ODOMETRY),
-        Row(
+        FaultRow("odometry x10, each fifth", lasting(spikes), rejects=Reject.ODOMETRY),
+        FaultRow(
             "odometry of the other sign",
             lasting(scaled(-1.0)),
             rejects=Reject.ODOMETRY,
             at_most=_SLOW,
             error_m=0.08,
         ),
-        Row("odometry 30 % off", lasting(scaled(1.3)), at_most=_SLOW, error_m=0.08),
-        Row(
+        FaultRow("odometry 30 % off", lasting(scaled(1.3)), at_most=_SLOW, error_m=0.08),
+        FaultRow(
             "odometry stuck",
             lasting(lambda: inject.odometry(inject.repeated())),
             faults=Fault.ODOMETRY_STUCK,
             at_most=_SLOW,
             error_m=0.08,
         ),
-        Row(
+        FaultRow(
             "odometry invalid",
             lasting(lambda: inject.odometry(invalid)),
             faults=Fault.ODOMETRY_INVALID,
@@ -264,7 +266,7 @@ def _odometry() -> list[Row]:
             at_most=_SLOW,
             error_m=0.08,
         ),
-        Row(
+        FaultRow(
             "odometry out",
             lasting(lambda: inject.odometry(inject.gone)),
             faults=Fault.ODOMETRY_STALE,
@@ -272,20 +274,20 @@ def _odometry() -> list[Row]:
             at_most=_SLOW,
             error_m=0.08,
         ),
-        Row(
+        FaultRow(
             "odometry wraps around",
             lasting(lambda: inject.odometry(wrapped), BEGIN_S + 0.03),
             rejects=Reject.ODOMETRY,
             ends_s=BEGIN_S + 0.03,
         ),
-        Row(
+        FaultRow(
             "NaN and inf in odometry",
             lasting(lambda: inject.odometry(inject.with_values(inject.NOT_FINITE))),
             faults=Fault.ODOMETRY_INVALID,
             at_most=_SLOW,
             error_m=0.08,
         ),
-        Row(
+        FaultRow(
             "blind and without odometry",
             lasting(lambda: lambda given: [dataclasses.replace(given, odometry=None, frames=())]),
             faults=Fault.CAMERAS_STALE,
@@ -296,22 +298,23 @@ def _odometry() -> list[Row]:
     ]
 
 
-def _calibration() -> list[Row]:
+def _calibration() -> list[FaultRow]:
     lasting: dict[str, Any] = {"begins_s": 2.0, "ends_s": _LATEST, "drive_s": 6.0}
     return [
-        Row("cameras off by 1 deg, 1 cm", telling="extrinsics", error_m=0.15, at_most=_SLOW,
+        FaultRow("cameras off by 1 deg, 1 cm", telling="extrinsics", error_m=0.15, at_most=_SLOW,
             **lasting),
-        Row("focal length off by 2 %", telling="focal", error_m=0.15, at_most=_SLOW, **lasting),
-        Row("cameras swapped", telling="swapped", error_m=np.inf, at_most=Health.STOP,
+        FaultRow("focal length off by 2 %", telling="focal", error_m=0.15, at_most=_SLOW,
+            **lasting),
+        FaultRow("cameras swapped", telling="swapped", error_m=np.inf, at_most=Health.STOP,
             rejects=Reject.INNOVATION, **(lasting | {"drive_s": 12.0})),  # to a side camera's view
     ]  # fmt: skip
 
 
-def _once(act: Callable[[World], None]) -> Callable[[], Happens]:
+def _once(act: Callable[[SimWorld], None]) -> Callable[[], Happens]:
     def made() -> Happens:
         done = False
 
-        def happens(now_ns: int, world: World) -> None:
+        def happens(now_ns: int, world: SimWorld) -> None:
             nonlocal done
             if not done and now_ns >= BEGIN_NS + int(BEGIN_S * 1e9):
                 done = True
@@ -322,9 +325,9 @@ def _once(act: Callable[[World], None]) -> Callable[[], Happens]:
     return made
 
 
-def _world() -> list[Row]:
+def _world() -> list[FaultRow]:
     return [
-        Row(
+        FaultRow(
             "marker moved by 5 cm",
             happens=_once(lambda world: world.move_markers((0.05, 0.0, 0.0))),
             error_m=0.15,
@@ -332,7 +335,7 @@ def _world() -> list[Row]:
             at_most=_SLOW,
             ends_s=BEGIN_S + 0.1,
         ),
-        Row(
+        FaultRow(
             "kidnapped: 1 m, 90 deg",
             happens=_once(lambda world: world.carry_off((-0.7, -0.7, np.pi / 2))),
             faults=Fault.RESTARTED,
@@ -346,11 +349,11 @@ def _world() -> list[Row]:
     ]
 
 
-def _loop() -> list[Row]:
+def _loop() -> list[FaultRow]:
     rows = []
     for stall_s in (0.05, 0.5, 1.5):
         rows.append(
-            Row(
+            FaultRow(
                 f"the loop stalls for {stall_s * 1e3:.0f} ms",
                 partial(inject.stalled, BEGIN_S, stall_s),
                 faults=Fault.CLOCK_JUMPED if stall_s > 1 else Fault(0),
@@ -362,7 +365,7 @@ def _loop() -> list[Row]:
     return rows
 
 
-def _nonsense() -> list[Row]:
+def _nonsense() -> list[FaultRow]:
     def anywhere() -> Change:
         rng = np.random.default_rng(0)
         return inject.frames(inject.corners(lambda c: rng.uniform([0, 0], [820, 410], c.shape)))
@@ -383,14 +386,14 @@ def _nonsense() -> list[Row]:
         "error_m": 0.10,
     }
     return [
-        Row(
+        FaultRow(
             "corners at random places",
             lasting(anywhere),
             rejects=Reject.INNOVATION,
             at_least=_SLOW,
             at_most=_SLOW,
         ),
-        Row(
+        FaultRow(
             "corners at random places from the start",
             anywhere,
             rejects=Reject.INNOVATION,
@@ -398,17 +401,17 @@ def _nonsense() -> list[Row]:
             begins_s=0.0,
             ends_s=_LATEST,
         ),
-        Row("odometry 0 without a marker", lasting(blind(0.0)), **doubted),
-        Row("odometry x3 without a marker", lasting(blind(3.0)), **doubted),
+        FaultRow("odometry 0 without a marker", lasting(blind(0.0)), **doubted),
+        FaultRow("odometry x3 without a marker", lasting(blind(3.0)), **doubted),
     ]
 
 
-def _spoofed() -> list[Row]:
+def _spoofed() -> list[FaultRow]:
     def dragged(by_mps: float) -> Callable[[], Happens]:
         def made() -> Happens:
             last_ns = BEGIN_NS + int(BEGIN_S * 1e9)
 
-            def happens(now_ns: int, world: World) -> None:
+            def happens(now_ns: int, world: SimWorld) -> None:
                 nonlocal last_ns
                 if now_ns > last_ns:
                     world.move_markers((by_mps * (now_ns - last_ns) / 1e9, 0.0, 0.0))
@@ -424,16 +427,16 @@ def _spoofed() -> list[Row]:
     relocated = lasting | {"faults": Fault.RELOCATED, "at_least": _SLOW}
     return [
         # A copy of the only marker can't be told from it: a slow and reported reaction is required.
-        Row("a copy 1 m away instead", happens=moved, error_m=1.1, **relocated),
-        Row("a larger copy instead", happens=larger, error_m=1.1, **relocated),
-        Row(
+        FaultRow("a copy 1 m away instead", happens=moved, error_m=1.1, **relocated),
+        FaultRow("a larger copy instead", happens=larger, error_m=1.1, **relocated),
+        FaultRow(
             "a copy 1 m away instead, not to relocate",
             happens=moved,
             relocate=False,
             error_m=0.10,
             **(relocated | {"at_least": Health.STOP}),
         ),
-        Row(
+        FaultRow(
             "a copy dragged at 0.1 m/s",
             happens=dragged(0.1),
             faults=Fault.WAYS_DISPUTED,
@@ -442,7 +445,7 @@ def _spoofed() -> list[Row]:
             **lasting,
         ),
         # Restart follows restart, and none of them is confirmed: the car stands.
-        Row(
+        FaultRow(
             "a copy dragged at 0.5 m/s",
             happens=dragged(0.5),
             faults=Fault.RESTARTED,
@@ -452,7 +455,7 @@ def _spoofed() -> list[Row]:
     ]
 
 
-def _outvoted() -> list[Row]:
+def _outvoted() -> list[FaultRow]:
     def three(markers: MarkerMap) -> MarkerMap:
         """The marker, with one more on either side."""
         Ts = np.repeat(np.asarray(markers.Ts_world_marker.wxyz_xyz)[:1], 3, axis=0)
@@ -465,7 +468,7 @@ def _outvoted() -> list[Row]:
         )
 
     return [
-        Row(
+        FaultRow(
             "one of three markers moved",
             happens=_once(lambda world: world.move_markers((0.3, 0.0, 0.0), slice(2, 3))),
             markers=three,
@@ -476,20 +479,20 @@ def _outvoted() -> list[Row]:
     ]
 
 
-def _far_origins() -> list[Row]:
+def _far_origins() -> list[FaultRow]:
     """Maps so far away that float32 resolves only 0.5 m or 1 m there; nothing else is wrong."""
     return [
-        Row("map 10 000 km from the origin", shift_m=(1e7, -1e7, 0.0)),
-        Row("map at UTM coordinates", shift_m=(448_251.37, 5_411_932.81, 0.0)),
+        FaultRow("map 10 000 km from the origin", shift_m=(1e7, -1e7, 0.0)),
+        FaultRow("map at UTM coordinates", shift_m=(448_251.37, 5_411_932.81, 0.0)),
     ]
 
 
-def _late_stamps() -> list[Row]:
+def _late_stamps() -> list[FaultRow]:
     """Frames taken earlier than their stamps, which no clock shows: this must be reported, but the
     estimate's error meanwhile is not limited."""
     late_s = 0.05
     return [
-        Row(
+        FaultRow(
             "frames 50 ms late, unsaid, all",
             lambda: inject.frames(inject.stamps(lambda ns: ns + int(late_s * 1e9))),
             faults=Fault.CAMERA_LATE,

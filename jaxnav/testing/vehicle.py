@@ -13,7 +13,7 @@ import numpy as np
 from jaxnav.loop.interfaces import Odometry, OpenVehicle, Setup, Vehicle
 from jaxnav.loop.limits import Limits
 from jaxnav.loop.plugins import missing_members
-from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, started
+from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, start_call
 
 _READ_S = 0.05  # "may wait for some milliseconds at most"
 _STOP_S = 0.5
@@ -45,7 +45,7 @@ def check_vehicle(
         check.closed()
     finally:
         with contextlib.suppress(Exception):  # an error here would hide the one found
-            started(vehicle.close)("close()", HANGS_S)
+            start_call(vehicle.close)("close()", HANGS_S)
         check.end()
 
 

@@ -22,7 +22,7 @@ from jaxnav.models.geometry import (
 )
 from jaxnav.navigator import Navigator, State
 from jaxnav.pose.observation import Observation
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 
 # Standard deviation of a pose that was carried back, m and rad: a third of the difference between
 # the two poses of a marker where they can be mistaken for each other.
@@ -30,7 +30,7 @@ _CARRIED_SIGMA = 0.3
 _LEAST_SHARE = 1e-4  # added to the diagonal of the correlation matrix
 
 
-class Estimated(eqx.Module):
+class SequenceEstimates(eqx.Module):
     """The output of the whole estimator in every frame of B sequences."""
 
     T_world_vehicle: Float[Array, "*B T 7"]
@@ -40,20 +40,22 @@ class Estimated(eqx.Module):
 
 
 @eqx.filter_jit
-def estimated(navigator: Navigator, recorded: Recorded) -> Estimated:
+def estimate_sequences(navigator: Navigator, recorded: FrameSequences) -> SequenceEstimates:
     """Estimate all sequences from cold starts. Frames not used or judged hold no valid values."""
 
-    def one(recorded: Recorded) -> Estimated:
+    def one(recorded: FrameSequences) -> SequenceEstimates:
         local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
 
-        def frame(state: State, now: tuple[Observation, Array, Array]) -> tuple[State, Estimated]:
+        def frame(
+            state: State, now: tuple[Observation, Array, Array]
+        ) -> tuple[State, SequenceEstimates]:
             obs, used, truth = now
             after, out = local.step(state, obs)
             after = jax.tree.map(lambda a, b: jnp.where(used, a, b), after, state)
             bank = after.belief.bank
             error = error_of(local.motion, bank.mean[heaviest(bank)], jaxlie.SE3(truth))
             d = error.shape[0]
-            return after, Estimated(
+            return after, SequenceEstimates(
                 out.T_world_vehicle.wxyz_xyz,
                 jnp.sum(error[: position_states(d)] ** 2),
                 nees(error, out.covariance[:d, :d]),
@@ -90,21 +92,21 @@ def position_states(pose_states: int) -> int:
     return 2 if pose_states == 3 else 3
 
 
-class Started(eqx.Module):
+class SequenceStarts(eqx.Module):
     """The start of each of B sequences: one hypothesis, in the local minimum chosen as true."""
 
     bank: Bank
     chosen: Bool[Array, "*B"]  # False: never decided, so the sequence carries no information
 
 
-def started(navigator: Navigator, recorded: Recorded) -> Started:
+def find_starts(navigator: Navigator, recorded: FrameSequences) -> SequenceStarts:
     """The start of every sequence, as this navigator decided."""
-    seen = estimated(navigator, recorded)
+    seen = estimate_sequences(navigator, recorded)
     chosen = jnp.any(seen.decided, axis=1)
     first = jnp.argmax(seen.decided, axis=1)
     rows = jnp.arange(len(recorded))
     poses = _carried_back(navigator, recorded.obs, seen.T_world_vehicle[rows, first], first)
-    return Started(_around(navigator, poses), chosen)
+    return SequenceStarts(_around(navigator, poses), chosen)
 
 
 @eqx.filter_jit

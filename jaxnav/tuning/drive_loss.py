@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxnav.models.geometry import safe_norm, safe_sqrt
 from jaxnav.simulation.scenarios import Scenario
-from jaxnav.simulation.world import World
+from jaxnav.simulation.world import DriveState
 from jaxnav.tuning.soft_switch import SoftState
 
 
@@ -71,7 +71,7 @@ class CostsOfFrame:
 
     scenario: Scenario
 
-    def __call__(self, before: World, after: World) -> Costs:
+    def __call__(self, before: DriveState, after: DriveState) -> Costs:
         scenario, dtype = self.scenario, after.car.pose.dtype
         period_s = jnp.asarray(scenario.frame_period_s, dtype)
         waypoints_m = jnp.asarray(scenario.waypoints_m, dtype).reshape(-1, 2)
@@ -107,7 +107,7 @@ class _Course(eqx.Module):
     change: Float[Array, " n"]
 
 
-def _course(before: World, after: World, count: int) -> _Course:
+def _course(before: DriveState, after: DriveState, count: int) -> _Course:
     was, now, car = before.state.control, after.state.control, after.truth.vehicle
     limits = jnp.stack([car.throttle_limit, car.steering_limit_rad])[:, None]
     if isinstance(was, SoftState) and isinstance(now, SoftState):

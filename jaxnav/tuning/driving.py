@@ -26,22 +26,22 @@ from jaxtyping import Array, Bool, Float, Key
 from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
 from jaxnav.navigator import Step
 from jaxnav.parameters import with_parameters
-from jaxnav.simulation.kept import Kept
 from jaxnav.simulation.queue import run_lanes
 from jaxnav.simulation.regimes import step_by_regime
 from jaxnav.simulation.rollout import Rollout, Trace
-from jaxnav.simulation.world import World
+from jaxnav.simulation.traces import DriveTraces
+from jaxnav.simulation.world import DriveState
 from jaxnav.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss, no_costs
-from jaxnav.tuning.soft_switch import softened
+from jaxnav.tuning.soft_switch import soften_switch
 from jaxnav.tuning.unconstrained import Space
 
 _jit = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
 
 
-class Sensitive(eqx.Module):
+class DriveSlopes(eqx.Module):
     """A drive and its derivatives with respect to P numbers."""
 
-    world: World
+    world: DriveState
     costs: Costs
     slopes: Any  # leaves (P, ...): derivatives of the world's moving part, and of the costs
 
@@ -101,10 +101,10 @@ class ClosedLoop(eqx.Module):
             lambda drives: advance(x, space, drives),
             lanes,
             threads,
-            Kept(len(keys), 1),
+            DriveTraces(len(keys), 1),
             progress,
         )
-        sums, _ = kept.side_by_side()
+        sums, _ = kept.stack()
         costs, slopes = jax.tree.map(lambda leaf: jnp.asarray(leaf[:, -1]), sums)
         return self._losses(costs, slopes)
 
@@ -132,22 +132,22 @@ class ClosedLoop(eqx.Module):
         return self.loss(costs), derivatives
 
     @eqx.filter_jit
-    def _start(self, x: Array, space: Space, keys: Key[Array, " lanes"]) -> Sensitive:
-        def first(key: Array) -> Sensitive:
-            def moving(x: Array) -> tuple[Any, World]:
+    def _start(self, x: Array, space: Space, keys: Key[Array, " lanes"]) -> DriveSlopes:
+        def first(key: Array) -> DriveSlopes:
+            def moving(x: Array) -> tuple[Any, DriveState]:
                 world = _strong(self._softened(x, space).first(key))
                 return (_moving(world)[0], no_costs(world.car.pose.dtype)), world
 
             (_, costs), slopes, world = _pushed(moving, (x,), (_basis(x),))
-            return Sensitive(world, costs, slopes)
+            return DriveSlopes(world, costs, slopes)
 
         return jax.vmap(first)(keys)
 
     @eqx.filter_jit
-    def _advance(self, x: Array, space: Space, drives: Sensitive) -> tuple[Sensitive, Any]:
+    def _advance(self, x: Array, space: Space, drives: DriveSlopes) -> tuple[DriveSlopes, Any]:
         """Advance every lane by `chunk_frames`: the drives, and their costs so far."""
 
-        def frame(drive: Sensitive) -> Sensitive:
+        def frame(drive: DriveSlopes) -> DriveSlopes:
             return self._frame(x, space, drive, lambda rollout: rollout.navigator.step)
 
         drives, _ = jax.lax.scan(
@@ -156,10 +156,10 @@ class ClosedLoop(eqx.Module):
         return drives, _sums(drives)
 
     @_jit(compiler_options=COMPILER_OPTIONS)
-    def _advance_many(self, x: Array, space: Space, drives: Sensitive) -> tuple[Sensitive, Any]:
+    def _advance_many(self, x: Array, space: Space, drives: DriveSlopes) -> tuple[DriveSlopes, Any]:
         """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
 
-        def frame(drive: Sensitive) -> Sensitive:
+        def frame(drive: DriveSlopes) -> DriveSlopes:
             return self._frame(x, space, drive, lambda r: step_by_regime(r.navigator))
 
         last, _ = jax.lax.scan(
@@ -171,12 +171,12 @@ class ClosedLoop(eqx.Module):
         return drives, _sums(drives)
 
     def _frame(
-        self, x: Array, space: Space, drive: Sensitive, step: Callable[[Rollout], Step]
-    ) -> Sensitive:
+        self, x: Array, space: Space, drive: DriveSlopes, step: Callable[[Rollout], Step]
+    ) -> DriveSlopes:
         before, costs_of_frame = drive.world, CostsOfFrame(self.rollout.scenario)
         moving, still = _moving(before)
 
-        def after(x: Array, moving: Any, costs: Costs) -> tuple[Any, World]:
+        def after(x: Array, moving: Any, costs: Costs) -> tuple[Any, DriveState]:
             rollout = self._softened(x, space)
             world = eqx.combine(moving, still)
             after = _strong(rollout.frame(world, step(rollout))[0])
@@ -190,11 +190,13 @@ class ClosedLoop(eqx.Module):
 
         tangents = (_basis(x), *drive.slopes)
         (_, costs), slopes, world = _pushed(after, (x, moving, drive.costs), tangents)
-        return Sensitive(world, costs, slopes)
+        return DriveSlopes(world, costs, slopes)
 
     def _softened(self, x: Array, space: Space) -> Rollout:
         navigator = with_parameters(self.rollout.navigator, space.values(x))
-        return dataclasses.replace(self.rollout, navigator=softened(navigator, self.softness_m))
+        return dataclasses.replace(
+            self.rollout, navigator=soften_switch(navigator, self.softness_m)
+        )
 
 
 def without_gradient(gradients: Float[Array, "B n"], labels: list[str]) -> list[str]:
@@ -204,7 +206,7 @@ def without_gradient(gradients: Float[Array, "B n"], labels: list[str]) -> list[
     return [name for name in dict.fromkeys(labels) if not np.any(asked[names == name])]
 
 
-def _moving(world: World) -> tuple[World, World]:
+def _moving(world: DriveState) -> tuple[DriveState, DriveState]:
     """Partition a world into the part that changes with the gains, and the rest."""
     spec = jax.tree.map(lambda _: False, world)
     spec = dataclasses.replace(
@@ -218,7 +220,7 @@ def _moving(world: World) -> tuple[World, World]:
     return moving, still
 
 
-def _pushed(fn: Callable[..., tuple[Any, World]], primals: Any, tangents: Any) -> Any:
+def _pushed(fn: Callable[..., tuple[Any, DriveState]], primals: Any, tangents: Any) -> Any:
     """The value of fn, its derivatives along P directions at once, and its auxiliary output."""
     return jax.vmap(
         lambda along: jax.jvp(fn, primals, along, has_aux=True), out_axes=(None, 0, None)
@@ -230,7 +232,7 @@ def _basis(x: Float[Array, " n"]) -> Float[Array, "n n"]:
     return jnp.eye(x.shape[0], dtype=x.dtype)
 
 
-def _sums(drives: Sensitive) -> tuple[Costs, Costs]:
+def _sums(drives: DriveSlopes) -> tuple[Costs, Costs]:
     """The costs and their slopes, as the single entry of a chunk."""
     sums: tuple[Costs, Costs] = jax.tree.map(
         lambda leaf: leaf[:, None], (drives.costs, drives.slopes[1])
@@ -238,7 +240,9 @@ def _sums(drives: Sensitive) -> tuple[Costs, Costs]:
     return sums
 
 
-def _strong(world: World) -> World:
+def _strong(world: DriveState) -> DriveState:
     """The world with strong types, so that the next frame is not compiled for other types."""
-    strong: World = jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), world)
+    strong: DriveState = jax.tree.map(
+        lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), world
+    )
     return strong

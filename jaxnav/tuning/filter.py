@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 from jaxnav.belief.motion import Bank
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import with_parameters
-from jaxnav.tuning.branches import started
-from jaxnav.tuning.following import follow, trusting
+from jaxnav.tuning.branches import find_starts
+from jaxnav.tuning.following import follow, trust_corners
 from jaxnav.tuning.objective import Batch
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 from jaxnav.tuning.unconstrained import Space
 
 LOSSES = {
@@ -28,7 +28,7 @@ class Item(NamedTuple):
     """One sequence, or many with leading axis (B,)."""
 
     start: Bank
-    recorded: Recorded
+    recorded: FrameSequences
 
 
 class FilterCost(eqx.Module):
@@ -48,7 +48,7 @@ class FilterCost(eqx.Module):
         self, x: Float[Array, " n"], item: Item, softness: Float[Array, ""]
     ) -> Float[Array, " T"]:
         del softness  # the choice of the branch is fixed
-        navigator = trusting(with_parameters(self.navigator, self.space.values(x)))
+        navigator = trust_corners(with_parameters(self.navigator, self.space.values(x)))
         followed = follow(navigator, item.start, item.recorded)
         if self.loss == "likelihood":
             return -followed.log_likelihood
@@ -56,10 +56,10 @@ class FilterCost(eqx.Module):
             return -followed.log_score
         return _CM2_PER_M2 * followed.square_m2
 
-    def batch(self, x: Float[Array, " n"], recorded: Recorded) -> Batch:
+    def batch(self, x: Float[Array, " n"], recorded: FrameSequences) -> Batch:
         """The batch of recordings, their branches chosen at these parameters and then fixed."""
         navigator = with_parameters(self.navigator, self.space.values(x))
-        start = started(navigator, recorded)
+        start = find_starts(navigator, recorded)
         usable = eqx.tree_at(
             lambda r: (r.used, r.judged),
             recorded,

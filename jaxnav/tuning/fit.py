@@ -2,7 +2,7 @@
 
     fit = Fit.begin(x, problem)
     while not fit.over:
-        fit = advanced(fit, problem)       # one step; `fit` is all there is to save
+        fit = take_step(fit, problem)      # one step; `fit` is all there is to save
 
 Stages: after a descent has ended the problem may be posed anew (branches chosen again, by the
 parameters found), until that changes nothing. The result of a fit is the x with the lowest loss on
@@ -51,7 +51,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Fit:
+class TuningFit:
     """The state of a fit.
 
     `history` has a row for the beginning of every stage, with loss NaN, and one for every step
@@ -72,15 +72,15 @@ class Fit:
     history: tuple[np.ndarray, ...] = field(default=())
 
     @staticmethod
-    def begin(x: Float[Array, " n"], problem: Problem) -> "Fit":
+    def begin(x: Float[Array, " n"], problem: Problem) -> "TuningFit":
         """The state at x, before any evaluation."""
         batch, softness = problem.batch(x, 0, 0), jnp.asarray(problem.softness(0), x.dtype)
         loss = _known(problem.held_out(x, x, 0))
         descent = problem.optimiser.init(x, batch, softness)
-        return Fit(descent, x, x, loss, loss, history=(_row(np.nan, loss, x),))
+        return TuningFit(descent, x, x, loss, loss, history=(_row(np.nan, loss, x),))
 
 
-def advanced(fit: Fit, problem: Problem) -> Fit:
+def take_step(fit: TuningFit, problem: Problem) -> TuningFit:
     """The fit after one more step."""
     x = fit.descent.x
     softness = jnp.asarray(problem.softness(fit.step), x.dtype)
@@ -118,7 +118,7 @@ def advanced(fit: Fit, problem: Problem) -> Fit:
     return fit
 
 
-def _next_stage(fit: Fit, problem: Problem) -> Fit:
+def _next_stage(fit: TuningFit, problem: Problem) -> TuningFit:
     gained = fit.best_of_stage - fit.best_loss
     little = fit.stage > 0 and gained < _SAME * max(1.0, abs(fit.best_loss))
     if little or fit.stage + 1 >= problem.stages:
@@ -150,7 +150,7 @@ def _known(loss: float) -> float:
     return np.inf if np.isnan(loss) else float(loss)
 
 
-def arrays_of(fit: Fit) -> dict[str, np.ndarray]:
+def arrays_of(fit: TuningFit) -> dict[str, np.ndarray]:
     """A fit as named arrays, to be written to a file."""
     leaves = jax.tree.leaves(fit.descent)
     inner = {f"descent_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
@@ -162,7 +162,7 @@ def arrays_of(fit: Fit) -> dict[str, np.ndarray]:
     return inner | plain | rest | {"history": np.array(fit.history)}
 
 
-def fit_of(arrays: dict[str, np.ndarray], like: Fit) -> Fit:
+def fit_of(arrays: dict[str, np.ndarray], like: TuningFit) -> TuningFit:
     """The fit from which `arrays_of` made these arrays.
 
     Args:
@@ -180,7 +180,7 @@ def fit_of(arrays: dict[str, np.ndarray], like: Fit) -> Fit:
     shapes = [arrays[name].shape for name in ("stage_x", "best_x")]
     if arrays["history"].shape[1:] != like.history[0].shape or shapes != [x.shape] * 2:
         raise ValueError("another number of parameters")
-    return Fit(
+    return TuningFit(
         descent=jax.tree.unflatten(form, [jnp.asarray(array) for array in found]),
         stage_x=jnp.asarray(arrays["stage_x"], x.dtype),
         best_x=jnp.asarray(arrays["best_x"], x.dtype),

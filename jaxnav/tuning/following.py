@@ -21,13 +21,13 @@ from jaxnav.belief.motion import Bank
 from jaxnav.navigator import Navigator
 from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND
 from jaxnav.pose.candidates import Candidates
-from jaxnav.pose.consistency import Consistent
+from jaxnav.pose.consistency import ConsistentSnapshot
 from jaxnav.pose.observation import Observation, Snapshot
 from jaxnav.tuning.branches import error_of, nees, position_states
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 
 
-class Followed(eqx.Module):
+class FilterScores(eqx.Module):
     """The filter's scores in every frame; 0 if the frame was not used, or not judged.
 
     After an overflow has lost the hypothesis the scores are infinitely bad, so that no step goes to
@@ -40,7 +40,7 @@ class Followed(eqx.Module):
     nees: Float[Array, "*B T"]
 
 
-def trusting(navigator: Navigator) -> Navigator:
+def trust_corners(navigator: Navigator) -> Navigator:
     """The navigator without its guards against outliers, which would hide a wrong Q or R."""
     motion, selector = navigator.motion, navigator.selector
     navigator = eqx.tree_at(lambda n: n.motion.gate_nis, navigator, float("inf"))
@@ -54,14 +54,14 @@ def trusting(navigator: Navigator) -> Navigator:
     return _Trusts.like(navigator)
 
 
-def follow(navigator: Navigator, start: Bank, recorded: Recorded) -> Followed:
+def follow(navigator: Navigator, start: Bank, recorded: FrameSequences) -> FilterScores:
     """Run the filter frame by frame along one sequence (no batch axis)."""
     local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
 
     @functools.partial(jax.checkpoint, policy=KEEP_FOUND)
     def frame(
         belief: Belief, now: tuple[Observation, Array, Array, Array]
-    ) -> tuple[Belief, Followed]:
+    ) -> tuple[Belief, FilterScores]:
         obs, used, truth, judged = now
         after, estimate = local.sense(belief, obs)
         after = jax.tree.map(lambda a, b: jnp.where(used, a, b), after, belief)
@@ -74,7 +74,7 @@ def follow(navigator: Navigator, start: Bank, recorded: Recorded) -> Followed:
             return jnp.where(counts, jnp.where(lives, value, otherwise), 0)
 
         judged = judged & used
-        return after, Followed(
+        return after, FilterScores(
             log_likelihood=told(used, estimate.log_likelihood, -worst),
             log_score=told(judged, log_likelihood(error, P), -worst),
             square_m2=told(judged, jnp.sum(error[: position_states(d)] ** 2), worst),
@@ -88,10 +88,10 @@ def follow(navigator: Navigator, start: Bank, recorded: Recorded) -> Followed:
 class _Trusts(Navigator):
     """A navigator that takes all corners for those of markers."""
 
-    def look(self, obs: Observation) -> Consistent:
+    def look(self, obs: Observation) -> ConsistentSnapshot:
         snapshot = self.snapshot(obs)
         nobody = jnp.zeros(len(self.markers.ids), bool)
-        return Consistent(snapshot, self.find_candidates(snapshot), nobody)
+        return ConsistentSnapshot(snapshot, self.find_candidates(snapshot), nobody)
 
 
 class _GoesOn(_Trusts):

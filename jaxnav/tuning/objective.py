@@ -72,7 +72,7 @@ class NotFinite(NamedTuple):
     item: int
     frame: int | None  # the first one; None: only the reverse pass is not finite
 
-    def told(self, labels: list[str], step: int) -> str:
+    def describe(self, labels: list[str], step: int) -> str:
         """A one-line message for a person."""
         where = "" if self.frame is None else f" from frame {self.frame} on"
         return (

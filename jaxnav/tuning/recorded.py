@@ -16,7 +16,7 @@ from jaxnav.pose.observation import Observation
 from jaxnav.simulation.rollout import Rollout
 
 
-class Recorded(eqx.Module):
+class FrameSequences(eqx.Module):
     """B sequences of T frames; every leaf has the leading axis (B,)."""
 
     markers: MarkerMap
@@ -28,20 +28,20 @@ class Recorded(eqx.Module):
     def __len__(self) -> int:
         return len(self.used)
 
-    def rows(self, rows: slice | np.ndarray) -> "Recorded":
+    def rows(self, rows: slice | np.ndarray) -> "FrameSequences":
         """Some of the sequences."""
-        some: Recorded = jax.tree.map(lambda leaf: leaf[rows], self)
+        some: FrameSequences = jax.tree.map(lambda leaf: leaf[rows], self)
         return some
 
     @staticmethod
-    def together(parts: "list[Recorded]") -> "Recorded":
+    def concatenate(parts: "list[FrameSequences]") -> "FrameSequences":
         """Concatenate the sequences; shorter ones are padded with unused frames."""
         length = max(part.used.shape[1] for part in parts)
-        padded = [part.padded(length) for part in parts]
-        joined: Recorded = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *padded)
+        padded = [part.pad_to(length) for part in parts]
+        joined: FrameSequences = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *padded)
         return joined
 
-    def padded(self, length: int) -> "Recorded":
+    def pad_to(self, length: int) -> "FrameSequences":
         """Pad to `length` frames: the last one repeated, without markers and unused."""
         more = length - self.used.shape[1]
         frames = (self.obs, self.used, self.T_world_vehicle_true, self.judged)
@@ -53,17 +53,17 @@ class Recorded(eqx.Module):
         shows = (obs.visible & known[..., None, None], jnp.where(known, obs.dt_s, 0))
         heard = known & obs.has_odometry
         obs = eqx.tree_at(lambda o: (o.visible, o.dt_s, o.has_odometry), obs, (*shows, heard))
-        return Recorded(self.markers, obs, used & known, truth, judged & known)
+        return FrameSequences(self.markers, obs, used & known, truth, judged & known)
 
 
-def simulated(rollout: Rollout, keys: Key[Array, " B"]) -> Recorded:
+def simulate_sequences(rollout: Rollout, keys: Key[Array, " B"]) -> FrameSequences:
     """Simulate closed-loop drives from a cold start, judged from the frame on in which the
     navigator that drove had decided its branch."""
     obs, true_poses, decided, active = jax.device_get(_drives(rollout, keys))
     count, length = len(active), int(active.sum(axis=1).max())
     judged = np.maximum.accumulate(decided & active, axis=1) & active
     poses = T_world_vehicle_from_planar(jnp.asarray(true_poses[:, :length]))
-    return Recorded(
+    return FrameSequences(
         markers=jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))),
             rollout.navigator.markers,

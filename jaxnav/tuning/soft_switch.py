@@ -94,7 +94,7 @@ class SoftController(eqx.Module):
         return state, command, done, jax.tree.map(lambda leaf: leaf[most], logs)
 
 
-def softened(navigator: Navigator, softness_m: float | Float[Array, ""]) -> Navigator:
+def soften_switch(navigator: Navigator, softness_m: float | Float[Array, ""]) -> Navigator:
     """The navigator, with a soft switch from waypoint to waypoint.
 
     Raises:

@@ -20,9 +20,9 @@ import numpy as np
 
 from jaxnav.detection.image_search import size_problem
 from jaxnav.errors import BadInput
-from jaxnav.files.images import decoded_image
+from jaxnav.files.images import decode_image
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Camera, Frame, Odometry, OwnFiles, Setup, Vehicle
 from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_log import DriveLog, read_drive
@@ -163,7 +163,7 @@ class ReplayCamera:
         self,
         name: str,
         clock: Clock,
-        frames: Sequence[tuple[int, Sighted]],
+        frames: Sequence[tuple[int, FrameDetections]],
         jpegs: Mapping[int, bytes],
     ):
         """Args:
@@ -191,7 +191,7 @@ class ReplayCamera:
         self._next += 1
         stamp_ns = self._clock.present_ns(sighted.stamp_ns)
         if sighted.stamp_ns in self._jpegs:
-            return Frame(stamp_ns, decoded_image(self._jpegs[sighted.stamp_ns]))
+            return Frame(stamp_ns, decode_image(self._jpegs[sighted.stamp_ns]))
         return Frame(stamp_ns, None, sighted.detections)
 
     def close(self) -> None:
@@ -215,7 +215,9 @@ def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
         if name not in vehicle.camera_names:
             problem = f"{log.path} has no camera {name!r}: it has {', '.join(vehicle.camera_names)}"
             raise BadInput("--rig", problem)
-    frames: dict[str, list[tuple[int, Sighted]]] = {name: [] for name in vehicle.camera_names}
+    frames: dict[str, list[tuple[int, FrameDetections]]] = {
+        name: [] for name in vehicle.camera_names
+    }
     for given in log.inputs:
         for sighted in given.frames:
             frames[vehicle.camera_names[sighted.camera]].append((given.now_ns, sighted))
@@ -260,7 +262,7 @@ def _jpegs(log: DriveLog, rig: CameraRig) -> dict[str, dict[int, bytes]]:
         if name not in found:
             continue
         if not found[name]:
-            pixels = decoded_image(image.jpeg)
+            pixels = decode_image(image.jpeg)
             if pixels is None:
                 raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
             if problem := size_problem(rig, rig.names.index(name), pixels):

@@ -103,7 +103,7 @@ class RosVehicle:
                 raise OSError("the ROS vehicle is closed")
             now_ns = time.monotonic_ns()
             before_ns = now_ns if self._written_ns is None else self._written_ns
-            self._steering_rad, throttle = self._limits.applied(
+            self._steering_rad, throttle = self._limits.apply(
                 steering_rad, throttle, self._steering_rad, (now_ns - before_ns) / 1e9
             )
             self._written_ns = now_ns

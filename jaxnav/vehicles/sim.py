@@ -15,18 +15,18 @@ from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.interfaces import Camera, Frame, Odometry, Setup, Vehicle
 from jaxnav.vehicles.options import choice, number
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
-from jaxnav.vehicles.world import World, WorldSettings
+from jaxnav.vehicles.world import SimWorld, WorldSettings
 
 _LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are known
 
 
 class SimVehicle:
-    """The car of a `World`, which stops by itself without commands.
+    """The car of a `SimWorld`, which stops by itself without commands.
 
     Its odometer, servo and stamps have the errors in the vehicle's description.
     """
 
-    def __init__(self, world: World):
+    def __init__(self, world: SimWorld):
         """Take the world, which the cameras look at too."""
         self.world = world
         self._corrections = Corrections.of(world.vehicle)
@@ -65,7 +65,7 @@ class SimVehicle:
 class _Shutter:
     """A thread that makes the frames of all cameras, all exposed at once."""
 
-    def __init__(self, world: World, rate_hz: float, renderer: RenderingProcess | None):
+    def __init__(self, world: SimWorld, rate_hz: float, renderer: RenderingProcess | None):
         self._world, self._renderer = world, renderer
         self._period_ns = int(1e9 / rate_hz)
         self._late_ns = Corrections.of(world.vehicle).frame_late_ns
@@ -157,7 +157,7 @@ def open_vehicle(setup: Setup) -> SimVehicle:
         corner_sigma_px=number(setup.options, "corner_sigma_px", 0.3, 0.0, 10.0)
     )
     now_ns = time.monotonic_ns()
-    world = World(
+    world = SimWorld(
         setup.rig, setup.markers, setup.vehicle, setup.start_pose, now_ns, settings, setup.seed
     )
     world.state(now_ns + 1)  # compiled now, and not while the loop waits

@@ -46,7 +46,7 @@ class WorldSettings:
     vehicle_timeout_s: float = 0.2  # without a command the car stops by itself
 
 
-class World:
+class SimWorld:
     """The simulated car and its track of the last two seconds. Thread-safe."""
 
     def __init__(

@@ -12,7 +12,7 @@ from jaxnav.recording.drive_log import Outcomes
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownOutcome:
     """The values of an outcome that are shown; see `Outcomes`. Poses and candidates are NumPy
     arrays in coordinates from the map's origin."""
 
@@ -33,12 +33,12 @@ class Shown:
     selected: int
 
     @staticmethod
-    def of(outcome: Outcome) -> "Shown":
+    def of(outcome: Outcome) -> "ShownOutcome":
         """The shown values of the pilot's outcome."""
         output, bank = outcome.output, outcome.belief.bank
         alive, valid = np.asarray(bank.initialised), np.asarray(output.candidates.valid)
         selected = int(output.selected)
-        return Shown(
+        return ShownOutcome(
             now_ns=outcome.now_ns,
             health=outcome.health,
             faults=outcome.faults,
@@ -57,14 +57,14 @@ class Shown:
         )
 
     @staticmethod
-    def of_row(outcomes: Outcomes, index: int, origin_m: Origin = ZERO) -> "Shown":
+    def of_row(outcomes: Outcomes, index: int, origin_m: Origin = ZERO) -> "ShownOutcome":
         """The shown values of one outcome of a recorded drive.
 
         Args:
             origin_m: origin of the map with which it is shown.
         """
         away_m = opposite(origin_m)
-        return Shown(
+        return ShownOutcome(
             now_ns=int(outcomes.now_ns[index]),
             health=Health(int(outcomes.health[index])),
             faults=Fault(int(outcomes.faults[index])),

@@ -29,8 +29,8 @@ from jaxnav.errors import BadInput
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
-from jaxnav.viewer.outcomes import Shown
-from jaxnav.viewer.scene import Scene
+from jaxnav.viewer.outcomes import ShownOutcome
+from jaxnav.viewer.scene import RerunScene
 
 APPLICATION = "jaxnav"
 _IDLE_S = 0.02  # between looks at an empty queue
@@ -82,9 +82,9 @@ class RerunView:
             sinks.append(rerun.GrpcSink(url))
         self._stream = rerun.RecordingStream(APPLICATION)
         self._stream.set_sinks(*sinks)
-        self._scene = Scene(rerun, self._stream, rig, markers, waypoints_m)
+        self._scene = RerunScene(rerun, self._stream, rig, markers, waypoints_m)
         self._waits = waits
-        self._queue: deque[Callable[[Scene], None]] = deque()
+        self._queue: deque[Callable[[RerunScene], None]] = deque()
         self._queue_items = queue_items
         self._lock = threading.RLock()
         self._closing = threading.Event()
@@ -105,7 +105,7 @@ class RerunView:
         """The reason why nothing is shown any more, or None."""
         return self._failed
 
-    def show(self, outcome: Outcome | Shown) -> None:
+    def show(self, outcome: Outcome | ShownOutcome) -> None:
         """Show the pilot's outcome of an event. Never raises."""
         has_corners = isinstance(outcome, Outcome) and _has_corners(outcome)
         if self._is_due((outcome.health, has_corners), outcome.now_ns):
@@ -148,7 +148,7 @@ class RerunView:
         self._shown_ns[kind] = stamp_ns
         return True
 
-    def _offer(self, draw: Callable[[Scene], None]) -> None:
+    def _offer(self, draw: Callable[[RerunScene], None]) -> None:
         with self._lock:
             gone = self._closing.is_set() or self._failed is not None
             if gone or len(self._queue) >= self._queue_items:
@@ -173,7 +173,7 @@ class RerunView:
                     self._queue.clear()
                 break
 
-    def _draw(self, draw: Callable[[Scene], None]) -> None:
+    def _draw(self, draw: Callable[[RerunScene], None]) -> None:
         try:
             draw(self._scene)
         except Exception:  # whatever fails in drawing, the vehicle drives on
@@ -193,11 +193,11 @@ def import_rerun() -> ModuleType:
 
 
 def _has_corners(outcome: Outcome) -> bool:
-    return outcome.told is not None and outcome.told.corners_px is not None
+    return outcome.data is not None and outcome.data.corners_px is not None
 
 
-def _shown(outcome: Outcome | Shown) -> Shown:
-    return outcome if isinstance(outcome, Shown) else Shown.of(outcome)
+def _shown(outcome: Outcome | ShownOutcome) -> ShownOutcome:
+    return outcome if isinstance(outcome, ShownOutcome) else ShownOutcome.of(outcome)
 
 
 def _file_sink(rerun: ModuleType, path: Path) -> Any:

@@ -23,7 +23,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import ZERO
 from jaxnav.models.rig import CameraRig
 from jaxnav.plots.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION
-from jaxnav.viewer.outcomes import Shown
+from jaxnav.viewer.outcomes import ShownOutcome
 
 TIMELINE = "drive"  # seconds since the first event
 _CHI2_2DOF_95 = 5.991
@@ -31,7 +31,7 @@ _ARROW_M = 0.15
 _IMAGE_PLANE_M = 0.12  # distance of a drawn image from its camera
 
 
-class Scene:
+class RerunScene:
     """A stream of Rerun and the last values sent to it. For one thread."""
 
     def __init__(
@@ -73,7 +73,7 @@ class Scene:
             self._still("health", rerun.TextLog(f"places are relative to ({from_m}) m"))
         stream.send_blueprint(self._blueprint())
 
-    def show(self, shown: Shown) -> None:
+    def show(self, shown: ShownOutcome) -> None:
         """Log the pilot's outcome of an event."""
         self._at(shown.now_ns)
         if shown.located and np.isfinite(shown.pose).all():
@@ -156,7 +156,7 @@ class Scene:
             strip = np.column_stack([ellipse_m, np.zeros(len(ellipse_m))])
             self._say("world/ellipse", rerun.LineStrips3D([strip], colors=_rgb(SKY)))
 
-    def _show_hypotheses(self, shown: Shown) -> None:
+    def _show_hypotheses(self, shown: ShownOutcome) -> None:
         usable = np.isfinite(shown.hypotheses).all(axis=1) & np.isfinite(shown.log_weight)
         rows, log_weight = shown.hypotheses[usable], shown.log_weight[usable]
         shares = np.exp(log_weight - np.max(log_weight, initial=-np.inf))
@@ -171,7 +171,7 @@ class Scene:
             ),
         )
 
-    def _show_candidates(self, shown: Shown) -> None:
+    def _show_candidates(self, shown: ShownOutcome) -> None:
         Ts = [poses.inverse(T) for T in shown.Ts_vehicle_world if np.isfinite(T).all()]
         taken = [index == shown.selected for index in range(len(Ts))]
         self._say(
@@ -184,7 +184,7 @@ class Scene:
             ),
         )
 
-    def _show_numbers(self, shown: Shown) -> None:
+    def _show_numbers(self, shown: ShownOutcome) -> None:
         sigma_m = math.sqrt(max(float(np.trace(shown.covariance[:2, :2])), 0.0))
         for entity, value in (
             ("flip_probability", shown.flip_probability),

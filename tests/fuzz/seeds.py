@@ -14,11 +14,11 @@ from mcap.writer import Writer
 from jaxnav import files
 from jaxnav.calibration.odometry.drive import Drive
 from jaxnav.detection import Detections, marker_cells
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_format import HEADER, PROFILE, encode, header_of
-from jaxnav.recording.mcap_messages import McapMessages, Recorded
+from jaxnav.recording.mcap_messages import McapMessages, RecordedMessage
 from jaxnav.recording.message_schemas import MESSAGES
 from jaxnav.recording.messages import input_message
 from tests.helpers import loader_seeds as loaders
@@ -119,7 +119,7 @@ def inputs_of(drive: Drive, ids: tuple[int, ...]) -> list[Input]:
             refined=np.array([True]),
             families=("tag36h11",),
         )
-        frame = Sighted(int(drive.camera[row]), int(stamp_ns), found)
+        frame = FrameDetections(int(drive.camera[row]), int(stamp_ns), found)
         inputs.append(Input(int(stamp_ns) + 30_000_000, frames=(frame,)))
     return sorted(inputs, key=lambda given: given.now_ns)
 
@@ -128,7 +128,7 @@ def drive_parts(path: Path) -> Parts:
     """A recorded drive in plain values."""
     parts: Parts = []
     for record in McapMessages(path):
-        if isinstance(record, Recorded):
+        if isinstance(record, RecordedMessage):
             if record.topic in MESSAGES:
                 parts.append((record.topic, json.loads(record.data)))
         elif record.name == HEADER:

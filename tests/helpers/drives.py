@@ -13,7 +13,7 @@ from jaxnav.belief.motion import Bank, Rejections
 from jaxnav.control import Command
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault, Health, Reject
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.navigator import Output
@@ -43,8 +43,8 @@ def make_input(index: int) -> Input:
     if index % 3 == 1:
         seen = make_detections(rng, index % 4 % 3)
         frames = (
-            Sighted(0, now_ns - 30_000_001, seen),
-            Sighted(3, now_ns - 30_000_001, None, Fault.FRAME_UNUSABLE),
+            FrameDetections(0, now_ns - 30_000_001, seen),
+            FrameDetections(3, now_ns - 30_000_001, None, Fault.FRAME_UNUSABLE),
         )
         return Input(now_ns, frames=frames)
     return Input(now_ns)
@@ -140,7 +140,7 @@ def make_outcome(index: int, seed: int = 0, dtype: type = float) -> Outcome:
         throttle=-0.1 / (index + 1),
         output=output,
         belief=belief,
-        told=None,
+        data=None,
         stamp_ns=now_ns - 3,
         restarts=2,
         restart_reason="the loop was away",

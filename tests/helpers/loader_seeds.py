@@ -216,7 +216,7 @@ def _resumed(path: Path) -> None:
 def _applied(path: Path) -> Any:
     """What a car takes from a file of tuned parameters."""
     params = files.load_params(path)
-    assert params.told().isprintable()
+    assert params.describe().isprintable()
     car = Navigator(qcar_rig(), room_markers(), qcar(), [(0.0, 0.0)])
     taken = parameters_of(files.apply_params(car, params))
     return {name: taken[name] for name in params.values}

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from jaxnav.loop.interfaces import Frame, Setup
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 from tests.helpers import plain_car
 
 NAME = f"{__name__}:open_cameras"
@@ -17,7 +17,7 @@ class Eyes:
 
     def __init__(self, setup: Setup):
         begin_ns = time.monotonic_ns()
-        self._world = World(
+        self._world = SimWorld(
             setup.rig, setup.markers, setup.vehicle, setup.start_pose, begin_ns, seed=setup.seed
         )
         self._world.detections(begin_ns + 1)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxnav.loop.interfaces import Setup
 from jaxnav.vehicles import sim
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 
 NAME = f"{__name__}:open_vehicle"
 
@@ -15,7 +15,7 @@ NAME = f"{__name__}:open_vehicle"
 class RecordedVehicle(sim.SimVehicle):
     """Each line of the file: when, `time.monotonic_ns()`, and the throttle."""
 
-    def __init__(self, world: World, path: str):
+    def __init__(self, world: SimWorld, path: str):
         super().__init__(world)
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
 

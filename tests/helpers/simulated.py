@@ -11,7 +11,7 @@ from jaxnav.recording.messages import digest, input_message, outcome_message
 from jaxnav.recording.recorder import Recorder
 from jaxnav.testing.faults import WAYPOINTS_M
 from jaxnav.testing.lockstep import BEGIN_NS, Step, drive
-from jaxnav.vehicles.world import World
+from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 
 ROUTE = Route(WAYPOINTS_M, 0.15, worlds.START_VIEW)
@@ -25,7 +25,7 @@ def make_setup() -> DriveSetup:
 def simulated(setup: DriveSetup, duration_s: float, **how) -> list[Step]:
     """A drive in lockstep; see there."""
     start = setup.route_on_map.start_pose
-    world = World(setup.rig, setup.markers, setup.vehicle, start, BEGIN_NS)
+    world = SimWorld(setup.rig, setup.markers, setup.vehicle, start, BEGIN_NS)
     return list(drive(setup.pilot(None), world, duration_s, **how))
 
 

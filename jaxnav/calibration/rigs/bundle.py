@@ -21,7 +21,7 @@ from jaxnav.calibration.rigs.views import RigViews
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import rotation_matrix, skew
 from jaxnav.models.rig import CameraRig
-from jaxnav.numerics.schur import Blocks, Reduced, SchurLM, reduce
+from jaxnav.numerics.schur import Blocks, ReducedSystem, SchurLM, reduce
 from jaxnav.numerics.small_matrices import cho_solve, cholesky
 
 # A sighting has eight coordinates; with Gaussian noise one sighting in a thousand is further off.
@@ -97,7 +97,7 @@ class Adjusted(eqx.Module):
     residuals_px: Float[Array, "N 4 2"]  # projected minus observed
     weight: Float[Array, " N"]  # of each sighting; 1 if it counts in full
     cost: Float[Array, ""]
-    reduced: Reduced  # of the weighted problem, undamped
+    reduced: ReducedSystem  # of the weighted problem, undamped
     scores: Float[Array, "B R"]  # of every part of the recording, see `_scores`
     steps: Int[Array, ""]
     converged: Bool[Array, ""]

@@ -22,7 +22,7 @@ from jaxnav.calibration.rigs.views import RigViews, both_poses, rays_camera
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.models.rig import CameraRig
-from jaxnav.numerics.schur import Reduced
+from jaxnav.numerics.schur import ReducedSystem
 from jaxnav.numerics.small_matrices import solve_upper
 
 _LEAST_SIGMA_PX = 1e-3  # for corners that are exact
@@ -280,7 +280,7 @@ def _calibration(
 
 
 @jax.jit
-def _follows(reduced: Reduced) -> Array:
+def _follows(reduced: ReducedSystem) -> Array:
     return -jax.vmap(solve_upper)(reduced.factor, reduced.carried)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxnav.calibration.rigs.views import RigViews
-from jaxnav.datasets.sightings import Sightings, read_sightings
+from jaxnav.datasets.sightings import RecordedSightings, read_sightings
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
 from jaxnav.models.markers import FAMILY_SIZES, MarkerMap
@@ -37,7 +37,7 @@ class RigData:
     markers: MarkerMap | None
     keys: tuple[MarkerKey, ...]
     known: dict[int, np.ndarray]
-    parts: tuple[Sightings, ...]
+    parts: tuple[RecordedSightings, ...]
     anchored: bool
 
 
@@ -119,12 +119,12 @@ def _wanted(key: MarkerKey, count: int, markers: MarkerMap | None, only_known: b
     return count >= _LEAST_SIGHTINGS and not only_known
 
 
-def _keys(part: Sightings, family: str) -> list[MarkerKey]:
+def _keys(part: RecordedSightings, family: str) -> list[MarkerKey]:
     families = part.families or (family,) * len(part.ids)
     return [(name, int(marker_id)) for name, marker_id in zip(families, part.ids, strict=True)]
 
 
-def _one_rig(parts: Sequence[Sightings], recordings: Sequence[Path]) -> None:
+def _one_rig(parts: Sequence[RecordedSightings], recordings: Sequence[Path]) -> None:
     for part, path in zip(parts[1:], recordings[1:], strict=True):
         if part.rig.names != parts[0].rig.names:
             problem = f"its cameras are not those of {recordings[0]}: give one --rig for all"

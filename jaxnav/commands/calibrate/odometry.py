@@ -12,7 +12,7 @@ from tqdm import tqdm
 from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
 from jaxnav.calibration.odometry.model import NAMES
 from jaxnav.commands.calibrate.arguments.recordings import CalibrateOdometry as Arguments
-from jaxnav.commands.calibrate.odometry_recordings import Recorded, read_recordings
+from jaxnav.commands.calibrate.odometry_recordings import RecordedDrives, read_recordings
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import visible
@@ -65,7 +65,7 @@ def calibrated_vehicle(vehicle: Vehicle, found: OdometryCalibration) -> Vehicle:
 
 
 def report(
-    args: Arguments, recorded: Recorded, found: OdometryCalibration, calibrated: Calibrated
+    args: Arguments, recorded: RecordedDrives, found: OdometryCalibration, calibrated: Calibrated
 ) -> dict[str, Any]:
     """The content of report.json."""
     speed_mps, steering_rad = np.abs(found.read[:, 0]), found.read[:, 1]

@@ -28,7 +28,7 @@ _SHARED = ("rig", "markers", "vehicle")  # header keys that must agree in all re
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class RecordedDrives:
     """Recorded drives, and the rig, map and vehicle that they were driven with.
 
     Attributes:
@@ -42,7 +42,7 @@ class Recorded:
     files: tuple[Path, ...]
 
 
-def read_recordings(args: Arguments) -> Recorded:
+def read_recordings(args: Arguments) -> RecordedDrives:
     """Read all recordings and files of the command; JAX's precision must be set before.
 
     Raises:
@@ -53,7 +53,7 @@ def read_recordings(args: Arguments) -> Recorded:
     return _ros(args, files) if args.topics is not None else _own(args, files)
 
 
-def _own(args: Arguments, files: tuple[Path, ...]) -> Recorded:
+def _own(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
     flags = dict(zip(_SHARED, (args.rig, args.markers_file, args.vehicle), strict=True))
     logs = []
     for path in args.recordings:
@@ -74,10 +74,10 @@ def _own(args: Arguments, files: tuple[Path, ...]) -> Recorded:
     drives = [
         drive_of(str(log.path), log.inputs, rig, markers, setup.corner_sigma_px) for log in logs
     ]
-    return Recorded(tuple(drives), rig, markers, vehicle, files)
+    return RecordedDrives(tuple(drives), rig, markers, vehicle, files)
 
 
-def _ros(args: Arguments, files: tuple[Path, ...]) -> Recorded:
+def _ros(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
     def needed(flag: str, path: Path | None, load: Callable[[Path], Any]) -> Any:
         if path is None:
             raise BadInput(flag, f"missing: a ROS bag ({args.recordings[0]}) does not hold it")
@@ -92,7 +92,7 @@ def _ros(args: Arguments, files: tuple[Path, ...]) -> Recorded:
     for path in args.recordings:
         inputs = read_ros_drive(path, topics, rig, markers, vehicle, args.corner_backend)
         drives.append(drive_of(str(path), inputs, rig, markers))
-    return Recorded(tuple(drives), rig, markers, vehicle, (*files, args.topics))
+    return RecordedDrives(tuple(drives), rig, markers, vehicle, (*files, args.topics))
 
 
 def drive_of(

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxnav.commands.doctor.findings import Finding, listed, said
 from jaxnav.loop.interfaces import Camera, Frame
-from jaxnav.testing.calls import Finish, started
+from jaxnav.testing.calls import Finish, start_call
 
 WATCH_S = 1.0
 _PATIENCE_S = 3.0  # until the first picture must have come
@@ -54,7 +54,7 @@ def watch(cameras: Sequence[Camera]) -> list[Watched]:
     watched = [Watched(camera.name) for camera in cameras]
     looks: list[Finish] = []
     for camera, into in zip(cameras, watched, strict=True):
-        looks.append(started(partial(_look, camera, into)))
+        looks.append(start_call(partial(_look, camera, into)))
     for look, into in zip(looks, watched, strict=True):
         try:
             look("read()", _PATIENCE_S + 2 * WATCH_S)

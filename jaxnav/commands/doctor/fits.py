@@ -17,7 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
-from jaxnav.detection.observe import Observed
+from jaxnav.detection.observe import CornerLanes
 from jaxnav.models.camera import Camera
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -47,7 +47,7 @@ class Sighted:
     sigma_px: np.ndarray
 
     @staticmethod
-    def of(rig: CameraRig, markers: MarkerMap, seen: Observed, most: int) -> "Sighted":
+    def of(rig: CameraRig, markers: MarkerMap, seen: CornerLanes, most: int) -> "Sighted":
         """The sightings of the `most` markers that look largest in any image."""
         diagonals_px = seen.corners_px[..., :2, :] - seen.corners_px[..., 2:, :]
         area_px2 = np.abs(

@@ -14,7 +14,7 @@ from jaxnav.loop import plugins
 from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
 from jaxnav.loop.limits import Limits
 from jaxnav.loop.moved_vehicle import GuardProcess
-from jaxnav.testing.calls import HANGS_S, Worker, started
+from jaxnav.testing.calls import HANGS_S, Worker, start_call
 from jaxnav.testing.cameras import Parked
 
 READINGS = 20
@@ -61,9 +61,11 @@ def plug_ins(
 
 
 def _open_vehicle(name: str, setup: Setup, opened: list[Vehicle]) -> Iterator[Finding]:
-    plugins.find("--vehicle", plugins.VEHICLES, name)
+    plugins.load_factory("--vehicle", plugins.VEHICLES, name)
     try:
-        vehicle = started(partial(plugins.open_vehicle, name, setup))("opening it", _OPENS_WITHIN_S)
+        vehicle = start_call(partial(plugins.open_vehicle, name, setup))(
+            "opening it", _OPENS_WITHIN_S
+        )
     except (BadInput, OSError, AssertionError) as error:
         yield _not_opened("vehicle", name, error)
         return
@@ -113,7 +115,7 @@ def _not_opened(part: str, name: str, error: Exception) -> Finding:
 def _close(part: str, things: Sequence[Any]) -> Iterator[Finding]:
     for thing in things:
         try:
-            started(thing.close)("close()", HANGS_S)
+            start_call(thing.close)("close()", HANGS_S)
         except Exception as error:
             yield Finding(part, "warning", f"closing failed: {said(error)}", "the driver's author")
 
@@ -267,9 +269,9 @@ def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Findi
 
 
 def _cameras(name: str, setup: Setup, vehicle: Vehicle) -> Iterator[Finding]:
-    plugins.find("--cameras", plugins.CAMERAS, name)
+    plugins.load_factory("--cameras", plugins.CAMERAS, name)
     try:
-        cameras = started(partial(plugins.open_cameras, name, setup, vehicle))(
+        cameras = start_call(partial(plugins.open_cameras, name, setup, vehicle))(
             "opening them", _OPENS_WITHIN_S
         )
     except (BadInput, OSError, AssertionError) as error:

@@ -120,7 +120,7 @@ class Faults(Headless):
 
 
 @dataclass(frozen=True)
-class Replay(Headless):
+class ReplayRecording(Headless):
     """Drive a recorded drive again, or localise a recorded camera rig in every frame.
 
     A drive is a .mcap of `jaxnav`, or a ROS bag with --topics, --rig, --markers-file, --vehicle and
@@ -177,7 +177,7 @@ class Replay(Headless):
 
 
 @dataclass(frozen=True)
-class View(Headless):
+class ViewDrive(Headless):
     """Look at a recorded drive in Rerun: map, cameras, candidates, health, over time.
 
     Opens a window, or writes an .rrd file to --out. Needs the extra `viz`.

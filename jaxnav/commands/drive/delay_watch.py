@@ -10,7 +10,7 @@ import numpy as np
 from jaxnav.loop.camera_delays import CameraDelays, Delay
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Frames, Sighted
+from jaxnav.loop.frames import FrameDetections, FrameIntake
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import opposite, planar_in_world
@@ -43,13 +43,13 @@ class DelayWatch:
         """See `Observer`."""
         return self._faults
 
-    def handled(self, given: Input, outcome: Outcome) -> None:
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
-        self._delays.take(outcome)
+        self._delays.add_outcome(outcome)
         if self._delays.due:
             self._wake.set()
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
 
     def close(self) -> None:
@@ -59,7 +59,7 @@ class DelayWatch:
         self._thread.join(_CLOSE_S)
 
     @property
-    def told(self) -> str | None:
+    def closing_note(self) -> str | None:
         """See `Onlooker`."""
         return "\n".join(warnings(self._delays, self._setup)) or None if self._faults else None
 
@@ -79,24 +79,25 @@ class DelayWatch:
 
 def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
     """A line for each camera whose stamps are surely wrong, or one line for all cameras."""
-    found, together = delays.found, delays.together
+    found, together = delays.delays, delays.common_delay
     known = [one for one in found if one.known]
     if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
         delay_s = setup.vehicle.camera_delay_s + together.delay_s
         do = f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
-        yield f"the cameras are {told(together)}: {do}"
+        yield f"the cameras are {describe_delay(together)}: {do}"
         return
     for name, one in zip(setup.rig.names, found, strict=True):
         if not one.late:
             continue
         delay_s = setup.vehicle.camera_delay_s + one.delay_s
         yield (
-            f"camera {name!r} is {told(one)}: raise its latency_ms by {one.delay_s * 1e3:.0f}, or "
+            f"camera {name!r} is {describe_delay(one)}: "
+            f"raise its latency_ms by {one.delay_s * 1e3:.0f}, or "
             f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml where all cameras are like it"
         )
 
 
-def told(delay: Delay) -> str:
+def describe_delay(delay: Delay) -> str:
     """A delay as text: `48 +- 6 ms later than stamps say`."""
     way = "later" if delay.delay_s > 0 else "earlier"
     off_ms, sigma_ms = abs(delay.delay_s) * 1e3, max(delay.sigma_s * 1e3, 1.0)
@@ -112,7 +113,7 @@ def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
     """The delays of the cameras in a recorded drive."""
     delays = CameraDelays(setup.rig, setup.markers, setup.vehicle)
     corrections = Corrections.of(setup.vehicle)
-    frames = Frames(len(setup.rig), setup.markers, setup.corner_sigma_px)
+    frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     outcomes = log.outcomes
     poses = planar_in_world(outcomes.pose, opposite(setup.markers.origin_m))
     known = outcomes.decided & np.isfinite(poses).all(axis=1)
@@ -120,15 +121,17 @@ def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
     for given in log.inputs:
         read = given.odometry
         if read is not None and read.valid:
-            right = corrections.reading(read)
+            right = corrections.correct_reading(read)
             if math.isfinite(right.speed_mps) and math.isfinite(right.steering_rad):
-                delays.read(right.stamp_ns, right.speed_mps, right.steering_rad)
-        seen, stamp_ns, _ = frames.told([corrections.frame(f) for f in given.frames], given.now_ns)
+                delays.add_reading(right.stamp_ns, right.speed_mps, right.steering_rad)
+        seen, stamp_ns, _ = frames.check(
+            [corrections.correct_frame(f) for f in given.frames], given.now_ns
+        )
         if seen is not None:
-            delays.seen(stamp_ns, seen)
+            delays.add_corners(stamp_ns, seen)
         while at < len(known) and outcomes.now_ns[at] <= given.now_ns:
             if known[at]:
-                delays.at(int(outcomes.now_ns[at]), np.asarray(poses[at], float))
+                delays.add_pose(int(outcomes.now_ns[at]), np.asarray(poses[at], float))
             at += 1
         while delays.due:
             delays.solve()

@@ -20,7 +20,7 @@ from jaxnav.files.images import read_image
 from jaxnav.models.camera import Camera
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
-from jaxnav.plots.localisation import View, photo_with_poses
+from jaxnav.plots.localisation import AnnotatedFrame, photo_with_poses
 from jaxnav.pose.candidates import Candidates, find_candidates
 from jaxnav.pose.observation import Observation, Snapshot
 
@@ -155,14 +155,14 @@ def _view(
     size_m: float,
     found: Detections,
     located: list[tuple[dict[str, Any], Candidates]],
-) -> View:
+) -> AnnotatedFrame:
     sticks: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for _, candidates in located:
         for rank, n in enumerate(np.flatnonzero(candidates.valid)[:2]):
             wxyz_xyz = candidates.T_vehicle_world.wxyz_xyz[n]
             Ts_camera_marker = jaxlie.SE3(jnp.asarray(wxyz_xyz)[None])
             sticks[rank].append(normals_px(camera, Ts_camera_marker, np.array([size_m]))[0])
-    return View(
+    return AnnotatedFrame(
         title=f"{title}: detected marker green, normal of the better pose blue, other pose orange",
         image=image[:, :, ::-1],
         detected_px=found.corners_px,

@@ -14,7 +14,7 @@ from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.status import notice, status_line
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import Sighted
+from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.loop import Observer
 from jaxnav.loop.pilot import Input, Outcome
@@ -38,7 +38,7 @@ class Onlooker(Observer, Protocol):
         ...
 
     @property
-    def told(self) -> str | None:
+    def closing_note(self) -> str | None:
         """A summary to print; None without one."""
         ...
 
@@ -59,19 +59,19 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
         found.append(onlooker)
 
     if args.record is not None:
-        add(Recording(args.record, setup, args.record_images))
+        add(DriveRecorder(args.record, setup, args.record_images))
     if args.view:
         from jaxnav.viewer.rerun_view import RerunView  # imports all that draws
 
         waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
-        add(View(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
+        add(LiveView(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
     add(DelayWatch(setup, warns=not args.headless))
     if not args.headless:
         add(StatusLine())
     return found
 
 
-class Recording:
+class DriveRecorder:
     """An observer that records the loop's inputs and outcomes into a file."""
 
     def __init__(self, path: Path, setup: DriveSetup, images: bool):
@@ -94,13 +94,13 @@ class Recording:
             self._dropped, found = self._recorder.dropped, Fault.RECORDER_BEHIND
         return found | Fault.RECORDER_FAILED if self._recorder.failed else found
 
-    def handled(self, given: Input, outcome: Outcome) -> None:
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
         self._recorder.put(*input_message(given))
         message = outcome_message(outcome, digest(outcome))
         self._recorder.put(OUTCOME, given.now_ns, message)
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
         if self._images and frame.image is not None:
             self._recorder.image(f"/camera/{name}", frame.stamp_ns, frame.image)
@@ -110,7 +110,7 @@ class Recording:
         self._recorder.close(keep_empty=False)
 
     @property
-    def told(self) -> str:
+    def closing_note(self) -> str:
         """See `Onlooker`."""
         text = f"recorded {self._recorder.written} messages in {self._path}"
         if self._recorder.dropped:
@@ -118,7 +118,7 @@ class Recording:
         return f"{text}; {self._recorder.failed}" if self._recorder.failed else text
 
 
-class View:
+class LiveView:
     """An observer that shows outcomes in Rerun's window; a closed window is no fault."""
 
     faults = Fault(0)
@@ -129,11 +129,11 @@ class View:
         """
         self._view = view
 
-    def handled(self, given: Input, outcome: Outcome) -> None:
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
         self._view.show(outcome)
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
         detections = sighted.detections
         corners_px = None if detections is None else detections.corners_px
@@ -144,7 +144,7 @@ class View:
         self._view.close()
 
     @property
-    def told(self) -> str | None:
+    def closing_note(self) -> str | None:
         """See `Onlooker`."""
         if self._view.failed:
             return f"view: {self._view.failed}"
@@ -156,16 +156,16 @@ class StatusLine:
     """An observer that writes one line in the terminal, five times a second."""
 
     faults = Fault(0)
-    told: str | None = None
+    closing_note: str | None = None
 
     def __init__(self) -> None:
         self._last_ns, self._count, self._marker_ns = 0, 0, 0
         self._faults = Fault(0)
 
-    def handled(self, given: Input, outcome: Outcome) -> None:
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
         self._count += 1
-        if outcome.told is not None and outcome.told.corners_px is not None:
+        if outcome.data is not None and outcome.data.corners_px is not None:
             self._marker_ns = given.now_ns
         if outcome.faults != self._faults:
             text, self._faults = notice(outcome, self._faults), outcome.faults
@@ -184,7 +184,7 @@ class StatusLine:
         sys.stderr.flush()
         self._last_ns, self._count = given.now_ns, 0
 
-    def seen(self, name: str, frame: Frame, sighted: Sighted) -> None:
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from jaxnav.files.ranges import is_within
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.plots.drive import drive_log_report
 from jaxnav.recording.drive_log import DriveLog
-from jaxnav.recording.plausible import left_out, plausible
+from jaxnav.recording.plausible import keep_plausible, left_out_note
 
 _LONGEST_STEP_S = 1.0  # between two readings, for the distance; a longer gap counts as this
 
@@ -39,14 +39,14 @@ def read_outcomes(path: Path, headless: bool) -> DriveLog:
 def draw_drive(args: Arguments) -> int:
     """Write drive.png, and print a summary of the drive."""
     log = read_outcomes(args.store, args.headless)
-    outcomes, odd = plausible(log.outcomes)
+    outcomes, odd = keep_plausible(log.outcomes)
     log = replace(log, outcomes=outcomes)
     out = output_folder(args.out)
     save_figure(drive_log_report(log, visible(args.store.name)), out / "drive.png")
     for line in summary_lines(log):
         print(visible(line))
     if odd:
-        print(left_out(odd))
+        print(left_out_note(odd))
     print(f"picture in {visible(out / 'drive.png')}")
     return 0
 

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.drive import replay_drive
-from jaxnav.commands.drive.arguments import Replay as Arguments
+from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import Selector
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
@@ -52,7 +52,7 @@ def run(args: Arguments) -> int:
         apply_params(Navigator(recording.rig, recording.markers), params)
     out = output_folder(args.out)
     if params is not None:
-        print(params.told())
+        print(params.describe())
     with tqdm(total=len(recording), unit="frame", disable=args.headless) as bar:
         bar.set_postfix_str("compiling")
 

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from jaxnav.commands.drive.arguments import Replay as Arguments
-from jaxnav.commands.drive.track import Row, Track
+from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
+from jaxnav.commands.drive.track import Track, TrackRow
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.commands.reading import read_shown
@@ -44,7 +44,7 @@ from jaxnav.recording.drive_setup import DriveSetup, needs_float64
 from jaxnav.recording.mcap_messages import profile_of
 from jaxnav.recording.message_schemas import OUTCOME
 from jaxnav.recording.messages import digest, input_message, outcome_message
-from jaxnav.recording.plausible import plausible
+from jaxnav.recording.plausible import keep_plausible
 from jaxnav.recording.recorder import Recorder
 
 EXIT_DIFFERS = 1
@@ -89,7 +89,7 @@ def run(args: Arguments) -> int:
     comparison = Comparison(log) if log is not None and not changed else None
     out = output_folder(args.out)
     if params is not None:
-        print(params.told())
+        print(params.describe())
     track = _replayed(args, setup, inputs, comparison)
     summary: dict[str, Any] = {
         "recording": str(args.recording),
@@ -100,8 +100,8 @@ def run(args: Arguments) -> int:
     recorded = None
     if log is not None:
         summary |= {"changed": changed, "missing": log.missing, "truncated": log.truncated}
-        recorded = plausible(log.outcomes)[0]
-        summary |= track.against(recorded)
+        recorded = keep_plausible(log.outcomes)[0]
+        summary |= track.rms_differences(recorded)
     if comparison is not None:
         summary |= {
             "compared": comparison.compared,
@@ -193,7 +193,7 @@ def _replayed(
         bar.set_postfix_str("compiling")
         for given, outcome in zip(inputs, outcomes, strict=True):
             bar.set_postfix_str("", refresh=False)
-            rows.append(Row.of(outcome))
+            rows.append(TrackRow.of(outcome))
             if comparison is not None:
                 comparison.look(outcome)
             if recorder is not None:
@@ -211,7 +211,7 @@ def _replayed(
 def _picture(setup: DriveSetup, track: Track, recorded: Outcomes | None, title: str) -> Figure:
     recorded_m, drawn = None, {}
     if recorded is not None:
-        shift_m, turn_rad = track.off(recorded)
+        shift_m, turn_rad = track.distances_to(recorded)
         # A logarithmic axis shows no zero: 1e-9 stands for it.
         drawn = {
             "position off (m)": np.maximum(shift_m, 1e-9),

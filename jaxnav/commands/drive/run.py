@@ -57,7 +57,7 @@ def run(args: Run, signals: Signals) -> int:
     if args.params is not None:
         params = load_params(args.params)
         setup = setup.with_params(params)
-        _say(args, params.told())
+        _say(args, params.describe())
     told = Setup(
         setup.rig, setup.markers, setup.vehicle, setup.route_on_map.start_pose, args.seed, options
     )
@@ -76,8 +76,8 @@ def run(args: Run, signals: Signals) -> int:
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
     for onlooker in onlookers:
-        if onlooker.told is not None:
-            print(onlooker.told)
+        if onlooker.closing_note is not None:
+            print(onlooker.closing_note)
     if drive.unheard is not None:
         print(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {drive.unheard}")
     return EXIT_STOPPED if drive.loop.stopped or drive.unheard is not None else 0
@@ -98,8 +98,8 @@ def _options(given: Sequence[str]) -> dict[str, str]:
 def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     """Read all files and find all plug-ins before anything is compiled or moves, so that bad input
     is found first."""
-    factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
-    plugins.find("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
+    factory = plugins.load_factory("--vehicle", plugins.VEHICLES, args.vehicle)
+    plugins.load_factory("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
     own = factory.own_files(options) if isinstance(factory, HasOwnFiles) else None
     qcar = calib_dir() / "qcar"
 
@@ -121,7 +121,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
 
 def _guarding(args: Run) -> GuardProcess | None:
     """The process that will own the vehicle; None where its plug-in must stay in this one."""
-    factory = plugins.find("--vehicle", plugins.VEHICLES, args.vehicle)
+    factory = plugins.load_factory("--vehicle", plugins.VEHICLES, args.vehicle)
     if isinstance(factory, SharesProcess) and factory.shares_process:
         return None
     try:

@@ -12,7 +12,7 @@ from jaxnav.loop.pilot import Outcome
 from jaxnav.recording.drive_log import Outcomes
 
 
-class Row(NamedTuple):
+class TrackRow(NamedTuple):
     """The kept part of one outcome, without its bank of hypotheses."""
 
     now_ns: int
@@ -27,10 +27,10 @@ class Row(NamedTuple):
     restart_reason: str
 
     @staticmethod
-    def of(outcome: Outcome) -> "Row":
+    def of(outcome: Outcome) -> "TrackRow":
         """The kept part of an outcome."""
         output = outcome.output
-        return Row(
+        return TrackRow(
             outcome.now_ns,
             np.asarray(outcome.pose, float),
             np.asarray(outcome.T_world_vehicle, float),
@@ -48,7 +48,7 @@ class Row(NamedTuple):
 class Track:
     """A track of N rows in the order of their outcomes."""
 
-    rows: Sequence[Row]
+    rows: Sequence[TrackRow]
 
     @property
     def now_ns(self) -> np.ndarray:
@@ -92,7 +92,7 @@ class Track:
             "restart_reason": last.restart_reason,
         }
 
-    def off(self, recorded: Outcomes) -> tuple[np.ndarray, np.ndarray]:
+    def distances_to(self, recorded: Outcomes) -> tuple[np.ndarray, np.ndarray]:
         """Distances (N,) m and (N,) rad to the recorded track, NaN where either has no pose."""
         index = np.searchsorted(recorded.now_ns, self.now_ns)
         known = index < len(recorded.now_ns)
@@ -105,9 +105,9 @@ class Track:
         shift_m = np.hypot(difference[:, 0], difference[:, 1])
         return np.where(known, shift_m, np.nan), np.where(known, turn, np.nan)
 
-    def against(self, recorded: Outcomes) -> dict[str, Any]:
+    def rms_differences(self, recorded: Outcomes) -> dict[str, Any]:
         """Root mean square differences from the recorded track."""
-        shift_m, turn_rad = self.off(recorded)
+        shift_m, turn_rad = self.distances_to(recorded)
         return {
             "rms_position_difference_m": _rms(shift_m),
             "rms_heading_difference_deg": np.rad2deg(_rms(turn_rad)),

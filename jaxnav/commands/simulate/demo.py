@@ -16,7 +16,7 @@ from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.pictures import corners_in_world, save_figure, views_of
 from jaxnav.commands.process import configure_jax, step_folder
 from jaxnav.commands.simulate.arguments import Demo
-from jaxnav.commands.simulate.rendered_world import Cameras, World
+from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
 from jaxnav.compiling.step import compiled_step
 from jaxnav.errors import visible
 from jaxnav.files import (
@@ -26,10 +26,10 @@ from jaxnav.files import (
 )
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.origin import planar_in_world, points_in_world, poses_in_world
-from jaxnav.plots.localisation import Track, camera_mosaic, drive_report
+from jaxnav.plots.localisation import Trajectory, camera_mosaic, drive_report
 from jaxnav.simulation.drive import (
+    DriveFrame,
     DriveSettings,
-    Frame,
     Methods,
     drive,
     waypoints_passed,
@@ -46,14 +46,14 @@ KEEP_EVERY = 8  # one of this many frames keeps its images, for the mosaic
 def run(args: Demo) -> int:
     """Drive with every seed, write reports, and print a line for each drive."""
     configure_jax(float64=True, threads=1)
-    world = World.load(args)
+    world = RenderedWorld.load(args)
     navigators = {
         OURS: world.navigator(make_selector(args.selector)),
         METHOD_A: world.navigator(LowestReprojection()),
     }
     out = output_folder(args.out)
     if world.params is not None:
-        print(world.params.told())
+        print(world.params.describe())
     methods = Methods(navigators, lambda navigator: compiled_step(navigator, step_folder()))
     summaries = []
     for seed in range(args.seed, args.seed + args.seeds):
@@ -75,7 +75,7 @@ def run(args: Demo) -> int:
 class Record:
     """A finished drive: its N frames, and the images that were kept."""
 
-    frames: list[Frame]
+    frames: list[DriveFrame]
     kept: dict[int, list[np.ndarray]]  # frame number -> images
 
     @property
@@ -89,7 +89,7 @@ class Record:
         return np.array([o.pose if o.located else np.full(3, np.nan) for o in outputs])
 
 
-def _drive(args: Demo, world: World, methods: Methods, seed: int) -> Record:
+def _drive(args: Demo, world: RenderedWorld, methods: Methods, seed: int) -> Record:
     rng = np.random.default_rng(seed)
     start = np.asarray(world.route.start_pose) + START_SPREAD * rng.uniform(-1, 1, 3)
     settings = DriveSettings(
@@ -97,8 +97,8 @@ def _drive(args: Demo, world: World, methods: Methods, seed: int) -> Record:
         duration_s=args.duration_s,
         floor_m=world.floor_m(),
     )
-    cameras = Cameras(world, rng, args.corner_noise_px)
-    frames: list[Frame] = []
+    cameras = RenderedCameras(world, rng, args.corner_noise_px)
+    frames: list[DriveFrame] = []
     kept: dict[int, list[np.ndarray]] = {}
     with tqdm(
         total=round(args.duration_s, 1),
@@ -119,7 +119,7 @@ def _drive(args: Demo, world: World, methods: Methods, seed: int) -> Record:
     return Record(frames, kept)
 
 
-def _summary(args: Demo, world: World, record: Record, seed: int) -> dict[str, Any]:
+def _summary(args: Demo, world: RenderedWorld, record: Record, seed: int) -> dict[str, Any]:
     passed = waypoints_passed(record.true_poses, np.asarray(world.route.waypoints_m))
     finished = bool(record.frames[-1].outputs[OURS].done)
     return {
@@ -172,7 +172,7 @@ def _overall(summaries: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _write(folder: Path, world: World, record: Record, summary: dict[str, Any]) -> None:
+def _write(folder: Path, world: RenderedWorld, record: Record, summary: dict[str, Any]) -> None:
     times_s = np.array([frame.stamp_s for frame in record.frames])
     origin_m = world.markers.origin_m
     poses = {"truth": record.true_poses} | {name: record.poses(name) for name in (OURS, METHOD_A)}
@@ -184,8 +184,8 @@ def _write(folder: Path, world: World, record: Record, summary: dict[str, Any]) 
     poses = {name: planar_in_world(rows, origin_m) for name, rows in poses.items()}
     report = drive_report(
         times_s,
-        Track("truth", poses["truth"]),
-        [Track(LABELS[name], poses[name]) for name in (OURS, METHOD_A)],
+        Trajectory("truth", poses["truth"]),
+        [Trajectory(LABELS[name], poses[name]) for name in (OURS, METHOD_A)],
         np.asarray(points_in_world(world.route.waypoints_m, origin_m)),
         world.route.waypoint_radius_m,
         corners_in_world(world.markers),

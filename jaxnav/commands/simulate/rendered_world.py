@@ -38,7 +38,7 @@ FLOOR_M = 5.0  # side of the floor around start, waypoints and markers, at least
 
 
 @dataclass(frozen=True)
-class World:
+class RenderedWorld:
     """The objects of a demo, built from its files, with a renderer and marker detectors."""
 
     rig: CameraRig
@@ -50,7 +50,7 @@ class World:
     detectors: list[Detector]
 
     @staticmethod
-    def load(args: Demo) -> "World":
+    def load(args: Demo) -> "RenderedWorld":
         """Read all files first, so that bad input is found before any work is done."""
         qcar = calib_dir() / "qcar"
         rig = load_rig(args.rig or qcar / "rig.yaml")
@@ -66,7 +66,7 @@ class World:
                 f"the last row would be read after the command is due "
                 f"({DriveSettings.latency_s * 1e3:.0f} ms after the stamp), got {args.exposure_ms}",
             )
-        return World(
+        return RenderedWorld(
             rig=rig,
             markers=markers,
             vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
@@ -108,10 +108,10 @@ class World:
 
 
 @dataclass
-class Cameras:
+class RenderedCameras:
     """Cameras whose rendered images are searched around the driver's belief and everywhere else."""
 
-    world: World
+    world: RenderedWorld
     rng: np.random.Generator
     corner_noise_px: float = 0.0  # on top of the detection's errors
     images: list[np.ndarray] = field(default_factory=list)  # the latest, one a camera

@@ -39,7 +39,7 @@ def _run(args: Arguments) -> int:
     done = _resumed(args)
     car = _load(args)
     if car.params is not None:
-        print(car.params.told())
+        print(car.params.describe())
     print(_HEADER)
     for name, noise_px in wanted:
         key = _key(args, car, name, noise_px)

@@ -10,7 +10,7 @@ from jaxnav.commands.kinds import Headless, ResultsFolder, Selector, StudyKind, 
 
 
 @dataclass(frozen=True)
-class Study(Headless):
+class RunStudy(Headless):
     """Run a Monte-Carlo study: a labelled grid of parameters, many trials in every cell.
 
     `ambiguity` studies single frames, `drive` closed-loop drives. CONFIG is a YAML file, or the
@@ -59,7 +59,7 @@ class Plot(Headless):
 
 
 @dataclass(frozen=True)
-class Reliability(Headless):
+class StudyReliability(Headless):
     """Draw whether flip probabilities mean what they say: when it says 10 %, are 10 % flipped?
 
     Without RECORDING, on random views of one marker (sides of 10 to 100 px, 0 to 60 degrees, corner

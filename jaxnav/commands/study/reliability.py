@@ -8,7 +8,7 @@ from tqdm import tqdm
 from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.study.arguments import Reliability as Arguments
+from jaxnav.commands.study.arguments import StudyReliability as Arguments
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.datasets.replay import replay
 from jaxnav.errors import BadInput, visible

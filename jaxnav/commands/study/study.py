@@ -9,7 +9,7 @@ import jax
 from tqdm import tqdm
 
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.study.arguments import Study as Arguments
+from jaxnav.commands.study.arguments import RunStudy as Arguments
 from jaxnav.commands.study.studies import KINDS, load_study, shipped_configs
 from jaxnav.errors import EXIT_INTERRUPTED, visible
 from jaxnav.files import output_folder

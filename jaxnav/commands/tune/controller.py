@@ -25,12 +25,12 @@ from jaxnav.plots.tuning import controller_report
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
-from jaxnav.simulation.statistics import resampled, wilson_interval
+from jaxnav.simulation.statistics import bootstrap_mean, wilson_interval
 from jaxnav.simulation.world import Spread
 from jaxnav.tuning.descent import Noisy
 from jaxnav.tuning.drive_loss import DriveLoss
 from jaxnav.tuning.driving import ClosedLoop
-from jaxnav.tuning.fit import Fit, Problem
+from jaxnav.tuning.fit import Problem, TuningFit
 from jaxnav.tuning.objective import Batch, NotFinite
 from jaxnav.tuning.unconstrained import Space
 
@@ -60,7 +60,7 @@ def run(args: Arguments) -> int:
     fitting = Fitting(out, key, gains.problem(), space, named=args.train)
     try:
         fit = fitting.run(args.headless)
-        found = gains.tested(fit)
+        found = gains.test(fit)
     except KeyboardInterrupt:
         print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
         return EXIT_INTERRUPTED
@@ -114,7 +114,7 @@ def gains_of(args: Arguments, navigator: Navigator) -> Space:
 
 
 @dataclass(frozen=True)
-class Tested:
+class ControllerTest:
     """Results of a controller in one scenario, on seeds never trained on."""
 
     loss: tuple[float, float, float]  # mean with its 95 % interval
@@ -147,7 +147,7 @@ class Gains:
             same_batch=False,
         )
 
-    def tested(self, fit: Fit) -> dict[str, tuple[Tested, Tested]]:
+    def test(self, fit: TuningFit) -> dict[str, tuple[ControllerTest, ControllerTest]]:
         """Test results before and after the fit, by scenario."""
         count = self._args.test_seeds
         with tqdm(
@@ -194,7 +194,7 @@ class Gains:
 
     def _test(
         self, loop: ClosedLoop, values: Mapping[str, Array], progress: Callable[[int], object]
-    ) -> Tested:
+    ) -> ControllerTest:
         """Drive with the scenario's own car: only what the seed draws is random."""
         nominal = dataclasses.replace(loop, rollout=dataclasses.replace(loop.rollout, spread=None))
         keys = _keys(_TEST_SEED, self._args.test_seeds)
@@ -204,10 +204,10 @@ class Gains:
         rate = float(np.mean(success))
         low, high = wilson_interval(np.array(rate), np.array(len(success)))
         own = np.asarray(trace.active)[0]
-        return Tested(
-            loss=resampled(losses, once),
+        return ControllerTest(
+            loss=bootstrap_mean(losses, once),
             parts={name: float(np.mean(p)) for name, p in loop.loss.parts(costs).items()},
-            time_s=resampled(np.asarray(costs.time_s), once),
+            time_s=bootstrap_mean(np.asarray(costs.time_s), once),
             success=(rate, float(low), float(high)),
             poses=np.asarray(trace.true_pose)[0][own],
             waypoints_m=np.asarray(loop.rollout.scenario.waypoints_m),
@@ -219,7 +219,7 @@ def _keys(first: int, count: int) -> Key[Array, " S"]:
     return keys
 
 
-def _told(tested: Tested) -> dict[str, Any]:
+def _told(tested: ControllerTest) -> dict[str, Any]:
     return {
         "loss": measure(tested.loss),
         "parts": tested.parts,

@@ -14,9 +14,9 @@ from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.reading import read_shown
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
-from jaxnav.commands.tune.drives import drives
-from jaxnav.commands.tune.recordings import navigator_of, tracks
-from jaxnav.commands.tune.sequences import Named, joined
+from jaxnav.commands.tune.drives import sequences_of_drive
+from jaxnav.commands.tune.recordings import navigator_of, sequences_of_recording
+from jaxnav.commands.tune.sequences import NamedSequences, join_sequences
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
@@ -24,7 +24,7 @@ from jaxnav.navigator import Navigator
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
-from jaxnav.tuning.recorded import Recorded, simulated
+from jaxnav.tuning.recorded import FrameSequences, simulate_sequences
 
 AT_A_TIME = 64  # sequences in a batch, where nothing is to be differentiated
 _TEST_SEED = 10**6
@@ -35,26 +35,26 @@ Progress = Callable[[int], object]
 
 
 @dataclass(frozen=True)
-class Test:
+class TuningTest:
     """Sequences that have no part in the tuning, and the navigator that goes with them."""
 
     name: str
     navigator: Navigator
     size: int  # how many there are
-    recorded: Callable[[Progress], Recorded]
+    recorded: Callable[[Progress], FrameSequences]
 
 
 @dataclass(frozen=True)
-class Data:
+class TuningData:
     """A navigator before tuning, and the sequences to learn from, to stop by and to test on."""
 
     navigator: Navigator
-    learned: Recorded
-    held_out: Recorded
-    tests: tuple[Test, ...]
+    learned: FrameSequences
+    held_out: FrameSequences
+    tests: tuple[TuningTest, ...]
 
 
-def read_data(args: Arguments) -> Data:
+def read_data(args: Arguments) -> TuningData:
     """Read all data before any work is done; simulated tests are driven only when called for.
 
     Raises:
@@ -63,33 +63,33 @@ def read_data(args: Arguments) -> Data:
     return _recorded(args) if args.recordings else _simulated(args)
 
 
-def _simulated(args: Arguments) -> Data:
+def _simulated(args: Arguments) -> TuningData:
     car, scenario = ScenarioCar.load(args), scenarios()[args.scenario]
     # The drives are the same whichever estimator is tuned.
     driver = car.navigator(scenario, MultiHypothesis())
     noise_px = jnp.asarray(args.corner_noise_px)
     rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px)
 
-    def drive(first: int, count: int, progress: Progress) -> Recorded:
+    def drive(first: int, count: int, progress: Progress) -> FrameSequences:
         """Simulate drives in batches of one size; the last batch repeats its last drive."""
         size, parts = min(count, AT_A_TIME), []
         for begin in range(0, count, size):
             seeds = first + np.minimum(np.arange(begin, begin + size), count - 1)
-            part = simulated(rollout, jax.vmap(jax.random.key)(jnp.asarray(seeds)))
+            part = simulate_sequences(rollout, jax.vmap(jax.random.key)(jnp.asarray(seeds)))
             parts.append(part.rows(slice(0, min(size, count - begin))))
             progress(len(parts[-1]))
-        return Recorded.together(parts)
+        return FrameSequences.concatenate(parts)
 
     count = args.seeds + args.held_out_seeds
     with tqdm(total=count, unit="drive", desc="drive", disable=args.headless, leave=False) as bar:
         known = drive(args.seed, count, bar.update)
     own = car.navigator(scenario, make_selector(args.selector))
-    return Data(
+    return TuningData(
         navigator=own,
         learned=known.rows(slice(0, args.seeds)),
         held_out=known.rows(slice(args.seeds, None)),
         tests=(
-            Test(
+            TuningTest(
                 f"{args.test_seeds} drives, {args.scenario}",
                 own,
                 args.test_seeds,
@@ -99,9 +99,9 @@ def _simulated(args: Arguments) -> Data:
     )
 
 
-def _recorded(args: Arguments) -> Data:
+def _recorded(args: Arguments) -> TuningData:
     learned = [_sequences(args, path, args.part) for path in args.recordings]
-    together = joined(learned)
+    together = join_sequences(learned)
     rows = np.arange(len(together))
     held_out = rows % _HELD_OUT == _HELD_OUT - 1
     if not held_out.any():
@@ -112,7 +112,7 @@ def _recorded(args: Arguments) -> Data:
     rest = [(0.0, begin)] * (begin > 0) + [(end, 1.0)] * (end < 1)
     tests = [(path, part) for path in args.recordings for part in rest]
     tests += [(path, (0.0, 1.0)) for path in args.test]
-    return Data(
+    return TuningData(
         navigator=learned[0].navigator,
         learned=together.rows(rows[~held_out]),
         held_out=together.rows(rows[held_out]),
@@ -120,30 +120,34 @@ def _recorded(args: Arguments) -> Data:
     )
 
 
-def _judging(args: Arguments, tests: Sequence[tuple[Path, tuple[float, float]]]) -> list[Test]:
+def _judging(
+    args: Arguments, tests: Sequence[tuple[Path, tuple[float, float]]]
+) -> list[TuningTest]:
     """The tests with a known pose of the vehicle in some frame."""
     found = []
     for path, part in tests:
         named = _sequences(args, path, part)
         if bool(jnp.any(named.recorded.judged)):
             name = named.name if part == (0.0, 1.0) else f"{named.name}, {part[0]:g} to {part[1]:g}"
-            found.append(Test(name, named.navigator, len(named.recorded), _known(named.recorded)))
+            found.append(
+                TuningTest(name, named.navigator, len(named.recorded), _known(named.recorded))
+            )
     return found
 
 
-def _known(recorded: Recorded) -> Callable[[Progress], Recorded]:
+def _known(recorded: FrameSequences) -> Callable[[Progress], FrameSequences]:
     return lambda progress: recorded
 
 
-def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> Named:
+def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> NamedSequences:
     if path.suffix == _DRIVE:
         log = read_shown(path, args.headless)
         setup = DriveSetup.of_header(log.header, path)
-        return Named(str(path), setup.navigator(), drives(log, setup, part))
+        return NamedSequences(str(path), setup.navigator(), sequences_of_drive(log, setup, part))
     recording = read_recording(
         path,
         None if args.rig is None else load_rig(args.rig),
         None if args.markers is None else load_markers(args.markers),
     )
     navigator = navigator_of(recording, True, args.selector)
-    return Named(str(path), navigator, tracks(recording, True, part))
+    return NamedSequences(str(path), navigator, sequences_of_recording(recording, True, part))

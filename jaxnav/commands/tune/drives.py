@@ -17,15 +17,15 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.commands.tune.sequences import IDENTITY, bounds, cut, maps, side_by_side
 from jaxnav.errors import BadInput
 from jaxnav.loop.flags import Reject
-from jaxnav.loop.frames import Frames
-from jaxnav.loop.history import Told
+from jaxnav.loop.frames import FrameIntake
+from jaxnav.loop.history import EventData
 from jaxnav.loop.pilot import Input
 from jaxnav.loop.stamps import Stamps
 from jaxnav.pose.observation import Observation
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_replay import check_inputs
 from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 
 _NS_PER_US = 1000
 
@@ -34,12 +34,12 @@ class Event(NamedTuple):
     """A reading of the odometry or a sighting of markers, with its stamp."""
 
     stamp_ns: int
-    told: Told  # odometry, or corners of some cameras
+    data: EventData  # odometry, or corners of some cameras
 
 
-def drives(
+def sequences_of_drive(
     log: DriveLog, setup: DriveSetup, part: tuple[float, float], length: int = 400
-) -> Recorded:
+) -> FrameSequences:
     """Sequences of a drive. The car's true pose is unknown, so that no frame is judged.
 
     Odometry that the pilot refused on the way is left out.
@@ -58,27 +58,27 @@ def drives(
         for now_ns, rejects in zip(outcomes.now_ns, outcomes.rejects, strict=True)
         if rejects & Reject.ODOMETRY
     }
-    return driven(log.inputs, setup, log.path, part, length, refused_ns)
+    return sequences_of_inputs(log.inputs, setup, log.path, part, length, refused_ns)
 
 
-def driven(
+def sequences_of_inputs(
     inputs: Sequence[Input],
     setup: DriveSetup,
     where: Path,
     part: tuple[float, float],
     length: int = 400,
     refused_ns: Collection[int] = (),
-) -> Recorded:
-    """`drives` for inputs of a pilot, which may come from a ROS bag.
+) -> FrameSequences:
+    """`sequences_of_drive` for inputs of a pilot, which may come from a ROS bag.
 
     Args:
         where: the file that the inputs are of.
         refused_ns: `now_ns` of inputs whose odometry is left out.
     """
     check_inputs(inputs, setup, where)
-    events = sensed(inputs, setup, refused_ns)
+    events = believed_events(inputs, setup, refused_ns)
     begin, end = bounds(len(events), part)
-    if not any(event.told.corners_px is not None for event in events[begin:end]):
+    if not any(event.data.corners_px is not None for event in events[begin:end]):
         problem = f"{end - begin} of its {len(events)} events, and none shows a marker of the map"
         raise BadInput(where, problem)
     rows = _Rows.of(events, len(setup.rig), len(setup.markers.ids))
@@ -94,7 +94,7 @@ def driven(
         jnp.asarray(rows.has_odometry[indices] & used),
         jnp.asarray(dt_s, float),
     )
-    return Recorded(
+    return FrameSequences(
         markers=maps(setup.markers, lanes),
         obs=obs,
         used=jnp.asarray(used),
@@ -103,7 +103,7 @@ def driven(
     )
 
 
-def sensed(
+def believed_events(
     inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int] = ()
 ) -> list[Event]:
     """Events that a pilot would believe of its inputs, in the order of the stamps.
@@ -124,10 +124,10 @@ def _told(
     inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int]
 ) -> Iterator[Event]:
     """Events of the inputs that `Pilot.handle` would believe, without an estimate."""
-    frames = Frames(len(setup.rig), setup.markers, setup.corner_sigma_px)
+    frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     stamps = Stamps()
     for given in inputs:
-        told, told_ns, _ = frames.told(given.frames, given.now_ns)
+        told, told_ns, _ = frames.check(given.frames, given.now_ns)
         if told is not None:
             yield Event(told_ns, told)
         reading = given.odometry
@@ -137,17 +137,17 @@ def _told(
         odometry = (reading.speed_mps, reading.steering_rad)
         believed = reading.valid and all(map(math.isfinite, odometry))
         if stamp_ns is not None and believed and given.now_ns not in refused_ns:
-            yield Event(stamp_ns, Told(odometry=odometry))
+            yield Event(stamp_ns, EventData(odometry=odometry))
 
 
 def _order(event: Event) -> tuple[int, bool]:
     """A sort key: by stamp, corners first."""
-    return event.stamp_ns, event.told.corners_px is None
+    return event.stamp_ns, event.data.corners_px is None
 
 
 def _both(one: Event, other: Event) -> Event | None:
     """Two events merged into one; None for different instants or the same camera."""
-    a, b = one.told, other.told
+    a, b = one.data, other.data
     if one.stamp_ns != other.stamp_ns or a.visible is None or b.visible is None:
         return None
     if np.any(np.any(a.visible, axis=1) & np.any(b.visible, axis=1)):
@@ -157,7 +157,7 @@ def _both(one: Event, other: Event) -> Event | None:
     assert a.sigma_px is not None
     assert b.sigma_px is not None
     there = np.any(b.visible, axis=1)[:, None]
-    told = Told(
+    told = EventData(
         corners_px=np.where(there[..., None, None], b.corners_px, a.corners_px),
         visible=a.visible | b.visible,
         sigma_px=np.where(there[..., None], b.sigma_px, a.sigma_px),
@@ -182,7 +182,7 @@ class _Rows(NamedTuple):
         rows = _Rows(
             stamps_us=np.array([event.stamp_ns // _NS_PER_US for event in events], np.int64),
             odometry=np.zeros((len(events), 2)),
-            has_odometry=np.array([event.told.odometry is not None for event in events], bool),
+            has_odometry=np.array([event.data.odometry is not None for event in events], bool),
             corners_px=np.zeros((*lanes, 4, 2)),
             visible=np.zeros(lanes, bool),
             sigma_px=np.ones((*lanes, 4)),

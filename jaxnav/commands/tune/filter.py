@@ -14,20 +14,20 @@ from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
-from jaxnav.commands.tune.data import AT_A_TIME, Data, read_data
+from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, summary_of
 from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
 from jaxnav.files import Params, apply_params, load_params, output_folder, write_json
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of, with_parameters
 from jaxnav.plots.tuning import tuning_report
-from jaxnav.simulation.statistics import anees_band, resampled
-from jaxnav.tuning.branches import estimated
+from jaxnav.simulation.statistics import anees_band, bootstrap_mean
+from jaxnav.tuning.branches import estimate_sequences
 from jaxnav.tuning.descent import Smooth
 from jaxnav.tuning.filter import FilterCost
-from jaxnav.tuning.fit import Fit, Problem
+from jaxnav.tuning.fit import Problem, TuningFit
 from jaxnav.tuning.objective import Batch, Objective, where_not_finite
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 from jaxnav.tuning.unconstrained import Space
 
 _STAGES = 4
@@ -66,7 +66,7 @@ def run(args: Arguments) -> int:
     return 0
 
 
-def space_of(args: Arguments, navigator: Navigator, learned: Recorded) -> Space:
+def space_of(args: Arguments, navigator: Navigator, learned: FrameSequences) -> Space:
     """The space of the parameters to be learned, starting at a navigator's values.
 
     Raises:
@@ -85,7 +85,7 @@ def space_of(args: Arguments, navigator: Navigator, learned: Recorded) -> Space:
         raise BadInput("--full", str(error)) from None
 
 
-def _by_default(navigator: Navigator, learned: Recorded) -> tuple[str, ...]:
+def _by_default(navigator: Navigator, learned: FrameSequences) -> tuple[str, ...]:
     """The default names: Q and all of R that the estimator uses for a car; Q alone for a free body,
     whose recordings tell by themselves how far its corners scatter."""
     names = ("motion.acceleration_density",)
@@ -98,7 +98,7 @@ def _by_default(navigator: Navigator, learned: Recorded) -> tuple[str, ...]:
     return (*names, "motion.odometry_sigma", *floors, corners)
 
 
-def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: Data) -> Problem:
+def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: TuningData) -> Problem:
     made: dict[int, tuple[Batch, Batch]] = {}
 
     def of_stage(x: Array, stage: int) -> tuple[Batch, Batch]:
@@ -118,7 +118,7 @@ def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: Data
 
 
 @dataclass(frozen=True)
-class Tested:
+class FilterTest:
     """Results of an estimator on drives that had no part in the tuning."""
 
     rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
@@ -129,8 +129,8 @@ class Tested:
 
 
 def _tested(
-    args: Arguments, data: Data, params: Params | None, space: Space, fit: Fit
-) -> dict[str, tuple[Tested, Tested]]:
+    args: Arguments, data: TuningData, params: Params | None, space: Space, fit: TuningFit
+) -> dict[str, tuple[FilterTest, FilterTest]]:
     """Results before and after the fit, by the name of the test."""
     found = {}
     for test in data.tests:
@@ -147,11 +147,13 @@ def _tested(
     return found
 
 
-def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object]) -> Tested:
+def _test(
+    navigator: Navigator, test: FrameSequences, progress: Callable[[int], object]
+) -> FilterTest:
     size, parts = min(len(test), AT_A_TIME), []
     for begin in range(0, len(test), size):
         rows = np.minimum(np.arange(begin, begin + size), len(test) - 1)
-        some = jax.device_get(estimated(navigator, test.rows(rows)))
+        some = jax.device_get(estimate_sequences(navigator, test.rows(rows)))
         kept = min(size, len(test) - begin)
         parts.append((np.asarray(some.square_m2)[:kept], np.asarray(some.nees)[:kept]))
         progress(kept)
@@ -160,11 +162,11 @@ def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object
     definite = judged & ~np.isnan(nees)
 
     def mean(values: np.ndarray, counted: np.ndarray) -> tuple[float, float, float]:
-        return resampled(np.where(counted, values, 0).sum(axis=1), counted.sum(axis=1))
+        return bootstrap_mean(np.where(counted, values, 0).sum(axis=1), counted.sum(axis=1))
 
     rmse_m = tuple(float(np.sqrt(value)) for value in mean(square_m2, judged))
     freedom = 3 if isinstance(navigator.motion, BicycleKalman) else 6
-    return Tested(
+    return FilterTest(
         rmse_m=(rmse_m[0], rmse_m[1], rmse_m[2]),
         anees=mean(nees, definite),
         band=anees_band(len(test), freedom),
@@ -173,7 +175,7 @@ def _test(navigator: Navigator, test: Recorded, progress: Callable[[int], object
     )
 
 
-def _told(tested: Tested) -> dict[str, Any]:
+def _told(tested: FilterTest) -> dict[str, Any]:
     return {
         "position_median_m": float(np.median(tested.error_m)),
         "position_rmse_m": measure(tested.rmse_m),

@@ -22,7 +22,7 @@ from jaxnav.files import write_params
 from jaxnav.files.locking import sole_writer
 from jaxnav.files.npz import read_npz
 from jaxnav.files.writing import atomic_write, plain_data
-from jaxnav.tuning.fit import Fit, Problem, advanced, arrays_of, fit_of
+from jaxnav.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
 from jaxnav.tuning.unconstrained import Space
 
 # Arguments on which a fit doesn't depend.
@@ -42,7 +42,7 @@ def plain_key(command: str, args: Any) -> dict[str, Any]:
 
 def summary_of(
     key: dict[str, Any],
-    fit: Fit,
+    fit: TuningFit,
     before: Mapping[str, Array],
     after: Mapping[str, Array],
     test: Mapping[str, tuple[Any, Any]],
@@ -105,7 +105,7 @@ class Fitting:
         """The file that holds the state of the fit."""
         return self._folder / "checkpoint.npz"
 
-    def run(self, headless: bool) -> Fit:
+    def run(self, headless: bool) -> TuningFit:
         """Run the fit to its end, from its checkpoint where there is one.
 
         Raises:
@@ -116,8 +116,8 @@ class Fitting:
         with sole_writer(self.checkpoint):
             return self._run(headless)
 
-    def _run(self, headless: bool) -> Fit:
-        fit = Fit.begin(self._space.start, self._problem)
+    def _run(self, headless: bool) -> TuningFit:
+        fit = TuningFit.begin(self._space.start, self._problem)
         kept = self._kept(fit)
         if kept is not None:
             fit = kept
@@ -127,7 +127,7 @@ class Fitting:
         ) as bar:
             bar.set_postfix_str("compiling")
             while not fit.over:
-                before, fit = fit, advanced(fit, self._problem)
+                before, fit = fit, take_step(fit, self._problem)
                 if fit.step == 1:
                     self._refuse_without_gradient(fit)
                 if not bool(fit.descent.finite):
@@ -141,19 +141,19 @@ class Fitting:
                 bar.update(1)
         return fit
 
-    def write(self, fit: Fit) -> None:
+    def write(self, fit: TuningFit) -> None:
         """Write the best parameters so far to params.yaml."""
         values = {name: np.asarray(value) for name, value in self._space.values(fit.best_x).items()}
         write_params(self._folder / "params.yaml", values, self._provenance(fit))
 
-    def _provenance(self, fit: Fit) -> dict[str, Any]:
+    def _provenance(self, fit: TuningFit) -> dict[str, Any]:
         return self._key | {
             "step": fit.step,
             "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
             "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         }
 
-    def _where(self, before: Fit, x: Array) -> str:
+    def _where(self, before: TuningFit, x: Array) -> str:
         """A message about a gradient at x that is not finite."""
         step = before.step
         softness = jnp.asarray(self._problem.softness(step), x.dtype)
@@ -161,9 +161,9 @@ class Fitting:
         found = self._problem.explain(x, batch, softness)
         if found is None:
             return f"step {step + 1}: the loss is not finite; not stepped on"
-        return found.told(self._space.labels, step + 1)
+        return found.describe(self._space.labels, step + 1)
 
-    def _refuse_without_gradient(self, fit: Fit) -> None:
+    def _refuse_without_gradient(self, fit: TuningFit) -> None:
         """Raise BadInput where the loss does not depend on a parameter at all."""
         batch = self._problem.batch(fit.stage_x, 0, 0)
         x, slope = self._space.start, fit.descent.gradient
@@ -175,12 +175,12 @@ class Fitting:
             if np.all(np.abs(of_frames[labels == name]) <= tiny[labels == name]):
                 raise BadInput("--train", f"the loss does not depend on {name}")
 
-    def _keep(self, fit: Fit) -> None:
+    def _keep(self, fit: TuningFit) -> None:
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, run=json.dumps(self._key), **arrays_of(fit))
         atomic_write(self.checkpoint, buffer.getvalue())
 
-    def _kept(self, like: Fit) -> Fit | None:
+    def _kept(self, like: TuningFit) -> TuningFit | None:
         if not self.checkpoint.exists():
             return None
         try:

@@ -14,7 +14,7 @@ from jaxnav.errors import BadInput
 from jaxnav.models.origin import opposite, poses_in_world
 from jaxnav.navigator import Navigator
 from jaxnav.pose.observation import Observation
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 
 LEAST_SEQUENCES = 4
 GAP_S = 0.5  # a marker that was away for longer appears anew
@@ -26,7 +26,7 @@ def navigator_of(
     selector: str,
     corner_sigma_px: float | None = None,
 ) -> Navigator:
-    """The navigator that localises the rig of a recording by its `tracks`.
+    """The navigator that localises the rig of a recording by its `sequences_of_recording`.
 
     Args:
         selector: one of `SELECTORS`.
@@ -44,13 +44,13 @@ def navigator_of(
     )
 
 
-def tracks(
+def sequences_of_recording(
     recording: Recording,
     one_at_a_time: bool,
     part: tuple[float, float],
     length: int = 64,
     shortest: int = 10,
-) -> Recorded:
+) -> FrameSequences:
     """Sequences of a recording, judged where the reference knows the pose and a marker is in view.
 
     Args:
@@ -88,7 +88,7 @@ def tracks(
 
 def _recorded(
     recording: Recording, markers: Int[np.ndarray, " B"] | None, pieces: list[np.ndarray]
-) -> Recorded:
+) -> FrameSequences:
     """Pieces of a recording as sequences side by side.
 
     Args:
@@ -120,7 +120,7 @@ def _recorded(
         known = reference.valid[frames][..., None]
         Ts = poses_in_world(reference.T_world_vehicle[frames], opposite(recording.markers.origin_m))
         truth = np.where(known, Ts, truth)
-    return Recorded(
+    return FrameSequences(
         markers=maps(recording.markers, lanes),
         obs=_observations(
             jnp.asarray(corners_px, float), jnp.asarray(visible), jnp.asarray(dt_s, float)

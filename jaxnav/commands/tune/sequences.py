@@ -12,17 +12,17 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Navigator
-from jaxnav.tuning.recorded import Recorded
+from jaxnav.tuning.recorded import FrameSequences
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # wxyz xyz
 
 
-class Named(NamedTuple):
+class NamedSequences(NamedTuple):
     """The sequences of one recording, with its name and navigator."""
 
     name: str  # of the file, for messages
     navigator: Navigator  # that goes with the sequences
-    recorded: Recorded
+    recorded: FrameSequences
 
 
 def bounds(count: int, part: tuple[float, float]) -> tuple[int, int]:
@@ -69,7 +69,7 @@ def maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
     return found
 
 
-def joined(recordings: Sequence[Named]) -> Recorded:
+def join_sequences(recordings: Sequence[NamedSequences]) -> FrameSequences:
     """The sequences of all recordings, padded to the longest.
 
     Raises:
@@ -79,10 +79,10 @@ def joined(recordings: Sequence[Named]) -> Recorded:
     for other in recordings[1:]:
         if problem := _apart(first, other):
             raise BadInput(f"{first.name}, {other.name}", problem)
-    return Recorded.together([named.recorded for named in recordings])
+    return FrameSequences.concatenate([named.recorded for named in recordings])
 
 
-def _apart(one: Named, other: Named) -> str | None:
+def _apart(one: NamedSequences, other: NamedSequences) -> str | None:
     """The reason why one estimator can't take two recordings together; None without one."""
     lanes, lanes_other = (named.recorded.obs.visible.shape[2:] for named in (one, other))
     for what, here, there in zip(("cameras", "markers"), lanes, lanes_other, strict=True):

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 
-class Kept:
+class DriveTraces:
     """The records of every drive, collected chunk by chunk as they arrive."""
 
     def __init__(self, count: int, chunk_frames: int):
@@ -14,7 +14,7 @@ class Kept:
         self.chunk_frames = chunk_frames
         self.pieces: list[tuple[np.ndarray, np.ndarray, Any]] = []
 
-    def take(self, owner: np.ndarray, trace: Any) -> None:
+    def add(self, owner: np.ndarray, trace: Any) -> None:
         """Add one chunk, leaves (lanes, frames, ...); `owner` is each lane's drive, -1 for none."""
         taken = np.flatnonzero(owner >= 0)
         drive = owner[taken]
@@ -22,7 +22,7 @@ class Kept:
         self.pieces.append((drive, self.chunks[drive], piece))
         self.chunks[drive] += 1
 
-    def side_by_side(self) -> tuple[Any, np.ndarray]:
+    def stack(self) -> tuple[Any, np.ndarray]:
         """Stack drives of unequal lengths; an ended drive repeats its last frame.
 
         Returns:
