@@ -21,7 +21,8 @@ from jaxnav.calibration.rigs.pose_arrays import retracted
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import rotation_matrix, skew, turn_and_shift
 from jaxnav.models.lenses import LENSES, MOST_COEFFICIENTS
-from jaxnav.numerics.schur import Blocks, SchurLM, SchurState, reduce
+from jaxnav.numerics.levenberg_marquardt import LMState
+from jaxnav.numerics.schur import Blocks, SchurLM, reduce
 
 # Names of the shared unknowns, in order; unknowns that a lens doesn't have are fixed at zero.
 FITTED = ("none", "radtan", "equidistant")
@@ -114,7 +115,7 @@ def solve(
         squared = jnp.sum(residual_px**2, axis=-1) * scale**2
         cost = cut**2 * jnp.log1p(squared / cut**2)
         counts = scale / jnp.sqrt(1 + squared / cut**2)
-        return jnp.sqrt(cost), normal_equations(residual_px, of_lens, of_pose, counts)
+        return jnp.sqrt(cost).reshape(-1), normal_equations(residual_px, of_lens, of_pose, counts)
 
     solution: optx.Solution = optx.least_squares(
         fn,
@@ -124,9 +125,9 @@ def solve(
         max_steps=max_steps,
         throw=False,
     )
-    state: SchurState = solution.state
+    state: LMState = solution.state
     residual_px = _predicted(lens, solution.value, seen) - seen.corners_px
-    blocks = jax.tree.map(lambda leaf: leaf * sigma_px**2, state.blocks)
+    blocks = jax.tree.map(lambda leaf: leaf * sigma_px**2, state.normal)
     return Bundle(
         unknowns=solution.value,
         residual_px=jnp.where(seen.present[..., None], residual_px, 0),

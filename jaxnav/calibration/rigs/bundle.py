@@ -125,8 +125,8 @@ def adjust(
         residuals_px=residuals,
         weight=_weight(_distance2(residuals, known.sigma_px)),
         cost=solution.state.cost,
-        reduced=reduce(solution.state.blocks, free, jnp.zeros(())),
-        scores=_scores(solution.value, known, solution.state.blocks, parts),
+        reduced=reduce(solution.state.normal, free, jnp.zeros(())),
+        scores=_scores(solution.value, known, solution.state.normal, parts),
         steps=solution.state.steps,
         converged=jnp.asarray(solution.result == optx.RESULTS.successful),
     )
