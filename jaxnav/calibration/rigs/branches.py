@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from jaxnav.calibration.rigs import bundle
-from jaxnav.calibration.rigs.linking import Linker, Links, inverted
-from jaxnav.calibration.rigs.pose_arrays import matrices, wxyz_xyz
+from jaxnav.calibration.rigs.linking import Linker, Links
+from jaxnav.calibration.rigs.pose_arrays import inverted, matrices, wxyz_xyz
 from jaxnav.models.rig import CameraRig
 
 _BETTER = 1.0  # a pose is replaced if another lowers its cost by more than this

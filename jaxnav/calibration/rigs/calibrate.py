@@ -16,8 +16,8 @@ from jaxtyping import Array
 
 from jaxnav.calibration.rigs import bundle
 from jaxnav.calibration.rigs.branches import other_branches
-from jaxnav.calibration.rigs.linking import Linker, Links, inverted
-from jaxnav.calibration.rigs.pose_arrays import matrices, wxyz_xyz
+from jaxnav.calibration.rigs.linking import Linker, Links
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, inverted, matrices, wxyz_xyz
 from jaxnav.calibration.rigs.views import RigViews, both_poses, rays_camera
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
@@ -111,7 +111,7 @@ def calibrate_rig(
     Raises:
         BadInput: no sighting defines the world frame, or no camera can be linked.
     """
-    given = inverted(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))
+    given = Ts_vehicle_camera(rig)
     start = _start(views, rig, given, known, reference_camera, refine_lenses)
     views, links, linker = start.views, start.links, start.linker
     free = _free(views, rig, start, known, reference_camera, refine_lenses)

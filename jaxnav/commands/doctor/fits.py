@@ -18,11 +18,10 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
 from jaxnav.detection.observe import Observed
-from jaxnav.models.camera import Camera
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
-from jaxnav.pose.ippe import ippe_from_rays
-from jaxnav.pose.observation import MODEL_SIGMA_PX
+from jaxnav.pose.candidates import both_poses
+from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, sightings
 
 MOST_ERRORS = 6  # numbers that may be unknown beside the pose
 _HEIGHT_SIGMA_M = 0.01  # of a car on a floor that is nearly level,
@@ -150,30 +149,17 @@ class Fit:
 
 def poses_by_each(seen: Sighted) -> list[np.ndarray]:
     """Both T_world_vehicle, (7,) wxyz_xyz each, by each marker in each camera."""
-    both = np.asarray(_both(seen.rig, seen.markers, jnp.asarray(seen.corners_px)))
-    return list(both[seen.visible].reshape(-1, 7))
+    both = np.asarray(_both(seen.rig, seen.markers, seen.corners_px, seen.visible))
+    return list(both[seen.visible.reshape(-1)].reshape(-1, 7))
 
 
 @jax.jit
-def _both(rig: CameraRig, markers: MarkerMap, corners_px: jax.Array) -> jax.Array:
-    def one(
-        camera: Camera,
-        T_camera_vehicle: jaxlie.SE3,
-        T_world_marker: jaxlie.SE3,
-        size_m: jax.Array,
-        corners_px: jax.Array,
-    ) -> jax.Array:
-        Ts_camera_marker = ippe_from_rays(camera.unproject(corners_px), size_m)
-        Ts_world_vehicle = jax.vmap(
-            lambda T_camera_marker: T_world_marker @ T_camera_marker.inverse() @ T_camera_vehicle
-        )(Ts_camera_marker)
-        return Ts_world_vehicle.wxyz_xyz
-
-    of_markers = jax.vmap(one, in_axes=(None, None, 0, 0, 0))
-    of_cameras = jax.vmap(of_markers, in_axes=(0, 0, None, None, 0))
-    return of_cameras(
-        rig.cameras, rig.Ts_camera_vehicle, markers.Ts_world_marker, markers.size_m, corners_px
-    )
+def _both(
+    rig: CameraRig, markers: MarkerMap, corners_px: jax.Array, visible: jax.Array
+) -> jax.Array:
+    seen = sightings(rig, markers, corners_px, visible)
+    snapshot = Snapshot(rig, markers, Observation(corners_px, visible), seen)
+    return both_poses(snapshot).inverse().wxyz_xyz
 
 
 def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: Unknowns) -> Fit:

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, listed
-from jaxnav.commands.doctor.sight import Ts_vehicle_camera, Views, views
+from jaxnav.commands.doctor.sight import Views, views
 from jaxnav.files import Route
 from jaxnav.models.bicycle import Vehicle, curvature_per_m
 from jaxnav.models.markers import MarkerMap
