@@ -260,7 +260,7 @@ def tagslam() -> None:
     assert reference is not None
     kept = reference.valid[views.frame]
     same = views.only(kept)
-    poses = bundle.Unknowns(
+    poses = bundle.RigUnknowns(
         jnp.asarray(reference.T_world_vehicle[np.unique(views.frame[kept])]),
         wxyz_xyz(true),
         wxyz_xyz(Ts_world_marker),

@@ -146,10 +146,10 @@ def test_a_reference_that_sees_no_known_marker_is_refused(world):
         calibrate_rig(views.only(kept), rig, {0: Ts_world_marker[0]}, 0)
 
 
-def small(rig, frames: int = 3) -> tuple[bundle.Unknowns, bundle.Seen]:
+def small(rig, frames: int = 3) -> tuple[bundle.RigUnknowns, bundle.RigSightings]:
     Ts_world_marker, Ts_world_vehicle = rig_rooms.room(4), rig_rooms.lemniscate(40)[:frames]
     views = rig_rooms.views_of(rig, Ts_world_marker, Ts_world_vehicle, 0.5, seed=2)
-    poses = bundle.Unknowns(
+    poses = bundle.RigUnknowns(
         wxyz_xyz(Ts_world_vehicle),
         wxyz_xyz(Ts_vehicle_camera(rig)),
         wxyz_xyz(Ts_world_marker),

@@ -34,7 +34,7 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Fit:
+class OdometryFit:
     """The most likely course.
 
     Attributes:
@@ -43,7 +43,6 @@ class Fit:
         information: (p, p), of the free parameters, with all nodes eliminated.
         blocks: the normal equations at this point.
         converged: true if no step lowers the cost any more.
-        steps: number of steps tried.
     """
 
     nodes: np.ndarray
@@ -51,7 +50,6 @@ class Fit:
     information: np.ndarray
     blocks: Blocks
     converged: bool
-    steps: int
 
 
 def fit(
@@ -62,7 +60,7 @@ def fit(
     prior: Prior,
     progress: Callable[[], object] = lambda: None,
     most_steps: int = 100,
-) -> Fit:
+) -> OdometryFit:
     """Search the nearest minimum from a start, with Nielsen's damping relative to the diagonal.
 
     Source: as `jaxnav.numerics.levenberg_marquardt`; the scaling is Marquardt's (1963).
@@ -83,9 +81,7 @@ def fit(
 
     cost, blocks = evaluated(nodes, theta)
     damping, growth, converged = 1e-3, 2.0, False
-    step = 0
-    while step < most_steps and not converged:
-        step += 1
+    for _ in range(most_steps):
         system = _System.of(blocks, theta, free, prior)
         try:
             moved = system.solved(damping)
@@ -101,13 +97,14 @@ def fit(
         converged = moved.promised <= _RTOL * cost or damping > 1e12
         if new_cost < cost:
             nodes, theta, blocks, cost = new_nodes, new_theta, new_blocks, new_cost
-    return Fit(
+        if converged:
+            break
+    return OdometryFit(
         nodes,
         theta,
         _System.of(blocks, theta, free, prior).reduced(),
         blocks,
         converged,
-        step,
     )
 
 

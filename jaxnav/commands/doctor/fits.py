@@ -90,7 +90,7 @@ class Sighted:
         return float(np.sqrt(np.mean(self.sigma_px[self.visible] ** 2)))
 
 
-class Unknowns(eqx.Module):
+class FileErrors(eqx.Module):
     """Differences from the files, or their sigmas, where 0 says that a number is known."""
 
     pose: np.ndarray  # (6,) xi in T_world_vehicle * exp(xi)
@@ -100,7 +100,7 @@ class Unknowns(eqx.Module):
     turned: np.ndarray  # (C, 3) rotation vector of each camera in its own frame, rad
 
     @staticmethod
-    def of_pose(seen: Sighted, level: bool, **others: np.ndarray) -> "Unknowns":
+    def of_pose(seen: Sighted, level: bool, **others: np.ndarray) -> "FileErrors":
         """Prior sigmas of a pose anywhere in space, or level on the ground, and of `others`."""
         C, M = seen.visible.shape
         on_ground = [_HEIGHT_SIGMA_M, _TILT_SIGMA_RAD, _TILT_SIGMA_RAD]
@@ -112,11 +112,11 @@ class Unknowns(eqx.Module):
             "turned": np.zeros((C, 3)),
         }
         pose = np.array([_FREE_M, _FREE_M, z_m, roll_rad, pitch_rad, _FREE_RAD])
-        return Unknowns(pose, **(none | others))
+        return FileErrors(pose, **(none | others))
 
 
 @dataclass(frozen=True)
-class Fit:
+class StandingFit:
     """The best fit of a pose and of unknowns to the corners.
 
     Attributes:
@@ -131,8 +131,8 @@ class Fit:
     T_world_vehicle: np.ndarray
     cost: float
     error_px: float
-    value: Unknowns
-    sigma: Unknowns
+    value: FileErrors
+    sigma: FileErrors
     pose_covariance: np.ndarray
 
     @property
@@ -162,7 +162,7 @@ def _both(
     return both_poses(snapshot).inverse().wxyz_xyz
 
 
-def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: Unknowns) -> Fit:
+def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: FileErrors) -> StandingFit:
     """The best fit from several starts.
 
     Args:
@@ -173,7 +173,7 @@ def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: Unknowns) -> F
     return min(fits, key=lambda each: each.cost)
 
 
-def _fit(seen: Sighted, start: np.ndarray, prior_sigma: Unknowns) -> Fit:
+def _fit(seen: Sighted, start: np.ndarray, prior_sigma: FileErrors) -> StandingFit:
     flat_sigma, unravel = ravel_pytree(prior_sigma)
     asked = np.flatnonzero(flat_sigma)
     slots = np.full(6 + MOST_ERRORS, flat_sigma.size)  # past the end where fewer are asked for
@@ -201,7 +201,7 @@ def _fit(seen: Sighted, start: np.ndarray, prior_sigma: Unknowns) -> Fit:
     sigma[asked] = np.sqrt(np.diag(covariance)[mine]) * flat_sigma[asked]
     pose_sigma = np.asarray(prior_sigma.pose)
     sigmas_px = np.repeat(seen.sigma_px.reshape(-1), 2)
-    return Fit(
+    return StandingFit(
         np.asarray(jaxlie.SE3(jnp.asarray(wxyz_xyz)).as_matrix()),
         cost=float(2 * found.cost),
         error_px=float(np.sqrt(np.sum((whitened * sigmas_px) ** 2) / max(seen.numbers, 1))),
@@ -219,7 +219,7 @@ def _errors(
     visible: jax.Array,
     sigma_px: jax.Array,
     start: jax.Array,
-    prior_sigma: Unknowns,
+    prior_sigma: FileErrors,
     slots: jax.Array,
     u: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -65,7 +65,7 @@ def sees_directions(rig: CameraRig, directions_vehicle: np.ndarray) -> np.ndarra
 
 
 @dataclass(frozen=True)
-class Views:
+class PoseViews:
     """Views of every marker in every camera from P poses of the vehicle.
 
     Attributes:
@@ -95,8 +95,8 @@ def _corners(
     return jax.vmap(one)(poses)
 
 
-def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> Views:
-    """`Views` from planar poses (P, 3): x m, y m, psi rad."""
+def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> PoseViews:
+    """`PoseViews` from planar poses (P, 3): x m, y m, psi rad."""
     corners_px, inside, Ts_world_vehicle = jax.device_get(
         _corners(rig, markers, jnp.asarray(poses, float))
     )
@@ -115,4 +115,4 @@ def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> Views:
     arms_m = positions_world_m[:, :, None] - centers_world_m
     to_vehicle_m = Ts_world_vehicle[:, None, :2, 3] - centers_world_m[:, :2]
     behind = np.einsum("pmi,mi->pm", to_vehicle_m, normals[:, :2]) < 0
-    return Views(side_px, behind, np.linalg.norm(arms_m, axis=-1))
+    return PoseViews(side_px, behind, np.linalg.norm(arms_m, axis=-1))
