@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import NO_CUT, Unknowns
+from jaxnav.calibration.lenses.bundle import NO_CUT, LensUnknowns
 from jaxnav.calibration.lenses.fit import LensFit, fit_lens
 from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.calibration.lenses.start import board_poses, opencv_calibration
@@ -109,7 +109,7 @@ def rms_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:
     poses = lens_bundle.padded_poses(board_poses(views, lens, parameters), len(seen.corners_px))
     held = lens_bundle.solve(
         lens,
-        Unknowns(jnp.asarray(parameters), jnp.asarray(poses)),
+        LensUnknowns(jnp.asarray(parameters), jnp.asarray(poses)),
         seen,
         jnp.asarray(seen.present, float),
         jnp.zeros(lens_bundle.COUNT, bool),
@@ -191,7 +191,7 @@ def scaling() -> None:
         found = jax.block_until_ready(
             lens_bundle.solve(
                 "equidistant",
-                Unknowns(jnp.asarray(start), jnp.asarray(padded)),
+                LensUnknowns(jnp.asarray(start), jnp.asarray(padded)),
                 seen,
                 jnp.asarray(seen.present, float),
                 jnp.asarray(lens_bundle.free_mask("equidistant")),

@@ -59,10 +59,10 @@ def trials(count: int, frames: int) -> None:
     from tqdm import trange
 
     from jaxnav.calibration.rigs.calibrate import calibrate_rig
-    from jaxnav.calibration.rigs.linking import turn_rad
+    from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, turn_rad
 
     rig, markers = rig_rooms.qcar(), rig_rooms.room()
-    path, true = rig_rooms.lemniscate(frames), rig_rooms.Ts_vehicle_camera(rig)
+    path, true = rig_rooms.lemniscate(frames), Ts_vehicle_camera(rig)
     everything = np.concatenate([true, markers])
     errors, within, nees, sigmas, rms = [], [], [], [], []
     for seed in trange(count, unit="trial"):
@@ -107,11 +107,11 @@ def branches(frames: int) -> None:
     import rig_rooms
 
     from jaxnav.calibration.rigs.calibrate import calibrate_rig
-    from jaxnav.calibration.rigs.linking import inverted, turn_rad
+    from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, inverted, turn_rad
     from jaxnav.calibration.rigs.views import both_poses, rays_camera
 
     rig, path = rig_rooms.qcar(), rig_rooms.lemniscate(frames)
-    true = rig_rooms.Ts_vehicle_camera(rig)
+    true = Ts_vehicle_camera(rig)
     for noise_px in (0.3, 1.0, 2.0, 3.0):
         for seed in range(3):
             room = rig_rooms.room(seed=seed)
@@ -147,7 +147,7 @@ def rendered(frames: int) -> None:
     from tqdm import tqdm
 
     from jaxnav.calibration.rigs.calibrate import calibrate_rig
-    from jaxnav.calibration.rigs.linking import turn_rad
+    from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, turn_rad
     from jaxnav.calibration.rigs.views import RigViews
     from jaxnav.commands.simulate.rendered_world import READOUT_S, SENSOR
     from jaxnav.detection import make_detector
@@ -157,7 +157,7 @@ def rendered(frames: int) -> None:
     from jaxnav.simulation.sensor import Shutter
 
     rig, room = rig_rooms.qcar(), rig_rooms.room()
-    true = rig_rooms.Ts_vehicle_camera(rig)
+    true = Ts_vehicle_camera(rig)
     scene = Scene.create(rig_rooms.as_map(room))
     detector, lenses = make_detector(), [rig.camera(c) for c in range(len(rig))]
     rows = max(height for _, height in rig.image_sizes_px)
@@ -223,8 +223,7 @@ def tagslam() -> None:
 
     from jaxnav.calibration.rigs import bundle
     from jaxnav.calibration.rigs.calibrate import calibrate_rig
-    from jaxnav.calibration.rigs.linking import inverted, turn_rad
-    from jaxnav.calibration.rigs.pose_arrays import wxyz_xyz
+    from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, inverted, turn_rad, wxyz_xyz
     from jaxnav.calibration.rigs.vehicle_frame import moved_to_places
     from jaxnav.calibration.rigs.views import RigViews
     from jaxnav.datasets.recordings import read_recording
@@ -238,7 +237,7 @@ def tagslam() -> None:
         np.asarray(recording.markers.size_m), ids, recording.stamps_ns,
     )  # fmt: skip
     Ts_world_marker = np.asarray(recording.markers.Ts_world_marker.as_matrix())
-    true = rig_rooms.Ts_vehicle_camera(recording.rig)
+    true = Ts_vehicle_camera(recording.rig)
     one = ids.index(1)
     start = rig_rooms.spoiled(recording.rig, seed=0)
     begin = time.perf_counter()
@@ -254,14 +253,14 @@ def tagslam() -> None:
     for c in range(1, len(true)):
         before, after, reference = (
             inverted(Ts[0]) @ Ts[c]
-            for Ts in (rig_rooms.Ts_vehicle_camera(start), found.Ts_vehicle_camera, true)
+            for Ts in (Ts_vehicle_camera(start), found.Ts_vehicle_camera, true)
         )
         print(f"  camera {c}: {off(before, reference)}; {off(after, reference)}")
     reference = recording.reference
     assert reference is not None
     kept = reference.valid[views.frame]
     same = views.only(kept)
-    poses = bundle.Unknowns(
+    poses = bundle.RigUnknowns(
         jnp.asarray(reference.T_world_vehicle[np.unique(views.frame[kept])]),
         wxyz_xyz(true),
         wxyz_xyz(Ts_world_marker),
@@ -285,8 +284,7 @@ def _localise(data: Path, Ts_vehicle_camera: np.ndarray, theirs: np.ndarray) -> 
     import jax.numpy as jnp
     import jaxlie
 
-    from jaxnav.calibration.rigs.linking import inverted
-    from jaxnav.calibration.rigs.pose_arrays import wxyz_xyz
+    from jaxnav.calibration.rigs.pose_arrays import inverted, wxyz_xyz
     from jaxnav.datasets.recordings import read_recording
     from jaxnav.files import save_rig
     from jaxnav.models.rig import CameraRig

@@ -5,7 +5,7 @@ import jaxlie
 import numpy as np
 
 from jaxnav.calibration.rigs.calibrate import RigCalibration
-from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.pose_arrays import inverted
 from jaxnav.calibration.rigs.views import RigViews
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.markers import marker_map
@@ -73,10 +73,6 @@ def views_of(
         marker_ids=tuple(range(count)),
         stamps_ns=np.arange(len(Ts_world_vehicle)) * 33_333_333,
     )
-
-
-def Ts_vehicle_camera(rig: CameraRig) -> np.ndarray:
-    return inverted(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))
 
 
 def spoiled(rig: CameraRig, seed: int, m: float = 0.05, deg: float = 5.0) -> CameraRig:

@@ -12,9 +12,8 @@ from scipy import stats
 
 from jaxnav.calibration.rigs import bundle
 from jaxnav.calibration.rigs.calibrate import RigCalibration, calibrate_rig
-from jaxnav.calibration.rigs.linking import inverted, turn_rad
 from jaxnav.calibration.rigs.marker_check import checked, sizes_m
-from jaxnav.calibration.rigs.pose_arrays import wxyz_xyz
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, inverted, turn_rad, wxyz_xyz
 from jaxnav.calibration.rigs.vehicle_frame import moved_to_places
 from jaxnav.calibration.rigs.views import RigViews, both_poses, rays_camera
 from jaxnav.errors import BadInput
@@ -53,7 +52,7 @@ def test_cameras_and_markers_are_found_without_a_start(world, found):
     rig, Ts_world_marker, _ = world
     assert found.calibrated.all()
     assert found.mapped.all()
-    far_m, far_deg = apart(found.Ts_vehicle_camera, rig_rooms.Ts_vehicle_camera(rig))
+    far_m, far_deg = apart(found.Ts_vehicle_camera, Ts_vehicle_camera(rig))
     assert far_m < 1e-3
     assert far_deg < 0.05
     far_m, far_deg = apart(found.Ts_world_marker, Ts_world_marker)
@@ -67,7 +66,7 @@ def test_cameras_and_markers_are_found_without_a_start(world, found):
 
 def test_the_covariance_says_how_wrong_it_is(world, found):
     rig, Ts_world_marker, _ = world
-    true = np.concatenate([rig_rooms.Ts_vehicle_camera(rig), Ts_world_marker])
+    true = np.concatenate([Ts_vehicle_camera(rig), Ts_world_marker])
     xi = rig_rooms.twists_to(np.concatenate([found.Ts_vehicle_camera, found.Ts_world_marker]), true)
     value, dof = rig_rooms.nees(found, xi, np.arange(xi.size))
     assert dof == 6 * (3 + 7)
@@ -76,7 +75,7 @@ def test_the_covariance_says_how_wrong_it_is(world, found):
 
 def test_a_frame_fitted_to_given_places_keeps_cameras_together(world, found):
     rig, *_ = world
-    true = rig_rooms.Ts_vehicle_camera(rig)
+    true = Ts_vehicle_camera(rig)
     tied = moved_to_places(found, true)
     between = [inverted(Ts[0]) @ Ts[1:] for Ts in (tied.Ts_vehicle_camera, found.Ts_vehicle_camera)]
     np.testing.assert_allclose(*between, atol=1e-9)
@@ -96,7 +95,7 @@ def test_a_frame_fitted_to_given_places_keeps_cameras_together(world, found):
 def test_mirrored_poses_are_outvoted(world):
     """With 3 px the better fit of a sighting is the mirrored pose almost as often as not."""
     rig, Ts_world_marker, _ = world
-    path, true = rig_rooms.lemniscate(FRAMES), rig_rooms.Ts_vehicle_camera(rig)
+    path, true = rig_rooms.lemniscate(FRAMES), Ts_vehicle_camera(rig)
     views = rig_rooms.views_of(rig, Ts_world_marker, path, 3.0, seed=1)
     pairs = both_poses(rays_camera(rig, views), views.size_m[views.marker])
     exact = inverted(true)[views.camera] @ inverted(path)[views.frame]
@@ -120,7 +119,7 @@ def test_wrong_sightings_count_little(world, found):
     corners[turned] = np.roll(corners[turned], 1, axis=1)
     spoiled = dataclasses.replace(views, corners_px=corners)
     robust = calibrate_rig(spoiled, rig, {0: Ts_world_marker[0]}, 0)
-    far_m, far_deg = apart(robust.Ts_vehicle_camera, rig_rooms.Ts_vehicle_camera(rig))
+    far_m, far_deg = apart(robust.Ts_vehicle_camera, Ts_vehicle_camera(rig))
     assert far_m < 1e-3
     assert far_deg < 0.05
     assert np.all(robust.weight[turned] < 1)
@@ -135,7 +134,7 @@ def test_what_nothing_links_stays_as_it_was_and_is_named(world):
     found = calibrate_rig(views.only(alone), rig, {0: Ts_world_marker[0]}, 0)
     assert found.calibrated.tolist() == [True, True, False, True]
     assert found.mapped.tolist() == [True] * 7 + [False]
-    given = rig_rooms.Ts_vehicle_camera(rig)
+    given = Ts_vehicle_camera(rig)
     np.testing.assert_array_equal(found.Ts_vehicle_camera[2], given[2])
     assert not found.sigmas()[2].any()
 
@@ -147,12 +146,12 @@ def test_a_reference_that_sees_no_known_marker_is_refused(world):
         calibrate_rig(views.only(kept), rig, {0: Ts_world_marker[0]}, 0)
 
 
-def small(rig, frames: int = 3) -> tuple[bundle.Unknowns, bundle.Seen]:
+def small(rig, frames: int = 3) -> tuple[bundle.RigUnknowns, bundle.RigSightings]:
     Ts_world_marker, Ts_world_vehicle = rig_rooms.room(4), rig_rooms.lemniscate(40)[:frames]
     views = rig_rooms.views_of(rig, Ts_world_marker, Ts_world_vehicle, 0.5, seed=2)
-    poses = bundle.Unknowns(
+    poses = bundle.RigUnknowns(
         wxyz_xyz(Ts_world_vehicle),
-        wxyz_xyz(rig_rooms.Ts_vehicle_camera(rig)),
+        wxyz_xyz(Ts_vehicle_camera(rig)),
         wxyz_xyz(Ts_world_marker),
         bundle.lenses_of(rig.cameras),
     )

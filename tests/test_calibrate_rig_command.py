@@ -10,7 +10,7 @@ import rig_rooms
 import yaml
 
 from jaxnav import cli
-from jaxnav.calibration.rigs.linking import turn_rad
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, turn_rad
 from jaxnav.commands.calibrate import check as calibrate_check
 from jaxnav.commands.calibrate import markers as calibrate_markers
 from jaxnav.commands.calibrate import rig as calibrate_rig
@@ -101,8 +101,8 @@ def test_rig_writes_what_other_commands_read(drive, tmp_path, capsys):
     assert (code, err) == (0, "")
     assert "8 of 8 markers mapped" in out
     rig = load_rig(tmp_path / "rig.yaml")
-    true = rig_rooms.Ts_vehicle_camera(rig_rooms.qcar())
-    found = rig_rooms.Ts_vehicle_camera(rig)
+    true = Ts_vehicle_camera(rig_rooms.qcar())
+    found = Ts_vehicle_camera(rig)
     for a, b in ((0, 1), (0, 2), (2, 3)):
         between, exact = (np.linalg.inv(Ts[a]) @ Ts[b] for Ts in (found, true))
         assert np.linalg.norm((between - exact)[:3, 3]) < 1e-3

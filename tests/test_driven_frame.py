@@ -9,7 +9,7 @@ import rig_rooms
 
 from jaxnav.calibration.rigs.calibrate import calibrate_rig
 from jaxnav.calibration.rigs.driven_frame import _level, driven_frame, level_follows
-from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, inverted
 from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven
 from jaxnav.errors import BadInput
 from jaxnav.models.bicycle import advance
@@ -52,7 +52,7 @@ EIGHT = 0.4 * np.sin(2 * np.pi * DT_S * np.arange(2000) / 10)
 def test_a_drive_with_turns_both_ways_tells(seed):
     stamps, Ts_world_vehicle, *odometry = drive(EIGHT, seed)
     # Cameras were found about some frame of the rig: tilted, turned and 12 cm up.
-    T_rig_vehicle = rig_rooms.Ts_vehicle_camera(rig_rooms.spoiled(rig_rooms.qcar(), 4, 0.2, 70))[1]
+    T_rig_vehicle = Ts_vehicle_camera(rig_rooms.spoiled(rig_rooms.qcar(), 4, 0.2, 70))[1]
     found = driven_frame(stamps, Ts_world_vehicle @ inverted(T_rig_vehicle), *odometry, WHEELBASE_M)
     driven = found.T_rig_level @ found.T_level_vehicle
     xi = rig_rooms.twists_to(driven[None], T_rig_vehicle[None])[0]
@@ -68,7 +68,7 @@ def test_a_drive_with_turns_both_ways_tells(seed):
 
 def test_the_ground_follows_what_all_frames_have_in_common():
     """Against the frame found anew when every frame is moved by a small twist."""
-    T_rig_vehicle = rig_rooms.Ts_vehicle_camera(rig_rooms.spoiled(rig_rooms.qcar(), 4, 0.2, 70))[1]
+    T_rig_vehicle = Ts_vehicle_camera(rig_rooms.spoiled(rig_rooms.qcar(), 4, 0.2, 70))[1]
     Ts_world_rig = rig_rooms.lemniscate(30) @ inverted(T_rig_vehicle)
     rng = np.random.default_rng(3)
     follow = rng.normal(size=(30, 6, 1))
@@ -122,7 +122,7 @@ def test_a_drive_ties_the_cameras_to_the_vehicle_as_well_as_it_says():
     frames = views.only(np.ones(len(views), bool)).stamps_ns // 33_333_333
     driven = driven_frame(stamps[::8][frames], found.Ts_world_vehicle, *odometry, WHEELBASE_M)
     tied = moved_to_driven(found, driven)
-    xi = rig_rooms.twists_to(tied.Ts_vehicle_camera, rig_rooms.Ts_vehicle_camera(rig))
+    xi = rig_rooms.twists_to(tied.Ts_vehicle_camera, Ts_vehicle_camera(rig))
     assert np.all(np.abs(xi) < 4 * tied.sigmas()[:4])
     assert np.all(tied.sigmas()[:4, :3] < 0.01)
     assert np.linalg.norm(xi[:, :3], axis=1).max() < 0.01

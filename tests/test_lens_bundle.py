@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import NO_CUT, Unknowns
+from jaxnav.calibration.lenses.bundle import NO_CUT, LensUnknowns
 from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.models.camera import Camera
 
@@ -39,7 +39,7 @@ def solved(lens, views, poses, fixed=(), weights=None, cut=NO_CUT):
         weights = np.asarray(seen.present, float)
     return seen, lens_bundle.solve(
         lens,
-        Unknowns(jnp.asarray(start), jnp.asarray(padded)),
+        LensUnknowns(jnp.asarray(start), jnp.asarray(padded)),
         seen,
         jnp.asarray(weights),
         jnp.asarray(lens_bundle.free_mask(lens, fixed)),

@@ -1,12 +1,15 @@
-"""A Levenberg-Marquardt step for a handful of unknowns, as a solver that optimistix runs.
+"""Levenberg-Marquardt with Nielsen's damping, as solvers that optimistix runs.
 
-optimistix provides the loop, the bound on the steps and the result codes; this class defines a
-step. Unlike `optimistix.LevenbergMarquardt` it forms J'J once a step, and it stops when no step can
-lower the cost any more, not when y and every residual stop changing.
+optimistix provides the loop, the bound on the steps and the result codes. `NielsenLM` damps and
+accepts steps; a subclass solves the damped equations in their own shape: `NormalEquationsLM` here
+for a handful of unknowns, `SchurLM` in `schur.py` for blocks. Unlike
+`optimistix.LevenbergMarquardt` they form J'J once a step, and stop when no step can lower the cost
+any more, not when y and every residual stop changing.
 `benchmarks/bench_pair.py`: 1.6 times as fast at equal steps; compilation takes half
 the time, and float32 works in a process that has float64 enabled.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -32,52 +35,53 @@ def mark_found(tree: PyTree) -> PyTree:
     )
 
 
-class NormalEquations(eqx.Module):
-    """J'J and J'r of N problems with n unknowns each."""
-
-    information: Float[Array, "n n N"]  # J'J
-    gradient: Float[Array, "n N"]  # J'r
-
-
 class LMState(eqx.Module):
-    """Cost and normal equations at the accepted points, and the damping to try next."""
+    """Cost and normal equations at the accepted points, and the damping to try next.
 
-    cost: Float[Array, " N"]  # sum of squares
-    normal: NormalEquations
-    damping: Float[Array, " N"]  # lambda; 0: none yet
-    growth: Float[Array, " N"]  # factor on lambda after a step that is not accepted
-    steps: Int[Array, " N"]
+    Every array has the axes of the problems last: (N,), or none for a single problem.
+    """
+
+    cost: Float[Array, "*N"]  # sum of squares
+    normal: PyTree  # the function's `aux`
+    damping: Float[Array, "*N"]  # lambda; 0: none yet
+    growth: Float[Array, "*N"]  # factor on lambda after a step that is not accepted
+    steps: Int[Array, "*N"]
     first: Bool[Array, ""]
-    done: Bool[Array, " N"]
+    done: Bool[Array, "*N"]
 
 
-class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
-    """Levenberg-Marquardt on dense normal equations with Nielsen's damping, N problems at once.
+class Move(eqx.Module):
+    """The damped step from the accepted points."""
 
-        (J'J + lambda I) move = -J'r
+    move: PyTree
+    promised: Float[Array, "*N"]  # by how much the model lowers the cost
+    damping: Float[Array, "*N"]  # with which it was solved
 
-    The function maps unknowns (n, N) to residuals (m, N), problem by problem, and returns their
-    `NormalEquations` as `aux`. A step is accepted where it lowers the cost |r|^2. A problem is done
-    where the model promises to lower its cost by less than `rtol * cost + atol`; it then stays
-    where it is, and the solver ends when all are done. `solution.state` holds `done` and `steps` of
-    each problem.
 
-    The unknowns should be scaled alike, since lambda * I damps them all, and few, since J'J squares
-    the condition number.
+class NielsenLM(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt with Nielsen's damping.
+
+    The function maps y to residuals (m, *N), N problems or a single one, and returns its normal
+    equations as `aux`. A step is accepted where it lowers the cost |r|^2. A problem is done where
+    the model promises to lower its cost by less than `rtol * cost + atol`; it then stays where it
+    is, and the solver ends when all are done. `solution.state` holds `done` and `steps` of each.
 
     Source: Madsen, Nielsen, Tingleff (2004), "Methods for non-linear least squares problems",
     Algorithm 3.16.
     """
 
-    rtol: float
-    atol: float
-    initial_damping: float = 1e-5  # times the largest diagonal entry of J'J
-    norm: Callable[[PyTree], Array] = optx.max_norm
+    @abstractmethod
+    def solved(self, normal: PyTree, damping: Array) -> Move:
+        """The step that solves the damped normal equations; a damping of 0 is none yet."""
+
+    @abstractmethod
+    def moved(self, y: PyTree, move: PyTree) -> PyTree:
+        """The unknowns after a move."""
 
     def init(
         self,
         fn: Any,
-        y: Array,
+        y: PyTree,
         args: PyTree,
         options: dict[str, Any],
         f_struct: PyTree,
@@ -85,66 +89,54 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
         tags: frozenset[object],
     ) -> LMState:
         """The state before the first step, which stays at y and evaluates the function there."""
-        lanes = jnp.zeros(y.shape[1], y.dtype)
+        problems = jnp.zeros(f_struct.shape[1:], f_struct.dtype)
         return LMState(
-            cost=lanes + jnp.inf,
-            normal=NormalEquations(jnp.zeros((y.shape[0], *y.shape), y.dtype), jnp.zeros_like(y)),
-            damping=lanes,  # the first point with a derivative chooses it
-            growth=lanes + 2,
-            steps=lanes.astype(int),
+            cost=problems + jnp.inf,
+            normal=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct),
+            damping=problems,  # the first point with a derivative chooses it
+            growth=problems + 2,
+            steps=problems.astype(int),
             first=jnp.asarray(True),
-            done=lanes > 0,
+            done=problems > 0,
         )
 
     def step(
         self,
         fn: Any,
-        y: Array,
+        y: PyTree,
         args: PyTree,
         options: dict[str, Any],
         state: LMState,
         tags: frozenset[object],
-    ) -> tuple[Array, LMState, PyTree]:
+    ) -> tuple[PyTree, LMState, PyTree]:
         """Try one damped step of every problem, accept it where the cost falls, adapt lambda."""
-        information, gradient = state.normal.information, state.normal.gradient
-        diagonal = jnp.stack([information[i, i] for i in range(y.shape[0])])
-        largest = jnp.max(diagonal, axis=0)
-        damping = jnp.where(
-            state.damping > 0,
-            jnp.maximum(state.damping, jnp.finfo(y.dtype).eps * largest),
-            self.initial_damping * largest,
-        )
-        move = -solve_positive(information, gradient, damping)
-        move = jnp.where(jnp.isfinite(move), move, 0)
-        promised = jnp.sum(move * (damping[None] * move - gradient), axis=0)
-
-        residual, normal = fn(y + move, args)
+        found = self.solved(state.normal, state.damping)
+        tried = self.moved(y, found.move)
+        residual, normal = fn(tried, args)
         cost = jnp.sum(residual**2, axis=0)
         accept = (cost < state.cost) & ~state.done
-        gained = (state.cost - cost) / jnp.where(promised > 0, promised, 1)
-        relaxed = jnp.maximum(1 / 3, 1 - (2 * gained - 1) ** 3)
-        exhausted = promised <= self.rtol * state.cost + self.atol
-        return (
-            jnp.where(accept[None], y + move, y),
-            LMState(
-                cost=jnp.where(accept, cost, state.cost),
-                normal=NormalEquations(
-                    jnp.where(accept[None, None], normal.information, information),
-                    jnp.where(accept[None], normal.gradient, gradient),
-                ),
-                damping=damping * jnp.where(accept, relaxed, state.growth),
-                growth=jnp.where(accept, 2.0, 2 * state.growth),
-                steps=state.steps + ~state.done,
-                first=jnp.asarray(False),
-                done=state.done | (~state.first & exhausted),
-            ),
-            normal,
+        gained = (state.cost - cost) / jnp.where(found.promised > 0, found.promised, 1)
+        exhausted = found.promised <= self.rtol * state.cost + self.atol
+        damping, growth = adapted(found.damping, state.growth, accept, gained)
+
+        def chosen(new: PyTree, old: PyTree) -> PyTree:
+            return jax.tree.map(lambda a, b: jnp.where(_for_leaf(accept, a), a, b), new, old)
+
+        after = LMState(
+            cost=jnp.where(accept, cost, state.cost),
+            normal=chosen(normal, state.normal),
+            damping=jnp.where(state.first, 0, damping),
+            growth=growth,
+            steps=state.steps + ~state.done,
+            first=jnp.asarray(False),
+            done=state.done | (~state.first & exhausted),
         )
+        return chosen(tried, y), after, normal
 
     def terminate(
         self,
         fn: Any,
-        y: Array,
+        y: PyTree,
         args: PyTree,
         options: dict[str, Any],
         state: LMState,
@@ -156,16 +148,76 @@ class NormalEquationsLM(optx.AbstractLeastSquaresSolver):
     def postprocess(
         self,
         fn: Any,
-        y: Array,
+        y: PyTree,
         aux: PyTree,
         args: PyTree,
         options: dict[str, Any],
         state: LMState,
         tags: frozenset[object],
         result: optx.RESULTS,
-    ) -> tuple[Array, PyTree, dict[str, Any]]:
+    ) -> tuple[PyTree, PyTree, dict[str, Any]]:
         """The accepted points as they are."""
         return y, aux, {}
+
+
+def adapted(
+    damping: Array | float, growth: Array | float, accept: Array | bool, gained: Array | float
+) -> tuple[Array, Array]:
+    """Lambda for the next step, and the factor on it should that one not be accepted.
+
+    Args:
+        damping: lambda of this step.
+        growth: the factor on it if this step is not accepted.
+        accept: whether it lowers the cost,
+        gained: and by how much, over what the model promised.
+    """
+    relaxed = jnp.maximum(1 / 3, 1 - (2 * gained - 1) ** 3)
+    return damping * jnp.where(accept, relaxed, growth), jnp.where(accept, 2.0, 2 * growth)
+
+
+def _for_leaf(accept: Array, leaf: Array) -> Array:
+    """The mask of the problems with axes for a leaf's own numbers before it."""
+    return jnp.expand_dims(accept, tuple(range(leaf.ndim - accept.ndim)))
+
+
+class NormalEquations(eqx.Module):
+    """J'J and J'r of N problems with n unknowns each."""
+
+    information: Float[Array, "n n N"]  # J'J
+    gradient: Float[Array, "n N"]  # J'r
+
+
+class NormalEquationsLM(NielsenLM):
+    """Levenberg-Marquardt on dense normal equations, N problems at once.
+
+        (J'J + lambda I) move = -J'r
+
+    The unknowns (n, N) should be scaled alike, since lambda * I damps them all, and few, since J'J
+    squares the condition number. The function's `aux` are `NormalEquations`.
+    """
+
+    rtol: float
+    atol: float
+    initial_damping: float = 1e-5  # times the largest diagonal entry of J'J
+    norm: Callable[[PyTree], Array] = optx.max_norm
+
+    def solved(self, normal: NormalEquations, damping: Array) -> Move:
+        """The step of every problem; none where its equations can't be solved."""
+        information, gradient = normal.information, normal.gradient
+        diagonal = jnp.stack([information[i, i] for i in range(gradient.shape[0])])
+        largest = jnp.max(diagonal, axis=0)
+        damping = jnp.where(
+            damping > 0,
+            jnp.maximum(damping, jnp.finfo(gradient.dtype).eps * largest),
+            self.initial_damping * largest,
+        )
+        move = -solve_positive(information, gradient, damping)
+        move = jnp.where(jnp.isfinite(move), move, 0)
+        return Move(move, jnp.sum(move * (damping[None] * move - gradient), axis=0), damping)
+
+    def moved(self, y: Array, move: Array) -> Array:
+        """The unknowns after a move."""
+        return y + move
 
 
 class ImplicitGradient(optx.AbstractAdjoint):

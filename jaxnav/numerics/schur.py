@@ -10,14 +10,13 @@ synthesis", section 6; damping as in `jaxnav.numerics.levenberg_marquardt`.
 """
 
 from collections.abc import Callable
-from typing import Any, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM
 from jaxnav.numerics.small_matrices import cholesky, solve_lower, solve_upper
 
 
@@ -83,25 +82,13 @@ def _damped(A: Float[Array, "*batch n n"], damping: Array) -> Array:
     return A + eye * raised[..., None]
 
 
-class SchurState(eqx.Module):
-    """Cost and normal equations at the accepted point, and the damping to try next."""
-
-    cost: Float[Array, ""]
-    blocks: Blocks
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]
-    steps: Int[Array, ""]
-    done: Bool[Array, ""]
-
-
-class SchurLM(optx.AbstractLeastSquaresSolver):
+class SchurLM(NielsenLM):
     """Levenberg-Marquardt that eliminates blocks of unknowns.
 
         (J'J + lambda diag(J'J)) move = -J'r
 
-    The function maps y, any pytree, to residuals, and returns their `Blocks` as `aux`;
-    `retract(y, own, shared)` moves y by the blocks' move (F, n) and the shared one (R,). The search
-    ends when the model promises to lower the cost by less than `rtol * cost + atol`.
+    The function's `aux` are the `Blocks`; `retract(y, own, shared)` moves y, any pytree, by the
+    blocks' move (F, n) and the shared one (R,).
     """
 
     rtol: float
@@ -111,98 +98,26 @@ class SchurLM(optx.AbstractLeastSquaresSolver):
     free: Bool[Array, " R"]
     initial_damping: float = 1e-4  # of J'J's diagonal
 
-    def init(
-        self,
-        fn: Any,
-        y: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        f_struct: PyTree,
-        aux_struct: PyTree,
-        tags: frozenset[object],
-    ) -> SchurState:
-        """The state at y: cost and normal equations there."""
-        residual, blocks = fn(y, args)
-        dtype = residual.dtype
-        return SchurState(
-            cost=jnp.sum(residual**2),
-            blocks=blocks,
-            damping=jnp.asarray(self.initial_damping, dtype),
-            growth=jnp.asarray(2, dtype),
-            steps=jnp.asarray(0),
-            done=jnp.asarray(False),
-        )
-
-    def step(
-        self,
-        fn: Any,
-        y: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        state: SchurState,
-        tags: frozenset[object],
-    ) -> tuple[PyTree, SchurState, PyTree]:
-        """Try one damped step, accept it where the cost falls, and adapt lambda."""
-        blocks, damping = state.blocks, state.damping
-        reduced = reduce(blocks, self.free, damping)
+    def solved(self, normal: Blocks, damping: Array) -> Move:
+        """The moves of the blocks and of the shared unknowns; none where they can't be solved."""
+        damping = jnp.where(damping > 0, jnp.clip(damping, 1e-12, 1e12), self.initial_damping)
+        reduced = reduce(normal, self.free, damping)
         factor = jax.scipy.linalg.cho_factor(reduced.system, lower=True)
         shared = -jax.scipy.linalg.cho_solve(factor, reduced.gradient)
         shared = jnp.where(self.free, shared, 0)
         own = reduced.back_substitute(shared)
         sound = jnp.all(jnp.isfinite(shared)) & jnp.all(jnp.isfinite(own))
         shared, own = jnp.where(sound, shared, 0), jnp.where(sound, own, 0)
-        raised = damping * jnp.diagonal(blocks.own, axis1=1, axis2=2) * own**2
-        raised_shared = damping * jnp.diagonal(blocks.shared) * shared**2
+        raised = damping * jnp.diagonal(normal.own, axis1=1, axis2=2) * own**2
+        raised_shared = damping * jnp.diagonal(normal.shared) * shared**2
         promised = (
             jnp.sum(raised)
             + jnp.sum(raised_shared)
-            - jnp.sum(own * blocks.own_gradient)
-            - jnp.sum(shared * blocks.shared_gradient)
+            - jnp.sum(own * normal.own_gradient)
+            - jnp.sum(shared * normal.shared_gradient)
         )
+        return Move((own, shared), jnp.where(sound, promised, jnp.inf), damping)
 
-        tried = self.retract(y, own, shared)
-        residual, tried_blocks = fn(tried, args)
-        cost = jnp.sum(residual**2)
-        accept = (cost < state.cost) & sound
-        gained = (state.cost - cost) / jnp.where(promised > 0, promised, 1)
-        relaxed = jnp.maximum(1 / 3, 1 - (2 * gained - 1) ** 3)
-        exhausted = sound & (promised <= self.rtol * state.cost + self.atol)
-
-        def chosen(new: PyTree, old: PyTree) -> PyTree:
-            return jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)
-
-        after = SchurState(
-            cost=jnp.where(accept, cost, state.cost),
-            blocks=chosen(tried_blocks, blocks),
-            damping=jnp.clip(damping * jnp.where(accept, relaxed, state.growth), 1e-12, 1e12),
-            growth=jnp.where(accept, 2.0, 2 * state.growth),
-            steps=state.steps + 1,
-            done=exhausted,
-        )
-        return chosen(tried, y), after, tried_blocks
-
-    def terminate(
-        self,
-        fn: Any,
-        y: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        state: SchurState,
-        tags: frozenset[object],
-    ) -> tuple[Array, optx.RESULTS]:
-        """Whether the model promises no further gain."""
-        return state.done, cast(optx.RESULTS, optx.RESULTS.successful)
-
-    def postprocess(
-        self,
-        fn: Any,
-        y: PyTree,
-        aux: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        state: SchurState,
-        tags: frozenset[object],
-        result: optx.RESULTS,
-    ) -> tuple[PyTree, PyTree, dict[str, Any]]:
-        """The accepted point as it is."""
-        return y, aux, {}
+    def moved(self, y: PyTree, move: tuple[Array, Array]) -> PyTree:
+        """The unknowns after a move."""
+        return self.retract(y, *move)

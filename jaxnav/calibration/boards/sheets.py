@@ -18,12 +18,10 @@ class Sheet:
     Attributes:
         ink: (rows, columns) bool, true where black, the top row first.
         module_m: side of a module.
-        quiet_m: width of the white zone.
     """
 
     ink: np.ndarray
     module_m: float
-    quiet_m: float
 
     @property
     def width_m(self) -> float:
@@ -66,7 +64,7 @@ def sheet_of(board: Board) -> Sheet:
         square = 2
         ink = _canvas(board.columns * square, board.rows * square, 1)
         _chequer(ink, board, square, 1)
-        return Sheet(ink, board.size_m / square, board.size_m / square)
+        return Sheet(ink, board.size_m / square)
     side_m = board.marker_m if board.kind == "charuco" else board.size_m
     n = len(board.tags[0].cells)
     cell_m = side_m / n
@@ -94,7 +92,7 @@ def sheet_of(board: Board) -> Sheet:
         y = round(ink.shape[0] / 2 - y_m / module_m)
         cells = np.kron(tag.cells < 0.5, np.ones((fine, fine), bool))
         ink[y : y + n * fine, x : x + n * fine] = cells
-    return Sheet(ink, module_m, cell_m)
+    return Sheet(ink, module_m)
 
 
 def _canvas(width: int, height: int, quiet: int) -> np.ndarray:

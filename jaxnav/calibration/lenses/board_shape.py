@@ -10,7 +10,7 @@ from jaxtyping import Array
 from scipy import stats
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import Unknowns
+from jaxnav.calibration.lenses.bundle import LensUnknowns
 from jaxnav.calibration.lenses.fit import LensFit
 from jaxnav.numerics.schur import reduce
 
@@ -43,7 +43,7 @@ def check_board(fit: LensFit) -> BoardCheck:
     poses = lens_bundle.padded_poses(fit.Ts_camera_board, rows)
     weights = np.zeros(seen.present.shape)
     weights[:count] = fit.weights
-    y = Unknowns(jnp.asarray(fit.parameters), jnp.asarray(poses))
+    y = LensUnknowns(jnp.asarray(fit.parameters), jnp.asarray(poses))
     free = lens_bundle.free_mask(fit.lens, fit.fixed)
     J, information, gradient = jax.device_get(
         _board_freedom(fit.lens, y, seen, jnp.asarray(weights))
@@ -73,7 +73,7 @@ def check_board(fit: LensFit) -> BoardCheck:
 
 @partial(jax.jit, static_argnames="lens")
 def _board_freedom(
-    lens: str, y: Unknowns, seen: lens_bundle.Seen, weights: Array
+    lens: str, y: LensUnknowns, seen: lens_bundle.BoardCorners, weights: Array
 ) -> tuple[Array, Array, Array]:
     """Derivatives (V, P, 2, 2) by a point's x and y; information (10, 10) and gradient (10,) of the
     lens and the board's stretch, with the poses eliminated."""

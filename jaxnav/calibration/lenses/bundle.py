@@ -21,7 +21,8 @@ from jaxnav.calibration.rigs.pose_arrays import retracted
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import rotation_matrix, skew, turn_and_shift
 from jaxnav.models.lenses import LENSES, MOST_COEFFICIENTS
-from jaxnav.numerics.schur import Blocks, SchurLM, SchurState, reduce
+from jaxnav.numerics.levenberg_marquardt import LMState
+from jaxnav.numerics.schur import Blocks, SchurLM, reduce
 
 # Names of the shared unknowns, in order; unknowns that a lens doesn't have are fixed at zero.
 FITTED = ("none", "radtan", "equidistant")
@@ -31,7 +32,7 @@ NO_CUT = 1e8  # in sigmas: plain least squares
 _BATCH = 16  # views are padded to a multiple of this, so that few sizes are compiled
 
 
-class Seen(eqx.Module):
+class BoardCorners(eqx.Module):
     """The observed corners, padded: V views of P points. They stay on the host until solved."""
 
     points_board_m: Float[Array | np.ndarray, "P 3"]
@@ -39,7 +40,7 @@ class Seen(eqx.Module):
     present: Bool[Array | np.ndarray, "V P"]
 
 
-class Unknowns(eqx.Module):
+class LensUnknowns(eqx.Module):
     """The unknowns of the problem: the lens and the pose of the board in every view."""
 
     lens: Float[Array, " 9"]  # fx fy cx cy, then the coefficients as the camera counts them
@@ -49,7 +50,7 @@ class Unknowns(eqx.Module):
 class Bundle(eqx.Module):
     """The solution of the least-squares problem: a minimum with its normal equations."""
 
-    unknowns: Unknowns
+    unknowns: LensUnknowns
     residual_px: Float[Array, "V P 2"]  # predicted - seen; 0 for points not seen
     blocks: Blocks  # in pixels, weighted as in the fit
     steps: Array
@@ -68,7 +69,7 @@ def camera_of(lens: str, parameters: Array) -> Camera:
     return Camera(parameters[:2], parameters[2:4], coefficients, jnp.asarray(0), (lens,))
 
 
-def gathered(views: BoardViews) -> Seen:
+def gathered(views: BoardViews) -> BoardCorners:
     """The views as arrays on the host, padded with empty views."""
     rows = -(-len(views.views) // _BATCH) * _BATCH
     points = len(views.points_board_m)
@@ -76,7 +77,7 @@ def gathered(views: BoardViews) -> Seen:
     for row, view in enumerate(views.views):
         corners_px[row, view.ids] = view.corners_px
         present[row, view.ids] = True
-    return Seen(np.asarray(views.points_board_m, float), corners_px, present)
+    return BoardCorners(np.asarray(views.points_board_m, float), corners_px, present)
 
 
 def padded_poses(Ts_camera_board: np.ndarray, rows: int) -> np.ndarray:
@@ -88,8 +89,8 @@ def padded_poses(Ts_camera_board: np.ndarray, rows: int) -> np.ndarray:
 @partial(jax.jit, static_argnames=("lens", "max_steps"))
 def solve(
     lens: str,
-    start: Unknowns,
-    seen: Seen,
+    start: LensUnknowns,
+    seen: BoardCorners,
     weights: Float[Array, "V P"],
     free: Bool[Array, " 9"],
     sigma_px: Float[Array, ""],
@@ -109,12 +110,12 @@ def solve(
     weights = jnp.where(seen.present, weights, 0)
     scale = jnp.sqrt(weights) / sigma_px
 
-    def fn(y: Unknowns, args: Any) -> Any:
+    def fn(y: LensUnknowns, args: Any) -> Any:
         residual_px, of_lens, of_pose = linearised(lens, y, seen)
         squared = jnp.sum(residual_px**2, axis=-1) * scale**2
         cost = cut**2 * jnp.log1p(squared / cut**2)
         counts = scale / jnp.sqrt(1 + squared / cut**2)
-        return jnp.sqrt(cost), normal_equations(residual_px, of_lens, of_pose, counts)
+        return jnp.sqrt(cost).reshape(-1), normal_equations(residual_px, of_lens, of_pose, counts)
 
     solution: optx.Solution = optx.least_squares(
         fn,
@@ -124,9 +125,9 @@ def solve(
         max_steps=max_steps,
         throw=False,
     )
-    state: SchurState = solution.state
+    state: LMState = solution.state
     residual_px = _predicted(lens, solution.value, seen) - seen.corners_px
-    blocks = jax.tree.map(lambda leaf: leaf * sigma_px**2, state.blocks)
+    blocks = jax.tree.map(lambda leaf: leaf * sigma_px**2, state.normal)
     return Bundle(
         unknowns=solution.value,
         residual_px=jnp.where(seen.present[..., None], residual_px, 0),
@@ -144,7 +145,7 @@ def lens_information(blocks: Blocks, free: Bool[Array, " 9"]) -> Float[Array, "9
 
 @partial(jax.jit, static_argnames="lens")
 def view_information(
-    lens: str, y: Unknowns, seen: Seen, weights: Float[Array, "V P"]
+    lens: str, y: LensUnknowns, seen: BoardCorners, weights: Float[Array, "V P"]
 ) -> Float[Array, "V 9 9"]:
     """Information of the nine from each view alone, its pose eliminated, for 1 px of noise."""
     _, of_lens, of_pose = linearised(lens, y, seen)
@@ -159,12 +160,12 @@ def view_information(
 
 
 @partial(jax.jit, static_argnames="lens")
-def residuals_px(lens: str, y: Unknowns, seen: Seen) -> Float[Array, "V P 2"]:
+def residuals_px(lens: str, y: LensUnknowns, seen: BoardCorners) -> Float[Array, "V P 2"]:
     """Residuals, predicted - seen; 0 for points not seen."""
     return jnp.where(seen.present[..., None], _predicted(lens, y, seen) - seen.corners_px, 0)
 
 
-def _predicted(lens: str, y: Unknowns, seen: Seen) -> Float[Array, "V P 2"]:
+def _predicted(lens: str, y: LensUnknowns, seen: BoardCorners) -> Float[Array, "V P 2"]:
     camera = camera_of(lens, y.lens)
     points_board_m = jnp.asarray(seen.points_board_m)
 
@@ -177,7 +178,7 @@ def _predicted(lens: str, y: Unknowns, seen: Seen) -> Float[Array, "V P 2"]:
     return jax.vmap(view)(y.Ts_camera_board)
 
 
-def linearised(lens: str, y: Unknowns, seen: Seen) -> tuple[Array, Array, Array]:
+def linearised(lens: str, y: LensUnknowns, seen: BoardCorners) -> tuple[Array, Array, Array]:
     """Residuals (V, P, 2), their Jacobians by the nine (V, P, 2, 9) and by xi (V, P, 2, 6)."""
 
     def pixel(parameters: Array, point_camera: Array) -> tuple[Array, Array]:
@@ -220,8 +221,8 @@ def normal_equations(residual_px: Array, of_lens: Array, of_pose: Array, counts:
     )
 
 
-def _moved(y: Unknowns, own: Array, shared: Array) -> Unknowns:
+def _moved(y: LensUnknowns, own: Array, shared: Array) -> LensUnknowns:
     # A negative focal length would mirror the image, so a step at most halves it.
     lens = y.lens + shared
     lens = lens.at[:2].set(jnp.maximum(lens[:2], y.lens[:2] / 2))
-    return Unknowns(lens, retracted(y.Ts_camera_board, own))
+    return LensUnknowns(lens, retracted(y.Ts_camera_board, own))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import Unknowns
+from jaxnav.calibration.lenses.bundle import LensUnknowns
 from jaxnav.calibration.lenses.start import board_poses
 from jaxnav.calibration.lenses.views import BoardViews
 
@@ -29,7 +29,7 @@ def informative(views: BoardViews, lens: str, parameters: np.ndarray, most: int)
     posed = ~np.isnan(poses[:, 0])
     poses = np.where(posed[:, None], poses, lens_bundle.padded_poses(poses[:0], len(poses)))
     padded = lens_bundle.padded_poses(poses, len(seen.corners_px))
-    y = Unknowns(jnp.asarray(parameters), jnp.asarray(padded))
+    y = LensUnknowns(jnp.asarray(parameters), jnp.asarray(padded))
     held = lens_bundle.solve(  # the poses alone, by pixels instead of rays
         lens,
         y,

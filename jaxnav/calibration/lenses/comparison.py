@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import COUNT, NO_CUT, Unknowns
+from jaxnav.calibration.lenses.bundle import COUNT, NO_CUT, LensUnknowns
 from jaxnav.calibration.lenses.fit import LensFit
 
 _FOLDS = 4
@@ -48,7 +48,7 @@ def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
     padded[:count] = weights
     free = jnp.asarray(lens_bundle.free_mask(fit.lens, fit.fixed))
     poses = jnp.asarray(lens_bundle.padded_poses(fit.Ts_camera_board, rows))
-    y = Unknowns(jnp.asarray(fit.parameters), poses)
+    y = LensUnknowns(jnp.asarray(fit.parameters), poses)
     sigma_px, no_cut = jnp.asarray(fit.sigma_px), jnp.asarray(NO_CUT)
     fold = np.arange(rows) % _FOLDS
     view_px = np.full(count, np.nan)
@@ -57,7 +57,7 @@ def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
         trained = lens_bundle.solve(fit.lens, y, seen, others, free, sigma_px, no_cut)
         held = lens_bundle.solve(
             fit.lens,
-            Unknowns(trained.unknowns.lens, poses),
+            LensUnknowns(trained.unknowns.lens, poses),
             seen,
             jnp.asarray(padded),
             jnp.zeros(COUNT, bool),

@@ -16,7 +16,14 @@ import numpy as np
 from scipy import stats
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import COUNT, NAMES, NO_CUT, Bundle, Seen, Unknowns
+from jaxnav.calibration.lenses.bundle import (
+    COUNT,
+    NAMES,
+    NO_CUT,
+    BoardCorners,
+    Bundle,
+    LensUnknowns,
+)
 from jaxnav.calibration.lenses.start import board_poses, lens_start
 from jaxnav.calibration.lenses.views import BoardViews
 
@@ -101,7 +108,7 @@ def fit_lens(
     problem = _Problem(lens, seen, free, np.append(posed, np.zeros(rows - count, bool)))
     poses = np.where(posed[:, None], poses, lens_bundle.padded_poses(poses[:0], count))
     padded = jnp.asarray(lens_bundle.padded_poses(poses, rows))
-    y = Unknowns(jnp.asarray(parameters), padded)
+    y = LensUnknowns(jnp.asarray(parameters), padded)
 
     weights = problem.posed[:, None] * seen.present
     sigma_px = problem.typical_px(np.asarray(lens_bundle.residuals_px(lens, y, seen)))
@@ -141,11 +148,11 @@ def fit_lens(
 @dataclass(frozen=True)
 class _Problem:
     lens: str
-    seen: Seen
+    seen: BoardCorners
     free: np.ndarray
     posed: np.ndarray  # (V,) true for views with a first guess of the pose
 
-    def solved(self, y: Unknowns, weights: np.ndarray, sigma_px: float, cut: float) -> Bundle:
+    def solved(self, y: LensUnknowns, weights: np.ndarray, sigma_px: float, cut: float) -> Bundle:
         return jax.block_until_ready(
             lens_bundle.solve(
                 self.lens,
@@ -221,7 +228,9 @@ class _Problem:
         return result
 
 
-def _posed_anew(views: BoardViews, problem: _Problem, bundle: Bundle, sigma_px: float) -> Unknowns:
+def _posed_anew(
+    views: BoardViews, problem: _Problem, bundle: Bundle, sigma_px: float
+) -> LensUnknowns:
     """Give views that are far off a new first pose: they may be stuck in the mirrored one."""
     each = problem.view_sigma_px(np.asarray(bundle.residual_px))
     far = np.flatnonzero(problem.posed & (each > 2 * sigma_px))
@@ -231,8 +240,8 @@ def _posed_anew(views: BoardViews, problem: _Problem, bundle: Bundle, sigma_px: 
     poses = board_poses(views, problem.lens, np.asarray(y.lens), far.tolist())
     Ts_camera_board = np.array(y.Ts_camera_board)
     Ts_camera_board[far] = np.where(np.isnan(poses), Ts_camera_board[far], poses)
-    again = Unknowns(y.lens, jnp.asarray(Ts_camera_board))
+    again = LensUnknowns(y.lens, jnp.asarray(Ts_camera_board))
     residual_px = np.asarray(lens_bundle.residuals_px(problem.lens, again, problem.seen))
     worse = problem.view_sigma_px(residual_px) >= each
     Ts_camera_board[worse] = np.asarray(y.Ts_camera_board)[worse]
-    return Unknowns(y.lens, jnp.asarray(Ts_camera_board))
+    return LensUnknowns(y.lens, jnp.asarray(Ts_camera_board))

@@ -98,7 +98,7 @@ def _misfit_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:
     lost = np.isnan(poses[:, 0])
     seen = lens_bundle.gathered(views)
     rows = len(seen.corners_px)
-    unknowns = lens_bundle.Unknowns(
+    unknowns = lens_bundle.LensUnknowns(
         jnp.asarray(parameters),
         jnp.asarray(lens_bundle.padded_poses(np.where(lost[:, None], [1, *6 * [0]], poses), rows)),
     )

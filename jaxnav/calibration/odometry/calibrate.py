@@ -26,9 +26,9 @@ from jaxnav.calibration.odometry.drive import (
     lay_out,
     reading_sigma,
 )
-from jaxnav.calibration.odometry.fit import Fit, Prior, fit
+from jaxnav.calibration.odometry.fit import OdometryFit, Prior, fit
 from jaxnav.calibration.odometry.model import FULL_WEIGHT, NAMES, Model
-from jaxnav.calibration.odometry.motion import STEERED_LITTLE, Motion, driven_m
+from jaxnav.calibration.odometry.motion import STEERED_LITTLE, DriveStatistics, driven_m
 from jaxnav.calibration.odometry.start import LOOSE, TIGHT, Trust, start
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
@@ -158,7 +158,7 @@ def _calibrated(
         )
         raise BadInput(where, problem)
     why = dict.fromkeys(fixed, "as told by --fix")
-    motion = Motion.of(course.intervals, sigma)
+    motion = DriveStatistics.of(course.intervals, sigma)
     why |= motion.cannot_tell(where, fixed)
     information = np.zeros(len(NAMES))
     if wheelbase_sigma_m is not None:
@@ -219,7 +219,7 @@ class _Search:
     prior: Prior
     progress: Callable[[], object]
 
-    def best(self, theta: np.ndarray, fixed: Mapping[str, str]) -> Fit:
+    def best(self, theta: np.ndarray, fixed: Mapping[str, str]) -> OdometryFit:
         """Fit from the present odometry; if that ends badly, also from other ways through the poses
         of single views, and from the parameters found."""
         found = self._started(theta, fixed, LOOSE)
@@ -232,21 +232,21 @@ class _Search:
             found = min(found, other, key=lambda one: one.blocks.cost)
         return found
 
-    def _started(self, theta: np.ndarray, fixed: Mapping[str, str], trust: Trust) -> Fit:
+    def _started(self, theta: np.ndarray, fixed: Mapping[str, str], trust: Trust) -> OdometryFit:
         nodes = start(self.course, self.rig, self.markers, theta, trust)
         return self._from(nodes, theta, fixed)
 
-    def again(self, found: Fit, fixed: Mapping[str, str]) -> Fit:
+    def again(self, found: OdometryFit, fixed: Mapping[str, str]) -> OdometryFit:
         """Fit again from a fit, with more parameters fixed at their values before."""
         kept = np.array([name in fixed for name in NAMES])
         return self._from(found.nodes, np.where(kept, self.prior.mean, found.theta), fixed)
 
-    def _from(self, nodes: np.ndarray, theta: np.ndarray, fixed: Mapping[str, str]) -> Fit:
+    def _from(self, nodes: np.ndarray, theta: np.ndarray, fixed: Mapping[str, str]) -> OdometryFit:
         free = np.array([name not in fixed for name in NAMES])
         return fit(self.model, nodes, theta, free, self.prior, self.progress)
 
 
-def _chi2_per_dof(found: Fit, course: Course) -> float:
+def _chi2_per_dof(found: OdometryFit, course: Course) -> float:
     """Chi-square per degree of freedom; outliers among the views count in neither."""
     chi2 = found.blocks.view_chi2
     good = chi2 <= FULL_WEIGHT
@@ -256,7 +256,7 @@ def _chi2_per_dof(found: Fit, course: Course) -> float:
     return (float(found.blocks.cost) - extra) / max(dof, 1)
 
 
-def _least_sure(found: Fit, fixed: Mapping[str, str], scale: float) -> str | None:
+def _least_sure(found: OdometryFit, fixed: Mapping[str, str], scale: float) -> str | None:
     """The name of the parameter to fix next; None if all are sure enough.
 
     The weakest direction of the information, with every parameter in units of its largest accepted
@@ -275,7 +275,9 @@ def _least_sure(found: Fit, fixed: Mapping[str, str], scale: float) -> str | Non
     return next((name for name in _KEPT_FIRST if name in involved), "speed_scale")
 
 
-def _refuse_contradiction(where: str, found: Fit, chi2: float, outliers: np.ndarray) -> None:
+def _refuse_contradiction(
+    where: str, found: OdometryFit, chi2: float, outliers: np.ndarray
+) -> None:
     if outliers.mean() > _MOST_OUTLIERS:
         problem = (
             f"{outliers.mean():.0%} of the markers seen are not where the map says: check "

@@ -75,7 +75,7 @@ class Intervals(NamedTuple):
     linked: Column
 
 
-class Views(NamedTuple):
+class MarkerViews(NamedTuple):
     """V views; see `Drive`.
 
     Attributes:
@@ -96,7 +96,7 @@ class Course(NamedTuple):
     """All stretches of all drives, one after the other."""
 
     intervals: Intervals
-    views: Views
+    views: MarkerViews
 
     @property
     def node_times_s(self) -> np.ndarray:
@@ -151,7 +151,7 @@ def lay_out(drives: Sequence[Drive]) -> Course:
         size = len(seen["time_s"])
         first, last = np.full(size, count), np.full(size, count + n - 1)
         on_axis = seen | {"time_s": seen["time_s"] + shift_s}
-        views.append(Views(first=first, last=last, **on_axis))
+        views.append(MarkerViews(first=first, last=last, **on_axis))
         count += n
         begin_s = edges_s[-1] + shift_s
         if number < len(parts) - 1:
@@ -161,7 +161,7 @@ def lay_out(drives: Sequence[Drive]) -> Course:
             count += 1
     return Course(
         Intervals(*(np.concatenate(column) for column in zip(*intervals, strict=True))),
-        Views(*(np.concatenate(column) for column in zip(*views, strict=True))),
+        MarkerViews(*(np.concatenate(column) for column in zip(*views, strict=True))),
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from jaxnav.calibration.odometry.model import NEXT, NODE, Blocks, Model
+from jaxnav.numerics.levenberg_marquardt import adapted
 
 _BELOW = NODE + NEXT - 1  # diagonals below the main one
 _RTOL = 1e-9
@@ -33,7 +34,7 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Fit:
+class OdometryFit:
     """The most likely course.
 
     Attributes:
@@ -42,7 +43,6 @@ class Fit:
         information: (p, p), of the free parameters, with all nodes eliminated.
         blocks: the normal equations at this point.
         converged: true if no step lowers the cost any more.
-        steps: number of steps tried.
     """
 
     nodes: np.ndarray
@@ -50,7 +50,6 @@ class Fit:
     information: np.ndarray
     blocks: Blocks
     converged: bool
-    steps: int
 
 
 def fit(
@@ -61,11 +60,10 @@ def fit(
     prior: Prior,
     progress: Callable[[], object] = lambda: None,
     most_steps: int = 100,
-) -> Fit:
+) -> OdometryFit:
     """Search the nearest minimum from a start, with Nielsen's damping relative to the diagonal.
 
-    Source: Madsen, Nielsen, Tingleff (2004), "Methods for non-linear least squares problems",
-    Algorithm 3.16; the scaling is Marquardt's (1963).
+    Source: as `jaxnav.numerics.levenberg_marquardt`; the scaling is Marquardt's (1963).
 
     Args:
         free: (5,) bool, true for parameters to fit; the others stay.
@@ -83,9 +81,7 @@ def fit(
 
     cost, blocks = evaluated(nodes, theta)
     damping, growth, converged = 1e-3, 2.0, False
-    step = 0
-    while step < most_steps and not converged:
-        step += 1
+    for _ in range(most_steps):
         system = _System.of(blocks, theta, free, prior)
         try:
             moved = system.solved(damping)
@@ -96,22 +92,19 @@ def fit(
         new_theta[free] += moved.theta
         possible = bool(new_theta[0] > 0 and new_theta[3] > 0)
         new_cost, new_blocks = evaluated(new_nodes, new_theta) if possible else (np.inf, blocks)
-        converged = moved.promised <= _RTOL * cost
+        gained = (cost - new_cost) / max(moved.promised, 1e-300)
+        damping, growth = map(float, adapted(damping, growth, new_cost < cost, gained))
+        converged = moved.promised <= _RTOL * cost or damping > 1e12
         if new_cost < cost:
-            ratio = (cost - new_cost) / max(moved.promised, 1e-300)
             nodes, theta, blocks, cost = new_nodes, new_theta, new_blocks, new_cost
-            damping *= max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3)
-            growth = 2.0
-        else:
-            damping, growth = damping * growth, 2 * growth
-            converged = converged or damping > 1e12
-    return Fit(
+        if converged:
+            break
+    return OdometryFit(
         nodes,
         theta,
         _System.of(blocks, theta, free, prior).reduced(),
         blocks,
         converged,
-        step,
     )
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnav.calibration.odometry.drive import Course, Intervals, ReadingSigma, Views
+from jaxnav.calibration.odometry.drive import Course, Intervals, MarkerViews, ReadingSigma
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.models.markers import MarkerMap
@@ -59,7 +59,10 @@ class Model:
 
     def __init__(self, course: Course, rig: CameraRig, markers: MarkerMap, sigma: ReadingSigma):
         self._count = len(course.intervals.dt_s), len(course.views.time_s)
-        intervals, views = Intervals(*_padded(course.intervals)), Views(*_padded(course.views))
+        intervals, views = (
+            Intervals(*_padded(course.intervals)),
+            MarkerViews(*_padded(course.views)),
+        )
         # Padding intervals link nothing and begin after all others.
         intervals.begin_s[self._count[0] :] = np.inf
         intervals.linked[self._count[0] :] = 0.0
@@ -111,7 +114,12 @@ def _process(local: Array, interval: Intervals, sigma: Array) -> Float[Array, " 
 
 
 def _view(
-    local: Array, interval: Intervals, sigma: Array, view: Views, rig: CameraRig, markers: MarkerMap
+    local: Array,
+    interval: Intervals,
+    sigma: Array,
+    view: MarkerViews,
+    rig: CameraRig,
+    markers: MarkerMap,
 ) -> Float[Array, " 8"]:
     """Residuals of a marker's corners in one camera, predicted minus seen, px.
 
@@ -145,7 +153,7 @@ def _blocks(
     markers: MarkerMap,
     sigma: Array,
     intervals: Intervals,
-    views: Views,
+    views: MarkerViews,
     used: Array,
     nodes: Array,
     theta: Array,
@@ -166,7 +174,7 @@ def _blocks(
     found = jnp.searchsorted(intervals.begin_s, views.time_s - theta[4], side="right") - 1
     index = jnp.clip(found, views.first, views.last)
 
-    def seen(one: Array, interval: Intervals, view: Views) -> tuple[Array, Array]:
+    def seen(one: Array, interval: Intervals, view: MarkerViews) -> tuple[Array, Array]:
         pixels = _view(one, interval, sigma, view, rig, markers)
         return pixels / jnp.repeat(view.sigma_px, 2), pixels
 
@@ -185,7 +193,7 @@ def _blocks(
     return cost, information, gradient, chi2, px.reshape(-1, 4, 2)
 
 
-def _padded(columns: Intervals | Views) -> list[np.ndarray]:
+def _padded(columns: Intervals | MarkerViews) -> list[np.ndarray]:
     """Pad columns to a multiple of `_PADDED` rows by repeating the last row."""
     extra = -len(columns[0]) % _PADDED
     return [np.concatenate([column, np.repeat(column[-1:], extra, axis=0)]) for column in columns]

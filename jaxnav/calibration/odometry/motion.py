@@ -36,7 +36,7 @@ def driven_m(intervals: Intervals) -> float:
 
 
 @dataclass(frozen=True)
-class Motion:
+class DriveStatistics:
     """Mean and spread of a car's speed and steering, with the sensors' noise subtracted.
 
     Attributes:
@@ -52,7 +52,7 @@ class Motion:
     varied_rad: float
 
     @staticmethod
-    def of(intervals: Intervals, sigma: ReadingSigma) -> "Motion":
+    def of(intervals: Intervals, sigma: ReadingSigma) -> "DriveStatistics":
         """Compute the motion from means of blocks of readings, which have little noise."""
         speed, size = _means(intervals, intervals.speed_mps)
         steering, _ = _means(intervals, intervals.steering_rad)
@@ -62,7 +62,7 @@ class Motion:
             return float(np.sqrt(max(variance - noise**2 / size, 0.0)))
 
         middle = float(weight @ steering)
-        return Motion(
+        return DriveStatistics(
             float(np.mean(np.abs(speed))),
             beyond_noise(float(np.var(speed)), sigma.speed_mps),
             middle,

@@ -13,7 +13,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnav.calibration.odometry.drive import Course, Intervals, Views
+from jaxnav.calibration.odometry.drive import Course, Intervals, MarkerViews
 from jaxnav.calibration.odometry.model import NODE, corrected
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import planar_from_T_world_vehicle
@@ -127,7 +127,9 @@ def _branches(
     return _Chosen(poses[rows, ways], good)
 
 
-def _both_poses(views: Views, rig: CameraRig, markers: MarkerMap) -> tuple[np.ndarray, np.ndarray]:
+def _both_poses(
+    views: MarkerViews, rig: CameraRig, markers: MarkerMap
+) -> tuple[np.ndarray, np.ndarray]:
     """(V, 2, 3) planar poses of the vehicle, and (V, 2) the costs of their corner residuals."""
     extra = -len(views.camera) % 512
     rows = np.concatenate([np.arange(len(views.camera)), np.zeros(extra, int)])
@@ -141,11 +143,11 @@ def _both_poses(views: Views, rig: CameraRig, markers: MarkerMap) -> tuple[np.nd
 
 @jax.jit
 def _poses_of_views(
-    rig: CameraRig, markers: MarkerMap, views: Views
+    rig: CameraRig, markers: MarkerMap, views: MarkerViews
 ) -> tuple[Float[Array, "V 2 3"], Float[Array, "V 2 4"]]:
     """Both poses of each view, and the residual of each corner in standard deviations."""
 
-    def one(view: Views) -> tuple[Array, Array]:
+    def one(view: MarkerViews) -> tuple[Array, Array]:
         camera = jax.tree.map(lambda leaf: leaf[view.camera], rig.cameras)
         rays_camera = camera.unproject(view.corners_px)
         Ts_camera_marker = ippe_from_rays(rays_camera, markers.size_m[view.marker])

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from jaxnav.calibration.rigs import bundle
-from jaxnav.calibration.rigs.linking import Linker, Links, inverted
-from jaxnav.calibration.rigs.pose_arrays import matrices, wxyz_xyz
+from jaxnav.calibration.rigs.linking import Linker, Links
+from jaxnav.calibration.rigs.pose_arrays import inverted, matrices, wxyz_xyz
 from jaxnav.models.rig import CameraRig
 
 _BETTER = 1.0  # a pose is replaced if another lowers its cost by more than this
@@ -21,10 +21,10 @@ def other_branches(
     rig: CameraRig,
     linker: Linker,
     links: Links,
-    poses: bundle.Unknowns,
+    poses: bundle.RigUnknowns,
     free: np.ndarray,
     sigma_px: float,
-) -> tuple[bundle.Unknowns, int]:
+) -> tuple[bundle.RigUnknowns, int]:
     """Move frames and markers to other poses that their sightings admit, if those cost less.
 
     Args:
@@ -39,13 +39,13 @@ def other_branches(
     links.Ts_group_marker[:] = matrices(poses.Ts_world_marker)
     known = bundle.seen(rig, views, sigma_px)
 
-    def cost(of: bundle.Unknowns, groups: np.ndarray, count: int) -> np.ndarray:
+    def cost(of: bundle.RigUnknowns, groups: np.ndarray, count: int) -> np.ndarray:
         residuals = np.asarray(bundle.reprojection_residuals_px(of, known))
         return np.bincount(groups, bundle.losses(residuals, float(known.sigma_px)), count)
 
     def best_of(
-        of: bundle.Unknowns, name: str, groups: np.ndarray, tries: Iterable[np.ndarray]
-    ) -> tuple[bundle.Unknowns, int]:
+        of: bundle.RigUnknowns, name: str, groups: np.ndarray, tries: Iterable[np.ndarray]
+    ) -> tuple[bundle.RigUnknowns, int]:
         """Replace each of the named poses by the one that costs its sightings least."""
         best, changed = matrices(getattr(of, name)), 0
         least = cost(of, groups, len(best))

@@ -34,7 +34,7 @@ _SETTLED = 1e-3
 _QUANTILE = 0.75
 
 
-class Unknowns(eqx.Module):
+class RigUnknowns(eqx.Module):
     """Poses, each wxyz_xyz and moved from the right, T * cay(xi); and lenses, if they move.
 
     All frames share S groups of six unknowns: the twists of C cameras and of M markers; then, if
@@ -65,7 +65,7 @@ def with_lenses(cameras: Camera, lenses: Float[Array, "*C 12"]) -> Camera:
     return Camera(focal_px, center_px, distortion, cameras.lens_index, cameras.lenses)
 
 
-class Seen(eqx.Module):
+class RigSightings(eqx.Module):
     """The N sightings and the known sizes, lenses and noise."""
 
     frame: Int[Array, " N"]
@@ -77,9 +77,9 @@ class Seen(eqx.Module):
     sigma_px: Float[Array, ""]
 
 
-def seen(rig: CameraRig, views: RigViews, sigma_px: float) -> Seen:
+def seen(rig: CameraRig, views: RigViews, sigma_px: float) -> RigSightings:
     """Convert the views for the solver, in the process's precision."""
-    return Seen(
+    return RigSightings(
         frame=jnp.asarray(views.frame),
         camera=jnp.asarray(views.camera),
         marker=jnp.asarray(views.marker),
@@ -93,19 +93,21 @@ def seen(rig: CameraRig, views: RigViews, sigma_px: float) -> Seen:
 class Adjusted(eqx.Module):
     """The result of a bundle adjustment."""
 
-    poses: Unknowns
+    poses: RigUnknowns
     residuals_px: Float[Array, "N 4 2"]  # projected minus observed
     weight: Float[Array, " N"]  # of each sighting; 1 if it counts in full
-    cost: Float[Array, ""]
     reduced: ReducedSystem  # of the weighted problem, undamped
     scores: Float[Array, "B R"]  # of every part of the recording, see `_scores`
-    steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
 
 @partial(jax.jit, static_argnames=("parts", "max_steps"))
 def adjust(
-    start: Unknowns, known: Seen, free: Bool[Array, " R"], parts: int = 1, max_steps: int = 60
+    start: RigUnknowns,
+    known: RigSightings,
+    free: Bool[Array, " R"],
+    parts: int = 1,
+    max_steps: int = 60,
 ) -> Adjusted:
     """Find the most likely poses near a start.
 
@@ -124,21 +126,19 @@ def adjust(
         poses=solution.value,
         residuals_px=residuals,
         weight=_weight(_distance2(residuals, known.sigma_px)),
-        cost=solution.state.cost,
-        reduced=reduce(solution.state.blocks, free, jnp.zeros(())),
-        scores=_scores(solution.value, known, solution.state.blocks, parts),
-        steps=solution.state.steps,
+        reduced=reduce(solution.state.normal, free, jnp.zeros(())),
+        scores=_scores(solution.value, known, solution.state.normal, parts),
         converged=jnp.asarray(solution.result == optx.RESULTS.successful),
     )
 
 
-def moved(poses: Unknowns, own: Float[Array, "F 6"], shared: Float[Array, " R"]) -> Unknowns:
+def moved(poses: RigUnknowns, own: Float[Array, "F 6"], shared: Float[Array, " R"]) -> RigUnknowns:
     """The unknowns after a move of the frames' twists and of the shared unknowns."""
     counts = [part.shape[0] for part in (poses.Ts_vehicle_camera, poses.Ts_world_marker)]
     ends = np.cumsum([*counts, poses.lenses.shape[0]])
     cameras, markers, lenses, others = jnp.split(shared.reshape(-1, 6), ends)
 
-    return Unknowns(
+    return RigUnknowns(
         retracted(poses.Ts_world_vehicle, own),
         retracted(poses.Ts_vehicle_camera, cameras),
         retracted(poses.Ts_world_marker, markers),
@@ -147,12 +147,14 @@ def moved(poses: Unknowns, own: Float[Array, "F 6"], shared: Float[Array, " R"])
 
 
 @jax.jit
-def reprojection_residuals_px(poses: Unknowns, known: Seen) -> Float[Array, "N 4 2"]:
+def reprojection_residuals_px(poses: RigUnknowns, known: RigSightings) -> Float[Array, "N 4 2"]:
     """Residuals of the corners, projected minus observed."""
     return _looked_at(poses, known)[0]
 
 
-def residuals_and_blocks(poses: Unknowns, known: Seen) -> tuple[Float[Array, " N"], Blocks]:
+def residuals_and_blocks(
+    poses: RigUnknowns, known: RigSightings
+) -> tuple[Float[Array, " N"], Blocks]:
     """Square roots of the sightings' costs, and the normal equations at their weights."""
     loss, r, J_frame, J_shared = _linearised(poses, known)
     F, slots = poses.Ts_world_vehicle.shape[0], _slots(poses, known)
@@ -176,7 +178,9 @@ def residuals_and_blocks(poses: Unknowns, known: Seen) -> tuple[Float[Array, " N
     )
 
 
-def _scores(poses: Unknowns, known: Seen, blocks: Blocks, parts: int) -> Float[Array, "B R"]:
+def _scores(
+    poses: RigUnknowns, known: RigSightings, blocks: Blocks, parts: int
+) -> Float[Array, "B R"]:
     """The contribution of each part of the recording, all equally long, to the gradient of the
     shared unknowns, with the frames' poses eliminated. At a minimum they add up to zero."""
     _, r, J_frame, J_shared = _linearised(poses, known)
@@ -191,7 +195,7 @@ def _scores(poses: Unknowns, known: Seen, blocks: Blocks, parts: int) -> Float[A
     return zero.at[part[:, None], slots].add(rows).reshape(parts, 6 * S)
 
 
-def _slots(poses: Unknowns, known: Seen) -> Int[Array, "N K"]:
+def _slots(poses: RigUnknowns, known: RigSightings) -> Int[Array, "N K"]:
     """Indices of the groups of six shared unknowns that each sighting depends on."""
     C, M = poses.Ts_vehicle_camera.shape[0], poses.Ts_world_marker.shape[0]
     slots = [known.camera, C + known.marker]
@@ -200,7 +204,7 @@ def _slots(poses: Unknowns, known: Seen) -> Int[Array, "N K"]:
     return jnp.stack(slots, axis=1)
 
 
-def _linearised(poses: Unknowns, known: Seen) -> tuple[Array, Array, Array, Array]:
+def _linearised(poses: RigUnknowns, known: RigSightings) -> tuple[Array, Array, Array, Array]:
     """Costs of the sightings (N,); residuals (N, 8), times the root of their weight; and their
     Jacobians by the frame's twist (N, 8, 6) and by the shared sixes (N, K, 8, 6)."""
     residuals, points, (slopes, lens_slopes), Rs = _looked_at(poses, known)
@@ -229,7 +233,7 @@ def _linearised(poses: Unknowns, known: Seen) -> tuple[Array, Array, Array, Arra
 
 
 def _looked_at(
-    poses: Unknowns, known: Seen
+    poses: RigUnknowns, known: RigSightings
 ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], tuple[Array, Array]]:
     """Residuals in px; corners in camera and vehicle; d px / d m in the camera and d px / d lens;
     rotations from vehicle and marker to the camera."""

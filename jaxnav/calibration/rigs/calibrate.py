@@ -16,8 +16,8 @@ from jaxtyping import Array
 
 from jaxnav.calibration.rigs import bundle
 from jaxnav.calibration.rigs.branches import other_branches
-from jaxnav.calibration.rigs.linking import Linker, Links, inverted
-from jaxnav.calibration.rigs.pose_arrays import matrices, wxyz_xyz
+from jaxnav.calibration.rigs.linking import Linker, Links
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, inverted, matrices, wxyz_xyz
 from jaxnav.calibration.rigs.views import RigViews, both_poses, rays_camera
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
@@ -48,7 +48,7 @@ class RigCalibration:
         weight: (N,), 1 if a sighting counts in full.
         cameras: the cameras with their lenses, as given unless they were to be refined.
         covariance: (6 S, 6 S) of the twists xi in T * cay(xi) of T_vehicle_camera and
-            T_world_marker and of the lenses, see `bundle.Unknowns`; zero for whatever was given.
+            T_world_marker and of the lenses, see `bundle.RigUnknowns`; zero for whatever was given.
         frames_follow: (F, 6, 6 S) derivatives of the frames' twists by those unknowns.
         inflation: factor of the covariance over that from noise independent between frames; 1 if
             there is no other noise.
@@ -111,7 +111,7 @@ def calibrate_rig(
     Raises:
         BadInput: no sighting defines the world frame, or no camera can be linked.
     """
-    given = inverted(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))
+    given = Ts_vehicle_camera(rig)
     start = _start(views, rig, given, known, reference_camera, refine_lenses)
     views, links, linker = start.views, start.links, start.linker
     free = _free(views, rig, start, known, reference_camera, refine_lenses)
@@ -138,7 +138,7 @@ def _free(
     reference_camera: int | None,
     refine_lenses: bool,
 ) -> np.ndarray:
-    """(S, 6) mask of the shared unknowns that move, see `bundle.Unknowns`."""
+    """(S, 6) mask of the shared unknowns that move, see `bundle.RigUnknowns`."""
     C, M = len(rig), len(views.size_m)
     sixes = (C, M, 2 * C if refine_lenses else 0)
     cameras, markers, lenses = (np.zeros((count, 6), bool) for count in sixes)
@@ -161,7 +161,7 @@ class _Start:
     views: RigViews
     links: Links
     linker: Linker
-    poses: bundle.Unknowns
+    poses: bundle.RigUnknowns
     calibrated: np.ndarray
     mapped: np.ndarray
 
@@ -207,7 +207,7 @@ def _start(
         linker.views,
         links,
         linker,
-        bundle.Unknowns(
+        bundle.RigUnknowns(
             wxyz_xyz(inverted(Ts_vehicle_world)),
             wxyz_xyz(np.where(calibrated[:, None, None], links.Ts_group_camera, given)),
             wxyz_xyz(links.Ts_group_marker),
@@ -219,7 +219,7 @@ def _start(
 
 
 def _adjusted(
-    rig: CameraRig, views: RigViews, poses: bundle.Unknowns, free: np.ndarray, sigma_px: float
+    rig: CameraRig, views: RigViews, poses: bundle.RigUnknowns, free: np.ndarray, sigma_px: float
 ) -> tuple[bundle.Adjusted, float]:
     """Adjust the poses at the noise estimated from their residuals; return it too, px."""
     for _ in range(_ROUNDS):

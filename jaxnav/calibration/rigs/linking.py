@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxnav.calibration.rigs.pose_arrays import inverted, turn_rad
 from jaxnav.calibration.rigs.views import RigViews
 
 _NEAR_RAD = 0.03  # error of a corner predicted through a link at which its vote counts half
@@ -281,19 +282,3 @@ def _join(
 
 def _agreement(error_rad: np.ndarray) -> np.ndarray:
     return np.asarray(np.nan_to_num(1 / (1 + (error_rad / _NEAR_RAD) ** 2)))
-
-
-def inverted(T: np.ndarray) -> np.ndarray:
-    """Inverses of rigid transforms (..., 4, 4)."""
-    inverse = np.zeros_like(T)
-    R = np.swapaxes(T[..., :3, :3], -1, -2)
-    inverse[..., :3, :3] = R
-    inverse[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
-    inverse[..., 3, 3] = 1
-    return inverse
-
-
-def turn_rad(T: np.ndarray, Ts: np.ndarray) -> np.ndarray:
-    """Angles between the rotation of T (4, 4) and those of Ts (..., 4, 4)."""
-    trace = np.sum(T[:3, :3] * Ts[..., :3, :3], axis=(-1, -2))
-    return np.asarray(np.arccos(np.clip((trace - 1) / 2, -1, 1)))

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.rigs.calibrate import RigCalibration
-from jaxnav.calibration.rigs.linking import inverted, turn_rad
+from jaxnav.calibration.rigs.pose_arrays import inverted, turn_rad
 from jaxnav.calibration.rigs.views import RigViews, rays_camera
 from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.models.rig import CameraRig

@@ -1,4 +1,4 @@
-"""Conversion of arrays of poses between wxyz_xyz and matrices, and their retraction."""
+"""Arrays of poses, as wxyz_xyz and as matrices: conversion, retraction, inverses, angles."""
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from jaxnav.models.geometry import cayley
+from jaxnav.models.rig import CameraRig
 
 
 def wxyz_xyz(Ts: np.ndarray) -> jax.Array:
@@ -29,3 +30,24 @@ def matrices(poses: jax.Array | np.ndarray) -> np.ndarray:
 def retracted(wxyz_xyz: Float[Array, " 7"], xi: Float[Array, " 6"]) -> Float[Array, " 7"]:
     """Move poses (n, 7) by twists (n, 6): T * cay(xi)."""
     return (jaxlie.SE3(wxyz_xyz) @ cayley(xi)).normalize().wxyz_xyz
+
+
+def inverted(T: np.ndarray) -> np.ndarray:
+    """Inverses of rigid transforms (..., 4, 4)."""
+    inverse = np.zeros_like(T)
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = R
+    inverse[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1
+    return inverse
+
+
+def turn_rad(T: np.ndarray, Ts: np.ndarray) -> np.ndarray:
+    """Angles between the rotation of T (4, 4) and those of Ts (..., 4, 4)."""
+    trace = np.sum(T[:3, :3] * Ts[..., :3, :3], axis=(-1, -2))
+    return np.asarray(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+def Ts_vehicle_camera(rig: CameraRig) -> np.ndarray:
+    """The poses of a rig's cameras, (C, 4, 4)."""
+    return inverted(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.rigs.calibrate import RigCalibration
 from jaxnav.calibration.rigs.driven_frame import DrivenFrame, level_follows
-from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.pose_arrays import inverted
 
 # Sigmas of poses measured by tape and eye.
 _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 0.01, np.deg2rad(3)

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from jaxnav.calibration.rigs.calibrate import calibrate_rig
-from jaxnav.calibration.rigs.linking import inverted
 from jaxnav.calibration.rigs.marker_check import Check, Verdict, checked
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.calibration.rigs.vehicle_frame import moved_world
 from jaxnav.commands.calibrate.arguments.recordings import CalibrateCheck as Arguments
 from jaxnav.commands.calibrate.data import RigData, gathered
@@ -33,7 +33,7 @@ def run(args: Arguments) -> int:
         )
     counts = np.bincount(data.views.marker, minlength=len(data.keys))
     anchor = max(data.known, key=lambda index: int(counts[index]))
-    given = inverted(np.asarray(data.rig.Ts_camera_vehicle.as_matrix(), float))
+    given = Ts_vehicle_camera(data.rig)
     found = calibrate_rig(data.views, data.rig, {anchor: data.known[anchor]}, None)
     check = checked(
         found, data.views, data.rig, data.known, args.tolerance_m, np.deg2rad(args.tolerance_deg)

@@ -1,9 +1,7 @@
 """`jaxnav calibrate markers`: find the places of markers with a calibrated rig."""
 
-import numpy as np
-
 from jaxnav.calibration.rigs.calibrate import calibrate_rig
-from jaxnav.calibration.rigs.linking import inverted
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.calibrate.arguments.recordings import CalibrateMarkers as Arguments
 from jaxnav.commands.calibrate.data import gathered
 from jaxnav.commands.calibrate.rig import publish, refuse_wrong_sizes
@@ -14,7 +12,7 @@ def run(args: Arguments) -> int:
     """Find the markers, write the files, and print a summary."""
     configure_jax(float64=True)
     data = gathered(args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family)
-    given = inverted(np.asarray(data.rig.Ts_camera_vehicle.as_matrix(), float))
+    given = Ts_vehicle_camera(data.rig)
     found = calibrate_rig(data.views, data.rig, data.known, None)
     refuse_wrong_sizes(data, found)
     publish(args.out, data, found, given, with_rig=False)

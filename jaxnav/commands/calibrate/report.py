@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxnav
 from jaxnav.calibration.rigs.calibrate import RigCalibration
-from jaxnav.calibration.rigs.linking import inverted, turn_rad
+from jaxnav.calibration.rigs.pose_arrays import inverted, turn_rad
 from jaxnav.commands.calibrate.data import RigData
 from jaxnav.files import save_markers, save_rig, write_tum
 from jaxnav.files.markers import MarkerSigma, marker_map

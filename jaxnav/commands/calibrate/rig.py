@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxnav.calibration.rigs.calibrate import RigCalibration, calibrate_rig
 from jaxnav.calibration.rigs.driven_frame import driven_frame
-from jaxnav.calibration.rigs.linking import inverted
 from jaxnav.calibration.rigs.marker_check import sizes_m
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven, moved_to_places
 from jaxnav.commands.calibrate.arguments.recordings import CalibrateRig as Arguments
 from jaxnav.commands.calibrate.data import RigData, gathered
@@ -40,7 +40,7 @@ def run(args: Arguments) -> int:
         raise BadInput("--vehicle-frame", problem)
     wheelbase_m = _wheelbase_m(args, data) if args.vehicle_frame == "drive" else 0.0
     reference = _reference_camera(args, data)
-    given = inverted(np.asarray(data.rig.Ts_camera_vehicle.as_matrix(), float))
+    given = Ts_vehicle_camera(data.rig)
     found = calibrate_rig(data.views, data.rig, data.known, reference, args.refine_lenses)
     _refuse_nonsense(args, data, found, given)
     found = _tied(args, data, found, given, wheelbase_m)

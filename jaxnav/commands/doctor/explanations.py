@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaxnav.commands.doctor.fits import MOST_ERRORS, Fit, Sighted, Unknowns, fit
+from jaxnav.commands.doctor.fits import MOST_ERRORS, FileErrors, Sighted, StandingFit, fit
 
 SIZE_SIGMA = 0.3  # of a logarithm
 _FOCAL_SIGMA = 0.1
@@ -32,10 +32,10 @@ class Explanation:
     kind: str
     index: int | None
     count: int
-    fit: Fit = field(repr=False)
+    fit: StandingFit = field(repr=False)
 
 
-def explained(seen: Sighted, starts: Sequence[np.ndarray], whole: Fit) -> list[Explanation]:
+def explained(seen: Sighted, starts: Sequence[np.ndarray], whole: StandingFit) -> list[Explanation]:
     """The errors that explain the corners best: up to three that can't be told apart, often none.
 
     Args:
@@ -63,13 +63,13 @@ def explained(seen: Sighted, starts: Sequence[np.ndarray], whole: Fit) -> list[E
     return [each for each in good if price(each) < price(good[0]) + _ALIKE][:3]
 
 
-def _errors_of_files(seen: Sighted) -> Iterator[tuple[str, int | None, int, Unknowns]]:
+def _errors_of_files(seen: Sighted) -> Iterator[tuple[str, int | None, int, FileErrors]]:
     """Each error that several markers can tell apart: kind, index, count, and prior sigmas."""
     C, M = seen.visible.shape
     used = np.flatnonzero(seen.visible.any(axis=1))[:MOST_ERRORS]
 
-    def of_pose(**others: np.ndarray) -> Unknowns:
-        return Unknowns.of_pose(seen, level=True, **others)
+    def of_pose(**others: np.ndarray) -> FileErrors:
+        return FileErrors.of_pose(seen, level=True, **others)
 
     yield "sizes", None, M, of_pose(size=np.full(M, SIZE_SIGMA))
     focal = np.where(np.isin(np.arange(C), used), _FOCAL_SIGMA, 0.0)

@@ -18,11 +18,10 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
 from jaxnav.detection.observe import CornerLanes
-from jaxnav.models.camera import Camera
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
-from jaxnav.pose.ippe import ippe_from_rays
-from jaxnav.pose.observation import MODEL_SIGMA_PX
+from jaxnav.pose.candidates import both_poses
+from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, sightings
 
 MOST_ERRORS = 6  # numbers that may be unknown beside the pose
 _HEIGHT_SIGMA_M = 0.01  # of a car on a floor that is nearly level,
@@ -91,7 +90,7 @@ class Sighted:
         return float(np.sqrt(np.mean(self.sigma_px[self.visible] ** 2)))
 
 
-class Unknowns(eqx.Module):
+class FileErrors(eqx.Module):
     """Differences from the files, or their sigmas, where 0 says that a number is known."""
 
     pose: np.ndarray  # (6,) xi in T_world_vehicle * exp(xi)
@@ -101,7 +100,7 @@ class Unknowns(eqx.Module):
     turned: np.ndarray  # (C, 3) rotation vector of each camera in its own frame, rad
 
     @staticmethod
-    def of_pose(seen: Sighted, level: bool, **others: np.ndarray) -> "Unknowns":
+    def of_pose(seen: Sighted, level: bool, **others: np.ndarray) -> "FileErrors":
         """Prior sigmas of a pose anywhere in space, or level on the ground, and of `others`."""
         C, M = seen.visible.shape
         on_ground = [_HEIGHT_SIGMA_M, _TILT_SIGMA_RAD, _TILT_SIGMA_RAD]
@@ -113,11 +112,11 @@ class Unknowns(eqx.Module):
             "turned": np.zeros((C, 3)),
         }
         pose = np.array([_FREE_M, _FREE_M, z_m, roll_rad, pitch_rad, _FREE_RAD])
-        return Unknowns(pose, **(none | others))
+        return FileErrors(pose, **(none | others))
 
 
 @dataclass(frozen=True)
-class Fit:
+class StandingFit:
     """The best fit of a pose and of unknowns to the corners.
 
     Attributes:
@@ -132,8 +131,8 @@ class Fit:
     T_world_vehicle: np.ndarray
     cost: float
     error_px: float
-    value: Unknowns
-    sigma: Unknowns
+    value: FileErrors
+    sigma: FileErrors
     pose_covariance: np.ndarray
 
     @property
@@ -150,33 +149,20 @@ class Fit:
 
 def poses_by_each(seen: Sighted) -> list[np.ndarray]:
     """Both T_world_vehicle, (7,) wxyz_xyz each, by each marker in each camera."""
-    both = np.asarray(_both(seen.rig, seen.markers, jnp.asarray(seen.corners_px)))
-    return list(both[seen.visible].reshape(-1, 7))
+    both = np.asarray(_both(seen.rig, seen.markers, seen.corners_px, seen.visible))
+    return list(both[seen.visible.reshape(-1)].reshape(-1, 7))
 
 
 @jax.jit
-def _both(rig: CameraRig, markers: MarkerMap, corners_px: jax.Array) -> jax.Array:
-    def one(
-        camera: Camera,
-        T_camera_vehicle: jaxlie.SE3,
-        T_world_marker: jaxlie.SE3,
-        size_m: jax.Array,
-        corners_px: jax.Array,
-    ) -> jax.Array:
-        Ts_camera_marker = ippe_from_rays(camera.unproject(corners_px), size_m)
-        Ts_world_vehicle = jax.vmap(
-            lambda T_camera_marker: T_world_marker @ T_camera_marker.inverse() @ T_camera_vehicle
-        )(Ts_camera_marker)
-        return Ts_world_vehicle.wxyz_xyz
-
-    of_markers = jax.vmap(one, in_axes=(None, None, 0, 0, 0))
-    of_cameras = jax.vmap(of_markers, in_axes=(0, 0, None, None, 0))
-    return of_cameras(
-        rig.cameras, rig.Ts_camera_vehicle, markers.Ts_world_marker, markers.size_m, corners_px
-    )
+def _both(
+    rig: CameraRig, markers: MarkerMap, corners_px: jax.Array, visible: jax.Array
+) -> jax.Array:
+    seen = sightings(rig, markers, corners_px, visible)
+    snapshot = Snapshot(rig, markers, Observation(corners_px, visible), seen)
+    return both_poses(snapshot).inverse().wxyz_xyz
 
 
-def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: Unknowns) -> Fit:
+def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: FileErrors) -> StandingFit:
     """The best fit from several starts.
 
     Args:
@@ -187,7 +173,7 @@ def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: Unknowns) -> F
     return min(fits, key=lambda each: each.cost)
 
 
-def _fit(seen: Sighted, start: np.ndarray, prior_sigma: Unknowns) -> Fit:
+def _fit(seen: Sighted, start: np.ndarray, prior_sigma: FileErrors) -> StandingFit:
     flat_sigma, unravel = ravel_pytree(prior_sigma)
     asked = np.flatnonzero(flat_sigma)
     slots = np.full(6 + MOST_ERRORS, flat_sigma.size)  # past the end where fewer are asked for
@@ -215,7 +201,7 @@ def _fit(seen: Sighted, start: np.ndarray, prior_sigma: Unknowns) -> Fit:
     sigma[asked] = np.sqrt(np.diag(covariance)[mine]) * flat_sigma[asked]
     pose_sigma = np.asarray(prior_sigma.pose)
     sigmas_px = np.repeat(seen.sigma_px.reshape(-1), 2)
-    return Fit(
+    return StandingFit(
         np.asarray(jaxlie.SE3(jnp.asarray(wxyz_xyz)).as_matrix()),
         cost=float(2 * found.cost),
         error_px=float(np.sqrt(np.sum((whitened * sigmas_px) ** 2) / max(seen.numbers, 1))),
@@ -233,7 +219,7 @@ def _errors(
     visible: jax.Array,
     sigma_px: jax.Array,
     start: jax.Array,
-    prior_sigma: Unknowns,
+    prior_sigma: FileErrors,
     slots: jax.Array,
     u: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:

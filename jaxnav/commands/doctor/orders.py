@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxnav.commands.doctor.findings import Finding
-from jaxnav.commands.doctor.fits import Fit, Sighted, Unknowns, fit, poses_by_each
+from jaxnav.commands.doctor.fits import FileErrors, Sighted, StandingFit, fit, poses_by_each
 from jaxnav.files import Route
 from jaxnav.models.markers import MarkerMap
 
@@ -26,7 +26,9 @@ _MAX_ERROR = 3.0  # times the RMS that the corners' sigma allows
 _POSE_NUMBERS = 6
 
 
-def in_their_order(seen: Sighted, route: Route | None) -> tuple[Sighted, list[Fit], list[Finding]]:
+def in_their_order(
+    seen: Sighted, route: Route | None
+) -> tuple[Sighted, list[StandingFit], list[Finding]]:
     """Find the order of each marker's corners, and the pose of the car by that marker alone.
 
     Args:
@@ -50,9 +52,9 @@ def in_their_order(seen: Sighted, route: Route | None) -> tuple[Sighted, list[Fi
     return seen, poses, findings
 
 
-def standing(seen: Sighted) -> Fit:
+def standing(seen: Sighted) -> StandingFit:
     """The most level pose, anywhere in space, among those that explain the corners."""
-    anywhere = Unknowns.of_pose(seen, level=False)
+    anywhere = FileErrors.of_pose(seen, level=False)
     fits = [fit(seen, [start], anywhere) for start in poses_by_each(seen)]
     least = min(each.cost for each in fits)
     return min(
@@ -60,7 +62,9 @@ def standing(seen: Sighted) -> Fit:
     )
 
 
-def _best_order(seen: Sighted, index: int, route: Route | None) -> tuple[Fit, tuple[int, ...]]:
+def _best_order(
+    seen: Sighted, index: int, route: Route | None
+) -> tuple[StandingFit, tuple[int, ...]]:
     """The pose and the corner order that leave the car level; the map's own order where it does."""
     alone = seen.only(index)
     behind = route is not None and _is_behind(seen.markers, index, route)
@@ -76,7 +80,7 @@ def _best_order(seen: Sighted, index: int, route: Route | None) -> tuple[Fit, tu
     return (pose, order) if _tilt_deg(pose) < _STANDS_DEG else (as_written, TURNED[0])
 
 
-def _tilt_deg(pose: Fit) -> float:
+def _tilt_deg(pose: StandingFit) -> float:
     return float(np.rad2deg(pose.tilt_rad))
 
 
@@ -87,7 +91,7 @@ def _is_behind(markers: MarkerMap, index: int, route: Route) -> bool:
     return bool(np.all((places_m - T[:2, 3]) @ T[:2, 2] < 0))
 
 
-def _wrong_order(name: str, order: tuple[int, ...], pose: Fit) -> Finding:
+def _wrong_order(name: str, order: tuple[int, ...], pose: StandingFit) -> Finding:
     # Entry order.index(j) of the map is corner j of the print.
     right = " ".join(str(order.index(corner) + 1) for corner in range(4))
     if order in TURNED:
@@ -105,7 +109,7 @@ def _wrong_order(name: str, order: tuple[int, ...], pose: Fit) -> Finding:
     )
 
 
-def _on_ground(name: str, pose: Fit) -> Finding:
+def _on_ground(name: str, pose: StandingFit) -> Finding:
     R_world_vehicle = pose.T_world_vehicle[:3, :3]
     height_m, tilt_deg = float(pose.T_world_vehicle[2, 3]), _tilt_deg(pose)
     variance_m2 = R_world_vehicle[2] @ pose.pose_covariance[:3, :3] @ R_world_vehicle[2]
@@ -126,7 +130,7 @@ def _on_ground(name: str, pose: Fit) -> Finding:
     return Finding("picture", "ok", text)
 
 
-def _square(name: str, alone: Sighted, pose: Fit) -> Iterator[Finding]:
+def _square(name: str, alone: Sighted, pose: StandingFit) -> Iterator[Finding]:
     """Warn where the corners fit no square at all."""
     free = (alone.numbers - _POSE_NUMBERS) / alone.numbers
     allowed_px = alone.allowed_px * float(np.sqrt(free))

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, listed
-from jaxnav.commands.doctor.sight import Ts_vehicle_camera, sees_directions, through_lens
+from jaxnav.commands.doctor.sight import sees_directions, through_lens
 from jaxnav.files.reading import read_mapping
 from jaxnav.models.rig import CameraRig
 

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, listed
-from jaxnav.commands.doctor.sight import Ts_vehicle_camera, Views, views
+from jaxnav.commands.doctor.sight import PoseViews, views
 from jaxnav.files import Route
 from jaxnav.models.bicycle import Vehicle, curvature_per_m
 from jaxnav.models.markers import MarkerMap
@@ -160,7 +161,7 @@ def sight_along(rig: CameraRig, markers: MarkerMap, route: Route) -> Iterator[Fi
         )
 
 
-def _never_seen(seen: Views, markers: MarkerMap) -> Finding:
+def _never_seen(seen: PoseViews, markers: MarkerMap) -> Finding:
     if seen.behind.all():
         return Finding(
             "sight",
@@ -177,7 +178,7 @@ def _never_seen(seen: Views, markers: MarkerMap) -> Finding:
     )
 
 
-def _from_place(rig: CameraRig, markers: MarkerMap, seen: Views, number: int) -> Finding:
+def _from_place(rig: CameraRig, markers: MarkerMap, seen: PoseViews, number: int) -> Finding:
     """Report the best view from the start (number 0) or from a waypoint."""
     place = "the start" if number == 0 else f"waypoint {number}"
     sides_px = seen.side_px[number]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
+from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.models.markers import MarkerMap
@@ -63,13 +64,8 @@ def sees_directions(rig: CameraRig, directions_vehicle: np.ndarray) -> np.ndarra
     return np.asarray(_sees_directions(rig, jnp.asarray(directions_vehicle, float)))
 
 
-def Ts_vehicle_camera(rig: CameraRig) -> np.ndarray:
-    """T_vehicle_camera of all cameras, (C, 4, 4)."""
-    return np.linalg.inv(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))
-
-
 @dataclass(frozen=True)
-class Views:
+class PoseViews:
     """Views of every marker in every camera from P poses of the vehicle.
 
     Attributes:
@@ -85,19 +81,25 @@ class Views:
 
 
 @jax.jit
-def _corners(rig: CameraRig, markers: MarkerMap, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    def one(pose: jax.Array) -> tuple[jax.Array, jax.Array]:
-        T_vehicle_world = T_world_vehicle_from_planar(pose).inverse()
+def _corners(
+    rig: CameraRig, markers: MarkerMap, poses: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def one(pose: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        T_world_vehicle = T_world_vehicle_from_planar(pose)
+        T_vehicle_world = T_world_vehicle.inverse()
         corners_world_m = markers.corners_world_m
         inside = jnp.all(rig.sees(T_vehicle_world, corners_world_m), axis=-1)
-        return rig.project(T_vehicle_world, corners_world_m), inside
+        pixels = rig.project(T_vehicle_world, corners_world_m)
+        return pixels, inside, T_world_vehicle.as_matrix()
 
     return jax.vmap(one)(poses)
 
 
-def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> Views:
-    """`Views` from planar poses (P, 3): x m, y m, psi rad."""
-    corners_px, inside = jax.device_get(_corners(rig, markers, jnp.asarray(poses, float)))
+def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> PoseViews:
+    """`PoseViews` from planar poses (P, 3): x m, y m, psi rad."""
+    corners_px, inside, Ts_world_vehicle = jax.device_get(
+        _corners(rig, markers, jnp.asarray(poses, float))
+    )
     diagonals_px = corners_px[..., :2, :] - corners_px[..., 2:, :]
     # Clockwise as the reader sees them, and y down in the image: positive from the front.
     area_px2 = (
@@ -105,7 +107,6 @@ def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> Views:
         - diagonals_px[..., 0, 1] * diagonals_px[..., 1, 0]
     ) / 2
     side_px = np.sqrt(np.where(inside & (area_px2 > 0), area_px2, 0))
-    Ts_world_vehicle = planar_matrices(poses)
     positions_world_m = np.einsum("pij,cj->pci", Ts_world_vehicle, Ts_vehicle_camera(rig)[:, :, 3])[
         ..., :3
     ]
@@ -114,13 +115,4 @@ def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> Views:
     arms_m = positions_world_m[:, :, None] - centers_world_m
     to_vehicle_m = Ts_world_vehicle[:, None, :2, 3] - centers_world_m[:, :2]
     behind = np.einsum("pmi,mi->pm", to_vehicle_m, normals[:, :2]) < 0
-    return Views(side_px, behind, np.linalg.norm(arms_m, axis=-1))
-
-
-def planar_matrices(poses: np.ndarray) -> np.ndarray:
-    """T_world_vehicle (P, 4, 4) of planar poses (P, 3)."""
-    T = np.tile(np.eye(4), (len(poses), 1, 1))
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
-    T[:, :2, 3] = poses[:, :2]
-    return T
+    return PoseViews(side_px, behind, np.linalg.norm(arms_m, axis=-1))

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxnav.commands.doctor.explanations import SIZE_SIGMA, explained, in_words
 from jaxnav.commands.doctor.findings import Finding
-from jaxnav.commands.doctor.fits import Fit, Sighted, Unknowns, fit
+from jaxnav.commands.doctor.fits import FileErrors, Sighted, StandingFit, fit
 from jaxnav.files import Route
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.origin import Origin
@@ -19,7 +19,7 @@ _LEAST_SIZE = 0.03  # a smaller error of a size is not reported
 _CLEARLY = 2.0  # sigma
 
 
-def together(seen: Sighted, poses: Sequence[Fit], route: Route | None) -> Iterator[Finding]:
+def together(seen: Sighted, poses: Sequence[StandingFit], route: Route | None) -> Iterator[Finding]:
     """Report where the car stands, and which part of the files contradicts the rest.
 
     Args:
@@ -27,7 +27,7 @@ def together(seen: Sighted, poses: Sequence[Fit], route: Route | None) -> Iterat
         poses: the pose by each marker alone.
     """
     starts = [_on_ground(pose) for pose in poses]
-    whole = fit(seen, starts, Unknowns.of_pose(seen, level=True))
+    whole = fit(seen, starts, FileErrors.of_pose(seen, level=True))
     if route is not None:
         yield _place(whole, route, seen.markers.origin_m)
     if len(seen.markers.ids) == 1:
@@ -58,11 +58,11 @@ def together(seen: Sighted, poses: Sequence[Fit], route: Route | None) -> Iterat
     )
 
 
-def _on_ground(pose: Fit) -> np.ndarray:
+def _on_ground(pose: StandingFit) -> np.ndarray:
     return np.asarray(T_world_vehicle_from_planar(jnp.asarray(pose.planar, float)).wxyz_xyz)
 
 
-def _place(whole: Fit, route: Route, origin_m: Origin) -> Finding:
+def _place(whole: StandingFit, route: Route, origin_m: Origin) -> Finding:
     x_m, y_m, psi_rad = whole.planar
     start = route.start_pose
     apart_m = math.hypot(x_m - start[0], y_m - start[1])
@@ -78,7 +78,7 @@ def _place(whole: Fit, route: Route, origin_m: Origin) -> Finding:
 
 def _size_alone(seen: Sighted, starts: Sequence[np.ndarray]) -> Finding:
     """Check the size of a single marker: its height over the camera tells its distance, so size."""
-    size = Unknowns.of_pose(seen, level=True, size=np.full(1, SIZE_SIGMA))
+    size = FileErrors.of_pose(seen, level=True, size=np.full(1, SIZE_SIGMA))
     found = fit(seen, starts, size)
     logarithm, sigma = float(found.value.size[0]), float(found.sigma.size[0])
     factor, written_m = math.exp(logarithm), float(seen.markers.size_m[0])
