@@ -31,7 +31,8 @@ from jaxnav.recording.drive_format import HEADER, PROFILE, encode
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.recording.message_schemas import MESSAGES, OUTCOME
-from jaxnav.recording.messages import input_message, outcome_message
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.outcomes import outcome_message
 from jaxnav.vehicles import replay
 from jaxnav.vehicles.options import number, whole_number
 from tests.helpers.drives import make_input, make_outcome

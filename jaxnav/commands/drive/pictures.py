@@ -68,7 +68,7 @@ def summary_lines(log: DriveLog) -> list[str]:
     healths = ", ".join(f"{name} {share:.1%}" for name, share in shares.items() if share > 0)
     faults = _counted(Fault, outcomes.faults) + _counted(Reject, outcomes.rejects)
     restarts = int(outcomes.restarts[-1])
-    reason = f", the last one: {outcomes.reasons[-1]}" if restarts else ""
+    reason = f", the last one: {outcomes.reason[-1]}" if restarts else ""
     lines = [
         f"{duration_s:.1f} s, {count} outcomes, {distance_m(log):.2f} m by the odometer",
         f"health by time: {healths}",

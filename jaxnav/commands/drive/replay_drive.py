@@ -33,7 +33,7 @@ from jaxnav.files import (
 from jaxnav.loop.pilot import Input
 from jaxnav.plots.localisation import localisation_report
 from jaxnav.recording.drive_format import PROFILE
-from jaxnav.recording.drive_log import DriveLog, Outcomes
+from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_replay import (
     Comparison,
     check_inputs,
@@ -43,7 +43,8 @@ from jaxnav.recording.drive_replay import (
 from jaxnav.recording.drive_setup import DriveSetup, needs_float64
 from jaxnav.recording.mcap_messages import profile_of
 from jaxnav.recording.message_schemas import OUTCOME
-from jaxnav.recording.messages import digest, input_message, outcome_message
+from jaxnav.recording.messages import digest, input_message
+from jaxnav.recording.outcomes import Outcomes, outcome_message
 from jaxnav.recording.plausible import plausible
 from jaxnav.recording.recorder import Recorder
 

@@ -11,7 +11,6 @@ from jaxnav.files import atomic_path, output_folder
 from jaxnav.plots.scenery import Scenery
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.plausible import left_out, plausible
-from jaxnav.viewer.outcomes import Shown
 from jaxnav.viewer.rerun_view import RerunView, import_rerun
 
 
@@ -48,7 +47,7 @@ def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool)
         print(left_out(odd))
     names = () if scenery.rig is None else scenery.rig.names
     for index in tqdm(range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False):
-        view.show(Shown.of_row(outcomes, index, scenery.origin_m))
+        view.show_recorded(outcomes, index)
     for frame in (frame for given in log.inputs for frame in given.frames):
         name = names[frame.camera] if frame.camera < len(names) else f"camera_{frame.camera}"
         if frame.detections is not None:
