@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from jaxnav import cli
-from jaxnav.commands.drive.pictures import distance_m, summary_lines
+from jaxnav.commands.drive.plot import distance_m, summary_lines
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry

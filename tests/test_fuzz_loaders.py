@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from jaxnav.commands.drive.pictures import summary_lines
+from jaxnav.commands.drive.plot import summary_lines
 from jaxnav.datasets.recordings import Recording
 from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping

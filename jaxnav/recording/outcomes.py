@@ -1,7 +1,8 @@
 """The fields of a recorded outcome, each in one place: the lines of `Outcomes`.
 
 A line says how its field is written, read, and compared with that of a replay. The message, its
-JSON schema, and the table of a whole drive are made of these lines.
+JSON schema, and the table of a whole drive are made of these lines. A field that older drives lack
+has a default, does not belong to the report, and is not compared.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -13,8 +13,9 @@ from tqdm import tqdm
 from jaxnav.commands.drive.arguments import Replay as Arguments
 from jaxnav.commands.drive.track import Row, Track
 from jaxnav.commands.pictures import corners_in_world, save_figure
-from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import read_shown
+from jaxnav.configuration import step_folder
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from tqdm import tqdm
 
 from jaxnav.commands.drive.arguments import View as Arguments
-from jaxnav.commands.drive.pictures import read_outcomes
+from jaxnav.commands.drive.plot import read_outcomes
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path, output_folder
 from jaxnav.plots.scenery import Scenery

@@ -1,4 +1,4 @@
-"""`jaxnav plot DRIVE.mcap`: a recorded drive as a picture and in a few lines."""
+"""`jaxnav plot`: a recorded drive as a picture and in a few lines, or the pictures of a study."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +19,14 @@ from jaxnav.recording.plausible import left_out, plausible
 _LONGEST_STEP_S = 1.0  # between two readings, for the distance; a longer gap counts as this
 
 
-def is_recording(path: Path) -> bool:
-    """Whether a path has the suffix of a recorded drive, .mcap."""
-    return path.suffix.lower() == ".mcap"
+def run(args: Arguments) -> int:
+    """Draw the drive or the study in the file."""
+    if args.store.suffix.lower() == ".mcap":
+        return _draw_drive(args)
+    # It needs the packages of the extra `study`.
+    from jaxnav.commands.study.pictures import draw_study
+
+    return draw_study(args)
 
 
 def read_outcomes(path: Path, headless: bool) -> DriveLog:
@@ -36,7 +41,7 @@ def read_outcomes(path: Path, headless: bool) -> DriveLog:
     return log
 
 
-def draw_drive(args: Arguments) -> int:
+def _draw_drive(args: Arguments) -> int:
     """Write drive.png, and print a summary of the drive."""
     log = read_outcomes(args.store, args.headless)
     outcomes, odd = plausible(log.outcomes)
