@@ -144,7 +144,7 @@ def test_whether_the_step_is_compiled_is_looked_up(monkeypatch, tmp_path, capsys
         asked.append("advance_packed" in structures)
         return "the.step"
 
-    monkeypatch.setattr("jaxnav.commands.process.step_folder", lambda: tmp_path)
+    monkeypatch.setattr("jaxnav.configuration.step_folder", lambda: tmp_path)
     monkeypatch.setattr("jaxnav.compiling.executables._file", file)
     monkeypatch.setattr(f"{CHECKS}.software.compile_cache", lambda directory, compiled, refused: [
         Finding("compile cache", "ok", f"compiled: {compiled}")

@@ -83,8 +83,8 @@ def test_outcomes_are_tables(whole):
     np.testing.assert_array_equal(outcomes.hypotheses[2], belief.mean[1:3, :3])
     assert outcomes.Ts_vehicle_world[2].shape == (2, 7)
     np.testing.assert_array_equal(outcomes.costs[2], [0.5, np.inf])
-    assert outcomes.digests[3] == "digest 3"
-    assert outcomes.reasons[3] == "the loop was away"
+    assert outcomes.digest[3] == "digest 3"
+    assert outcomes.reason[3] == "the loop was away"
 
 
 def test_what_an_outcome_does_not_report_is_missing(tmp_path):
@@ -159,7 +159,7 @@ def _same_beginning(log: DriveLog, of: DriveLog) -> bool:
             )
             for name in ("now_ns", "health", "faults", "steering_rad", "pose", "nis", "selected")
         )
-        and log.outcomes.digests == of.outcomes.digests[:count]
+        and log.outcomes.digest == of.outcomes.digest[:count]
     )
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from jaxnav import cli
-from jaxnav.commands.drive.pictures import distance_m, summary_lines
+from jaxnav.commands.drive.plot import distance_m, summary_lines
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry
@@ -59,7 +59,6 @@ def log(recorded) -> DriveLog:
     outcomes = dataclasses.replace(
         log.outcomes,
         now_ns=log.outcomes.now_ns[0] + (TIMES_S * 1e9).astype(np.int64),
-        times_s=TIMES_S,
         health=np.full(COUNT, int(Health.OK)),
         faults=no_flags,
         rejects=no_flags,
@@ -240,7 +239,7 @@ def test_the_summary_counts(log):
             faults=during(3, 5, Fault.NO_MARKER | Fault.CAMERA_STALE) | during(9, 10, 1),
             rejects=during(5, 6, Reject.INNOVATION),
             restarts=during(7, 99, 2),
-            reasons=("contradicted",) * COUNT,
+            reason=("contradicted",) * COUNT,
         ),
         inputs=(),
         missing={"/frames": 3},

@@ -26,7 +26,8 @@ from jaxnav.recording.drive_replay import (
     replay_drive,
 )
 from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.messages import input_message, outcome_message
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.outcomes import outcome_message
 from jaxnav.recording.recorder import Recorder
 from jaxnav.testing.faults import WAYPOINTS_M
 from jaxnav.testing.lockstep import BEGIN_NS

@@ -21,8 +21,9 @@ from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_format import decode, encode, header_metadata, header_of
-from jaxnav.recording.message_schemas import MESSAGES, REPORTED, ImageMessage, json_schema
-from jaxnav.recording.messages import digest, input_message, input_of, outcome_message
+from jaxnav.recording.message_schemas import MESSAGES, ImageMessage, json_schema
+from jaxnav.recording.messages import digest, input_message, input_of
+from jaxnav.recording.outcomes import REPORTED, outcome_message
 from tests.helpers.drives import make_input, make_outcome, same_input
 
 PATH = Path("drive.mcap")

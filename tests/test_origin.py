@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import jax
 import numpy as np
@@ -33,8 +34,9 @@ from jaxnav.plots.scenery import Scenery
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_replay import Comparison, replay_drive
 from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.outcomes import Outcomes
 from jaxnav.testing.faults import WAYPOINTS_M
-from jaxnav.viewer.outcomes import ShownOutcome
+from jaxnav.viewer.scene import RerunScene
 from tests import worlds
 from tests.helpers.simulated import record, simulated
 
@@ -216,6 +218,16 @@ def test_a_recording_holds_the_world_and_replays_to_the_bits(away, tmp_path):
     assert comparison.first.what.startswith("pose")
 
 
+def drawn_m(scenery: Scenery, outcomes: Outcomes, index: int) -> list[np.ndarray]:
+    """What Rerun is told: where the vehicle, the hypotheses and the candidates are."""
+    rerun = MagicMock()
+    scene = RerunScene(rerun, MagicMock(), scenery.rig, scenery.markers, np.zeros((0, 2)))
+    rerun.Arrows3D.reset_mock()
+    scene.show(outcomes, index)
+    arrows = [np.array(call.kwargs["origins"]) for call in rerun.Arrows3D.call_args_list]
+    return [np.array(rerun.Transform3D.call_args.kwargs["translation"]), *arrows]
+
+
 def test_what_is_drawn_of_a_recording_lies_among_its_markers(away, tmp_path):
     path = tmp_path / "drive.mcap"
     record(path, away.setup.header(), [(s.input, s.outcome) for s in away.steps[:90]])
@@ -228,16 +240,21 @@ def test_what_is_drawn_of_a_recording_lies_among_its_markers(away, tmp_path):
     taken = int(log.outcomes.selected[index])
     T = poses.inverse(log.outcomes.Ts_vehicle_world[index][taken])
     assert np.linalg.norm(T[4:6] - pose_m) < 0.1
-    # What Rerun is told, which has float32 alone, is near zero, and the same.
-    shown = ShownOutcome.of_row(log.outcomes, index, scenery.origin_m)
-    live = ShownOutcome.of(away.steps[index].outcome)
-    assert np.abs(live.pose[:2]).max() < 60
-    np.testing.assert_allclose(shown.pose, live.pose, atol=0.01 * MM)
-    np.testing.assert_allclose(shown.hypotheses, live.hypotheses, atol=0.01 * MM)
-    T_live, T_shown = (
-        poses.inverse(s.Ts_vehicle_world[taken].astype(float)) for s in (live, shown)
+    # What Rerun is told, which has float32 alone, is near zero, and the same as while it drives.
+    outcome = away.steps[index].outcome
+    shown, live = (
+        drawn_m(scenery, *row) for row in ((log.outcomes, index), (Outcomes.of(outcome), 0))
     )
-    np.testing.assert_allclose(T_shown[4:], T_live[4:], atol=0.1 * MM)
+    for places_m, live_m in zip(shown, live, strict=True):
+        assert np.abs(places_m).max() < 60
+        np.testing.assert_allclose(places_m, live_m, atol=0.01 * MM)
+    np.testing.assert_allclose(shown[0][:2], outcome.output.pose[:2], atol=0.01 * MM)
+    T_live = poses.inverse(
+        outcome.output.candidates.T_vehicle_world.wxyz_xyz.astype(float)[
+            int(outcome.output.selected)
+        ]
+    )
+    np.testing.assert_allclose(shown[2][taken], T_live[4:], atol=0.1 * MM)
     assert np.abs(scenery.on_map_m(scenery.waypoints_m)).max() < 60
 
 

@@ -20,7 +20,8 @@ from mcap.reader import make_reader
 from jaxnav.errors import BadInput
 from jaxnav.recording import recorder as recorder_module
 from jaxnav.recording.drive_log import read_drive
-from jaxnav.recording.messages import input_message, outcome_message
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.outcomes import outcome_message
 from jaxnav.recording.recorder import Recorder
 from tests.helpers.drives import (
     make_input,

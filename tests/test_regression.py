@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from jaxnav.loop.flags import Fault, Health, Reject, names
-from jaxnav.recording.drive_log import Outcomes, read_drive
+from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_replay import first_difference, replay_drive
 from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.outcomes import Outcomes
 from jaxnav.testing import injections as inject
 from jaxnav.testing.lockstep import BEGIN_NS, Rates
 from tests.helpers.simulated import make_setup, record, simulated

@@ -15,8 +15,9 @@ from jaxnav.loop.flags import Fault, Health
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Ending, HasOwnFiles, Odometry, Vehicle
 from jaxnav.loop.pilot import Input
-from jaxnav.recording.drive_log import Outcomes, read_drive
+from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.messages import input_message
+from jaxnav.recording.outcomes import Outcomes
 from jaxnav.recording.recorder import Recorder
 from jaxnav.testing import check_cameras, check_vehicle
 from jaxnav.vehicles.replay import ReplayVehicle, open_cameras

@@ -67,7 +67,7 @@ COMMANDS = {
     "study": Registered("study.arguments:RunStudy", "study.study", made="out"),
     "plot": Registered(
         "study.arguments:Plot",
-        "study.plot",
+        "drive.plot",
         in_folder=("drive.png", "map_*.png", "curves*.png", "reliability.png", "summary.json"),
     ),
     "run": Registered("drive.arguments:Run", "drive.run", made="record"),

@@ -91,6 +91,12 @@ def require(condition: bool, flag: str, problem: str) -> None:
         raise BadInput(flag, problem)
 
 
+def require_at_least(least: int, flag: str, value: int) -> None:
+    """Raise BadInput where a number is too small."""
+    bound = "not be negative" if least == 0 else f"be at least {least}"
+    require(value >= least, flag, f"must {bound}, got {value}")
+
+
 def require_finite(flag: str, value: float, zero_allowed: bool = False) -> None:
     """Raise BadInput where a number is not positive, or not finite."""
     large_enough = value >= 0 if zero_allowed else value > 0

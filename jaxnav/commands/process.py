@@ -2,9 +2,7 @@
 
 import warnings
 
-from jaxnav.configuration import cache_refused, configure, step_folder
-
-__all__ = ["cache_refused", "configure_jax", "step_folder"]
+from jaxnav.configuration import configure
 
 
 def configure_jax(float64: bool, threads: int | None = None) -> None:

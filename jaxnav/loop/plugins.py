@@ -28,16 +28,6 @@ _COMES_WITH = {
 }
 
 
-def vehicle_names() -> list[str]:
-    """The names of the installed vehicles."""
-    return sorted(_installed(VEHICLES))
-
-
-def camera_names() -> list[str]:
-    """The names of the installed camera drivers."""
-    return sorted(_installed(CAMERAS))
-
-
 def open_vehicle(name: str, setup: Setup) -> Vehicle:
     """Open a vehicle.
 

@@ -15,7 +15,8 @@ from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.plots.drive_map import HEALTH_COLORS, PURPLE, draw_drive_map
 from jaxnav.plots.localisation import BLACK, BLUE, GREEN, VERMILION
 from jaxnav.plots.scenery import Scenery
-from jaxnav.recording.drive_log import DriveLog, Outcomes
+from jaxnav.recording.drive_log import DriveLog
+from jaxnav.recording.outcomes import Outcomes
 
 _FAULT = "#444444"  # distinct from all colours of health
 _JOIN_S = 0.15  # a shorter gap in a flag is closed: not every event can raise it

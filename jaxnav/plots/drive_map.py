@@ -21,7 +21,7 @@ from jaxnav.plots.localisation import (
     draw_waypoints,
 )
 from jaxnav.plots.scenery import Scenery
-from jaxnav.recording.drive_log import Outcomes
+from jaxnav.recording.outcomes import Outcomes
 
 GREY, PURPLE = "#999999", "#CC79A7"
 # From pale to dark as health gets worse, so that it is readable in grey too.

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mcap.records import Metadata
 
 from jaxnav.errors import BadInput
@@ -22,54 +21,9 @@ from jaxnav.recording.message_schemas import (
     OUTCOME,
     AnyMessage,
     ImageMessage,
-    OutcomeMessage,
 )
 from jaxnav.recording.messages import input_of
-
-
-@dataclass(frozen=True)
-class Outcomes:
-    """N outcomes, one row each. NaN, an empty array or -1 where there was no report.
-
-    Attributes:
-        now_ns: (N,), time of each outcome.
-        times_s: (N,), since the first.
-        health, faults, rejects: (N,), values of `Health`, `Fault` and `Reject`.
-        steering_rad, throttle: (N,), what was commanded, within the limits.
-        pose: (N, 3), x_m y_m psi_rad.
-        covariance: (N, d, d).
-        located, decided, done: (N,) bool.
-        flip_probability, nis: (N,).
-        hypothesis, restarts: (N,) int.
-        hypotheses, log_weight: N arrays, (K, 3) and (K,), of the hypotheses alive.
-        Ts_vehicle_world, costs: N arrays, (M, 7) wxyz_xyz and (M,), of the candidates.
-        selected: (N,) int, index of the selected candidate.
-        reasons, digests: N texts: reason of the last restart, digest of the pilot's state.
-    """
-
-    now_ns: np.ndarray
-    times_s: np.ndarray
-    health: np.ndarray
-    faults: np.ndarray
-    rejects: np.ndarray
-    steering_rad: np.ndarray
-    throttle: np.ndarray
-    pose: np.ndarray
-    covariance: np.ndarray
-    located: np.ndarray
-    decided: np.ndarray
-    done: np.ndarray
-    flip_probability: np.ndarray
-    nis: np.ndarray
-    hypothesis: np.ndarray
-    restarts: np.ndarray
-    hypotheses: tuple[np.ndarray, ...]
-    log_weight: tuple[np.ndarray, ...]
-    Ts_vehicle_world: tuple[np.ndarray, ...]
-    costs: tuple[np.ndarray, ...]
-    selected: np.ndarray
-    reasons: tuple[str, ...]
-    digests: tuple[str, ...]
+from jaxnav.recording.outcomes import COLUMNS, OutcomeMessage, Outcomes
 
 
 @dataclass(frozen=True)
@@ -129,7 +83,7 @@ def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
     header: dict[str, Any] | None = None
     inputs: list[Input] = []
     # Values, not message objects: those take four times the memory.
-    told: dict[str, list[Any]] = {name: [] for name in OutcomeMessage.model_fields}
+    told: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     detections = 0
     gaps = _Gaps()
     records = McapMessages(path, told_bytes)
@@ -155,7 +109,7 @@ def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
     if header is None:
         problem = "is cut off before its header" if records.truncated else "is no recorded drive"
         raise BadInput(path, problem)
-    table = _table(told, path)
+    table = Outcomes.of_values(told, f"{path}: {OUTCOME}")
     return DriveLog(path, header, tuple(inputs), table, gaps.missing, records.truncated)
 
 
@@ -201,47 +155,3 @@ def _checked(model: type[Model], record: RecordedMessage, path: Path, key: str) 
     except ValueError as error:
         raise BadInput(f"{path}: {key}", f"is not valid JSON: {error}") from None
     return validate(model, data, path, key)
-
-
-def _table(told: dict[str, list[Any]], path: Path) -> Outcomes:
-    def column(name: str, dtype: type, missing: Any = None) -> np.ndarray:
-        return np.array([missing if value is None else value for value in told[name]], dtype)
-
-    def rows(name: str, shape: tuple[int, ...]) -> np.ndarray:
-        missing = np.full(shape, np.nan)
-        filled = [missing if value is None else value for value in told[name]]
-        return np.array(filled, float).reshape(len(filled), *shape)
-
-    def ragged(name: str, *row: int) -> tuple[np.ndarray, ...]:
-        return tuple(np.zeros((0, *row)) if value is None else value for value in told[name])
-
-    sides = {len(covariance) for covariance in told["covariance"] if covariance is not None}
-    if len(sides) > 1:
-        raise BadInput(f"{path}: {OUTCOME}.covariance", f"differ in size: {sorted(sides)}")
-    side = sides.pop() if sides else 0
-    now_ns = column("now_ns", np.int64)
-    return Outcomes(
-        now_ns=now_ns,
-        times_s=(now_ns - now_ns[:1]) / 1e9,
-        health=column("health", int),
-        faults=column("faults", int),
-        rejects=column("rejects", int),
-        steering_rad=column("steering_rad", float),
-        throttle=column("throttle", float),
-        pose=rows("pose", (3,)),
-        covariance=rows("covariance", (side, side)),
-        located=column("located", bool),
-        decided=column("decided", bool),
-        done=column("done", bool),
-        flip_probability=column("flip_probability", float, np.nan),
-        nis=column("nis", float, np.nan),
-        hypothesis=column("hypothesis", int, -1),
-        restarts=column("restarts", int),
-        hypotheses=ragged("hypotheses", 3),
-        log_weight=ragged("log_weight"),
-        Ts_vehicle_world=ragged("Ts_vehicle_world", 7),
-        costs=ragged("costs"),
-        selected=column("selected", int, -1),
-        reasons=tuple(told["reason"]),
-        digests=tuple(told["digest"]),
-    )

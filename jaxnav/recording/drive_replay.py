@@ -9,6 +9,7 @@ up to rounding (docs/promises.md, Replay).
 """
 
 import dataclasses
+import enum
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,17 +21,25 @@ from jaxnav.detection import Detections
 from jaxnav.detection.image_search import ImageSearch, size_problem
 from jaxnav.errors import BadInput
 from jaxnav.files.images import decode_image
-from jaxnav.loop.flags import Fault, Health, Reject, names
+from jaxnav.loop.flags import names
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import opposite, planar_in_world
-from jaxnav.recording.drive_log import DriveLog, Outcomes
+from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_setup import DriveSetup, made_here
 from jaxnav.recording.messages import digest
+from jaxnav.recording.outcomes import COLUMNS, Outcomes
 
 # Rounding differences between machines, relative to values above 1.
 TOLERANCE_FLOAT64, TOLERANCE_FLOAT32 = 1e-9, 1e-3
-_MAGNIFIED = 1e3  # NIS is in units of sigma, which is a millimetre
+
+_EXACT = [name for name, column in COLUMNS.items() if column.slack == 0]
+# The report first: the command follows from it.
+_NEAR = [
+    name
+    for name in sorted(COLUMNS, key=lambda name: not COLUMNS[name].is_reported)
+    if COLUMNS[name].slack
+]
 
 
 @dataclass(frozen=True)
@@ -110,7 +119,7 @@ class Comparison:
         if self.first is not None:
             return
         what = _difference(recorded, index, outcome, self._tolerance)
-        if self.bit_for_bit and recorded.digests[index] not in ("", digest(outcome)):
+        if self.bit_for_bit and recorded.digest[index] not in ("", digest(outcome)):
             what = what or _difference(recorded, index, outcome, 0.0) or "bits that are not shown"
         if what is not None:
             self.first = Difference(index, float(recorded.times_s[index]), what)
@@ -125,34 +134,21 @@ def first_difference(log: DriveLog, outcomes: Iterable[Outcome]) -> Difference |
 
 
 def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: float) -> str | None:
-    output, away_m = outcome.output, opposite(outcome.origin_m)
-    for name, kind in (("health", Health), ("faults", Fault), ("rejects", Reject)):
-        before, now = kind(int(getattr(recorded, name)[index])), getattr(outcome, name)
+    def pair(name: str) -> tuple[Any, Any]:
+        return getattr(recorded, name)[index], COLUMNS[name].value(outcome)
+
+    for name in _EXACT:
+        before, now = pair(name)
         if before != now:
+            before = type(now)(before) if isinstance(now, enum.Enum) else before
             return f"{name}: {_words(now)}, recorded {_words(before)}"
-    for name, now in (
-        ("restarts", outcome.restarts),
-        ("located", bool(output.located)),
-        ("decided", bool(output.decided)),
-        ("done", bool(output.done)),
-    ):
-        if (before := getattr(recorded, name)[index]) != now:
-            return f"{name}: {now}, recorded {before}"
-    for name, value in (
-        ("pose", outcome.pose),
-        ("covariance", output.covariance),
-        ("steering_rad", outcome.steering_rad),
-        ("throttle", outcome.throttle),
-        ("flip_probability", output.flip_probability),
-        ("nis", output.nis),
-    ):
-        before, bound = getattr(recorded, name)[index], tolerance
-        if name == "nis":
-            bound *= _MAGNIFIED
+    for name in _NEAR:
+        (before, now), bound = pair(name), (COLUMNS[name].slack or 0.0) * tolerance
         if name == "pose":  # in the coordinates of the computation, less the rounding since then
-            value, before = (planar_in_world(pose, away_m) for pose in (value, before))
+            away_m = opposite(outcome.origin_m)
+            now, before = (planar_in_world(pose, away_m) for pose in (now, before))
             bound += float(np.spacing(max(map(abs, away_m)))) if tolerance else 0.0
-        off = _off(np.asarray(value, float), np.asarray(before, float))
+        off = _off(np.asarray(now, float), np.asarray(before, float))
         if not off <= bound:
             return f"{name}: off by {off:.3g}"
     return None
@@ -167,8 +163,10 @@ def _off(now: np.ndarray, before: np.ndarray) -> float:
     return float(np.max(np.where(same, 0.0, np.where(np.isnan(off), np.inf, off)), initial=0.0))
 
 
-def _words(flags: Any) -> str:
-    return flags.name if isinstance(flags, Health) else " ".join(names(flags)) or "none"
+def _words(value: Any) -> str:
+    if isinstance(value, enum.IntFlag):
+        return " ".join(names(value)) or "none"
+    return value.name if isinstance(value, enum.Enum) else str(value)
 
 
 def inputs_from_images(

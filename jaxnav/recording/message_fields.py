@@ -61,6 +61,26 @@ class Array:
 
 
 @dataclass(frozen=True)
+class Rows:
+    """Rows of an array as one list, made by the thread that writes them, not by the driving one."""
+
+    array: Any
+    which: Any = ...
+    in_world: Callable[[Any], Any] | None = None  # to the world's coordinates
+
+    @property
+    def values(self) -> np.ndarray:
+        """The rows as an array."""
+        rows = self.array[self.which]
+        return np.asarray(rows if self.in_world is None else self.in_world(rows))
+
+    def tolist(self) -> list[Any]:
+        """The rows as one list, as `encode` writes them."""
+        values: list[Any] = self.values.ravel().tolist()
+        return values
+
+
+@dataclass(frozen=True)
 class Words:
     """A field that reads flags from the list of their names, or an enum from its name."""
 

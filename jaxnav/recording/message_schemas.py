@@ -14,25 +14,22 @@ import json
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from jaxnav.files import limits
 from jaxnav.files.validation import Count, Entry
-from jaxnav.loop.flags import Health, Reject
 from jaxnav.recording.drive_format import NOT_FINITE
 from jaxnav.recording.message_fields import (
     Array,
     Base64,
     Faults,
     Flag,
-    Index,
     Now,
     Real,
     Stamp,
     Word,
-    Words,
-    square,
 )
+from jaxnav.recording.outcomes import OUTCOME_MESSAGE, OutcomeMessage
 
 ODOMETRY, FRAMES, TICK, OUTCOME = "/odometry", "/frames", "/tick", "/outcome"
 IMAGE_SCHEMA = "foxglove.CompressedImage"
@@ -90,67 +87,6 @@ class TickMessage(Entry):
     faults: Faults
 
 
-class OutcomeMessage(Entry):
-    """An `Outcome` and its report; without a report all fields from `pose` on are missing. All
-    poses are in the world.
-
-    Attributes:
-        covariance: (d, d).
-        hypotheses: (K, 3), x_m y_m psi_rad of the hypotheses alive.
-        Ts_vehicle_world: (N, 7), wxyz_xyz of the valid candidates.
-        selected: index into these, -1: none.
-        digest: of the pilot's state, to compare a replay with; "" where none was taken.
-        outvoted: ids of markers that were left out; older drives have none.
-    """
-
-    now_ns: Now
-    stamp_ns: Stamp | None = None
-    health: Annotated[Health, Words(Health)]
-    faults: Faults
-    rejects: Annotated[Reject, Words(Reject)]
-    steering_rad: Real
-    throttle: Real
-    restarts: Count
-    reason: Word
-    digest: Word
-    pose: Annotated[np.ndarray, Array("number", (3,))] | None = None
-    covariance: Annotated[np.ndarray, Array("number"), AfterValidator(square)] | None = None
-    located: Flag = False
-    decided: Flag = False
-    done: Flag = False
-    flip_probability: Real | None = None
-    nis: Real | None = None
-    hypothesis: Index | None = None
-    hypotheses: Annotated[np.ndarray, Array("number", (-1, 3))] | None = None
-    log_weight: Annotated[np.ndarray, Array("number")] | None = None
-    Ts_vehicle_world: Annotated[np.ndarray, Array("number", (-1, 7))] | None = None
-    costs: Annotated[np.ndarray, Array("number")] | None = None
-    selected: Index | None = None
-    outvoted: list[Count] = Field(default_factory=list)
-
-    @model_validator(mode="after")
-    def _is_whole(self) -> "OutcomeMessage":
-        told = vars(self)
-        missing = sum(told[name] is None for name in REPORTED)
-        if 0 < missing < len(REPORTED):
-            raise ValueError(f"must have all of {', '.join(REPORTED)}, or none")
-        return self
-
-
-REPORTED = [
-    "pose",
-    "covariance",
-    "flip_probability",
-    "nis",
-    "hypothesis",
-    "hypotheses",
-    "log_weight",
-    "Ts_vehicle_world",
-    "costs",
-    "selected",
-]
-
-
 class TimeMessage(Entry):
     """A time as Foxglove has it."""
 
@@ -174,7 +110,7 @@ MESSAGES: dict[str, tuple[str, type[AnyMessage]]] = {
     ODOMETRY: ("jaxnav.Odometry", OdometryMessage),
     FRAMES: ("jaxnav.Frames", FramesMessage),
     TICK: ("jaxnav.Tick", TickMessage),
-    OUTCOME: ("jaxnav.Outcome", OutcomeMessage),
+    OUTCOME: ("jaxnav.Outcome", OUTCOME_MESSAGE),
 }
 
 

@@ -1,4 +1,4 @@
-"""Convert the pilot's inputs and outcomes to messages of a recorded drive, and inputs back.
+"""Convert the pilot's inputs to messages of a recorded drive, and back.
 
 This is cheap: arrays are passed on as they are, and the recorder's thread makes them JSON. So they
 must not be changed afterwards.
@@ -6,22 +6,16 @@ must not be changed afterwards.
 
 import hashlib
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
 
-from jaxnav.belief.bicycle_kalman import planar_poses
-from jaxnav.belief.motion import Bank
 from jaxnav.detection.types import Detections
 from jaxnav.files.ranges import RANGES
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome
-from jaxnav.models.origin import Origin, inverses_in_world, planar_in_world
-from jaxnav.navigator import Output
+from jaxnav.recording.message_fields import Rows
 from jaxnav.recording.message_schemas import (
     FRAMES,
     ODOMETRY,
@@ -70,68 +64,6 @@ def input_of(message: OdometryMessage | FramesMessage | TickMessage) -> Input:
     return Input(message.now_ns, faults=message.faults)
 
 
-def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
-    """The message of an outcome; see `OutcomeMessage`.
-
-    Args:
-        outcome: with NumPy leaves in its output.
-        digest: digest of the pilot's state, to compare a replay with.
-    """
-    message: dict[str, Any] = {
-        "now_ns": outcome.now_ns,
-        "health": outcome.health,
-        "faults": outcome.faults,
-        "rejects": outcome.rejects,
-        "steering_rad": float(outcome.steering_rad),
-        "throttle": float(outcome.throttle),
-        "restarts": outcome.restarts,
-        "reason": outcome.restart_reason,
-        "digest": digest,
-        "stamp_ns": outcome.stamp_ns,
-    }
-    if outcome.outvoted:
-        message["outvoted"] = list(outcome.outvoted)
-    return message | _reported(outcome.output, outcome.belief.bank, outcome.origin_m)
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Rows of an array as one list, made by the thread that writes them, not by the driving one."""
-
-    array: Any
-    which: Any = ...
-    in_world: Callable[[Any], Any] | None = None  # to the world's coordinates
-
-    def tolist(self) -> list[Any]:
-        rows = self.array[self.which]
-        if self.in_world is not None:
-            rows = self.in_world(rows)
-        values: list[Any] = rows.ravel().tolist()
-        return values
-
-
-def _reported(output: Output, bank: Bank, origin_m: Origin) -> dict[str, Any]:
-    alive, valid = bank.initialised, output.candidates.valid
-    selected = int(output.selected)
-    planar = partial(planar_in_world, origin_m=origin_m)
-    inverses = partial(inverses_in_world, origin_m=origin_m)
-    return {
-        "pose": _Rows(output.pose, in_world=planar),
-        "covariance": _Rows(output.covariance),
-        "located": output.located,
-        "decided": output.decided,
-        "done": output.done,
-        "flip_probability": output.flip_probability,
-        "nis": output.nis,
-        "hypothesis": output.hypothesis,
-        "hypotheses": _Rows(planar_poses(bank)[0], alive, planar),
-        "log_weight": _Rows(bank.log_weight, alive),
-        "Ts_vehicle_world": _Rows(output.candidates.T_vehicle_world.wxyz_xyz, valid, inverses),
-        "costs": _Rows(output.costs, valid),
-        "selected": sum(valid[:selected].tolist()) if selected >= 0 else -1,
-    }
-
-
 def _sighted_message(frame: FrameDetections) -> dict[str, Any]:
     found = _NONE if frame.detections is None else frame.detections
     return {
@@ -140,8 +72,8 @@ def _sighted_message(frame: FrameDetections) -> dict[str, Any]:
         "usable": frame.detections is not None,
         "ids": found.ids,
         "families": found.families,
-        "corners_px": _Rows(found.corners_px),
-        "sigma_px": _Rows(found.sigma_px),
+        "corners_px": Rows(found.corners_px),
+        "sigma_px": Rows(found.sigma_px),
         "refined": found.refined,
         "faults": frame.faults,
     }

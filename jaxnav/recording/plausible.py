@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxnav.files.ranges import RANGES, is_within
-from jaxnav.recording.drive_log import Outcomes
+from jaxnav.recording.outcomes import Outcomes
 
 _MOST = RANGES["pose"].most
 _UNIT = 1e-3  # a quaternion's length may be off by this

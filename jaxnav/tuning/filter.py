@@ -16,11 +16,6 @@ from jaxnav.tuning.objective import Batch
 from jaxnav.tuning.recorded import FrameSequences
 from jaxnav.tuning.unconstrained import Space
 
-LOSSES = {
-    "likelihood": "minus the log-likelihood of the corners given what was predicted; asks no truth",
-    "score": "minus the log density of the true pose under what is believed",
-    "error": "the squared position error, cm^2: says nothing of the covariance's size",
-}
 _CM2_PER_M2 = 1e4
 
 
@@ -42,7 +37,7 @@ class FilterCost(eqx.Module):
 
     navigator: Navigator
     space: Space
-    loss: str = eqx.field(static=True)
+    loss: str = eqx.field(static=True)  # likelihood, score or error, see `TuneFilter`
 
     def __call__(
         self, x: Float[Array, " n"], item: Item, softness: Float[Array, ""]

@@ -29,7 +29,7 @@ from jaxnav.errors import BadInput
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
-from jaxnav.viewer.outcomes import ShownOutcome
+from jaxnav.recording.outcomes import Outcomes
 from jaxnav.viewer.scene import RerunScene
 
 APPLICATION = "jaxnav"
@@ -105,11 +105,15 @@ class RerunView:
         """The reason why nothing is shown any more, or None."""
         return self._failed
 
-    def show(self, outcome: Outcome | ShownOutcome) -> None:
+    def show(self, outcome: Outcome) -> None:
         """Show the pilot's outcome of an event. Never raises."""
-        has_corners = isinstance(outcome, Outcome) and _has_corners(outcome)
+        has_corners = outcome.data is not None and outcome.data.corners_px is not None
         if self._is_due((outcome.health, has_corners), outcome.now_ns):
-            self._offer(lambda scene: scene.show(_shown(outcome)))
+            self._offer(lambda scene: scene.show(Outcomes.of(outcome)))
+
+    def show_recorded(self, outcomes: Outcomes, index: int) -> None:
+        """Show an outcome of a recorded drive. Never raises."""
+        self._offer(lambda scene: scene.show(outcomes, index))
 
     def image(
         self,
@@ -190,14 +194,6 @@ def import_rerun() -> ModuleType:
     rerun = importlib.import_module("rerun")
     importlib.import_module("rerun.blueprint")
     return rerun
-
-
-def _has_corners(outcome: Outcome) -> bool:
-    return outcome.data is not None and outcome.data.corners_px is not None
-
-
-def _shown(outcome: Outcome | ShownOutcome) -> ShownOutcome:
-    return outcome if isinstance(outcome, ShownOutcome) else ShownOutcome.of(outcome)
 
 
 def _file_sink(rerun: ModuleType, path: Path) -> Any:

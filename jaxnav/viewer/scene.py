@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from jaxnav.files import poses
-from jaxnav.loop.flags import Health, names
+from jaxnav.loop.flags import Fault, Health, Reject, names
 from jaxnav.models.markers import MarkerMap
-from jaxnav.models.origin import ZERO
+from jaxnav.models.origin import ZERO, inverses_in_world, opposite, planar_in_world
 from jaxnav.models.rig import CameraRig
 from jaxnav.plots.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION
-from jaxnav.viewer.outcomes import ShownOutcome
+from jaxnav.recording.outcomes import Outcomes
 
 TIMELINE = "drive"  # seconds since the first event
 _CHI2_2DOF_95 = 5.991
@@ -48,6 +48,7 @@ class RerunScene:
         """
         self._rerun, self._stream = rerun, stream
         self._names = () if rig is None else rig.names
+        self._from_world = opposite(ZERO if markers is None else markers.origin_m)
         self._begin_ns: int | None = None
         self._told = ""
         self._last_m: np.ndarray | None = None
@@ -73,19 +74,23 @@ class RerunScene:
             self._still("health", rerun.TextLog(f"places are relative to ({from_m}) m"))
         stream.send_blueprint(self._blueprint())
 
-    def show(self, shown: ShownOutcome) -> None:
-        """Log the pilot's outcome of an event."""
-        self._at(shown.now_ns)
-        if shown.located and np.isfinite(shown.pose).all():
-            self._show_vehicle(shown.pose, shown.covariance)
-        self._show_hypotheses(shown)
-        if len(shown.Ts_vehicle_world):
-            self._show_candidates(shown)
-        self._show_numbers(shown)
-        told = [shown.health.name, *names(shown.faults), *names(shown.rejects)]
-        if (text := " ".join(told)) != self._told:
+    def show(self, outcomes: Outcomes, index: int = 0) -> None:
+        """Log one of the pilot's outcomes."""
+        self._at(int(outcomes.now_ns[index]))
+        pose = planar_in_world(outcomes.pose[index], self._from_world)
+        if outcomes.located[index] and np.isfinite(pose).all():
+            self._show_vehicle(pose, outcomes.covariance[index])
+        hypotheses = planar_in_world(outcomes.hypotheses[index], self._from_world)
+        self._show_hypotheses(hypotheses, outcomes.log_weight[index])
+        if len(Ts_vehicle_world := outcomes.Ts_vehicle_world[index]):
+            Ts_vehicle_map = inverses_in_world(Ts_vehicle_world, self._from_world)
+            self._show_candidates(Ts_vehicle_map, int(outcomes.selected[index]))
+        self._show_numbers(outcomes, index)
+        health = Health(outcomes.health[index])
+        faults, rejects = Fault(int(outcomes.faults[index])), Reject(int(outcomes.rejects[index]))
+        if (text := " ".join([health.name, *names(faults), *names(rejects)])) != self._told:
             self._told = text
-            level = "INFO" if shown.health <= Health.OK else "WARN"
+            level = "INFO" if health <= Health.OK else "WARN"
             self._say("health", self._rerun.TextLog(text, level=level))
 
     def image(
@@ -156,9 +161,9 @@ class RerunScene:
             strip = np.column_stack([ellipse_m, np.zeros(len(ellipse_m))])
             self._say("world/ellipse", rerun.LineStrips3D([strip], colors=_rgb(SKY)))
 
-    def _show_hypotheses(self, shown: ShownOutcome) -> None:
-        usable = np.isfinite(shown.hypotheses).all(axis=1) & np.isfinite(shown.log_weight)
-        rows, log_weight = shown.hypotheses[usable], shown.log_weight[usable]
+    def _show_hypotheses(self, rows: np.ndarray, log_weight: np.ndarray) -> None:
+        usable = np.isfinite(rows).all(axis=1) & np.isfinite(log_weight)
+        rows, log_weight = rows[usable], log_weight[usable]
         shares = np.exp(log_weight - np.max(log_weight, initial=-np.inf))
         alphas = np.round(255 * np.maximum(shares, 0.1)).astype(int)
         self._say(
@@ -171,9 +176,9 @@ class RerunScene:
             ),
         )
 
-    def _show_candidates(self, shown: ShownOutcome) -> None:
-        Ts = [poses.inverse(T) for T in shown.Ts_vehicle_world if np.isfinite(T).all()]
-        taken = [index == shown.selected for index in range(len(Ts))]
+    def _show_candidates(self, Ts_vehicle_map: np.ndarray, selected: int) -> None:
+        Ts = [poses.inverse(T) for T in Ts_vehicle_map if np.isfinite(T).all()]
+        taken = [index == selected for index in range(len(Ts))]
         self._say(
             "world/candidates",
             self._rerun.Arrows3D(
@@ -184,18 +189,19 @@ class RerunScene:
             ),
         )
 
-    def _show_numbers(self, shown: ShownOutcome) -> None:
-        sigma_m = math.sqrt(max(float(np.trace(shown.covariance[:2, :2])), 0.0))
+    def _show_numbers(self, outcomes: Outcomes, index: int) -> None:
+        sigma_m = math.sqrt(max(float(np.trace(outcomes.covariance[index][:2, :2])), 0.0))
+        nis = outcomes.nis[index]
         for entity, value in (
-            ("flip_probability", shown.flip_probability),
-            ("hypotheses", float(len(shown.hypotheses))),
-            ("nis", shown.nis if shown.nis > 0 else math.nan),
-            ("throttle", shown.throttle),
-            ("steering_rad", shown.steering_rad),
-            ("position_sigma_m", sigma_m if shown.located else math.nan),
+            ("flip_probability", outcomes.flip_probability[index]),
+            ("hypotheses", len(outcomes.hypotheses[index])),
+            ("nis", nis if nis > 0 else math.nan),
+            ("throttle", outcomes.throttle[index]),
+            ("steering_rad", outcomes.steering_rad[index]),
+            ("position_sigma_m", sigma_m if outcomes.located[index] else math.nan),
         ):
             if math.isfinite(value):
-                self._say(f"plots/{entity}", self._rerun.Scalars(value))
+                self._say(f"plots/{entity}", self._rerun.Scalars(float(value)))
 
     def _blueprint(self) -> Any:
         blueprint = self._rerun.blueprint

@@ -18,7 +18,8 @@ from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.navigator import Output
 from jaxnav.pose.candidates import Candidates
-from jaxnav.recording.messages import input_message, outcome_message
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.outcomes import outcome_message
 
 BEGIN_NS = 5_000_000_123
 PERIOD_NS = 10_000_000

@@ -7,7 +7,8 @@ from typing import Any
 from jaxnav.files import Route
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.messages import digest, input_message, outcome_message
+from jaxnav.recording.messages import digest, input_message
+from jaxnav.recording.outcomes import outcome_message
 from jaxnav.recording.recorder import Recorder
 from jaxnav.testing.faults import WAYPOINTS_M
 from jaxnav.testing.lockstep import BEGIN_NS, Step, drive

@@ -95,7 +95,7 @@ def _cache(patient: SimpleNamespace) -> Iterable[Finding]:
     """Report whether the program that a car runs with these files is compiled."""
     import jax
 
-    from jaxnav.commands.process import cache_refused, step_folder
+    from jaxnav.configuration import cache_refused, step_folder
 
     folder, compiled = step_folder(), None
     if folder is not None and None not in vars(patient).values():

@@ -24,6 +24,7 @@ from jaxnav.commands.kinds import (
     Switch,
     optional,
     require,
+    require_at_least,
     require_finite,
     require_within,
 )
@@ -83,7 +84,7 @@ class Run:
     """No status line."""
 
     def __post_init__(self) -> None:
-        require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
+        require_at_least(0, "--seed", self.seed)
         require(
             0.002 <= self.period_s <= 0.1,
             "--period-s",
@@ -171,7 +172,7 @@ class ReplayRecording(Headless):
 
     def __post_init__(self) -> None:
         if self.limit is not None:
-            require(self.limit >= 1, "--limit", f"must be at least 1, got {self.limit}")
+            require_at_least(1, "--limit", self.limit)
         if self.corner_sigma_px is not None:
             require_within("--corner-sigma-px", self.corner_sigma_px, "corner_sigma_px")
 

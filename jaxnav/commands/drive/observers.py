@@ -20,7 +20,8 @@ from jaxnav.loop.loop import Observer
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.recording.message_schemas import OUTCOME
-from jaxnav.recording.messages import digest, input_message, outcome_message
+from jaxnav.recording.messages import digest, input_message
+from jaxnav.recording.outcomes import outcome_message
 from jaxnav.recording.recorder import Recorder
 
 if TYPE_CHECKING:

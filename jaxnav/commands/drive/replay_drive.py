@@ -13,8 +13,9 @@ from tqdm import tqdm
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.drive.track import Track, TrackRow
 from jaxnav.commands.pictures import corners_in_world, save_figure
-from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import read_shown
+from jaxnav.configuration import step_folder
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
@@ -33,7 +34,7 @@ from jaxnav.files import (
 from jaxnav.loop.pilot import Input
 from jaxnav.plots.localisation import localisation_report
 from jaxnav.recording.drive_format import PROFILE
-from jaxnav.recording.drive_log import DriveLog, Outcomes
+from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_replay import (
     Comparison,
     check_inputs,
@@ -43,7 +44,8 @@ from jaxnav.recording.drive_replay import (
 from jaxnav.recording.drive_setup import DriveSetup, needs_float64
 from jaxnav.recording.mcap_messages import profile_of
 from jaxnav.recording.message_schemas import OUTCOME
-from jaxnav.recording.messages import digest, input_message, outcome_message
+from jaxnav.recording.messages import digest, input_message
+from jaxnav.recording.outcomes import Outcomes, outcome_message
 from jaxnav.recording.plausible import keep_plausible
 from jaxnav.recording.recorder import Recorder
 

@@ -18,8 +18,9 @@ import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.observers import open_onlookers
-from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
+from jaxnav.configuration import step_folder
 from jaxnav.detection import make_detectors
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle

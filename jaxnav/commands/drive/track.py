@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxnav.loop.flags import Fault, Health, Reject, names
 from jaxnav.loop.pilot import Outcome
-from jaxnav.recording.drive_log import Outcomes
+from jaxnav.recording.outcomes import Outcomes
 
 
 class TrackRow(NamedTuple):

@@ -5,13 +5,12 @@ from contextlib import ExitStack
 from tqdm import tqdm
 
 from jaxnav.commands.drive.arguments import ViewDrive as Arguments
-from jaxnav.commands.drive.pictures import read_outcomes
+from jaxnav.commands.drive.plot import read_outcomes
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path, output_folder
 from jaxnav.plots.scenery import Scenery
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.plausible import keep_plausible, left_out_note
-from jaxnav.viewer.outcomes import ShownOutcome
 from jaxnav.viewer.rerun_view import RerunView, import_rerun
 
 
@@ -48,7 +47,7 @@ def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool)
         print(left_out_note(odd))
     names = () if scenery.rig is None else scenery.rig.names
     for index in tqdm(range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False):
-        view.show(ShownOutcome.of_row(outcomes, index, scenery.origin_m))
+        view.show_recorded(outcomes, index)
     for frame in (frame for given in log.inputs for frame in given.frames):
         name = names[frame.camera] if frame.camera < len(names) else f"camera_{frame.camera}"
         if frame.detections is not None:

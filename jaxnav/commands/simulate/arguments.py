@@ -21,6 +21,7 @@ from jaxnav.commands.kinds import (
     Switch,
     optional,
     require,
+    require_at_least,
     require_finite,
     require_within,
 )
@@ -63,8 +64,8 @@ class Demo(Headless):
     """Give up when the car has not arrived after this simulated time, s."""
 
     def __post_init__(self) -> None:
-        require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
-        require(self.seeds >= 1, "--seeds", f"must be at least 1, got {self.seeds}")
+        require_at_least(0, "--seed", self.seed)
+        require_at_least(1, "--seeds", self.seeds)
         require_finite("--exposure-ms", self.exposure_ms, zero_allowed=True)
         require_finite("--corner-noise-px", self.corner_noise_px, zero_allowed=True)
         require_finite("--duration-s", self.duration_s)
@@ -104,8 +105,8 @@ class Simulate(Headless):
     """Keep the rows that --json holds already."""
 
     def __post_init__(self) -> None:
-        require(self.seeds >= 1, "--seeds", f"must be at least 1, got {self.seeds}")
-        require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
+        require_at_least(1, "--seeds", self.seeds)
+        require_at_least(0, "--seed", self.seed)
         require(bool(self.selector), "--selector", "names no selector")
         require(bool(self.corner_noise_px), "--corner-noise-px", "holds no number")
         for value in self.corner_noise_px:

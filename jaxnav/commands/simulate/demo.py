@@ -14,10 +14,11 @@ from tqdm import tqdm
 from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.pictures import corners_in_world, save_figure, views_of
-from jaxnav.commands.process import configure_jax, step_folder
+from jaxnav.commands.process import configure_jax
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
 from jaxnav.compiling.step import compiled_step
+from jaxnav.configuration import step_folder
 from jaxnav.errors import visible
 from jaxnav.files import (
     output_folder,

@@ -6,7 +6,15 @@ from typing import Annotated
 
 import tyro
 
-from jaxnav.commands.kinds import Headless, ResultsFolder, Selector, StudyKind, optional, require
+from jaxnav.commands.kinds import (
+    Headless,
+    ResultsFolder,
+    Selector,
+    StudyKind,
+    optional,
+    require,
+    require_at_least,
+)
 
 
 @dataclass(frozen=True)
@@ -36,10 +44,9 @@ class RunStudy(Headless):
 
     def __post_init__(self) -> None:
         if self.chunk_trials is not None:
-            least = f"must be at least 1, got {self.chunk_trials}"
-            require(self.chunk_trials >= 1, "--chunk-trials", least)
+            require_at_least(1, "--chunk-trials", self.chunk_trials)
         if self.workers is not None:
-            require(self.workers >= 1, "--workers", f"must be at least 1, got {self.workers}")
+            require_at_least(1, "--workers", self.workers)
             require(self.scheduler is None, "--scheduler", "brings its own workers")
 
 
@@ -78,5 +85,5 @@ class StudyReliability(Headless):
     out: ResultsFolder = Path("out")
 
     def __post_init__(self) -> None:
-        require(self.frames >= 1, "--frames", f"must be at least 1, got {self.frames}")
-        require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
+        require_at_least(1, "--frames", self.frames)
+        require_at_least(0, "--seed", self.seed)

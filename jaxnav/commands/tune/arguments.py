@@ -17,6 +17,7 @@ from jaxnav.commands.kinds import (
     Scenario,
     optional,
     require,
+    require_at_least,
     require_finite,
     require_within,
 )
@@ -78,13 +79,7 @@ class TuneFilter(Headless):
     out: ResultsFolder = Path("tuned")
 
     def __post_init__(self) -> None:
-        for flag, count in (
-            ("--seeds", self.seeds),
-            ("--held-out-seeds", self.held_out_seeds),
-            ("--test-seeds", self.test_seeds),
-            ("--steps", self.steps),
-        ):
-            require(count >= 1, flag, f"must be at least 1, got {count}")
+        _require_counts(self)
         require(0 <= self.seed < 10**6, "--seed", f"must be from 0 to 999999, got {self.seed}")
         most = 10**6 - self.seed - self.seeds
         require(self.held_out_seeds <= most, "--seeds", "test drives count from a million on")
@@ -146,14 +141,8 @@ class TuneController(Headless):
     out: ResultsFolder = Path("tuned")
 
     def __post_init__(self) -> None:
-        for flag, count in (
-            ("--seeds", self.seeds),
-            ("--held-out-seeds", self.held_out_seeds),
-            ("--test-seeds", self.test_seeds),
-            ("--steps", self.steps),
-        ):
-            require(count >= 1, flag, f"must be at least 1, got {count}")
-        require(self.seed >= 0, "--seed", f"must not be negative, got {self.seed}")
+        _require_counts(self)
+        require_at_least(0, "--seed", self.seed)
         require(bool(self.test_scenario), "--test-scenario", "names no scenario")
         for flag, value in (
             ("--time", self.time),
@@ -166,3 +155,8 @@ class TuneController(Headless):
         require(total > 0, "--time", "is 0 as all other weights are: there is nothing to lower")
         require_within("--corner-noise-px", self.corner_noise_px, "corner_sigma_px")
         require_finite("--learning-rate", self.learning_rate)
+
+
+def _require_counts(args: TuneFilter | TuneController) -> None:
+    for name in ("seeds", "held_out_seeds", "test_seeds", "steps"):
+        require_at_least(1, f"--{name.replace('_', '-')}", getattr(args, name))

@@ -1,4 +1,4 @@
-"""`jaxnav plot DRIVE.mcap`: a recorded drive as a picture and in a few lines."""
+"""`jaxnav plot`: a recorded drive as a picture and in a few lines, or the pictures of a study."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +19,14 @@ from jaxnav.recording.plausible import keep_plausible, left_out_note
 _LONGEST_STEP_S = 1.0  # between two readings, for the distance; a longer gap counts as this
 
 
-def is_recording(path: Path) -> bool:
-    """Whether a path has the suffix of a recorded drive, .mcap."""
-    return path.suffix.lower() == ".mcap"
+def run(args: Arguments) -> int:
+    """Draw the drive or the study in the file."""
+    if args.store.suffix.lower() == ".mcap":
+        return _draw_drive(args)
+    # It needs the packages of the extra `study`.
+    from jaxnav.commands.study.pictures import draw_study
+
+    return draw_study(args)
 
 
 def read_outcomes(path: Path, headless: bool) -> DriveLog:
@@ -36,7 +41,7 @@ def read_outcomes(path: Path, headless: bool) -> DriveLog:
     return log
 
 
-def draw_drive(args: Arguments) -> int:
+def _draw_drive(args: Arguments) -> int:
     """Write drive.png, and print a summary of the drive."""
     log = read_outcomes(args.store, args.headless)
     outcomes, odd = keep_plausible(log.outcomes)
@@ -68,7 +73,7 @@ def summary_lines(log: DriveLog) -> list[str]:
     healths = ", ".join(f"{name} {share:.1%}" for name, share in shares.items() if share > 0)
     faults = _counted(Fault, outcomes.faults) + _counted(Reject, outcomes.rejects)
     restarts = int(outcomes.restarts[-1])
-    reason = f", the last one: {outcomes.reasons[-1]}" if restarts else ""
+    reason = f", the last one: {outcomes.reason[-1]}" if restarts else ""
     lines = [
         f"{duration_s:.1f} s, {count} outcomes, {distance_m(log):.2f} m by the odometer",
         f"health by time: {healths}",
