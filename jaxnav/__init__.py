@@ -46,12 +46,12 @@ if TYPE_CHECKING:
     from jaxnav.models.origin import poses_in_world as poses_in_world
     from jaxnav.models.rig import CameraRig as CameraRig
     from jaxnav.navigator import Navigator as Navigator
-    from jaxnav.navigator import Observation as Observation
     from jaxnav.navigator import Output as Output
     from jaxnav.navigator import State as State
     from jaxnav.pose.candidates import Candidates as Candidates
     from jaxnav.pose.ippe import PosePair as PosePair
     from jaxnav.pose.ippe import ippe_square as ippe_square
+    from jaxnav.pose.observation import Observation as Observation
     from jaxnav.pose.observation import Snapshot as Snapshot
     from jaxnav.pose.refine import refine_pose as refine_pose
     from jaxnav.pose.refine import solve_marker as solve_marker
@@ -80,7 +80,7 @@ _MODULE_OF = {
     "MultiHypothesis": "belief.hypotheses",
     "Navigator": "navigator",
     "ObjectSpace": "belief.ambiguity",
-    "Observation": "navigator",
+    "Observation": "pose.observation",
     "Oracle": "belief.ambiguity",
     "OrientationGiven": "belief.ambiguity",
     "Output": "navigator",

@@ -20,7 +20,7 @@ from hashlib import blake2b
 from pathlib import Path
 
 import jax
-import jaxlib
+import jaxlib.version
 
 from jaxnav.files.private import NotPrivateError, PrivateFolder
 
@@ -96,7 +96,7 @@ def known_flags(flags: dict[str, str]) -> dict[str, str]:
     process is started with the flags, which takes 0.2 s.
     """
     build = Path(jaxlib.__file__).stat().st_mtime_ns  # a build by hand may keep its version
-    asked = repr((sorted(flags.items()), jax.__version__, jaxlib.__version__, build))
+    asked = repr((sorted(flags.items()), jax.__version__, jaxlib.version.__version__, build))
     name = f"flags-{blake2b(asked.encode(), digest_size=8).hexdigest()}.json"
     folder = step_folder()
     with suppress(OSError, ValueError, NotPrivateError):
@@ -181,7 +181,7 @@ def _choose_cache(own: Path | None) -> None:
     elif asked:
         folder = _private(Path(asked))
     else:
-        host = f"jaxlib-{jaxlib.__version__}-{platform.machine()}-{platform.node()}"
+        host = f"jaxlib-{jaxlib.version.__version__}-{platform.machine()}-{platform.node()}"
         try:
             folder = _private(_cache_home() / "jaxnav" / host)
         except RuntimeError:

@@ -164,14 +164,18 @@ def _best_e1_px2(
     return jnp.min(jnp.where(candidates.valid, candidates.e1_px2, jnp.inf))
 
 
+# Of a frame: poses (tracks, 7), whether one was selected, located, the probability, the branch.
+_Told = tuple[Array, Array, Array, Array, Branch]
+
+
 @functools.partial(jax.jit, static_argnums=3)
 def _run_chunk(
     navigator: Navigator, state: State, chunk: _Frames, one_at_a_time: bool
-) -> tuple[State, tuple]:
+) -> tuple[State, _Told]:
     """Run all tracks over the frames of a chunk; `state` has a leading axis (tracks,)."""
     markers = navigator.markers
 
-    def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, tuple]:
+    def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, _Told]:
         obs = Observation(frame.corners_px, frame.visible, dt_s=frame.dt_s)
         state, out = eqx.tree_at(lambda n: n.markers, navigator, markers).step(state, obs)
         truth = jaxlie.SE3(frame.T_world_vehicle_true)
@@ -179,8 +183,8 @@ def _run_chunk(
         pose = out.T_world_vehicle.wxyz_xyz
         return state, (pose, out.selected >= 0, out.located, out.flip_probability, branch)
 
-    def step(state: State, frame: _Frames) -> tuple[State, tuple]:
-        def alone(state: State, marker: Array) -> tuple[State, tuple]:
+    def step(state: State, frame: _Frames) -> tuple[State, _Told]:
+        def alone(state: State, marker: Array) -> tuple[State, _Told]:
             seen_alone = _Frames(
                 frame.corners_px[:, marker][:, None],
                 frame.visible[:, marker][:, None],
@@ -189,7 +193,7 @@ def _run_chunk(
             )
             return outputs_of(_single(markers, marker), state, seen_alone)
 
-        def together(state: State, _: Array) -> tuple[State, tuple]:
+        def together(state: State, _: Array) -> tuple[State, _Told]:
             return outputs_of(markers, state, frame)
 
         tracks = jnp.arange(len(markers.ids) if one_at_a_time else 1)

@@ -23,7 +23,7 @@ from pydantic import Field
 from jaxnav.files.provenance import Calibrated
 from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import with_provenance, yaml_text
+from jaxnav.files.rigs import with_provenance
 from jaxnav.files.validation import (
     AngleDeg,
     Entry,
@@ -34,7 +34,7 @@ from jaxnav.files.validation import (
     Radius,
     validate,
 )
-from jaxnav.files.writing import atomic_write
+from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.origin import Origin, opposite, planar_in_world, points_in_world
 

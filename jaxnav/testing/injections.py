@@ -10,7 +10,8 @@ from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
-from jaxnav.testing.lockstep import BEGIN_NS, Change, Input
+from jaxnav.loop.pilot import Input
+from jaxnav.testing.lockstep import BEGIN_NS, Change
 
 EditFrame = Callable[[FrameDetections], FrameDetections | None]  # None: the frame is lost
 EditOdometry = Callable[[Odometry], Odometry | None]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.pilot import Input
 from jaxnav.models.markers import MarkerMap
 from jaxnav.testing import injections as inject
 from jaxnav.testing.faults import ALL_CAMERAS, BEGIN_S, FaultRow, Happens, lasting
@@ -192,7 +193,7 @@ def _stamps() -> list[FaultRow]:
     def drifting_odometry(reading: Odometry) -> Odometry:
         return dataclasses.replace(reading, stamp_ns=drifting(reading.stamp_ns))
 
-    def both(given: inject.Input) -> list[inject.Input]:
+    def both(given: Input) -> list[Input]:
         edited = inject.frames(inject.stamps(drifting))(given)
         return inject.odometry(drifting_odometry)(edited[0])
 
