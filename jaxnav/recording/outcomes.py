@@ -8,6 +8,7 @@ has a default, does not belong to the report, and is not compared.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from operator import attrgetter
 from typing import Annotated, Any, get_type_hints
 
 import numpy as np
@@ -88,10 +89,14 @@ _Of = str | Callable[[Outcome], Any]  # a path of attributes, or a function
 
 
 def _at(path: str) -> Callable[[Outcome], Any]:
-    names = path.split(".")
+    first, *rest = path.split(".")
+    own = attrgetter(first)
+    if not rest:
+        return own
 
-    def of(value: Any) -> Any:
-        for name in names:
+    def of(outcome: Outcome) -> Any:
+        value = own(outcome)
+        for name in rest:
             value = vars(value)[name]  # reading an attribute of an equinox module takes 1 us
         return value
 
@@ -121,7 +126,11 @@ def _ragged(row: tuple[int, ...], of: _Of) -> Column:
 _initialised, _valid = _at("belief.bank.initialised"), _at("output.candidates.valid")
 _candidates, _taken = _at("output.candidates.T_vehicle_world.wxyz_xyz"), _at("output.selected")
 _covariance, _log_weight = _at("output.covariance"), _at("belief.bank.log_weight")
-_costs, _bank = _at("output.costs"), _at("belief.bank")
+_costs, _bank, _pose = _at("output.costs"), _at("belief.bank"), _at("output.pose")
+
+
+def _world_pose(one: Outcome) -> Rows:
+    return Rows(_pose(one), in_world=partial(planar_in_world, origin_m=one.origin_m))
 
 
 def _hypotheses(one: Outcome) -> Rows:
@@ -172,7 +181,7 @@ class Outcomes:
     restarts: Annotated[np.ndarray, _field(Count, "restarts", int, slack=0)]
     reason: Annotated[tuple[str, ...], _field(Word, "restart_reason", None)]
     digest: Annotated[tuple[str, ...], _field(Word, lambda one: "", None)]
-    pose: Annotated[np.ndarray, _array((3,), lambda one: Rows(one.pose))]
+    pose: Annotated[np.ndarray, _array((3,), _world_pose)]
     covariance: Annotated[np.ndarray, _array((0, 0), lambda one: Rows(_covariance(one)), _SQUARE)]
     located: Annotated[np.ndarray, _flag("output.located")]
     decided: Annotated[np.ndarray, _flag("output.decided")]
@@ -228,7 +237,12 @@ COLUMNS: dict[str, Column] = {
 }
 REPORTED = [name for name, one in COLUMNS.items() if one.is_reported and one.default is None]
 # The order in a message: what all have, what older drives lack, the report.
-_WRITTEN = sorted(COLUMNS, key=lambda n: (COLUMNS[n].default is not ..., COLUMNS[n].is_reported))
+_WRITTEN = [
+    (name, one.of)
+    for name, one in sorted(
+        COLUMNS.items(), key=lambda item: (item[1].default is not ..., item[1].is_reported)
+    )
+]
 
 
 class OutcomeMessage(Entry):
@@ -258,5 +272,9 @@ def outcome_message(outcome: Outcome, digest: str = "") -> dict[str, Any]:
         outcome: with NumPy leaves in its output.
         digest: digest of the pilot's state, to compare a replay with.
     """
-    message = {name: COLUMNS[name].of(outcome) for name in _WRITTEN} | {"digest": digest}
-    return {name: value for name, value in message.items() if value is not None}
+    message = {}
+    for name, of in _WRITTEN:
+        if (value := of(outcome)) is not None:
+            message[name] = value
+    message["digest"] = digest
+    return message
