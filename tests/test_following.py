@@ -432,7 +432,7 @@ def test_a_cost_is_what_its_loss_says(monkeypatch):
     decided = jnp.asarray([True, False, True])
     monkeypatch.setattr(tuned_filter, "follow", stub)
     monkeypatch.setattr(
-        tuned_filter, "started", lambda n, r: SequenceStarts(starts().bank, decided)
+        tuned_filter, "find_starts", lambda n, r: SequenceStarts(starts().bank, decided)
     )
     for loss, cost, frames in (("likelihood", -3.0, 24), ("score", -5.0 * 9 / 12, 18)):
         of = FilterCost(NAVIGATOR, SPACE, loss)
