@@ -161,7 +161,7 @@ def test_a_stop_while_a_command_is_made_is_not_lost(hardware, car, monkeypatch):
         let_go.wait(5.0)
         return 0.0, 0.2
 
-    monkeypatch.setattr(car, "_limits", SimpleNamespace(applied=slow))
+    monkeypatch.setattr(car, "_limits", SimpleNamespace(apply=slow))
     driving = threading.Thread(target=car.write, args=(0.0, 0.2))
     driving.start()
     begun.wait(5.0)
