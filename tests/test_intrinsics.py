@@ -229,7 +229,9 @@ def test_opencv_is_not_needed(monkeypatch) -> None:
     views, _ = views_of("equidistant", seed=11)
     expected = fit_lens(views, "equidistant")
     monkeypatch.setattr(lens_start, "opencv_calibration", throws)
-    np.testing.assert_allclose(fit_lens(views, "equidistant").parameters, expected.parameters, 1e-6)
+    # Steps end where they promise a cost of 1e-12 of the sum, here 1e-4 of a standard deviation.
+    away = fit_lens(views, "equidistant").parameters - expected.parameters
+    assert np.max(np.abs(away) - 1e-4 * expected.sigma) <= 0
 
 
 def test_blurred_and_empty_views_are_screened() -> None:

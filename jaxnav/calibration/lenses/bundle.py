@@ -119,7 +119,7 @@ def solve(
 
     solution: optx.Solution = optx.least_squares(
         fn,
-        SchurLM(rtol=1e-15, atol=1e-15, norm=optx.max_norm, retract=_moved, free=free),
+        SchurLM(rtol=1e-12, atol=1e-12, norm=optx.max_norm, retract=_moved, free=free),
         start,
         has_aux=True,
         max_steps=max_steps,
