@@ -57,7 +57,7 @@ def timed(drives: Rollout, seeds: int) -> tuple[float, float, int]:
 
 def start(drives: Rollout, chunks: int = 1) -> float:
     """Steps a second of one thread in the first second, when the bank is full."""
-    worlds = drives._start(_keys(drives.many_lanes))
+    worlds = drives.start(_keys(drives.many_lanes))
     jax.block_until_ready(drives._advance_many(worlds))  # compiled for this thread
     begin = time.perf_counter()
     for _ in range(chunks):

@@ -436,7 +436,7 @@ def test_a_cost_is_what_its_loss_says(monkeypatch):
     )
     for loss, cost, frames in (("likelihood", -3.0, 24), ("score", -5.0 * 9 / 12, 18)):
         of = FilterCost(NAVIGATOR, SPACE, loss)
-        batch = of.batch(SPACE.start, drives)
+        [batch] = of.batches(SPACE.start, drives)
         assert float(batch.frames) == frames
         np.testing.assert_array_equal(np.any(batch.items.recorded.used, axis=1), decided)
         item = first_of(batch.items)
@@ -447,6 +447,6 @@ def test_a_cost_is_what_its_loss_says(monkeypatch):
     np.testing.assert_allclose(error(SPACE.start, item, jnp.zeros(())), 200.0)
     nobody = SimpleNamespace(bank=starts().bank, chosen=jnp.zeros(3, bool))
     monkeypatch.setattr(tuned_filter, "find_starts", lambda n, r: nobody)
-    assert float(error.batch(SPACE.start, drives).frames) == 1
+    assert float(error.batches(SPACE.start, drives)[0].frames) == 1
     assert seen[0].selector.max_inflation == seen[0].selector.max_misfit == 1
     assert np.isinf(seen[0].motion.gate_nis)

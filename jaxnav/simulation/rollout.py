@@ -106,7 +106,7 @@ class Rollout(eqx.Module):
             lanes, threads, advance = self.many_lanes, self.threads, self._advance_many
         kept = run_lanes(
             keys,
-            self._start,
+            self.start,
             lambda worlds: advance(worlds, keep),
             lanes,
             threads,
@@ -117,7 +117,8 @@ class Rollout(eqx.Module):
         return eqx.tree_at(lambda t: t.active, trace, trace.active & own), further
 
     @eqx.filter_jit
-    def _start(self, keys: Key[Array, " lanes"]) -> DriveState:
+    def start(self, keys: Key[Array, " lanes"]) -> DriveState:
+        """The worlds of drives before their first frames, leading axis (lanes,)."""
         worlds = jax.vmap(self.first)(keys)
         # Strong types, as `_advance` returns them, or it would be compiled twice.
         return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), worlds)

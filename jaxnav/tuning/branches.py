@@ -22,6 +22,7 @@ from jaxnav.models.geometry import (
 )
 from jaxnav.navigator import Navigator, State
 from jaxnav.pose.observation import Observation
+from jaxnav.simulation.batch_jit import batch_jit
 from jaxnav.tuning.recorded import FrameSequences
 
 # Standard deviation of a pose that was carried back, m and rad: a third of the difference between
@@ -39,7 +40,7 @@ class SequenceEstimates(eqx.Module):
     decided: Bool[Array, "*B T"]
 
 
-@eqx.filter_jit
+@batch_jit
 def estimate_sequences(navigator: Navigator, recorded: FrameSequences) -> SequenceEstimates:
     """Estimate all sequences from cold starts. Frames not used or judged hold no valid values."""
 

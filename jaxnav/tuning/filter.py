@@ -5,11 +5,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnav.belief.motion import Bank
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import with_parameters
+from jaxnav.simulation.batch_jit import batch_jit
 from jaxnav.tuning.branches import find_starts
 from jaxnav.tuning.following import follow, trust_corners
 from jaxnav.tuning.objective import Batch
@@ -51,9 +53,13 @@ class FilterCost(eqx.Module):
             return -followed.log_score
         return _CM2_PER_M2 * followed.square_m2
 
-    def batch(self, x: Float[Array, " n"], recorded: FrameSequences) -> Batch:
-        """The batch of recordings, their branches chosen at these parameters and then fixed."""
+    def batches(self, x: Float[Array, " n"], *parts: FrameSequences) -> list[Batch]:
+        """A batch of each part, the branches chosen at these parameters and then fixed.
+
+        The parts are estimated in one run, whose program is compiled once for all of them.
+        """
         navigator = with_parameters(self.navigator, self.space.values(x))
+        recorded = FrameSequences.concatenate(list(parts))
         start = find_starts(navigator, recorded)
         usable = eqx.tree_at(
             lambda r: (r.used, r.judged),
@@ -61,15 +67,20 @@ class FilterCost(eqx.Module):
             (recorded.used & start.chosen[:, None], recorded.judged & start.chosen[:, None]),
         )
         counted = usable.used if self.loss == "likelihood" else usable.judged
-        frames = jnp.maximum(jnp.sum(counted), 1).astype(x.dtype)
-        return Batch(Item(start.bank, usable), frames)
+        ends = np.cumsum([len(part) for part in parts])
+        batches = []
+        for begin, end in zip([0, *ends[:-1]], ends, strict=True):
+            items = jax.tree.map(lambda leaf: leaf[begin:end], Item(start.bank, usable))  # noqa: B023
+            frames = jnp.maximum(jnp.sum(counted[begin:end]), 1).astype(x.dtype)
+            batches.append(Batch(items, frames))
+        return batches
 
     def mean(self, x: Float[Array, " n"], batch: Batch) -> Float[Array, ""]:
         """The mean cost of a frame in a batch."""
         return _mean(self, x, batch)
 
 
-@eqx.filter_jit
+@batch_jit
 def _mean(cost: FilterCost, x: Array, batch: Batch) -> Array:
     zero = jnp.zeros((), x.dtype)
     costs = jax.vmap(lambda item: cost(x, item, zero))(batch.items)

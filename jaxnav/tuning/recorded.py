@@ -1,6 +1,7 @@
 """Hold the measurements of many drives, on which a filter is tuned and then judged."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +14,11 @@ from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Output, State
 from jaxnav.pose.observation import Observation
+from jaxnav.simulation.batch_jit import batch_jit
+from jaxnav.simulation.queue import run_lanes
 from jaxnav.simulation.rollout import Rollout
+from jaxnav.simulation.traces import DriveTraces
+from jaxnav.simulation.world import DriveState
 
 
 class FrameSequences(eqx.Module):
@@ -56,10 +61,29 @@ class FrameSequences(eqx.Module):
         return FrameSequences(self.markers, obs, used & known, truth, judged & known)
 
 
-def simulate_sequences(rollout: Rollout, keys: Key[Array, " B"]) -> FrameSequences:
+def simulate_sequences(
+    rollout: Rollout,
+    keys: Key[Array, " B"],
+    progress: Callable[[int], object] = lambda ended: None,
+) -> FrameSequences:
     """Simulate closed-loop drives from a cold start, judged from the frame on in which the
-    navigator that drove had decided its branch."""
-    obs, true_poses, decided, active = jax.device_get(_drives(rollout, keys))
+    navigator that drove had decided its branch.
+
+    Args:
+        keys: one for each drive; a key's drive does not depend on the others.
+        progress: called with the number of drives that have ended since the last call.
+    """
+    kept = run_lanes(
+        keys,
+        rollout.start,
+        lambda worlds: _advance(rollout, worlds),
+        min(rollout.lanes, len(keys)),
+        1,
+        DriveTraces(len(keys), rollout.chunk_frames),
+        progress,
+    )
+    (obs, true_poses, decided, active), own = kept.stack()
+    active &= own
     count, length = len(active), int(active.sum(axis=1).max())
     judged = np.maximum.accumulate(decided & active, axis=1) & active
     poses = T_world_vehicle_from_planar(jnp.asarray(true_poses[:, :length]))
@@ -75,21 +99,22 @@ def simulate_sequences(rollout: Rollout, keys: Key[Array, " B"]) -> FrameSequenc
     )
 
 
-@eqx.filter_jit
-def _drives(rollout: Rollout, keys: Key[Array, " B"]) -> tuple[Observation, Array, Array, Array]:
-    """The observations, true poses, and masks of decided and of active frames; (B, frames)."""
+@batch_jit
+def _advance(rollout: Rollout, worlds: DriveState) -> tuple[DriveState, tuple[Any, ...]]:
+    """Advance every lane by `chunk_frames`, and keep its frames: the observations, true poses, and
+    masks of decided and of active ones; (lanes, frames, ...)."""
 
-    def drive(key: Array) -> tuple[Observation, Array, Array, Array]:
-        def frame(world: Any, _: None) -> tuple[Any, tuple[Observation, Array, Array, Array]]:
-            seen: list[Observation] = []
+    def frame(world: DriveState, _: None) -> tuple[DriveState, tuple[Any, ...]]:
+        seen: list[Observation] = []
 
-            def step(state: State, obs: Observation) -> tuple[State, Output]:
-                seen.append(dataclasses.replace(obs, T_world_vehicle_true=None, heading_rad=None))
-                return rollout.navigator.step(state, obs)
+        def step(state: State, obs: Observation) -> tuple[State, Output]:
+            seen.append(dataclasses.replace(obs, T_world_vehicle_true=None, heading_rad=None))
+            return rollout.navigator.step(state, obs)
 
-            world, trace = rollout.frame(world, step)
-            return world, (seen[0], trace.true_pose, trace.decided, trace.active)
+        world, trace = rollout.frame(world, step)
+        return world, (seen[0], trace.true_pose, trace.decided, trace.active)
 
-        return jax.lax.scan(frame, rollout.first(key), length=rollout.scenario.frames)[1]
-
-    return jax.vmap(drive)(keys)
+    advanced: tuple[DriveState, tuple[Any, ...]] = jax.vmap(
+        lambda world: jax.lax.scan(frame, world, length=rollout.chunk_frames)
+    )(worlds)
+    return advanced

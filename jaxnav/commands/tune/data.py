@@ -68,17 +68,11 @@ def _simulated(args: Arguments) -> TuningData:
     # The drives are the same whichever estimator is tuned.
     driver = car.navigator(scenario, MultiHypothesis())
     noise_px = jnp.asarray(args.corner_noise_px)
-    rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px)
+    rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px, lanes=AT_A_TIME)
 
     def drive(first: int, count: int, progress: Progress) -> FrameSequences:
-        """Simulate drives in batches of one size; the last batch repeats its last drive."""
-        size, parts = min(count, AT_A_TIME), []
-        for begin in range(0, count, size):
-            seeds = first + np.minimum(np.arange(begin, begin + size), count - 1)
-            part = simulate_sequences(rollout, jax.vmap(jax.random.key)(jnp.asarray(seeds)))
-            parts.append(part.rows(slice(0, min(size, count - begin))))
-            progress(len(parts[-1]))
-        return FrameSequences.concatenate(parts)
+        keys = jax.vmap(jax.random.key)(first + jnp.arange(count))
+        return simulate_sequences(rollout, keys, progress)
 
     count = args.seeds + args.held_out_seeds
     with tqdm(total=count, unit="drive", desc="drive", disable=args.headless, leave=False) as bar:

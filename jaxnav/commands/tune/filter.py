@@ -99,12 +99,12 @@ def _by_default(navigator: Navigator, learned: FrameSequences) -> tuple[str, ...
 
 
 def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: TuningData) -> Problem:
-    made: dict[int, tuple[Batch, Batch]] = {}
+    made: dict[int, list[Batch]] = {}
 
-    def of_stage(x: Array, stage: int) -> tuple[Batch, Batch]:
+    def of_stage(x: Array, stage: int) -> list[Batch]:
         if stage not in made:
             made.clear()
-            made[stage] = (cost.batch(x, data.learned), cost.batch(x, data.held_out))
+            made[stage] = cost.batches(x, data.learned, data.held_out)
         return made[stage]
 
     return Problem(
@@ -139,6 +139,8 @@ def _tested(
         ) as bar:
             recorded = test.recorded(bar.update)
             before = test.navigator if params is None else apply_params(test.navigator, params)
+            # As arrays, like those after the fit, so that one program estimates with both.
+            before = with_parameters(before, parameters_of(before))
             after = with_parameters(before, space.values(fit.best_x))
             found[test.name] = (
                 _test(before, recorded, bar.update),
