@@ -17,7 +17,7 @@ _OPTIONS = {} if f"--{_LEVEL}=" in os.environ.get("XLA_FLAGS", "") else {_LEVEL:
 def batch_jit(function: Function) -> Function:
     """`equinox.filter_jit` for what runs a few times, without LLVM's costly passes.
 
-    They take a third of the time to compile a batch of drives, which runs 1.2 times as long without
-    them (`benchmarks/README-simulate.md`).
+    They take a third of the time to compile a batch of drives, which runs 1.26 times as long
+    without them (`benchmarks/README-simulate.md`).
     """
     return cast(Function, _jit(function, compiler_options=_OPTIONS))

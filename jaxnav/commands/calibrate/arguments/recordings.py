@@ -42,7 +42,7 @@ OdometryParameter = Literal[
 _RecordedFile = Annotated[Path | None, optional("FILE", "(default: the recording's)")]
 
 
-def _require_recordings(recordings: tuple[Path, ...], marker_size_m: float | None = None) -> None:
+def _require_inputs(recordings: tuple[Path, ...], marker_size_m: float | None = None) -> None:
     """Raise BadInput where there is none, or where markers are of no size."""
     require(len(recordings) > 0, "RECORDING", "missing: what has the rig seen?")
     if marker_size_m is not None:
@@ -80,7 +80,7 @@ class CalibrateRig:
     out: ResultsFolder = Path("calibrated")
 
     def __post_init__(self) -> None:
-        _require_recordings(self.recordings, self.marker_size_m)
+        _require_inputs(self.recordings, self.marker_size_m)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class CalibrateMarkers:
     out: ResultsFolder = Path("calibrated")
 
     def __post_init__(self) -> None:
-        _require_recordings(self.recordings, self.marker_size_m)
+        _require_inputs(self.recordings, self.marker_size_m)
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class CalibrateCheck:
     out: ResultsFolder = Path("checked")
 
     def __post_init__(self) -> None:
-        _require_recordings(self.recordings)
+        _require_inputs(self.recordings)
         require_finite("--tolerance-m", self.tolerance_m)
         require_finite("--tolerance-deg", self.tolerance_deg)
 
