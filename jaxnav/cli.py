@@ -211,10 +211,10 @@ def _one_line(box: str) -> str:
             sections.append([])
         elif not line.startswith(" " * 5):
             sections[-1].append(line)
-    told = (
+    problems = (
         lines for lines in sections if lines and not lines[0].startswith(("For full", "Argument"))
     )
-    text = " ".join("; ".join(_listed(lines) for lines in told).split())
+    text = " ".join("; ".join(_listed(lines) for lines in problems).split())
     # A command has its class's name; one of `tune` and `calibrate` stands in the field `what`.
     return re.sub(r"^Error parsing ([A-Z]\w*: |what: )?", "", text) or "wrong usage"
 

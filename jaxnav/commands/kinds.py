@@ -39,7 +39,7 @@ def optional(
     metavar: str,
     without: str = "(optional)",
     constructor: type | None = None,
-    told: str | None = None,
+    help_text: str | None = None,
 ) -> object:
     """How help shows an option that may be left out.
 
@@ -49,7 +49,7 @@ def optional(
         told: the help, where the field has none of its own.
     """
     return tyro.conf.arg(
-        metavar=metavar, help_behavior_hint=without, constructor=constructor, help=told
+        metavar=metavar, help_behavior_hint=without, constructor=constructor, help=help_text
     )
 
 

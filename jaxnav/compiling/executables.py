@@ -60,30 +60,32 @@ class kept:
         self._ready: dict[Any, tuple[Any, Any]] = {}
         update_wrapper(self, function)
 
-    def __call__(self, *told: Any, **named: Any) -> Any:
-        leaves, given = jax.tree.flatten(told)
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        leaves, given = jax.tree.flatten(arguments)
         if not _folders or named or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            return self.jitted(*told, **named)
+            return self.jitted(*arguments, **named)
         kind = given, *((leaf.shape, leaf.dtype) for leaf in leaves)
         if kind not in self._ready:
-            self._ready[kind] = program(self._function, told, _folders[-1])
+            self._ready[kind] = program(self._function, arguments, _folders[-1])
         run, structure = self._ready[kind]
         return jax.tree.unflatten(structure, run(leaves))
 
 
-def program(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -> tuple[Run, Any]:
+def program(
+    function: Callable[..., Any], arguments: tuple[Any, ...], folder: Path
+) -> tuple[Run, Any]:
     """The executable of a function on its arguments' leaves, and the structure of its result.
 
     Loaded if another process has kept it, else compiled and kept.
     """
-    given, inputs = _asked(told)
+    given, inputs = _asked(arguments)
     name = _file(_name(function, given), inputs)
     return _loaded(folder, name, inputs) or _compiled(function, folder, name, given, inputs)
 
 
-def is_kept(function: Callable[..., Any], told: tuple[Any, ...], folder: Path) -> bool:
+def is_kept(function: Callable[..., Any], arguments: tuple[Any, ...], folder: Path) -> bool:
     """Whether `program` finds the executable in the folder."""
-    given, inputs = _asked(told)
+    given, inputs = _asked(arguments)
     with suppress(OSError, NotPrivateError), PrivateFolder(folder) as files:
         return files.holds(_file(_name(function, given), inputs))
     return False
@@ -101,8 +103,8 @@ def sources_digest(package: Path, without: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
-def _asked(told: tuple[Any, ...]) -> tuple[Any, list[Any]]:
-    leaves, given = jax.tree.flatten(told)
+def _asked(arguments: tuple[Any, ...]) -> tuple[Any, list[Any]]:
+    leaves, given = jax.tree.flatten(arguments)
     return given, jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
 
 

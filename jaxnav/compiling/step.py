@@ -50,10 +50,10 @@ def compile_or_load(
     numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
     ready: dict[Any, tuple[Any, Any]] = {}  # a program for each structure of the arguments
 
-    def call(*told: Any) -> Any:
-        leaves, given = jax.tree.flatten(told)
+    def call(*arguments: Any) -> Any:
+        leaves, given = jax.tree.flatten(arguments)
         if given not in ready:
-            ready[given] = executables.program(function, (navigator, *told), folder)
+            ready[given] = executables.program(function, (navigator, *arguments), folder)
         program, returned = ready[given]
         return jax.tree.unflatten(returned, program([*numbers, *leaves]))
 
@@ -61,10 +61,10 @@ def compile_or_load(
 
 
 def is_compiled(
-    function: Callable[..., Any], navigator: Navigator, folder: Path, *told: Any
+    function: Callable[..., Any], navigator: Navigator, folder: Path, *arguments: Any
 ) -> bool:
     """Whether `compile_or_load(function, navigator, folder)(*told)` finds its executable."""
-    return executables.is_kept(function, (strip_static(navigator), *told), folder)
+    return executables.is_kept(function, (strip_static(navigator), *arguments), folder)
 
 
 def strip_static(navigator: Navigator) -> Navigator:

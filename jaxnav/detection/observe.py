@@ -48,9 +48,9 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes
         if not len(found):
             continue
         keys = list(zip(found.ids.tolist(), found.families, strict=True))
-        told = _told_once(keys, found.corners_px)
-        counts = Counter(keys[k] for k in told)
-        for k in told:
+        kept = _once_each(keys, found.corners_px)
+        counts = Counter(keys[k] for k in kept)
+        for k in kept:
             key = keys[k]
             marker = lanes.get(key)
             if marker is None:
@@ -64,7 +64,7 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes
     return CornerLanes(corners_px, visible, sigma_px, unknown, duplicates)
 
 
-def _told_once(keys: Sequence[tuple[int, str]], corners_px: np.ndarray) -> list[int]:
+def _once_each(keys: Sequence[tuple[int, str]], corners_px: np.ndarray) -> list[int]:
     """Indices of the detections without repetitions of a marker at the same place."""
     kept: list[int] = []
     for k, key in enumerate(keys):

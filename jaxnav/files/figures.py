@@ -123,12 +123,12 @@ def to_se3(pose: np.ndarray) -> jaxlie.SE3:
 
 def unread_keys(data: Mapping[str, Any], known: Sequence[str], prefix: str = "") -> list[str]:
     """The keys of a file, except the known ones, whose values are not empty, zero or false."""
-    told = []
+    unread = []
     for key, value in data.items():
         if key not in known and _says_something(value):
             count = f" ({len(value)} entries)" if isinstance(value, list) else ""
-            told.append(f"{prefix}{key if key.isprintable() else ascii(key)}{count}")
-    return told
+            unread.append(f"{prefix}{key if key.isprintable() else ascii(key)}{count}")
+    return unread
 
 
 def _says_something(value: Any, levels: int = 8) -> bool:

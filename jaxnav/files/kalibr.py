@@ -179,12 +179,12 @@ def names_by_topic(chain: dict[str, KalibrCamera]) -> list[str]:
 
 def camchain_left_out(data: dict[str, Any], chain: dict[str, KalibrCamera]) -> list[str]:
     """The keys that are not read and not empty, see `unread_keys`."""
-    told = unread_keys(data, list(chain))
+    unread = unread_keys(data, list(chain))
     read = set(KalibrCamera.model_fields) - {"tagtopic", "rig_body"}
     for key, camera in zip(chain, camchain_figures(chain), strict=True):
         unplaced = {"T_cn_cnm1"} if camera.T_camera_vehicle is None else set()
-        told += unread_keys(data[key], sorted(read - unplaced), f"{key}.")
-    return told
+        unread += unread_keys(data[key], sorted(read - unplaced), f"{key}.")
+    return unread
 
 
 def camchain_text(cameras: Sequence[CameraFigures]) -> str:

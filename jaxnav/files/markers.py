@@ -218,9 +218,9 @@ def markers_text(markers: Sequence[MarkerFigures]) -> str:
 
 def markers_left_out(file: MarkerFile) -> list[str]:
     """The names of the entries of a map file that `MarkerFigures` don't hold."""
-    told = ["calibrated"] if file.calibrated else []
+    left_out = ["calibrated"] if file.calibrated else []
     sigmas = sum(entry.sigma is not None for entry in file.markers)
-    return told + ([f"sigma (of {sigmas} markers)"] if sigmas else [])
+    return left_out + ([f"sigma (of {sigmas} markers)"] if sigmas else [])
 
 
 def fit_square(corners_m: np.ndarray, size_m: float) -> np.ndarray:

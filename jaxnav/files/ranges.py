@@ -158,13 +158,13 @@ def pinhole_problem(pinhole_px: Sequence[float], image_size_px: Sequence[float])
         image_size_px: width, height.
     """
     width, height = image_size_px
-    told = f"for images of {width:g} x {height:g} px"
+    of_images = f"for images of {width:g} x {height:g} px"
     for name, value in zip(("fx", "fy"), pinhole_px[:2], strict=True):
         if problem := _problem_in_sides("focal", value, max(width, height)):
-            return f"the focal length {name} {problem} {told}"
+            return f"the focal length {name} {problem} {of_images}"
     for name, value, side in zip(("cx", "cy"), pinhole_px[2:], (width, height), strict=True):
         if problem := _problem_in_sides("center", value, side):
-            return f"the principal point's {name} {problem} {told}"
+            return f"the principal point's {name} {problem} {of_images}"
     return None
 
 

@@ -257,8 +257,8 @@ def rig_text(cameras: Sequence[CameraFigures]) -> str:
 
 def rig_left_out(file: RigFile) -> list[str]:
     """The names of the entries of a rig file that `CameraFigures` don't hold."""
-    told = ["calibrated"] if file.calibrated else []
-    return told + [f"cameras.{entry.name}.sigma" for entry in file.cameras if entry.sigma]
+    left_out = ["calibrated"] if file.calibrated else []
+    return left_out + [f"cameras.{entry.name}.sigma" for entry in file.cameras if entry.sigma]
 
 
 def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> np.ndarray:

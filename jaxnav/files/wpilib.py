@@ -135,13 +135,15 @@ def layout_figures(
 
 def layout_left_out(data: dict[str, Any]) -> list[str]:
     """The keys that are not read and not empty, with the size of the field among them."""
-    told = unread_keys(data, ["tags", "field"])
+    unread = unread_keys(data, ["tags", "field"])
     if data.get("field"):
         size = data["field"]
-        told.append(f"field ({size['length']} x {size['width']} m, --field-size-m on the way back)")
+        unread.append(
+            f"field ({size['length']} x {size['width']} m, --field-size-m on the way back)"
+        )
     for index, tag in enumerate(data["tags"]):
-        told += unread_keys(tag, ["ID", "pose"], f"tags[{index}].")
-    return told
+        unread += unread_keys(tag, ["ID", "pose"], f"tags[{index}].")
+    return unread
 
 
 def layout_text(markers: Sequence[MarkerFigures], field_size_m: tuple[float, float]) -> str:
@@ -162,8 +164,8 @@ def layout_text(markers: Sequence[MarkerFigures], field_size_m: tuple[float, flo
         )
     sizes = sorted({marker.size_m for marker in markers})
     if len(sizes) > 1:
-        told = ", ".join(f"{size_m:g}" for size_m in sizes)
-        problem = f"a layout has tags of one size, these have {told} m: split the map"
+        sizes_text = ", ".join(f"{size_m:g}" for size_m in sizes)
+        problem = f"a layout has tags of one size, these have {sizes_text} m: split the map"
         raise BadInput("--to wpilib: size_m", problem)
     length, width = field_size_m
     data = {

@@ -134,11 +134,11 @@ class CameraDelays:
 
     def add_outcome(self, outcome: Outcome) -> None:
         """Keep the data of an outcome and its estimated pose."""
-        told = outcome.data
-        if told is not None and told.odometry is not None:
-            self.add_reading(outcome.stamp_ns, *told.odometry)
-        if told is not None and told.corners_px is not None:
-            self.add_corners(outcome.stamp_ns, told)
+        data = outcome.data
+        if data is not None and data.odometry is not None:
+            self.add_reading(outcome.stamp_ns, *data.odometry)
+        if data is not None and data.corners_px is not None:
+            self.add_corners(outcome.stamp_ns, data)
         output = outcome.output
         if outcome.now_ns >= self._next_ns and bool(output.decided):
             self.add_pose(outcome.now_ns, np.asarray(output.pose, float))
@@ -148,13 +148,13 @@ class CameraDelays:
         if not self._readings or stamp_ns > self._readings[-1][0]:
             self._readings.append((stamp_ns, speed_mps, steering_rad))
 
-    def add_corners(self, stamp_ns: int, told: EventData) -> None:
+    def add_corners(self, stamp_ns: int, data: EventData) -> None:
         """Keep corners and their corrected stamp."""
-        assert told.corners_px is not None
-        assert told.visible is not None
-        assert told.sigma_px is not None
-        camera, marker = np.nonzero(told.visible)
-        corners_px, sigma_px = told.corners_px[camera, marker], told.sigma_px[camera, marker]
+        assert data.corners_px is not None
+        assert data.visible is not None
+        assert data.sigma_px is not None
+        camera, marker = np.nonzero(data.visible)
+        corners_px, sigma_px = data.corners_px[camera, marker], data.sigma_px[camera, marker]
         self._views.append(_View(stamp_ns, camera, marker, corners_px, sigma_px))
 
     def add_pose(self, now_ns: int, pose: np.ndarray) -> None:
@@ -242,8 +242,8 @@ class CameraDelays:
         return float(delay_s), information / (_INFLATION**2 * max(chi2 / max(numbers, 1), 1.0))
 
     def _equations(self, stretch: Stretch, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        told = (np.int32(stretch.camera), *stretch[2:], p.astype(self._dtype))
-        A, b, chi2 = jax.device_get(_normal(*self._world, *told))
+        arguments = (np.int32(stretch.camera), *stretch[2:], p.astype(self._dtype))
+        A, b, chi2 = jax.device_get(_normal(*self._world, *arguments))
         return A.astype(float), b.astype(float), float(chi2)
 
 

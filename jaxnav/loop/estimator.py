@@ -93,7 +93,7 @@ class Estimator:
             self._program(self._first, self._control, self._events([], 0, seeing), numbers)
 
     def fuse(
-        self, told: EventData | None, stamp_ns: int, now_ns: int, elapsed_ns: int
+        self, data: EventData | None, stamp_ns: int, now_ns: int, elapsed_ns: int
     ) -> FusionResult:
         """Fuse an event, or only predict to the present.
 
@@ -103,21 +103,21 @@ class Estimator:
             now_ns: time of the returned pose and command.
             elapsed_ns: time since the last command.
         """
-        if told is not None and told.odometry is not None:
-            self._odometry = told.odometry
+        if data is not None and data.odometry is not None:
+            self._odometry = data.odometry
         placed = None
-        if told is not None:
+        if data is not None:
             if self._history is None:
                 self._history = History(self._first, stamp_ns)
-            placed = self._history.place(stamp_ns, told)
+            placed = self._history.place(stamp_ns, data)
         if placed is None:
             base_ns = self._belief_ns if self._history is not None else now_ns
             belief, _, output = self._call(self._belief, [], base_ns, 0, now_ns, elapsed_ns)
             believed = belief.fetch().unpack()
-            return FusionResult(output.fetch().unpack(), believed, told is not None, 0)
+            return FusionResult(output.fetch().unpack(), believed, data is not None, 0)
         base, entries = placed
         assert self._history is not None
-        new = next(index for index, entry in enumerate(entries) if entry.data is told)
+        new = next(index for index, entry in enumerate(entries) if entry.data is data)
         belief, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
         self._belief, self._belief_ns = belief, entries[-1].stamp_ns
         self._history.store(belief, entries[new], then)
@@ -164,7 +164,7 @@ class Estimator:
         now_ns: int,
         elapsed_ns: int,
     ) -> tuple[Packed, Packed, Packed]:
-        seeing = any(told.corners_px is not None for _, told in rows)
+        seeing = any(data.corners_px is not None for _, data in rows)
         events = self._events(rows, base_ns, seeing)
         now_us, elapsed_us = _us_between(base_ns, now_ns), elapsed_ns // 1000
         numbers = np.array([len(rows), new, _int32(now_us), _int32(elapsed_us)], np.int32)
@@ -182,16 +182,16 @@ class Estimator:
         into = vars(events)  # reading an attribute of an equinox module takes 1 us
         speed_mps, steering_rad = into["speed_mps"], into["steering_rad"]
         speed_mps[:], steering_rad[:] = self._odometry
-        for index, (stamp_ns, told) in enumerate(rows):
+        for index, (stamp_ns, data) in enumerate(rows):
             into["stamps_us"][index] = _int32(_us_between(base_ns, stamp_ns))
-            if told.odometry is not None:
-                speed_mps[index], steering_rad[index] = told.odometry
+            if data.odometry is not None:
+                speed_mps[index], steering_rad[index] = data.odometry
                 into["has_odometry"][index] = True
-            if told.corners_px is not None:
+            if data.corners_px is not None:
                 corners = vars(into["corners"])
-                corners["corners_px"][index] = told.corners_px
-                corners["visible"][index] = told.visible
-                corners["corner_sigma_px"][index] = told.sigma_px
+                corners["corners_px"][index] = data.corners_px
+                corners["visible"][index] = data.visible
+                corners["corner_sigma_px"][index] = data.sigma_px
 
 
 def _with_evidence(output: Output, of_new: Output) -> Output:
@@ -200,8 +200,8 @@ def _with_evidence(output: Output, of_new: Output) -> Output:
     def evidence(output: Output) -> list[Any]:
         return [getattr(output, field.name) for field in fields(Evidence)]
 
-    told: Output = eqx.tree_at(evidence, output, evidence(of_new))
-    return told
+    completed: Output = eqx.tree_at(evidence, output, evidence(of_new))
+    return completed
 
 
 def _layout(navigator: Navigator, seeing: bool) -> PackedLayout:

@@ -113,9 +113,9 @@ def main(commands: int, readings: int) -> None:
     """Serve until the vehicle can be released."""
     for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTOU", "SIGPIPE"):
         signal.signal(getattr(signal, name), signal.SIG_IGN)  # the computing process handles them
-    told = os.pipe()
-    os.set_blocking(told[1], False)
-    signal.set_wakeup_fd(told[1], warn_on_full_buffer=False)
+    wakeup = os.pipe()
+    os.set_blocking(wakeup[1], False)
+    signal.set_wakeup_fd(wakeup[1], warn_on_full_buffer=False)
     signal.signal(signal.SIGTERM, lambda number, frame: None)  # sent when the machine shuts down
     link = Link(socket.socket(fileno=commands))
     asked = Link(socket.socket(fileno=readings))
@@ -145,7 +145,7 @@ def main(commands: int, readings: int) -> None:
         threading.Thread(target=_report, args=(guard, link), daemon=True).start()
         try:
             link.tell(opened=float(vehicle.timeout_s), priority=priority)
-            _Server(vehicle, guard, link, asked, told[0]).serve()
+            _Server(vehicle, guard, link, asked, wakeup[0]).serve()
         finally:
             guard.close(HEARD_WITHIN_S)
             with suppress(OSError):
@@ -229,11 +229,13 @@ def _factory(name: str, path: list[str]) -> Any:
 
 
 def _opened(factory: Any, order: dict[str, Any]) -> Vehicle:
-    told: Any = order["setup"]
+    received: Any = order["setup"]
     missing: Any = _Missing
-    numbers: Any = SimpleNamespace(**told["vehicle"])
-    start: Any = tuple(told["start_pose"])
-    setup = Setup(missing("rig"), missing("markers"), numbers, start, told["seed"], told["options"])
+    numbers: Any = SimpleNamespace(**received["vehicle"])
+    start: Any = tuple(received["start_pose"])
+    setup = Setup(
+        missing("rig"), missing("markers"), numbers, start, received["seed"], received["options"]
+    )
     return plugins.opened_vehicle(order["vehicle"], factory, setup)
 
 

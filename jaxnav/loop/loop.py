@@ -101,9 +101,8 @@ class Loop:
         self._now_ns = now_ns
         self._outcome: Outcome | None = None
         self._odometry_ns: int | None = None
-        self._blank: tuple[
-            FrameDetections, ...
-        ] = ()  # frames without markers, kept for the next tick
+        # Frames without markers, kept for the next tick.
+        self._blank: tuple[FrameDetections, ...] = ()
         self._belief: tuple[np.ndarray, np.ndarray] | None = None
         self._expectation: tuple[tuple[np.ndarray, np.ndarray], Expected] | None = None  # of it
         dtype = np.asarray(pilot.navigator.corner_sigma_px).dtype

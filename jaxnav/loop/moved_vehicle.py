@@ -108,7 +108,7 @@ class GuardProcess:
         numbers = {
             field.name: float(getattr(setup.vehicle, field.name)) for field in fields(setup.vehicle)
         }
-        told = {
+        changes = {
             "setup": {
                 "vehicle": numbers,
                 "start_pose": [float(value) for value in setup.start_pose],
@@ -119,9 +119,9 @@ class GuardProcess:
             "corrections": asdict(Corrections.of(setup.vehicle)),
             "timeout_s": timeout_s,
         }
-        self._order |= told
+        self._order |= changes
         self._opens = True
-        self.commands.tell(**told)
+        self.commands.tell(**changes)
         answer = self._answer(check)
         if "bad" in answer:
             raise BadInput(*answer["bad"].split(": ", 1))
@@ -182,7 +182,7 @@ class MovedVehicle:
         self._closing = self._closed = False
         self._dead: str | None = None
         self._unheard: str | None = None
-        self._told: Callable[[str], None] = lambda reason: None
+        self._report: Callable[[str], None] = lambda reason: None
         self._ended = threading.Event()
         guarding.readings.socket.settimeout(_READ_S)
         self._thread = threading.Thread(target=self._listen, name="jaxnav-events", daemon=True)
@@ -202,9 +202,9 @@ class MovedVehicle:
         """See `Ending`; as sent with the vehicle's last reading."""
         return self._over
 
-    def watch(self, told: Callable[[str], None]) -> None:
+    def watch(self, report: Callable[[str], None]) -> None:
         """Call this with the reason when the guard there has stopped the vehicle, or has died."""
-        self._told = told
+        self._report = report
         self._thread.start()
 
     def read(self) -> Odometry:
@@ -293,7 +293,7 @@ class MovedVehicle:
             while True:
                 said = link.mapping()
                 if "tripped" in said:
-                    self._told(said["tripped"])
+                    self._report(said["tripped"])
                 if "closed" in said:
                     self._unheard = said["unheard"]
         except (EOFError, OSError, ValueError):
@@ -303,7 +303,7 @@ class MovedVehicle:
         if not self._closing or self._guarding.process.returncode:
             how = f"the guard's process {ending(self._guarding.process)}"
             self._dead = self._unheard = how
-            self._told(how)
+            self._report(how)
             if self._guarding.rescue():
                 self._dead = self._unheard = None
                 self._closed = True

@@ -124,9 +124,9 @@ class Odometer:
         self._path.append((stamp_ns, speed_mps, believed[0]))
         while self._path[0][0] < stamp_ns - _PATH_NS:
             self._path.popleft()
-        stamps, told, seen = zip(*self._path, strict=True)
+        stamps, read, seen = zip(*self._path, strict=True)
         gaps_s = [max(b - a, 0) / 1e9 for a, b in pairwise(stamps)]
-        off_m = sum((a - b) * dt for a, b, dt in zip(told, seen, gaps_s, strict=False))
+        off_m = sum((a - b) * dt for a, b, dt in zip(read, seen, gaps_s, strict=False))
         way_m = sum(abs(b) * dt for b, dt in zip(seen, gaps_s, strict=False))
         long_enough = stamp_ns - stamps[0] > _PATH_NS / 2
         return long_enough and abs(off_m) < _PATH_M + _PATH_SHARE * way_m

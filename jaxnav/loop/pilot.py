@@ -105,18 +105,18 @@ class _Known(NamedTuple):
 
     @staticmethod
     def of(output: Output) -> "_Known":
-        told = vars(output)  # reading an attribute of an equinox module takes 1 us
-        command = vars(told["command"])
+        of_output = vars(output)  # reading an attribute of an equinox module takes 1 us
+        command = vars(of_output["command"])
         return _Known(
-            told["pose"],
-            told["pose_covariance"],
-            told["velocity"],
-            told["velocity_covariance"],
-            bool(told["located"]),
-            bool(told["decided"]),
-            bool(told["accepted"]),
-            float(told["nis"]),
-            float(told["gate_nis"]),
+            of_output["pose"],
+            of_output["pose_covariance"],
+            of_output["velocity"],
+            of_output["velocity_covariance"],
+            bool(of_output["located"]),
+            bool(of_output["decided"]),
+            bool(of_output["accepted"]),
+            float(of_output["nis"]),
+            float(of_output["gate_nis"]),
             float(command["steering_rad"]),
             float(command["throttle"]),
         )
@@ -199,17 +199,17 @@ class Pilot:
         """Fuse an input, frames first. `now_ns` must not be less than in the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
         frames = [self._corrections.correct_frame(frame) for frame in given.frames]
-        told, stamp_ns, seen_faults = self._frames.check(frames, now_ns, self._frozen)
+        data, stamp_ns, seen_faults = self._frames.check(frames, now_ns, self._frozen)
         faults |= seen_faults
-        if told is not None:
-            told, self._hidden = self._outvoted.remove_outvoted(told)
+        if data is not None:
+            data, self._hidden = self._outvoted.remove_outvoted(data)
             if self._hidden:
                 faults |= Fault.MARKER_OUTVOTED
-        if told is not None:
-            outcome = self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
+        if data is not None:
+            outcome = self._fuse(data, stamp_ns, now_ns, faults, _NO_REJECT)
         if given.odometry is not None:
             return self._odometry(self._corrections.correct_reading(given.odometry), now_ns, faults)
-        return outcome if told is not None else self._tick(now_ns, faults)
+        return outcome if data is not None else self._tick(now_ns, faults)
 
     def _odometry(self, reading: Odometry, now_ns: int, faults: Fault) -> Outcome:
         jumps = self._odometry_stamps.jumps
@@ -249,17 +249,17 @@ class Pilot:
             )
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
         self._standstill.add_believed(stamp_ns, now_ns, reading.speed_mps, reading.steering_rad)
-        told = EventData(odometry=(reading.speed_mps, reading.steering_rad))
-        return self._fuse(told, stamp_ns, now_ns, faults, _NO_REJECT)
+        data = EventData(odometry=(reading.speed_mps, reading.steering_rad))
+        return self._fuse(data, stamp_ns, now_ns, faults, _NO_REJECT)
 
     def _tick(self, now_ns: int, faults: Fault, rejects: Reject = _NO_REJECT) -> Outcome:
         return self._fuse(None, now_ns, now_ns, faults, rejects)
 
     def _fuse(
-        self, told: EventData | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
+        self, data: EventData | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
     ) -> Outcome:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
-        fused = self._estimator.fuse(told, stamp_ns, now_ns, elapsed_ns)
+        fused = self._estimator.fuse(data, stamp_ns, now_ns, elapsed_ns)
         known = _Known.of(fused.output)
         finite = known.is_finite
         if not finite:
@@ -267,7 +267,7 @@ class Pilot:
             self._begin_anew("the estimate was no number")
         if fused.refused:
             rejects |= Reject.TOO_LATE
-        if told is not None and told.corners_px is not None and fused.refused:
+        if data is not None and data.corners_px is not None and fused.refused:
             self._frames.forget_last()
         restarts = self._restarts_before + int(fused.belief.restarts)
         if finite and restarts > self._restarts:
@@ -277,8 +277,8 @@ class Pilot:
             self._restarts_ns.append(now_ns)
             self._support.note_restart()
         outvoted: tuple[int, ...] = ()
-        if told is not None and told.corners_px is not None and not fused.refused:
-            outvoted = self._outvoted.count(told, np.asarray(fused.output.outvoted))
+        if data is not None and data.corners_px is not None and not fused.refused:
+            outvoted = self._outvoted.count(data, np.asarray(fused.output.outvoted))
             if outvoted:
                 faults |= Fault.MARKER_OUTVOTED
             rejects |= self._judge(known, fused.belief, stamp_ns, now_ns)
@@ -301,7 +301,7 @@ class Pilot:
             throttle,
             output,
             fused.belief,
-            told,
+            data,
             stamp_ns,
             self._restarts,
             self._restart_reason,
@@ -357,7 +357,7 @@ class Pilot:
         for covariance in covariances:
             covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
         honest: Output = eqx.tree_at(
-            lambda told: (told.decided, told.pose_covariance, told.covariance),
+            lambda output: (output.decided, output.pose_covariance, output.covariance),
             output,
             (np.asarray(False), *covariances),
         )

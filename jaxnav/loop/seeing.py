@@ -224,7 +224,7 @@ class Eyes:
                         self._frames[index] = frame
                         self._waiting.notify()
         except Exception as error:  # its meaning is unknown: the vehicle stops
-            self._guard.trip(f"{name}: {_told(error)}")
+            self._guard.trip(f"{name}: {_error_text(error)}")
         finally:
             self._guard.leave(name)
 
@@ -247,7 +247,7 @@ class Eyes:
                     self._seen.append(seen)
                     self._woken.notify()
         except Exception as error:
-            self._guard.trip(f"{name}: {_told(error)}")
+            self._guard.trip(f"{name}: {_error_text(error)}")
         finally:
             self._guard.leave(name)
 
@@ -267,7 +267,7 @@ class Eyes:
         return None
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 

@@ -47,7 +47,7 @@ class Signals:
         self._seen = threading.Event()  # set when the main thread has noticed the signal
         self._came = threading.Event()
         self._closed = threading.Event()
-        self._told: list[Callable[[str], None]] = []
+        self._listeners: list[Callable[[str], None]] = []
         self._lock = threading.Lock()
         self._before: dict[int, Any] = {}
         self._pipe: tuple[int, int] | None = None
@@ -106,7 +106,7 @@ class Signals:
         A thread of its own calls it, also while the main thread is inside a library.
         """
         with self._lock:
-            self._told.append(tell)
+            self._listeners.append(tell)
             name = self.name
         if name is not None:
             tell(name)
@@ -161,8 +161,8 @@ class Signals:
 
     def _tell(self) -> None:
         with self._lock:
-            told = list(self._told)
-        for tell in told:
+            listeners = list(self._listeners)
+        for tell in listeners:
             with suppress(Exception):  # one that fails must not keep the others from being called
                 tell(self.name or "")
 

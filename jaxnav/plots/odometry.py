@@ -22,15 +22,17 @@ def odometry_report(
         figures: the lines of a table.
     """
     figure = Figure(figsize=(11, 8), layout="constrained")
-    (drive, residuals), (told, readings) = figure.subplots(2, 2)
+    (drive, residuals), (text_axes, readings) = figure.subplots(2, 2)
     _draw_drive(drive, found, corners_world_m)
     _draw_residuals(residuals, found)
     _draw_readings(readings, found)
-    told.axis("off")
-    told.text(0, 1, figures, family="monospace", fontsize=9, va="top", transform=told.transAxes)
+    text_axes.axis("off")
+    text_axes.text(
+        0, 1, figures, family="monospace", fontsize=9, va="top", transform=text_axes.transAxes
+    )
     advice = "\n".join(textwrap.fill(sentence, 62) for sentence in found.advice)
-    told.text(0, 0.55, f"What to drive next\n{advice}", fontsize=9, va="top",
-              transform=told.transAxes)  # fmt: skip
+    text_axes.text(0, 0.55, f"What to drive next\n{advice}", fontsize=9, va="top",
+              transform=text_axes.transAxes)  # fmt: skip
     return figure
 
 

@@ -66,7 +66,7 @@ class DriveLog:
                     yield RecordedImage(record.topic, record.stamp_ns, message.data)
 
 
-def read_drive(path: str | Path, told: Callable[[int], object] = lambda size: None) -> DriveLog:
+def read_drive(path: str | Path, progress: Callable[[int], object] = lambda size: None) -> DriveLog:
     """Read a file of `Recorder`, to its end or as far as it goes.
 
     Args:
@@ -76,14 +76,14 @@ def read_drive(path: str | Path, told: Callable[[int], object] = lambda size: No
         BadInput: one line naming file and topic: not such a file, of a newer format, or damaged.
     """
     with _uncollected():
-        return _read(Path(path), told)
+        return _read(Path(path), progress)
 
 
 def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
     header: dict[str, Any] | None = None
     inputs: list[Input] = []
     # Values, not message objects: those take four times the memory.
-    told: dict[str, list[Any]] = {name: [] for name in COLUMNS}
+    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     detections = 0
     gaps = _Gaps()
     records = McapMessages(path, told_bytes)
@@ -94,11 +94,11 @@ def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
             continue
         gaps.count(record)
         if record.topic in MESSAGES:
-            index = len(told["now_ns"] if record.topic == OUTCOME else inputs)
+            index = len(columns["now_ns"] if record.topic == OUTCOME else inputs)
             message = _message(record, path, index)
             if isinstance(message, OutcomeMessage):
                 for name, value in vars(message).items():
-                    told[name].append(value)
+                    columns[name].append(value)
                 continue
             inputs.append(input_of(message))
             found = (frame.detections for frame in inputs[-1].frames)
@@ -109,7 +109,7 @@ def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
     if header is None:
         problem = "is cut off before its header" if records.truncated else "is no recorded drive"
         raise BadInput(path, problem)
-    table = Outcomes.of_values(told, f"{path}: {OUTCOME}")
+    table = Outcomes.of_values(columns, f"{path}: {OUTCOME}")
     return DriveLog(path, header, tuple(inputs), table, gaps.missing, records.truncated)
 
 

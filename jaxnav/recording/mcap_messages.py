@@ -69,13 +69,13 @@ class McapMessages:
         truncated: after the last item, whether the file lacks its end.
     """
 
-    def __init__(self, path: Path, told: Callable[[int], object] = lambda size: None):
+    def __init__(self, path: Path, progress: Callable[[int], object] = lambda size: None):
         """Args:
         told: called with the size in bytes of each piece that was read.
         """
         self.path = path
         self.truncated = True
-        self._told = told
+        self._progress = progress
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._messages = 0
@@ -100,7 +100,7 @@ class McapMessages:
             raise BadInput(self.path, problem) from None
 
     def _read(self, file: IO[bytes]) -> Iterator[Metadata | RecordedMessage]:
-        bounded = cast(IO[bytes], _Bounded(file, self._told))
+        bounded = cast(IO[bytes], _Bounded(file, self._progress))
         reader = _Reader(
             bounded, emit_chunks=True, validate_crcs=True, record_size_limit=limits.CHUNK_BYTES
         )
@@ -155,8 +155,8 @@ class _CutOff(Exception):
 class _Bounded:
     """A file whose `read` returns all requested bytes, or raises `_CutOff`."""
 
-    def __init__(self, file: IO[bytes], told: Callable[[int], object]):
-        self._file, self._told, self._begun = file, told, False
+    def __init__(self, file: IO[bytes], progress: Callable[[int], object]):
+        self._file, self._progress, self._begun = file, progress, False
 
     def read(self, size: int) -> bytes:
         if size > limits.CHUNK_BYTES:
@@ -165,7 +165,7 @@ class _Bounded:
         if len(data) < size:
             raise _CutOff(self._begun)
         self._begun = True
-        self._told(size)
+        self._progress(size)
         return data
 
 

@@ -98,9 +98,9 @@ def _sighted(message: SightedMessage) -> FrameDetections:
 def digest(outcome: Outcome) -> str:
     """The digest of an outcome's belief and command: drives with the same digests are the same."""
     output = outcome.output
-    told = (outcome.belief, output.pose, output.covariance, output.command)
+    numbers = (outcome.belief, output.pose, output.covariance, output.command)
     state = hashlib.blake2b(digest_size=8)
-    for leaf in jax.tree.leaves(told):
+    for leaf in jax.tree.leaves(numbers):
         state.update(leaf.tobytes())
     state.update(struct.pack("<2d", outcome.steering_rad, outcome.throttle))
     return state.hexdigest()

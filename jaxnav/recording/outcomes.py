@@ -250,8 +250,8 @@ class OutcomeMessage(Entry):
 
     @model_validator(mode="after")
     def _is_whole(self) -> "OutcomeMessage":
-        told = vars(self)
-        missing = sum(told[name] is None for name in REPORTED)
+        columns = vars(self)
+        missing = sum(columns[name] is None for name in REPORTED)
         if 0 < missing < len(REPORTED):
             raise ValueError(f"must have all of {', '.join(REPORTED)}, or none")
         return self

@@ -284,9 +284,9 @@ def _judged(
     no_pose = jnp.where(jnp.any(candidates.valid), DECLINED, INVALID)
     outcome = jnp.where(selected >= 0, outcome, no_pose)
     outcome = jnp.where(jnp.any(visible), outcome, UNSEEN)
-    told = (selected >= 0) & jnp.any(visible)
+    is_selected = (selected >= 0) & jnp.any(visible)
     return {"outcome": outcome.astype(jnp.int8)} | {
-        name: jnp.where(told, number, jnp.nan) for name, number in measured.items()
+        name: jnp.where(is_selected, number, jnp.nan) for name, number in measured.items()
     }
 
 

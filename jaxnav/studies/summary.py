@@ -187,10 +187,12 @@ class _Reliability:
                 self._trials[name][(*index, span)].values.reshape(-1, selectors, _length(span))
                 for name in (self._schema.predicted, rate.variable)
             )
-            told = np.isin(outcome, [codes.index(o) for o in rate.among]) & np.isfinite(predicted)
+            counted = np.isin(outcome, [codes.index(o) for o in rate.among]) & np.isfinite(
+                predicted
+            )
             happened = np.isin(outcome, [codes.index(o) for o in rate.of])
             for s in range(selectors):
-                p, h = predicted[:, s][told[:, s]], happened[:, s][told[:, s]]
+                p, h = predicted[:, s][counted[:, s]], happened[:, s][counted[:, s]]
                 bins = np.clip((p * RELIABILITY_BINS).astype(int), 0, RELIABILITY_BINS - 1)
                 for row, weights in enumerate((np.ones_like(p), p, h)):
                     self._sums[row, s] += np.bincount(bins, weights, RELIABILITY_BINS)

@@ -70,15 +70,15 @@ def follow(navigator: Navigator, start: Bank, recorded: FrameSequences) -> Filte
         P = after.bank.covariance[0, :d, :d]
         lives, worst = after.bank.initialised[0], jnp.asarray(jnp.inf, P.dtype)
 
-        def told(counts: Array, value: Array, otherwise: Array) -> Array:
+        def select(counts: Array, value: Array, otherwise: Array) -> Array:
             return jnp.where(counts, jnp.where(lives, value, otherwise), 0)
 
         judged = judged & used
         return after, FilterScores(
-            log_likelihood=told(used, estimate.log_likelihood, -worst),
-            log_score=told(judged, log_likelihood(error, P), -worst),
-            square_m2=told(judged, jnp.sum(error[: position_states(d)] ** 2), worst),
-            nees=told(judged, nees(error, P), worst),
+            log_likelihood=select(used, estimate.log_likelihood, -worst),
+            log_score=select(judged, log_likelihood(error, P), -worst),
+            square_m2=select(judged, jnp.sum(error[: position_states(d)] ** 2), worst),
+            nees=select(judged, nees(error, P), worst),
         )
 
     frames = (recorded.obs, recorded.used, recorded.T_world_vehicle_true, recorded.judged)

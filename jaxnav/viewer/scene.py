@@ -50,7 +50,7 @@ class RerunScene:
         self._names = () if rig is None else rig.names
         self._from_world = opposite(ZERO if markers is None else markers.origin_m)
         self._begin_ns: int | None = None
-        self._told = ""
+        self._shown_flags = ""
         self._last_m: np.ndarray | None = None
         self._still("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
         if rig is not None:
@@ -88,8 +88,8 @@ class RerunScene:
         self._show_numbers(outcomes, index)
         health = Health(outcomes.health[index])
         faults, rejects = Fault(int(outcomes.faults[index])), Reject(int(outcomes.rejects[index]))
-        if (text := " ".join([health.name, *names(faults), *names(rejects)])) != self._told:
-            self._told = text
+        if (text := " ".join([health.name, *names(faults), *names(rejects)])) != self._shown_flags:
+            self._shown_flags = text
             level = "INFO" if health <= Health.OK else "WARN"
             self._say("health", self._rerun.TextLog(text, level=level))
 

@@ -66,8 +66,8 @@ def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
         )
         squared = np.sum(padded * np.sum(np.asarray(held.residual_px) ** 2, axis=-1), axis=1)
         freedom = 2 * np.sum(padded > 0, axis=1) - 6
-        told = np.flatnonzero((fold[:count] == number) & (freedom[:count] > 0))
-        view_px[told] = np.sqrt(squared[told] / freedom[told])
+        rated = np.flatnonzero((fold[:count] == number) & (freedom[:count] > 0))
+        view_px[rated] = np.sqrt(squared[rated] / freedom[rated])
     return HeldOut(view_px, float(np.sqrt(np.nanmean(view_px**2))))
 
 

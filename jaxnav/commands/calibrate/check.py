@@ -43,7 +43,7 @@ def run(args: Arguments) -> int:
     calibrated = provenance(data, "check")
     report = summary(data, found, given, calibrated) | {
         "agreeing": check.agreeing,
-        "verdicts": {_name(data, i): _told(verdict) for i, verdict in check.verdicts.items()},
+        "verdicts": {_name(data, i): _as_json(verdict) for i, verdict in check.verdicts.items()},
     }
     write_files(out, data, found, calibrated, with_rig=False, all_found=True)
     write_json(out / "report.json", report)
@@ -66,7 +66,7 @@ def _name(data: RigData, index: int) -> str:
     return f"{family} {marker_id}"
 
 
-def _told(verdict: Verdict) -> dict[str, Any]:
+def _as_json(verdict: Verdict) -> dict[str, Any]:
     return {
         "right": verdict.right,
         "sightings": verdict.seen,
@@ -92,18 +92,18 @@ def _text(data: RigData, check: Check) -> str:
 
 
 def _sentences(data: RigData, index: int, verdict: Verdict) -> list[str]:
-    told = []
+    findings = []
     if verdict.wrong_size and verdict.size_m is not None:
-        told.append(
+        findings.append(
             f"is {verdict.size_m:.4g} m large, the map says {data.views.size_m[index]:.4g} m"
         )
     if verdict.moved_m:
-        told.append(f"moved by {verdict.moved_m:.3g} m while it was watched")
-    if verdict.apart_m is None and not told:
-        told.append(f"seen {verdict.seen} times, nothing links it to the others")
+        findings.append(f"moved by {verdict.moved_m:.3g} m while it was watched")
+    if verdict.apart_m is None and not findings:
+        findings.append(f"seen {verdict.seen} times, nothing links it to the others")
     if verdict.wrong and verdict.apart_m is not None and verdict.apart_rad is not None:
-        told.append(
+        findings.append(
             f"is {verdict.apart_m:.3g} m and {np.rad2deg(verdict.apart_rad):.3g} deg from where "
             "the map says: it has moved, or was entered wrongly"
         )
-    return told
+    return findings

@@ -50,10 +50,10 @@ def run(args: CalibrateConvert) -> int:
     if source.format == args.to:
         raise BadInput(args.source, f"is {args.to}'s already: nothing to convert")
     if source.markers:
-        told, left_out = _write_markers(args, source)
+        written, left_out = _write_markers(args, source)
     else:
-        told, left_out = _write_cameras(args, source)
-    for path, what in told.items():
+        written, left_out = _write_cameras(args, source)
+    for path, what in written.items():
         print(f"{visible(path)}: {what}")
     if left_out:
         print(f"not carried over: {', '.join(left_out)}")
@@ -96,19 +96,19 @@ def _write_markers(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, 
     markers, left_out = source.markers, list(source.left_out)
     count = f"{len(markers)} marker{'s' if len(markers) > 1 else ''}"
     if args.to == "jaxnav":
-        text, told = markers_text(markers), f"{count} of {markers[0].family}, "
-        told += f"{markers[0].size_m:g} m, as jaxnav's detectors see them"
+        text, figures = markers_text(markers), f"{count} of {markers[0].family}, "
+        figures += f"{markers[0].size_m:g} m, as jaxnav's detectors see them"
     else:
         length, width = args.field_size_m or wpilib.extent_m(markers)
         if min(length, width) <= 0:
             raise BadInput("--field-size-m", "missing: the map has no extent to take it from")
         text = wpilib.layout_text(markers, (length, width))
-        told = f"{count} on a field of {length:g} x {width:g} m"
+        figures = f"{count} on a field of {length:g} x {width:g} m"
         left_out.append(f"family {markers[0].family}")
         left_out.append(f"size_m {markers[0].size_m!r} (--marker-size-m on the way back)")
     _require_suffix(args.to, args.out)
     _write(args.source, {args.out: text})
-    return {args.out: told}, left_out
+    return {args.out: figures}, left_out
 
 
 def _write_cameras(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, str], list[str]]:
@@ -119,12 +119,12 @@ def _write_cameras(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, 
     if args.to in _MANY:
         _require_suffix(args.to, args.out)
         contents = {args.out: _MANY[args.to](cameras)}
-        told = {args.out: ", ".join(_told(camera) for camera in cameras)}
+        written = {args.out: ", ".join(_figures_text(camera) for camera in cameras)}
     else:
         write = _ONE[args.to]
         paths = _paths(args, cameras)
         contents = {path: write(camera) for path, camera in zip(paths, cameras, strict=True)}
-        told = {path: _told(camera) for path, camera in zip(paths, cameras, strict=True)}
+        written = {path: _figures_text(camera) for path, camera in zip(paths, cameras, strict=True)}
         placed = [camera.name for camera in cameras if camera.T_camera_vehicle is not None]
         if placed:
             left_out.append(f"where on the vehicle {', '.join(placed)} {_is(placed)}")
@@ -135,7 +135,7 @@ def _write_cameras(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, 
         if renamed and args.to == "photonvision":
             left_out.append(f"the name{'s' if len(renamed) > 1 else ''} {', '.join(renamed)}")
     _write(args.source, contents)
-    return told, left_out
+    return written, left_out
 
 
 def _chosen(args: CalibrateConvert, source: _Source) -> tuple[CameraFigures, ...]:
@@ -184,7 +184,7 @@ def _write(source: Path, contents: dict[Path, str]) -> None:
     atomic_write_all(contents)
 
 
-def _told(camera: CameraFigures) -> str:
+def _figures_text(camera: CameraFigures) -> str:
     width, height = camera.image_size_px
     return f"{camera.name} {width} x {height} {camera.lens}"
 

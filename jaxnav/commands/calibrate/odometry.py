@@ -112,6 +112,6 @@ def table(found: OdometryCalibration) -> str:
     lines = [f"{'':20}{'before':>10}{'found':>11}{'sigma':>10}"]
     for name in NAMES:
         sigma = found.sigma.get(name, math.nan)
-        told = f"{sigma:10.5f}" if name in found.sigma else f"{'kept':>10}"
-        lines.append(f"{name:20}{found.before[name]:10.4f}{found.value[name]:11.5f}{told}")
+        sigma_text = f"{sigma:10.5f}" if name in found.sigma else f"{'kept':>10}"
+        lines.append(f"{name:20}{found.before[name]:10.4f}{found.value[name]:11.5f}{sigma_text}")
     return "\n".join(lines)

@@ -242,50 +242,50 @@ def coverage(corners_px: np.ndarray, image_size_px: tuple[int, int]) -> float:
 
 def advice(data: RigData, found: RigCalibration, sigmas: np.ndarray) -> list[str]:
     """Advice in sentences: what to record next, and what to check."""
-    told = []
+    findings = []
     rows = data.views
     for c, name in enumerate(data.rig.names):
         count = int(np.sum(rows.camera == c))
         if not found.calibrated[c]:
-            told.append(
+            findings.append(
                 f"{name} saw {count} markers and nothing links it to the others: its place is as "
                 "given; turn on the spot between markers, so that it sees what others see"
             )
         elif sigmas[c, :3].max() > _WELL_M or sigmas[c, 3:].max() > _WELL_DEG:
-            told.append(
+            findings.append(
                 f"{name} is known to {1e3 * sigmas[c, :3].max():.0f} mm and "
                 f"{sigmas[c, 3:].max():.2f} deg: let it see markers from nearer, while others do"
             )
         seen = found.views.corners_px[found.views.camera == c]
         part = coverage(seen, data.rig.image_sizes_px[c])
         if found.calibrated[c] and part < _LITTLE_SEEN:
-            told.append(
+            findings.append(
                 f"{name} saw markers in {part:.0%} of its image: move them through all of it, for "
                 "a lens that is off shows elsewhere"
             )
     for m, (_, marker_id) in enumerate(data.keys):
         count = int(np.sum(rows.marker == m))
         if not found.mapped[m]:
-            told.append(
+            findings.append(
                 f"marker {marker_id} was seen {count} times and nothing links it to the known "
                 "ones: it is in no file; pass it with another marker in view of any camera"
             )
         elif count < _FEW_SIGHTINGS:
-            told.append(f"marker {marker_id} was seen {count} times only: pass it once more")
+            findings.append(f"marker {marker_id} was seen {count} times only: pass it once more")
     share = float(np.mean(found.weight < 1))
     if share > _MANY_OUTLIERS:
-        told.append(
+        findings.append(
             f"{share:.0%} of the sightings are outliers: did a marker move, are the lenses "
             "calibrated, are the cameras triggered together?"
         )
     if found.inflation > 1:
-        told.append(
+        findings.append(
             f"parts of the recording disagree {np.sqrt(found.inflation):.1f} times as far as their "
             "noise explains, and the sigmas are that much larger: the lenses, or markers that are "
             "not flat, are the likely cause: calibrate the lenses, or let them move with "
             "--refine-lenses"
         )
-    return told
+    return findings
 
 
 def text(report: dict[str, Any]) -> str:

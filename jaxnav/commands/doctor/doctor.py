@@ -131,8 +131,10 @@ def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
             waypoint_radius_m=patient.route.waypoint_radius_m,
         )
         asked: list[tuple[Any, ...]] = []  # with what the estimator would call it
-        Estimator(navigator, program=lambda *told: asked.append(told)).warm_up()  # type: ignore
-        return all(is_compiled(advance_packed, navigator, folder, *told) for told in asked)
+        Estimator(navigator, program=lambda *arguments: asked.append(arguments)).warm_up()  # type: ignore
+        return all(
+            is_compiled(advance_packed, navigator, folder, *arguments) for arguments in asked
+        )
 
 
 def _pictures(args: Doctor, patient: SimpleNamespace) -> Iterable[Finding]:

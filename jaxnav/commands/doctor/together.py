@@ -49,11 +49,11 @@ def together(seen: Sighted, poses: Sequence[StandingFit], route: Route | None) -
             "calibrate the lenses, then measure the cameras' places and the markers' corners again",
         )
         return
-    told = " or ".join(in_words(seen, each)[0] for each in best)
+    ways = " or ".join(in_words(seen, each)[0] for each in best)
     yield Finding(
         "picture",
         "error",
-        f"{text}; {best[0].fit.error_px:.2f} if {told}",
+        f"{text}; {best[0].fit.error_px:.2f} if {ways}",
         in_words(seen, best[0])[1],
     )
 

@@ -34,13 +34,13 @@ def run(args: Faults) -> int:
             results.append(run_trial(row, trial))
             tqdm.write(line(results[-1]))
     if args.json is not None:
-        write_json(args.json, {"faults": [_told(result) for result in results]})
+        write_json(args.json, {"faults": [_as_json(result) for result in results]})
     broken = sum(bool(result.broken) for result in results)
     print(f"{len(results) - broken} of {len(results)} faults came to what they must")
     return EXIT_BROKEN if broken else 0
 
 
-def _told(result: Result) -> dict[str, object]:
+def _as_json(result: Result) -> dict[str, object]:
     return {
         "fault": result.row.name,
         "seen": [*names(result.faults), *names(result.rejects)],

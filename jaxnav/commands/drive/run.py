@@ -59,7 +59,7 @@ def run(args: Run, signals: Signals) -> int:
         params = load_params(args.params)
         setup = setup.with_params(params)
         _say(args, params.describe())
-    told = Setup(
+    vehicle_setup = Setup(
         setup.rig, setup.markers, setup.vehicle, setup.route_on_map.start_pose, args.seed, options
     )
     with ExitStack() as closing:
@@ -72,7 +72,7 @@ def run(args: Run, signals: Signals) -> int:
         signals.check()
         pilot = _compiled(args, setup, searches)
         signals.check()
-        drive = _Drive(args, told, guarding, signals)
+        drive = _Drive(args, vehicle_setup, guarding, signals)
         reason = drive.run(pilot, searches, onlookers)
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
@@ -165,13 +165,13 @@ class _Drive:
     kept_by = ""
     unheard: str | None = None
 
-    def __init__(self, args: Run, told: Setup, guarding: GuardProcess | None, signals: Signals):
+    def __init__(self, args: Run, setup: Setup, guarding: GuardProcess | None, signals: Signals):
         """Open nothing yet.
 
         Args:
             guarding: the process for the vehicle; None keeps it in this one.
         """
-        self._args, self._told, self._guarding, self._signals = args, told, guarding, signals
+        self._args, self._setup, self._guarding, self._signals = args, setup, guarding, signals
 
     def run(self, pilot: Pilot, searches: list[Search], onlookers: Sequence[Observer]) -> str:
         """Open, drive, stop and close; return why the drive ended."""
@@ -185,7 +185,7 @@ class _Drive:
             closing.callback(self._close, vehicle, guard)
             signals.on_signal(guard.trip)
             signals.check()
-            cameras = plugins.open_cameras(args.cameras or args.vehicle, self._told, vehicle)
+            cameras = plugins.open_cameras(args.cameras or args.vehicle, self._setup, vehicle)
             self.eyes = Eyes(cameras, searches, guard, workers=max(1, os.cpu_count() or 1))
             closing.callback(self.eyes.close)
             # The guard trips before the eyes are closed, which their threads may delay.
@@ -198,7 +198,7 @@ class _Drive:
         """The vehicle, in a process of its own where possible, and the guard of this process."""
         args, why = self._args, "it shares its process"
         if self._guarding is not None:
-            moved = self._guarding.open(self._told, limits, args.timeout_s, self._signals.check)
+            moved = self._guarding.open(self._setup, limits, args.timeout_s, self._signals.check)
             if moved is not None:
                 guard = Guard(moved, limits, args.timeout_s)
                 moved.watch(guard.trip)
@@ -208,8 +208,8 @@ class _Drive:
             why = self._guarding.stays or why
         self.kept_by = f"a thread, {args.vehicle} can't be moved to another process: {why}"
         _say(args, f"guard: {self.kept_by}")
-        vehicle = plugins.open_vehicle(args.vehicle, self._told)
-        corrections = Corrections.of(self._told.vehicle)
+        vehicle = plugins.open_vehicle(args.vehicle, self._setup)
+        corrections = Corrections.of(self._setup.vehicle)
         return vehicle, Guard(vehicle, limits, args.timeout_s, corrections=corrections)
 
     def _close(self, vehicle: Vehicle, guard: Guard) -> None:

@@ -74,14 +74,16 @@ def notice(outcome: Outcome, before: Fault) -> str | None:
         before: the faults of the outcome before.
     """
     new = outcome.faults & ~before
-    told = []
+    reasons = []
     if Fault.RELOCATED in new:
-        told.append(f"not where its wheels can have brought it: {outcome.restart_reason}")
+        reasons.append(f"not where its wheels can have brought it: {outcome.restart_reason}")
     if Fault.WAYS_DISPUTED in new:
-        told.append("corners and odometer tell of different ways: a marker moves, or wheels slip")
+        reasons.append(
+            "corners and odometer tell of different ways: a marker moves, or wheels slip"
+        )
     if Fault.ODOMETRY_DOUBTFUL in new:
-        told.append("no marker in view, and the odometer contradicts the throttle")
+        reasons.append("no marker in view, and the odometer contradicts the throttle")
     if Fault.MARKER_OUTVOTED in new and outcome.outvoted:
         ids = ", ".join(map(str, outcome.outvoted))
-        told.append(f"marker {ids} is not where the others say: left out")
-    return "; ".join(told) or None
+        reasons.append(f"marker {ids} is not where the others say: left out")
+    return "; ".join(reasons) or None

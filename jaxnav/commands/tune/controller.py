@@ -70,7 +70,7 @@ def run(args: Arguments) -> int:
         fit,
         {name: known[name] for name in space.free},
         space.values(fit.best_x),
-        {name: (_told(before), _told(after)) for name, (before, after) in found.items()},
+        {name: (_as_json(before), _as_json(after)) for name, (before, after) in found.items()},
     )
     write_json(out / "summary.json", summary)
     save_figure(controller_report(fit, space, found), out / "report.png")
@@ -219,7 +219,7 @@ def _keys(first: int, count: int) -> Key[Array, " S"]:
     return keys
 
 
-def _told(tested: ControllerTest) -> dict[str, Any]:
+def _as_json(tested: ControllerTest) -> dict[str, Any]:
     return {
         "loss": measure(tested.loss),
         "parts": tested.parts,

@@ -110,7 +110,7 @@ def believed_events(
 
     Sightings by several cameras at one instant are one event.
     """
-    events = sorted(_told(inputs, setup, refused_ns), key=_order)
+    events = sorted(_read_events(inputs, setup, refused_ns), key=_order)
     merged: list[Event] = []
     for event in events:
         if merged and (both := _both(merged[-1], event)):
@@ -120,16 +120,16 @@ def believed_events(
     return merged
 
 
-def _told(
+def _read_events(
     inputs: Sequence[Input], setup: DriveSetup, refused_ns: Collection[int]
 ) -> Iterator[Event]:
     """Events of the inputs that `Pilot.handle` would believe, without an estimate."""
     frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     stamps = Stamps()
     for given in inputs:
-        told, told_ns, _ = frames.check(given.frames, given.now_ns)
-        if told is not None:
-            yield Event(told_ns, told)
+        data, data_ns, _ = frames.check(given.frames, given.now_ns)
+        if data is not None:
+            yield Event(data_ns, data)
         reading = given.odometry
         if reading is None:
             continue
@@ -157,12 +157,12 @@ def _both(one: Event, other: Event) -> Event | None:
     assert a.sigma_px is not None
     assert b.sigma_px is not None
     there = np.any(b.visible, axis=1)[:, None]
-    told = EventData(
+    data = EventData(
         corners_px=np.where(there[..., None, None], b.corners_px, a.corners_px),
         visible=a.visible | b.visible,
         sigma_px=np.where(there[..., None], b.sigma_px, a.sigma_px),
     )
-    return Event(one.stamp_ns, told)
+    return Event(one.stamp_ns, data)
 
 
 class _Rows(NamedTuple):
@@ -188,13 +188,13 @@ class _Rows(NamedTuple):
             sigma_px=np.ones((*lanes, 4)),
         )
         odometry = (0.0, 0.0)
-        for index, (_, told) in enumerate(events):
-            odometry = told.odometry or odometry
+        for index, (_, data) in enumerate(events):
+            odometry = data.odometry or odometry
             rows.odometry[index] = odometry
-            if told.corners_px is not None:
-                rows.corners_px[index] = told.corners_px
-                rows.visible[index] = told.visible
-                rows.sigma_px[index] = told.sigma_px
+            if data.corners_px is not None:
+                rows.corners_px[index] = data.corners_px
+                rows.visible[index] = data.visible
+                rows.sigma_px[index] = data.sigma_px
         return rows
 
 

@@ -57,7 +57,7 @@ def run(args: Arguments) -> int:
         fit,
         space.values(space.start),
         space.values(fit.best_x),
-        {name: (_told(before), _told(after)) for name, (before, after) in found.items()},
+        {name: (_as_json(before), _as_json(after)) for name, (before, after) in found.items()},
     )
     write_json(out / "summary.json", summary)
     save_figure(tuning_report(fit, space, found), out / "report.png")
@@ -177,7 +177,7 @@ def _test(
     )
 
 
-def _told(tested: FilterTest) -> dict[str, Any]:
+def _as_json(tested: FilterTest) -> dict[str, Any]:
     return {
         "position_median_m": float(np.median(tested.error_m)),
         "position_rmse_m": measure(tested.rmse_m),

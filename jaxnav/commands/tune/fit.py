@@ -31,13 +31,13 @@ _OF_THE_REPORT = ("out", "headless", "test", "test_seeds")
 
 def plain_key(command: str, args: Any) -> dict[str, Any]:
     """All that a result depends on, as plain values: command, arguments, versions."""
-    told = {
+    settings = {
         name: plain_data(value)
         for name, value in dataclasses.asdict(args).items()
         if name not in _OF_THE_REPORT
     }
     versions = {name: version(name) for name in ("jaxnav", "jax", "optimistix", "optax")}
-    return {"command": command} | told | {"versions": versions}
+    return {"command": command} | settings | {"versions": versions}
 
 
 def summary_of(
@@ -93,11 +93,11 @@ class Fitting:
         problem: Problem,
         space: Space,
         prior_sigma: float = np.inf,
-        told: Callable[[str], object] = print,
+        report: Callable[[str], object] = print,
         named: Collection[str] | None = None,
     ):
         self._folder, self._key, self._problem = folder, key, problem
-        self._space, self._prior_sigma, self._told = space, prior_sigma, told
+        self._space, self._prior_sigma, self._report = space, prior_sigma, report
         self._named = set(space.labels if named is None else named)
 
     @property
@@ -121,7 +121,7 @@ class Fitting:
         kept = self._kept(fit)
         if kept is not None:
             fit = kept
-            self._told(f"{self.checkpoint}: going on after step {fit.step}")
+            self._report(f"{self.checkpoint}: going on after step {fit.step}")
         with tqdm(
             total=self._problem.steps, initial=fit.step, unit="step", disable=headless
         ) as bar:
@@ -132,7 +132,7 @@ class Fitting:
                     self._refuse_without_gradient(fit)
                 if not bool(fit.descent.finite):
                     bar.clear()
-                    self._told(self._where(before, fit.descent.asked_x))
+                    self._report(self._where(before, fit.descent.asked_x))
                 # Losses can't be compared here: another stage has other ones.
                 if fit.step == 1 or bool(jnp.any(fit.best_x != before.best_x)):
                     self.write(fit)

@@ -170,5 +170,5 @@ class CalibrateOdometry(Headless):
         require(bool(self.recordings), "RECORDING", "names no recording")
         if self.wheelbase_sigma_m is not None:
             require_within("--wheelbase-sigma-m", self.wheelbase_sigma_m, "size_m")
-            told = "goes with a wheelbase that is looked for: leave it out of --fix"
-            require("wheelbase_m" not in self.fix, "--wheelbase-sigma-m", told)
+            problem = "goes with a wheelbase that is looked for: leave it out of --fix"
+            require("wheelbase_m" not in self.fix, "--wheelbase-sigma-m", problem)
