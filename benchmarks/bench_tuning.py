@@ -273,7 +273,7 @@ def _filter_loss(seeds: int) -> tuple[Any, Any, Any]:
     space = space_of(args, with_parameters(data.navigator, values), data.learned)
     cost = FilterCost(data.navigator, space, "likelihood")
     right = space_of(args, data.navigator, data.learned)
-    return Objective(cost), cost.batch(right.start, data.learned), space.start
+    return Objective(cost), cost.batches(right.start, data.learned)[0], space.start
 
 
 if __name__ == "__main__":
