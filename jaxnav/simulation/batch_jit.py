@@ -8,7 +8,7 @@ import equinox as eqx
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_jit = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
+jit_with = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
 _LEVEL = "xla_backend_optimization_level"
 # What the user sets in $XLA_FLAGS has precedence.
 _OPTIONS = {} if f"--{_LEVEL}=" in os.environ.get("XLA_FLAGS", "") else {_LEVEL: 1}
@@ -20,4 +20,4 @@ def batch_jit(function: Function) -> Function:
     They take a third of the time to compile a batch of drives, which runs 1.26 times as long
     without them (`benchmarks/README-simulate.md`).
     """
-    return cast(Function, _jit(function, compiler_options=_OPTIONS))
+    return cast(Function, jit_with(function, compiler_options=_OPTIONS))

@@ -7,7 +7,7 @@ without its images. The car of a finished drive stands still, and its frames are
 import dataclasses
 import os
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ from jaxnav.models.geometry import T_world_vehicle_from_planar, safe_norm, wrap_
 from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.observation import Observation
+from jaxnav.simulation.batch_jit import jit_with
 from jaxnav.simulation.corners import see
 from jaxnav.simulation.drive import PASSED_M
 from jaxnav.simulation.plant import CarState, move_through, read_odometry
@@ -32,7 +33,6 @@ from jaxnav.simulation.single_frames import directions
 from jaxnav.simulation.traces import DriveTraces
 from jaxnav.simulation.world import DriveState, Spread, nominal
 
-_jit = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
 _SUBSTEPS = 4  # for each of the two parts of a frame period
 
 
@@ -134,7 +134,7 @@ class Rollout(eqx.Module):
         )(worlds)
         return advanced
 
-    @_jit(compiler_options=COMPILER_OPTIONS)
+    @jit_with(compiler_options=COMPILER_OPTIONS)
     def _advance_many(self, worlds: DriveState, keep: Keep) -> tuple[DriveState, tuple[Trace, Any]]:
         """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
         step = step_by_regime(self.navigator)

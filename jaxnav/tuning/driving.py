@@ -15,7 +15,7 @@ and a lane whose drive has ended takes the next one.
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Key
 from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
 from jaxnav.navigator import Step
 from jaxnav.parameters import with_parameters
+from jaxnav.simulation.batch_jit import jit_with
 from jaxnav.simulation.queue import run_lanes
 from jaxnav.simulation.regimes import step_by_regime
 from jaxnav.simulation.rollout import Rollout, Trace
@@ -34,8 +35,6 @@ from jaxnav.simulation.world import DriveState
 from jaxnav.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss, no_costs
 from jaxnav.tuning.soft_switch import soften_switch
 from jaxnav.tuning.unconstrained import Space
-
-_jit = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
 
 
 class DriveSlopes(eqx.Module):
@@ -155,7 +154,7 @@ class ClosedLoop(eqx.Module):
         )
         return drives, _sums(drives)
 
-    @_jit(compiler_options=COMPILER_OPTIONS)
+    @jit_with(compiler_options=COMPILER_OPTIONS)
     def _advance_many(self, x: Array, space: Space, drives: DriveSlopes) -> tuple[DriveSlopes, Any]:
         """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
 
