@@ -44,9 +44,10 @@ def optional(
     """How help shows an option that may be left out.
 
     Args:
+        metavar: the value's name in the help.
         without: what is then.
         constructor: of the value, where the word None is none.
-        told: the help, where the field has none of its own.
+        help_text: the help, where the field has none of its own.
     """
     return tyro.conf.arg(
         metavar=metavar, help_behavior_hint=without, constructor=constructor, help=help_text

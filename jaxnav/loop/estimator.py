@@ -98,7 +98,7 @@ class Estimator:
         """Fuse an event, or only predict to the present.
 
         Args:
-            told: the event's data; None to predict only.
+            data: the event's data; None to predict only.
             stamp_ns: timestamp of the event.
             now_ns: time of the returned pose and command.
             elapsed_ns: time since the last command.

@@ -70,7 +70,7 @@ def read_drive(path: str | Path, progress: Callable[[int], object] = lambda size
     """Read a file of `Recorder`, to its end or as far as it goes.
 
     Args:
-        told: called with the size in bytes of each piece that was read; for a progress bar.
+        progress: called with the size in bytes of each piece that was read; for a progress bar.
 
     Raises:
         BadInput: one line naming file and topic: not such a file, of a newer format, or damaged.
@@ -79,14 +79,14 @@ def read_drive(path: str | Path, progress: Callable[[int], object] = lambda size
         return _read(Path(path), progress)
 
 
-def _read(path: Path, told_bytes: Callable[[int], object]) -> DriveLog:
+def _read(path: Path, progress: Callable[[int], object]) -> DriveLog:
     header: dict[str, Any] | None = None
     inputs: list[Input] = []
     # Values, not message objects: those take four times the memory.
     columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     detections = 0
     gaps = _Gaps()
-    records = McapMessages(path, told_bytes)
+    records = McapMessages(path, progress)
     for record in records:
         if isinstance(record, Metadata):
             if record.name == HEADER and header is None:

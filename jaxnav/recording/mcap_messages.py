@@ -71,7 +71,7 @@ class McapMessages:
 
     def __init__(self, path: Path, progress: Callable[[int], object] = lambda size: None):
         """Args:
-        told: called with the size in bytes of each piece that was read.
+        progress: called with the size in bytes of each piece that was read.
         """
         self.path = path
         self.truncated = True
