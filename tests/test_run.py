@@ -289,6 +289,22 @@ def test_a_start_that_is_called_off_opens_nothing(workplace, tmp_path, after_s):
         assert list(tmp_path.iterdir()) == [record]
 
 
+def test_a_start_that_is_called_off_while_it_compiles_leaves_no_part_of_a_recording(
+    workplace, tmp_path
+):
+    record = tmp_path / "drive.mcap"
+    cold = workplace.environment() | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    process = subprocess.Popen(workplace.driving(tmp_path / "told", record), env=cold)
+    with process:
+        while process.poll() is None and not list(tmp_path.glob(".*.part")):
+            time.sleep(0.002)
+        time.sleep(0.5)  # the main thread compiles by then, and compiles on
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
+    assert process.returncode in (-signal.SIGINT, 128 + signal.SIGINT)
+    assert not list(tmp_path.glob("*drive*"))
+
+
 def test_of_a_drive_that_is_killed_the_recording_lacks_less_than_the_last_second(
     workplace, tmp_path
 ):

@@ -12,6 +12,7 @@ library's callback, which swallows it. This handler raises nothing and loses no 
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from types import FrameType, TracebackType
@@ -22,6 +23,7 @@ from typing import Any
 _NAMES = "SIGINT SIGTERM SIGHUP SIGQUIT SIGTSTP SIGUSR1 SIGUSR2 SIGALRM SIGVTALRM SIGPROF SIGXCPU"
 _BY_HAND = ("SIGINT", "SIGTERM", "SIGQUIT", "SIGTSTP")  # taken over from any other handler
 _LEAVES_S = 1.0  # after a signal, while nothing moves and the main thread compiles or imports
+_FINISHES_S = 0.5  # for what must be finished before the process is ended
 _ENDS_S = 60.0  # after a signal, while a vehicle is open: longer than closing it may take
 EXIT = 128  # plus the signal's number, as shells report it
 
@@ -48,6 +50,7 @@ class Signals:
         self._came = threading.Event()
         self._closed = threading.Event()
         self._listeners: list[Callable[[str], None]] = []
+        self._finishes: list[Callable[[], object]] = [_say_interrupted]
         self._lock = threading.Lock()
         self._before: dict[int, Any] = {}
         self._pipe: tuple[int, int] | None = None
@@ -110,6 +113,13 @@ class Signals:
             name = self.name
         if name is not None:
             tell(name)
+
+    def before_leaving(self, finish: Callable[[], object]) -> None:
+        """Call a function before the process is ended whose main thread does not answer.
+
+        A thread of its own calls it and may be cut off after half a second.
+        """
+        self._finishes.append(finish)
 
     def ignore(self) -> None:
         """Ignore further signals: all is closed and the process ends."""
@@ -177,9 +187,12 @@ class Signals:
     def _exit(self) -> None:
         if self._closed.is_set():
             return
-        said = threading.Thread(target=_say_interrupted, daemon=True)
-        said.start()
-        said.join(0.2)  # a terminal that is stuck must not hold up the end
+        threads = [threading.Thread(target=finish, daemon=True) for finish in self._finishes]
+        for thread in threads:
+            thread.start()
+        until_s = time.monotonic() + _FINISHES_S
+        for thread in threads:  # neither a stuck terminal nor a stuck disk holds up the end
+            thread.join(max(0.0, until_s - time.monotonic()))
         os._exit(self.exit_code or EXIT)
 
 

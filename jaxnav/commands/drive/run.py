@@ -69,6 +69,8 @@ def run(args: Run, signals: Signals) -> int:
             guarding.prepare(signals.check)  # its errors are reported before anything is compiled
         searches = _searches(args, setup)
         onlookers = open_onlookers(args, setup, closing)
+        for onlooker in onlookers:
+            signals.before_leaving(onlooker.close)
         signals.check()
         pilot = _compiled(args, setup, searches)
         signals.check()
