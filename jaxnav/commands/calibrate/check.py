@@ -9,7 +9,7 @@ from jaxnav.calibration.rigs.marker_check import Check, Verdict, checked
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.calibration.rigs.vehicle_frame import moved_world
 from jaxnav.commands.calibrate.arguments.recordings import CalibrateCheck as Arguments
-from jaxnav.commands.calibrate.data import RigData, gathered
+from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import provenance, summary, write_files
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
@@ -23,7 +23,7 @@ EXIT_WRONG = 1
 def run(args: Arguments) -> int:
     """Compare the map with the recordings, write a report, name wrong markers; 1 if there are."""
     configure_jax(float64=True)
-    data = gathered(
+    data = read_rig_data(
         args.recordings, args.rig, args.markers_file, None, args.family, only_known=True
     )
     if len(data.known) < 2:
@@ -34,23 +34,28 @@ def run(args: Arguments) -> int:
     counts = np.bincount(data.views.marker, minlength=len(data.keys))
     anchor = max(data.known, key=lambda index: int(counts[index]))
     given = Ts_vehicle_camera(data.rig)
-    found = calibrate_rig(data.views, data.rig, {anchor: data.known[anchor]}, None)
+    calibration = calibrate_rig(data.views, data.rig, {anchor: data.known[anchor]}, None)
     check = checked(
-        found, data.views, data.rig, data.known, args.tolerance_m, np.deg2rad(args.tolerance_deg)
+        calibration,
+        data.views,
+        data.rig,
+        data.known,
+        args.tolerance_m,
+        np.deg2rad(args.tolerance_deg),
     )
-    found = moved_world(found, check.T_map_world)
+    calibration = moved_world(calibration, check.T_map_world)
     out = output_folder(args.out)
     calibrated = provenance(data, "check")
-    report = summary(data, found, given, calibrated) | {
+    report = summary(data, calibration, given, calibrated) | {
         "agreeing": check.agreeing,
         "verdicts": {_name(data, i): _as_json(verdict) for i, verdict in check.verdicts.items()},
     }
-    write_files(out, data, found, calibrated, with_rig=False, all_found=True)
+    write_files(out, data, calibration, calibrated, with_rig=False, all_found=True)
     write_json(out / "report.json", report)
-    mapped = [int(index) for index in np.flatnonzero(found.mapped)]
+    mapped = [int(index) for index in np.flatnonzero(calibration.mapped)]
     figure = map_check(
         given=np.stack([data.known[index] for index in mapped]),
-        found=found.Ts_world_marker[mapped],
+        found=calibration.Ts_world_marker[mapped],
         size_m=data.views.size_m[mapped],
         ids=[data.keys[index][1] for index in mapped],
         wrong=[not check.verdicts[index].right for index in mapped],

@@ -41,7 +41,7 @@ class RigData:
     anchored: bool
 
 
-def gathered(
+def read_rig_data(
     recordings: Sequence[Path],
     rig_file: Path | None,
     markers_file: Path | None,

@@ -48,7 +48,7 @@ def run(args: CalibrateIntrinsics) -> int:
         )
     folder = output_folder(args.out)
     collected: dict[str, CollectedViews] = {}
-    found: dict[str, LensCalibration] = {}
+    calibrations: dict[str, LensCalibration] = {}
     for name, sources in args.by_camera.items():
         with tqdm(unit=" step", desc=name, disable=args.headless) as bar:
 
@@ -56,19 +56,19 @@ def run(args: CalibrateIntrinsics) -> int:
                 bar.set_postfix_str(stage, refresh=False)
                 bar.update()
 
-            collected[name], found[name] = calibrate_images(
+            collected[name], calibrations[name] = calibrate_images(
                 board, sources, args.lens, args.max_views, tell, args.headless
             )
 
     files = [args.board, *(file for one in collected.values() for file in one.files)]
     calibrated = calibrated_now(f"jaxnav {__version__} calibrate intrinsics", files)
-    entries = {name: _entry(name, one, placed.get(name)) for name, one in found.items()}
+    entries = {name: _entry(name, one, placed.get(name)) for name, one in calibrations.items()}
     rig = RigFile(cameras=list((placed | entries).values()))
     sigmas = [entry.sigma or CameraSigma() for entry in rig.cameras]
     save_rig(folder / "camera.yaml", rig.rig(), calibrated, sigmas)
-    write_json(folder / "report.json", _report(str(board), calibrated, collected, found))
-    save_figure(lens_report(found), folder / "report.png")
-    for name, one in found.items():
+    write_json(folder / "report.json", _report(str(board), calibrated, collected, calibrations))
+    save_figure(lens_report(calibrations), folder / "report.png")
+    for name, one in calibrations.items():
         print(_text(name, one, collected[name]))
     if not placed:
         print("where the cameras are is not measured: write it into camera.yaml, or give --rig")
@@ -87,9 +87,9 @@ def _placed(path: Path | None) -> dict[str, CameraEntry]:
     return {entry.name: entry for entry in validate(RigFile, data, path).cameras}
 
 
-def _entry(name: str, found: LensCalibration, placed: CameraEntry | None) -> CameraEntry:
+def _entry(name: str, calibration: LensCalibration, placed: CameraEntry | None) -> CameraEntry:
     """The rig file's entry of a calibrated camera, at its place where that is known."""
-    fit = found.fit
+    fit = calibration.fit
     coefficients = slice(4, 4 + LENS_COEFFICIENTS[fit.lens])
     before = placed.sigma if placed and placed.sigma else CameraSigma()
     update: dict[str, Any] = {
@@ -116,22 +116,24 @@ def _report(
     board: str,
     calibrated: Calibrated,
     collected: Mapping[str, CollectedViews],
-    found: Mapping[str, LensCalibration],
+    calibrations: Mapping[str, LensCalibration],
 ) -> dict[str, Any]:
-    several = len(found) > 1
+    several = len(calibrations) > 1
     return calibrated.model_dump() | {
         "board": board,
-        "cameras": {name: _camera_report(one, collected[name]) for name, one in found.items()},
+        "cameras": {
+            name: _camera_report(one, collected[name]) for name, one in calibrations.items()
+        },
         "advice": [
             f"{name}: {sentence}" if several else sentence
-            for name, one in found.items()
+            for name, one in calibrations.items()
             for sentence in one.advice
         ],
     }
 
 
-def _camera_report(found: LensCalibration, collected: CollectedViews) -> dict[str, Any]:
-    fit, seen = found.fit, cells(found.fit)
+def _camera_report(calibration: LensCalibration, collected: CollectedViews) -> dict[str, Any]:
+    fit, seen = calibration.fit, cells(calibration.fit)
     median_deg, spread_deg = tilts_deg(fit)
     return {
         "lens": fit.lens,
@@ -144,16 +146,16 @@ def _camera_report(found: LensCalibration, collected: CollectedViews) -> dict[st
             for name, value, sigma in zip(fit.names, fit.parameters, fit.sigma, strict=False)
         },
         "border_sigma_px": rim_sigma_px(fit),
-        "held_out_sigma_px": found.held_out_px,
+        "held_out_sigma_px": calibration.held_out_px,
         "views": {
-            "given": found.given,
+            "given": calibration.given,
             "in_the_fit": int(np.sum(fit.view_weights > 0)),
             "sigma_px": {
                 view.name: float(sigma_px)
                 for view, sigma_px in zip(fit.views.views, fit.view_sigma_px, strict=True)
             },
-            "left_out": found.left_out,
-            "downweighted": found.downweighted,
+            "left_out": calibration.left_out,
+            "downweighted": calibration.downweighted,
             "duplicates": dict(collected.duplicates),
             "without_board": collected.without_board,
         },
@@ -164,14 +166,15 @@ def _camera_report(found: LensCalibration, collected: CollectedViews) -> dict[st
             "largest_angle_between_views_deg": spread_deg,
         },
         "systematic_residual_px": seen.systematic_px,
-        "findings": found.findings,
-        "advice": found.advice,
+        "findings": calibration.findings,
+        "advice": calibration.advice,
     }
 
 
-def _text(name: str, found: LensCalibration, collected: CollectedViews) -> str:
-    fit = found.fit
-    used, given = int(np.sum(fit.view_weights > 0)), found.given + len(collected.without_board)
+def _text(name: str, calibration: LensCalibration, collected: CollectedViews) -> str:
+    fit = calibration.fit
+    used = int(np.sum(fit.view_weights > 0))
+    given = calibration.given + len(collected.without_board)
     lines = [
         f"{name}: {fit.lens}, {used} of {given} views, {int(fit.used.sum())} corners, "
         f"RMS {fit.rms_px:.3f} px, corner noise {fit.sigma_px:.3f} px"
@@ -180,9 +183,9 @@ def _text(name: str, found: LensCalibration, collected: CollectedViews) -> str:
         value, sigma = fit.parameters[number], fit.sigma[number]
         sure = "held at zero" if parameter in fit.fixed else f"+- {sigma:.2g}"
         lines.append(f"  {parameter:>2} {value:12.6g} {sure}")
-    lines += [f"  left out: {view}: {why}" for view, why in found.left_out.items()]
+    lines += [f"  left out: {view}: {why}" for view, why in calibration.left_out.items()]
     lines += [f"  left out: {view}: repeats {twin}" for view, twin in collected.duplicates]
-    lines += [f"  counts {weight:.2g}: {view}" for view, weight in found.downweighted.items()]
-    lines += [f"  note: {sentence}" for sentence in found.findings]
-    lines += [f"  next: {sentence}" for sentence in found.advice]
+    lines += [f"  counts {weight:.2g}: {view}" for view, weight in calibration.downweighted.items()]
+    lines += [f"  note: {sentence}" for sentence in calibration.findings]
+    lines += [f"  next: {sentence}" for sentence in calibration.advice]
     return "\n".join(lines)

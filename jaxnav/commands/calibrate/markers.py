@@ -3,7 +3,7 @@
 from jaxnav.calibration.rigs.calibrate import calibrate_rig
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.calibrate.arguments.recordings import CalibrateMarkers as Arguments
-from jaxnav.commands.calibrate.data import gathered
+from jaxnav.commands.calibrate.data import read_rig_data
 from jaxnav.commands.calibrate.rig import publish, refuse_wrong_sizes
 from jaxnav.commands.process import configure_jax
 
@@ -11,9 +11,11 @@ from jaxnav.commands.process import configure_jax
 def run(args: Arguments) -> int:
     """Find the markers, write the files, and print a summary."""
     configure_jax(float64=True)
-    data = gathered(args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family)
+    data = read_rig_data(
+        args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family
+    )
     given = Ts_vehicle_camera(data.rig)
-    found = calibrate_rig(data.views, data.rig, data.known, None)
-    refuse_wrong_sizes(data, found)
-    publish(args.out, data, found, given, with_rig=False)
+    calibration = calibrate_rig(data.views, data.rig, data.known, None)
+    refuse_wrong_sizes(data, calibration)
+    publish(args.out, data, calibration, given, with_rig=False)
     return 0

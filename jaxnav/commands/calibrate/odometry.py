@@ -29,7 +29,7 @@ def run(args: Arguments) -> int:
     recorded = read_recordings(args)
     before = {name: float(getattr(recorded.vehicle, name)) for name in NAMES}
     with tqdm(unit="step", disable=args.headless, leave=False) as bar:
-        found = calibrate_odometry(
+        calibration = calibrate_odometry(
             recorded.drives,
             recorded.rig,
             recorded.markers,
@@ -41,77 +41,86 @@ def run(args: Arguments) -> int:
     calibrated = calibrated_now(f"jaxnav {version('jaxnav')} calibrate odometry", recorded.files)
     out = output_folder(args.out)
     save_vehicle(
-        out / "vehicle.yaml", calibrated_vehicle(recorded.vehicle, found), calibrated, found.sigma
+        out / "vehicle.yaml",
+        calibrated_vehicle(recorded.vehicle, calibration),
+        calibrated,
+        calibration.sigma,
     )
-    write_json(out / "report.json", report(args, recorded, found, calibrated))
+    write_json(out / "report.json", report(args, recorded, calibration, calibrated))
     origin_m = recorded.markers.origin_m
-    drawn = dataclasses.replace(found, poses=planar_in_world(found.poses, origin_m))
-    figure = odometry_report(drawn, corners_in_world(recorded.markers), table(found))
+    drawn = dataclasses.replace(calibration, poses=planar_in_world(calibration.poses, origin_m))
+    figure = odometry_report(drawn, corners_in_world(recorded.markers), table(calibration))
     save_figure(figure, out / "report.png")
-    print(f"{head(found)}\n{table(found)}")
+    print(f"{head(calibration)}\n{table(calibration)}")
     if left_out := sum(drive.left_out for drive in recorded.drives):
         print(f"left out: {left_out} readings and views that are not finite, or of no car")
-    for sentence in found.advice:
+    for sentence in calibration.advice:
         print(f"next: {sentence}")
     print(f"vehicle.yaml, report.json and report.png in {visible(out)}")
     return 0
 
 
-def calibrated_vehicle(vehicle: Vehicle, found: OdometryCalibration) -> Vehicle:
+def calibrated_vehicle(vehicle: Vehicle, calibration: OdometryCalibration) -> Vehicle:
     """The vehicle with the calibrated figures."""
-    values: dict[str, Any] = dict(found.value)
+    values: dict[str, Any] = dict(calibration.value)
     values["wheelbase_m"] = jnp.asarray(values["wheelbase_m"], vehicle.wheelbase_m.dtype)
     return dataclasses.replace(vehicle, **values)
 
 
 def report(
-    args: Arguments, recorded: RecordedDrives, found: OdometryCalibration, calibrated: Calibrated
+    args: Arguments,
+    recorded: RecordedDrives,
+    calibration: OdometryCalibration,
+    calibrated: Calibrated,
 ) -> dict[str, Any]:
     """The content of report.json."""
-    speed_mps, steering_rad = np.abs(found.read[:, 0]), found.read[:, 1]
+    speed_mps, steering_rad = np.abs(calibration.read[:, 0]), calibration.read[:, 1]
     return calibrated.model_dump() | {
         "recordings": list(args.recordings),
-        "reprojection_rms_px": found.rms_px,
-        "chi2_per_dof": found.chi2_per_dof,
+        "reprojection_rms_px": calibration.rms_px,
+        "chi2_per_dof": calibration.chi2_per_dof,
         "parameters": {
             name: {
-                "value": found.value[name],
-                "sigma": found.sigma.get(name),
-                "before": found.before[name],
-                "kept": found.fixed.get(name),
+                "value": calibration.value[name],
+                "sigma": calibration.sigma.get(name),
+                "before": calibration.before[name],
+                "kept": calibration.fixed.get(name),
             }
             for name in NAMES
         },
-        "correlation": {"of": list(found.sigma), "matrix": found.correlation},
-        "reading_sigma": found.reading_sigma._asdict(),
+        "correlation": {"of": list(calibration.sigma), "matrix": calibration.correlation},
+        "reading_sigma": calibration.reading_sigma._asdict(),
         "coverage": {
-            "duration_s": found.duration_s,
-            "way_m": found.way_m,
-            "views": len(found.outliers),
-            "outliers": int(found.outliers.sum()),
+            "duration_s": calibration.duration_s,
+            "way_m": calibration.way_m,
+            "views": len(calibration.outliers),
+            "outliers": int(calibration.outliers.sum()),
             "speed_read_mps": [float(np.median(speed_mps)), float(np.percentile(speed_mps, 95))],
             "steering_read_rad": [float(q) for q in np.percentile(steering_rad, (5, 95))],
             "markers": sorted({recorded.markers.ids[m] for d in recorded.drives for m in d.marker}),
             "cameras": sorted({recorded.rig.names[c] for d in recorded.drives for c in d.camera}),
         },
-        "advice": list(found.advice),
+        "advice": list(calibration.advice),
     }
 
 
-def head(found: OdometryCalibration) -> str:
+def head(calibration: OdometryCalibration) -> str:
     """A line with distance, duration, views, and how well the fit explains them."""
     return (
-        f"{found.way_m:.1f} m in {found.duration_s:.0f} s, {len(found.outliers)} views "
-        f"({int(found.outliers.sum())} far off), {found.rms_px:.2f} px RMS, chi-square "
-        f"{found.chi2_per_dof:.2f} per degree of freedom"
+        f"{calibration.way_m:.1f} m in {calibration.duration_s:.0f} s, "
+        f"{len(calibration.outliers)} views ({int(calibration.outliers.sum())} far off), "
+        f"{calibration.rms_px:.2f} px RMS, chi-square "
+        f"{calibration.chi2_per_dof:.2f} per degree of freedom"
     )
 
 
-def table(found: OdometryCalibration) -> str:
+def table(calibration: OdometryCalibration) -> str:
     """A line for each figure: before, found, one sigma."""
     lines = [f"{'':20}{'before':>10}{'found':>11}{'sigma':>10}"]
     for name in NAMES:
-        sigma = found.sigma.get(name, math.nan)
-        sigma_text = f"{sigma:10.5f}" if name in found.sigma else f"{'kept':>10}"
-        lines.append(f"{name:20}{found.before[name]:10.4f}{found.value[name]:11.5f}{sigma_text}")
+        sigma = calibration.sigma.get(name, math.nan)
+        sigma_text = f"{sigma:10.5f}" if name in calibration.sigma else f"{'kept':>10}"
+        lines.append(
+            f"{name:20}{calibration.before[name]:10.4f}{calibration.value[name]:11.5f}{sigma_text}"
+        )
     return "\n".join(lines)

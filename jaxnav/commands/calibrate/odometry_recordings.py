@@ -123,9 +123,9 @@ def drive_of(
             if not frame.detections or key in looked or not 0 <= frame.camera < len(rig):
                 continue
             looked.add(key)
-            found = [_NONE] * len(rig)
-            found[frame.camera] = frame.detections
-            seen = observe(found, markers)
+            detections = [_NONE] * len(rig)
+            detections[frame.camera] = frame.detections
+            seen = observe(detections, markers)
             for marker in np.flatnonzero(seen.visible[frame.camera]):
                 sigma_px = seen.sigma_px[frame.camera, marker]
                 if corner_sigma_px is not None:

@@ -37,56 +37,56 @@ def provenance(data: RigData, command: str) -> Calibrated:
     return calibrated_now(f"jaxnav {jaxnav.__version__} calibrate {command}", arrays)
 
 
-def calibrated_rig(data: RigData, found: RigCalibration) -> CameraRig:
+def calibrated_rig(data: RigData, calibration: RigCalibration) -> CameraRig:
     """The rig with the calibrated places and lenses of its cameras."""
-    poses = [pose_from_matrix(T) for T in inverted(found.Ts_vehicle_camera)]
+    poses = [pose_from_matrix(T) for T in inverted(calibration.Ts_vehicle_camera)]
     return CameraRig(
-        found.cameras,
+        calibration.cameras,
         jaxlie.SE3(jnp.asarray(np.stack(poses), float)),
         data.rig.names,
         data.rig.image_sizes_px,
     )
 
 
-def found_markers(data: RigData, found: RigCalibration) -> tuple[MarkerMap, list[int]]:
+def found_markers(data: RigData, calibration: RigCalibration) -> tuple[MarkerMap, list[int]]:
     """The map of all markers that could be linked, and their indices in `data.keys`."""
-    mapped = [int(index) for index in np.flatnonzero(found.mapped)]
+    mapped = [int(index) for index in np.flatnonzero(calibration.mapped)]
     return marker_map(
-        np.stack([pose_from_matrix(found.Ts_world_marker[index]) for index in mapped]),
+        np.stack([pose_from_matrix(calibration.Ts_world_marker[index]) for index in mapped]),
         [float(data.views.size_m[index]) for index in mapped],
         [data.keys[index][1] for index in mapped],
         [data.keys[index][0] for index in mapped],
     ), mapped
 
 
-def with_unseen(data: RigData, found: MarkerMap) -> tuple[MarkerMap, int]:
+def with_unseen(data: RigData, markers: MarkerMap) -> tuple[MarkerMap, int]:
     """The found map with the given map's unseen markers added where they are, and how many these
     are."""
     if data.markers is None:
-        return found, 0
+        return markers, 0
     given = data.markers
     keys = zip(given.families, given.ids, strict=True)
     unseen = [index for index, key in enumerate(keys) if key not in data.keys]
     poses = [
         np.asarray(poses_in_world(of.Ts_world_marker.wxyz_xyz, of.origin_m))
-        for of in (found, given)
+        for of in (markers, given)
     ]
-    sizes_m = [np.asarray(of.size_m) for of in (found, given)]
+    sizes_m = [np.asarray(of.size_m) for of in (markers, given)]
     return marker_map(
         np.concatenate([poses[0], poses[1][unseen]]),
         np.concatenate([sizes_m[0], sizes_m[1][unseen]]).tolist(),
-        [*found.ids, *(given.ids[index] for index in unseen)],
-        [*found.families, *(given.families[index] for index in unseen)],
+        [*markers.ids, *(given.ids[index] for index in unseen)],
+        [*markers.families, *(given.families[index] for index in unseen)],
     ), len(unseen)
 
 
-def axes_sigmas(found: RigCalibration) -> np.ndarray:
+def axes_sigmas(calibration: RigCalibration) -> np.ndarray:
     """Sigmas (C + M, 6) of cameras and markers, m and deg, along and about the axes of the vehicle
     for cameras and of the world for markers."""
-    Ts = np.concatenate([found.Ts_vehicle_camera, found.Ts_world_marker])
+    Ts = np.concatenate([calibration.Ts_vehicle_camera, calibration.Ts_world_marker])
     sigmas = np.zeros((len(Ts), 6))
     for index, T in enumerate(Ts):
-        P = found.covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
+        P = calibration.covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
         for part in (slice(0, 3), slice(3, 6)):
             turned = T[:3, :3] @ P[part, part] @ T[:3, :3].T
             sigmas[index, part] = np.sqrt(np.maximum(np.diag(turned), 0))
@@ -97,7 +97,7 @@ def axes_sigmas(found: RigCalibration) -> np.ndarray:
 def write_files(
     out: Path,
     data: RigData,
-    found: RigCalibration,
+    calibration: RigCalibration,
     calibrated: Calibrated,
     with_rig: bool,
     all_found: bool = False,
@@ -110,20 +110,20 @@ def write_files(
     Raises:
         BadInput: a file can't be written.
     """
-    sigmas, C = axes_sigmas(found), len(data.rig)
+    sigmas, C = axes_sigmas(calibration), len(data.rig)
     if with_rig:
         cameras = [
             CameraSigma(
                 position_m=sigmas[c, :3].tolist(),
                 rotation_deg=sigmas[c, 3:].tolist(),
-                **_lens_sigma(data, found, c),
+                **_lens_sigma(data, calibration, c),
             )
-            if found.calibrated[c]
+            if calibration.calibrated[c]
             else CameraSigma()
             for c in range(C)
         ]
-        save_rig(out / "rig.yaml", calibrated_rig(data, found), calibrated, cameras)
-    mapped = np.flatnonzero(found.mapped)
+        save_rig(out / "rig.yaml", calibrated_rig(data, calibration), calibrated, cameras)
+    mapped = np.flatnonzero(calibration.mapped)
     given = data.known if data.anchored and not all_found else {}
     of_markers: list[MarkerSigma | None] = [
         None
@@ -133,16 +133,16 @@ def write_files(
         )
         for index in mapped
     ]
-    markers, unseen = with_unseen(data, found_markers(data, found)[0])
+    markers, unseen = with_unseen(data, found_markers(data, calibration)[0])
     of_markers += [None] * unseen
     save_markers(out / "markers.yaml", markers, calibrated, of_markers)
-    poses = np.stack([pose_from_matrix(T) for T in found.Ts_world_vehicle])
-    write_tum(out / "trajectory.tum", found.views.stamps_ns / 1e9, poses)
+    poses = np.stack([pose_from_matrix(T) for T in calibration.Ts_world_vehicle])
+    write_tum(out / "trajectory.tum", calibration.views.stamps_ns / 1e9, poses)
 
 
-def _lens_sigma(data: RigData, found: RigCalibration, camera: int) -> dict[str, list[float]]:
+def _lens_sigma(data: RigData, calibration: RigCalibration, camera: int) -> dict[str, list[float]]:
     """Sigmas of a camera's lens by the fields of `CameraSigma`; empty if it was not refined."""
-    sigma = found.lens_sigmas()[camera]
+    sigma = calibration.lens_sigmas()[camera]
     if not sigma.any():
         return {}
     lens = data.rig.cameras.lenses[int(data.rig.cameras.lens_index[camera])]
@@ -153,12 +153,12 @@ def _lens_sigma(data: RigData, found: RigCalibration, camera: int) -> dict[str, 
     }
 
 
-def _lens(data: RigData, found: RigCalibration, camera: int) -> dict[str, Any]:
+def _lens(data: RigData, calibration: RigCalibration, camera: int) -> dict[str, Any]:
     """The report's lens figures, with sigma and given value each; empty if it was not refined."""
-    sigma = _lens_sigma(data, found, camera)
+    sigma = _lens_sigma(data, calibration, camera)
     return {
         name: {
-            "value": np.asarray(getattr(found.cameras, name))[camera][: len(of)],
+            "value": np.asarray(getattr(calibration.cameras, name))[camera][: len(of)],
             "sigma": of,
             "given": np.asarray(getattr(data.rig.cameras, name))[camera][: len(of)],
         }
@@ -167,21 +167,21 @@ def _lens(data: RigData, found: RigCalibration, camera: int) -> dict[str, Any]:
 
 
 def summary(
-    data: RigData, found: RigCalibration, given: np.ndarray, calibrated: Calibrated
+    data: RigData, calibration: RigCalibration, given: np.ndarray, calibrated: Calibrated
 ) -> dict[str, Any]:
     """The content of report.json.
 
     Args:
         given: (C, 4, 4) T_vehicle_camera before calibration.
     """
-    sigmas, C = axes_sigmas(found), len(data.rig)
-    views = found.views
+    sigmas, C = axes_sigmas(calibration), len(data.rig)
+    views = calibration.views
 
     def seen(rows: np.ndarray) -> dict[str, Any]:
-        residuals = found.residuals_px[rows]
+        residuals = calibration.residuals_px[rows]
         return {
             "sightings": int(rows.sum()),
-            "outliers": int(np.sum(found.weight[rows] < 1)),
+            "outliers": int(np.sum(calibration.weight[rows] < 1)),
             "reprojection_rms_px": float(np.sqrt(np.mean(residuals**2))) if rows.any() else None,
         }
 
@@ -194,25 +194,33 @@ def summary(
 
     cameras = {
         name: {
-            "calibrated": bool(found.calibrated[c]),
+            "calibrated": bool(calibration.calibrated[c]),
             **seen(views.camera == c),
             "coverage": coverage(views.corners_px[views.camera == c], data.rig.image_sizes_px[c]),
-            **placed(found.Ts_vehicle_camera[c], sigmas[c]),
-            **_lens(data, found, c),
+            **placed(calibration.Ts_vehicle_camera[c], sigmas[c]),
+            **_lens(data, calibration, c),
             "from_given": {
-                "position_m": float(np.linalg.norm((found.Ts_vehicle_camera[c] - given[c])[:3, 3])),
-                "rotation_deg": float(np.rad2deg(turn_rad(found.Ts_vehicle_camera[c], given[c]))),
+                "position_m": float(
+                    np.linalg.norm((calibration.Ts_vehicle_camera[c] - given[c])[:3, 3])
+                ),
+                "rotation_deg": float(
+                    np.rad2deg(turn_rad(calibration.Ts_vehicle_camera[c], given[c]))
+                ),
             },
         }
         for c, name in enumerate(data.rig.names)
     }
     markers = {
         f"{family} {marker_id}": {
-            "mapped": bool(found.mapped[m]),
+            "mapped": bool(calibration.mapped[m]),
             "given": data.anchored and m in data.known,
             "size_m": float(views.size_m[m]),
             **seen(views.marker == m),
-            **(placed(found.Ts_world_marker[m], sigmas[C + m]) if found.mapped[m] else {}),
+            **(
+                placed(calibration.Ts_world_marker[m], sigmas[C + m])
+                if calibration.mapped[m]
+                else {}
+            ),
         }
         for m, (family, marker_id) in enumerate(data.keys)
     }
@@ -220,14 +228,14 @@ def summary(
         **calibrated.model_dump(),
         "frames": views.frames,
         "sightings": len(views),
-        "outliers": int(np.sum(found.weight < 1)),
-        "reprojection_rms_px": found.rms_px(),
-        "corner_sigma_px": found.sigma_px,
-        "variance_inflation": found.inflation,
-        "branches_changed": found.turned,
+        "outliers": int(np.sum(calibration.weight < 1)),
+        "reprojection_rms_px": calibration.rms_px(),
+        "corner_sigma_px": calibration.sigma_px,
+        "variance_inflation": calibration.inflation,
+        "branches_changed": calibration.turned,
         "cameras": cameras,
         "markers": markers,
-        "advice": advice(data, found, sigmas),
+        "advice": advice(data, calibration, sigmas),
     }
 
 
@@ -240,13 +248,13 @@ def coverage(corners_px: np.ndarray, image_size_px: tuple[int, int]) -> float:
     return len(np.unique(inside, axis=0)) / (across * down)
 
 
-def advice(data: RigData, found: RigCalibration, sigmas: np.ndarray) -> list[str]:
+def advice(data: RigData, calibration: RigCalibration, sigmas: np.ndarray) -> list[str]:
     """Advice in sentences: what to record next, and what to check."""
     findings = []
     rows = data.views
     for c, name in enumerate(data.rig.names):
         count = int(np.sum(rows.camera == c))
-        if not found.calibrated[c]:
+        if not calibration.calibrated[c]:
             findings.append(
                 f"{name} saw {count} markers and nothing links it to the others: its place is as "
                 "given; turn on the spot between markers, so that it sees what others see"
@@ -256,33 +264,33 @@ def advice(data: RigData, found: RigCalibration, sigmas: np.ndarray) -> list[str
                 f"{name} is known to {1e3 * sigmas[c, :3].max():.0f} mm and "
                 f"{sigmas[c, 3:].max():.2f} deg: let it see markers from nearer, while others do"
             )
-        seen = found.views.corners_px[found.views.camera == c]
+        seen = calibration.views.corners_px[calibration.views.camera == c]
         part = coverage(seen, data.rig.image_sizes_px[c])
-        if found.calibrated[c] and part < _LITTLE_SEEN:
+        if calibration.calibrated[c] and part < _LITTLE_SEEN:
             findings.append(
                 f"{name} saw markers in {part:.0%} of its image: move them through all of it, for "
                 "a lens that is off shows elsewhere"
             )
     for m, (_, marker_id) in enumerate(data.keys):
         count = int(np.sum(rows.marker == m))
-        if not found.mapped[m]:
+        if not calibration.mapped[m]:
             findings.append(
                 f"marker {marker_id} was seen {count} times and nothing links it to the known "
                 "ones: it is in no file; pass it with another marker in view of any camera"
             )
         elif count < _FEW_SIGHTINGS:
             findings.append(f"marker {marker_id} was seen {count} times only: pass it once more")
-    share = float(np.mean(found.weight < 1))
+    share = float(np.mean(calibration.weight < 1))
     if share > _MANY_OUTLIERS:
         findings.append(
             f"{share:.0%} of the sightings are outliers: did a marker move, are the lenses "
             "calibrated, are the cameras triggered together?"
         )
-    if found.inflation > 1:
+    if calibration.inflation > 1:
         findings.append(
-            f"parts of the recording disagree {np.sqrt(found.inflation):.1f} times as far as their "
-            "noise explains, and the sigmas are that much larger: the lenses, or markers that are "
-            "not flat, are the likely cause: calibrate the lenses, or let them move with "
+            f"parts of the recording disagree {np.sqrt(calibration.inflation):.1f} times as far as "
+            "their noise explains, and the sigmas are that much larger: the lenses, or markers "
+            "that are not flat, are the likely cause: calibrate the lenses, or let them move with "
             "--refine-lenses"
         )
     return findings

@@ -10,7 +10,7 @@ from jaxnav.calibration.rigs.marker_check import sizes_m
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven, moved_to_places
 from jaxnav.commands.calibrate.arguments.recordings import CalibrateRig as Arguments
-from jaxnav.commands.calibrate.data import RigData, gathered
+from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import (
     found_markers,
     provenance,
@@ -32,7 +32,9 @@ _APART_M = 0.05  # a smaller given distance is not compared
 def run(args: Arguments) -> int:
     """Find cameras and markers, write the files, and print a summary."""
     configure_jax(float64=True)
-    data = gathered(args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family)
+    data = read_rig_data(
+        args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family
+    )
     names = data.rig.names
     ties = ("places", "drive", *names)
     if args.vehicle_frame not in ties:
@@ -41,15 +43,15 @@ def run(args: Arguments) -> int:
     wheelbase_m = _wheelbase_m(args, data) if args.vehicle_frame == "drive" else 0.0
     reference = _reference_camera(args, data)
     given = Ts_vehicle_camera(data.rig)
-    found = calibrate_rig(data.views, data.rig, data.known, reference, args.refine_lenses)
-    _refuse_nonsense(args, data, found, given)
-    found = _tied(args, data, found, given, wheelbase_m)
-    publish(args.out, data, found, given, with_rig=True)
+    calibration = calibrate_rig(data.views, data.rig, data.known, reference, args.refine_lenses)
+    _refuse_nonsense(args, data, calibration, given)
+    calibration = _tied(args, data, calibration, given, wheelbase_m)
+    publish(args.out, data, calibration, given, with_rig=True)
     return 0
 
 
 def publish(
-    folder: Path, data: RigData, found: RigCalibration, given: np.ndarray, with_rig: bool
+    folder: Path, data: RigData, calibration: RigCalibration, given: np.ndarray, with_rig: bool
 ) -> None:
     """Write all files, and print in a few lines what they hold.
 
@@ -62,28 +64,30 @@ def publish(
     """
     out = output_folder(folder)
     calibrated = provenance(data, "rig" if with_rig else "markers")
-    report = summary(data, found, given, calibrated)
-    write_files(out, data, found, calibrated, with_rig)
+    report = summary(data, calibration, given, calibrated)
+    write_files(out, data, calibration, calibrated, with_rig)
     write_json(out / "report.json", report)
-    _write_picture(out, data, found, given)
+    _write_picture(out, data, calibration, given)
     print(text(report))
     print(f"{'rig, markers' if with_rig else 'markers'} and report in {visible(out)}")
 
 
-def _write_picture(out: Path, data: RigData, found: RigCalibration, given: np.ndarray) -> None:
-    markers, mapped = found_markers(data, found)
-    views = found.views
+def _write_picture(
+    out: Path, data: RigData, calibration: RigCalibration, given: np.ndarray
+) -> None:
+    markers, mapped = found_markers(data, calibration)
+    views = calibration.views
     figure = rig_report(
         names=data.rig.names,
         image_sizes_px=data.rig.image_sizes_px,
         camera=views.camera,
         centers_px=views.corners_px.mean(axis=1),
-        residuals_px=found.residuals_px.mean(axis=1),
-        weight=found.weight,
+        residuals_px=calibration.residuals_px.mean(axis=1),
+        weight=calibration.weight,
         corners_world_m=corners_in_world(markers),
         marker_ids=[data.keys[index][1] for index in mapped],
-        path_m=found.Ts_world_vehicle[:, :3, 3],
-        Ts_vehicle_camera=found.Ts_vehicle_camera,
+        path_m=calibration.Ts_world_vehicle[:, :3, 3],
+        Ts_vehicle_camera=calibration.Ts_vehicle_camera,
         given=given,
     )
     save_figure(figure, out / "report.png")
@@ -96,9 +100,9 @@ def _reference_camera(args: Arguments, data: RigData) -> int:
     return int(np.argmax(np.bincount(data.views.camera, minlength=len(data.rig))))
 
 
-def refuse_wrong_sizes(data: RigData, found: RigCalibration) -> None:
+def refuse_wrong_sizes(data: RigData, calibration: RigCalibration) -> None:
     """Raise BadInput where a marker's size is far from the given one."""
-    for index, size_m in sizes_m(found, data.views, data.rig).items():
+    for index, size_m in sizes_m(calibration, data.views, data.rig).items():
         said_m = float(data.views.size_m[index])
         if not 1 / _WRONG_SIZE < size_m / said_m < _WRONG_SIZE:
             problem = (
@@ -109,11 +113,11 @@ def refuse_wrong_sizes(data: RigData, found: RigCalibration) -> None:
 
 
 def _refuse_nonsense(
-    args: Arguments, data: RigData, found: RigCalibration, given: np.ndarray
+    args: Arguments, data: RigData, calibration: RigCalibration, given: np.ndarray
 ) -> None:
     """Raise BadInput for wrong sizes, cameras that can't be linked, or a rig of another scale."""
-    refuse_wrong_sizes(data, found)
-    cameras = np.flatnonzero(found.calibrated)
+    refuse_wrong_sizes(data, calibration)
+    cameras = np.flatnonzero(calibration.calibrated)
     if len(cameras) < 2:
         problem = (
             "no two cameras could be linked: two of them must see the same markers, at once or one "
@@ -125,7 +129,7 @@ def _refuse_nonsense(
         positions = Ts[cameras, :3, 3]
         return float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))))
 
-    was, is_now = apart_m(given), apart_m(found.Ts_vehicle_camera)
+    was, is_now = apart_m(given), apart_m(calibration.Ts_vehicle_camera)
     if was > _APART_M and not 1 / _WRONG_SCALE < is_now / was < _WRONG_SCALE:
         problem = (
             f"the cameras come out {is_now / was:.1f} times as far apart as the rig says: is the "
@@ -146,24 +150,24 @@ def _wheelbase_m(args: Arguments, data: RigData) -> float:
 def _tied(
     args: Arguments,
     data: RigData,
-    found: RigCalibration,
+    calibration: RigCalibration,
     given: np.ndarray,
     wheelbase_m: float,
 ) -> RigCalibration:
     """The calibration moved into the vehicle frame that --vehicle-frame asks for."""
     if args.vehicle_frame in data.rig.names:
-        return found
+        return calibration
     if args.vehicle_frame == "places":
-        return moved_to_places(found, given)
+        return moved_to_places(calibration, given)
     readings = (one for one in data.parts[0].odometry if one.valid)
     odometry = sorted(readings, key=lambda one: one.stamp_ns)
-    start_ns = found.views.stamps_ns[0]
+    start_ns = calibration.views.stamps_ns[0]
     driven = driven_frame(
-        (found.views.stamps_ns - start_ns) / 1e9,
-        found.Ts_world_vehicle,
+        (calibration.views.stamps_ns - start_ns) / 1e9,
+        calibration.Ts_world_vehicle,
         np.array([(one.stamp_ns - start_ns) / 1e9 for one in odometry]),
         np.array([one.speed_mps for one in odometry]),
         np.array([one.steering_rad for one in odometry]),
         wheelbase_m,
     )
-    return moved_to_driven(found, driven)
+    return moved_to_driven(calibration, driven)

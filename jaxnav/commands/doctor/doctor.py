@@ -55,8 +55,8 @@ def _jax() -> Iterable[Finding]:
     """Examine JAX, configured as the car will be started: one thread, float64."""
     process = importlib.import_module("jaxnav.commands.process")
     process.configure_jax(float64=True, threads=1)
-    found: Iterable[Finding] = _check("software", "jax_device")()
-    return found
+    findings: Iterable[Finding] = _check("software", "jax_device")()
+    return findings
 
 
 def _files(report: Report, args: Doctor) -> SimpleNamespace:
@@ -101,10 +101,10 @@ def _cache(patient: SimpleNamespace) -> Iterable[Finding]:
     if folder is not None and None not in vars(patient).values():
         compiled = _is_compiled(patient, folder)
     directory = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    found: Iterable[Finding] = _check("software", "compile_cache")(
+    findings: Iterable[Finding] = _check("software", "compile_cache")(
         Path(directory) if directory else None, compiled, cache_refused()
     )
-    return found
+    return findings
 
 
 def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:

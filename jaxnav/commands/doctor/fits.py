@@ -192,18 +192,18 @@ def _fit(seen: Sighted, start: np.ndarray, prior_sigma: FileErrors) -> StandingF
     def jacobian(u: np.ndarray) -> np.ndarray:
         return np.vstack([look(u)[1], np.eye(slots.size)])
 
-    found = least_squares(residuals, np.zeros(slots.size), jacobian, method="lm", max_nfev=200)
-    whitened, J, wxyz_xyz = look(found.x)
+    solution = least_squares(residuals, np.zeros(slots.size), jacobian, method="lm", max_nfev=200)
+    whitened, J, wxyz_xyz = look(solution.x)
     covariance = np.linalg.inv(J.T @ J + np.eye(slots.size))
     value, sigma = np.zeros(flat_sigma.size), np.zeros(flat_sigma.size)
     mine = slice(len(asked))
-    value[asked] = found.x[mine] * flat_sigma[asked]
+    value[asked] = solution.x[mine] * flat_sigma[asked]
     sigma[asked] = np.sqrt(np.diag(covariance)[mine]) * flat_sigma[asked]
     pose_sigma = np.asarray(prior_sigma.pose)
     sigmas_px = np.repeat(seen.sigma_px.reshape(-1), 2)
     return StandingFit(
         np.asarray(jaxlie.SE3(jnp.asarray(wxyz_xyz)).as_matrix()),
-        cost=float(2 * found.cost),
+        cost=float(2 * solution.cost),
         error_px=float(np.sqrt(np.sum((whitened * sigmas_px) ** 2) / max(seen.numbers, 1))),
         value=unravel(jnp.asarray(value)),
         sigma=unravel(jnp.asarray(sigma)),

@@ -23,16 +23,16 @@ _MOST_SIZE_M = 2.0
 def measured_corners(path: Path) -> Iterator[Finding]:
     """Check that measured corners make a flat square of the size that the file says."""
     checked = 0
-    found = False
+    has_findings = False
     for index, entry in enumerate(_entries(path)):
         corners_m, size_m = _numbers(entry.get("corners_world_m")), entry.get("size_m")
         if corners_m is None or not isinstance(size_m, int | float) or not size_m > 0:
             continue
         checked += 1
         for finding in _square(f"marker {entry.get('id', index)}", corners_m, float(size_m)):
-            found = True
+            has_findings = True
             yield finding
-    if checked and not found:
+    if checked and not has_findings:
         yield Finding("markers", "ok", f"corners of {checked} are squares of their size within 1 %")
 
 
@@ -101,19 +101,19 @@ def placed(markers: MarkerMap) -> Iterator[Finding]:
     """Check where the markers are, which way up, and how large."""
     corners_world_m = np.asarray(markers.corners_world_m)
     Rs_world_marker = np.asarray(markers.Ts_world_marker.as_matrix())[:, :3, :3]
-    found = False
+    has_findings = False
     for index, marker_id in enumerate(markers.ids):
         name, size_m = f"marker {marker_id}", float(markers.size_m[index])
         lowest_m = corners_world_m[index, :, 2].min()
         x_axis, y_axis, normal = Rs_world_marker[index].T
         turned_rad = np.arctan2(x_axis[2], y_axis[2])
         if size_m > _MOST_SIZE_M:
-            found = True
+            has_findings = True
             yield Finding(
                 "markers", "warning", f"{name} is {size_m:.3g} m wide", "lengths are in m"
             )
         if lowest_m < -_MAX_ERROR * size_m:
-            found = True
+            has_findings = True
             yield Finding(
                 "markers",
                 "warning",
@@ -122,7 +122,7 @@ def placed(markers: MarkerMap) -> Iterator[Finding]:
             )
         if abs(normal[2]) < _UPRIGHT and abs(turned_rad) > _TURNED_RAD:
             quarters = round(float(np.rad2deg(turned_rad)) / 90)
-            found = True
+            has_findings = True
             yield Finding(
                 "markers",
                 "note",
@@ -131,7 +131,7 @@ def placed(markers: MarkerMap) -> Iterator[Finding]:
                 "if the printed marker stands upright its corners are in the wrong order; "
                 "--frame with a picture of it tells",
             )
-    if not found:
+    if not has_findings:
         count = len(markers.ids)
         families = listed(sorted(set(markers.families)))
         yield Finding("markers", "ok", f"{count} of {families}, upright or flat, above the ground")

@@ -51,14 +51,14 @@ def _detections(
 
 
 def identities(
-    rig: CameraRig, markers: MarkerMap, found: Sequence[Detections]
+    rig: CameraRig, markers: MarkerMap, detections: Sequence[Detections]
 ) -> Iterator[Finding]:
     """Report which markers are in view, of the map and others."""
     known, foreign, twice = [], [], []
-    for name, detections in zip(rig.names, found, strict=True):
-        keys = list(zip(detections.ids.tolist(), detections.families, strict=True))
+    for name, one in zip(rig.names, detections, strict=True):
+        keys = list(zip(one.ids.tolist(), one.families, strict=True))
         counts = Counter(keys)
-        for key, corners_px in zip(keys, detections.corners_px, strict=True):
+        for key, corners_px in zip(keys, one.corners_px, strict=True):
             if markers.index(*key) is None:
                 foreign.append(f"{key[0]} of {key[1]} in {name}")
             elif counts[key] > 1:
@@ -110,9 +110,9 @@ def examine_pictures(
     yield from wrong
     if wrong:
         return
-    found = _detections(rig, markers, images)
-    yield from identities(rig, markers, found)
-    seen = Sighted.of(rig, markers, observe(found, markers), _MOST_MARKERS)
+    detections = _detections(rig, markers, images)
+    yield from identities(rig, markers, detections)
+    seen = Sighted.of(rig, markers, observe(detections, markers), _MOST_MARKERS)
     if not seen.visible.any():
         return
     seen, poses, findings = in_their_order(seen, route)

@@ -79,8 +79,8 @@ def _place(whole: StandingFit, route: Route, origin_m: Origin) -> Finding:
 def _size_alone(seen: Sighted, starts: Sequence[np.ndarray]) -> Finding:
     """Check the size of a single marker: its height over the camera tells its distance, so size."""
     size = FileErrors.of_pose(seen, level=True, size=np.full(1, SIZE_SIGMA))
-    found = fit(seen, starts, size)
-    logarithm, sigma = float(found.value.size[0]), float(found.sigma.size[0])
+    standing_fit = fit(seen, starts, size)
+    logarithm, sigma = float(standing_fit.value.size[0]), float(standing_fit.sigma.size[0])
     factor, written_m = math.exp(logarithm), float(seen.markers.size_m[0])
     text = f"marker {seen.markers.ids[0]} is {factor:.2f} (+- {sigma:.2f}) of its size in the map"
     if abs(logarithm) > max(_CLEARLY * sigma, _LEAST_SIZE):

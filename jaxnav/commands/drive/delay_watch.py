@@ -79,14 +79,14 @@ class DelayWatch:
 
 def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
     """A line for each camera whose stamps are surely wrong, or one line for all cameras."""
-    found, together = delays.delays, delays.common_delay
-    known = [one for one in found if one.known]
+    camera_delays, together = delays.delays, delays.common_delay
+    known = [one for one in camera_delays if one.known]
     if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
         delay_s = setup.vehicle.camera_delay_s + together.delay_s
         do = f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
         yield f"the cameras are {describe_delay(together)}: {do}"
         return
-    for name, one in zip(setup.rig.names, found, strict=True):
+    for name, one in zip(setup.rig.names, camera_delays, strict=True):
         if not one.late:
             continue
         delay_s = setup.vehicle.camera_delay_s + one.delay_s

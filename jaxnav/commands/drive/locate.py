@@ -38,11 +38,11 @@ def run(args: Locate) -> int:
             f"is {width} x {height} pixels, but --camera {args.camera} was calibrated at "
             f"{image_size_px[0]} x {image_size_px[1]}",
         )
-    found = detector.detect(image, camera)
+    detections = detector.detect(image, camera)
     rig = CameraRig.create([camera], [jaxlie.SE3.identity()], ["camera"], [image_size_px])
     located = [
-        _locate(rig, args.marker_size_m, found, index)
-        for index in np.argsort(found.ids, kind="stable")
+        _locate(rig, args.marker_size_m, detections, index)
+        for index in np.argsort(detections.ids, kind="stable")
     ]
     report = {
         "image": str(args.image),
@@ -52,7 +52,7 @@ def run(args: Locate) -> int:
         "markers": [marker for marker, _ in located],
     }
     if args.out is not None:
-        view = _view(args.image.name, image, camera, args.marker_size_m, found, located)
+        view = _view(args.image.name, image, camera, args.marker_size_m, detections, located)
         save_figure(photo_with_poses(view), args.out)
     print(json.dumps(report, indent=2) if args.json else table(report))
     return 0
@@ -69,23 +69,23 @@ def _solve(rig: CameraRig, markers: MarkerMap, obs: Observation) -> tuple[Candid
 
 
 def _locate(
-    rig: CameraRig, size_m: float, found: Detections, index: int
+    rig: CameraRig, size_m: float, detections: Detections, index: int
 ) -> tuple[dict[str, Any], Candidates]:
     # The marker is the world and the camera the vehicle: T_vehicle_world is T_camera_marker.
     world = jaxlie.SE3(jaxlie.SE3.identity().wxyz_xyz[None])
-    markers = MarkerMap(world, jnp.asarray([size_m]), (0,), (found.families[index],))
+    markers = MarkerMap(world, jnp.asarray([size_m]), (0,), (detections.families[index],))
     obs = Observation(
-        corners_px=jnp.asarray(found.corners_px[index])[None, None],
+        corners_px=jnp.asarray(detections.corners_px[index])[None, None],
         visible=jnp.ones((1, 1), bool),
-        corner_sigma_px=jnp.asarray(found.sigma_px[index])[None, None],
+        corner_sigma_px=jnp.asarray(detections.sigma_px[index])[None, None],
     )
     candidates, flip_probability = jax.device_get(_solve(rig, markers, obs))
     kept = np.flatnonzero(candidates.valid)
     errors_px = np.sqrt(candidates.e1_px2[kept] / 4)
     marker = {
-        "id": int(found.ids[index]),
-        "corners_px": found.corners_px[index].tolist(),
-        "corner_sigma_px": found.sigma_px[index].tolist(),
+        "id": int(detections.ids[index]),
+        "corners_px": detections.corners_px[index].tolist(),
+        "corner_sigma_px": detections.sigma_px[index].tolist(),
         "flip_probability": float(flip_probability),
         "error_ratio": float(errors_px[0] / errors_px[1]) if len(kept) > 1 else None,
         "poses": [
@@ -153,7 +153,7 @@ def _view(
     image: np.ndarray,
     camera: Camera,
     size_m: float,
-    found: Detections,
+    detections: Detections,
     located: list[tuple[dict[str, Any], Candidates]],
 ) -> AnnotatedFrame:
     sticks: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
@@ -165,7 +165,7 @@ def _view(
     return AnnotatedFrame(
         title=f"{title}: detected marker green, normal of the better pose blue, other pose orange",
         image=image[:, :, ::-1],
-        detected_px=found.corners_px,
+        detected_px=detections.corners_px,
         selected_px=np.asarray(sticks[0]).reshape(-1, 2, 2),
         other_px=np.asarray(sticks[1]).reshape(-1, 2, 2),
     )

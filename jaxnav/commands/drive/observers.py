@@ -53,11 +53,11 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     Raises:
         BadInput: the file can't be written, Rerun is missing or its window does not open.
     """
-    found: list[Onlooker] = []
+    onlookers: list[Onlooker] = []
 
     def add(onlooker: Onlooker) -> None:
         closing.callback(onlooker.close)
-        found.append(onlooker)
+        onlookers.append(onlooker)
 
     if args.record is not None:
         add(DriveRecorder(args.record, setup, args.record_images))
@@ -69,7 +69,7 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     add(DelayWatch(setup, warns=not args.headless))
     if not args.headless:
         add(StatusLine())
-    return found
+    return onlookers
 
 
 class DriveRecorder:
@@ -90,10 +90,10 @@ class DriveRecorder:
     @property
     def faults(self) -> Fault:
         """Faults of the recording: messages dropped since the last call, or that it has failed."""
-        found = Fault(0)
+        faults = Fault(0)
         if self._recorder.dropped > self._dropped:
-            self._dropped, found = self._recorder.dropped, Fault.RECORDER_BEHIND
-        return found | Fault.RECORDER_FAILED if self._recorder.failed else found
+            self._dropped, faults = self._recorder.dropped, Fault.RECORDER_BEHIND
+        return faults | Fault.RECORDER_FAILED if self._recorder.failed else faults
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""

@@ -123,7 +123,7 @@ class RenderedCameras:
         world = self.world
         self.images = world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)
         predicted_px, expected = self._predicted(believed)
-        found = [
+        detections = [
             Detections.concatenate(
                 [
                     detector.detect(image, world.rig.camera(c), predicted_px[c][expected[c]])
@@ -132,7 +132,7 @@ class RenderedCameras:
             )
             for c, image in enumerate(self.images)
         ]
-        observed = observe(found, world.markers)
+        observed = observe(detections, world.markers)
         noise_px = self.corner_noise_px * self.rng.standard_normal(observed.corners_px.shape)
         sigma_px = np.hypot(observed.sigma_px, self.corner_noise_px)
         return observed.corners_px + noise_px, observed.visible, sigma_px

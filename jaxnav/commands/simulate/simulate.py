@@ -44,9 +44,9 @@ def _run(args: Arguments) -> int:
     for name, noise_px in wanted:
         key = _key(args, car, name, noise_px)
         # A result of a version without parameters has no such key.
-        found = [one for one in done if {"params": None} | one["run"] == key]
-        result = found[0] if found else {"run": key} | _drive(args, car, key)
-        if not found:
+        matches = [one for one in done if {"params": None} | one["run"] == key]
+        result = matches[0] if matches else {"run": key} | _drive(args, car, key)
+        if not matches:
             done.append(result)
         if args.json is not None:
             several = len(wanted) > 1 or len(done) > 1

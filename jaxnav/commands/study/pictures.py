@@ -80,12 +80,12 @@ def draw_study(args: Arguments) -> int:
     return 0
 
 
-def _first_of(summary: xr.Dataset, taken: tuple[str | None, ...]) -> str | None:
+def _first_of(summary: xr.Dataset, plot_axes: tuple[str | None, ...]) -> str | None:
     """The remaining axis for panels or lines: the selectors, else the shortest one."""
     left = [
         str(name)
         for name in summary.coords
-        if name not in taken and summary[name].ndim == 1 and name not in _LABELS
+        if name not in plot_axes and summary[name].ndim == 1 and name not in _LABELS
     ]
     left = [name for name in left if summary.sizes[name] > 1]
     if "selector" in left:

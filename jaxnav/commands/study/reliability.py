@@ -25,24 +25,28 @@ def run(args: Arguments) -> int:
     if not len(probability):
         raise BadInput(args.recording or "--frames", "gave no frame with two poses to choose from")
     out = output_folder(args.out)
-    found = Reliability.of(probability, flipped)
+    reliability = Reliability.of(probability, flipped)
     summary: dict[str, Any] = {
         "frames": name,
         "pairs": len(probability),
         "flipped_fraction": float(np.mean(flipped)),
-        "expected_calibration_error": found.expected_calibration_error,
+        "expected_calibration_error": reliability.expected_calibration_error,
         "bins": {
-            "predicted": found.predicted.tolist(),
-            "observed": found.observed.tolist(),
-            "counts": found.counts.tolist(),
+            "predicted": reliability.predicted.tolist(),
+            "observed": reliability.observed.tolist(),
+            "counts": reliability.counts.tolist(),
         },
     }
     text = (
         f"{name}: {summary['pairs']} pairs, {summary['flipped_fraction']:.2%} flipped, "
-        f"expected calibration error {found.expected_calibration_error:.4f}"
+        f"expected calibration error {reliability.expected_calibration_error:.4f}"
     )
     figure = reliability_diagram(
-        found.predicted, found.observed, found.intervals, found.counts, title=text
+        reliability.predicted,
+        reliability.observed,
+        reliability.intervals,
+        reliability.counts,
+        title=text,
     )
     save_figure(figure, out / "reliability.png")
     write_json(out / "summary.json", summary)

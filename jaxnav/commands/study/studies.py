@@ -96,7 +96,7 @@ def _stored_grid(path: Path) -> Grid:
 def _calibration(data: Mapping[str, Any], path: Path, kind: str) -> dict[str, Path]:
     """The calibration files of a config, relative to it; `qcar` stands for the shipped ones."""
     wanted = ("rig",) if kind == "ambiguity" else ("rig", "markers", "vehicle")
-    found = {}
+    files = {}
     for name in ("rig", "markers", "vehicle"):
         given = data.get(name, None if kind == "ambiguity" else "qcar")
         if given is None:
@@ -106,10 +106,10 @@ def _calibration(data: Mapping[str, Any], path: Path, kind: str) -> dict[str, Pa
         if not isinstance(given, str) or not given:
             raise BadInput(f"{path}: {name}", f"must be a file, or qcar, got {given!r}")
         shipped = calib_dir() / "qcar" / f"{name}.yaml"
-        found[name] = shipped if given == "qcar" else path.parent / given
-        if not _is_file(found[name]):
-            raise BadInput(f"{path}: {name}", f"there is no file {found[name]}")
-    return found
+        files[name] = shipped if given == "qcar" else path.parent / given
+        if not _is_file(files[name]):
+            raise BadInput(f"{path}: {name}", f"there is no file {files[name]}")
+    return files
 
 
 def _is_file(path: Path) -> bool:

@@ -60,7 +60,7 @@ def run(args: Arguments) -> int:
     fitting = Fitting(out, key, gains.problem(), space, named=args.train)
     try:
         fit = fitting.run(args.headless)
-        found = gains.test(fit)
+        results = gains.test(fit)
     except KeyboardInterrupt:
         print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
         return EXIT_INTERRUPTED
@@ -70,10 +70,10 @@ def run(args: Arguments) -> int:
         fit,
         {name: known[name] for name in space.free},
         space.values(fit.best_x),
-        {name: (_as_json(before), _as_json(after)) for name, (before, after) in found.items()},
+        {name: (_as_json(before), _as_json(after)) for name, (before, after) in results.items()},
     )
     write_json(out / "summary.json", summary)
-    save_figure(controller_report(fit, space, found), out / "report.png")
+    save_figure(controller_report(fit, space, results), out / "report.png")
     print(_text(summary))
     print(f"parameters and report in {visible(out)}")
     return 0

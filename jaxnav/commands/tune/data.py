@@ -118,15 +118,15 @@ def _judging(
     args: Arguments, tests: Sequence[tuple[Path, tuple[float, float]]]
 ) -> list[TuningTest]:
     """The tests with a known pose of the vehicle in some frame."""
-    found = []
+    tuning_tests = []
     for path, part in tests:
         named = _sequences(args, path, part)
         if bool(jnp.any(named.recorded.judged)):
             name = named.name if part == (0.0, 1.0) else f"{named.name}, {part[0]:g} to {part[1]:g}"
-            found.append(
+            tuning_tests.append(
                 TuningTest(name, named.navigator, len(named.recorded), _known(named.recorded))
             )
-    return found
+    return tuning_tests
 
 
 def _known(recorded: FrameSequences) -> Callable[[Progress], FrameSequences]:

@@ -51,16 +51,16 @@ def run(args: Arguments) -> int:
     except KeyboardInterrupt:
         print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
         return EXIT_INTERRUPTED
-    found = _tested(args, data, params, space, fit)
+    results = _tested(args, data, params, space, fit)
     summary = summary_of(
         key,
         fit,
         space.values(space.start),
         space.values(fit.best_x),
-        {name: (_as_json(before), _as_json(after)) for name, (before, after) in found.items()},
+        {name: (_as_json(before), _as_json(after)) for name, (before, after) in results.items()},
     )
     write_json(out / "summary.json", summary)
-    save_figure(tuning_report(fit, space, found), out / "report.png")
+    save_figure(tuning_report(fit, space, results), out / "report.png")
     print(_text(summary))
     print(f"parameters and report in {visible(out)}")
     return 0
@@ -132,7 +132,7 @@ def _tested(
     args: Arguments, data: TuningData, params: Params | None, space: Space, fit: TuningFit
 ) -> dict[str, tuple[FilterTest, FilterTest]]:
     """Results before and after the fit, by the name of the test."""
-    found = {}
+    results = {}
     for test in data.tests:
         with tqdm(
             total=3 * test.size, unit="drive", desc="test", disable=args.headless, leave=False
@@ -142,11 +142,11 @@ def _tested(
             # As arrays, like those after the fit, so that one program estimates with both.
             before = with_parameters(before, parameters_of(before))
             after = with_parameters(before, space.values(fit.best_x))
-            found[test.name] = (
+            results[test.name] = (
                 _test(before, recorded, bar.update),
                 _test(after, recorded, bar.update),
             )
-    return found
+    return results
 
 
 def _test(

@@ -158,10 +158,10 @@ class Fitting:
         step = before.step
         softness = jnp.asarray(self._problem.softness(step), x.dtype)
         batch = self._problem.batch(before.stage_x, before.stage, step)
-        found = self._problem.explain(x, batch, softness)
-        if found is None:
+        place = self._problem.explain(x, batch, softness)
+        if place is None:
             return f"step {step + 1}: the loss is not finite; not stepped on"
-        return found.describe(self._space.labels, step + 1)
+        return place.describe(self._space.labels, step + 1)
 
     def _refuse_without_gradient(self, fit: TuningFit) -> None:
         """Raise BadInput where the loss does not depend on a parameter at all."""
@@ -184,8 +184,8 @@ class Fitting:
         if not self.checkpoint.exists():
             return None
         try:
-            found = dict(read_npz(self.checkpoint))
-            key = dict(json.loads(str(found.pop("run"))))
+            arrays = dict(read_npz(self.checkpoint))
+            key = dict(json.loads(str(arrays.pop("run"))))
         except _DAMAGED as error:
             raise self._damaged(error) from None
         for name in self._key | key:
@@ -196,7 +196,7 @@ class Fitting:
                 )
                 raise BadInput(self.checkpoint, problem)
         try:
-            return fit_of(found, like)
+            return fit_of(arrays, like)
         except _DAMAGED as error:
             raise self._damaged(error) from None
 

@@ -65,8 +65,8 @@ def maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
         ids = tuple(range(len(size_m)))
         return MarkerMap(jaxlie.SE3(wxyz_xyz), size_m, ids, families=("",) * len(ids))
 
-    found: MarkerMap = jax.vmap(some)(markers.Ts_world_marker.wxyz_xyz[rows], markers.size_m[rows])
-    return found
+    stack: MarkerMap = jax.vmap(some)(markers.Ts_world_marker.wxyz_xyz[rows], markers.size_m[rows])
+    return stack
 
 
 def join_sequences(recordings: Sequence[NamedSequences]) -> FrameSequences:

@@ -146,12 +146,12 @@ class CalibrateIntrinsics(Headless):
     @property
     def by_camera(self) -> dict[str, tuple[Path, ...]]:
         """The sources of every camera, in the order they were given in."""
-        found: dict[str, tuple[Path, ...]] = {}
+        paths: dict[str, tuple[Path, ...]] = {}
         for source in self.sources:
             match = _NAMED.fullmatch(source)
             name, path = match.groups() if match else (self.name, source)
-            found[name] = (*found.get(name, ()), Path(path))
-        return found
+            paths[name] = (*paths.get(name, ()), Path(path))
+        return paths
 
 
 @dataclass(frozen=True)
