@@ -105,7 +105,7 @@ def consistency(case: Case) -> None:
 
 def rms_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:
     """Of all corners with these figures, every view's pose at its best; as OpenCV counts it."""
-    seen = lens_bundle.gathered(views)
+    seen = lens_bundle.padded_corners(views)
     poses = lens_bundle.padded_poses(board_poses(views, lens, parameters), len(seen.corners_px))
     held = lens_bundle.solve(
         lens,
@@ -182,7 +182,7 @@ def scaling() -> None:
     views, poses = simulated_views(
         case.camera, IMAGE_SIZE_PX, points_m, 500, np.random.default_rng(0)
     )
-    seen = lens_bundle.gathered(views)
+    seen = lens_bundle.padded_corners(views)
     start = np.append([300.0, 300, 410, 205], np.zeros(5))
     padded = lens_bundle.padded_poses(poses, len(seen.corners_px))
     took = []

@@ -106,7 +106,7 @@ def known_flags(flags: dict[str, str]) -> dict[str, str]:
             if isinstance(kept, list):
                 return {flag: value for flag, value in flags.items() if flag in kept}
     try:
-        known = flags if _taken(flags) else {f: v for f, v in flags.items() if _taken({f: v})}
+        known = flags if _survives(flags) else {f: v for f, v in flags.items() if _survives({f: v})}
     except (OSError, subprocess.SubprocessError):  # no child can be started here, or in time
         return {}
     with suppress(OSError, NotPrivateError):
@@ -136,7 +136,7 @@ def _with_flags(theirs: str) -> str:
     return " ".join([theirs, *ours]).strip() if ours else theirs
 
 
-def _taken(flags: dict[str, str]) -> bool:
+def _survives(flags: dict[str, str]) -> bool:
     """Whether a process started with these flags survives."""
     inherited = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "TF_"))}
     run = subprocess.run(
@@ -202,9 +202,9 @@ def _private(folder: Path) -> Path | None:
     The returned path contains no links.
     """
     try:
-        with PrivateFolder(folder, make=True) as found:
-            found.require_own_entries()
-            folder = found.path
+        with PrivateFolder(folder, make=True) as files:
+            files.require_own_entries()
+            folder = files.path
     except NotPrivateError as error:
         _refuse(str(error))
         return None

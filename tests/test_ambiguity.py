@@ -143,7 +143,7 @@ def check_selection(selection: Selection, selector: Selector, candidates: Candid
     assert measured.covariance.shape == (K, 6, 6)
     if isinstance(measured, PosePosterior):
         assert measured.innovation.shape == (K, 3)
-    for mask in (measured.taken, selection.kept):
+    for mask in (measured.valid, selection.kept):
         assert mask.shape == (K,)
         assert mask.dtype == bool
     assert selection.log_weight.shape == selection.heir.shape == (K,)
@@ -189,11 +189,11 @@ class TestEverySelector:
                 check_selection(alone, selector, found[index], precision)
                 if name == "none":
                     assert int(alone.selected) == -1
-                    assert not np.any(alone.measured.taken)
+                    assert not np.any(alone.measured.valid)
                     assert bool(alone.decided) <= initialised
                 elif not isinstance(selector, RatioTest):
                     assert int(alone.selected) >= 0
-                    assert np.any(alone.measured.taken)
+                    assert np.any(alone.measured.valid)
                 if together is not None:
                     for one, leaf in zip(*map(jax.tree.leaves, (alone, together)), strict=True):
                         np.testing.assert_allclose(leaf[index], one, rtol=1e-9, atol=1e-9)
@@ -206,7 +206,7 @@ class TestEverySelector:
         selection = select(selector, prior, candidates, seen_from(TRUTH))
         check_selection(selection, selector, candidates, np.float64)
         assert int(selection.selected) == 1
-        assert np.all(selection.measured.taken)
+        assert np.all(selection.measured.valid)
         if selector.hypotheses == 1:
             expected = worlds.planar(*poses[1]).wxyz_xyz
             np.testing.assert_allclose(
@@ -223,7 +223,7 @@ class TestEverySelector:
         selection = select(selector, prior, candidates, seen_from(worlds.NO_VIEW))
         check_selection(selection, selector, candidates, np.float64)
         assert int(selection.selected) == -1
-        assert not np.any(selection.measured.taken)
+        assert not np.any(selection.measured.valid)
         np.testing.assert_array_equal(selection.kept, prior.initialised)
         if selector.hypotheses == 1 or not initialised:
             assert selection.flip_probability == 0
@@ -310,7 +310,7 @@ def test_ratio_test_discards_what_is_not_clear(errors_px, max_ratio, taken):
         prior = belief(worlds.planar(*TRUTH))
         selection = select(RatioTest(max_ratio), prior, candidates, seen_from(TRUTH))
         np.testing.assert_allclose(selection.costs, np.square(errors))
-        assert bool(selection.measured.taken[0]) == taken
+        assert bool(selection.measured.valid[0]) == taken
         assert int(selection.selected) == (int(np.argmin(errors)) if taken else -1)
         # Of a pose that is not given nothing is doubtful.
         assert taken or selection.flip_probability == 0

@@ -84,7 +84,7 @@ def test_what_comes_too_late_is_said_in_one_line_and_changes_nothing(tmp_path) -
 def asked(monkeypatch) -> list[dict[str, str]]:
     """What a child would have been asked; it takes all."""
     questions: list[dict[str, str]] = []
-    monkeypatch.setattr(configuration, "_taken", lambda flags: not questions.append(flags))
+    monkeypatch.setattr(configuration, "_survives", lambda flags: not questions.append(flags))
     monkeypatch.setattr(configuration, "step_folder", lambda: None)
     return questions
 
@@ -108,7 +108,7 @@ def test_where_no_child_can_be_started_no_flag_is_set(monkeypatch, asked) -> Non
     def fails(flags: dict[str, str]) -> bool:
         raise BlockingIOError("no more processes")
 
-    monkeypatch.setattr(configuration, "_taken", fails)
+    monkeypatch.setattr(configuration, "_survives", fails)
     assert configuration._with_flags("--xla_own=1") == "--xla_own=1"
 
 

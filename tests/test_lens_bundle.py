@@ -32,7 +32,7 @@ def some_views(lens, count=6, seed=0):
 
 
 def solved(lens, views, poses, fixed=(), weights=None, cut=NO_CUT):
-    seen = lens_bundle.gathered(views)
+    seen = lens_bundle.padded_corners(views)
     start = np.array([1.03 * f for f in TRUTHS[lens][:2]] + [405.0, 207.0] + [0.0] * 5)
     padded = lens_bundle.padded_poses(poses, len(seen.corners_px))
     if weights is None:

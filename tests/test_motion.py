@@ -30,7 +30,7 @@ def chosen(prior: Bank, T_world_vehicle: jaxlie.SE3, covariance, taken) -> Selec
             T_world_vehicle=jaxlie.SE3(jnp.tile(T_world_vehicle.wxyz_xyz, (count, 1))),
             covariance=jnp.tile(jnp.asarray(covariance, float), (count, 1, 1)),
             log_misfit=jnp.zeros(count),
-            taken=jnp.full(count, taken),
+            valid=jnp.full(count, taken),
         ),
         kept=prior.initialised,
         log_weight=prior.log_weight,

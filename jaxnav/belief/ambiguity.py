@@ -48,19 +48,19 @@ class PoseBelief(eqx.Module):
 
 
 class PoseMeasurement(eqx.Module):
-    """The pose that each hypothesis takes as measured; finite numbers where `taken` is False."""
+    """The pose that each hypothesis takes as measured; finite numbers where `valid` is False."""
 
     T_world_vehicle: jaxlie.SE3  # batch axis (K,)
     covariance: Float[Array, "*K 6 6"]  # of xi in T_world_vehicle * exp(xi)
     log_misfit: Float[Array, "*K"]  # log p(residuals at the pose), up to a constant
-    taken: Bool[Array, "*K"]
+    valid: Bool[Array, "*K"]
 
 
 class PosePosterior(eqx.Module):
     """The corrected pose of each hypothesis: prediction and corners fused by the selector.
 
     The filter adopts it and corrects the rest of its state by regression (`motion.follow_pose`).
-    Lanes where `taken` is False hold finite numbers.
+    Lanes where `valid` is False hold finite numbers.
     """
 
     T_world_vehicle: jaxlie.SE3  # batch axis (K,)
@@ -70,7 +70,7 @@ class PosePosterior(eqx.Module):
     # is counted as a rejection all the same.
     inflation: Float[Array, "*K"]
     log_likelihood: Float[Array, "*K"]  # of the corners given the prediction, up to a constant
-    taken: Bool[Array, "*K"]
+    valid: Bool[Array, "*K"]
 
 
 class Selection(eqx.Module):

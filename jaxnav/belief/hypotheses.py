@@ -131,7 +131,7 @@ class MultiHypothesis(eqx.Module):
                 lambda: own,
             )
         return Selection(
-            measured=eqx.tree_at(lambda m: m.taken, posteriors, alive & any_seen),
+            measured=eqx.tree_at(lambda m: m.valid, posteriors, alive & any_seen),
             kept=alive & ~starts,
             log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
             heir=mark_found(heir),

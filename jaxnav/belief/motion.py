@@ -162,8 +162,8 @@ class Motion(eqx.Module):
 
         def one(before: Bank, measured: Any) -> BankUpdate:
             offered = offer(before, measured, obs)
-            after, nis, accepted = apply_gate(before, offered, measured.taken)
-            compared = measured.taken & before.initialised
+            after, nis, accepted = apply_gate(before, offered, measured.valid)
+            compared = measured.valid & before.initialised
             return BankUpdate(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
 
         updated: BankUpdate = jax.vmap(one)(bank, measured)
@@ -232,7 +232,7 @@ def contradicted(
 def apply_gate(
     bank: Bank,
     offer: Offer,
-    taken: Bool[Array, ""],
+    valid: Bool[Array, ""],
 ) -> tuple[Bank, Float[Array, ""], Bool[Array, ""]]:
     """One hypothesis after the gate, the NIS of its pose, and whether the pose was accepted.
 
@@ -245,11 +245,11 @@ def apply_gate(
     Args:
         bank: a bank without its leading axis.
         offer: what the pose makes of it.
-        taken: whether there is a pose at all.
+        valid: whether there is a pose at all.
     """
     nis = jnp.sum(offer.innovation**2)
-    offered = taken & bank.initialised
-    starts, agrees = taken & ~bank.initialised, offered & (nis <= offer.gate_nis)
+    offered = valid & bank.initialised
+    starts, agrees = valid & ~bank.initialised, offered & (nis <= offer.gate_nis)
     accepted = offered & (nis <= offer.gate_nis * offer.inflation)
     predicted = (bank.mean, bank.covariance)
     mean, covariance = where(accepted, offer.posterior, where(starts, offer.first, predicted))
@@ -258,7 +258,7 @@ def apply_gate(
             mean,
             covariance,
             bank.log_weight,
-            bank.initialised | taken,
+            bank.initialised | valid,
             _cleared(_and_another(bank.rejections, offered, offer.innovation), agrees | starts),
             bank.number,
         ),

@@ -162,13 +162,13 @@ def _tree(plain: Any) -> Any:
 def _class(name: str) -> Any:
     """Find a class by `module:name` among the modules already imported."""
     module, _, qualified = name.partition(":")
-    found: Any = sys.modules.get(module)
+    member: Any = sys.modules.get(module)
     if module.partition(".")[0] in _OURS:
         for part in qualified.split("."):
-            found = getattr(found, part, None)
-        is_named = isinstance(found, type) and hasattr(found, "_fields")
-        if isinstance(found, type) and (dataclasses.is_dataclass(found) or is_named):
-            return found
+            member = getattr(member, part, None)
+        is_named = isinstance(member, type) and hasattr(member, "_fields")
+        if isinstance(member, type) and (dataclasses.is_dataclass(member) or is_named):
+            return member
     raise NotStorableError(f"{name} is no class of jaxnav's that consists of fields")
 
 

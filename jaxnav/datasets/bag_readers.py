@@ -97,10 +97,10 @@ class Ros2Reader(_Ros2Reader):
         self, connections: Collection[Connection] = (), start: Any = None, stop: Any = None
     ) -> Generator[tuple[Connection, int, bytes], None, None]:
         """See rosbags."""
-        found = _Ros2Reader.messages(self, connections, start, stop)
+        iterator = _Ros2Reader.messages(self, connections, start, stop)
         while True:
             with _spending(self._budget):
-                one = next(found, None)
+                one = next(iterator, None)
             if one is None:
                 return
             yield one
@@ -150,7 +150,7 @@ def typestore(connections: Collection[Connection], known: dict[str, str]) -> Any
     return types
 
 
-def _register(types: Any, found: Any) -> None:
+def _register(types: Any, definitions: Any) -> None:
     """Add types; refuse one whose messages take more memory than their bytes account for."""
     least: dict[str, int] = {}
 
@@ -158,7 +158,7 @@ def _register(types: Any, found: Any) -> None:
         if name in above or len(above) > limits.DEPTH:
             raise ValueError(f"{name} holds itself")
         if name not in least:
-            definition = found.get(name) or types.fielddefs.get(name)
+            definition = definitions.get(name) or types.fielddefs.get(name)
             fields = definition[1] if definition else ()
             least[name] = sum(of_field(field[1], (*above, name)) for field in fields)
         return least[name]
@@ -180,10 +180,10 @@ def _register(types: Any, found: Any) -> None:
             raise ValueError(f"a list of {length} entries in every message")
         return int(length) * size
 
-    for name in found:
+    for name in definitions:
         if least_bytes(name, ()) > limits.MESSAGE_BYTES:
             raise ValueError(f"{name} is larger than any message")
-    types.register(found)
+    types.register(definitions)
 
 
 # rosbags' own tables and names, by which it unpacks without a budget.

@@ -30,9 +30,9 @@ def read_recording(
     path = Path(path)
     if rig is not None and markers is None and bags.is_bag(path) and path.is_file():
         _no_markers(path)  # before all of it is read
-    found = read_source(path, rig)
-    reference = found.reference()
-    return assemble(found.name, found.rows, found.rig, markers or found.markers(), reference)
+    source = read_source(path, rig)
+    reference = source.reference()
+    return assemble(source.name, source.rows, source.rig, markers or source.markers(), reference)
 
 
 def read_source(path: Path, rig: CameraRig | None, also: str = "") -> RecordingSource:

@@ -127,43 +127,43 @@ class _Reader:
         }
         if self.topics.odometry is not None:
             wanted["odometry"] = (self.topics.odometry, ros_messages.ODOMETRY_TYPES)
-        chosen = [self._found(kinds, key, *entry) for key, entry in wanted.items()]
+        chosen = [self._find(kinds, key, *entry) for key, entry in wanted.items()]
         if ros_messages.TAGSLAM in [kinds[topic] for topic in chosen]:
             if len(set(self.markers.ids)) < len(self.markers.ids):
                 problem = "ids must differ: the recording does not tell families"
                 raise BadInput("--markers-file", problem)
         return chosen
 
-    def _found(
+    def _find(
         self, kinds: Mapping[str, str], key: str, topic: str, expected: tuple[str, ...]
     ) -> str:
         where = at(self.topics.path, key)
-        found = [recorded for recorded in kinds if _same(recorded, topic)]
-        if not found:
+        matches = [recorded for recorded in kinds if _same(recorded, topic)]
+        if not matches:
             listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(kinds.items()))
             problem = f"{self.path} has no topic {topic}; topics found: {listed or 'none'}"
             raise BadInput(where, problem)
-        if kinds[found[0]] not in expected:
-            problem = f"{topic} of {self.path} is of {kinds[found[0]]}, not of"
+        if kinds[matches[0]] not in expected:
+            problem = f"{topic} of {self.path} is of {kinds[matches[0]]}, not of"
             raise BadInput(where, f"{problem} {', '.join(expected)}")
-        return found[0]
+        return matches[0]
 
     def sighted(self, received: ReceivedMessage) -> FrameDetections:
         """The sightings in a message of detections or of an image."""
         camera = self._camera_of[received.topic.strip("/")]
         stamp_ns = ros_messages.stamp_ns(received.message)
         if received.kind in (ros_messages.IMAGE, ros_messages.COMPRESSED):
-            found = self._search(camera, received)
-            faults = Fault.FRAME_UNUSABLE if found is None else Fault(0)
-            return FrameDetections(camera, stamp_ns, found, faults)
-        found = ros_messages.detections(
+            detections = self._search(camera, received)
+            faults = Fault.FRAME_UNUSABLE if detections is None else Fault(0)
+            return FrameDetections(camera, stamp_ns, detections, faults)
+        detections = ros_messages.detections(
             received.kind,
             received.message,
             self.topics.first_corner,
             self.topics.corner_sigma_px,
             self._families,
         )
-        return FrameDetections(camera, stamp_ns, found)
+        return FrameDetections(camera, stamp_ns, detections)
 
     def _search(self, camera: int, received: ReceivedMessage) -> Detections | None:
         image = ros_messages.grey_image(received.kind, received.message)

@@ -57,8 +57,8 @@ def read_sightings(path: str | Path, rig: CameraRig | None = None) -> RecordedSi
     path = Path(path)
     if path.suffix == ".mcap" and path.exists() and not path.is_dir():
         return _of_drive(path, rig)
-    found = read_source(path, rig, also="a .mcap, ")
-    return _of_rows(found.rows, found.rig)
+    source = read_source(path, rig, also="a .mcap, ")
+    return _of_rows(source.rows, source.rig)
 
 
 def _of_rows(rows: Rows, rig: CameraRig) -> RecordedSightings:
@@ -84,12 +84,12 @@ def _of_drive(path: Path, rig: CameraRig | None) -> RecordedSightings:
         if not seen:
             continue
         for one in seen:
-            found = one.detections
-            assert found is not None
-            for index, marker_id in enumerate(found.ids):
-                family = found.families[index]
+            detections = one.detections
+            assert detections is not None
+            for index, marker_id in enumerate(detections.ids):
+                family = detections.families[index]
                 rows.append((len(stamps_ns), one.camera, int(marker_id), family))
-                corners_px.append(found.corners_px[index])
+                corners_px.append(detections.corners_px[index])
         stamps_ns.append(max(one.stamp_ns for one in seen))
     frame, camera, ids = (np.array([row[k] for row in rows], int) for k in range(3))
     return _ordered(

@@ -125,11 +125,13 @@ def _detections(
     where = at(path / "cameras.yaml", key, "tagtopic")
     if entry.tagtopic is None:
         raise BadInput(where, "missing: on which topic are this camera's detections?")
-    found = [bag.detections[entry.tagtopic] for bag in recorded if entry.tagtopic in bag.detections]
-    if len(found) != 1:
-        problem = f"{len(found) or 'no'} bags have {entry.tagtopic} of {bags.DETECTIONS_TYPE}"
+    detections = [
+        bag.detections[entry.tagtopic] for bag in recorded if entry.tagtopic in bag.detections
+    ]
+    if len(detections) != 1:
+        problem = f"{len(detections) or 'no'} bags have {entry.tagtopic} of {bags.DETECTIONS_TYPE}"
         raise BadInput(where, f"{problem}; {bags.list_topics(recorded)}")
-    return found[0]
+    return detections[0]
 
 
 def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: Edges, body: str) -> CameraRig:

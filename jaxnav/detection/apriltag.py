@@ -49,9 +49,9 @@ class AprilTagDetector:
         """
         del predicted_corners_px
         image = grey(image)
-        found = [
+        markers = [
             (int(tag.tag_id), np.asarray(tag.corners, float)[_TO_OURS] - APRILTAG_PIXEL_EDGE_PX)
             for tag in self._decoder.detect(np.ascontiguousarray(image))
             if tag.decision_margin > _MIN_DECISION_MARGIN
         ]
-        return refine_detections(image, found, self.family, camera)
+        return refine_detections(image, markers, self.family, camera)

@@ -51,24 +51,24 @@ class ArucoDetector:
         """Detect all markers of the family in the image: see `Detector.detect`."""
         image = grey(image)
         lens = Lens(camera)
-        found, unread = self._decode(image)
+        markers, unread = self._decode(image)
         if predicted_corners_px is not None:
             for quad in np.asarray(predicted_corners_px, float).reshape(-1, 4, 2):
-                if np.all(np.isfinite(quad)) and not any(_overlap(quad, c) for _, c in found):
-                    found_there, unread_there = self._decode_around(image, quad)
-                    found += [
-                        f for f in found_there if not any(_overlap(f[1], c) for _, c in found)
+                if np.all(np.isfinite(quad)) and not any(_overlap(quad, c) for _, c in markers):
+                    markers_there, unread_there = self._decode_around(image, quad)
+                    markers += [
+                        f for f in markers_there if not any(_overlap(f[1], c) for _, c in markers)
                     ]
                     unread = [quad, *unread_there, *unread]
-        looked_at = [corners for _, corners in found]
+        looked_at = [corners for _, corners in markers]
         for quad in frames_first(image, _worth_a_look(unread))[: self._closer_looks]:
             if any(_overlap(quad, other) for other in looked_at):
                 continue
             read = read_marker(image, quad, self.family, lens)
             if read is not None:
-                found.append((read[0], read[1].corners_px))
+                markers.append((read[0], read[1].corners_px))
                 looked_at.append(read[1].corners_px)
-        return refine_detections(image, found, self.family, camera)
+        return refine_detections(image, markers, self.family, camera)
 
     def detect_near(
         self,
@@ -79,22 +79,22 @@ class ArucoDetector:
     ) -> Detections:
         """Detect markers near their expected places: see `RegionDetector`."""
         image = grey(image)
-        found: list[tuple[int, np.ndarray]] = []
+        markers: list[tuple[int, np.ndarray]] = []
         unread: list[np.ndarray] = []
         for quad, radius in zip(quads_px, radius_px, strict=True):
             if np.all(np.isfinite(quad)) and np.isfinite(radius):
                 margin_px = _SEARCH_SIDES * mean_side_px(quad) + float(radius)
                 read, left = self._decode_region(image, quad, margin_px)
-                found += [f for f in read if not any(_overlap(f[1], c) for _, c in found)]
+                markers += [f for f in read if not any(_overlap(f[1], c) for _, c in markers)]
                 unread += left
-        if not found:
+        if not markers:
             lens = Lens(camera)
             for quad in frames_first(image, _worth_a_look(unread))[:2]:
                 code = read_marker(image, quad, self.family, lens)
                 if code is not None:
-                    found.append((code[0], code[1].corners_px))
+                    markers.append((code[0], code[1].corners_px))
                     break
-        return refine_detections(image, found, self.family, camera)
+        return refine_detections(image, markers, self.family, camera)
 
     def _decoder(self, perimeter_rate: float) -> cv2.aruco.ArucoDetector:
         """The decoder whose least perimeter is this part of the image's longer side."""
@@ -116,14 +116,14 @@ class ArucoDetector:
         least_px = max(perimeter_rate, _PERIMETER_RATE) * max(image.shape)
         left = thin_crowd(image, self.family, least_px)
         quads, ids, unread = self._decoder(perimeter_rate).detectMarkers(left)
-        found_ids = [] if ids is None else [int(i) for i in ids.ravel()]
-        found = [
-            (i, quad.reshape(4, 2).astype(float)) for i, quad in zip(found_ids, quads, strict=True)
+        marker_ids = [] if ids is None else [int(i) for i in ids.ravel()]
+        markers = [
+            (i, quad.reshape(4, 2).astype(float)) for i, quad in zip(marker_ids, quads, strict=True)
         ]
         others = [quad.reshape(4, 2).astype(float) for quad in unread]
         if left is not image:
             others = frames_first(image, _worth_a_look(others))[:_LOOKS_IN_A_CROWD]
-        return found, others
+        return markers, others
 
     def _decode_around(
         self, image: np.ndarray, quad: np.ndarray
@@ -148,12 +148,12 @@ class ArucoDetector:
         scale = _ENLARGE if side_px <= _ENLARGE_UP_TO_PX else 1
         if scale > 1:
             region = cv2.resize(region, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        found, unread = self._decode(region, np.floor(10 * perimeter_rate) / 10)
+        markers, unread = self._decode(region, np.floor(10 * perimeter_rate) / 10)
 
         def back(corners: np.ndarray) -> np.ndarray:
             return (corners + 0.5) / scale - 0.5 + low
 
-        return [(i, back(corners)) for i, corners in found], [back(corners) for corners in unread]
+        return [(i, back(corners)) for i, corners in markers], [back(corners) for corners in unread]
 
 
 def _worth_a_look(quads: list[np.ndarray]) -> list[np.ndarray]:

@@ -73,8 +73,8 @@ def _quads(image: np.ndarray, least_perimeter_px: float) -> np.ndarray:
     outlines: list[np.ndarray] = []
     for window_px in _WINDOWS_PX:
         dark = _dark(image, window_px)
-        found_there, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        outlines += [np.asarray(o) for o in found_there if len(o) >= least_perimeter_px]
+        contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        outlines += [np.asarray(o) for o in contours if len(o) >= least_perimeter_px]
     quads = []
     for outline in sorted(outlines, key=len)[::-1]:
         corners = cv2.approxPolyDP(outline, _STRAIGHT * len(outline), True)
@@ -82,13 +82,13 @@ def _quads(image: np.ndarray, least_perimeter_px: float) -> np.ndarray:
             quads.append(corners.reshape(4, 2))
             if len(quads) == _MOST_LOOKED_AT:
                 break
-    found = np.array(quads, float).reshape(-1, 4, 2)
+    quads_px = np.array(quads, float).reshape(-1, 4, 2)
     # Each threshold window finds the same quadrilateral again.
-    places = np.round(found.mean(axis=1) / _SAME_PLACE_PX)
-    found = found[np.sort(np.unique(places, axis=0, return_index=True)[1])]
-    edges = np.roll(found, -1, axis=1) - found
+    places = np.round(quads_px.mean(axis=1) / _SAME_PLACE_PX)
+    quads_px = quads_px[np.sort(np.unique(places, axis=0, return_index=True)[1])]
+    edges = np.roll(quads_px, -1, axis=1) - quads_px
     is_clockwise = edges[:, 0, 0] * edges[:, 1, 1] > edges[:, 0, 1] * edges[:, 1, 0]
-    return np.where(is_clockwise[:, None, None], found, found[:, ::-1])
+    return np.where(is_clockwise[:, None, None], quads_px, quads_px[:, ::-1])
 
 
 def _unlikeness(image: np.ndarray, quads: np.ndarray, family: str) -> np.ndarray:

@@ -32,7 +32,9 @@ class ImageSearch:
         if camera not in self._lenses:
             self._lenses[camera] = self._rig.camera(camera)
         lens = self._lenses[camera]
-        return Detections.concatenate([found.detect(image, lens) for found in self._detectors])
+        return Detections.concatenate(
+            [detector.detect(image, lens) for detector in self._detectors]
+        )
 
 
 def size_problem(rig: CameraRig, camera: int, image: np.ndarray) -> str | None:

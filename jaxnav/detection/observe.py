@@ -44,11 +44,11 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes
     visible = np.zeros(shape, bool)
     sigma_px = np.ones((*shape, 4))
     unknown = duplicates = 0
-    for camera, found in enumerate(detections):
-        if not len(found):
+    for camera, sightings in enumerate(detections):
+        if not len(sightings):
             continue
-        keys = list(zip(found.ids.tolist(), found.families, strict=True))
-        kept = _once_each(keys, found.corners_px)
+        keys = list(zip(sightings.ids.tolist(), sightings.families, strict=True))
+        kept = _once_each(keys, sightings.corners_px)
         counts = Counter(keys[k] for k in kept)
         for k in kept:
             key = keys[k]
@@ -58,8 +58,8 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes
             elif counts[key] > 1:
                 duplicates += 1
             else:
-                corners_px[camera, marker] = found.corners_px[k]
-                sigma_px[camera, marker] = found.sigma_px[k]
+                corners_px[camera, marker] = sightings.corners_px[k]
+                sigma_px[camera, marker] = sightings.sigma_px[k]
                 visible[camera, marker] = True
     return CornerLanes(corners_px, visible, sigma_px, unknown, duplicates)
 

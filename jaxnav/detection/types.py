@@ -112,17 +112,17 @@ def grey(image: np.ndarray) -> np.ndarray:
 
 def refine_detections(
     image: np.ndarray,
-    found: Sequence[tuple[int, np.ndarray]],
+    markers: Sequence[tuple[int, np.ndarray]],
     family: str,
     camera: Camera | None,
 ) -> Detections:
     """Refine the corners of markers that a decoder found, given as (id, (4, 2) corners) each."""
     lens = Lens(camera)
-    fits = [refine_corners(image, corners, marker_cells(family, i), lens) for i, corners in found]
+    fits = [refine_corners(image, corners, marker_cells(family, i), lens) for i, corners in markers]
     return Detections(
-        ids=np.array([marker_id for marker_id, _ in found], int),
+        ids=np.array([marker_id for marker_id, _ in markers], int),
         corners_px=np.array([fit.corners_px for fit in fits], float).reshape(-1, 4, 2),
         sigma_px=np.array([fit.sigma_px for fit in fits], float).reshape(-1, 4),
         refined=np.array([fit.good for fit in fits], bool),
-        families=(family,) * len(found),
+        families=(family,) * len(markers),
     )

@@ -23,7 +23,7 @@ def read_npz(path: Path, keys: Collection[str] | None = None) -> Mapping[str, np
     Raises:
         Exception: any that the bytes lead to in NumPy, zipfile, zlib and here.
     """
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     left = limits.NPZ_BYTES
     with path.open("rb") as file:
         if file.read(6) == np.lib.format.MAGIC_PREFIX:
@@ -33,12 +33,12 @@ def read_npz(path: Path, keys: Collection[str] | None = None) -> Mapping[str, np
             key = info.filename.removesuffix(".npy")
             if keys is not None and key not in keys:
                 continue
-            if key in found:
+            if key in arrays:
                 raise ValueError(f"it holds {key!r} twice")
             with archive.open(info) as stream:
-                found[key] = _array(key, stream, left)
-            left -= found[key].nbytes
-    return found
+                arrays[key] = _array(key, stream, left)
+            left -= arrays[key].nbytes
+    return arrays
 
 
 def _array(key: str, stream: IO[bytes], most_bytes: int) -> np.ndarray:

@@ -72,9 +72,9 @@ class PrivateFolder:
         """
         fd = os.open(name, _FILE, dir_fd=self._fd)
         with os.fdopen(fd, "rb") as file:
-            found = os.fstat(fd)
-            _require_own(self.path / name, found, _OTHERS_WRITE)
-            if not stat.S_ISREG(found.st_mode) or found.st_size > _MAX_BYTES:
+            status = os.fstat(fd)
+            _require_own(self.path / name, status, _OTHERS_WRITE)
+            if not stat.S_ISREG(status.st_mode) or status.st_size > _MAX_BYTES:
                 raise OSError(f"{self.path / name} is no file of at most {_MAX_BYTES} bytes")
             raw = file.read(_MAX_BYTES)
             os.utime(fd)
@@ -103,17 +103,17 @@ class PrivateFolder:
     def holds(self, name: str) -> bool:
         """Whether there is a file of that name."""
         try:
-            return stat.S_ISREG(self._found(name).st_mode)
+            return stat.S_ISREG(self._status(name).st_mode)
         except OSError:
             return False
 
     def names_by_use(self) -> list[str]:
         """The names of all entries, the one used longest ago first."""
-        found = []
+        entries = []
         for name in self._names():
             with suppress(FileNotFoundError):
-                found.append((self._found(name).st_mtime_ns, name))
-        return [name for _, name in sorted(found)]
+                entries.append((self._status(name).st_mtime_ns, name))
+        return [name for _, name in sorted(entries)]
 
     def remove(self, name: str) -> None:
         """Remove a file if it is still there."""
@@ -130,16 +130,16 @@ class PrivateFolder:
         may_enter = os.fstat(self._fd).st_mode & _OTHERS_ENTER
         for name in self._names():
             with suppress(FileNotFoundError):
-                found = self._found(name)
-                if stat.S_ISLNK(found.st_mode):
+                status = self._status(name)
+                if stat.S_ISLNK(status.st_mode):
                     raise NotPrivateError(f"{self.path / name} is a link")
-                _require_own(self.path / name, found, _OTHERS_WRITE if may_enter else 0)
+                _require_own(self.path / name, status, _OTHERS_WRITE if may_enter else 0)
 
     def _names(self) -> list[str]:
         with os.scandir(self._fd) as entries:
             return [entry.name for entry in entries]
 
-    def _found(self, name: str) -> os.stat_result:
+    def _status(self, name: str) -> os.stat_result:
         return os.stat(name, dir_fd=self._fd, follow_symlinks=False)
 
 
@@ -156,10 +156,10 @@ def _opened(path: Path, make: bool) -> int:
             inner = _opened_in(fd, name, so_far, _LISTED if is_last else _PASSED, make)
             os.close(fd)
             fd = inner
-            found = os.fstat(fd)
+            status = os.fstat(fd)
             # In such a folder no other user can rename or replace what is ours.
-            names_are_their_owners = bool(found.st_mode & stat.S_ISVTX) and not is_last
-            _require_own(so_far, found, 0 if names_are_their_owners else _OTHERS_WRITE)
+            names_are_their_owners = bool(status.st_mode & stat.S_ISVTX) and not is_last
+            _require_own(so_far, status, 0 if names_are_their_owners else _OTHERS_WRITE)
     except BaseException:
         os.close(fd)
         raise
@@ -181,11 +181,11 @@ def _opened_in(fd: int, name: str, path: Path, flags: int, make: bool) -> int:
         raise
 
 
-def _require_own(path: Path, found: os.stat_result, forbidden: int) -> None:
-    if found.st_uid not in (_ROOT, os.geteuid()):
-        raise NotPrivateError(f"{path} belongs to another user, number {found.st_uid}")
-    if found.st_mode & forbidden:
-        others = "all" if found.st_mode & stat.S_IWOTH else "its group"
+def _require_own(path: Path, status: os.stat_result, forbidden: int) -> None:
+    if status.st_uid not in (_ROOT, os.geteuid()):
+        raise NotPrivateError(f"{path} belongs to another user, number {status.st_uid}")
+    if status.st_mode & forbidden:
+        others = "all" if status.st_mode & stat.S_IWOTH else "its group"
         raise NotPrivateError(f"{path} can be written to by {others}: chmod go-w {path}")
 
 

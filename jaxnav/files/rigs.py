@@ -101,8 +101,8 @@ class CameraEntry(Entry):
         places = ("T_vehicle_camera", "T_camera_vehicle", "position_m")
         given = [key for key in places if getattr(self, key) is not None]
         if len(given) != 1:
-            found = f"got {' and '.join(given)}" if given else "got none"
-            raise ValueError(f"needs exactly one of {', '.join(places)}, {found}")
+            ending = f"got {' and '.join(given)}" if given else "got none"
+            raise ValueError(f"needs exactly one of {', '.join(places)}, {ending}")
         angles = [key for key in ("yaw_deg", "elevation_deg", "roll_deg") if getattr(self, key)]
         if angles and given != ["position_m"]:
             raise ValueError(f"{angles[0]} goes with position_m, not with {given[0]}")

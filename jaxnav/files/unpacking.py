@@ -60,14 +60,14 @@ def unpack_chunk(kind: str, data: bytes, budget: Budget, most: int = limits.CHUN
         pieces = _framed(
             {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}[kind], data
         )
-    found, count = [], 0
+    parts, count = [], 0
     for piece in pieces:
         count += len(piece)
         if count > most:
             raise ValueError(f"a chunk that is larger than it says, or than {most} bytes")
         budget.take(len(piece))
-        found.append(piece)
-    return b"".join(found)
+        parts.append(piece)
+    return b"".join(parts)
 
 
 def copy_bz2(source: Path, target: IO[bytes], budget: Budget) -> None:

@@ -210,10 +210,10 @@ def _remember(folder: Path) -> None:
 def _identity(path: Path) -> tuple[int, int] | None:
     """Device and inode of a path; None where there is no such file, or it can't be a name."""
     try:
-        found = path.stat()
+        status = path.stat()
     except (OSError, ValueError):
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def _metres(value: float) -> str:

@@ -261,7 +261,7 @@ def _sorted_switch(
     slot = first_block[chosen] * block + place
     slots = (lanes // block + count) * block
 
-    def gathered(at: jax.Array) -> list[Value]:
+    def gather(at: jax.Array) -> list[Value]:
         return [Lane(o.rows, 0, at) if isinstance(o, Lane) else o for o in operands]
 
     buffers = [jnp.zeros((*aval.shape, slots), aval.dtype) for aval in shapes]
@@ -276,7 +276,7 @@ def _sorted_switch(
             last: jax.Array = last,
         ) -> list[jax.Array]:
             at = order[jnp.minimum(first[number] + j * block + jnp.arange(block), last)]
-            outs = branch(gathered(at))
+            outs = branch(gather(at))
             start = (first_block[number] + j) * block
             return [
                 lax.dynamic_update_slice_in_dim(b, out, start, b.ndim - 1)

@@ -66,12 +66,12 @@ def in_strips(
 
             rows, others = map(here, varying), iter(shared)
 
-            def taken(arg: Value) -> Value:
+            def take(arg: Value) -> Value:
                 if isinstance(arg, Lane):
                     return next(rows)
                 return arg if isinstance(arg, np.ndarray) else next(others)
 
-            ends = loop([*map(taken, fixed), *map(here, start)])
+            ends = loop([*map(take, fixed), *map(here, start)])
             return [
                 lax.dynamic_update_slice_in_dim(out, rows_of(end, STRIP), first, out.ndim - 1)
                 for out, end in zip(outs, ends, strict=True)

@@ -176,8 +176,8 @@ def _rows_at(rows: jax.Array, flat: np.ndarray) -> jax.Array:
     breaks = np.flatnonzero(np.diff(order) != 1) + 1
     runs = np.split(order, breaks)
     if len(runs) > 4:
-        taken = rows.at[order].get(mode="promise_in_bounds", unique_indices=False)
-        return taken.reshape(*flat.shape, lanes)
+        selection = rows.at[order].get(mode="promise_in_bounds", unique_indices=False)
+        return selection.reshape(*flat.shape, lanes)
     pieces = [lax.slice_in_dim(rows, int(run[0]), int(run[-1]) + 1) for run in runs if run.size]
     if not pieces:
         return jnp.zeros((*flat.shape, lanes), rows.dtype)

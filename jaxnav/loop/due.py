@@ -36,5 +36,5 @@ def _quads_px(navigator: Navigator, place: Place) -> np.ndarray:
     """Corners as seen from a place, (C, M, 4, 2), by the program that predicts search regions."""
     (x_m, y_m, psi_rad), dtype = place, np.asarray(navigator.corner_sigma_px).dtype
     wxyz_xyz = np.array([math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0], dtype)
-    found = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))
-    return np.asarray(found.quads_px)
+    corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))
+    return np.asarray(corners.quads_px)

@@ -73,7 +73,7 @@ class FrameIntake:
         if not frames:
             return None, now_ns, _NO_FAULT
         faults = _NO_FAULT
-        found = [_NONE] * len(self.newest_ns)
+        detections = [_NONE] * len(self.newest_ns)
         stamps_ns: dict[int, int] = {}
         for frame in frames:
             if frame.faults:
@@ -93,8 +93,8 @@ class FrameIntake:
                 continue
             self.newest_ns[frame.camera] = max(stamp_ns, self.newest_ns[frame.camera] or 0)
             if len(frame.detections):
-                found[frame.camera], stamps_ns[frame.camera] = frame.detections, stamp_ns
-        seen = observe(found, self._markers)
+                detections[frame.camera], stamps_ns[frame.camera] = frame.detections, stamp_ns
+        seen = observe(detections, self._markers)
         if seen.unknown:
             faults |= Fault.UNKNOWN_MARKER
         if seen.duplicates:

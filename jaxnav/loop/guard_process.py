@@ -223,8 +223,8 @@ def _factory(name: str, path: list[str]) -> Any:
     factory = plugins.load_factory("--vehicle", plugins.VEHICLES, name)
     if isinstance(factory, SharesProcess) and factory.shares_process:
         raise CanNotMoveError("it shares its process")
-    if found := [module for module in _HEAVY if module in sys.modules]:
-        raise CanNotMoveError(f"its module imports {' and '.join(found)}")
+    if modules := [module for module in _HEAVY if module in sys.modules]:
+        raise CanNotMoveError(f"its module imports {' and '.join(modules)}")
     return factory
 
 

@@ -104,23 +104,23 @@ class Monitor:
     def _missing(self, senses: Senses) -> Fault:
         limits = self.timeouts
         stale = [age_s > limits.camera_stale_s for age_s in senses.cameras_age_s]
-        found = _NO_FAULT
+        faults = _NO_FAULT
         if any(stale):
-            found |= Fault.CAMERA_STALE
+            faults |= Fault.CAMERA_STALE
         if stale and all(stale):
-            found |= Fault.CAMERAS_STALE
+            faults |= Fault.CAMERAS_STALE
         if senses.odometry_age_s > limits.odometry_stale_s:
-            found |= Fault.ODOMETRY_STALE
+            faults |= Fault.ODOMETRY_STALE
         if senses.restarts > MOST_RESTARTS:
-            found |= Fault.RESTARTED_OFTEN
+            faults |= Fault.RESTARTED_OFTEN
         if senses.located:
             if senses.fix_age_s > limits.flag_s:
-                found |= Fault.NO_MARKER
+                faults |= Fault.NO_MARKER
             if not senses.position_sigma_m <= limits.position_sigma_m and senses.decided:
-                found |= Fault.UNSURE
+                faults |= Fault.UNSURE
             if senses.distance_m > limits.distance_m:
-                found |= Fault.FAR_FROM_FIX
-        return found
+                faults |= Fault.FAR_FROM_FIX
+        return faults
 
     def _wanted(self, senses: Senses, faults: Fault) -> Health:
         limits = self.timeouts

@@ -177,12 +177,12 @@ class Loop:
     def _handle(self, given: Input) -> None:
         begin_s = time.perf_counter()
         outcome = self.pilot.handle(given)
-        taken = self.guard.write(outcome.steering_rad, outcome.throttle)
+        success = self.guard.write(outcome.steering_rad, outcome.throttle)
         end_s = time.perf_counter()
         kind = "odometry" if given.odometry else "frames" if given.frames else "tick"
         self.statistics.add(f"handle {kind}", (end_s - begin_s) * 1e3)
         self.statistics.handled += 1
-        if kind == "frames" and taken:
+        if kind == "frames" and success:
             self.statistics.add(
                 "frame to command", (self._now_ns() - given.frames[0].stamp_ns) / 1e6
             )
@@ -219,5 +219,5 @@ class Loop:
 
     def _expected(self, wxyz_xyz: np.ndarray, covariance: np.ndarray) -> Expected:
         navigator = self.pilot.navigator
-        found = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, covariance)
-        return Expected(*jax.device_get(found))
+        corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, covariance)
+        return Expected(*jax.device_get(corners))

@@ -339,14 +339,14 @@ class Pilot:
 
     def _contradictions(self) -> Fault:
         """The faults that contradict the estimated pose."""
-        support, found = self._support, _NO_FAULT
+        support, faults = self._support, _NO_FAULT
         if support.relocated:
-            found |= Fault.RELOCATED
+            faults |= Fault.RELOCATED
         if support.disputed:
-            found |= Fault.WAYS_DISPUTED
+            faults |= Fault.WAYS_DISPUTED
         if support.odometry_doubtful:
-            found |= Fault.ODOMETRY_DOUBTFUL
-        return found
+            faults |= Fault.ODOMETRY_DOUBTFUL
+        return faults
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""

@@ -62,11 +62,11 @@ def open_cameras(name: str, setup: Setup, vehicle: Vehicle) -> tuple[Camera, ...
             the rig's cameras.
     """
     flag = "--cameras"
-    found = _opened(flag, name, load_factory(flag, CAMERAS, name), setup, vehicle)
-    if not isinstance(found, Sequence) or isinstance(found, str | bytes):
-        _close([found])
-        raise BadInput(flag, f"{name} gives {_what(found)}, expected a sequence of cameras")
-    cameras = tuple(found)
+    product = _opened(flag, name, load_factory(flag, CAMERAS, name), setup, vehicle)
+    if not isinstance(product, Sequence) or isinstance(product, str | bytes):
+        _close([product])
+        raise BadInput(flag, f"{name} gives {_what(product)}, expected a sequence of cameras")
+    cameras = tuple(product)
     if problem := _wrong_with(cameras, setup.rig.names):
         _close(cameras)
         raise BadInput(flag, f"{name} {problem}")
@@ -93,14 +93,14 @@ def load_factory(flag: str, group: str, name: str) -> Callable[..., Any]:
             f"there is no {name!r}: expected {', '.join(sorted(installed)) or 'an installed name'}"
             " or module:name",
         )
-    found: Any = _imported(flag, name, module)
+    member: Any = _imported(flag, name, module)
     for part in attribute.split("."):
-        if not hasattr(found, part):
+        if not hasattr(member, part):
             raise BadInput(flag, f"{name}: the module {module} has no {attribute!r}")
-        found = getattr(found, part)
-    if not callable(found):
-        raise BadInput(flag, f"{name}: {target} is {_what(found)}, expected a function")
-    return found
+        member = getattr(member, part)
+    if not callable(member):
+        raise BadInput(flag, f"{name}: {target} is {_what(member)}, expected a function")
+    return member
 
 
 def missing_members(opened: object, protocol: type) -> list[str]:

@@ -95,15 +95,15 @@ class Search:
         if self._repeats(frame.image):
             return FrameDetections(self._camera, frame.stamp_ns, None, Fault.FRAME_FROZEN)
         self._since_whole += 1
-        found = _NONE
+        detections = _NONE
         if region is not None and self._since_whole < WHOLE_EVERY:
             if not len(region.quads_px):
                 return FrameDetections(self._camera, frame.stamp_ns, _NONE)
-            found = self._near(frame.image, region)
-        if not len(found):
+            detections = self._near(frame.image, region)
+        if not len(detections):
             self._since_whole = 0
-            found = self._everywhere(frame.image, region)
-        return FrameDetections(self._camera, frame.stamp_ns, found)
+            detections = self._everywhere(frame.image, region)
+        return FrameDetections(self._camera, frame.stamp_ns, detections)
 
     def _repeats(self, image: np.ndarray) -> bool:
         """Whether a picture has come FROZEN_AFTER times in a row: every sensor has noise. Bytes are
@@ -232,10 +232,10 @@ class Eyes:
         try:
             while not self._over.is_set():
                 self._guard.beat(name)
-                taken = self._next()
-                if taken is None:
+                task = self._next()
+                if task is None:
                     continue
-                index, frame = taken
+                index, frame = task
                 try:
                     # A camera that detects markers itself needs no region.
                     region = self.expected(index) if frame.detections is None else None

@@ -110,14 +110,14 @@ class NielsenLM(optx.AbstractLeastSquaresSolver):
         tags: frozenset[object],
     ) -> tuple[PyTree, LMState, PyTree]:
         """Try one damped step of every problem, accept it where the cost falls, adapt lambda."""
-        found = self.solved(state.normal, state.damping)
-        tried = self.moved(y, found.move)
+        solution = self.solved(state.normal, state.damping)
+        tried = self.moved(y, solution.move)
         residual, normal = fn(tried, args)
         cost = jnp.sum(residual**2, axis=0)
         accept = (cost < state.cost) & ~state.done
-        gained = (state.cost - cost) / jnp.where(found.promised > 0, found.promised, 1)
-        exhausted = found.promised <= self.rtol * state.cost + self.atol
-        damping, growth = adapted(found.damping, state.growth, accept, gained)
+        gained = (state.cost - cost) / jnp.where(solution.promised > 0, solution.promised, 1)
+        exhausted = solution.promised <= self.rtol * state.cost + self.atol
+        damping, growth = adapted(solution.damping, state.growth, accept, gained)
 
         def chosen(new: PyTree, old: PyTree) -> PyTree:
             return jax.tree.map(lambda a, b: jnp.where(_for_leaf(accept, a), a, b), new, old)

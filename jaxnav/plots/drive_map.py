@@ -126,15 +126,15 @@ def _draw_ellipses(axes: Axes, outcomes: Outcomes, known: np.ndarray) -> None:
 
 def _candidate_poses(outcomes: Outcomes) -> dict[bool, np.ndarray]:
     """Whether selected -> (N, 3) planar poses of single frames' candidates, evenly spaced."""
-    found: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    candidates: dict[bool, list[np.ndarray]] = {True: [], False: []}
     seen = [index for index, Ts in enumerate(outcomes.Ts_vehicle_world) if len(Ts)]
     for index in (seen[number] for number in _evenly(len(seen), _CANDIDATES)):
         for number, T_vehicle_world in enumerate(outcomes.Ts_vehicle_world[index]):
             w, x, y, z, *place_m = poses.inverse(T_vehicle_world)
             psi_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
-            taken = number == outcomes.selected[index]
-            found[taken].append(np.array([place_m[0], place_m[1], psi_rad]))
-    return {taken: np.array(rows).reshape(-1, 3) for taken, rows in found.items()}
+            is_selected = number == outcomes.selected[index]
+            candidates[is_selected].append(np.array([place_m[0], place_m[1], psi_rad]))
+    return {is_selected: np.array(rows).reshape(-1, 3) for is_selected, rows in candidates.items()}
 
 
 def _alternatives(outcomes: Outcomes) -> np.ndarray:

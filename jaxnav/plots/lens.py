@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from jaxnav.calibration.lenses.bundle import gathered
+from jaxnav.calibration.lenses.bundle import padded_corners
 from jaxnav.calibration.lenses.checks import Cells, cells
 from jaxnav.calibration.lenses.intrinsics import LensCalibration
 from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
@@ -45,7 +45,7 @@ def _draw(part: SubFigure, name: str, calibration: LensCalibration) -> None:
 def _draw_residuals(axes: Axes, calibration: LensCalibration, seen: Cells) -> None:
     """Draw the mean residual of every cell, over the corners themselves."""
     fit = calibration.fit
-    corners_px = np.asarray(gathered(fit.views).corners_px)[: len(fit.used)][fit.used]
+    corners_px = np.asarray(padded_corners(fit.views).corners_px)[: len(fit.used)][fit.used]
     axes.plot(*corners_px.T, ".", ms=1.5, color=SKY, alpha=0.6)
     filled = seen.corners > 0
     length_px = np.linalg.norm(seen.mean_px[filled], axis=-1)

@@ -60,7 +60,7 @@ def rig_report(
 def map_check(
     *,
     given: np.ndarray,
-    found: np.ndarray,
+    estimate: np.ndarray,
     size_m: np.ndarray,
     ids: Sequence[int],
     wrong: Sequence[bool],
@@ -68,7 +68,7 @@ def map_check(
     """Draw a given map and the found one over each other, with arrows from one to the other.
 
     Args:
-        given, found: (M, 4, 4) T_world_marker.
+        given, estimate: (M, 4, 4) T_world_marker.
         wrong: for each marker, whether something is wrong with it.
     """
     figure = Figure(figsize=(7.5, 6.5), layout="constrained")
@@ -76,7 +76,7 @@ def map_check(
     corners = size_m[:, None, None] / 2 * CORNER_SIGNS
     squares = [
         (Ts[:, None, :3, :3] @ corners[..., None])[..., 0] + Ts[:, None, :3, 3]
-        for Ts in (given, found)
+        for Ts in (given, estimate)
     ]
     flat, labels = _flattened(np.concatenate(squares).reshape(-1, 3))
     before, after = flat.reshape(2, -1, 4, 2)

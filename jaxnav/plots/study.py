@@ -22,12 +22,12 @@ _MAP_WIDTH, _MAP_HEIGHT = 3.9, 3.5  # of one panel, inches
 
 def numeric_axes(summary: xr.Dataset) -> list[str]:
     """The axes that can be drawn: numeric, with at least two values; the longest first."""
-    found = [
+    names = [
         name
         for name, values in summary.coords.items()
         if values.dtype.kind in "if" and values.ndim == 1 and values.size > 1
     ]
-    return sorted(map(str, found), key=lambda name: -summary.sizes[name])
+    return sorted(map(str, names), key=lambda name: -summary.sizes[name])
 
 
 def study_map(summary: xr.Dataset, measure: str, x: str, y: str, panels: str | None) -> Figure:

@@ -91,10 +91,10 @@ def find_inliers(snapshot: Snapshot, find: Find) -> Inliers:
         # One slot of each marker stands for it; slots of the same marker come to the same.
         def without(marker: Array) -> tuple[Array, Candidates]:
             rest = _among(snapshot, seen.marker_index != marker)
-            found = find(rest, own)
-            return _excess(found, rest.seen), found
+            alternative = find(rest, own)
+            return _excess(alternative, rest.seen), alternative
 
-        excess, found = jax.vmap(without)(seen.marker_index)
+        excess, alternatives = jax.vmap(without)(seen.marker_index)
         excess = jnp.where(seen.visible, excess, jnp.inf)
         best = jnp.argmin(excess)
         is_other = seen.marker_index != seen.marker_index[best]
@@ -103,7 +103,7 @@ def find_inliers(snapshot: Snapshot, find: Find) -> Inliers:
             excess[best] * _GAIN <= jnp.minimum(second, all_of_them)
         )
         kept = is_other | ~clear
-        rest = jax.tree.map(lambda leaf: leaf[best], found)
+        rest = jax.tree.map(lambda leaf: leaf[best], alternatives)
         return kept, where(clear, rest, candidates)
 
     kept, candidates = jax.lax.cond(

@@ -101,8 +101,8 @@ def _read(path: Path, progress: Callable[[int], object]) -> DriveLog:
                     columns[name].append(value)
                 continue
             inputs.append(input_of(message))
-            found = (frame.detections for frame in inputs[-1].frames)
-            detections += sum(len(one) for one in found if one is not None)
+            sightings = (frame.detections for frame in inputs[-1].frames)
+            detections += sum(len(one) for one in sightings if one is not None)
             if detections > limits.DETECTIONS:
                 problem = f"holds more than {limits.DETECTIONS} detections"
                 raise BadInput(f"{path}: {record.topic}", problem)

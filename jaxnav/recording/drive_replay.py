@@ -185,7 +185,7 @@ def inputs_from_images(
     Raises:
         BadInput: there is no camera's image, or one has a wrong size; as `make_detector`.
     """
-    search, found = ImageSearch(setup.rig, setup.markers, corner_backend), {}
+    search, detections = ImageSearch(setup.rig, setup.markers, corner_backend), {}
     camera_of = {f"/camera/{name}": index for index, name in enumerate(setup.rig.names)}
     for image in log.images():
         if image.topic not in camera_of:
@@ -196,14 +196,14 @@ def inputs_from_images(
             raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
         if problem := size_problem(setup.rig, camera, pixels):
             raise BadInput(f"{log.path}: {image.topic}", problem)
-        found[camera, image.stamp_ns] = search.detections(camera, pixels)
-    if not found:
+        detections[camera, image.stamp_ns] = search.detections(camera, pixels)
+    if not detections:
         raise BadInput(log.path, f"holds no image on {', '.join(camera_of)}")
     searched = 0
 
     def anew(frame: FrameDetections) -> FrameDetections:
         nonlocal searched
-        seen: Detections | None = found.get((frame.camera, frame.stamp_ns))
+        seen: Detections | None = detections.get((frame.camera, frame.stamp_ns))
         if seen is None or frame.detections is None:
             return frame
         searched += 1

@@ -259,8 +259,8 @@ def this_process() -> dict[str, str]:
 
 
 def _checked(header: dict[str, Any], where: Path) -> SetupEntry:
-    found = header.get("setup_version")
-    if isinstance(found, int) and found != SETUP_VERSION:
-        problem = f"this program reads {SETUP_VERSION}, the file has {found}"
+    setup_version = header.get("setup_version")
+    if isinstance(setup_version, int) and setup_version != SETUP_VERSION:
+        problem = f"this program reads {SETUP_VERSION}, the file has {setup_version}"
         raise BadInput(at(where, "header.setup_version"), problem)
     return validate(SetupEntry, header, where, "header")

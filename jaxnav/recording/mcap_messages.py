@@ -110,11 +110,11 @@ class McapMessages:
             if is_over:
                 continue
             for inner in _opened(record, budget) if isinstance(record, Chunk) else [record]:
-                if (found := self._found(inner)) is not None:
-                    yield found
+                if (content := self._content(inner)) is not None:
+                    yield content
         self.truncated = False
 
-    def _found(self, record: McapRecord) -> Metadata | RecordedMessage | None:
+    def _content(self, record: McapRecord) -> Metadata | RecordedMessage | None:
         if isinstance(record, Message):
             self._messages += 1
             if self._messages > limits.MCAP_MESSAGES:

@@ -65,16 +65,16 @@ def input_of(message: OdometryMessage | FramesMessage | TickMessage) -> Input:
 
 
 def _sighted_message(frame: FrameDetections) -> dict[str, Any]:
-    found = _NONE if frame.detections is None else frame.detections
+    detections = _NONE if frame.detections is None else frame.detections
     return {
         "camera": frame.camera,
         "stamp_ns": _recordable(frame.stamp_ns),
         "usable": frame.detections is not None,
-        "ids": found.ids,
-        "families": found.families,
-        "corners_px": Rows(found.corners_px),
-        "sigma_px": Rows(found.sigma_px),
-        "refined": found.refined,
+        "ids": detections.ids,
+        "families": detections.families,
+        "corners_px": Rows(detections.corners_px),
+        "sigma_px": Rows(detections.sigma_px),
+        "refined": detections.refined,
         "faults": frame.faults,
     }
 
@@ -84,14 +84,14 @@ def _recordable(stamp_ns: int) -> int:
 
 
 def _sighted(message: SightedMessage) -> FrameDetections:
-    found = Detections(
+    markers = Detections(
         ids=message.ids,
         corners_px=message.corners_px,
         sigma_px=message.sigma_px,
         refined=message.refined,
         families=tuple(message.families),
     )
-    detections = found if message.usable else None
+    detections = markers if message.usable else None
     return FrameDetections(message.camera, message.stamp_ns, detections, message.faults)
 
 

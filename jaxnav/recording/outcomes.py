@@ -124,7 +124,7 @@ def _ragged(row: tuple[int, ...], of: _Of) -> Column:
 
 
 _initialised, _valid = _at("belief.bank.initialised"), _at("output.candidates.valid")
-_candidates, _taken = _at("output.candidates.T_vehicle_world.wxyz_xyz"), _at("output.selected")
+_candidates, _slot = _at("output.candidates.T_vehicle_world.wxyz_xyz"), _at("output.selected")
 _covariance, _log_weight = _at("output.covariance"), _at("belief.bank.log_weight")
 _costs, _bank, _pose = _at("output.costs"), _at("belief.bank"), _at("output.pose")
 
@@ -144,7 +144,7 @@ def _Ts_vehicle_world(one: Outcome) -> Rows:
 
 
 def _selected(one: Outcome) -> int:
-    selected = int(_taken(one))
+    selected = int(_slot(one))
     return sum(_valid(one)[:selected].tolist()) if selected >= 0 else -1
 
 

@@ -160,7 +160,7 @@ class Recorder:
             self._images += is_image
             self._queue.append(_Item(topic, stamp_ns, log_ns, sequence, content, is_image))
 
-    def _taken(self) -> _Item | None:
+    def _take(self) -> _Item | None:
         with self._lock:
             if not self._queue:
                 return None
@@ -171,7 +171,7 @@ class Recorder:
     def _run(self) -> None:
         try:
             while True:
-                item = self._taken()
+                item = self._take()
                 if item is not None:
                     self._write(item)
                     time.sleep(0)  # lets the driving thread have the interpreter

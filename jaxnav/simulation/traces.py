@@ -16,9 +16,9 @@ class DriveTraces:
 
     def add(self, owner: np.ndarray, trace: Any) -> None:
         """Add one chunk, leaves (lanes, frames, ...); `owner` is each lane's drive, -1 for none."""
-        taken = np.flatnonzero(owner >= 0)
-        drive = owner[taken]
-        piece = jax.tree.map(lambda leaf: leaf[taken], trace)
+        lanes = np.flatnonzero(owner >= 0)
+        drive = owner[lanes]
+        piece = jax.tree.map(lambda leaf: leaf[lanes], trace)
         self.pieces.append((drive, self.chunks[drive], piece))
         self.chunks[drive] += 1
 

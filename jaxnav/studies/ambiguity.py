@@ -131,7 +131,7 @@ class AmbiguityStudy(Study):
         for index, cell in enumerate(cells):
             key = (cell["cameras"], cell["baseline_m"], cell["max_lm_steps"])
             programs.setdefault(key, []).append(index)
-        found = {
+        results = {
             name: np.empty((len(cells), *self._inner_shape(variable), len(trials)), variable.dtype)
             for name, variable in SCHEMA.variables.items()
         }
@@ -146,8 +146,10 @@ class AmbiguityStudy(Study):
             )
             for name, values in lanes.items():
                 values = values.reshape(len(members), len(trials), -1)
-                found[name][members] = np.moveaxis(values, 2, 1).reshape(found[name][members].shape)
-        return found
+                results[name][members] = np.moveaxis(values, 2, 1).reshape(
+                    results[name][members].shape
+                )
+        return results
 
     @property
     def _selectors(self) -> tuple[str, ...]:

@@ -95,11 +95,11 @@ class Config:
         }
 
 
-def difference(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str = "") -> list[str]:
+def difference(wanted: Mapping[str, Any], other: Mapping[str, Any], prefix: str = "") -> list[str]:
     """The differences between two studies, as lines `key: here, there`."""
     differing = []
-    for key in sorted(set(wanted) | set(found)):
-        here, there = wanted.get(key), found.get(key)
+    for key in sorted(set(wanted) | set(other)):
+        here, there = wanted.get(key), other.get(key)
         if here == there and type(here) is type(there):
             continue
         name = f"{prefix}{key}"
@@ -107,7 +107,7 @@ def difference(wanted: Mapping[str, Any], found: Mapping[str, Any], prefix: str 
             differing += difference(here, there, f"{name}.") or [f"{name}: in another order"]
         else:
             differing.append(f"{name} is {_short(here)} here and {_short(there)} there")
-    if not differing and list(wanted.get("axes", {})) != list(found.get("axes", {})):
+    if not differing and list(wanted.get("axes", {})) != list(other.get("axes", {})):
         differing.append("axes are in another order")
     return differing
 

@@ -97,8 +97,8 @@ def check_trials(path: Path, trials: xr.Dataset, grid: Grid) -> None:
     axes = grid.config.axes
     for name, values in axes.items():
         with reading(path):
-            found = trials.coords[name].values.tolist() if name in trials.coords else None
-        if found != list(values):
+            labels = trials.coords[name].values.tolist() if name in trials.coords else None
+        if labels != list(values):
             raise BadInput(f"{path}: {name}", "is not the axis that the config says")
     sizes = {name: len(values) for name, values in axes.items()} | {"trial": grid.config.trials}
     for name, variable in grid.schema.variables.items():
@@ -106,6 +106,6 @@ def check_trials(path: Path, trials: xr.Dataset, grid: Grid) -> None:
         wanted = dims, tuple(sizes[dim] for dim in dims), np.dtype(variable.dtype)
         if name not in trials:
             raise BadInput(f"{path}: {name}", "missing")
-        found = trials[name].dims, trials[name].shape, trials[name].dtype
-        if found != wanted:
-            raise BadInput(f"{path}: {name}", f"must be {wanted}, got {found}")
+        form = trials[name].dims, trials[name].shape, trials[name].dtype
+        if form != wanted:
+            raise BadInput(f"{path}: {name}", f"must be {wanted}, got {form}")

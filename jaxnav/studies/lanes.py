@@ -40,9 +40,9 @@ def run_lanes(
         shared, lanes = in_precision((shared, lanes), precision)
         for begin in range(0, count, batch):
             some = [_padded(leaf[begin : begin + batch], batch) for leaf in lanes]
-            found = run(shared, *jax.device_put(some, sharding))
+            outputs = run(shared, *jax.device_put(some, sharding))
             kept = min(batch, count - begin)
-            parts.append({name: leaf[:kept] for name, leaf in jax.device_get(found).items()})
+            parts.append({name: leaf[:kept] for name, leaf in jax.device_get(outputs).items()})
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 

@@ -30,18 +30,18 @@ def run_here(store: StudyStore, progress: Progress = lambda done: None) -> None:
         BadInput: the store can't be written to.
     """
 
-    def keep(box: Box, found: Mapping[str, np.ndarray]) -> None:
-        store.write(box, found)
+    def keep(box: Box, results: Mapping[str, np.ndarray]) -> None:
+        store.write(box, results)
         progress(store.layout.size(box))
 
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         try:
             for box in store.missing():
-                found = run_box(store.study, *_task(store, box))
+                results = run_box(store.study, *_task(store, box))
                 if writing is not None:
                     writing.result()
-                writing = writer.submit(keep, box, found)
+                writing = writer.submit(keep, box, results)
         finally:
             if writing is not None:
                 writing.result()

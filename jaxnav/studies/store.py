@@ -67,7 +67,7 @@ class StudyStore:
         for index in np.argwhere(done != 1):
             yield tuple(int(i) for i in index)
 
-    def write(self, box: Box, found: Mapping[str, np.ndarray]) -> None:
+    def write(self, box: Box, results: Mapping[str, np.ndarray]) -> None:
         """Write the results of one box, and mark it as done.
 
         Raises:
@@ -77,7 +77,7 @@ class StudyStore:
         lengths = [part.stop - part.start for part in region]
         try:
             for name in self.study.schema.variables:
-                values = found[name]
+                values = results[name]
                 inner = values.shape[1:-1]
                 shaped = values.reshape(*lengths[:-1], *inner, lengths[-1])
                 everything = [slice(None)] * len(inner)
@@ -98,10 +98,10 @@ def open_store(path: Path, study: Study, box_trials: int | None = None) -> Study
     """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         _create(path, study, box_trials or study.box_trials)
-    found = read_attributes(path)
+    attributes = read_attributes(path)
     wanted = {"config": study.config.to_dict(), "versions": versions()}
     differing = [
-        line for key in ("config", "versions") for line in difference(wanted[key], found[key])
+        line for key in ("config", "versions") for line in difference(wanted[key], attributes[key])
     ]
     if differing:
         raise BadInput(
@@ -127,15 +127,15 @@ def read_attributes(path: Path) -> dict[str, Any]:
         BadInput: it is not a store of a study.
     """
     attributes: dict[str, Any] = dict(_open_group(path, "r").attrs)
-    found = {}
+    entries = {}
     for key in ("config", "versions"):
         try:
-            found[key] = json.loads(attributes[key])
+            entries[key] = json.loads(attributes[key])
         except (KeyError, TypeError, ValueError, RecursionError):
             raise BadInput(path, "is not a store of jaxnav study") from None
-        if not isinstance(found[key], dict):
+        if not isinstance(entries[key], dict):
             raise BadInput(f"{path}: {key}", "must be a mapping")
-    return found
+    return entries
 
 
 def read_dataset(path: Path) -> xr.Dataset:

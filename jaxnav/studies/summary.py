@@ -50,9 +50,9 @@ def summarise(
         for name, variable in grid.schema.variables.items():
             dims = grid.dimensions(variable)[:-1]
             index = region + (slice(None),) * (len(dims) - len(region))
-            for measure, found in _summed(trials, grid, layout, name, index).items():
+            for measure, numbers in _summed(trials, grid, layout, name, index).items():
                 part = summary[measure].values[index]
-                summary[measure].values[index] = found.reshape(part.shape)
+                summary[measure].values[index] = numbers.reshape(part.shape)
         bins.add(layout, region)
         progress(layout.shape[-1] * int(np.prod([s.stop - s.start for s in region])))
     for name, rate in grid.schema.rates.items():
@@ -71,10 +71,10 @@ def _measures(name: str, variable: Variable) -> dict[str, tuple[dict[str, Any], 
     """The measures of a variable: name -> further dimensions with labels, unit and dtype."""
     if variable.outcomes:
         return {f"{name}_count": ({name: list(variable.outcomes)}, "", np.int64)}
-    found: dict[str, tuple[dict[str, Any], str, Any]] = {
+    measures: dict[str, tuple[dict[str, Any], str, Any]] = {
         f"{name}_{statistic}": ({}, variable.unit, np.float64) for statistic in (*SHARES, "mean")
     }
-    return found | {f"{name}_counted": ({}, "", np.int64)}
+    return measures | {f"{name}_counted": ({}, "", np.int64)}
 
 
 def _summed(
@@ -110,13 +110,13 @@ def _summed(
     for block in blocks():
         counted = counted + np.sum(np.isfinite(block), axis=1)
         total = total + np.nansum(block, axis=1, dtype=np.float64)
-    found = {f"{name}_counted": np.asarray(counted)}
-    found[f"{name}_mean"] = np.where(counted, total / np.maximum(counted, 1), np.nan)
+    measures = {f"{name}_counted": np.asarray(counted)}
+    measures[f"{name}_mean"] = np.where(counted, total / np.maximum(counted, 1), np.nan)
     for statistic, share in SHARES.items():
-        found[f"{name}_{statistic}"] = order_statistic(
+        measures[f"{name}_{statistic}"] = order_statistic(
             blocks, share, np.asarray(counted), len(spans)
         )
-    return found
+    return measures
 
 
 def _rows(array: xr.DataArray, index: tuple[slice, ...], span: slice) -> np.ndarray:

@@ -62,7 +62,9 @@ def detections(edit: Callable[[Detections], Detections]) -> EditFrame:
 
 def corners(edit: Callable[[np.ndarray], np.ndarray]) -> EditFrame:
     """Edit the corners (N, 4, 2) of frames."""
-    return detections(lambda found: dataclasses.replace(found, corners_px=edit(found.corners_px)))
+    return detections(
+        lambda sightings: dataclasses.replace(sightings, corners_px=edit(sightings.corners_px))
+    )
 
 
 def stamps(edit: Callable[[int], int]) -> EditFrame:
@@ -129,11 +131,11 @@ def frozen(cameras: Iterable[int], jitter_px: float, seed: int = 0) -> EditFrame
             return frame
         if frame.detections is not None:
             kept.setdefault(frame.camera, frame.detections)
-        found = kept.get(frame.camera)
-        if found is not None:
-            noise_px = jitter_px * rng.uniform(-1, 1, found.corners_px.shape)
-            found = dataclasses.replace(found, corners_px=found.corners_px + noise_px)
-        return dataclasses.replace(frame, detections=found)
+        sightings = kept.get(frame.camera)
+        if sightings is not None:
+            noise_px = jitter_px * rng.uniform(-1, 1, sightings.corners_px.shape)
+            sightings = dataclasses.replace(sightings, corners_px=sightings.corners_px + noise_px)
+        return dataclasses.replace(frame, detections=sightings)
 
     return edit
 

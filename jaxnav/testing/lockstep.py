@@ -107,9 +107,10 @@ def _inputs(
             if number < 0:
                 return Input(now_ns, Odometry(now_ns, *world.odometry(now_ns)))
             stamp_ns = now_ns - delay_ns
-            found = world.detections(stamp_ns)
+            detections = world.detections(stamp_ns)
             return Input(
-                now_ns, frames=tuple(FrameDetections(c, stamp_ns, found[c]) for c in groups[number])
+                now_ns,
+                frames=tuple(FrameDetections(c, stamp_ns, detections[c]) for c in groups[number]),
             )
 
         yield now_ns, made

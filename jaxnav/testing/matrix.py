@@ -126,13 +126,13 @@ def _frames() -> list[FaultRow]:
 
 
 def _markers() -> list[FaultRow]:
-    def renamed(found: Detections) -> Detections:
-        return dataclasses.replace(found, ids=found.ids + 7)
+    def renamed(detections: Detections) -> Detections:
+        return dataclasses.replace(detections, ids=detections.ids + 7)
 
     def doubled(shift_px: float) -> Callable[[Detections], Detections]:
-        def edit(found: Detections) -> Detections:
-            other = dataclasses.replace(found, corners_px=found.corners_px + shift_px)
-            return Detections.concatenate([found, other])
+        def edit(detections: Detections) -> Detections:
+            other = dataclasses.replace(detections, corners_px=detections.corners_px + shift_px)
+            return Detections.concatenate([detections, other])
 
         return edit
 

@@ -172,8 +172,8 @@ def fit_of(arrays: dict[str, np.ndarray], like: TuningFit) -> TuningFit:
         KeyError, ValueError: arrays of something else.
     """
     leaves, form = jax.tree.flatten(like.descent)
-    found = [arrays[f"descent_{i}"] for i in range(len(leaves))]
-    for leaf, array in zip(leaves, found, strict=True):
+    values = [arrays[f"descent_{i}"] for i in range(len(leaves))]
+    for leaf, array in zip(leaves, values, strict=True):
         if leaf.shape != array.shape or leaf.dtype != array.dtype:
             raise ValueError(f"{leaf.shape} {leaf.dtype} became {array.shape} {array.dtype}")
     x = like.best_x
@@ -181,7 +181,7 @@ def fit_of(arrays: dict[str, np.ndarray], like: TuningFit) -> TuningFit:
     if arrays["history"].shape[1:] != like.history[0].shape or shapes != [x.shape] * 2:
         raise ValueError("another number of parameters")
     return TuningFit(
-        descent=jax.tree.unflatten(form, [jnp.asarray(array) for array in found]),
+        descent=jax.tree.unflatten(form, [jnp.asarray(array) for array in values]),
         stage_x=jnp.asarray(arrays["stage_x"], x.dtype),
         best_x=jnp.asarray(arrays["best_x"], x.dtype),
         best_loss=float(arrays["best_loss"]),

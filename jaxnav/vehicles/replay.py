@@ -256,16 +256,16 @@ def _read(path: Path, written_ns: int) -> DriveLog:
 
 def _jpegs(log: DriveLog, rig: CameraRig) -> dict[str, dict[int, bytes]]:
     """The JPEGs of each camera of a rig, by their stamps."""
-    found: dict[str, dict[int, bytes]] = {name: {} for name in rig.names}
+    jpegs: dict[str, dict[int, bytes]] = {name: {} for name in rig.names}
     for image in log.images():
         name = image.topic.removeprefix("/camera/")
-        if name not in found:
+        if name not in jpegs:
             continue
-        if not found[name]:
+        if not jpegs[name]:
             pixels = decode_image(image.jpeg)
             if pixels is None:
                 raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
             if problem := size_problem(rig, rig.names.index(name), pixels):
                 raise BadInput(f"{log.path}: {image.topic}", problem)
-        found[name][image.stamp_ns] = image.jpeg
-    return found
+        jpegs[name][image.stamp_ns] = image.jpeg
+    return jpegs

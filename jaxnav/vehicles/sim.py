@@ -114,8 +114,8 @@ class _Shutter:
 
     def _looked(self, stamp_ns: int) -> list[Frame]:
         if self._renderer is None:
-            found = self._world.detections(stamp_ns)
-            return [Frame(stamp_ns + self._late_ns, None, one) for one in found]
+            detections = self._world.detections(stamp_ns)
+            return [Frame(stamp_ns + self._late_ns, None, one) for one in detections]
         times_ns = stamp_ns + (1e9 * track_times_s()).astype(int)
         poses = np.array([self._world.state(int(t))[:3] for t in times_ns])
         return [Frame(stamp_ns + self._late_ns, image) for image in self._renderer.render(poses)]

@@ -178,13 +178,13 @@ class RerunScene:
 
     def _show_candidates(self, Ts_vehicle_map: np.ndarray, selected: int) -> None:
         Ts = [poses.inverse(T) for T in Ts_vehicle_map if np.isfinite(T).all()]
-        taken = [index == selected for index in range(len(Ts))]
+        selection = [index == selected for index in range(len(Ts))]
         self._say(
             "world/candidates",
             self._rerun.Arrows3D(
                 origins=[T[4:] for T in Ts],
                 vectors=[_ARROW_M * _x_axis(T[:4]) for T in Ts],
-                colors=[_rgb(BLUE if is_taken else ORANGE) for is_taken in taken],
+                colors=[_rgb(BLUE if is_selected else ORANGE) for is_selected in selection],
                 radii=0.006,
             ),
         )

@@ -117,7 +117,7 @@ def _first_look(
     board: Board, levels: np.ndarray, ids: np.ndarray, places: Places
 ) -> tuple[np.ndarray, Places]:
     """Fit the saddles at the places, then at places predicted from the saddles found."""
-    found, there = np.zeros(0, int), no_places(board)[1]
+    saddle_ids, there = np.zeros(0, int), no_places(board)[1]
     for _ in range(1 + _GROWTHS):
         if len(ids) == 0:
             break
@@ -127,12 +127,12 @@ def _first_look(
         ids, places, _ = _kept(board, ids, places, saddles)
         if len(ids) == 0:
             break
-        found, there = np.append(found, ids), joined_places(there, places)
-        unfound = np.setdiff1d(np.arange(len(board.points_board_m)), found)
-        points_m = board.points_board_m[found, :2]
-        ids, places = predicted_places(board, unfound, points_m, there.points_px)
-    order = np.argsort(found, kind="stable")
-    return found[order], chosen_places(there, order)
+        saddle_ids, there = np.append(saddle_ids, ids), joined_places(there, places)
+        missing_ids = np.setdiff1d(np.arange(len(board.points_board_m)), saddle_ids)
+        points_m = board.points_board_m[saddle_ids, :2]
+        ids, places = predicted_places(board, missing_ids, points_m, there.points_px)
+    order = np.argsort(saddle_ids, kind="stable")
+    return saddle_ids[order], chosen_places(there, order)
 
 
 def _radius_px(places: Places) -> float:
@@ -143,12 +143,12 @@ def _radius_px(places: Places) -> float:
 def _look_for_marker(
     board: Board, levels: np.ndarray, name: str, camera: Camera | None
 ) -> BoardLook:
-    found = make_detector("aruco", board.family).detect(levels, camera)
-    own = np.flatnonzero((found.ids == board.first_id) & found.refined)
-    foreign = tuple(sorted({int(i) for i in found.ids if i != board.first_id}))
+    detections = make_detector("aruco", board.family).detect(levels, camera)
+    own = np.flatnonzero((detections.ids == board.first_id) & detections.refined)
+    foreign = tuple(sorted({int(i) for i in detections.ids if i != board.first_id}))
     if len(own) != 1:
         return BoardLook(None, foreign, (board.first_id,) * len(own))
-    corners_px = found.corners_px[own[0]]
+    corners_px = detections.corners_px[own[0]]
     fit = refine_corners(levels, corners_px, board.tags[0].cells, Lens(camera))
     width_px = float("nan")
     if fit.fitted is not None:
@@ -164,8 +164,8 @@ def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[np.ndarray, Pl
     """The chessboard's inner corners as OpenCV finds them; empty if it doesn't find all."""
     pattern = (board.pattern_columns, board.pattern_rows)
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-    found, corners = cv2.findChessboardCornersSB(levels, pattern, flags=flags)
-    if not found:
+    success, corners = cv2.findChessboardCornersSB(levels, pattern, flags=flags)
+    if not success:
         return no_places(board)
     grid = np.asarray(corners, float).reshape(board.pattern_rows, board.pattern_columns, 2)
     right, down = np.mean(grid[:, -1] - grid[:, 0], axis=0), np.mean(grid[-1] - grid[0], axis=0)

@@ -66,8 +66,8 @@ def _largest_chessboard(examples: Sequence[np.ndarray]) -> tuple[int, int] | Non
     best: tuple[int, int] | None = None
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     for image in examples:
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
-        if found:
+        success, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
+        if success:
             rows, columns = np.asarray(meta).shape
             if best is None or rows * columns > (best[0] - 1) * (best[1] - 1):
                 best = (columns + 1, rows + 1)

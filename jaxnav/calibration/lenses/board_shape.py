@@ -37,7 +37,7 @@ def check_board(fit: LensFit) -> BoardCheck:
     One camera can't see that a board is too large or too small as a whole: that scales the
     distances of all views and changes nothing else.
     """
-    seen = lens_bundle.gathered(fit.views)
+    seen = lens_bundle.padded_corners(fit.views)
     rows = len(seen.corners_px)
     count = len(fit.views.views)
     poses = lens_bundle.padded_poses(fit.Ts_camera_board, rows)

@@ -69,7 +69,7 @@ def camera_of(lens: str, parameters: Array) -> Camera:
     return Camera(parameters[:2], parameters[2:4], coefficients, jnp.asarray(0), (lens,))
 
 
-def gathered(views: BoardViews) -> BoardCorners:
+def padded_corners(views: BoardViews) -> BoardCorners:
     """The views as arrays on the host, padded with empty views."""
     rows = -(-len(views.views) // _BATCH) * _BATCH
     points = len(views.points_board_m)

@@ -122,4 +122,4 @@ def cells(fit: LensFit) -> Cells:
 
 def _used_px(fit: LensFit) -> np.ndarray:
     """(N, 2) the corners that are in the fit, px."""
-    return np.asarray(lens_bundle.gathered(fit.views).corners_px[: len(fit.used)][fit.used])
+    return np.asarray(lens_bundle.padded_corners(fit.views).corners_px[: len(fit.used)][fit.used])

@@ -24,7 +24,7 @@ def informative(views: BoardViews, lens: str, parameters: np.ndarray, most: int)
     """
     if len(views.views) <= most:
         return tuple(range(len(views.views)))
-    seen = lens_bundle.gathered(views)
+    seen = lens_bundle.padded_corners(views)
     poses = board_poses(views, lens, parameters)
     posed = ~np.isnan(poses[:, 0])
     poses = np.where(posed[:, None], poses, lens_bundle.padded_poses(poses[:0], len(poses)))

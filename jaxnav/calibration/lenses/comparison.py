@@ -42,7 +42,7 @@ def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
     Args:
         weights: (V, P) of the corners, the same for all lenses that are compared.
     """
-    seen = lens_bundle.gathered(fit.views)
+    seen = lens_bundle.padded_corners(fit.views)
     count, rows = len(fit.views.views), len(seen.corners_px)
     padded = np.zeros(seen.present.shape)
     padded[:count] = weights

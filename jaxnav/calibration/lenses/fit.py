@@ -103,7 +103,7 @@ def fit_lens(
     count = len(views.views)
     poses = board_poses(views, lens, parameters)
     posed = ~np.isnan(poses[:, 0])
-    seen = lens_bundle.gathered(views)
+    seen = lens_bundle.padded_corners(views)
     rows = len(seen.corners_px)
     problem = _Problem(lens, seen, free, np.append(posed, np.zeros(rows - count, bool)))
     poses = np.where(posed[:, None], poses, lens_bundle.padded_poses(poses[:0], count))

@@ -76,18 +76,18 @@ def _camera_of_marker(
         for one in FITTED if lens == "auto" else (lens,):
             start = before.parameters if before is not None and before.lens == one else None
             fits.append(fit_lens(views, one, start=start))
-        found = within_reach(min(fits, key=lambda fit: fit.sigma_px), tell)
-        if before is not None and _stays(before, found):
-            return _camera(found)
-        before = found
-    return _camera(found)
+        best = within_reach(min(fits, key=lambda fit: fit.sigma_px), tell)
+        if before is not None and _stays(before, best):
+            return _camera(best)
+        before = best
+    return _camera(best)
 
 
 def _camera(fit: LensFit) -> Camera:
     return camera_of(fit.lens, jnp.asarray(fit.parameters, float))
 
 
-def _stays(before: LensFit, found: LensFit) -> bool:
-    moved = np.abs(before.parameters - found.parameters)
-    same = (before.lens, before.fixed) == (found.lens, found.fixed)
-    return bool(same and np.all(moved <= _STAYS * found.sigma))
+def _stays(before: LensFit, fit: LensFit) -> bool:
+    moved = np.abs(before.parameters - fit.parameters)
+    same = (before.lens, before.fixed) == (fit.lens, fit.fixed)
+    return bool(same and np.all(moved <= _STAYS * fit.sigma))

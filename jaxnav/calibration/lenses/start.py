@@ -51,7 +51,7 @@ def board_poses(
     Source: Collins and Bartoli (2014), "Infinitesimal plane-based pose estimation", by OpenCV.
     """
     shown = [views.views[i] for i in range(len(views.views)) if chosen is None or i in set(chosen)]
-    corners_px = lens_bundle.gathered(replace(views, views=tuple(shown))).corners_px
+    corners_px = lens_bundle.padded_corners(replace(views, views=tuple(shown))).corners_px
     rays = np.asarray(_rays(lens, jnp.asarray(parameters), jnp.asarray(corners_px)))
     return np.array(
         [
@@ -96,7 +96,7 @@ def _misfit_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:
     """Median distance of a corner from its prediction, px; infinite if half have no pose."""
     poses = board_poses(views, lens, parameters)
     lost = np.isnan(poses[:, 0])
-    seen = lens_bundle.gathered(views)
+    seen = lens_bundle.padded_corners(views)
     rows = len(seen.corners_px)
     unknowns = lens_bundle.LensUnknowns(
         jnp.asarray(parameters),

@@ -165,11 +165,11 @@ def _calibrated(
         information[NAMES.index("wheelbase_m")] = wheelbase_sigma_m**-2
     prior = Prior(theta, information)
     search = _Search(Model(course, rig, markers, sigma), course, rig, markers, prior, progress)
-    found = search.best(theta, why)
-    chi2 = _chi2_per_dof(found, course)
-    outliers = found.blocks.view_chi2 > FULL_WEIGHT
-    _refuse_contradiction(where, found, chi2, outliers)
-    while (name := _least_sure(found, why, max(chi2, 1.0))) is not None:
+    solution = search.best(theta, why)
+    chi2 = _chi2_per_dof(solution, course)
+    outliers = solution.blocks.view_chi2 > FULL_WEIGHT
+    _refuse_contradiction(where, solution, chi2, outliers)
+    while (name := _least_sure(solution, why, max(chi2, 1.0))) is not None:
         if name == "speed_scale":
             problem = (
                 "the drive does not tell the scale of the speed to 2 %: drive further, along "
@@ -177,29 +177,29 @@ def _calibrated(
             )
             raise BadInput(where, problem)
         why[name] = _WHY[name]
-        found = search.again(found, why)
-        chi2 = _chi2_per_dof(found, course)
-        outliers = found.blocks.view_chi2 > FULL_WEIGHT
-    _refuse_contradiction(where, found, chi2, outliers)
+        solution = search.again(solution, why)
+        chi2 = _chi2_per_dof(solution, course)
+        outliers = solution.blocks.view_chi2 > FULL_WEIGHT
+    _refuse_contradiction(where, solution, chi2, outliers)
     free = [name for name in NAMES if name not in why]
-    covariance = np.linalg.inv(found.information) * max(chi2, 1.0)
+    covariance = np.linalg.inv(solution.information) * max(chi2, 1.0)
     if why.get("steering_gain") == STEERED_LITTLE and "steering_offset_rad" in free:
         row = free.index("steering_offset_rad")
         covariance[row, row] += (_GAIN_SIGMA * motion.steering_rad) ** 2
     deviation = np.sqrt(np.diag(covariance))
     return OdometryCalibration(
         before={name: float(before[name]) for name in NAMES},
-        value=dict(zip(NAMES, found.theta.tolist(), strict=True)),
+        value=dict(zip(NAMES, solution.theta.tolist(), strict=True)),
         sigma=dict(zip(free, deviation.tolist(), strict=True)),
         fixed=why,
         correlation=covariance / np.outer(deviation, deviation),
         chi2_per_dof=chi2,
-        rms_px=float(np.sqrt(np.mean(found.blocks.views_px[~outliers] ** 2))),
+        rms_px=float(np.sqrt(np.mean(solution.blocks.views_px[~outliers] ** 2))),
         outliers=outliers,
-        views_px=found.blocks.views_px,
+        views_px=solution.blocks.views_px,
         view_times_s=course.views.time_s,
         node_times_s=course.node_times_s,
-        poses=found.nodes[:, :3],
+        poses=solution.nodes[:, :3],
         read=np.column_stack([course.intervals.speed_mps, course.intervals.steering_rad]),
         reading_sigma=sigma,
         way_m=way_m,
@@ -222,52 +222,52 @@ class _Search:
     def best(self, theta: np.ndarray, fixed: Mapping[str, str]) -> OdometryFit:
         """Fit from the present odometry; if that ends badly, also from other ways through the poses
         of single views, and from the parameters found."""
-        found = self._started(theta, fixed, LOOSE)
+        solution = self._started(theta, fixed, LOOSE)
         for again in range(3):
-            outliers = float(np.mean(found.blocks.view_chi2 > FULL_WEIGHT))
-            chi2 = _chi2_per_dof(found, self.course)
-            if found.converged and chi2 < _AGAIN_CHI2 and outliers < _AGAIN_OUTLIERS:
+            outliers = float(np.mean(solution.blocks.view_chi2 > FULL_WEIGHT))
+            chi2 = _chi2_per_dof(solution, self.course)
+            if solution.converged and chi2 < _AGAIN_CHI2 and outliers < _AGAIN_OUTLIERS:
                 break
-            other = self._started(found.theta if again == 1 else theta, fixed, _OTHER[again])
-            found = min(found, other, key=lambda one: one.blocks.cost)
-        return found
+            other = self._started(solution.theta if again == 1 else theta, fixed, _OTHER[again])
+            solution = min(solution, other, key=lambda one: one.blocks.cost)
+        return solution
 
     def _started(self, theta: np.ndarray, fixed: Mapping[str, str], trust: Trust) -> OdometryFit:
         nodes = start(self.course, self.rig, self.markers, theta, trust)
         return self._from(nodes, theta, fixed)
 
-    def again(self, found: OdometryFit, fixed: Mapping[str, str]) -> OdometryFit:
+    def again(self, solution: OdometryFit, fixed: Mapping[str, str]) -> OdometryFit:
         """Fit again from a fit, with more parameters fixed at their values before."""
         kept = np.array([name in fixed for name in NAMES])
-        return self._from(found.nodes, np.where(kept, self.prior.mean, found.theta), fixed)
+        return self._from(solution.nodes, np.where(kept, self.prior.mean, solution.theta), fixed)
 
     def _from(self, nodes: np.ndarray, theta: np.ndarray, fixed: Mapping[str, str]) -> OdometryFit:
         free = np.array([name not in fixed for name in NAMES])
         return fit(self.model, nodes, theta, free, self.prior, self.progress)
 
 
-def _chi2_per_dof(found: OdometryFit, course: Course) -> float:
+def _chi2_per_dof(solution: OdometryFit, course: Course) -> float:
     """Chi-square per degree of freedom; outliers among the views count in neither."""
-    chi2 = found.blocks.view_chi2
+    chi2 = solution.blocks.view_chi2
     good = chi2 <= FULL_WEIGHT
     far = chi2[~good]
     extra = float(np.sum(FULL_WEIGHT * (1 + np.log(far / FULL_WEIGHT))))
-    dof = 8 * int(good.sum()) - 3 * course.stretches - found.information.shape[0]
-    return (float(found.blocks.cost) - extra) / max(dof, 1)
+    dof = 8 * int(good.sum()) - 3 * course.stretches - solution.information.shape[0]
+    return (float(solution.blocks.cost) - extra) / max(dof, 1)
 
 
-def _least_sure(found: OdometryFit, fixed: Mapping[str, str], scale: float) -> str | None:
+def _least_sure(solution: OdometryFit, fixed: Mapping[str, str], scale: float) -> str | None:
     """The name of the parameter to fix next; None if all are sure enough.
 
     The weakest direction of the information, with every parameter in units of its largest accepted
     sigma, shows which can't be told apart.
     """
     free = [name for name in NAMES if name not in fixed]
-    values = dict(zip(NAMES, found.theta, strict=True))
+    values = dict(zip(NAMES, solution.theta, strict=True))
     asked = np.array(
         [_LEAST_SURE[name] * (abs(values[name]) if name in _RELATIVE else 1.0) for name in free]
     )
-    weakest, directions = np.linalg.eigh(found.information * np.outer(asked, asked) / scale)
+    weakest, directions = np.linalg.eigh(solution.information * np.outer(asked, asked) / scale)
     if not len(free) or weakest[0] >= 1.0:
         return None
     share = np.abs(directions[:, 0])
@@ -276,7 +276,7 @@ def _least_sure(found: OdometryFit, fixed: Mapping[str, str], scale: float) -> s
 
 
 def _refuse_contradiction(
-    where: str, found: OdometryFit, chi2: float, outliers: np.ndarray
+    where: str, solution: OdometryFit, chi2: float, outliers: np.ndarray
 ) -> None:
     if outliers.mean() > _MOST_OUTLIERS:
         problem = (
@@ -284,7 +284,7 @@ def _refuse_contradiction(
             "--markers-file and --rig, with calibrate check"
         )
         raise BadInput(where, problem)
-    if not found.converged:
+    if not solution.converged:
         problem = (
             "no figures explain the drive best, whatever the search tries: drive eights in view of "
             "a marker, or keep some by --fix"
@@ -305,21 +305,21 @@ def _advice(
     outliers: np.ndarray,
     wheelbase_sigma_m: float | None,
 ) -> tuple[str, ...]:
-    found = [f"{name}: {why}" for name, why in fixed.items() if not why.startswith("as told")]
+    lines = [f"{name}: {why}" for name, why in fixed.items() if not why.startswith("as told")]
     if "wheelbase_m" in fixed and "steering_gain" not in fixed and wheelbase_sigma_m is None:
-        found.append(
+        lines.append(
             "The steering gain is as sure as the wheelbase that was taken as exact: an error of "
             "1 % there is one of 1 % here."
         )
     if chi2 > 1.5:
-        found.append(
+        lines.append(
             f"Residuals are {np.sqrt(chi2):.1f} times as large as readings and corners say of "
             "themselves; all sigma are larger by that. Calibrate the cameras and the rig first, "
             "and drive more slowly."
         )
     if outliers.mean() > 0.02:
-        found.append(
+        lines.append(
             f"{outliers.mean():.0%} of the views are far off: look for reflections, and for "
             "markers that were moved."
         )
-    return tuple(found) or ("Nothing: every figure is found.",)
+    return tuple(lines) or ("Nothing: every figure is found.",)

@@ -125,7 +125,7 @@ def lay_out(drives: Sequence[Drive]) -> Course:
         BadInput: there are too few readings or views; the message names the drive.
     """
     parts = [part for drive in drives for part in _stretches(drive)]
-    if sum(len(found["time_s"]) for _, found in parts) < _LEAST_VIEWS:
+    if sum(len(columns["time_s"]) for _, columns in parts) < _LEAST_VIEWS:
         names = ", ".join(drive.name for drive in drives)
         count = sum(len(drive.view_stamps_ns) for drive in drives)
         problem = (
@@ -220,7 +220,7 @@ def _stretches(drive: Drive) -> list[tuple[_Columns, _Columns]]:
     views = {name: column[usable] for name, column in views.items()}
     views = _chosen(views, np.argsort(views["time_s"], kind="stable"))
     cuts = np.flatnonzero(np.diff(readings["time_s"]) > GAP_S) + 1
-    found = []
+    stretches = []
     for piece in np.split(np.arange(len(stamps_ns)), cuts):
         times_s = readings["time_s"][piece]
         inside = (views["time_s"] >= times_s[0]) & (views["time_s"] <= times_s[-1])
@@ -229,8 +229,8 @@ def _stretches(drive: Drive) -> list[tuple[_Columns, _Columns]]:
         seen = _chosen(views, inside)
         near = times_s >= seen["time_s"][0] - _ROOM_S
         near &= times_s <= seen["time_s"][-1] + _ROOM_S
-        found.append((_chosen(readings, piece[near]), seen))
-    return found
+        stretches.append((_chosen(readings, piece[near]), seen))
+    return stretches
 
 
 def _chosen(columns: _Columns, rows: np.ndarray) -> _Columns:

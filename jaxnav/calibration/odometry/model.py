@@ -171,8 +171,8 @@ def _blocks(
     information = jnp.einsum("nri,nrj->nij", J, J)
     gradient = jnp.einsum("nri,nr->ni", J, r)
 
-    found = jnp.searchsorted(intervals.begin_s, views.time_s - theta[4], side="right") - 1
-    index = jnp.clip(found, views.first, views.last)
+    rows = jnp.searchsorted(intervals.begin_s, views.time_s - theta[4], side="right") - 1
+    index = jnp.clip(rows, views.first, views.last)
 
     def seen(one: Array, interval: Intervals, view: MarkerViews) -> tuple[Array, Array]:
         pixels = _view(one, interval, sigma, view, rig, markers)

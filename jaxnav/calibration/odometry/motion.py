@@ -84,10 +84,10 @@ class DriveStatistics:
                 "steering_offset_rad"
             )
             raise BadInput(where, problem)
-        found = {}
+        reasons = {}
         if not steered and not aside:
-            found["steering_gain"] = STEERED_LITTLE
-            found["wheelbase_m"] = _TURNED_LITTLE
+            reasons["steering_gain"] = STEERED_LITTLE
+            reasons["wheelbase_m"] = _TURNED_LITTLE
         if not steered and self.varied_mps < max(_VARIED_MPS, _VARIED_SHARE * self.speed_mps):
-            found["camera_delay_s"] = _CHANGED_LITTLE
-        return {name: why for name, why in found.items() if name not in fixed}
+            reasons["camera_delay_s"] = _CHANGED_LITTLE
+        return {name: why for name, why in reasons.items() if name not in fixed}

@@ -120,10 +120,10 @@ def _branches(
         ways[v - 1] = came[v, ways[v]]
     rows = np.arange(len(at))
     own = cost[rows, ways]
-    taken = np.concatenate([[_MOST], steps[rows[1:], ways[:-1], ways[1:]]])
-    taken[new] = _MOST
-    following = np.concatenate([taken[1:], [_MOST]])
-    good = (own < _MOST) & (np.minimum(taken, following) < _MOST / 2)
+    step_costs = np.concatenate([[_MOST], steps[rows[1:], ways[:-1], ways[1:]]])
+    step_costs[new] = _MOST
+    following = np.concatenate([step_costs[1:], [_MOST]])
+    good = (own < _MOST) & (np.minimum(step_costs, following) < _MOST / 2)
     return _Chosen(poses[rows, ways], good)
 
 

@@ -50,11 +50,11 @@ def other_branches(
         best, changed = matrices(getattr(of, name)), 0
         least = cost(of, groups, len(best))
         for tried in tries:
-            found = cost(replace(of, **{name: wxyz_xyz(tried)}), groups, len(best))
-            better = found < least - _BETTER
+            costs = cost(replace(of, **{name: wxyz_xyz(tried)}), groups, len(best))
+            better = costs < least - _BETTER
             changed += int(better.sum())
             best[better] = tried[better]
-            least = np.minimum(least, found)
+            least = np.minimum(least, costs)
         return replace(of, **{name: wxyz_xyz(best)}), changed
 
     candidates = inverted(linker.sights(links).Ts_cameras_markers)

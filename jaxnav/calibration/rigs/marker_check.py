@@ -67,7 +67,7 @@ class Check:
 
 
 def checked(
-    found: RigCalibration,
+    calibration: RigCalibration,
     views: RigViews,
     rig: CameraRig,
     given: Mapping[int, np.ndarray],
@@ -77,28 +77,28 @@ def checked(
     """Compare a map with a calibration that did not use it.
 
     Args:
-        found: a calibration with a single marker known, the gauge.
+        calibration: one with a single marker known, the gauge.
         views: all sightings, including those that were not linked.
         given: marker index -> T_map_marker (4, 4).
     """
     C = len(rig)
-    linked = [index for index in given if found.mapped[index]]
+    linked = [index for index in given if calibration.mapped[index]]
     T_map_world, agree = _laid_over(
         np.stack([given[index] for index in linked]),
-        found.Ts_world_marker[linked],
-        found.views.size_m[linked],
+        calibration.Ts_world_marker[linked],
+        calibration.views.size_m[linked],
         tolerance_m,
         tolerance_rad,
     )
-    rays = _Rays.of(found, views, rig)
-    sigmas = found.sigmas()
+    rays = _Rays.of(calibration, views, rig)
+    sigmas = calibration.sigmas()
     verdicts = {}
     for index in given:
         seen = int(np.sum(views.marker == index))
         apart_m = apart_rad = None
         wrong = False
-        if found.mapped[index]:
-            T = T_map_world @ found.Ts_world_marker[index]
+        if calibration.mapped[index]:
+            T = T_map_world @ calibration.Ts_world_marker[index]
             apart_m = float(np.linalg.norm((T - given[index])[:3, 3]))
             apart_rad = float(turn_rad(T, given[index]))
             sigma_m = float(np.linalg.norm(sigmas[C + index, :3]))
@@ -120,16 +120,16 @@ def checked(
     return Check(verdicts, T_map_world, agree)
 
 
-def sizes_m(found: RigCalibration, views: RigViews, rig: CameraRig) -> dict[int, float]:
+def sizes_m(calibration: RigCalibration, views: RigViews, rig: CameraRig) -> dict[int, float]:
     """Marker index -> side in m from the rays to its corners, for markers with enough rays."""
-    rays = _Rays.of(found, views, rig)
+    rays = _Rays.of(calibration, views, rig)
     sizes = {index: rays.size_and_move(index)[0] for index in range(len(views.size_m))}
     return {index: size for index, size in sizes.items() if size is not None}
 
 
 def _laid_over(
     given: np.ndarray,
-    found: np.ndarray,
+    Ts_world_marker: np.ndarray,
     size_m: np.ndarray,
     tolerance_m: float,
     tolerance_rad: float,
@@ -137,7 +137,7 @@ def _laid_over(
     """T_map_world under which most markers agree, fitted to their corners; and their number."""
 
     def agreeing(T: np.ndarray, slack: float) -> np.ndarray:
-        over = T @ found
+        over = T @ Ts_world_marker
         apart_m = np.linalg.norm((over - given)[:, :3, 3], axis=1)
         turned = np.array([turn_rad(a, b) for a, b in zip(over, given, strict=True)])
         return (apart_m < slack * tolerance_m) & (turned < slack * tolerance_rad)
@@ -147,7 +147,7 @@ def _laid_over(
     def fitted(of: np.ndarray) -> np.ndarray:
         to, fro = (
             (Ts[of, None, :3, :3] @ corners[of][..., None])[..., 0] + Ts[of, None, :3, 3]
-            for Ts in (given, found)
+            for Ts in (given, Ts_world_marker)
         )
         to, fro = to.reshape(-1, 3), fro.reshape(-1, 3)
         turn, _ = Rotation.align_vectors(to - to.mean(axis=0), fro - fro.mean(axis=0))
@@ -159,7 +159,7 @@ def _laid_over(
     best, most = np.eye(4), np.zeros(len(given), bool)
     for one in range(len(given)):
         # One marker's error turns all others, so they may be further off at first.
-        T = given[one] @ inverted(found[one])
+        T = given[one] @ inverted(Ts_world_marker[one])
         near = agreeing(T, 3)
         near[one] = True
         T = fitted(near)
@@ -172,7 +172,7 @@ def _laid_over(
         if inside.sum() > most.sum():
             best, most = T, inside
     if not most.any():  # no fit has markers that agree: the first is as good as any
-        best = given[0] @ inverted(found[0])
+        best = given[0] @ inverted(Ts_world_marker[0])
         most[0] = True
     return best, int(most.sum())
 
@@ -186,15 +186,15 @@ class _Rays:
     directions: np.ndarray  # (N, 4, 3)
 
     @staticmethod
-    def of(found: RigCalibration, views: RigViews, rig: CameraRig) -> "_Rays":
+    def of(calibration: RigCalibration, views: RigViews, rig: CameraRig) -> "_Rays":
         """The rays of the sightings by calibrated cameras in frames with a pose."""
-        frame_of = {int(stamp): index for index, stamp in enumerate(found.views.stamps_ns)}
+        frame_of = {int(stamp): index for index, stamp in enumerate(calibration.views.stamps_ns)}
         frames = np.array([frame_of.get(int(stamp), -1) for stamp in views.stamps_ns], int)
-        posed = (frames[views.frame] >= 0) & found.calibrated[views.camera]
+        posed = (frames[views.frame] >= 0) & calibration.calibrated[views.camera]
         rays = rays_camera(rig, views)[posed]
         Ts = (
-            found.Ts_world_vehicle[frames[views.frame[posed]]]
-            @ found.Ts_vehicle_camera[views.camera[posed]]
+            calibration.Ts_world_vehicle[frames[views.frame[posed]]]
+            @ calibration.Ts_vehicle_camera[views.camera[posed]]
         )
         directions = np.einsum("nij,nkj->nki", Ts[:, :3, :3], rays)
         return _Rays(views.marker[posed], Ts[:, :3, 3], directions)

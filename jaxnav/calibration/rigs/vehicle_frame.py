@@ -19,15 +19,15 @@ from jaxnav.calibration.rigs.pose_arrays import inverted
 _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 0.01, np.deg2rad(3)
 
 
-def moved_to_places(found: RigCalibration, given: np.ndarray) -> RigCalibration:
+def moved_to_places(calibration: RigCalibration, given: np.ndarray) -> RigCalibration:
     """Move the calibration to the vehicle frame in which the cameras fit their given poses best.
 
     Args:
         given: (C, 4, 4) T_vehicle_camera as measured by hand; those of cameras that were not
             calibrated don't count.
     """
-    cameras = np.flatnonzero(found.calibrated)
-    Ts_vehicle_camera, wanted = found.Ts_vehicle_camera[cameras], given[cameras]
+    cameras = np.flatnonzero(calibration.calibrated)
+    Ts_vehicle_camera, wanted = calibration.Ts_vehicle_camera[cameras], given[cameras]
     weight = np.repeat([1 / _PLACE_SIGMA_M, 1 / _PLACE_SIGMA_RAD], 3)
     start = wanted[0] @ inverted(Ts_vehicle_camera[0])
 
@@ -41,56 +41,56 @@ def moved_to_places(found: RigCalibration, given: np.ndarray) -> RigCalibration:
     A = np.concatenate([adjoint(T) for T in inverted(T_tied_vehicle @ Ts_vehicle_camera)])
     W = np.tile(weight**2, len(cameras))
     keep = np.eye(len(A)) - A @ np.linalg.solve((A.T * W) @ A, A.T * W)
-    G = np.eye(len(found.covariance))
+    G = np.eye(len(calibration.covariance))
     rows = (6 * cameras[:, None] + np.arange(6)).ravel()
     G[np.ix_(rows, rows)] = keep
-    return moved(found, T_tied_vehicle, G @ found.covariance @ G.T)
+    return moved(calibration, T_tied_vehicle, G @ calibration.covariance @ G.T)
 
 
-def moved_to_driven(found: RigCalibration, driven: DrivenFrame) -> RigCalibration:
+def moved_to_driven(calibration: RigCalibration, driven: DrivenFrame) -> RigCalibration:
     """Move the calibration to the frame found from driving; add the drive's and ground's errors."""
-    cameras = np.flatnonzero(found.calibrated)
+    cameras = np.flatnonzero(calibration.calibrated)
     T_tied_vehicle = inverted(driven.T_rig_level @ driven.T_level_vehicle)
-    Ts_tied_camera = T_tied_vehicle @ found.Ts_vehicle_camera[cameras]
+    Ts_tied_camera = T_tied_vehicle @ calibration.Ts_vehicle_camera[cameras]
     A = np.concatenate([adjoint(T) for T in inverted(Ts_tied_camera)])
     follows = adjoint(inverted(driven.T_level_vehicle)) @ level_follows(
-        found.Ts_world_vehicle, found.frames_follow
+        calibration.Ts_world_vehicle, calibration.frames_follow
     )
     rows = (6 * cameras[:, None] + np.arange(6)).ravel()
-    G = np.eye(len(found.covariance))
+    G = np.eye(len(calibration.covariance))
     G[rows] -= A @ follows
-    covariance = G @ found.covariance @ G.T
+    covariance = G @ calibration.covariance @ G.T
     covariance[np.ix_(rows, rows)] += A @ driven.covariance @ A.T
-    return moved(found, T_tied_vehicle, covariance)
+    return moved(calibration, T_tied_vehicle, covariance)
 
 
 def moved(
-    found: RigCalibration, T_tied_vehicle: np.ndarray, covariance: np.ndarray
+    calibration: RigCalibration, T_tied_vehicle: np.ndarray, covariance: np.ndarray
 ) -> RigCalibration:
     """Express a calibration in another vehicle frame; cameras that were not calibrated stay."""
     Ts = np.where(
-        found.calibrated[:, None, None],
-        T_tied_vehicle @ found.Ts_vehicle_camera,
-        found.Ts_vehicle_camera,
+        calibration.calibrated[:, None, None],
+        T_tied_vehicle @ calibration.Ts_vehicle_camera,
+        calibration.Ts_vehicle_camera,
     )
     return replace(
-        found,
+        calibration,
         Ts_vehicle_camera=Ts,
-        Ts_world_vehicle=found.Ts_world_vehicle @ inverted(T_tied_vehicle),
+        Ts_world_vehicle=calibration.Ts_world_vehicle @ inverted(T_tied_vehicle),
         covariance=covariance,
     )
 
 
-def moved_world(found: RigCalibration, move: np.ndarray) -> RigCalibration:
+def moved_world(calibration: RigCalibration, move: np.ndarray) -> RigCalibration:
     """Express a calibration in another world frame; covariances stay, as twists are body-fixed.
 
     Args:
         move: (4, 4), pose of the old world in the new.
     """
     return replace(
-        found,
-        Ts_world_marker=move @ found.Ts_world_marker,
-        Ts_world_vehicle=move @ found.Ts_world_vehicle,
+        calibration,
+        Ts_world_marker=move @ calibration.Ts_world_marker,
+        Ts_world_vehicle=move @ calibration.Ts_world_vehicle,
     )
 
 

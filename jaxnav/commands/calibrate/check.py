@@ -55,7 +55,7 @@ def run(args: Arguments) -> int:
     mapped = [int(index) for index in np.flatnonzero(calibration.mapped)]
     figure = map_check(
         given=np.stack([data.known[index] for index in mapped]),
-        found=calibration.Ts_world_marker[mapped],
+        estimate=calibration.Ts_world_marker[mapped],
         size_m=data.views.size_m[mapped],
         ids=[data.keys[index][1] for index in mapped],
         wrong=[not check.verdicts[index].right for index in mapped],
