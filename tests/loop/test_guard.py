@@ -305,7 +305,7 @@ kept = [os.dup(0) for _ in range(1500)]
 
 @pytest.mark.parametrize("name", ENDINGS)
 def test_however_a_program_ends_zero_throttle_is_the_last_word(name):
-    root = str(Path(__file__).resolve().parents[1])
+    root = str(Path(__file__).resolve().parents[2])
     before = MANY_FILES if "many files" in name else ""
     source = textwrap.dedent(PROGRAM).format(root=root, ending=ENDINGS[name], before=before)
     process = subprocess.Popen(

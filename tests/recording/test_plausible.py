@@ -11,7 +11,7 @@ from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.message_schemas import OUTCOME
 from jaxnav.recording.plausible import keep_plausible
 from tests.fuzz.seeds import drive_parts, write_drive
-from tests.test_regression import FOLDER
+from tests.recording.test_regression import FOLDER
 
 ODD = [1e308, -1e300, 1e12, math.inf, math.nan]
 

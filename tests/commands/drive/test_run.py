@@ -24,7 +24,7 @@ from tests import worlds
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle
 from tests.helpers.recorded_vehicle import Word, words
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[3]
 MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
 STOPS_S = 0.2  # after a signal, at the latest
 SLACK_S = 0.3  # of a machine that does something else

@@ -1,8 +1,8 @@
 """Recorded drives of the simulated car give the same outcomes as when they were recorded.
 
-`pytest tests/test_regression.py --update-refs` replays the recorded inputs, makes the outcomes the
-new reference, and writes a summary for review beside each recording. A recording that is missing
-is driven first.
+`pytest tests/recording/test_regression.py --update-refs` replays the recorded inputs, makes the
+outcomes the new reference, and writes a summary for review beside each recording. A recording that
+is missing is driven first.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ from jaxnav.testing import injections as inject
 from jaxnav.testing.lockstep import BEGIN_NS, Rates
 from tests.helpers.simulated import make_setup, record, simulated
 
-FOLDER = Path(__file__).parent / "data" / "drives"
+FOLDER = Path(__file__).parents[1] / "data" / "drives"
 RATES = Rates(odometry_period_s=0.04, frame_period_s=1 / 15)  # the files are to be small
 MAX_BYTES = 150_000
 LINE_S = 0.5

@@ -25,7 +25,7 @@ from tests.helpers.drives import BEGIN_NS, make_detections, make_picture
 from tests.helpers.setups import GoodVehicle, setup_with
 from tests.helpers.simulated import make_setup
 
-PLAIN = Path(__file__).parent / "data" / "drives" / "plain.mcap"
+PLAIN = Path(__file__).parents[1] / "data" / "drives" / "plain.mcap"
 SETUP = make_setup()
 FRONT, REAR = 0, 2
 MS = 1_000_000

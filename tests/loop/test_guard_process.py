@@ -17,7 +17,7 @@ from tests.helpers import plain_car
 from tests.helpers.dying_parent import ENDS, LIMITS, make_setup
 from tests.helpers.plain_car import words
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 STOPS_S = 0.2
 SLACK_S = 0.3  # of a machine that does something else; measured without it by bench_stop.py
 

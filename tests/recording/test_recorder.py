@@ -31,7 +31,7 @@ from tests.helpers.drives import (
     same_input,
 )
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def _until(condition, timeout_s: float = 10.0) -> None:

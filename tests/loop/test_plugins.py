@@ -15,7 +15,7 @@ from jaxnav.loop.interfaces import Camera, Vehicle
 from jaxnav.loop.plugins import CAMERAS, VEHICLES, load_factory, open_cameras, open_vehicle
 from tests.helpers.setups import GoodCamera, GoodVehicle, good_cameras, setup_with
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SETUP = setup_with()
 HERE = "tests.helpers.setups"
 

@@ -27,7 +27,7 @@ from tests.helpers.simulated import make_setup
 from tests.helpers.yaml_numbers import dumped
 from tests.worlds import room_markers
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "ranges.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "ranges.md"
 ODD = [1e9, 1e-6, 1e300]
 # Loader of `loader_seeds`, the way to a number, and odd numbers for it.
 FIELDS: list[tuple[str, tuple[Any, ...], list[float]]] = [

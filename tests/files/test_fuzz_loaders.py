@@ -2,7 +2,7 @@
 
 See docs/promises.md, Files can't hurt.
 
-JAXNAV_FUZZ=3000 pytest tests/test_fuzz_loaders.py      # number of examples for each loader
+JAXNAV_FUZZ=3000 pytest tests/files/test_fuzz_loaders.py      # number of examples for each loader
 """
 
 import dataclasses

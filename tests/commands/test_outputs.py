@@ -21,7 +21,7 @@ from jaxnav.files import atomic_path, atomic_write
 from jaxnav.files.locking import sole_writer
 from jaxnav.files.writing import atomic_write_all, refuse_overwriting, require_writable
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 # What is typed, the file that would be destroyed, and the flag that is to be named.
 OVERWRITING = [
     ("run --vehicle replay --option drive=a.mcap --record a.mcap", "a.mcap", "--record"),
