@@ -48,8 +48,8 @@ install_import_hook(CORE, "beartype.beartype")
 
 
 # A file is one worker's: what takes minutes must not come last.
-LONG = """test_navigator test_hypotheses test_replay test_faults test_tune test_following
-    test_tuning_driving test_demo test_rollout test_study_kinds test_studies test_examples""".split()
+LONG = """test_navigator test_hypotheses test_replay test_faults test_tune test_following test_demo
+    test_tuning_driving test_rollout test_study_kinds test_studies test_examples""".split()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
