@@ -1,5 +1,5 @@
-"""Set strict numerics for every test: warnings raise, ranks never promote implicitly, jaxtyping's
-shapes are checked at every call, and float64 is the default."""
+"""Set strict numerics for every test: warnings raise, ranks never promote implicitly, annotations
+are checked at every call, and float64 is the default."""
 
 import functools
 import gc
@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import jaxlie
 import pytest
 from jaxtyping import install_import_hook
+
+import tests.helpers.shapes  # the hook below finds it by name  # noqa: F401
 
 # As a terminal has it: a suite under `nohup` would have tests whose programs ignore it too.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
@@ -45,6 +47,16 @@ CORE = [
     )
 ]  # fmt: skip
 install_import_hook(CORE, "beartype.beartype")
+# Elsewhere arrays alone are checked: tests put stand-ins in the place of classes. Studies send
+# objects to processes that lack the hook.
+AROUND = [
+    f"jaxnav.{name}"
+    for name in (
+        "calibration", "compiling", "datasets", "detection", "files", "loop", "recording",
+        "simulation", "testing", "tuning", "vehicles",
+    )
+]  # fmt: skip
+install_import_hook(AROUND, "tests.helpers.shapes.check_arrays")
 
 
 # A file is one worker's: what takes minutes must not come last.

@@ -45,7 +45,7 @@ class DriveSlopes(eqx.Module):
     slopes: Any  # leaves (P, ...): derivatives of the world's moving part, and of the costs
 
     @property
-    def ended(self) -> Bool[Array, ""]:
+    def ended(self) -> Bool[Array, "*L"]:
         """Whether the drive is over."""
         return self.world.ended
 

@@ -95,9 +95,9 @@ def view_weights(chi2: Array | np.ndarray) -> Array:
 
 def corrected(
     theta: Float[Array, " 5"],
-    speed_mps: Float[Array, ""],
-    steering_rad: Float[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    speed_mps: Float[Array, "*N"],
+    steering_rad: Float[Array, "*N"],
+) -> tuple[Float[Array, "*N"], Float[Array, "*N"]]:
     """Correct the speed and steering of a reading by the parameters."""
     return theta[0] * speed_mps, theta[1] * steering_rad + theta[2]
 
