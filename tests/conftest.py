@@ -15,7 +15,7 @@ import jaxlie
 import pytest
 from jaxtyping import install_import_hook
 
-import tests.helpers.shapes  # the hook below finds it by name  # noqa: F401
+import tests.helpers.shapes
 
 # As a terminal has it: a suite under `nohup` would have tests whose programs ignore it too.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
@@ -51,6 +51,7 @@ CORE = [
         "timeline",
     )
 ]  # fmt: skip
+tests.helpers.shapes.wrap_arrays_alone()
 install_import_hook(CORE, "beartype.beartype")
 # Elsewhere arrays alone are checked: tests put stand-ins in the place of classes. Studies send
 # objects to processes that lack the hook.
