@@ -45,19 +45,6 @@ _RADIUS_M = 0.15
 Happens = Callable[[int, SimWorld], None]
 
 
-def lasting(change: Callable[[], Change], end_s: float = END_S) -> Callable[[], Change]:
-    """Make a change that lasts from BEGIN_S to `end_s`."""
-    return lambda: between(BEGIN_S, end_s, change())
-
-
-def _unchanged() -> Change:
-    return lambda given: [given]
-
-
-def _nothing_happens() -> Happens:
-    return lambda now_ns, world: None
-
-
 @dataclass(frozen=True)
 class FaultRow:
     """One fault, and the requirements on a drive with it.
@@ -65,12 +52,13 @@ class FaultRow:
     Attributes:
         name: as `jaxnav faults` prints it.
         change: makes the change to the data on their way, anew for each drive.
-        happens: makes the change to the world, anew for each drive.
         faults, rejects: one at least must be seen by SETTLE_S after its end; none: no requirement.
-        at_least, at_most: bounds of the worst health in the same time.
+        health: bounds of the worst health in the same time.
         error_m: largest error of a decided position during the fault and SETTLE_S after.
         error_after_m: largest error after that.
+        happens: makes the change to the world, anew for each drive.
         begins_s, ends_s: of the fault; inf: it lasts.
+        always: the data are changed before `begins_s` too.
         drive_s: duration of the whole drive.
         telling: how the navigator's rig differs from the true one, see `navigator_rig`.
         markers: makes the drive's markers from the trial's.
@@ -80,16 +68,16 @@ class FaultRow:
     """
 
     name: str
-    change: Callable[[], Change] = _unchanged
-    happens: Callable[[], Happens] = _nothing_happens
+    change: Callable[[], Change] = lambda: lambda given: [given]
     faults: Fault = Fault(0)  # noqa: RUF009
     rejects: Reject = Reject(0)  # noqa: RUF009
-    at_least: Health = Health.OK
-    at_most: Health = Health.OK
+    health: tuple[Health, Health] = (Health.OK, Health.OK)
     error_m: float = 0.05
     error_after_m: float = 0.05
+    happens: Callable[[], Happens] = lambda: lambda now_ns, world: None
     begins_s: float = BEGIN_S
     ends_s: float = END_S
+    always: bool = False
     drive_s: float = 7.0
     rates: Rates = field(default_factory=Rates)
     telling: str = ""
@@ -143,7 +131,8 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
     delays = None
     if Fault.CAMERA_LATE in row.faults:
         delays = CameraDelays(navigator.rig, markers, trial.vehicle)
-    steps = list(drive(pilot, world, row.drive_s, row.change(), row.rates, row.happens(), delays))
+    change = between(-math.inf if row.always else row.begins_s, row.ends_s, row.change())
+    steps = list(drive(pilot, world, row.drive_s, change, row.rates, row.happens(), delays))
     return judge(row, steps, pilot)
 
 
@@ -228,7 +217,7 @@ def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:
         said.append(f"no {'/'.join(names(row.faults))}")
     if row.rejects and not result.rejects & row.rejects:
         said.append(f"no {'/'.join(names(row.rejects))}")
-    if not row.at_least <= result.worst <= row.at_most:
+    if not row.health[0] <= result.worst <= row.health[1]:
         said.append(f"health {result.worst.name}")
     if result.error_m > row.error_m:
         said.append(f"error {result.error_m:.3f} m")

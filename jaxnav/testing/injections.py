@@ -1,6 +1,7 @@
 """Change data on their way to the pilot: the parts from which faults are made."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterable
 
@@ -53,11 +54,12 @@ def odometry(edit: EditOdometry) -> Change:
 
 def detections(edit: Callable[[Detections], Detections]) -> EditFrame:
     """Edit the detections of frames."""
-    return lambda frame: (
-        frame
-        if frame.detections is None
-        else dataclasses.replace(frame, detections=edit(frame.detections))
-    )
+
+    def edited(frame: FrameDetections) -> FrameDetections:
+        seen = frame.detections
+        return frame if seen is None else dataclasses.replace(frame, detections=edit(seen))
+
+    return edited
 
 
 def corners(edit: Callable[[np.ndarray], np.ndarray]) -> EditFrame:
@@ -93,28 +95,21 @@ def only_camera(camera: int, edit: EditFrame) -> EditFrame:
 
 def late(delay_s: float, every: int = 1) -> Change:
     """Delay every n-th input with frames, n = `every`."""
-    count = 0
+    calls = itertools.count(1)
 
     def change(given: Input) -> list[Input]:
-        nonlocal count
         if not given.frames:
             return [given]
-        count += 1
-        delay_ns = int(delay_s * 1e9) if count % every == 0 else 0
+        delay_ns = int(delay_s * 1e9) if next(calls) % every == 0 else 0
         return [dataclasses.replace(given, now_ns=given.now_ns + delay_ns)]
 
     return change
 
 
-def stalled(begin_s: float, stall_s: float) -> Change:
-    """Stall the loop for a while; it then gets all inputs of that time at once."""
-    end_ns = BEGIN_NS + int((begin_s + stall_s) * 1e9)
-
-    def change(given: Input) -> list[Input]:
-        waits = begin_s <= seconds(given) < begin_s + stall_s
-        return [dataclasses.replace(given, now_ns=max(given.now_ns, end_ns))] if waits else [given]
-
-    return change
+def stalled(end_s: float) -> Change:
+    """Stall the loop; it gets all inputs at once at the end."""
+    end_ns = BEGIN_NS + int(end_s * 1e9)
+    return lambda given: [dataclasses.replace(given, now_ns=max(given.now_ns, end_ns))]
 
 
 def frozen(cameras: Iterable[int], jitter_px: float, seed: int = 0) -> EditFrame:
@@ -175,13 +170,12 @@ def repeated() -> EditOdometry:
 def with_values(values: Iterable[float]) -> EditOdometry:
     """Replace speed or steering, in turns, by these values, which are no numbers."""
     kinds = list(values)
-    count = 0
+    calls = itertools.count(1)
 
     def edit(reading: Odometry) -> Odometry:
-        nonlocal count
-        count += 1
-        bad = kinds[count % len(kinds)]
-        if count % 2:
+        call = next(calls)
+        bad = kinds[call % len(kinds)]
+        if call % 2:
             return dataclasses.replace(reading, speed_mps=bad)
         return dataclasses.replace(reading, steering_rad=bad)
 
