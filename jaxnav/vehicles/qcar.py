@@ -12,6 +12,7 @@ that do not change are taken for an error: the noise of a gyroscope never repeat
 import math
 import threading
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from jaxnav.loop.interfaces import Camera, Frame, Odometry, Setup, Vehicle
 from jaxnav.loop.limits import Limits
 from jaxnav.vehicles.grabber import Grabber
 from jaxnav.vehicles.options import latency_ns, whole_number
-from jaxnav.vehicles.servo import Servo
 
 THROTTLE_LIMIT = 0.3  # PWM duty, the maker's own limit
 STEERING_LIMIT_RAD = 0.6  # the maker's own limit
@@ -96,6 +96,30 @@ def _maker(flag: str) -> Any:
         # On import it reads the login name and the type of car, and fails where there is none.
         raise BadInput(flag, f"pal.products.qcar: {type(error).__name__}: {error}") from error
     return maker
+
+
+@dataclass
+class Servo:
+    """A steering servo that turns at its full rate until it reaches the commanded angle."""
+
+    rate_limit_radps: float
+    angle_rad: float = 0.0
+    target_rad: float = 0.0
+    _time_ns: int | None = None
+
+    def turn_to(self, target_rad: float, now_ns: int) -> None:
+        """Command an angle from this instant on."""
+        self.angle_at(now_ns)
+        self.target_rad = target_rad
+
+    def angle_at(self, now_ns: int) -> float:
+        """The angle at a time, rad. Times must not decrease."""
+        elapsed_s = 0.0 if self._time_ns is None else max(now_ns - self._time_ns, 0) / 1e9
+        self._time_ns = now_ns
+        reach_rad = self.rate_limit_radps * elapsed_s
+        way_rad = self.target_rad - self.angle_rad
+        self.angle_rad += min(max(way_rad, -reach_rad), reach_rad)
+        return self.angle_rad
 
 
 class QCarVehicle:

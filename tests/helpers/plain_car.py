@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jaxnav.loop.interfaces import Odometry, Setup
-from jaxnav.vehicles.servo import Servo
+from jaxnav.vehicles.qcar import Servo
 
 NAME = f"{__name__}:open_vehicle"
 

@@ -17,8 +17,7 @@ from jaxnav.loop.limits import Limits
 from jaxnav.loop.plugins import open_cameras as open_by_name
 from jaxnav.loop.plugins import open_vehicle as open_vehicle_by_name
 from jaxnav.testing import check_cameras, check_vehicle
-from jaxnav.vehicles.qcar import QCarVehicle, open_cameras, open_vehicle
-from jaxnav.vehicles.servo import Servo
+from jaxnav.vehicles.qcar import QCarVehicle, Servo, open_cameras, open_vehicle
 from tests.helpers.fake_pal import Hardware, fake_pal
 from tests.helpers.setups import setup_with
 
