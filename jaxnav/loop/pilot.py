@@ -20,7 +20,6 @@ import numpy as np
 from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.belief.estimate import Belief
 from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.due import due_px
 from jaxnav.loop.estimator import Estimator, Program
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.frames import FrameDetections, FrameIntake
@@ -31,9 +30,8 @@ from jaxnav.loop.limits import Limits
 from jaxnav.loop.odometer import Odometer
 from jaxnav.loop.outvoted import MarkerVotes
 from jaxnav.loop.stamps import Stamps
-from jaxnav.loop.standstill import Standstill
+from jaxnav.loop.standstill import Place, Standstill, Way, due_px
 from jaxnav.loop.support import Support
-from jaxnav.loop.way import Place, Way
 from jaxnav.loop.ways import Fix
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.navigator import Navigator, Output
@@ -212,7 +210,7 @@ class Pilot:
         return outcome if data is not None else self._tick(now_ns, faults)
 
     def _odometry(self, reading: Odometry, now_ns: int, faults: Fault) -> Outcome:
-        jumps = self._odometry_stamps.jumps
+        known, jumps = self._known, self._odometry_stamps.jumps
         stamp_ns = self._odometry_stamps.take(reading.stamp_ns, now_ns)
         if not reading.valid or not (
             math.isfinite(reading.speed_mps) and math.isfinite(reading.steering_rad)
@@ -226,7 +224,7 @@ class Pilot:
             reading.speed_mps,
             reading.steering_rad,
             stamp_ns,
-            self._speed(),
+            known.speed_mps if known is not None and known.decided else None,
             self._seeing(now_ns),
             self._command[1],
             self._standstill.add_reading(stamp_ns, now_ns, reading.speed_mps),
@@ -242,7 +240,7 @@ class Pilot:
             self._support.add_odometry(
                 reading.speed_mps,
                 reading.steering_rad,
-                0.0 if self._known is None else float(self._known.pose[2]),
+                0.0 if known is None else float(known.pose[2]),
                 gap_s,
                 self._command[1],
                 self._seeing(now_ns),
@@ -282,7 +280,7 @@ class Pilot:
             if outvoted:
                 faults |= Fault.MARKER_OUTVOTED
             rejects |= self._judge(known, fused.belief, stamp_ns, now_ns)
-        faults |= self._contradictions()
+        faults |= self._support.faults
         output, known = self._honest(fused.output, known)
         if self._left is not None and output.decided:
             self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
@@ -327,26 +325,12 @@ class Pilot:
         ):
             self._fix_ns, self._distance_m = max(stamp_ns, self._fix_ns or 0), 0.0
         if support.relocations > before[0] or support.refused > before[1]:
-            self._explain("refused" if support.refused else "relocated")
+            what = "refused" if support.refused else "relocated"
+            parts = [self._restart_reason, f"{what}: no slip explains the way there"]
+            self._restart_reason = "; ".join(part for part in parts if part)
         if not known.accepted:
             return Reject.INNOVATION
         return Reject.INNOVATION_LARGE if known.nis > known.gate_nis / 2 else _NO_REJECT
-
-    def _explain(self, what: str) -> None:
-        """Append a note to the reason of the last restart."""
-        parts = [self._restart_reason, f"{what}: no slip explains the way there"]
-        self._restart_reason = "; ".join(part for part in parts if part)
-
-    def _contradictions(self) -> Fault:
-        """The faults that contradict the estimated pose."""
-        support, faults = self._support, _NO_FAULT
-        if support.relocated:
-            faults |= Fault.RELOCATED
-        if support.disputed:
-            faults |= Fault.WAYS_DISPUTED
-        if support.odometry_doubtful:
-            faults |= Fault.ODOMETRY_DOUBTFUL
-        return faults
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""
@@ -378,6 +362,8 @@ class Pilot:
 
     def _senses(self, known: _Known, now_ns: int, faults: Fault) -> Senses:
         began_ns = self._began_ns if self._began_ns is not None else now_ns
+        while self._restarts_ns and now_ns - self._restarts_ns[0] > RESTARTS_S * 1e9:
+            self._restarts_ns.popleft()
 
         def age_s(stamp_ns: int | None) -> float:
             return max(now_ns - (began_ns if stamp_ns is None else stamp_ns), 0) / 1e9
@@ -391,15 +377,10 @@ class Pilot:
             position_sigma_m=known.position_sigma_m,
             distance_m=self._distance_m,
             faults=faults,
-            restarts=self._restarts_lately(now_ns),
+            restarts=len(self._restarts_ns),
             confirmed=self._support.confirmed,
             refused=self._support.refused,
         )
-
-    def _restarts_lately(self, now_ns: int) -> int:
-        while self._restarts_ns and now_ns - self._restarts_ns[0] > RESTARTS_S * 1e9:
-            self._restarts_ns.popleft()
-        return len(self._restarts_ns)
 
     def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
         """See `due_px`."""
@@ -428,11 +409,6 @@ class Pilot:
     def _seeing(self, now_ns: int) -> bool:
         """Whether recent corners tell how fast the vehicle is."""
         return self._fix_ns is not None and now_ns - self._fix_ns < _SEEING_NS
-
-    def _speed(self) -> tuple[float, float] | None:
-        """Speed along the course and its sigma, m/s; None where the pose is not decided."""
-        known = self._known
-        return None if known is None or not known.decided else known.speed_mps
 
 
 def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:

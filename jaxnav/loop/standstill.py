@@ -16,13 +16,17 @@ something moves, for example when someone pushes it. Missing data are stale, and
 """
 
 import math
+from bisect import bisect_right
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaxnav.loop.way import Place, Way, between
+from jaxnav.loop.expect import expect_corners
+from jaxnav.navigator import Navigator
 
+Place = tuple[float, float, float]  # x_m, y_m, psi_rad
 # The corners before and after a motion (x_m, y_m, psi_rad, in the vehicle's earlier axes),
 # (C, M, 4, 2) each; None: the pose of the vehicle is not known.
 Due = Callable[[Place], tuple[np.ndarray, np.ndarray] | None]
@@ -47,6 +51,69 @@ _PAUSE_NS = 1_000_000_000  # longest time between two moves of one motion
 _PULLS_NS, _PULLS_M = 1_000_000_000, 0.2
 _MAX_GAP_NS = 200_000_000  # without a command this long the watchdog stops it; cameras are stale
 _GOES_MPS, _GOES_SHARE = 0.05, 0.25  # five sigmas of the odometer; share of the expected speed
+
+
+_KEPT_NS = 1_500_000_000  # more than the age of the oldest frame that is taken, see `stamps`
+_SILENT_NS = 250_000_000  # without a reading for this long the way is unknown
+_AHEAD_NS = 100_000_000  # the newest reading is extrapolated for this long: it is not stale yet
+
+
+@dataclass
+class Way:
+    """The vehicle's way of the last 1.5 s by odometry alone, in a frame of its own."""
+
+    wheelbase_m: float
+    number: int = 0  # of the way: places on different ways can't be compared
+    _track: deque[tuple[int, Place]] = field(default_factory=deque)
+    _speed_mps: float = 0.0
+    _steering_rad: float = 0.0
+
+    def go(self, stamp_ns: int, speed_mps: float, steering_rad: float) -> None:
+        """Take a reading; a late one is left out, and after a pause a new way begins."""
+        if self._track and not 0 < stamp_ns - self._track[-1][0] <= _SILENT_NS:
+            if stamp_ns <= self._track[-1][0]:
+                return
+            self._track.clear()
+            self.number += 1
+        self._speed_mps, self._steering_rad = speed_mps, steering_rad
+        place = self._beyond(stamp_ns) if self._track else (0.0, 0.0, 0.0)
+        self._track.append((stamp_ns, place))
+        while self._track[0][0] < stamp_ns - _KEPT_NS:
+            self._track.popleft()
+
+    def at(self, stamp_ns: int) -> Place | None:
+        """The place at a time, interpolated; None: not known."""
+        track = self._track
+        if not track or not track[0][0] <= stamp_ns <= track[-1][0] + _AHEAD_NS:
+            return None
+        if stamp_ns >= track[-1][0]:
+            return self._beyond(stamp_ns)
+        index = bisect_right(track, stamp_ns, key=lambda row: row[0])
+        (before_ns, before), (after_ns, after) = track[index - 1], track[index]
+        share = (stamp_ns - before_ns) / (after_ns - before_ns)
+        x_m, y_m, psi_rad = (a + share * (b - a) for a, b in zip(before, after, strict=True))
+        return x_m, y_m, psi_rad
+
+    def _beyond(self, stamp_ns: int) -> Place:
+        """The place extrapolated from the newest reading (see `bicycle.velocity_world`)."""
+        before_ns, (x_m, y_m, psi_rad) = self._track[-1]
+        tangent = math.tan(self._steering_rad)
+        beta_rad = math.atan(tangent / 2)
+        gone_m = self._speed_mps * (stamp_ns - before_ns) / 1e9
+        turned_rad = gone_m * math.cos(beta_rad) * tangent / self.wheelbase_m
+        course_rad = psi_rad + beta_rad + turned_rad / 2
+        return (
+            x_m + gone_m * math.cos(course_rad),
+            y_m + gone_m * math.sin(course_rad),
+            psi_rad + turned_rad,
+        )
+
+
+def between(place: Place, other: Place) -> Place:
+    """The other place relative to the first, in the first one's axes."""
+    x_m, y_m = other[0] - place[0], other[1] - place[1]
+    c, s = math.cos(place[2]), math.sin(place[2])
+    return c * x_m + s * y_m, c * y_m - s * x_m, other[2] - place[2]
 
 
 @dataclass
@@ -201,3 +268,34 @@ def _withheld(due_px: np.ndarray, seen_px: np.ndarray, sigma_px: float) -> bool:
         return False
     share = along_px2 / squared_px2
     return share + _SHARE_SIGMAS * math.sqrt(2 / squared_px2) * sigma_px < _SHARE
+
+
+def due_px(
+    navigator: Navigator, pose: np.ndarray | None, motion: Place
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Corners before and after a motion, (C, M, 4, 2) each; None where the pose is not known.
+
+    Args:
+        pose: estimated (x_m, y_m, psi_rad) after the motion. Its error matters little: the relative
+            error of a shift is that of the distance to the marker.
+        motion: (x_m, y_m, psi_rad) in the vehicle's axes before the motion.
+    """
+    if pose is None:
+        return None
+    x_m, y_m, psi_rad = map(float, pose)
+    before_rad = psi_rad - motion[2]
+    c, s = math.cos(before_rad), math.sin(before_rad)
+    before = (
+        x_m - c * motion[0] + s * motion[1],
+        y_m - s * motion[0] - c * motion[1],
+        before_rad,
+    )
+    return _quads_px(navigator, before), _quads_px(navigator, (x_m, y_m, psi_rad))
+
+
+def _quads_px(navigator: Navigator, place: Place) -> np.ndarray:
+    """Corners as seen from a place, (C, M, 4, 2), by the program that predicts search regions."""
+    (x_m, y_m, psi_rad), dtype = place, np.asarray(navigator.corner_sigma_px).dtype
+    wxyz_xyz = np.array([math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0], dtype)
+    corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))
+    return np.asarray(corners.quads_px)

@@ -14,6 +14,7 @@ copy of the marker elsewhere looks like the marker.
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from jaxnav.loop.flags import Fault
 from jaxnav.loop.propulsion import Propulsion
 from jaxnav.loop.ways import Fix, Ways
 from jaxnav.models.bicycle import Vehicle
@@ -24,6 +25,7 @@ CONFIRMED = 2  # frames in a row, with the first: a single one never confirms
 SLOW_M = 1.0
 # Every further restart on that way needs twice as many frames, up to three seconds of a camera's.
 _MOST_CONFIRMED = 96
+_NO_FAULT = Fault(0)
 
 
 class Doubt(NamedTuple):
@@ -65,14 +67,14 @@ class Support:
         return self.refused or self._ways.way_m < self._slow_until_m
 
     @property
-    def disputed(self) -> bool:
-        """Whether the ways by corners and by odometer differ."""
-        return self._ways.disputed
-
-    @property
-    def odometry_doubtful(self) -> bool:
-        """Whether the odometer contradicts the throttle, and no marker has confirmed it since."""
-        return self._propulsion.doubtful
+    def faults(self) -> Fault:
+        """The faults that contradict the estimated pose."""
+        faults = Fault.RELOCATED if self.relocated else _NO_FAULT
+        if self._ways.disputed:
+            faults |= Fault.WAYS_DISPUTED
+        if self._propulsion.doubtful:
+            faults |= Fault.ODOMETRY_DOUBTFUL
+        return faults
 
     def add_odometry(
         self,
@@ -146,8 +148,9 @@ class Support:
         Args:
             contradicted: the corners contradict it more often than not.
         """
-        off_m = self._propulsion.off_m if self.odometry_doubtful else 0.0
+        doubtful = self._propulsion.doubtful
+        off_m = self._propulsion.off_m if doubtful else 0.0
         if contradicted or self.refused:
             off_m += self._ways.since_fix_m
-        is_doubted = not self.confirmed or self.refused or contradicted or self.odometry_doubtful
+        is_doubted = not self.confirmed or self.refused or contradicted or doubtful
         return Doubt(is_doubted, off_m)

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.loop.standstill import Standstill
-from jaxnav.loop.way import Way, between
+from jaxnav.loop.standstill import Standstill, Way, between
 
 MS = 1_000_000
 BEGIN_NS = 10**12
