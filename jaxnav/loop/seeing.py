@@ -8,6 +8,7 @@ image now and then, and whenever nothing was found where it should be.
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -166,13 +167,13 @@ class Eyes:
         self.dropped = 0  # frames replaced by newer ones before a search
         self.errors = [0] * len(cameras)  # failed reads
         self.expected: Callable[[int], Region | None] = lambda camera: None
-        names = [f"camera {camera.name}" for camera in cameras]
+        turns: list[tuple[str, Callable[[], None]]] = [
+            (f"camera {camera.name}", partial(self._read, c)) for c, camera in enumerate(cameras)
+        ]
+        turns += [(f"detector {number}", self._look) for number in range(workers)]
         self._threads = [
-            threading.Thread(target=self._reading, args=(c, name), name=name, daemon=True)
-            for c, name in enumerate(names)
-        ] + [
-            threading.Thread(target=self._looking, args=(name,), name=name, daemon=True)
-            for name in (f"detector {number}" for number in range(workers))
+            threading.Thread(target=self._repeat, args=(turn, name), name=name, daemon=True)
+            for name, turn in turns
         ]
 
     def start(self) -> None:
@@ -207,49 +208,45 @@ class Eyes:
             if thread.ident is not None:
                 thread.join(0.5)
 
-    def _reading(self, index: int, name: str) -> None:
-        camera = self._cameras[index]
+    def _repeat(self, turn: Callable[[], None], name: str) -> None:
+        """Take turns until the end, watched by the guard. Runs in a thread."""
         try:
             while not self._over.is_set():
                 self._guard.beat(name)
-                try:
-                    frame = camera.read(_READ_S)
-                except OSError:
-                    self.errors[index] += 1
-                    self._over.wait(_RETRY_S)
-                    continue
-                if frame is not None:
-                    with self._waiting:
-                        self.dropped += self._frames[index] is not None
-                        self._frames[index] = frame
-                        self._waiting.notify()
+                turn()
         except Exception as error:  # its meaning is unknown: the vehicle stops
-            self._guard.trip(f"{name}: {_error_text(error)}")
+            self._guard.trip(f"{name}: {type(error).__name__}: {error}")
         finally:
             self._guard.leave(name)
 
-    def _looking(self, name: str) -> None:
+    def _read(self, index: int) -> None:
         try:
-            while not self._over.is_set():
-                self._guard.beat(name)
-                task = self._next()
-                if task is None:
-                    continue
-                index, frame = task
-                try:
-                    # A camera that detects markers itself needs no region.
-                    region = self.expected(index) if frame.detections is None else None
-                    sighted = self._searches[index].look(frame, region)
-                finally:
-                    self._busy[index] = False
-                seen = SearchedFrame(sighted, frame, self._cameras[index].name)
-                with self._woken:
-                    self._seen.append(seen)
-                    self._woken.notify()
-        except Exception as error:
-            self._guard.trip(f"{name}: {_error_text(error)}")
+            frame = self._cameras[index].read(_READ_S)
+        except OSError:
+            self.errors[index] += 1
+            self._over.wait(_RETRY_S)
+            return
+        if frame is not None:
+            with self._waiting:
+                self.dropped += self._frames[index] is not None
+                self._frames[index] = frame
+                self._waiting.notify()
+
+    def _look(self) -> None:
+        task = self._next()
+        if task is None:
+            return
+        index, frame = task
+        try:
+            # A camera that detects markers itself needs no region.
+            region = self.expected(index) if frame.detections is None else None
+            sighted = self._searches[index].look(frame, region)
         finally:
-            self._guard.leave(name)
+            self._busy[index] = False
+        seen = SearchedFrame(sighted, frame, self._cameras[index].name)
+        with self._woken:
+            self._seen.append(seen)
+            self._woken.notify()
 
     def _next(self) -> tuple[int, Frame] | None:
         """The camera whose turn it is, and its frame; None: none came in time."""
@@ -265,10 +262,6 @@ class Eyes:
                 if attempt == 0:
                     self._waiting.wait(_READ_S)
         return None
-
-
-def _error_text(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
 
 
 def group_frames(
