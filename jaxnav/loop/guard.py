@@ -34,7 +34,12 @@ HEARD_WITHIN_S = 10.0  # time for which `close` repeats the stop to a vehicle th
 
 
 class Guard:
-    """The watchdog of one vehicle. Thread-safe, but only one thread may call `write`."""
+    """The watchdog of one vehicle. Thread-safe, but only one thread may call `write`.
+
+    Attributes:
+        reason: why the guard has tripped; None: it has not.
+        unheard: why the last stop did not reach the vehicle; None: it did, or there was none.
+    """
 
     def __init__(
         self,
@@ -55,13 +60,13 @@ class Guard:
         self._timeout_ns = int((timeout_s - 1.5 * _LOOK_S) * 1e9)
         self._lock = threading.Lock()
         self._armed = False
-        self._reason: str | None = None
+        self.reason: str | None = None
         self._tripped = threading.Event()
         self._closed = threading.Event()
         self._beats: dict[str, int] = {}  # time of each watched thread's last sign of life
         self._steering_rad, self._written_ns = 0.0, now_ns()
         self._deadline_ns = self._written_ns
-        self._unheard: str | None = None  # why the last stop did not reach the vehicle
+        self.unheard: str | None = None
         self._stopped_s = 0.0  # time of the last stop that did
         self._thread = threading.Thread(target=self._watch, name="jaxnav-guard", daemon=True)
         self._thread.start()
@@ -71,16 +76,6 @@ class Guard:
     def tripped(self) -> bool:
         """Whether the guard has stopped the vehicle for good."""
         return self._tripped.is_set()
-
-    @property
-    def reason(self) -> str | None:
-        """Why the guard has tripped; None: it has not."""
-        return self._reason
-
-    @property
-    def unheard(self) -> str | None:
-        """Why the last stop did not reach the vehicle; None: it did, or there was none."""
-        return self._unheard
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the guard trips or the time is over; return whether it has tripped."""
@@ -142,8 +137,8 @@ class Guard:
         # A thread that hangs inside the driver holds the lock: then stop without it.
         held = self._lock.acquire(timeout=_LOCK_S)
         try:
-            if self._reason is None:
-                self._reason = reason
+            if self.reason is None:
+                self.reason = reason
             self._armed = False
             self._tripped.set()
             self._stop()
@@ -162,7 +157,7 @@ class Guard:
             return
         self.trip("closed")
         end_s = time.monotonic() + heard_within_s
-        while self._unheard is not None and time.monotonic() < end_s:
+        while self.unheard is not None and time.monotonic() < end_s:
             time.sleep(_LOOK_S)
             self._stop()
         self._closed.set()
@@ -188,7 +183,7 @@ class Guard:
 
     def _look(self) -> None:
         if self.tripped:
-            if self._unheard is not None or time.monotonic() - self._stopped_s > _AGAIN_S:
+            if self.unheard is not None or time.monotonic() - self._stopped_s > _AGAIN_S:
                 self._stop()
             return
         if not self._armed:
@@ -205,9 +200,9 @@ class Guard:
         try:
             self._vehicle.stop()
         except Exception as error:  # whatever it is, all that can be done is to try again
-            self._unheard = f"{type(error).__name__}: {error}"
+            self.unheard = f"{type(error).__name__}: {error}"
         else:
-            self._unheard, self._stopped_s = None, time.monotonic()
+            self.unheard, self._stopped_s = None, time.monotonic()
 
     def _at_exit(self) -> None:
         self.trip("the program ends")

@@ -52,6 +52,10 @@ class Recorder:
 
     Messages that do not fit into the queue are dropped and counted; a gap in the sequence numbers
     of their topic shows where. Images are dropped first.
+
+    Attributes:
+        dropped, written: numbers of messages and images so far.
+        failed: why recording has ended early; None: it has not.
     """
 
     def __init__(
@@ -90,29 +94,14 @@ class Recorder:
         self._queue: deque[_Item] = deque()
         self._lock = threading.RLock()  # a signal handler may call `close` during a `put`
         self._closing = threading.Event()
-        self._images = self._dropped = self._written = 0
-        self._failed: str | None = None
+        self._images = self.dropped = self.written = 0
+        self.failed: str | None = None
         self._keeps_empty = True
         self._sequences: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._flushed_s = self._synced_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="jaxnav-recorder", daemon=True)
         self._thread.start()
-
-    @property
-    def dropped(self) -> int:
-        """Number of messages and images dropped so far."""
-        return self._dropped
-
-    @property
-    def failed(self) -> str | None:
-        """Why recording has ended early; None: it has not."""
-        return self._failed
-
-    @property
-    def written(self) -> int:
-        """Number of messages and images written so far."""
-        return self._written
 
     def put(self, topic: str, stamp_ns: int, message: dict[str, Any]) -> None:
         """Record a message. Never waits, never raises.
@@ -143,8 +132,8 @@ class Recorder:
             self._keeps_empty = keep_empty
             self._closing.set()
         self._thread.join(timeout_s)
-        if self._thread.is_alive() and self._failed is None:
-            self._failed = f"{self.path}: the disk does not answer"
+        if self._thread.is_alive() and self.failed is None:
+            self.failed = f"{self.path}: the disk does not answer"
 
     def _offer(self, topic: str, stamp_ns: int, log_ns: int, content: Any, is_image: bool) -> None:
         with self._lock:
@@ -154,8 +143,8 @@ class Recorder:
             full = waiting >= self._queue_messages
             if is_image:
                 full |= self._images >= self._queue_images or waiting >= self._queue_messages // 2
-            if full or self._closing.is_set() or self._failed is not None:
-                self._dropped += 1
+            if full or self._closing.is_set() or self.failed is not None:
+                self.dropped += 1
                 return
             self._images += is_image
             self._queue.append(_Item(topic, stamp_ns, log_ns, sequence, content, is_image))
@@ -193,14 +182,14 @@ class Recorder:
             log_ns, stamp_ns = _time(item.log_ns), _time(item.stamp_ns)
         except Exception:  # a message that can't be written must not end the recording
             with self._lock:
-                self._dropped += 1
+                self.dropped += 1
             return
         if item.topic not in self._channels:
             self._channels[item.topic] = self._new_channel(item)
         self._file.take_place()
         channel, sequence = self._channels[item.topic], item.sequence & 0xFFFFFFFF
         self._writer.add_message(channel, log_ns, raw, stamp_ns, sequence)
-        self._written += 1
+        self.written += 1
 
     def _new_channel(self, item: _Item) -> int:
         schema = (IMAGE_SCHEMA, ImageMessage) if item.is_image else MESSAGES.get(item.topic)
@@ -221,8 +210,8 @@ class Recorder:
 
     def _fail(self, error: Exception) -> None:
         with self._lock:
-            self._failed = f"{self.path}: can't be written: {_reason(error)}"
-            self._dropped += len(self._queue)
+            self.failed = f"{self.path}: can't be written: {_reason(error)}"
+            self.dropped += len(self._queue)
             self._queue.clear()
 
 

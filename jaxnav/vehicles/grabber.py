@@ -33,18 +33,13 @@ class Grabber:
             release: releases the hardware; called once, after the last `grab`.
             pause_s: pause after each None.
         """
-        self._name, self._grab, self._release, self._pause_s = name, grab, release, pause_s
+        self.name, self._grab, self._release, self._pause_s = name, grab, release, pause_s
         self._changed = threading.Condition()
         self._closing = threading.Event()
         self._frame: Frame | None = None
         self._error: OSError | None = None
         self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
         self._thread.start()
-
-    @property
-    def name(self) -> str:
-        """The camera's name in the rig."""
-        return self._name
 
     def read(self, timeout_s: float) -> Frame | None:
         """The newest frame that was not read yet; None if none comes within the timeout.
@@ -56,13 +51,13 @@ class Grabber:
         with self._changed:
             while True:
                 if self._closing.is_set():
-                    raise OSError(f"the camera {self._name} is closed")
+                    raise OSError(f"the camera {self.name} is closed")
                 if self._frame is not None:
                     frame, self._frame = self._frame, None
                     return frame
                 if self._error is not None:
                     error, self._error = self._error, None
-                    raise OSError(f"the camera {self._name}: {error}") from error
+                    raise OSError(f"the camera {self.name}: {error}") from error
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0:
                     return None

@@ -28,14 +28,9 @@ class SimVehicle:
 
     def __init__(self, world: SimWorld):
         """Take the world, which the cameras look at too."""
-        self.world = world
+        self.world, self.timeout_s = world, world.settings.vehicle_timeout_s
         self._corrections = Corrections.of(world.vehicle)
         self._closed = False
-
-    @property
-    def timeout_s(self) -> float:
-        """See `Vehicle`."""
-        return self.world.settings.vehicle_timeout_s
 
     def read(self) -> Odometry:
         """See `Vehicle`."""
@@ -128,13 +123,8 @@ class SimCamera:
         """Args:
         camera: its index in the rig.
         """
-        self._name, self._camera, self._shutter = name, camera, shutter
+        self.name, self._camera, self._shutter = name, camera, shutter
         self._last_ns = 0
-
-    @property
-    def name(self) -> str:
-        """See `Camera`."""
-        return self._name
 
     def read(self, timeout_s: float) -> Frame | None:
         """See `Camera`."""
