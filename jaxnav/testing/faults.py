@@ -174,25 +174,20 @@ def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
     outcomes = [step.outcome for step in steps]
     healths = np.array([outcome.health for outcome in outcomes])
     errors_m = np.array([_error_m(step) for step in steps])
-    lasts = (times_s >= row.begins_s) & (times_s < row.ends_s)
     shaken = (times_s >= row.begins_s) & (times_s < row.ends_s + SETTLE_S)
     faults, rejects = Fault(0), Reject(0)
     for index in np.flatnonzero(shaken):
         faults |= outcomes[index].faults
         rejects |= outcomes[index].rejects
-    after = times_s >= row.ends_s
-    is_well = (healths >= Health.OK) & (healths <= row.well)
-    well = np.flatnonzero(after & is_well)
-    ill = np.flatnonzero(after & ~is_well)
-    recovered_s = math.inf
-    if len(well) and (not len(ill) or ill[-1] < well[-1]):
-        first = well[0] if not len(ill) else well[well > ill[-1]][0]
-        recovered_s = float(times_s[first] - row.ends_s)
+    after = np.flatnonzero(times_s >= row.ends_s)
+    ill = after[(healths[after] < Health.OK) | (healths[after] > row.well)]
+    well = after[after > ill.max(initial=-1)]  # all that follow the last ill one
+    recovered_s = float(times_s[well[0]] - row.ends_s) if len(well) else math.inf
     result = Result(
         row,
         faults,
         rejects,
-        Health(int(healths[lasts | shaken].max(initial=0))),
+        Health(int(healths[shaken].max(initial=0))),
         float(np.nanmax(errors_m[shaken], initial=0.0)),
         float(np.nanmax(errors_m[times_s >= row.ends_s + SETTLE_S], initial=0.0)),
         recovered_s,

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
@@ -140,11 +141,11 @@ def speed(edit: Callable[[float], float]) -> EditOdometry:
     return lambda reading: dataclasses.replace(reading, speed_mps=edit(reading.speed_mps))
 
 
-def constant() -> Callable[[float], float]:
+def constant() -> Callable[[Any], Any]:
     """Repeat the first value for ever."""
-    first: list[float] = []
+    first: list[Any] = []
 
-    def edit(value: float) -> float:
+    def edit(value: Any) -> Any:
         first.append(value)
         return first[0]
 
@@ -158,28 +159,17 @@ def both(change: Change, other: Change) -> Change:
 
 def repeated() -> EditOdometry:
     """Repeat the first reading under new stamps."""
-    last: list[Odometry] = []
+    first = constant()
+    return lambda reading: dataclasses.replace(first(reading), stamp_ns=reading.stamp_ns)
+
+
+def not_finite() -> EditOdometry:
+    """Replace speed or steering, in turns, by what is no number."""
+    names = itertools.cycle(("speed_mps", "steering_rad"))
+    values = itertools.cycle((math.inf, -math.inf, math.nan))
 
     def edit(reading: Odometry) -> Odometry:
-        last.append(reading)
-        return dataclasses.replace(last[0], stamp_ns=reading.stamp_ns)
+        bad: dict[str, Any] = {next(names): next(values)}
+        return dataclasses.replace(reading, **bad)
 
     return edit
-
-
-def with_values(values: Iterable[float]) -> EditOdometry:
-    """Replace speed or steering, in turns, by these values, which are no numbers."""
-    kinds = list(values)
-    calls = itertools.count(1)
-
-    def edit(reading: Odometry) -> Odometry:
-        call = next(calls)
-        bad = kinds[call % len(kinds)]
-        if call % 2:
-            return dataclasses.replace(reading, speed_mps=bad)
-        return dataclasses.replace(reading, steering_rad=bad)
-
-    return edit
-
-
-NOT_FINITE = (math.nan, math.inf, -math.inf)

@@ -181,9 +181,6 @@ def _odometry() -> list[FaultRow]:
     def without(given: Input) -> list[Input]:
         return [dataclasses.replace(given, odometry=None, frames=())]
 
-    def not_finite() -> inject.EditOdometry:
-        return inject.with_values(inject.NOT_FINITE)
-
     off = partial(_may_slow, error_m=0.08)
     return [
         FaultRow("odometry x10, each fifth", spikes, rejects=Reject.ODOMETRY),
@@ -198,7 +195,7 @@ def _odometry() -> list[FaultRow]:
             rejects=Reject.ODOMETRY,
             ends_s=BEGIN_S + 0.03,
         ),
-        off("NaN and inf in odometry", read(not_finite), Fault.ODOMETRY_INVALID),
+        off("NaN and inf in odometry", read(inject.not_finite), Fault.ODOMETRY_INVALID),
         _stops("blind and without odometry", lambda: without, Fault.CAMERAS_STALE, error_m=0.30),
     ]
 
@@ -270,9 +267,6 @@ def _calibration_and_world() -> list[FaultRow]:
 def _standstill() -> list[FaultRow]:
     """Rows in which something stands still while others move, or rates matter."""
 
-    def stuck_speed() -> Change:
-        return _speed(inject.constant())()
-
     def all_of_it() -> Change:
         return inject.both(_frozen(ALL_CAMERAS)(), inject.odometry(inject.repeated()))
 
@@ -301,7 +295,7 @@ def _standstill() -> list[FaultRow]:
         stuck("odometry at 0 from the start", stopped, error_m=0.20, begins_s=0.0),
         _may_slow(
             "odometry stuck, steering not",
-            stuck_speed,
+            lambda: _speed(inject.constant())(),
             Fault.ODOMETRY_STUCK,
             error_m=0.10,
             ends_s=BEGIN_S + 4.0,
