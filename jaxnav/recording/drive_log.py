@@ -2,8 +2,7 @@
 
 import gc
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +74,13 @@ def read_drive(path: str | Path, progress: Callable[[int], object] = lambda size
     Raises:
         BadInput: one line naming file and topic: not such a file, of a newer format, or damaged.
     """
-    with _uncollected():
+    was_enabled = gc.isenabled()
+    gc.disable()  # the search for cycles, a tenth of the time: a drive's messages have none
+    try:
         return _read(Path(path), progress)
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def _read(path: Path, progress: Callable[[int], object]) -> DriveLog:
@@ -85,14 +89,17 @@ def _read(path: Path, progress: Callable[[int], object]) -> DriveLog:
     # Values, not message objects: those take four times the memory.
     columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     detections = 0
-    gaps = _Gaps()
+    missing: dict[str, int] = {}
+    last: dict[str, int] = {}  # topic -> its last sequence number
     records = McapMessages(path, progress)
     for record in records:
         if isinstance(record, Metadata):
             if record.name == HEADER and header is None:
                 header = header_of(record.metadata, path)
             continue
-        gaps.count(record)
+        if (gap := record.sequence - last.get(record.topic, -1) - 1) > 0:
+            missing[record.topic] = missing.get(record.topic, 0) + gap
+        last[record.topic] = record.sequence
         if record.topic in MESSAGES:
             index = len(columns["now_ns"] if record.topic == OUTCOME else inputs)
             message = _message(record, path, index)
@@ -110,33 +117,7 @@ def _read(path: Path, progress: Callable[[int], object]) -> DriveLog:
         problem = "is cut off before its header" if records.truncated else "is no recorded drive"
         raise BadInput(path, problem)
     table = Outcomes.of_values(columns, f"{path}: {OUTCOME}")
-    return DriveLog(path, header, tuple(inputs), table, gaps.missing, records.truncated)
-
-
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Turn off the search for cycles, a tenth of the time: a drive's messages have none."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
-
-
-@dataclass
-class _Gaps:
-    """Counts of missing messages by gaps in the sequence numbers."""
-
-    missing: dict[str, int] = field(default_factory=dict)
-    _last: dict[str, int] = field(default_factory=dict)
-
-    def count(self, record: RecordedMessage) -> None:
-        gap = record.sequence - self._last.get(record.topic, -1) - 1
-        if gap > 0:
-            self.missing[record.topic] = self.missing.get(record.topic, 0) + gap
-        self._last[record.topic] = record.sequence
+    return DriveLog(path, header, tuple(inputs), table, missing, records.truncated)
 
 
 def _message(record: RecordedMessage, path: Path, index: int) -> AnyMessage:

@@ -25,7 +25,8 @@ from jaxnav.loop.flags import names
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import opposite, planar_in_world
-from jaxnav.recording.drive_log import DriveLog
+from jaxnav.models.rig import CameraRig
+from jaxnav.recording.drive_log import DriveLog, RecordedImage
 from jaxnav.recording.drive_setup import DriveSetup, made_here
 from jaxnav.recording.messages import digest
 from jaxnav.recording.outcomes import COLUMNS, Outcomes
@@ -169,6 +170,20 @@ def _words(value: Any) -> str:
     return value.name if isinstance(value, enum.Enum) else str(value)
 
 
+def recorded_pixels(log: DriveLog, image: RecordedImage, rig: CameraRig, camera: int) -> np.ndarray:
+    """The pixels of an image.
+
+    Raises:
+        BadInput: it can't be decoded, or has another size than the camera of the rig.
+    """
+    pixels = decode_image(image.jpeg)
+    if pixels is None:
+        raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
+    if problem := size_problem(rig, camera, pixels):
+        raise BadInput(f"{log.path}: {image.topic}", problem)
+    return pixels
+
+
 def inputs_from_images(
     log: DriveLog, setup: DriveSetup, corner_backend: str
 ) -> tuple[list[Input], int]:
@@ -191,11 +206,7 @@ def inputs_from_images(
         if image.topic not in camera_of:
             continue
         camera = camera_of[image.topic]
-        pixels = decode_image(image.jpeg)
-        if pixels is None:
-            raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
-        if problem := size_problem(setup.rig, camera, pixels):
-            raise BadInput(f"{log.path}: {image.topic}", problem)
+        pixels = recorded_pixels(log, image, setup.rig, camera)
         detections[camera, image.stamp_ns] = search.detections(camera, pixels)
     if not detections:
         raise BadInput(log.path, f"holds no image on {', '.join(camera_of)}")

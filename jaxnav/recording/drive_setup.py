@@ -46,7 +46,7 @@ from jaxnav.loop.health import Timeouts
 from jaxnav.loop.pilot import Pilot
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
-from jaxnav.models.origin import ZERO, Origin
+from jaxnav.models.origin import ZERO
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
 from jaxnav.recording.message_fields import Flag
@@ -104,13 +104,6 @@ class SetupEntry(Entry):
     float64: Flag
     relocate: Flag = True  # older drives don't say
     made_by: dict[str, str]
-
-    def origin(self) -> Origin:
-        """The origin of the map's coordinates in the recording."""
-        if self.origin_m is None:
-            return ZERO
-        x_m, y_m, z_m = self.origin_m
-        return x_m, y_m, z_m
 
     @field_validator("selector")
     @classmethod
@@ -214,9 +207,10 @@ class DriveSetup:
             BadInput: one line naming file and key; also where the header has a newer version.
         """
         entry = _checked(header, where)
+        x_m, y_m, z_m = entry.origin_m or ZERO
         setup = DriveSetup(
             rig=entry.rig.rig(),
-            markers=entry.markers.map(entry.origin()),
+            markers=entry.markers.map((x_m, y_m, z_m)),
             vehicle=entry.vehicle.vehicle(),
             route=entry.route.route(),
             selector=entry.selector,

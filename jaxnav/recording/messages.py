@@ -51,17 +51,11 @@ def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
 
 def input_of(message: OdometryMessage | FramesMessage | TickMessage) -> Input:
     """The input of a message."""
-    match message:
-        case OdometryMessage():
-            reading = Odometry(
-                message.stamp_ns, message.speed_mps, message.steering_rad, message.valid
-            )
-            frames = tuple(_sighted(frame) for frame in message.frames)
-            return Input(message.now_ns, reading, frames, message.faults)
-        case FramesMessage():
-            frames = tuple(_sighted(frame) for frame in message.frames)
-            return Input(message.now_ns, frames=frames, faults=message.faults)
-    return Input(message.now_ns, faults=message.faults)
+    reading = None
+    if isinstance(message, OdometryMessage):
+        reading = Odometry(message.stamp_ns, message.speed_mps, message.steering_rad, message.valid)
+    frames = () if isinstance(message, TickMessage) else tuple(map(_sighted, message.frames))
+    return Input(message.now_ns, reading, frames, message.faults)
 
 
 def _sighted_message(frame: FrameDetections) -> dict[str, Any]:

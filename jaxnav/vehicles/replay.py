@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnav.detection.image_search import size_problem
 from jaxnav.errors import BadInput
 from jaxnav.files.images import decode_image
 from jaxnav.loop.flags import Fault
@@ -26,7 +25,7 @@ from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Camera, Frame, Odometry, OwnFiles, Setup, Vehicle
 from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_log import DriveLog, read_drive
-from jaxnav.recording.drive_replay import check_inputs
+from jaxnav.recording.drive_replay import check_inputs, recorded_pixels
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.vehicles.options import choice
 
@@ -78,6 +77,7 @@ class ReplayVehicle:
     """
 
     shares_process = True  # its cameras share its clock
+    timeout_s = 0.2  # the car stands whatever the command, so any time is true
 
     def __init__(self, setup: Setup):
         """Options: drive, the recording; images (false).
@@ -105,11 +105,6 @@ class ReplayVehicle:
         """See `HasOwnFiles`: the files with which the drive was recorded."""
         _, own = _recorded(options)
         return OwnFiles(own.rig, own.markers, own.vehicle, own.route)
-
-    @property
-    def timeout_s(self) -> float:
-        """See `Vehicle`. The car stands whatever the command, so any time is true."""
-        return 0.2
 
     @property
     def over(self) -> str | None:
@@ -170,15 +165,10 @@ class ReplayCamera:
         frames: (time of handling in ns of the recording, frame), in the order of time.
         jpegs: recorded stamp in ns -> the image to show in place of detections.
         """
-        self._name, self._clock = name, clock
+        self.name, self._clock = name, clock
         self._frames, self._jpegs = frames, jpegs
         self._next = 0
         self._closed = threading.Event()
-
-    @property
-    def name(self) -> str:
-        """See `Camera`."""
-        return self._name
 
     def read(self, timeout_s: float) -> Frame | None:
         """See `Camera`. A frame that could not be used has no image."""
@@ -262,10 +252,6 @@ def _jpegs(log: DriveLog, rig: CameraRig) -> dict[str, dict[int, bytes]]:
         if name not in jpegs:
             continue
         if not jpegs[name]:
-            pixels = decode_image(image.jpeg)
-            if pixels is None:
-                raise BadInput(f"{log.path}: {image.topic}", "an image can't be decoded")
-            if problem := size_problem(rig, rig.names.index(name), pixels):
-                raise BadInput(f"{log.path}: {image.topic}", problem)
+            recorded_pixels(log, image, rig, rig.names.index(name))
         jpegs[name][image.stamp_ns] = image.jpeg
     return jpegs
