@@ -189,7 +189,11 @@ class CameraDelays:
         if not moved or len(readings) < 3:
             return
         for camera in range(len(self._counts)):
-            among = [row for view in views if (row := _of_camera(view, camera)) is not None]
+            among = [
+                _View(view.stamp_ns, *(column[which] for column in view[1:]))
+                for view in views
+                if (which := view.camera == camera).any()
+            ]
             if len(among) < _LEAST_VIEWS:
                 continue
             stretch = _stretch(camera, begin_ns, pose, readings, among, self._dtype)
@@ -245,13 +249,6 @@ class CameraDelays:
         arguments = (np.int32(stretch.camera), *stretch[2:], p.astype(self._dtype))
         A, b, chi2 = jax.device_get(_normal(*self._world, *arguments))
         return A.astype(float), b.astype(float), float(chi2)
-
-
-def _of_camera(view: _View, camera: int) -> _View | None:
-    which = view.camera == camera
-    if not which.any():
-        return None
-    return _View(view.stamp_ns, *(column[which] for column in view[1:]))
 
 
 def _of_stretches(sums: np.ndarray, count: int) -> Delay:

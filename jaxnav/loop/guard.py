@@ -67,7 +67,7 @@ class Guard:
         self._steering_rad, self._written_ns = 0.0, now_ns()
         self._deadline_ns = self._written_ns
         self.unheard: str | None = None
-        self._stopped_s = 0.0  # time of the last stop that did
+        self._stopped_s = 0.0  # time of the last stop that reached it
         self._thread = threading.Thread(target=self._watch, name="jaxnav-guard", daemon=True)
         self._thread.start()
         atexit.register(self._at_exit)

@@ -13,7 +13,6 @@ import queue
 import sys
 import threading
 from contextlib import suppress
-from types import TracebackType
 
 _WAITING = 1000  # pieces of at most 64 KiB in the queue: what does not fit is left out
 _PATIENCE_S = 1.0  # time at the end to write what is still in the queue
@@ -26,12 +25,7 @@ class FreeOutput:
         self._pumps = [_Pump(1), _Pump(2)]
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()

@@ -9,7 +9,7 @@ Every problem of a plug-in is reported in one line for a person.
 import contextlib
 import importlib
 from collections.abc import Callable, Sequence
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any
 
 from jaxnav.errors import BadInput
@@ -84,7 +84,7 @@ def load_factory(flag: str, group: str, name: str) -> Callable[..., Any]:
     Raises:
         BadInput: there is none of that name, or it can't be imported or called.
     """
-    installed = _installed(group)
+    installed = {point.name: point for point in entry_points(group=group)}
     target = installed[name].value if name in installed else name
     module, colon, attribute = target.partition(":")
     if not (colon and module and attribute):
@@ -114,10 +114,6 @@ def missing_members(opened: object, protocol: type) -> list[str]:
         elif callable(value) and not callable(getattr(opened, name, None)):
             lacking.append(f"{name}()")
     return lacking
-
-
-def _installed(group: str) -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=group)}
 
 
 def _imported(flag: str, name: str, module: str) -> Any:

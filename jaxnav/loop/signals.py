@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 # The signals of a person, a shell, a closed terminal or a supervisor that would end or suspend a
@@ -142,12 +142,7 @@ class Signals:
     def __enter__(self) -> "Signals":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _note(self, number: int, frame: FrameType | None = None) -> None:

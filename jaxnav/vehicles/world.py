@@ -139,18 +139,17 @@ class SimWorld:
         with self._lock:
             noise_px = sigma_px * self.rng.standard_normal(corners_px.shape)
         return [
-            self._detections(corners_px[c] + noise_px[c], visible[c]) for c in range(len(self.rig))
+            Detections(
+                ids=np.array([self.markers.ids[m] for m in index], int),
+                corners_px=noisy_px[index],
+                sigma_px=np.full((len(index), 4), max(sigma_px, 0.05)),
+                refined=np.ones(len(index), bool),
+                families=tuple(self.markers.families[m] for m in index),
+            )
+            for noisy_px, index in zip(
+                corners_px + noise_px, map(np.flatnonzero, visible), strict=True
+            )
         ]
-
-    def _detections(self, corners_px: np.ndarray, visible: np.ndarray) -> Detections:
-        index = np.flatnonzero(visible)
-        return Detections(
-            ids=np.array([self.markers.ids[m] for m in index], int),
-            corners_px=corners_px[index],
-            sigma_px=np.full((len(index), 4), max(self.settings.corner_sigma_px, 0.05)),
-            refined=np.ones(len(index), bool),
-            families=tuple(self.markers.families[m] for m in index),
-        )
 
     def _advance(self, until_ns: int) -> None:
         while self._time_ns < until_ns:
