@@ -151,8 +151,7 @@ def own_errors_px(snapshot: Snapshot, own: jaxlie.SE3) -> Float[Array, " D"]:
         return jnp.min(jax.vmap(error)(Ts))
 
     squared = jax.vmap(one)(
-        cameras_of(rig, seen),
-        jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index]),
+        *cameras_of(rig, seen),
         own,
         markers.corners_world_m[seen.marker_index],
         seen.corners_px,
@@ -182,8 +181,7 @@ def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
         )(Ts_camera_marker)
 
     return jax.vmap(one)(
-        cameras_of(rig, seen),
-        jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index]),
+        *cameras_of(rig, seen),
         jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[seen.marker_index]),
         markers.size_m[seen.marker_index],
         seen.corners_px,

@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
 from jaxnav.models.geometry import rotation_matrix
@@ -33,8 +32,7 @@ def reprojection_rows(rig: CameraRig, seen: Sightings) -> Callable[[Float[Array,
         A function of each sighting's own corners in the vehicle frame, P = 4 D of them, m.
     """
     of_corner = jnp.repeat(jnp.arange(seen.camera_index.shape[0]), 4)
-    cameras = cameras_of(rig, seen)
-    Ts_camera_vehicle = jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index])
+    cameras, Ts_camera_vehicle = cameras_of(rig, seen)
     Rs_camera_vehicle = jax.vmap(rotation_matrix)(Ts_camera_vehicle.rotation())
 
     def last(leaf: Array) -> Array:

@@ -184,6 +184,7 @@ def log_sigmas(seen: Sightings) -> Float[Array, ""]:
     return 2 * jnp.sum(jnp.where(seen.visible[:, None], jnp.log(seen.sigma_px), 0))
 
 
-def cameras_of(rig: CameraRig, seen: Sightings) -> Camera:
-    """The camera of every sighting, batch axis (D,)."""
-    return jax.tree.map(lambda leaf: leaf[seen.camera_index], rig.cameras)
+def cameras_of(rig: CameraRig, seen: Sightings) -> tuple[Camera, jaxlie.SE3]:
+    """The camera of every sighting and its `T_camera_vehicle`, batch axis (D,)."""
+    cameras_and_poses = rig.cameras, rig.Ts_camera_vehicle
+    return jax.tree.map(lambda leaf: leaf[seen.camera_index], cameras_and_poses)

@@ -25,6 +25,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.numerics.levenberg_marquardt import LanewiseSolver
 from jaxnav.pose.ippe import PosePair
 
 _SIGNS = [(int(a), int(b)) for a, b, _ in CORNER_SIGNS]
@@ -306,7 +307,7 @@ def _moved(pose: Poses, move: list[Lane]) -> Poses:
     )
 
 
-class LaneLM(optx.AbstractLeastSquaresSolver):
+class LaneLM(LanewiseSolver):
     """Levenberg-Marquardt on every lane by itself, for `optimistix.least_squares`.
 
     `y` is the `Poses`, `args` the `Marks`; `options` has the `trace` to go on from and how many
@@ -382,20 +383,6 @@ class LaneLM(optx.AbstractLeastSquaresSolver):
         """Whether all lanes are done, or no step is left."""
         over = jnp.all(state.trace.done) | (state.left <= 0)
         return over, cast(optx.RESULTS, optx.RESULTS.successful)
-
-    def postprocess(
-        self,
-        fn: Any,
-        y: Poses,
-        aux: PyTree,
-        args: Marks,
-        options: dict[str, Any],
-        state: _State,
-        tags: frozenset[object],
-        result: optx.RESULTS,
-    ) -> tuple[Poses, PyTree, dict[str, Any]]:
-        """The accepted poses as they are."""
-        return y, aux, {}
 
 
 def _improve(

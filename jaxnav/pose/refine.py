@@ -323,9 +323,7 @@ def solve_markers(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) 
     return _solve_pairs(corners_n, size_m)
 
 
-@jax.custom_jvp
-def _solve_pairs(corners_n: Array, size_m: Array) -> PosePair:
-    return solve_pairs(corners_n, size_m)
+_solve_pairs = jax.custom_jvp(solve_pairs)
 
 
 @_solve_pairs.defjvp

@@ -31,8 +31,7 @@ def reprojection_residuals(
     Returns:
         A function of the corners of all markers of the map, in the vehicle frame, m.
     """
-    cameras = cameras_of(rig, seen)
-    Ts_camera_vehicle = jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index])
+    cameras, Ts_camera_vehicle = cameras_of(rig, seen)
     Rs_camera_vehicle = jax.vmap(rotation_matrix)(Ts_camera_vehicle.rotation())
 
     def one(camera: Camera, R: Array, t: Array, corners: Array, corners_px: Array) -> Array:

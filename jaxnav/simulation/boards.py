@@ -59,7 +59,8 @@ class BoardRenderer:
         atlas = texture_atlas(plaster(np.random.default_rng(0)))
         wall = Surface(T_world_wall, whole_plane, 128.0, 14.0, 4e-3, atlas)
         scene = Scene(MarkerMap(nowhere, jnp.zeros(0), (), ()), (wall,), ())
-        sheet = board_print(ink, module_m, np.eye(4))
+        grey = np.where(ink, INK_GREY, PAPER_GREY).astype(np.float32)
+        sheet = Print.centred(np.eye(4), module_m, grey)
         self._renderer = Renderer(scene, rig, shutter, sensor, prints=(sheet,))
 
     def render(self, T_camera_board: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -69,21 +70,6 @@ class BoardRenderer:
     def render_moving(self, T_board_camera_at: PoseAt, rng: np.random.Generator) -> np.ndarray:
         """The image of a moving camera: see `Renderer.render`, with `stamp_s` = 0."""
         return self._renderer.render(T_board_camera_at, 0.0, rng)[0]
-
-
-def board_print(ink: np.ndarray, module_m: float, T_world_board: np.ndarray) -> Print:
-    """The `Print`, as `Renderer` takes it, of a sheet of modules centred on the board's origin."""
-    rows, columns = ink.shape
-    half_width_m, half_height_m = columns * module_m / 2, rows * module_m / 2
-    T_board_sheet = np.diag([1.0, -1, -1, 1])
-    T_board_sheet[:2, 3] = -half_width_m, half_height_m
-    return Print(
-        T_world_board,
-        T_world_board @ T_board_sheet,
-        module_m,
-        float(np.hypot(half_width_m, half_height_m)),
-        np.where(ink, INK_GREY, PAPER_GREY).astype(np.float32),
-    )
 
 
 def facing_pose(

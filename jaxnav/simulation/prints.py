@@ -35,28 +35,26 @@ class Print:
     radius_m: float  # of the paper, from the marker's centre
     sheet: np.ndarray  # (rows, columns) grey
 
+    @staticmethod
+    def centred(T_world_marker: np.ndarray, module_m: float, sheet: np.ndarray) -> "Print":
+        """The print whose middle is the origin of a marker's or a board's frame."""
+        half_height_m, half_width_m = module_m * np.array(sheet.shape) / 2
+        T_marker_sheet = np.diag([1.0, -1, -1, 1])
+        T_marker_sheet[:2, 3] = -half_width_m, half_height_m
+        radius_m = float(np.hypot(half_width_m, half_height_m))
+        return Print(T_world_marker, T_world_marker @ T_marker_sheet, module_m, radius_m, sheet)
+
 
 def prints_of(scene: Scene) -> list[Print]:
     """The prints of a scene's markers, in the map's order."""
     Ts_world_marker = np.asarray(scene.markers.Ts_world_marker.as_matrix(), float)
     sizes_m = np.asarray(scene.markers.size_m, float)
-    markers = []
-    for T_world_marker, size_m, sheet in zip(Ts_world_marker, sizes_m, scene.sheets, strict=True):
-        modules = len(sheet)
-        module_m = size_m / (modules - 2 * QUIET_ZONE_MODULES)
-        half_m = module_m * modules / 2
-        T_marker_sheet = np.diag([1.0, -1, -1, 1])
-        T_marker_sheet[:2, 3] = -half_m, half_m
-        markers.append(
-            Print(
-                T_world_marker,
-                T_world_marker @ T_marker_sheet,
-                module_m,
-                float(np.hypot(half_m, half_m)),
-                sheet,
-            )
+    return [
+        Print.centred(T_world_marker, size_m / (len(sheet) - 2 * QUIET_ZONE_MODULES), sheet)
+        for T_world_marker, size_m, sheet in zip(
+            Ts_world_marker, sizes_m, scene.sheets, strict=True
         )
-    return markers
+    ]
 
 
 def render_print(

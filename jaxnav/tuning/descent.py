@@ -20,6 +20,8 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxnav.numerics.trees import where
+
 Loss = Callable[[Float[Array, " n"], Any, Float[Array, ""]], Float[Array, ""]]
 
 
@@ -49,13 +51,30 @@ class Smooth(eqx.Module):
     def _solver(self) -> optx.BFGS:
         return optx.BFGS(self.rtol, self.atol)
 
+    def _fn(self, x: Array, args: tuple[Any, Array]) -> tuple[Array, None]:
+        return self.loss(x, *args), None
+
+    @eqx.filter_jit
     def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
         """The state at x, before any evaluation."""
-        return _smooth_init(self, x, batch, softness)
+        scalar = jax.ShapeDtypeStruct((), x.dtype)
+        state = self._solver.init(self._fn, x, (batch, softness), {}, scalar, None, frozenset())
+        return _unknown(x, eqx.filter(state, eqx.is_array))
 
+    @eqx.filter_jit
     def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
         """Evaluate once more; the point is kept if it lowers the loss enough."""
-        return _smooth_step(self, state, batch, softness)
+        solver, args, tags = self._solver, (batch, softness), frozenset[object]()
+        scalar = jax.ShapeDtypeStruct((), state.x.dtype)
+        form = solver.init(self._fn, state.x, args, {}, scalar, None, tags)
+        before = eqx.combine(state.inner, eqx.filter(form, eqx.is_array, inverse=True))
+        x, after, _ = solver.step(self._fn, state.x, args, {}, before, tags)
+        over, _ = solver.terminate(self._fn, x, args, {}, after, tags)
+        f, gradient = after.f_info.f, after.f_info.grad
+        finite = jnp.all(jnp.isfinite(jnp.append(gradient, f)))
+        moved = Descent(x, x, f, gradient, finite, over, eqx.filter(after, eqx.is_array))
+        kept = Descent(state.x, x, state.loss, gradient, finite, finite, state.inner)
+        return where(finite, moved, kept)
 
 
 class Noisy(eqx.Module):
@@ -90,35 +109,6 @@ def _unknown(x: Array, inner: PyTree) -> Descent:
     return Descent(x, x, jnp.full((), jnp.inf, x.dtype), jnp.zeros_like(x), yes, no, inner)
 
 
-def _fn(loss: Loss) -> Callable[..., tuple[Array, None]]:
-    return lambda x, args: (loss(x, *args), None)
-
-
-@eqx.filter_jit
-def _smooth_init(smooth: Smooth, x: Array, batch: Any, softness: Array) -> Descent:
-    scalar = jax.ShapeDtypeStruct((), x.dtype)
-    state = smooth._solver.init(
-        _fn(smooth.loss), x, (batch, softness), {}, scalar, None, frozenset()
-    )
-    return _unknown(x, eqx.filter(state, eqx.is_array))
-
-
-@eqx.filter_jit
-def _smooth_step(smooth: Smooth, state: Descent, batch: Any, softness: Array) -> Descent:
-    solver, args, tags = smooth._solver, (batch, softness), frozenset[object]()
-    fn, scalar = _fn(smooth.loss), jax.ShapeDtypeStruct((), state.x.dtype)
-    form = solver.init(fn, state.x, args, {}, scalar, None, tags)
-    before = eqx.combine(state.inner, eqx.filter(form, eqx.is_array, inverse=True))
-    x, after, _ = solver.step(fn, state.x, args, {}, before, tags)
-    over, _ = solver.terminate(fn, x, args, {}, after, tags)
-    f, gradient = after.f_info.f, after.f_info.grad
-    finite = jnp.all(jnp.isfinite(jnp.append(gradient, f)))
-    moved = Descent(x, x, f, gradient, finite, over, eqx.filter(after, eqx.is_array))
-    kept = Descent(state.x, x, state.loss, gradient, finite, finite, state.inner)
-    chosen: Descent = jax.tree.map(lambda a, b: jnp.where(finite, a, b), moved, kept)
-    return chosen
-
-
 @eqx.filter_jit
 def _moved(
     solver: optax.GradientTransformation, state: Descent, loss: Array, gradient: Array
@@ -129,5 +119,4 @@ def _moved(
     x = optax.apply_updates(state.x, update)
     moved = Descent(x, state.x, loss, gradient, finite, no, inner)
     kept = Descent(state.x, state.x, state.loss, gradient, finite, no, state.inner)
-    chosen: Descent = jax.tree.map(lambda a, b: jnp.where(finite, a, b), moved, kept)
-    return chosen
+    return where(finite, moved, kept)

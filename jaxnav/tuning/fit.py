@@ -12,6 +12,7 @@ held-out drives; the fit ends when `patience` steps have found no better one.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -150,16 +151,18 @@ def _known(loss: float) -> float:
     return np.inf if np.isnan(loss) else float(loss)
 
 
+_SCALARS: dict[str, Callable[[Any], Any]] = {
+    "best_loss": float, "best_of_stage": float, "step": int, "stage": int, "stale": int,
+    "refused": int, "over": bool, "ended": str,
+}  # fmt: skip
+
+
 def arrays_of(fit: TuningFit) -> dict[str, np.ndarray]:
     """A fit as named arrays, to be written to a file."""
     leaves = jax.tree.leaves(fit.descent)
     inner = {f"descent_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-    plain = {
-        name: np.asarray(getattr(fit, name))
-        for name in ("stage_x", "best_x", "best_loss", "best_of_stage", "step", "stage", "stale")
-    }
-    rest = {name: np.asarray(getattr(fit, name)) for name in ("refused", "over", "ended")}
-    return inner | plain | rest | {"history": np.array(fit.history)}
+    plain = {name: np.asarray(getattr(fit, name)) for name in ("stage_x", "best_x", *_SCALARS)}
+    return inner | plain | {"history": np.array(fit.history)}
 
 
 def fit_of(arrays: dict[str, np.ndarray], like: TuningFit) -> TuningFit:
@@ -184,13 +187,6 @@ def fit_of(arrays: dict[str, np.ndarray], like: TuningFit) -> TuningFit:
         descent=jax.tree.unflatten(form, [jnp.asarray(array) for array in values]),
         stage_x=jnp.asarray(arrays["stage_x"], x.dtype),
         best_x=jnp.asarray(arrays["best_x"], x.dtype),
-        best_loss=float(arrays["best_loss"]),
-        best_of_stage=float(arrays["best_of_stage"]),
-        step=int(arrays["step"]),
-        stage=int(arrays["stage"]),
-        stale=int(arrays["stale"]),
-        refused=int(arrays["refused"]),
-        over=bool(arrays["over"]),
-        ended=str(arrays["ended"]),
         history=tuple(arrays["history"]),
+        **{name: kind(arrays[name]) for name, kind in _SCALARS.items()},
     )

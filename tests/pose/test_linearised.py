@@ -46,7 +46,7 @@ def sightings_of(rig: CameraRig, rng: np.random.Generator) -> Sightings:
 @jax.jit
 def projected(rig: CameraRig, seen: Sightings, points: jax.Array) -> jax.Array:
     """Residuals (2, P, N) by `Camera.project`, point by point."""
-    cameras = cameras_of(rig, seen)
+    cameras, _ = cameras_of(rig, seen)
 
     def one(camera, T, corners_px, sigma_px, visible, corners):
         pixels = jax.vmap(camera.project)(jax.vmap(lambda p: T @ p)(corners))
