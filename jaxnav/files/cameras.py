@@ -5,27 +5,21 @@ FileStorage YAML (as its calibration sample and most scripts write it) and Photo
 file's keys tell its format.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr
 from jaxnav.files.figures import CameraFigures
-from jaxnav.files.opencv_storage import is_opencv, opencv_figures, opencv_left_out
-from jaxnav.files.photonvision import (
-    is_photonvision,
-    photonvision_figures,
-    photonvision_left_out,
+from jaxnav.files.matrix_cameras import (
+    CameraInfo,
+    MatrixCamera,
+    OpenCVCamera,
+    PhotonVisionCamera,
 )
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import RigFile, rig_left_out
-from jaxnav.files.ros_camera_info import (
-    camera_info_figures,
-    camera_info_left_out,
-    is_camera_info,
-)
 from jaxnav.files.validation import validate
 from jaxnav.models.camera import Camera
 
@@ -47,20 +41,11 @@ class CameraFile:
     left_out: tuple[str, ...]
 
 
-class _OneCamera(NamedTuple):
-    """The functions that read the format of a tool that writes one camera a file."""
-
-    format: CameraFormat
-    recognised: Callable[[dict[str, Any]], bool]
-    figures: Callable[[Path, dict[str, Any], str], CameraFigures]
-    left_out: Callable[[dict[str, Any]], list[str]]
-
-
-_ONE_CAMERA = (
-    _OneCamera("photonvision", is_photonvision, photonvision_figures, photonvision_left_out),
-    _OneCamera("ros", is_camera_info, camera_info_figures, camera_info_left_out),
-    _OneCamera("opencv", is_opencv, opencv_figures, opencv_left_out),
-)
+_ONE_CAMERA: dict[CameraFormat, type[MatrixCamera]] = {
+    "photonvision": PhotonVisionCamera,
+    "ros": CameraInfo,
+    "opencv": OpenCVCamera,
+}
 
 
 def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, ImageSizePx]:
@@ -106,10 +91,11 @@ def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
         chain = kalibr.camchain(path, data)
         left_out = kalibr.camchain_left_out(data, chain)
         return CameraFile("kalibr", tuple(kalibr.camchain_figures(chain)), tuple(left_out))
-    for tool in _ONE_CAMERA:
-        if tool.recognised(data):
-            camera = tool.figures(path, data, _name(data.get("camera_name")) or path.stem)
-            return CameraFile(tool.format, (camera,), tuple(tool.left_out(data)))
+    for tool, model in _ONE_CAMERA.items():
+        if data.keys() & set(model.told_by):
+            stored = validate(model, data, path)
+            camera = stored.figures(path, _name(data.get("camera_name")) or path.stem)
+            return CameraFile(tool, (camera,), tuple(stored.left_out(data)))
     raise BadInput(
         path,
         "is no camera file that jaxnav knows: expected a rig (`cameras:`), a Kalibr camchain "

@@ -12,11 +12,9 @@ from jaxnav.files.cameras import camera_file, choose_camera, named_by_topic
 from jaxnav.files.figures import CameraFigures, MarkerFigures
 from jaxnav.files.kalibr import camchain_text
 from jaxnav.files.markers import MarkerFile, markers_left_out, markers_text
-from jaxnav.files.opencv_storage import opencv_text
-from jaxnav.files.photonvision import photonvision_text
+from jaxnav.files.matrix_cameras import camera_info_text, opencv_text, photonvision_text
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import place, rig_text
-from jaxnav.files.ros_camera_info import camera_info_text
 from jaxnav.files.validation import validate
 from jaxnav.files.writing import atomic_write_all, refuse_overwriting
 
