@@ -71,7 +71,7 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
     return camera.camera(), camera.image_size_px
 
 
-def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
+def camera_file(path: Path, data: dict[str, Any], by_topic: bool = False) -> CameraFile:
     """All cameras of a file, whichever tool wrote it.
 
     Cameras of a camchain are called `cam0`, `cam1` and so on; a camera without a name in its file
@@ -79,6 +79,7 @@ def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
 
     Args:
         data: the content of the file.
+        by_topic: whether a camchain's cameras are named after their topics instead, if they can be.
 
     Raises:
         BadInput: one line naming file and key.
@@ -90,7 +91,10 @@ def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
     if kalibr.is_camchain(data):
         chain = kalibr.camchain(path, data)
         left_out = kalibr.camchain_left_out(data, chain)
-        return CameraFile("kalibr", tuple(kalibr.camchain_figures(chain)), tuple(left_out))
+        names = kalibr.names_by_topic(chain) if by_topic else list(chain)
+        figures = zip(kalibr.camchain_figures(chain), names, strict=True)
+        cameras = tuple(replace(camera, name=name) for camera, name in figures)
+        return CameraFile("kalibr", cameras, tuple(left_out))
     for tool, model in _ONE_CAMERA.items():
         if data.keys() & set(model.told_by):
             stored = validate(model, data, path)
@@ -108,15 +112,6 @@ def _name(named: Any) -> str:
     """A tool's name of a camera, which may be a serial number; empty where it is not usable."""
     name = str(named) if isinstance(named, str | int) else ""
     return name if len(name) <= 100 and name.isprintable() else ""
-
-
-def named_by_topic(path: Path, data: dict[str, Any], file: CameraFile) -> CameraFile:
-    """The file with cameras named after their topics, if it is a camchain; else unchanged."""
-    if file.format != "kalibr":
-        return file
-    names = kalibr.names_by_topic(kalibr.camchain(path, data))
-    cameras = [replace(camera, name=name) for camera, name in zip(file.cameras, names, strict=True)]
-    return replace(file, cameras=tuple(cameras))
 
 
 def choose_camera(
