@@ -8,7 +8,6 @@ Boards are rendered before a camera of the QCar, an equidistant lens of 147 degr
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -82,7 +81,7 @@ def straight(board: Board, image: np.ndarray, truth_px: np.ndarray) -> tuple:
     """Ours with edges that are straight in the image."""
 
     def unbent(image: np.ndarray, places, *limits: float):
-        return fit_saddles(image, replace(places, bend_px=0 * places.bend_px), *limits)
+        return fit_saddles(image, places._replace(bend_px=0 * places.bend_px), *limits)
 
     board_detection.fit_saddles = unbent
     try:

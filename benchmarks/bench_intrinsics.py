@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import NO_CUT, LensUnknowns
+from jaxnav.calibration.lenses.bundle import NO_CUT
 from jaxnav.calibration.lenses.fit import LensFit, fit_lens
 from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.calibration.lenses.start import board_poses, opencv_calibration
@@ -105,11 +105,10 @@ def consistency(case: Case) -> None:
 
 def rms_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:
     """Of all corners with these figures, every view's pose at its best; as OpenCV counts it."""
-    seen = lens_bundle.padded_corners(views)
-    poses = lens_bundle.padded_poses(board_poses(views, lens, parameters), len(seen.corners_px))
+    seen, start = lens_bundle.padded(views, parameters, board_poses(views, lens, parameters))
     held = lens_bundle.solve(
         lens,
-        LensUnknowns(jnp.asarray(parameters), jnp.asarray(poses)),
+        start,
         seen,
         jnp.asarray(seen.present, float),
         jnp.zeros(lens_bundle.COUNT, bool),
@@ -182,16 +181,14 @@ def scaling() -> None:
     views, poses = simulated_views(
         case.camera, IMAGE_SIZE_PX, points_m, 500, np.random.default_rng(0)
     )
-    seen = lens_bundle.padded_corners(views)
-    start = np.append([300.0, 300, 410, 205], np.zeros(5))
-    padded = lens_bundle.padded_poses(poses, len(seen.corners_px))
+    seen, start = lens_bundle.padded(views, np.append([300.0, 300, 410, 205], np.zeros(5)), poses)
     took = []
     for _ in range(5):
         begun = time.perf_counter()
         found = jax.block_until_ready(
             lens_bundle.solve(
                 "equidistant",
-                LensUnknowns(jnp.asarray(start), jnp.asarray(padded)),
+                start,
                 seen,
                 jnp.asarray(seen.present, float),
                 jnp.asarray(lens_bundle.free_mask("equidistant")),

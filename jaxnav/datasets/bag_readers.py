@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from jaxnav.files import limits
 from jaxnav.files.unpacking import Budget, unpack_chunk, zstd_pieces
 
-_RULE = "=" * 80 + "\n"  # between the definitions of a message's parts
+RULE = "=" * 80 + "\n"  # between the definitions of a message's parts
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _SIZES = {"8": 1, "bool": 1, "byte": 1, "char": 1, "16": 2, "32": 4, "64": 8, "128": 16}
 
@@ -142,7 +142,7 @@ def typestore(connections: Collection[Connection], known: dict[str, str]) -> Any
         if definition.format is MessageDefinitionFormat.MSG:
             _register(types, get_types_from_msg(definition.data, connection.msgtype))
         elif definition.format is MessageDefinitionFormat.IDL:
-            for part in definition.data.split(_RULE):
+            for part in definition.data.split(RULE):
                 # Each part is headed by `IDL: package/msg/Type`, unless there is only one.
                 text = part.partition("\n")[2] if part.startswith("IDL: ") else part
                 if text.strip():

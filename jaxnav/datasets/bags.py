@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxnav.datasets import ros_messages
 from jaxnav.datasets.bag_readers import Ros1Reader, messages
 from jaxnav.datasets.recording import Rows
 from jaxnav.errors import BadInput
@@ -20,7 +21,6 @@ from jaxnav.files import limits
 from jaxnav.files.ranges import is_within
 from jaxnav.files.unpacking import Budget, copy_bz2
 
-DETECTIONS_TYPE = "apriltag_msgs/msg/ApriltagArrayStamped"
 _TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
 
 
@@ -55,13 +55,24 @@ def read_bag(path: Path) -> Bag:
     Raises:
         BadInput: the file is no bag, or ends too early.
     """
+    bag = Bag()
     with decompress_bag(path) as plain:
         try:
-            return _read(plain)
+            with Ros1Reader(plain) as reader:
+                bag.topics = {c.topic: c.msgtype for c in reader.connections}
+                kinds = (ros_messages.TAGSLAM, *_TF_TYPES)
+                wanted = [c for c in reader.connections if c.msgtype in kinds]
+                for connection, _, message in messages(reader, wanted, {}):
+                    if connection.msgtype == ros_messages.TAGSLAM:
+                        detections = bag.detections.setdefault(connection.topic, TopicDetections())
+                        _add_detections(detections, message)
+                    else:
+                        _add_transforms(bag.transforms, message)
         except Exception as error:
             # The reader may meet any bytes, and raises whatever they lead to.
             problem = f"is not a readable ROS 1 bag ({type(error).__name__}: {error})"
             raise BadInput(path, problem) from None
+    return bag
 
 
 @contextmanager
@@ -85,24 +96,8 @@ def decompress_bag(path: Path) -> Iterator[Path]:
         yield plain
 
 
-def _read(path: Path) -> Bag:
-    bag = Bag()
-    with Ros1Reader(path) as reader:
-        bag.topics = {connection.topic: connection.msgtype for connection in reader.connections}
-        kinds = (DETECTIONS_TYPE, *_TF_TYPES)
-        wanted = [c for c in reader.connections if c.msgtype in kinds]
-        for connection, _, message in messages(reader, wanted, {}):
-            if connection.msgtype == DETECTIONS_TYPE:
-                _add_detections(
-                    bag.detections.setdefault(connection.topic, TopicDetections()), message
-                )
-            else:
-                _add_transforms(bag.transforms, message)
-    return bag
-
-
 def _add_detections(detections: TopicDetections, message: Any) -> None:
-    stamp_ns = _nanoseconds(message.header)
+    stamp_ns = ros_messages.stamp_ns(message)
     if len(message.apriltags) > limits.IN_VIEW:
         raise ValueError(f"a frame of more than {limits.IN_VIEW} detections")
     if len(detections.ids) > limits.DETECTIONS:
@@ -127,11 +122,7 @@ def _add_transforms(
             raise ValueError(f"the transform from {edge[1]} to {edge[0]} is not rigid")
         if not is_within("position_m", pose[4:]).all():
             raise ValueError(f"the transform from {edge[1]} to {edge[0]} leads out of the world")
-        transforms.setdefault(edge, {})[_nanoseconds(stamped.header)] = pose
-
-
-def _nanoseconds(header: Any) -> int:
-    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+        transforms.setdefault(edge, {})[ros_messages.stamp_ns(stamped)] = pose
 
 
 def list_topics(recorded: Sequence[Bag]) -> str:
@@ -147,11 +138,8 @@ def rows_of_topics(topics: Sequence[TopicDetections]) -> Rows:
         stamps_ns=np.array([s for topic in topics for s in topic.stamps_ns], np.int64),
         cameras=np.repeat(np.arange(len(topics)), [len(topic.ids) for topic in topics]),
         ids=np.array([i for topic in topics for i in topic.ids], np.int64),
-        corners_px=_corners_array([c for topic in topics for c in topic.corners_px]),
+        corners_px=np.asarray([c for topic in topics for c in topic.corners_px], float).reshape(
+            -1, 4, 2
+        ),
         frame_stamps_ns=np.unique(np.array(frame_stamps, np.int64)),
     )
-
-
-def _corners_array(corners_px: list[Any]) -> np.ndarray:
-    """Corners as an array (N, 4, 2), also for none."""
-    return np.asarray(corners_px, float).reshape(-1, 4, 2)

@@ -1,5 +1,6 @@
 """Reading of decoded TagSLAM recordings: one .npz with a row for each detection."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +9,11 @@ import numpy as np
 from jaxnav.datasets.recording import RecordingSource, Rows
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import to_se3
+from jaxnav.files.figures import CameraFigures, rig_from_figures
 from jaxnav.files.markers import marker_map
 from jaxnav.files.npz import read_npz
 from jaxnav.files.ranges import is_within, pinhole_problem, problem_of
-from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.camera import LENS_COEFFICIENTS
 from jaxnav.models.conventions import APRILTAG_CORNERS
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -66,7 +67,12 @@ def _reference(path: Path, stored: dict[str, np.ndarray]) -> dict[int, np.ndarra
 
 
 def _checked(path: Path) -> dict[str, np.ndarray]:
-    stored = _load(path)
+    try:
+        stored = dict(read_npz(path, _KEYS.keys() | _REFERENCE_KEYS.keys() | {"obj_order"}))
+    except Exception as error:
+        # NumPy, zipfile and zlib may meet any bytes, and raise whatever they lead to.
+        problem = f"is not a readable .npz file ({type(error).__name__}: {error})"
+        raise BadInput(path, problem) from None
     has_reference = bool(_REFERENCE_KEYS.keys() & stored.keys())
     _check(path, stored, _KEYS | (_REFERENCE_KEYS if has_reference else {}))
     if "obj_order" in stored and not np.array_equal(stored["obj_order"], APRILTAG_CORNERS):
@@ -75,22 +81,24 @@ def _checked(path: Path) -> dict[str, np.ndarray]:
     return stored
 
 
-# key -> the quantity of its numbers in `RANGES`; translations of poses are in `_PLACES`.
+# key -> the quantity in `RANGES` of its numbers, or of the translations of its poses.
 _QUANTITIES = {
     "stamp_ns": "stamp_ns",
     "rig_stamp": "stamp_ns",
     "tag_id": "id",
     "map_ids": "id",
     "dist": "distortion",
+    "T_rig_cam": "position_m",
+    "T_map_tag": "position_m",
+    "T_map_rig": "position_m",
 }
-_PLACES = {"T_rig_cam": "position_m", "T_map_tag": "position_m", "T_map_rig": "position_m"}
 
 
 def _check_ranges(path: Path, stored: dict[str, np.ndarray]) -> None:
-    places = {key: stored[key][:, :3, 3] for key in _PLACES.keys() & stored.keys()}
-    plain = {key: stored[key] for key in _QUANTITIES.keys() & stored.keys()}
-    for key, values in (plain | places).items():
-        name = (_QUANTITIES | _PLACES)[key]
+    for key, name in _QUANTITIES.items():
+        if key not in stored:
+            continue
+        values = stored[key][:, :3, 3] if key.startswith("T_") else stored[key]
         inside = is_within(name, values)
         if not inside.all():
             place = tuple(int(i) for i in np.argwhere(~inside)[0])
@@ -118,15 +126,6 @@ def _rows(
         frame_stamps_ns=np.unique(stamps_ns),
     )
     return rows, rig or _rig(path, stored)
-
-
-def _load(path: Path) -> dict[str, np.ndarray]:
-    try:
-        return dict(read_npz(path, _KEYS.keys() | _REFERENCE_KEYS.keys() | {"obj_order"}))
-    except Exception as error:
-        # NumPy, zipfile and zlib may meet any bytes, and raise whatever they lead to.
-        problem = f"is not a readable .npz file ({type(error).__name__}: {error})"
-        raise BadInput(path, problem) from None
 
 
 def _check(path: Path, stored: dict[str, np.ndarray], keys: dict[str, Any]) -> None:
@@ -168,9 +167,9 @@ def _pose(path: Path, key: str, T: np.ndarray) -> np.ndarray:
 
 
 def _rig(path: Path, stored: dict[str, np.ndarray]) -> CameraRig:
-    cameras, sizes_px = [], []
+    cameras = []
     for index, (K, distortion) in enumerate(zip(stored["K"], stored["dist"], strict=True)):
-        lens = str(stored["dist_model"][index])
+        lens: Any = str(stored["dist_model"][index])
         if lens not in LENS_COEFFICIENTS:
             problem = f"must be one of {', '.join(LENS_COEFFICIENTS)}, got {lens!r}"
             raise BadInput(f"{path}: dist_model[{index}]", problem)
@@ -179,9 +178,6 @@ def _rig(path: Path, stored: dict[str, np.ndarray]) -> CameraRig:
         count = LENS_COEFFICIENTS[lens]
         if np.any(distortion[count:]):
             raise BadInput(f"{path}: dist[{index}]", f"only the first {count} may differ from zero")
-        cameras.append(
-            Camera.create(K[:2].tolist(), K[2:].tolist(), lens, distortion[:count].tolist())
-        )
         corners = stored["corners_px"][stored["cam"] == index].reshape(-1, 2)
         inside = is_within("image_px", corners)
         furthest = np.max(corners, axis=0, initial=0, where=inside)
@@ -192,13 +188,12 @@ def _rig(path: Path, stored: dict[str, np.ndarray]) -> CameraRig:
         wrong = pinhole_problem(K.tolist(), size_px.tolist())
         if wrong is not None:
             raise BadInput(f"{path}: K[{index}]", wrong)
-        sizes_px.append((int(size_px[0]), int(size_px[1])))
-    Ts_camera_vehicle = [
-        to_se3(poses.inverse(_pose(path, f"T_rig_cam[{index}]", T)))
-        for index, T in enumerate(stored["T_rig_cam"])
-    ]
-    names = [str(name) for name in stored["cam_names"]]
-    return CameraRig.create(cameras, Ts_camera_vehicle, names, sizes_px)
+        name = str(stored["cam_names"][index])
+        cameras.append(CameraFigures.create(name, lens, K, distortion[:count], size_px))
+    Ts = [_pose(path, f"T_rig_cam[{index}]", T) for index, T in enumerate(stored["T_rig_cam"])]
+    return rig_from_figures(
+        [replace(c, T_camera_vehicle=poses.inverse(T)) for c, T in zip(cameras, Ts, strict=True)]
+    )
 
 
 def _markers(path: Path, stored: dict[str, np.ndarray]) -> MarkerMap:

@@ -15,6 +15,7 @@ Conventions of the existing recordings, as found in their data:
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -28,11 +29,9 @@ from jaxnav.models.rig import CameraRig
 TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER]
 
 
-@dataclass(frozen=True)
-class Reference:
+class Reference(NamedTuple):
     """Reference poses of the vehicle by other software, one row for each frame of a recording."""
 
-    stamps_ns: Int[np.ndarray, " F"]
     T_world_vehicle: Float[np.ndarray, "F 7"]  # wxyz xyz, m; the identity where not valid
     valid: Bool[np.ndarray, " F"]
 
@@ -93,19 +92,12 @@ class Recording:
     def first(self, frames: int) -> "Recording":
         """The recording cut to its first frames."""
         kept = np.searchsorted(self.seen_at[0], frames)
-        reference = self.reference
-        if reference is not None:
-            reference = Reference(
-                reference.stamps_ns[:frames],
-                reference.T_world_vehicle[:frames],
-                reference.valid[:frames],
-            )
         return replace(
             self,
             stamps_ns=self.stamps_ns[:frames],
             seen_at=self.seen_at[:, :kept],
             seen_px=self.seen_px[:kept],
-            reference=reference,
+            reference=self.reference and Reference(*(rows[:frames] for rows in self.reference)),
         )
 
 
@@ -186,4 +178,4 @@ def _align(stamps_ns: np.ndarray, poses: dict[int, np.ndarray]) -> Reference:
     valid = np.array([int(stamp) in poses for stamp in stamps_ns], bool)
     for row in np.flatnonzero(valid):
         T_world_vehicle[row] = poses[int(stamps_ns[row])]
-    return Reference(stamps_ns, T_world_vehicle, valid)
+    return Reference(T_world_vehicle, valid)

@@ -6,6 +6,7 @@ from typing import NoReturn
 from jaxnav.datasets import bags
 from jaxnav.datasets.decoded import read_decoded
 from jaxnav.datasets.recording import Recording, RecordingSource, Reference, assemble
+from jaxnav.datasets.ros_messages import TAGSLAM
 from jaxnav.datasets.tagslam import read_tagslam
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
@@ -76,7 +77,7 @@ def _topic_of(path: Path, bag: bags.Bag, camera: str) -> str:
     candidates = candidates or [topic for topic in bag.detections if camera in topic.split("/")]
     if len(candidates) == 1:
         return candidates[0]
-    problem = f"no topic of {bags.DETECTIONS_TYPE} belongs to the camera {camera!r}"
+    problem = f"no topic of {TAGSLAM} belongs to the camera {camera!r}"
     if candidates:
         problem = f"several topics belong to the camera {camera!r}"
     raise BadInput(path, f"{problem}; {bags.list_topics([bag])}")

@@ -136,18 +136,9 @@ def estimate_corner_sigma_px(recording: Recording) -> float:
         return 1.0
     picks = np.linspace(0, sightings - 1, min(sightings, SIGMA_SAMPLES)).astype(int)
     _, cameras, marker_indices = recording.seen_at[:, picks]
-    padding = SIGMA_SAMPLES - len(picks)
-
-    def padded(rows: np.ndarray) -> Array:
-        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)]))
-
-    e1_px2 = _best_e1_px2(
-        recording.rig,
-        recording.markers,
-        padded(recording.seen_px[picks]),
-        padded(cameras),
-        padded(marker_indices),
-    )
+    rows = (recording.seen_px[picks], cameras, marker_indices)
+    padded = (_padded(column, SIGMA_SAMPLES) for column in rows)
+    e1_px2 = _best_e1_px2(recording.rig, recording.markers, *padded)
     sigma_px = np.sqrt(np.median(np.asarray(e1_px2)[: len(picks)]) / (2 * np.log(2)))
     return float(np.hypot(sigma_px, MODEL_SIGMA_PX))
 
@@ -211,28 +202,28 @@ def _single(markers: MarkerMap, index: Array) -> MarkerMap:
 def _frames(recording: Recording, begin: int) -> _Frames:
     """A chunk of frames, padded beyond the last one with frames that show nothing."""
     frames = np.arange(begin, min(begin + CHUNK_FRAMES, len(recording)))
-    padding = CHUNK_FRAMES - len(frames)
     dt_s = (
         np.diff(recording.stamps_ns[frames], prepend=recording.stamps_ns[max(begin - 1, 0)]) / 1e9
     )
     reference = recording.reference
-    identity = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(frames), 1))
-    truth = identity
+    truth = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(frames), 1))
     if reference is not None:
         there = opposite(recording.markers.origin_m)
         truth = poses_in_world(reference.T_world_vehicle[frames], there)
     corners_px, visible = recording.lanes(frames)
 
-    def pad(rows: np.ndarray) -> Array:
-        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)]))
-
-    hidden = np.zeros((padding, *visible.shape[1:]), bool)
+    hidden = np.zeros((CHUNK_FRAMES - len(frames), *visible.shape[1:]), bool)
     return _Frames(
-        corners_px=pad(corners_px),
+        corners_px=_padded(corners_px, CHUNK_FRAMES),
         visible=jnp.asarray(np.concatenate([visible, hidden])),
-        dt_s=pad(np.clip(dt_s, 0, MAX_DT_S)),
-        T_world_vehicle_true=pad(truth),
+        dt_s=_padded(np.clip(dt_s, 0, MAX_DT_S), CHUNK_FRAMES),
+        T_world_vehicle_true=_padded(truth, CHUNK_FRAMES),
     )
+
+
+def _padded(rows: np.ndarray, count: int) -> Array:
+    """Pad rows to a number of them by repeating the last one."""
+    return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)]))
 
 
 def frames_in_view(seen: Bool[np.ndarray, "F tracks"]) -> Int[np.ndarray, "F tracks"]:

@@ -13,19 +13,18 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.datasets import bags
-from jaxnav.datasets.bag_readers import Ros1Reader, Ros2Reader, messages
+from jaxnav.datasets.bag_readers import RULE, Ros1Reader, Ros2Reader, messages
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import problem_of
 
 _ROS2_FILES = (".db3", ".mcap")
 _LONGEST = 200  # characters of a library's message about broken bytes, which may quote all of them
-_RULE = "=" * 80 + "\n"  # between the definitions of a message's parts
 
 # Of apriltag_msgs 2 and ackermann_msgs 2.
 _DEFINITIONS = {
     "apriltag_msgs/msg/AprilTagDetectionArray": f"""std_msgs/Header header
 AprilTagDetection[] detections
-{_RULE}MSG: apriltag_msgs/AprilTagDetection
+{RULE}MSG: apriltag_msgs/AprilTagDetection
 string family
 int32 id
 int32 hamming
@@ -34,13 +33,13 @@ float32 decision_margin
 Point centre
 Point[4] corners
 float64[9] homography
-{_RULE}MSG: apriltag_msgs/Point
+{RULE}MSG: apriltag_msgs/Point
 float64 x
 float64 y
 """,
     "ackermann_msgs/msg/AckermannDriveStamped": f"""std_msgs/Header header
 AckermannDrive drive
-{_RULE}MSG: ackermann_msgs/AckermannDrive
+{RULE}MSG: ackermann_msgs/AckermannDrive
 float32 steering_angle
 float32 steering_angle_velocity
 float32 speed

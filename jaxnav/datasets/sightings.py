@@ -1,12 +1,12 @@
 """Reading of all sightings of markers in a recording, of markers in any map or none."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnav.datasets.recording import TO_OURS, Rows
+from jaxnav.datasets.recording import TO_OURS
 from jaxnav.datasets.recordings import read_source
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
@@ -58,15 +58,14 @@ def read_sightings(path: str | Path, rig: CameraRig | None = None) -> RecordedSi
     if path.suffix == ".mcap" and path.exists() and not path.is_dir():
         return _of_drive(path, rig)
     source = read_source(path, rig, also="a .mcap, ")
-    return _of_rows(source.rows, source.rig)
-
-
-def _of_rows(rows: Rows, rig: CameraRig) -> RecordedSightings:
+    rows = source.rows
     stamps_ns, frame = np.unique(rows.stamps_ns, return_inverse=True)
-    return _ordered(
-        rig, None, stamps_ns, frame, rows.cameras, rows.ids,
-        rows.corners_px[:, TO_OURS], None, (),
-    )  # fmt: skip
+    corners_px = rows.corners_px[:, TO_OURS]
+    return _once(
+        RecordedSightings(
+            source.rig, None, stamps_ns, frame, rows.cameras, rows.ids, corners_px, None, ()
+        )
+    )
 
 
 def _of_drive(path: Path, rig: CameraRig | None) -> RecordedSightings:
@@ -92,38 +91,35 @@ def _of_drive(path: Path, rig: CameraRig | None) -> RecordedSightings:
                 corners_px.append(detections.corners_px[index])
         stamps_ns.append(max(one.stamp_ns for one in seen))
     frame, camera, ids = (np.array([row[k] for row in rows], int) for k in range(3))
-    return _ordered(
-        rig or setup.rig, setup.markers, np.array(stamps_ns, np.int64), frame, camera, ids,
-        np.array(corners_px, float).reshape(-1, 4, 2), tuple(row[3] for row in rows),
-        tuple(given.odometry for given in log.inputs if given.odometry is not None),
-    )  # fmt: skip
+    return _once(
+        RecordedSightings(
+            rig=rig or setup.rig,
+            markers=setup.markers,
+            stamps_ns=np.array(stamps_ns, np.int64),
+            frame=frame,
+            camera=camera,
+            ids=ids,
+            corners_px=np.array(corners_px, float).reshape(-1, 4, 2),
+            families=tuple(row[3] for row in rows),
+            odometry=tuple(given.odometry for given in log.inputs if given.odometry is not None),
+        )
+    )
 
 
-def _ordered(
-    rig: CameraRig,
-    markers: MarkerMap | None,
-    stamps_ns: np.ndarray,
-    frame: np.ndarray,
-    camera: np.ndarray,
-    ids: np.ndarray,
-    corners_px: np.ndarray,
-    families: tuple[str, ...] | None,
-    odometry: tuple[Odometry, ...],
-) -> RecordedSightings:
+def _once(seen: RecordedSightings) -> RecordedSightings:
+    """The sightings with corners in range of markers that a camera reports once in a frame."""
+    frame, camera, ids, families = seen.frame, seen.camera, seen.ids, seen.families
     named = np.array(families if families is not None else [""] * len(ids), str)
     keys = np.rec.fromarrays([frame, camera, ids, named])
     _, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
-    once = (count[inverse] == 1) & is_within("corner_px", corners_px).all(axis=(1, 2))
+    once = (count[inverse] == 1) & is_within("corner_px", seen.corners_px).all(axis=(1, 2))
     kept = np.flatnonzero(once)
     kept = kept[np.lexsort([ids[kept], camera[kept], frame[kept]])]
-    return RecordedSightings(
-        rig=rig,
-        markers=markers,
-        stamps_ns=stamps_ns,
+    return replace(
+        seen,
         frame=frame[kept],
         camera=camera[kept],
         ids=ids[kept],
-        corners_px=corners_px[kept],
+        corners_px=seen.corners_px[kept],
         families=None if families is None else tuple(named[kept].tolist()),
-        odometry=odometry,
     )

@@ -15,33 +15,20 @@ from pydantic import Field
 
 from jaxnav.datasets import bags
 from jaxnav.datasets.recording import RecordingSource
+from jaxnav.datasets.ros_messages import TAGSLAM
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
-from jaxnav.files.figures import to_se3
+from jaxnav.files.figures import rig_from_figures
 from jaxnav.files.markers import marker_map
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import Count, ForeignEntry, Position, Size, at, validate
+from jaxnav.files.validation import Count, ForeignEntry, Size, Vector, at, validate
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
 _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 
 
-class Vector(ForeignEntry):
-    """A vector x y z in a file: a position in m, or a rotation vector in rad."""
-
-    x: Position
-    y: Position
-    z: Position
-
-    def xyz(self) -> list[float]:
-        """The vector as a list."""
-        return [self.x, self.y, self.z]
-
-
-class PoseEntry(ForeignEntry):
-    """A pose in the enclosing frame."""
-
+class _PoseEntry(ForeignEntry):
     position: Vector
     rotation: Vector
 
@@ -50,34 +37,28 @@ class PoseEntry(ForeignEntry):
         return poses.pose_from_rotation_vector(self.rotation.xyz(), self.position.xyz())
 
 
-class TagEntry(ForeignEntry):
-    """A marker on a body."""
-
+class _TagEntry(ForeignEntry):
     id: Count
     size: Size | None = None
-    pose: PoseEntry | None = None
+    pose: _PoseEntry | None = None
 
 
-class BodyEntry(ForeignEntry):
-    """A body that carries markers."""
-
+class _BodyEntry(ForeignEntry):
     is_static: bool = True
     default_tag_size: Size | None = None
-    pose: PoseEntry | None = None
-    tags: list[TagEntry] = Field(default_factory=list)
+    pose: _PoseEntry | None = None
+    tags: list[_TagEntry] = Field(default_factory=list)
 
 
 class TagSlamFile(ForeignEntry):
     """The content of tagslam.yaml."""
 
     default_body: str | None = None
-    bodies: Annotated[list[dict[str, BodyEntry]], Field(min_length=1)]
+    bodies: Annotated[list[dict[str, _BodyEntry]], Field(min_length=1)]
 
 
-class CameraPoseEntry(ForeignEntry):
-    """A camera in camera_poses.yaml."""
-
-    pose: PoseEntry
+class _CameraPoseEntry(ForeignEntry):
+    pose: _PoseEntry
 
 
 def read_tagslam(path: Path, rig: CameraRig | None) -> RecordingSource:
@@ -129,30 +110,25 @@ def _detections(
         bag.detections[entry.tagtopic] for bag in recorded if entry.tagtopic in bag.detections
     ]
     if len(detections) != 1:
-        problem = f"{len(detections) or 'no'} bags have {entry.tagtopic} of {bags.DETECTIONS_TYPE}"
+        problem = f"{len(detections) or 'no'} bags have {entry.tagtopic} of {TAGSLAM}"
         raise BadInput(where, f"{problem}; {bags.list_topics(recorded)}")
     return detections[0]
 
 
 def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: Edges, body: str) -> CameraRig:
-    Ts_camera_body = []
+    cameras = []
     file = path / "camera_poses.yaml"
     written = None
-    for key in chain:
+    for key, entry in chain.items():
         if (body, key) in edges:
             T_body_camera = _last(edges[body, key])
         else:
             written = read_mapping(file) if written is None else written
             if key not in written:
                 raise BadInput(at(file, key), f"missing, and no /tf from {body} to {key} either")
-            T_body_camera = validate(CameraPoseEntry, written[key], file, key).pose.pose()
-        Ts_camera_body.append(poses.inverse(T_body_camera))
-    return CameraRig.create(
-        [entry.camera() for entry in chain.values()],
-        [to_se3(pose) for pose in Ts_camera_body],
-        list(chain),
-        [(entry.resolution[0], entry.resolution[1]) for entry in chain.values()],
-    )
+            T_body_camera = validate(_CameraPoseEntry, written[key], file, key).pose.pose()
+        cameras.append(entry.figures(key, poses.inverse(T_body_camera)))
+    return rig_from_figures(cameras)
 
 
 def _markers(path: Path, edges: Edges) -> MarkerMap:

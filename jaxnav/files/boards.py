@@ -12,6 +12,7 @@ An aprilgrid has also `spacing`, in sides of a tag, and `border_cells`, the widt
 black frame in cells: 2 as Kalibr prints them.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,62 +27,62 @@ from jaxnav.files.writing import atomic_write
 
 Spacing = Annotated[Positive, within("spacing")]
 Squares = Annotated[int, Field(strict=True, ge=1, le=100)]
+_Side = Annotated[Size, Field(serialization_alias="size_m")]
+_KIND = Field(serialization_alias="kind")
 
 
-class Charuco(Entry):
+class _Own(Entry):
+    """A board in our own file; its aliases are the arguments of `Board`."""
+
+    def figures(self) -> dict[str, Any]:
+        """The arguments of `jaxnav.calibration.boards.board.Board`."""
+        return self.model_dump(by_alias=True)
+
+
+class Charuco(_Own):
     """A board file's chessboard with markers in its white squares."""
 
-    board: Literal["charuco"]
+    board: Annotated[Literal["charuco"], _KIND]
     columns: Squares
     rows: Squares
-    square_m: Size
+    square_m: _Side
     marker_m: Size
     family: Text
     first_id: Count = 0
 
-    def figures(self) -> dict[str, Any]:
-        """The arguments of `jaxnav.calibration.boards.board.Board`, as in every class here."""
-        return _figures(self, size_m=self.square_m)
 
-
-class Aprilgrid(Entry):
+class Aprilgrid(_Own):
     """A board file's grid of tags with black squares between them."""
 
-    board: Literal["aprilgrid"]
+    board: Annotated[Literal["aprilgrid"], _KIND]
     columns: Squares
     rows: Squares
-    tag_m: Size
+    tag_m: _Side
     spacing: Spacing
     family: Text = "tag36h11"
     first_id: Count = 0
     border_cells: Annotated[int, Field(strict=True, ge=1, le=2)] = 2
 
-    def figures(self) -> dict[str, Any]:
-        return _figures(self, size_m=self.tag_m)
 
-
-class Chessboard(Entry):
+class Chessboard(_Own):
     """A board file's chessboard of black and white squares."""
 
-    board: Literal["chessboard"]
+    board: Annotated[Literal["chessboard"], _KIND]
     columns: Squares
     rows: Squares
-    square_m: Size
-
-    def figures(self) -> dict[str, Any]:
-        return _figures(self, size_m=self.square_m)
+    square_m: _Side
 
 
-class SingleMarker(Entry):
+class SingleMarker(_Own):
     """A board file's single navigation marker."""
 
-    board: Literal["marker"]
+    board: Annotated[Literal["marker"], _KIND]
     size_m: Size
     family: Text
     first_id: Count
 
     def figures(self) -> dict[str, Any]:
-        return _figures(self, columns=1, rows=1)
+        return self.model_dump(by_alias=True) | {"columns": 1, "rows": 1}
 
 
 class KalibrAprilgrid(ForeignEntry):
@@ -92,17 +93,6 @@ class KalibrAprilgrid(ForeignEntry):
     tagSize: Size
     tagSpacing: Spacing
 
-    def figures(self) -> dict[str, Any]:
-        return {
-            "kind": "aprilgrid",
-            "columns": self.tagCols,
-            "rows": self.tagRows,
-            "size_m": self.tagSize,
-            "spacing": self.tagSpacing,
-            "family": "tag36h11",
-            "border_cells": 2,
-        }
-
 
 class KalibrCheckerboard(ForeignEntry):
     """Kalibr's target of `target_type: 'checkerboard'`; it counts the corners between squares."""
@@ -112,17 +102,9 @@ class KalibrCheckerboard(ForeignEntry):
     rowSpacingMeters: Size
     colSpacingMeters: Size
 
-    def figures(self) -> dict[str, Any]:
-        return {
-            "kind": "chessboard",
-            "columns": self.targetCols + 1,
-            "rows": self.targetRows + 1,
-            "size_m": self.rowSpacingMeters,
-        }
 
-
-BoardFile = Charuco | Aprilgrid | Chessboard | SingleMarker | KalibrAprilgrid | KalibrCheckerboard
-_OWN: dict[str, type[Charuco] | type[Aprilgrid] | type[Chessboard] | type[SingleMarker]] = {
+BoardFile = Charuco | Aprilgrid | Chessboard | SingleMarker
+_OWN: dict[str, type[BoardFile]] = {
     "charuco": Charuco,
     "aprilgrid": Aprilgrid,
     "chessboard": Chessboard,
@@ -143,17 +125,24 @@ def load_board(path: str | Path) -> BoardFile:
     return _own(path, data)
 
 
-def save_board(path: str | Path, data: dict[str, Any]) -> None:
-    """Write the content of a board file, which `load_board` reads back.
+def save_board(path: str | Path, figures: Mapping[str, Any]) -> None:
+    """Write a board, which `load_board` reads back.
+
+    Args:
+        figures: the arguments of `Board`, with those that its kind does not have.
 
     Raises:
-        BadInput: a key is wrong, or the file can't be written.
+        BadInput: a figure is wrong, or the file can't be written.
     """
-    entry = _own(Path(path), data)
+    fields = _OWN[figures["kind"]].model_fields
+    entry = _own(
+        Path(path),
+        {key: figures[field.serialization_alias or key] for key, field in fields.items()},
+    )
     atomic_write(path, yaml.safe_dump(entry.model_dump(), sort_keys=False))
 
 
-def _own(path: Path, data: dict[str, Any]) -> Charuco | Aprilgrid | Chessboard | SingleMarker:
+def _own(path: Path, data: dict[str, Any]) -> BoardFile:
     if "board" not in data:
         raise BadInput(path, "is neither a board (`board:`) nor a target of Kalibr")
     kind = data["board"]
@@ -165,19 +154,23 @@ def _own(path: Path, data: dict[str, Any]) -> Charuco | Aprilgrid | Chessboard |
 def _kalibr(path: Path, data: dict[str, Any]) -> BoardFile:
     kind = data["target_type"]
     if kind == "aprilgrid":
-        return validate(KalibrAprilgrid, data, path)
+        grid = validate(KalibrAprilgrid, data, path)
+        return Aprilgrid.model_construct(
+            board="aprilgrid",
+            columns=grid.tagCols,
+            rows=grid.tagRows,
+            tag_m=grid.tagSize,
+            spacing=grid.tagSpacing,
+        )
     if kind != "checkerboard":
         problem = f"must be aprilgrid or checkerboard, got {kind!r}"
         raise BadInput(at(path, "target_type"), problem)
     target = validate(KalibrCheckerboard, data, path)
-    if target.rowSpacingMeters != target.colSpacingMeters:
-        problem = f"must be as rowSpacingMeters ({target.rowSpacingMeters:g}): squares are square"
+    square_m = target.rowSpacingMeters
+    if square_m != target.colSpacingMeters:
+        problem = f"must be as rowSpacingMeters ({square_m:g}): squares are square"
         raise BadInput(at(path, "colSpacingMeters"), problem)
-    return target
-
-
-def _figures(entry: Entry, **also: Any) -> dict[str, Any]:
-    figures = {
-        "kind" if key == "board" else key: value for key, value in entry.model_dump().items()
-    }
-    return {k: v for k, v in figures.items() if k not in ("square_m", "tag_m")} | also
+    columns, rows = target.targetCols + 1, target.targetRows + 1
+    return Chessboard.model_construct(
+        board="chessboard", columns=columns, rows=rows, square_m=square_m
+    )

@@ -5,27 +5,21 @@ FileStorage YAML (as its calibration sample and most scripts write it) and Photo
 file's keys tell its format.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr
 from jaxnav.files.figures import CameraFigures
-from jaxnav.files.opencv_storage import is_opencv, opencv_figures, opencv_left_out
-from jaxnav.files.photonvision import (
-    is_photonvision,
-    photonvision_figures,
-    photonvision_left_out,
+from jaxnav.files.matrix_cameras import (
+    CameraInfo,
+    MatrixCamera,
+    OpenCVCamera,
+    PhotonVisionCamera,
 )
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import RigFile, rig_left_out
-from jaxnav.files.ros_camera_info import (
-    camera_info_figures,
-    camera_info_left_out,
-    is_camera_info,
-)
 from jaxnav.files.validation import validate
 from jaxnav.models.camera import Camera
 
@@ -47,20 +41,11 @@ class CameraFile:
     left_out: tuple[str, ...]
 
 
-class _OneCamera(NamedTuple):
-    """The functions that read the format of a tool that writes one camera a file."""
-
-    format: CameraFormat
-    recognised: Callable[[dict[str, Any]], bool]
-    figures: Callable[[Path, dict[str, Any], str], CameraFigures]
-    left_out: Callable[[dict[str, Any]], list[str]]
-
-
-_ONE_CAMERA = (
-    _OneCamera("photonvision", is_photonvision, photonvision_figures, photonvision_left_out),
-    _OneCamera("ros", is_camera_info, camera_info_figures, camera_info_left_out),
-    _OneCamera("opencv", is_opencv, opencv_figures, opencv_left_out),
-)
+_ONE_CAMERA: dict[CameraFormat, type[MatrixCamera]] = {
+    "photonvision": PhotonVisionCamera,
+    "ros": CameraInfo,
+    "opencv": OpenCVCamera,
+}
 
 
 def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, ImageSizePx]:
@@ -86,7 +71,7 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
     return camera.camera(), camera.image_size_px
 
 
-def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
+def camera_file(path: Path, data: dict[str, Any], by_topic: bool = False) -> CameraFile:
     """All cameras of a file, whichever tool wrote it.
 
     Cameras of a camchain are called `cam0`, `cam1` and so on; a camera without a name in its file
@@ -94,6 +79,7 @@ def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
 
     Args:
         data: the content of the file.
+        by_topic: whether a camchain's cameras are named after their topics instead, if they can be.
 
     Raises:
         BadInput: one line naming file and key.
@@ -105,11 +91,15 @@ def camera_file(path: Path, data: dict[str, Any]) -> CameraFile:
     if kalibr.is_camchain(data):
         chain = kalibr.camchain(path, data)
         left_out = kalibr.camchain_left_out(data, chain)
-        return CameraFile("kalibr", tuple(kalibr.camchain_figures(chain)), tuple(left_out))
-    for tool in _ONE_CAMERA:
-        if tool.recognised(data):
-            camera = tool.figures(path, data, _name(data.get("camera_name")) or path.stem)
-            return CameraFile(tool.format, (camera,), tuple(tool.left_out(data)))
+        names = kalibr.names_by_topic(chain) if by_topic else list(chain)
+        figures = zip(kalibr.camchain_figures(chain), names, strict=True)
+        cameras = tuple(replace(camera, name=name) for camera, name in figures)
+        return CameraFile("kalibr", cameras, tuple(left_out))
+    for tool, model in _ONE_CAMERA.items():
+        if data.keys() & set(model.told_by):
+            stored = validate(model, data, path)
+            camera = stored.figures(path, _name(data.get("camera_name")) or path.stem)
+            return CameraFile(tool, (camera,), tuple(stored.left_out(data)))
     raise BadInput(
         path,
         "is no camera file that jaxnav knows: expected a rig (`cameras:`), a Kalibr camchain "
@@ -122,15 +112,6 @@ def _name(named: Any) -> str:
     """A tool's name of a camera, which may be a serial number; empty where it is not usable."""
     name = str(named) if isinstance(named, str | int) else ""
     return name if len(name) <= 100 and name.isprintable() else ""
-
-
-def named_by_topic(path: Path, data: dict[str, Any], file: CameraFile) -> CameraFile:
-    """The file with cameras named after their topics, if it is a camchain; else unchanged."""
-    if file.format != "kalibr":
-        return file
-    names = kalibr.names_by_topic(kalibr.camchain(path, data))
-    cameras = [replace(camera, name=name) for camera, name in zip(file.cameras, names, strict=True)]
-    return replace(file, cameras=tuple(cameras))
 
 
 def choose_camera(

@@ -30,7 +30,6 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import yaml_text
-from jaxnav.models.camera import Camera
 
 _LENS: dict[str, Lens] = {
     "radtan": "radtan",
@@ -110,10 +109,6 @@ class KalibrCamera(ForeignEntry):
             name, lens, self.intrinsics, coefficients, self.resolution, T_camera_vehicle
         )
 
-    def camera(self) -> Camera:
-        """The camera without its place."""
-        return self.figures("").camera()
-
 
 def is_camchain(data: dict[str, Any]) -> bool:
     """Whether a mapping looks like a camchain."""
@@ -151,18 +146,6 @@ def camchain_figures(chain: dict[str, KalibrCamera]) -> list[CameraFigures]:
             place = poses.compose(step, poses.pose_as_read(before))
         cameras.append(entry.figures(key, place))
     return cameras
-
-
-def require_places(path: Path, cameras: Sequence[CameraFigures]) -> None:
-    """Require a place of every camera of a camchain; cameras are named by their keys.
-
-    Raises:
-        BadInput: a camera has no place.
-    """
-    for camera in cameras:
-        if camera.T_camera_vehicle is None:
-            problem = "missing: where is this camera on the vehicle (imu := vehicle)?"
-            raise BadInput(at(path, camera.name, "T_cam_imu"), problem)
 
 
 def names_by_topic(chain: dict[str, KalibrCamera]) -> list[str]:

@@ -14,6 +14,16 @@ _OLD = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 @contextmanager
+def naming_written(path: str | Path) -> Iterator[None]:
+    """Turn the system's errors about a file that is written into `BadInput`."""
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise BadInput(path, f"can't be written: {reason}") from None
+
+
+@contextmanager
 def sole_writer(path: str | Path) -> Iterator[None]:
     """Keep all other processes out of such a block for the same path while this one runs.
 
@@ -24,11 +34,8 @@ def sole_writer(path: str | Path) -> Iterator[None]:
     """
     path = Path(os.path.realpath(path))
     beside = path.with_name(f".{path.name}.lock")
-    try:
+    with naming_written(path):
         fd = _locked(beside)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise BadInput(path, f"can't be written: {reason}") from None
     if fd is None:
         raise BadInput(path, "is being written by another process")
     try:

@@ -87,10 +87,6 @@ class MarkerEntry(Entry):
             T_world_marker = written_pose(self.T_world_marker)
         return MarkerFigures(self.id, self.family, float(self.size_m), T_world_marker)
 
-    def pose(self) -> np.ndarray:
-        """The pose of the marker in the world, (7,) wxyz_xyz."""
-        return poses.pose_as_read(self.figures().T_world_marker)
-
 
 class MarkerFile(Entry):
     """A marker map file."""
@@ -111,8 +107,9 @@ class MarkerFile(Entry):
 
     def map(self, origin_m: Origin | None = None) -> MarkerMap:
         """The map, in the process's precision; see `marker_map`."""
+        written = [entry.figures().T_world_marker for entry in self.markers]
         return marker_map(
-            np.stack([entry.pose() for entry in self.markers]),
+            np.stack([poses.pose_as_read(T) for T in written]),
             [entry.size_m for entry in self.markers],
             [entry.id for entry in self.markers],
             [entry.family for entry in self.markers],
@@ -238,13 +235,11 @@ def fit_square(corners_m: np.ndarray, size_m: float) -> np.ndarray:
     center = corners_m.mean(axis=0)
     U, _, Vt = np.linalg.svd((corners_m - center).T @ model)
     mirrored = np.linalg.det(U @ Vt) < 0
-    T = np.eye(4)
-    T[:3, :3] = U @ np.diag([1, 1, -1 if mirrored else 1]) @ Vt
-    T[:3, 3] = center
-    errors_m = np.linalg.norm(center + model @ T[:3, :3].T - corners_m, axis=1)
+    R = U @ np.diag([1, 1, -1 if mirrored else 1]) @ Vt
+    errors_m = np.linalg.norm(center + model @ R.T - corners_m, axis=1)
     if errors_m.max() > _MAX_CORNER_ERROR * size_m:
         raise ValueError(
             f"TL TR BR BL must be a square with sides of {size_m:g} m: "
             f"corner [{errors_m.argmax()}] is {errors_m.max():.3g} m off"
         )
-    return poses.pose_from_matrix(T)
+    return poses.pose_from_matrix(poses.transform(R, center))

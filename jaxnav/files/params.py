@@ -28,7 +28,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files.param_values import param_array
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import Entry, at, validate
-from jaxnav.files.writing import atomic_write, plain_data
+from jaxnav.files.writing import PlainDumper, atomic_write, plain_data
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 
@@ -191,11 +191,8 @@ def _counted(shape: tuple[int, ...]) -> str:
     return f"{shape[0]} rows of {shape[1]}"
 
 
-class _Dumper(yaml.SafeDumper):
-    """A dumper without aliases, with rows on one line, and texts that can't pass for numbers."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
+class _Dumper(PlainDumper):
+    """A dumper with rows on one line, and texts that can't pass for numbers."""
 
 
 def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:

@@ -117,17 +117,22 @@ def pose_from_rotation_vector(rotation_rad: Sequence[float], xyz_m: Sequence[flo
     )
 
 
+def transform(R: np.ndarray, translation_m: np.ndarray | Sequence[float]) -> np.ndarray:
+    """The 4x4 of a rotation (..., 3, 3) and a translation (..., 3), m."""
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, translation_m, 1
+    return T
+
+
 def matrix(pose: np.ndarray) -> np.ndarray:
     """The 4x4 of a pose (7,)."""
     w, x, y, z = pose[:4] / np.linalg.norm(pose[:4])
-    T = np.eye(4)
-    T[:3, :3] = [
+    R = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    T[:3, 3] = pose[4:]
-    return T
+    return transform(np.array(R), pose[4:])
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:

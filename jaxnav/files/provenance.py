@@ -43,16 +43,12 @@ def calibrated_now(tool: str, data: Iterable[Path | np.ndarray]) -> Calibrated:
             digest.update(f"{item.dtype.str}{item.shape}".encode())
             digest.update(np.ascontiguousarray(item).tobytes())
         else:
-            _digest_file(item, digest)
+            try:
+                with item.open("rb") as file:
+                    digest.update(hashlib.file_digest(file, "sha256").digest())
+            except OSError as error:
+                reason = (error.strerror or str(error)).lower()
+                raise BadInput(item, f"can't be read: {reason}") from None
     return Calibrated(
         date=datetime.now(UTC).date().isoformat(), tool=tool, data_sha256=digest.hexdigest()
     )
-
-
-def _digest_file(path: Path, digest: "hashlib._Hash") -> None:
-    try:
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise BadInput(path, f"can't be read: {reason}") from None

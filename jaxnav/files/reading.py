@@ -36,7 +36,9 @@ def read_mapping(path: Path) -> dict[str, Any]:
     if data is None:
         raise BadInput(path, "the file is empty")
     if not isinstance(data, dict):
-        raise BadInput(path, f"must be a mapping of keys to values, got a {_kind(data)}")
+        names = {list: "list", str: "text", bool: "true/false"}
+        got = names.get(type(data), type(data).__name__)
+        raise BadInput(path, f"must be a mapping of keys to values, got a {got}")
     return data
 
 
@@ -52,7 +54,8 @@ def read_text(path: Path, max_bytes: int) -> str:
     except IsADirectoryError:
         raise BadInput(path, "is a folder, not a file") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise BadInput(path, f"can't be read: {_reason(error)}") from None
+        reason = getattr(error, "strerror", None) or str(error)
+        raise BadInput(path, f"can't be read: {reason.lower()}") from None
     if len(raw) > max_bytes:
         raise BadInput(path, f"is larger than {max_bytes // 2**20} MiB")
     try:
@@ -181,10 +184,6 @@ def _scalar(construct: Callable[[str], Any]) -> Callable[[_Loader, Any], Any]:
     return lambda loader, node: construct(loader.construct_scalar(node))
 
 
-def _matrix(loader: _Loader, node: Any) -> dict[Hashable, Any]:
-    return loader.construct_mapping(node, deep=True)
-
-
 def _to_float(text: str) -> float:
     return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
 
@@ -204,12 +203,6 @@ for _name, _pattern, _first, _construct in (
     _Loader.add_implicit_resolver(_TAG + _name, re.compile(_pattern), _first)
     _Loader.yaml_constructors[_TAG + _name] = _scalar(_construct)
 for _name in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.yaml_constructors[_TAG + _name] = _matrix
-
-
-def _kind(value: Any) -> str:
-    return {list: "list", str: "text", bool: "true/false"}.get(type(value), type(value).__name__)
-
-
-def _reason(error: Exception) -> str:
-    return (getattr(error, "strerror", None) or str(error)).lower()
+    _Loader.yaml_constructors[_TAG + _name] = lambda loader, node: loader.construct_mapping(
+        node, deep=True
+    )

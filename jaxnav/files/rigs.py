@@ -49,10 +49,11 @@ from jaxnav.files.validation import (
     Point,
     PositivePair,
     QuaternionPose,
+    at,
     validate,
 )
 from jaxnav.files.writing import atomic_write, yaml_text
-from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.camera import LENS_COEFFICIENTS
 from jaxnav.models.rig import CameraRig
 
 
@@ -133,16 +134,6 @@ class CameraEntry(Entry):
             self.name, self.lens, pinhole_px, self.distortion, self.image_size_px, T_camera_vehicle
         )
 
-    def camera(self) -> Camera:
-        """The camera without its place."""
-        return self.figures().camera()
-
-    def T_camera_vehicle_pose(self) -> np.ndarray:
-        """The pose of the vehicle in the camera, (7,) wxyz_xyz."""
-        written = self.figures().T_camera_vehicle
-        assert written is not None
-        return poses.pose_as_read(written)
-
 
 class RigFile(Entry):
     """A rig file."""
@@ -177,7 +168,10 @@ def load_rig(path: str | Path) -> CameraRig:
     if kalibr.is_camchain(data):
         chain = kalibr.camchain(path, data)
         cameras = kalibr.camchain_figures(chain)
-        kalibr.require_places(path, cameras)
+        for camera in cameras:
+            if camera.T_camera_vehicle is None:
+                problem = "missing: where is this camera on the vehicle (imu := vehicle)?"
+                raise BadInput(at(path, camera.name, "T_cam_imu"), problem)
         return rig_from_figures(
             [
                 replace(camera, name=entry.tagtopic or camera.name)
@@ -268,9 +262,7 @@ def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> np.ndarra
         position_m: of the camera in the vehicle.
         angles_deg: yaw, elevation and roll, see `poses.rotation_towards`.
     """
-    T_vehicle_camera = np.eye(4)
-    T_vehicle_camera[:3, :3] = poses.rotation_towards(*angles_deg)
-    T_vehicle_camera[:3, 3] = position_m
+    T_vehicle_camera = poses.transform(poses.rotation_towards(*angles_deg), position_m)
     return poses.inverse(poses.pose_from_matrix(T_vehicle_camera))
 
 

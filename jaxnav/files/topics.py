@@ -10,25 +10,37 @@ OpenCV's picture of the same marker stands on its head. A map made for AprilTag'
 with `bottom_left`; one made for OpenCV's, as jaxnav's own detectors see it, with `top_right`.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator
+from pydantic import Field, PrivateAttr, field_validator
 
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import CornerSigma, Entry, Name, validate
 from jaxnav.models.conventions import FirstCorner
 
 
-class TopicsFile(Entry):
-    """A topic map file."""
+class TopicMap(Entry):
+    """The topics of a ROS bag that hold the cameras' frames and the odometry.
 
+    Attributes:
+        cameras: name in the rig -> topic of detections or of images.
+        odometry: the topic; None where the bag has none.
+        corner_sigma_px: standard deviation of a detected corner along one axis.
+        first_corner: the corner, as the marker map sees the marker, that a detection begins with;
+            the others follow counter-clockwise.
+    """
+
+    _path: Path = PrivateAttr(default=Path())
     cameras: Annotated[dict[str, Name], Field(min_length=1, max_length=64)]
     odometry: Name | None = None
     corner_sigma_px: CornerSigma = 0.3
     first_corner: FirstCorner = "bottom_left"
+
+    @property
+    def path(self) -> Path:
+        """The file, for messages."""
+        return self._path
 
     @field_validator("cameras")
     @classmethod
@@ -48,26 +60,6 @@ class TopicsFile(Entry):
         return odometry
 
 
-@dataclass(frozen=True)
-class TopicMap:
-    """The topics of a ROS bag that hold the cameras' frames and the odometry.
-
-    Attributes:
-        path: the file, for messages.
-        cameras: name in the rig -> topic of detections or of images.
-        odometry: the topic; None where the bag has none.
-        corner_sigma_px: standard deviation of a detected corner along one axis.
-        first_corner: the corner, as the marker map sees the marker, that a detection begins with;
-            the others follow counter-clockwise.
-    """
-
-    path: Path
-    cameras: Mapping[str, str]
-    odometry: str | None
-    corner_sigma_px: float
-    first_corner: FirstCorner
-
-
 def load_topics(path: str | Path) -> TopicMap:
     """Read a topic map.
 
@@ -75,5 +67,6 @@ def load_topics(path: str | Path) -> TopicMap:
         BadInput: one line naming file and key.
     """
     path = Path(path)
-    entry = validate(TopicsFile, read_mapping(path), path)
-    return TopicMap(path, entry.cameras, entry.odometry, entry.corner_sigma_px, entry.first_corner)
+    topics = validate(TopicMap, read_mapping(path), path)
+    topics._path = path
+    return topics

@@ -62,6 +62,19 @@ Mount = Annotated[list[Number], Field(min_length=3, max_length=3), placed_within
 PositivePair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 ImageSize = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
 
+
+class Vector(ForeignEntry):
+    """A vector x y z in a file: a position in m, or a rotation vector in rad."""
+
+    x: Position
+    y: Position
+    z: Position
+
+    def xyz(self) -> list[float]:
+        """The vector as a list."""
+        return [self.x, self.y, self.z]
+
+
 _Row = Annotated[list[Number], Field(min_length=4, max_length=4)]
 Matrix = Annotated[
     list[_Row], Field(min_length=4, max_length=4), AfterValidator(check_matrix)

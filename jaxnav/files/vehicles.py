@@ -60,13 +60,12 @@ class VehicleFile(Entry):
         return Vehicle.create(**self.model_dump(exclude={"calibrated", "sigma"}, exclude_none=True))
 
 
-_FIGURES = [name for name in VehicleFile.model_fields if name not in ("calibrated", "sigma")]
-CORRECTIONS = {
-    "speed_scale": 1.0,
-    "steering_gain": 1.0,
-    "steering_offset_rad": 0.0,
-    "camera_delay_s": 0.0,
-}  # the values that correct nothing
+# Name -> its default; that of a correction corrects nothing.
+_FIGURES = {
+    name: field.default
+    for name, field in VehicleFile.model_fields.items()
+    if name not in ("calibrated", "sigma")
+}
 
 
 class StartEntry(Entry):
@@ -119,7 +118,7 @@ def vehicle_data(vehicle: Vehicle) -> dict[str, float]:
     """The content of a vehicle's file, all numbers bit for bit; see `VehicleFile`."""
     data = {name: float(getattr(vehicle, name)) for name in _FIGURES}
     # Without corrections that correct nothing, any version of the program reads the file.
-    return {name: v for name, v in data.items() if CORRECTIONS.get(name) != v}
+    return {name: value for name, value in data.items() if _FIGURES[name] != value}
 
 
 def save_vehicle(

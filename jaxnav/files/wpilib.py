@@ -25,8 +25,8 @@ from jaxnav.files.validation import (
     Count,
     ForeignEntry,
     Number,
-    Position,
     Positive,
+    Vector,
     at,
     validate,
 )
@@ -37,64 +37,46 @@ SIZE_M = 0.1651  # the black square of FIRST's tags, 6.5 inches
 FAMILY = "tag36h11"  # FIRST's since 2024
 
 
-class Translation(ForeignEntry):
-    """The position of a tag on the field, m."""
-
-    x: Position
-    y: Position
-    z: Position
-
-
-class Quaternion(ForeignEntry):
-    """A quaternion of length 1."""
-
+class _Quaternion(ForeignEntry):
     W: Number
     X: Number
     Y: Number
     Z: Number
 
     @model_validator(mode="after")
-    def _of_length_1(self) -> "Quaternion":
+    def _of_length_1(self) -> "_Quaternion":
         poses.check_quaternion([self.W, self.X, self.Y, self.Z])
         return self
 
 
-class Rotation(ForeignEntry):
-    """The rotation of a tag on the field."""
-
-    quaternion: Quaternion
+class _Rotation(ForeignEntry):
+    quaternion: _Quaternion
 
 
-class TagPose(ForeignEntry):
-    """The pose of a tag on the field."""
-
-    translation: Translation
-    rotation: Rotation
+class _TagPose(ForeignEntry):
+    translation: Vector
+    rotation: _Rotation
 
 
-class FieldTag(ForeignEntry):
-    """One tag of a layout."""
-
+class _FieldTag(ForeignEntry):
     ID: Count
-    pose: TagPose
+    pose: _TagPose
 
 
-class FieldSize(ForeignEntry):
-    """The size of a field, m."""
-
-    length: Annotated[Positive, within("position_m")]
-    width: Annotated[Positive, within("position_m")]
+class _FieldSize(ForeignEntry):
+    length: Annotated[Positive, within("position_m")]  # m
+    width: Annotated[Positive, within("position_m")]  # m
 
 
 class FieldLayout(ForeignEntry):
     """A field layout."""
 
-    tags: Annotated[list[FieldTag], Field(min_length=1, max_length=4096)]
-    field: FieldSize | None = None
+    tags: Annotated[list[_FieldTag], Field(min_length=1, max_length=4096)]
+    field: _FieldSize | None = None
 
     @field_validator("tags")
     @classmethod
-    def _each_once(cls, tags: list[FieldTag]) -> list[FieldTag]:
+    def _each_once(cls, tags: list[_FieldTag]) -> list[_FieldTag]:
         ids = [tag.ID for tag in tags]
         if len(set(ids)) < len(ids):
             raise ValueError(f"tag {next(i for i in ids if ids.count(i) > 1)} is there twice")
@@ -128,7 +110,7 @@ def layout_figures(
             raise BadInput(at(path, f"tags[{index}].ID"), problem)
         place, turn = tag.pose.translation, tag.pose.rotation.quaternion
         wxyz = poses.quaternion_product([turn.W, turn.X, turn.Y, turn.Z], WXYZ_TAG_MARKER)
-        T_world_marker = np.array([*wxyz, place.x, place.y, place.z])
+        T_world_marker = np.array([*wxyz, *place.xyz()])
         markers.append(MarkerFigures(marker_id, family, size_m, T_world_marker))
     return markers
 

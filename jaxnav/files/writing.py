@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from jaxnav.errors import BadInput
-from jaxnav.files.locking import create_temporary, sweep
+from jaxnav.files.locking import create_temporary, naming_written, sweep
 
 
 @contextmanager
@@ -29,7 +29,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         BadInput: the folder is missing or closed to writing, or `path` is a folder, a device or
             write-protected.
     """
-    with _naming(path):
+    with naming_written(path):
         target, older = _target(path)
         word = hashlib.blake2b(os.fsencode(target.name), digest_size=4).hexdigest()
         begin = f".jaxnav-{word}-"
@@ -58,7 +58,7 @@ def require_writable(path: str | Path) -> None:
     Raises:
         BadInput: the file can't be written.
     """
-    with _naming(path):
+    with naming_written(path):
         target, _ = _target(path)
         name, fd = create_temporary(lambda unique: f"{target.parent}/.jaxnav-{unique}", 0o600)
         os.unlink(name)  # noqa: PTH108
@@ -163,16 +163,6 @@ def write_tum(path: str | Path, stamps_s: np.ndarray, Ts_world_vehicle: np.ndarr
     atomic_write(path, "".join(lines))
 
 
-@contextmanager
-def _naming(path: str | Path) -> Iterator[None]:
-    """Turn the system's errors about a file into `BadInput`."""
-    try:
-        yield
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise BadInput(path, f"can't be written: {reason}") from None
-
-
 def _target(path: str | Path) -> tuple[Path, os.stat_result | None]:
     """The file that a path leads to, and the status of an older file there; None without one."""
     if "\0" in str(path):
@@ -223,10 +213,12 @@ def _metres(value: float) -> str:
 
 def yaml_text(data: dict[str, Any]) -> str:
     """Data as YAML, with each list of numbers on one line."""
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=200)
+    return yaml.dump(data, Dumper=PlainDumper, sort_keys=False, default_flow_style=None, width=200)
 
 
-class _Dumper(yaml.SafeDumper):
+class PlainDumper(yaml.SafeDumper):
+    """A dumper without aliases."""
+
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
@@ -235,7 +227,7 @@ class Quoted(str):
     """Text that is always written in quotes, so that no reader takes it for a number."""
 
 
-_Dumper.add_representer(
+PlainDumper.add_representer(
     Quoted, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"')
 )
 

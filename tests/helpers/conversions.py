@@ -12,7 +12,7 @@ from jaxnav.commands.calibrate import convert as calibrate_convert
 from jaxnav.commands.calibrate.arguments.cameras import CalibrateConvert
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.cameras import camera_file, named_by_topic
+from jaxnav.files.cameras import camera_file
 from jaxnav.files.figures import CameraFigures, MarkerFigures
 from jaxnav.files.markers import MarkerFile
 from jaxnav.files.reading import read_mapping
@@ -37,8 +37,7 @@ def problem(source: Path, to: str, out: Path, **flags: Any) -> str:
 
 
 def cameras_in(path: Path) -> tuple[CameraFigures, ...]:
-    data = read_mapping(path)
-    return named_by_topic(path, data, camera_file(path, data)).cameras
+    return camera_file(path, read_mapping(path), by_topic=True).cameras
 
 
 def markers_in(path: Path) -> list[MarkerFigures]:

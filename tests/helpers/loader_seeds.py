@@ -18,7 +18,7 @@ from jaxnav.commands.simulate.arguments import Simulate
 from jaxnav.commands.study.studies import load_study, summary_of
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.datasets.ros_drives import read_ros_drive
-from jaxnav.files.cameras import camera_file, named_by_topic
+from jaxnav.files.cameras import camera_file
 from jaxnav.files.images import read_image
 from jaxnav.files.markers import marker_map
 from jaxnav.files.poses import pose_as_read
@@ -243,7 +243,7 @@ def _layout(path: Path) -> Any:
 def _cameras(path: Path) -> Any:
     """All cameras of a file, as `jaxnav calibrate convert` takes them."""
     data = read_mapping(path)
-    file = named_by_topic(path, data, camera_file(path, data))
+    file = camera_file(path, data, by_topic=True)
     assert all(isinstance(key, str) for key in file.left_out)
     return [camera.camera() for camera in file.cameras]
 

@@ -6,7 +6,7 @@ it; on a chessboard, OpenCV finds all points at once. From there all three kinds
 neighbours in their rows and columns show. Points that don't fit their neighbours are dropped.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -14,8 +14,6 @@ import numpy as np
 from jaxnav.calibration.boards.board import MIN_POINTS, Board
 from jaxnav.calibration.boards.places import (
     bent_places,
-    chosen_places,
-    joined_places,
     mapped,
     no_places,
     predicted_places,
@@ -84,10 +82,10 @@ def look_at(board: Board, image: np.ndarray, name: str, camera: Camera | None = 
     if board.kind == "chessboard":
         ids, places = _chessboard_places(board, levels)
     else:
-        tags = read_tags(board, levels)
-        foreign, own = tags.foreign_ids, tuple(board.tags[place].id for place in tags.places)
-        corners_m = [board.tags[place].corners_board_m for place in tags.places]
-        known_m, known_px = np.reshape(corners_m, (-1, 2)), tags.corners_px.reshape(-1, 2)
+        tags, corners_px, foreign = read_tags(board, levels)
+        own = tuple(board.tags[place].id for place in tags)
+        corners_m = [board.tags[place].corners_board_m for place in tags]
+        known_m, known_px = np.reshape(corners_m, (-1, 2)), corners_px.reshape(-1, 2)
         ids, places = predicted_places(
             board, np.arange(len(board.points_board_m)), known_m, known_px
         )
@@ -127,12 +125,13 @@ def _first_look(
         ids, places, _ = _kept(board, ids, places, saddles)
         if len(ids) == 0:
             break
-        saddle_ids, there = np.append(saddle_ids, ids), joined_places(there, places)
+        saddle_ids = np.append(saddle_ids, ids)
+        there = Places(*map(np.concatenate, zip(there, places, strict=True)))
         missing_ids = np.setdiff1d(np.arange(len(board.points_board_m)), saddle_ids)
         points_m = board.points_board_m[saddle_ids, :2]
         ids, places = predicted_places(board, missing_ids, points_m, there.points_px)
     order = np.argsort(saddle_ids, kind="stable")
-    return saddle_ids[order], chosen_places(there, order)
+    return saddle_ids[order], there.only(order)
 
 
 def _radius_px(places: Places) -> float:
@@ -189,15 +188,8 @@ def _kept(
     apart = np.linalg.norm(saddles.points_px[:, None] - saddles.points_px, axis=2)
     np.fill_diagonal(apart, np.inf)
     keep &= apart.min(axis=1, initial=np.inf) > 1.0
-    moved = replace(chosen_places(places, keep), points_px=saddles.points_px[keep])
-    kept = Saddles(
-        saddles.points_px[keep],
-        saddles.amplitude[keep],
-        saddles.sigma_px[keep],
-        saddles.noise[keep],
-        saddles.good[keep],
-    )
-    return ids[keep], moved, kept
+    kept = Saddles(*(column[keep] for column in saddles))
+    return ids[keep], places.only(keep)._replace(points_px=kept.points_px), kept
 
 
 def _with_neighbours(board: Board, ids: np.ndarray, points_px: np.ndarray) -> np.ndarray:

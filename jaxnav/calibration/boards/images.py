@@ -25,6 +25,7 @@ VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mj
 _MOST_FRAMES = 600  # of one video that are searched
 # A frame is searched when its thumbnail differs by this much from that of the last frame kept.
 _THUMBNAIL_PX, _MIN_CHANGE_GREY = (64, 48), 1.5
+_MIN_MOVE_PX = 10.0  # median distance of the board's points from where the last view has them
 _EXAMPLES = 5  # images kept to find out why no board is seen
 
 
@@ -47,22 +48,10 @@ class CollectedViews:
     foreign_ids: tuple[int, ...]
 
 
-def board_views(
-    board: Board,
-    sources: Sequence[Path],
-    camera: Camera | None = None,
-    min_move_px: float = 10.0,
-    headless: bool = True,
-) -> BoardViews:
-    """Collect the views and return them alone: see `collect_views`."""
-    return collect_views(board, sources, camera, min_move_px, headless).views
-
-
 def collect_views(
     board: Board,
     sources: Sequence[Path],
     camera: Camera | None = None,
-    min_move_px: float = 10.0,
     headless: bool = True,
 ) -> CollectedViews:
     """Find the board in images and videos of one camera.
@@ -75,7 +64,6 @@ def collect_views(
         sources: folders of images, images, videos. The images of a folder are read in the order
             of their names, with numbers compared by value.
         camera: see `find_board`.
-        min_move_px: the least median distance by which the board's points must have moved.
         headless: show no progress bar.
 
     Raises:
@@ -83,7 +71,7 @@ def collect_views(
             message then says what is seen instead.
     """
     files = source_files(sources)
-    collector = _Collector(board, camera, min_move_px)
+    collector = _Collector(board, camera)
     names = _names(files)
     for file, name in tqdm(zip(files, names, strict=True), total=len(files), disable=headless):
         if file.suffix.lower() in VIDEOS:
@@ -104,7 +92,8 @@ def source_files(sources: Sequence[Path]) -> tuple[Path, ...]:
     for source in sources:
         if not source.is_dir():
             if source.suffix.lower() not in IMAGES + VIDEOS:
-                raise BadInput(source, f"is neither a folder, an image nor a video ({_known()})")
+                known = ", ".join(IMAGES + VIDEOS)
+                raise BadInput(source, f"is neither a folder, an image nor a video ({known})")
             files.append(source)
             continue
         inside = sorted(
@@ -132,10 +121,6 @@ def _names(files: Sequence[Path]) -> list[str]:
     ]
 
 
-def _known() -> str:
-    return ", ".join(IMAGES + VIDEOS)
-
-
 def _by_number(path: Path) -> list[tuple[int, str]]:
     """A key that sorts 2.png before 10.png."""
     return [
@@ -147,8 +132,8 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
 class _Collector:
     """Collects views image by image and remembers why images gave none."""
 
-    def __init__(self, board: Board, camera: Camera | None, min_move_px: float):
-        self._board, self._camera, self._min_move_px = board, camera, min_move_px
+    def __init__(self, board: Board, camera: Camera | None):
+        self._board, self._camera = board, camera
         self._size_px: tuple[int, int] | None = None
         self._first = ""
         self._digests: dict[bytes, str] = {}
@@ -178,7 +163,7 @@ class _Collector:
                 if np.mean(np.abs(thumbnail - last_thumbnail)) < _MIN_CHANGE_GREY:
                     continue
             view = self._look(f"{name}#{number}", image).view
-            if view is None or _move_px(last_view, view) < self._min_move_px:
+            if view is None or _move_px(last_view, view) < _MIN_MOVE_PX:
                 continue
             self._views.append(view)
             last_view, last_thumbnail = view, thumbnail

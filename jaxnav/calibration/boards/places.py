@@ -58,40 +58,12 @@ def bent_places(board: Board, ids: np.ndarray, places: Places) -> Places:
     known = np.isfinite(steps).all(axis=2)
     along_px = np.where(known[..., None], steps, places.along_px)
     bend_px = np.where(known & np.isfinite(bends), bends, 0)
-    return Places(places.points_px, along_px, bend_px, places.clear, places.cross)
-
-
-def joined_places(first: Places, second: Places) -> Places:
-    """Concatenate two sets of places."""
-    return Places(
-        np.concatenate([first.points_px, second.points_px]),
-        np.concatenate([first.along_px, second.along_px]),
-        np.concatenate([first.bend_px, second.bend_px]),
-        first.clear,
-        first.cross,
-    )
-
-
-def chosen_places(places: Places, which: np.ndarray) -> Places:
-    """Select places by index or by mask."""
-    return Places(
-        places.points_px[which],
-        places.along_px[which],
-        places.bend_px[which],
-        places.clear,
-        places.cross,
-    )
+    return places._replace(along_px=along_px, bend_px=bend_px)
 
 
 def _places(board: Board, points_px: np.ndarray, along_px: np.ndarray) -> Places:
-    pitch_m = board.pitch_m
-    return Places(
-        points_px,
-        along_px,
-        np.zeros((len(points_px), 2)),
-        board.clear_m / pitch_m,
-        board.cross_m / pitch_m,
-    )
+    clear, cross = np.tile([[board.clear_m], [board.cross_m]], len(points_px)) / board.pitch_m
+    return Places(points_px, along_px, np.zeros((len(points_px), 2)), clear, cross)
 
 
 def mapped(source: np.ndarray, target: np.ndarray, at: np.ndarray) -> np.ndarray | None:

@@ -10,6 +10,7 @@ once. Each edge has its own blur because motion blurs one and not the other.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import erf
@@ -23,8 +24,7 @@ _MIN_PIXELS = 24
 EDGE_WIDTH_SIGMAS = 2.563
 
 
-@dataclass(frozen=True)
-class Places:
+class Places(NamedTuple):
     """First guesses of N saddles: their places and the directions and bends of their edges.
 
     Attributes:
@@ -33,33 +33,34 @@ class Places:
             and down its columns: [step, u or v].
         bend_px: (N, 2), how far the line along either step is off its tangent one step away, to
             the left of the step (in the image, y down: to its right as one looks at it).
-        clear: part of a step up to which there is nothing but the saddle.
-        cross: part of a step off both edges beyond which there may be other ink.
+        clear: (N,), part of a step up to which there is nothing but the saddle.
+        cross: (N,), part of a step off both edges beyond which there may be other ink.
     """
 
     points_px: np.ndarray
     along_px: np.ndarray
     bend_px: np.ndarray
-    clear: float
-    cross: float
+    clear: np.ndarray
+    cross: np.ndarray
+
+    def only(self, which: np.ndarray) -> "Places":
+        """The places at some indices or in a mask."""
+        return Places(*(column[which] for column in self))
 
 
-@dataclass(frozen=True)
-class Saddles:
+class Saddles(NamedTuple):
     """N fitted saddles.
 
     Attributes:
         points_px: (N, 2), the places.
         amplitude: (N,) grey levels; positive if the saddle's top left on the board is black.
         sigma_px: (N, 2), blur of the edges along x and along y.
-        noise: (N,), RMS of the residual, grey levels.
         good: (N,) bool, true if the fit converged on a saddle.
     """
 
     points_px: np.ndarray
     amplitude: np.ndarray
     sigma_px: np.ndarray
-    noise: np.ndarray
     good: np.ndarray
 
 
@@ -114,7 +115,7 @@ def fit_saddles(image: np.ndarray, places: Places, radius_px: float, max_move_px
         & (noise < _MAX_NOISE * np.abs(state[:, 7]))
         & (state[:, 4:6].max(axis=1) < 0.6 * patch.radius_px)
     )
-    return Saddles(state[:, :2], state[:, 7], state[:, 4:6], noise, good)
+    return Saddles(state[:, :2], state[:, 7], state[:, 4:6], good)
 
 
 _LONGEST_STEP = np.array([1.5, 1.5, 0.2, 0.2, 0.4, 0.4, 60.0, 60.0])
@@ -150,8 +151,8 @@ class _Patch:
         margin = 1.0 / step_px[:, None, :]
         near = np.abs(steps) + margin
         distance = np.linalg.norm(offset, axis=2)
-        mask = inside & (distance <= radius_px) & np.all(near < places.clear, axis=2)
-        mask &= np.any(near < places.cross, axis=2)
+        mask = inside & (distance <= radius_px) & np.all(near < places.clear[:, None, None], axis=2)
+        mask &= np.any(near < places.cross[:, None, None], axis=2)
         curvature = 2 * places.bend_px / step_px**2
         reached = np.where(mask, distance, 0).max(axis=1)
         grey = image[clipped[..., 1], clipped[..., 0]].astype(float)

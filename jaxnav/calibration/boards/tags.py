@@ -1,7 +1,5 @@
 """Detection of a board's tags in an image: their ids, and their corners to a pixel."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -13,23 +11,13 @@ _FEW = 0.5
 _MAX_CORRECTION = 0.4  # part of the bits that a family can correct
 
 
-@dataclass(frozen=True)
-class SeenTags:
-    """The tags of a board that were read in one image.
+def read_tags(board: Board, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+    """Read the tags of a charuco board or an aprilgrid in an image (H, W) by OpenCV's decoder.
 
-    Attributes:
-        places: (N,) int, indices into `Board.tags`.
-        corners_px: (N, 4, 2), TL TR BR BL.
-        foreign_ids: ids that were read, but are not on the board.
+    Returns:
+        Of N tags the indices (N,) into `Board.tags` and the corners (N, 4, 2), px, TL TR BR BL; and
+        the ids that were read, but are not on the board.
     """
-
-    places: np.ndarray
-    corners_px: np.ndarray
-    foreign_ids: tuple[int, ...]
-
-
-def read_tags(board: Board, image: np.ndarray) -> SeenTags:
-    """Read the tags of a charuco board or an aprilgrid in an image (H, W) by OpenCV's decoder."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.markerBorderBits = board.border_cells
@@ -50,7 +38,7 @@ def read_tags(board: Board, image: np.ndarray) -> SeenTags:
         np.roll(seen[marker_id], -board.tags[place].turns, axis=0)
         for marker_id, place in zip(own, places, strict=True)
     ]
-    return SeenTags(
+    return (
         places,
         np.array(corners, float).reshape(-1, 4, 2),
         tuple(sorted(marker_id for marker_id in seen if marker_id not in place_of)),

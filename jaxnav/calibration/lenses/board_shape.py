@@ -37,13 +37,10 @@ def check_board(fit: LensFit) -> BoardCheck:
     One camera can't see that a board is too large or too small as a whole: that scales the
     distances of all views and changes nothing else.
     """
-    seen = lens_bundle.padded_corners(fit.views)
-    rows = len(seen.corners_px)
+    seen, y = lens_bundle.padded(fit.views, fit.parameters, fit.Ts_camera_board)
     count = len(fit.views.views)
-    poses = lens_bundle.padded_poses(fit.Ts_camera_board, rows)
     weights = np.zeros(seen.present.shape)
     weights[:count] = fit.weights
-    y = LensUnknowns(jnp.asarray(fit.parameters), jnp.asarray(poses))
     free = lens_bundle.free_mask(fit.lens, fit.fixed)
     J, information, gradient = jax.device_get(
         _board_freedom(fit.lens, y, seen, jnp.asarray(weights))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from jaxnav.calibration.lenses.views import BoardViews
 from jaxnav.calibration.rigs.pose_arrays import retracted
@@ -80,22 +80,30 @@ def padded_corners(views: BoardViews) -> BoardCorners:
     return BoardCorners(np.asarray(views.points_board_m, float), corners_px, present)
 
 
-def padded_poses(Ts_camera_board: np.ndarray, rows: int) -> np.ndarray:
-    """(rows, 7): the given poses, padded with poses that face the board from 1 m away."""
-    away = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    return np.concatenate([Ts_camera_board, np.tile(away, (rows - len(Ts_camera_board), 1))])
+def padded(
+    views: BoardViews, parameters: np.ndarray, Ts_camera_board: np.ndarray
+) -> tuple[BoardCorners, LensUnknowns]:
+    """The views, and unknowns to start from, padded with empty views.
+
+    Args:
+        parameters: (9,) of the lens.
+        Ts_camera_board: (V, 7); a view whose pose is NaN faces the board from 1 m away.
+    """
+    seen = padded_corners(views)
+    poses = np.tile([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(seen.corners_px), 1))
+    known = np.flatnonzero(~np.isnan(Ts_camera_board[:, 0]))
+    poses[known] = Ts_camera_board[known]
+    return seen, LensUnknowns(jnp.asarray(parameters), jnp.asarray(poses))
 
 
-@partial(jax.jit, static_argnames=("lens", "max_steps"))
 def solve(
     lens: str,
     start: LensUnknowns,
     seen: BoardCorners,
-    weights: Float[Array, "V P"],
-    free: Bool[Array, " 9"],
-    sigma_px: Float[Array, ""],
-    cut: Float[Array, ""],
-    max_steps: int = 100,
+    weights: Shaped[Array | np.ndarray, "V P"],
+    free: Bool[Array | np.ndarray, " 9"],
+    sigma_px: float | Float[Array, ""] = 1.0,
+    cut: float | Float[Array, ""] = NO_CUT,
 ) -> Bundle:
     """Find the unknowns that explain the corners best.
 
@@ -107,6 +115,21 @@ def solve(
         free: mask of the nine shared unknowns that move.
         cut: in sigmas; `NO_CUT` for plain least squares.
     """
+    numbers = jnp.asarray(weights, float), jnp.asarray(free)
+    scalars = jnp.asarray(sigma_px), jnp.asarray(cut)
+    return jax.block_until_ready(_solved(lens, start, seen, *numbers, *scalars))
+
+
+@partial(jax.jit, static_argnames="lens")
+def _solved(
+    lens: str,
+    start: LensUnknowns,
+    seen: BoardCorners,
+    weights: Array,
+    free: Array,
+    sigma_px: Array,
+    cut: Array,
+) -> Bundle:
     weights = jnp.where(seen.present, weights, 0)
     scale = jnp.sqrt(weights) / sigma_px
 
@@ -122,7 +145,7 @@ def solve(
         SchurLM(rtol=1e-12, atol=1e-12, norm=optx.max_norm, retract=_moved, free=free),
         start,
         has_aux=True,
-        max_steps=max_steps,
+        max_steps=100,
         throw=False,
     )
     state: LMState = solution.state

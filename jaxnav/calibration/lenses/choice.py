@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import LensUnknowns
 from jaxnav.calibration.lenses.start import board_poses
 from jaxnav.calibration.lenses.views import BoardViews
 
@@ -24,21 +23,11 @@ def informative(views: BoardViews, lens: str, parameters: np.ndarray, most: int)
     """
     if len(views.views) <= most:
         return tuple(range(len(views.views)))
-    seen = lens_bundle.padded_corners(views)
     poses = board_poses(views, lens, parameters)
     posed = ~np.isnan(poses[:, 0])
-    poses = np.where(posed[:, None], poses, lens_bundle.padded_poses(poses[:0], len(poses)))
-    padded = lens_bundle.padded_poses(poses, len(seen.corners_px))
-    y = LensUnknowns(jnp.asarray(parameters), jnp.asarray(padded))
-    held = lens_bundle.solve(  # the poses alone, by pixels instead of rays
-        lens,
-        y,
-        seen,
-        jnp.asarray(seen.present, float),
-        jnp.zeros(lens_bundle.COUNT, bool),
-        jnp.asarray(1.0),
-        jnp.asarray(lens_bundle.NO_CUT),
-    )
+    seen, y = lens_bundle.padded(views, parameters, poses)
+    # The poses alone, by pixels instead of rays.
+    held = lens_bundle.solve(lens, y, seen, seen.present, np.zeros(lens_bundle.COUNT, bool))
     squared = np.sum(np.asarray(held.residual_px) ** 2, axis=(1, 2))[: len(poses)]
     rms_px = np.sqrt(squared / np.maximum([len(view.ids) for view in views.views], 1))
     sound = posed & (rms_px < _WRONG * np.median(rms_px[posed]))

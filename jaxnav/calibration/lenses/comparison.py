@@ -9,11 +9,10 @@ Source: Stone (1974), "Cross-validatory choice and assessment of statistical pre
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import COUNT, NO_CUT, LensUnknowns
+from jaxnav.calibration.lenses.bundle import COUNT, LensUnknowns
 from jaxnav.calibration.lenses.fit import LensFit
 
 _FOLDS = 4
@@ -42,28 +41,18 @@ def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
     Args:
         weights: (V, P) of the corners, the same for all lenses that are compared.
     """
-    seen = lens_bundle.padded_corners(fit.views)
+    seen, y = lens_bundle.padded(fit.views, fit.parameters, fit.Ts_camera_board)
     count, rows = len(fit.views.views), len(seen.corners_px)
     padded = np.zeros(seen.present.shape)
     padded[:count] = weights
-    free = jnp.asarray(lens_bundle.free_mask(fit.lens, fit.fixed))
-    poses = jnp.asarray(lens_bundle.padded_poses(fit.Ts_camera_board, rows))
-    y = LensUnknowns(jnp.asarray(fit.parameters), poses)
-    sigma_px, no_cut = jnp.asarray(fit.sigma_px), jnp.asarray(NO_CUT)
+    free = lens_bundle.free_mask(fit.lens, fit.fixed)
     fold = np.arange(rows) % _FOLDS
     view_px = np.full(count, np.nan)
     for number in range(_FOLDS):
-        others = jnp.asarray(np.where((fold != number)[:, None], padded, 0))
-        trained = lens_bundle.solve(fit.lens, y, seen, others, free, sigma_px, no_cut)
-        held = lens_bundle.solve(
-            fit.lens,
-            LensUnknowns(trained.unknowns.lens, poses),
-            seen,
-            jnp.asarray(padded),
-            jnp.zeros(COUNT, bool),
-            sigma_px,
-            no_cut,
-        )
+        others = np.where((fold != number)[:, None], padded, 0)
+        trained = lens_bundle.solve(fit.lens, y, seen, others, free, fit.sigma_px)
+        start = LensUnknowns(trained.unknowns.lens, y.Ts_camera_board)
+        held = lens_bundle.solve(fit.lens, start, seen, padded, np.zeros(COUNT, bool), fit.sigma_px)
         squared = np.sum(padded * np.sum(np.asarray(held.residual_px) ** 2, axis=-1), axis=1)
         freedom = 2 * np.sum(padded > 0, axis=1) - 6
         rated = np.flatnonzero((fold[:count] == number) & (freedom[:count] > 0))

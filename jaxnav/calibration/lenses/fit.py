@@ -10,7 +10,6 @@ Source: Rousseeuw and Leroy (1987), "Robust regression and outlier detection", c
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
@@ -26,6 +25,7 @@ from jaxnav.calibration.lenses.bundle import (
 )
 from jaxnav.calibration.lenses.start import board_poses, lens_start
 from jaxnav.calibration.lenses.views import BoardViews
+from jaxnav.models.camera import Camera
 
 _CUT = 2.0  # in sigmas, of Cauchy's cost
 _FAR = 5.0  # in sigmas: Gaussian noise takes one corner in 270 000 there
@@ -71,6 +71,11 @@ class LensFit:
         return NAMES[self.lens]
 
     @property
+    def camera(self) -> Camera:
+        """The fitted camera, in the process's precision."""
+        return lens_bundle.camera_of(self.lens, jnp.asarray(self.parameters, float))
+
+    @property
     def sigma(self) -> np.ndarray:
         """(9,) standard deviations of the parameters; 0 for fixed ones."""
         return np.sqrt(np.diag(self.covariance))
@@ -103,12 +108,8 @@ def fit_lens(
     count = len(views.views)
     poses = board_poses(views, lens, parameters)
     posed = ~np.isnan(poses[:, 0])
-    seen = lens_bundle.padded_corners(views)
-    rows = len(seen.corners_px)
-    problem = _Problem(lens, seen, free, np.append(posed, np.zeros(rows - count, bool)))
-    poses = np.where(posed[:, None], poses, lens_bundle.padded_poses(poses[:0], count))
-    padded = jnp.asarray(lens_bundle.padded_poses(poses, rows))
-    y = LensUnknowns(jnp.asarray(parameters), padded)
+    seen, y = lens_bundle.padded(views, parameters, poses)
+    problem = _Problem(lens, seen, free, np.pad(posed, (0, len(seen.corners_px) - count)))
 
     weights = problem.posed[:, None] * seen.present
     sigma_px = problem.typical_px(np.asarray(lens_bundle.residuals_px(lens, y, seen)))
@@ -153,17 +154,7 @@ class _Problem:
     posed: np.ndarray  # (V,) true for views with a first guess of the pose
 
     def solved(self, y: LensUnknowns, weights: np.ndarray, sigma_px: float, cut: float) -> Bundle:
-        return jax.block_until_ready(
-            lens_bundle.solve(
-                self.lens,
-                y,
-                self.seen,
-                jnp.asarray(weights, float),
-                jnp.asarray(self.free),
-                jnp.asarray(sigma_px),
-                jnp.asarray(cut),
-            )
-        )
+        return lens_bundle.solve(self.lens, y, self.seen, weights, self.free, sigma_px, cut)
 
     def view_sigma_px(self, residual_px: np.ndarray) -> np.ndarray:
         """(V,) sigma by the median, so up to half the corners may be wrong; inf without a pose.

@@ -9,12 +9,11 @@ detection and fit are repeated, each with the last lens, until the lens stays th
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.images import CollectedViews, collect_views
-from jaxnav.calibration.lenses.bundle import FITTED, camera_of
+from jaxnav.calibration.lenses.bundle import FITTED
 from jaxnav.calibration.lenses.fit import LensFit, fit_lens
 from jaxnav.calibration.lenses.intrinsics import (
     FEWEST_VIEWS,
@@ -22,7 +21,7 @@ from jaxnav.calibration.lenses.intrinsics import (
     calibrate_lens,
     within_reach,
 )
-from jaxnav.calibration.lenses.screening import screened
+from jaxnav.calibration.lenses.views import screened
 from jaxnav.models.camera import Camera
 
 _LOOKS = 5
@@ -68,7 +67,7 @@ def _camera_of_marker(
     before: LensFit | None = None
     for look in range(_LOOKS):
         tell(f"look {look + 1}")
-        seen_by = None if before is None else _camera(before)
+        seen_by = None if before is None else before.camera
         views, _ = screened(collect_views(board, sources, seen_by, headless=headless).views)
         if len(views.views) < FEWEST_VIEWS:
             return seen_by
@@ -78,13 +77,9 @@ def _camera_of_marker(
             fits.append(fit_lens(views, one, start=start))
         best = within_reach(min(fits, key=lambda fit: fit.sigma_px), tell)
         if before is not None and _stays(before, best):
-            return _camera(best)
+            return best.camera
         before = best
-    return _camera(best)
-
-
-def _camera(fit: LensFit) -> Camera:
-    return camera_of(fit.lens, jnp.asarray(fit.parameters, float))
+    return best.camera
 
 
 def _stays(before: LensFit, fit: LensFit) -> bool:

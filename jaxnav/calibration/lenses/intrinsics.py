@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
@@ -17,9 +16,8 @@ from jaxnav.calibration.lenses.advice import advice, findings
 from jaxnav.calibration.lenses.checks import reach, rim_sigma_px, tilts_deg
 from jaxnav.calibration.lenses.choice import informative
 from jaxnav.calibration.lenses.fit import LensFit, fit_lens
-from jaxnav.calibration.lenses.screening import screened
 from jaxnav.calibration.lenses.start import lens_start
-from jaxnav.calibration.lenses.views import BoardViews
+from jaxnav.calibration.lenses.views import BoardViews, screened
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
 
@@ -72,7 +70,7 @@ class LensCalibration:
     @property
     def camera(self) -> Camera:
         """The calibrated camera, in the process's precision."""
-        return lens_bundle.camera_of(self.fit.lens, jnp.asarray(self.fit.parameters, float))
+        return self.fit.camera
 
 
 def calibrate_lens(
@@ -101,7 +99,11 @@ def calibrate_lens(
     tell("start")
     starts = {one: lens_start(good, one) for one in lenses}
     rough = min(starts, key=lambda one: starts[one][1])
-    _require_board(starts[rough][1], good.image_size_px[0], where)
+    misfit_px = starts[rough][1]
+    # A wrong board fits no view, and the search would take long to show it.
+    if misfit_px > _NO_START * good.image_size_px[0]:
+        problem = f"no lens explains the corners to less than {misfit_px:.2g} px: {_WHICH_BOARD}"
+        raise BadInput(where, problem)
     tell("choose")
     chosen = informative(good, rough, starts[rough][0], max_views)
     good = replace(good, views=tuple(good.views[i] for i in chosen))
@@ -115,7 +117,11 @@ def calibrate_lens(
             _require_sound(fits[one], where)
     tell("compare")
     compared = _compared(fits)
-    best = lens if lens != "auto" else _best(fits, compared)
+    best = lens
+    if lens == "auto" and compared:
+        best = lens_comparison.best_lens(compared)
+    elif lens == "auto":
+        best = min(fits, key=lambda one: fits[one].sigma_px)
     tell("check")
     _require_sound(fits[best], where)
     better = min(compared, key=lambda one: compared[one].rms_px, default=best)
@@ -168,12 +174,6 @@ def _compared(fits: dict[str, LensFit]) -> dict[str, lens_comparison.HeldOut]:
     return {one: lens_comparison.held_out(fit, trusted.weights) for one, fit in fits.items()}
 
 
-def _best(fits: dict[str, LensFit], compared: dict[str, lens_comparison.HeldOut]) -> str:
-    if compared:
-        return lens_comparison.best_lens(compared)
-    return min(fits, key=lambda one: fits[one].sigma_px)
-
-
 def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
     """Refit the lens with coefficients that the corners don't determine held at zero."""
     width = fit.views.image_size_px[0]
@@ -191,11 +191,6 @@ def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
 
 
 def _require_sound(fit: LensFit, where: str) -> None:
-    _require_agreement(fit, where)
-    _require_tilt(fit, where)
-
-
-def _require_agreement(fit: LensFit, where: str) -> None:
     width = fit.views.image_size_px[0]
     kept = int(np.sum(fit.view_weights > 0))
     if fit.sigma_px > _WRONG_BOARD * width or kept < max(FEWEST_VIEWS, len(fit.view_weights) / 2):
@@ -204,17 +199,6 @@ def _require_agreement(fit: LensFit, where: str) -> None:
             f"the corners miss lens {fit.lens} by {fit.sigma_px:.2g} px and {kept} of "
             f"{len(fit.view_weights)} views agree: {_WHICH_BOARD}",
         )
-
-
-def _require_board(misfit_px: float, width: int, where: str) -> None:
-    # A wrong board fits no view, and the search would take long to show it.
-    if misfit_px > _NO_START * width:
-        raise BadInput(
-            where, f"no lens explains the corners to less than {misfit_px:.2g} px: {_WHICH_BOARD}"
-        )
-
-
-def _require_tilt(fit: LensFit, where: str) -> None:
     _, spread_deg = tilts_deg(fit)
     if spread_deg < _LEAST_SPREAD_DEG:
         raise BadInput(

@@ -31,7 +31,10 @@ def lens_start(views: BoardViews, lens: str) -> tuple[np.ndarray, float]:
     """
     some = np.unique(np.linspace(0, len(views.views) - 1, _MOST_VIEWS).round().astype(int))
     few = BoardViews(views.points_board_m, views.image_size_px, tuple(views.views[i] for i in some))
-    candidates = [*_focal_lengths(views.image_size_px), *_opencv(few, lens)]
+    width, height = views.image_size_px
+    middle = [(width - 1) / 2, (height - 1) / 2, *[0.0] * 5]
+    guesses = [np.array([f * width, f * width, *middle]) for f in _FOCALS]
+    candidates = [*guesses, *_opencv(few, lens)]
     misfits_px = [_misfit_px(few, lens, candidate) for candidate in candidates]
     best = int(np.argmin(misfits_px))
     return candidates[best], misfits_px[best]
@@ -96,21 +99,10 @@ def _misfit_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:
     """Median distance of a corner from its prediction, px; infinite if half have no pose."""
     poses = board_poses(views, lens, parameters)
     lost = np.isnan(poses[:, 0])
-    seen = lens_bundle.padded_corners(views)
-    rows = len(seen.corners_px)
-    unknowns = lens_bundle.LensUnknowns(
-        jnp.asarray(parameters),
-        jnp.asarray(lens_bundle.padded_poses(np.where(lost[:, None], [1, *6 * [0]], poses), rows)),
-    )
+    seen, unknowns = lens_bundle.padded(views, parameters, poses)
     residual_px = np.linalg.norm(lens_bundle.residuals_px(lens, unknowns, seen), axis=2)
     residual_px[: len(lost)][lost] = np.inf
     return float(np.median(residual_px[np.asarray(seen.present)]))
-
-
-def _focal_lengths(image_size_px: tuple[int, int]) -> Iterator[np.ndarray]:
-    width, height = image_size_px
-    for focal_px in _FOCALS * width:
-        yield np.array([focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, *[0.0] * 5])
 
 
 def _opencv(views: BoardViews, lens: str) -> Iterator[np.ndarray]:

@@ -14,7 +14,8 @@ gain * steering / wheelbase; only the car's sideslip, and the bend of the tangen
 tell one from the other. The delay shows where speed or steering change.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,8 +29,8 @@ from jaxnav.calibration.odometry.drive import (
 )
 from jaxnav.calibration.odometry.fit import OdometryFit, Prior, fit
 from jaxnav.calibration.odometry.model import FULL_WEIGHT, NAMES, Model
-from jaxnav.calibration.odometry.motion import STEERED_LITTLE, DriveStatistics, driven_m
-from jaxnav.calibration.odometry.start import LOOSE, TIGHT, Trust, start
+from jaxnav.calibration.odometry.motion import STEERED_LITTLE, cannot_tell, driven_m
+from jaxnav.calibration.odometry.start import LOOSE, TIGHT, start
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -49,7 +50,7 @@ _GAIN_SIGMA = 0.1  # of a gain that was kept, for its effect on the offset's sig
 _LEAST_WAY_M = 1.0
 _REFUSED_CHI2, _AGAIN_CHI2 = 4.0, 1.2  # per degree of freedom
 _MOST_OUTLIERS, _AGAIN_OUTLIERS = 0.3, 0.05
-_OTHER = (Trust(per_m=0.1, per_rad=0.1), TIGHT, TIGHT)  # for further starts
+_OTHER = (0.1, TIGHT, TIGHT)  # errors of the odometry, for further starts
 
 _WHY = {
     "wheelbase_m": "steering gain and wheelbase can't be told apart: drive circles at full lock "
@@ -127,26 +128,6 @@ def calibrate_odometry(
             each other; the message names the drives and says what to do.
     """
     where = ", ".join(drive.name for drive in drives)
-    try:
-        return _calibrated(where, drives, rig, markers, before, fixed, wheelbase_sigma_m, progress)
-    except np.linalg.LinAlgError:
-        problem = (
-            "odometry, cameras and map have no course of a car in common that can be computed: "
-            "check --markers-file, --rig and --vehicle"
-        )
-        raise BadInput(where, problem) from None
-
-
-def _calibrated(
-    where: str,
-    drives: Sequence[Drive],
-    rig: CameraRig,
-    markers: MarkerMap,
-    before: Mapping[str, float],
-    fixed: Sequence[str],
-    wheelbase_sigma_m: float | None,
-    progress: Callable[[], object],
-) -> OdometryCalibration:
     theta = np.array([before[name] for name in NAMES])
     course = lay_out(drives)
     sigma = reading_sigma(course.intervals)
@@ -158,34 +139,35 @@ def _calibrated(
         )
         raise BadInput(where, problem)
     why = dict.fromkeys(fixed, "as told by --fix")
-    motion = DriveStatistics.of(course.intervals, sigma)
-    why |= motion.cannot_tell(where, fixed)
+    untold, steering_rad = cannot_tell(course.intervals, sigma, where, fixed)
+    why |= untold
     information = np.zeros(len(NAMES))
     if wheelbase_sigma_m is not None:
         information[NAMES.index("wheelbase_m")] = wheelbase_sigma_m**-2
     prior = Prior(theta, information)
     search = _Search(Model(course, rig, markers, sigma), course, rig, markers, prior, progress)
-    solution = search.best(theta, why)
-    chi2 = _chi2_per_dof(solution, course)
-    outliers = solution.blocks.view_chi2 > FULL_WEIGHT
-    _refuse_contradiction(where, solution, chi2, outliers)
-    while (name := _least_sure(solution, why, max(chi2, 1.0))) is not None:
-        if name == "speed_scale":
-            problem = (
-                "the drive does not tell the scale of the speed to 2 %: drive further, along "
-                "and around a marker, in view of the cameras"
-            )
-            raise BadInput(where, problem)
-        why[name] = _WHY[name]
-        solution = search.again(solution, why)
+    with _computable(where):
+        solution = search.best(theta, why)
         chi2 = _chi2_per_dof(solution, course)
         outliers = solution.blocks.view_chi2 > FULL_WEIGHT
-    _refuse_contradiction(where, solution, chi2, outliers)
-    free = [name for name in NAMES if name not in why]
-    covariance = np.linalg.inv(solution.information) * max(chi2, 1.0)
-    if why.get("steering_gain") == STEERED_LITTLE and "steering_offset_rad" in free:
-        row = free.index("steering_offset_rad")
-        covariance[row, row] += (_GAIN_SIGMA * motion.steering_rad) ** 2
+        _refuse_contradiction(where, solution, chi2, outliers)
+        while (name := _least_sure(solution, why, max(chi2, 1.0))) is not None:
+            if name == "speed_scale":
+                problem = (
+                    "the drive does not tell the scale of the speed to 2 %: drive further, along "
+                    "and around a marker, in view of the cameras"
+                )
+                raise BadInput(where, problem)
+            why[name] = _WHY[name]
+            solution = search.again(solution, why)
+            chi2 = _chi2_per_dof(solution, course)
+            outliers = solution.blocks.view_chi2 > FULL_WEIGHT
+        _refuse_contradiction(where, solution, chi2, outliers)
+        free = [name for name in NAMES if name not in why]
+        covariance = np.linalg.inv(solution.information) * max(chi2, 1.0)
+        if why.get("steering_gain") == STEERED_LITTLE and "steering_offset_rad" in free:
+            row = free.index("steering_offset_rad")
+            covariance[row, row] += (_GAIN_SIGMA * steering_rad) ** 2
     deviation = np.sqrt(np.diag(covariance))
     return OdometryCalibration(
         before={name: float(before[name]) for name in NAMES},
@@ -206,6 +188,19 @@ def _calibrated(
         duration_s=course.duration_s,
         advice=_advice(why, chi2, outliers, wheelbase_sigma_m),
     )
+
+
+@contextmanager
+def _computable(where: str) -> Iterator[None]:
+    """Turn equations that can't be solved into `BadInput`."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        problem = (
+            "odometry, cameras and map have no course of a car in common that can be computed: "
+            "check --markers-file, --rig and --vehicle"
+        )
+        raise BadInput(where, problem) from None
 
 
 @dataclass(frozen=True)
@@ -232,8 +227,8 @@ class _Search:
             solution = min(solution, other, key=lambda one: one.blocks.cost)
         return solution
 
-    def _started(self, theta: np.ndarray, fixed: Mapping[str, str], trust: Trust) -> OdometryFit:
-        nodes = start(self.course, self.rig, self.markers, theta, trust)
+    def _started(self, theta: np.ndarray, fixed: Mapping[str, str], error: float) -> OdometryFit:
+        nodes = start(self.course, self.rig, self.markers, theta, error)
         return self._from(nodes, theta, fixed)
 
     def again(self, solution: OdometryFit, fixed: Mapping[str, str]) -> OdometryFit:

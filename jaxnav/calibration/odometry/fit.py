@@ -17,6 +17,7 @@ from jaxnav.numerics.levenberg_marquardt import adapted
 
 _BELOW = NODE + NEXT - 1  # diagonals below the main one
 _RTOL = 1e-9
+_MOST_STEPS = 100
 _HOLDS = 1e-9  # of a pose that nothing tells of, as the last of a stretch before its first view
 
 
@@ -59,7 +60,6 @@ def fit(
     free: np.ndarray,
     prior: Prior,
     progress: Callable[[], object] = lambda: None,
-    most_steps: int = 100,
 ) -> OdometryFit:
     """Search the nearest minimum from a start, with Nielsen's damping relative to the diagonal.
 
@@ -81,20 +81,20 @@ def fit(
 
     cost, blocks = evaluated(nodes, theta)
     damping, growth, converged = 1e-3, 2.0, False
-    for _ in range(most_steps):
+    for _ in range(_MOST_STEPS):
         system = _System.of(blocks, theta, free, prior)
         try:
-            moved = system.solved(damping)
+            step_nodes, step_theta, promised = system.solved(damping)
         except LinAlgError:
             damping *= 10.0
             continue
-        new_nodes, new_theta = nodes + moved.nodes, theta.copy()
-        new_theta[free] += moved.theta
+        new_nodes, new_theta = nodes + step_nodes, theta.copy()
+        new_theta[free] += step_theta
         possible = bool(new_theta[0] > 0 and new_theta[3] > 0)
         new_cost, new_blocks = evaluated(new_nodes, new_theta) if possible else (np.inf, blocks)
-        gained = (cost - new_cost) / max(moved.promised, 1e-300)
+        gained = (cost - new_cost) / max(promised, 1e-300)
         damping, growth = map(float, adapted(damping, growth, new_cost < cost, gained))
-        converged = moved.promised <= _RTOL * cost or damping > 1e12
+        converged = promised <= _RTOL * cost or damping > 1e12
         if new_cost < cost:
             nodes, theta, blocks, cost = new_nodes, new_theta, new_blocks, new_cost
         if converged:
@@ -106,13 +106,6 @@ def fit(
         blocks,
         converged,
     )
-
-
-@dataclass(frozen=True)
-class _Step:
-    nodes: np.ndarray
-    theta: np.ndarray
-    promised: float  # decrease of the cost by the quadratic model
 
 
 @dataclass(frozen=True)
@@ -157,16 +150,13 @@ class _System:
             of_theta[free],
         )
 
-    def reduced(self, damping: float = 0.0) -> np.ndarray:
-        """(p, p): the parameters' information with the nodes eliminated.
+    def reduced(self) -> np.ndarray:
+        """(p, p): the parameters' information with the nodes eliminated; raises as `solved`."""
+        return self._eliminated(0.0)[0]
 
-        Raises:
-            LinAlgError: as `solved`.
-        """
-        return self._eliminated(damping)[0]
-
-    def solved(self, damping: float) -> _Step:
-        """Solve for the damped step.
+    def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """The damped step of the nodes and of the parameters, and the decrease of the cost that the
+        quadratic model promises.
 
         Raises:
             LinAlgError: the damped equations are not positive definite.
@@ -179,7 +169,7 @@ class _System:
             np.sum(self.band[0] * nodes**2) + np.sum(np.diag(self.corner) * theta**2)
         )
         promised = extra - self.gradient_nodes @ nodes - self.gradient_theta @ theta
-        return _Step(nodes.reshape(-1, NODE), theta, float(promised))
+        return nodes.reshape(-1, NODE), theta, float(promised)
 
     def _eliminated(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
         """The Schur complement, and the band's inverse times border and gradient."""

@@ -60,8 +60,8 @@ class Model:
     def __init__(self, course: Course, rig: CameraRig, markers: MarkerMap, sigma: ReadingSigma):
         self._count = len(course.intervals.dt_s), len(course.views.time_s)
         intervals, views = (
-            Intervals(*_padded(course.intervals)),
-            MarkerViews(*_padded(course.views)),
+            Intervals(*padded(course.intervals)),
+            MarkerViews(*padded(course.views)),
         )
         # Padding intervals link nothing and begin after all others.
         intervals.begin_s[self._count[0] :] = np.inf
@@ -193,7 +193,7 @@ def _blocks(
     return cost, information, gradient, chi2, px.reshape(-1, 4, 2)
 
 
-def _padded(columns: Intervals | MarkerViews) -> list[np.ndarray]:
+def padded(columns: Intervals | MarkerViews) -> list[np.ndarray]:
     """Pad columns to a multiple of `_PADDED` rows by repeating the last row."""
     extra = -len(columns[0]) % _PADDED
     return [np.concatenate([column, np.repeat(column[-1:], extra, axis=0)]) for column in columns]

@@ -1,7 +1,6 @@
 """Statistics of a car's motion in a drive, which decide which parameters it can determine."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,59 +34,44 @@ def driven_m(intervals: Intervals) -> float:
     return float(np.sum(np.abs(speed_mps) * dt_s * size))
 
 
-@dataclass(frozen=True)
-class DriveStatistics:
-    """Mean and spread of a car's speed and steering, with the sensors' noise subtracted.
+def cannot_tell(
+    intervals: Intervals, sigma: ReadingSigma, where: str, fixed: Sequence[str]
+) -> tuple[dict[str, str], float]:
+    """Name -> why this motion can't determine the parameter, whatever was seen.
 
-    Attributes:
-        speed_mps: mean of the absolute speed.
-        varied_mps: standard deviation of the speed.
-        steering_rad: mean of the steering, weighted by distance.
-        varied_rad: standard deviation of the steering, weighted by distance.
+    Mean and spread of speed and steering, the latter weighted by distance, are those of means of
+    blocks of readings, which have little noise; what noise they have is subtracted.
+
+    Returns:
+        The reasons, and the mean steering, rad.
+
+    Raises:
+        BadInput: the steering was turned and constant, so its gain and its offset are one.
     """
+    speed, size = _means(intervals, intervals.speed_mps)
+    steering, _ = _means(intervals, intervals.steering_rad)
+    weight = np.abs(speed) / np.sum(np.abs(speed))
 
-    speed_mps: float
-    varied_mps: float
-    steering_rad: float
-    varied_rad: float
+    def beyond_noise(variance: float, noise: float) -> float:
+        return float(np.sqrt(max(variance - noise**2 / size, 0.0)))
 
-    @staticmethod
-    def of(intervals: Intervals, sigma: ReadingSigma) -> "DriveStatistics":
-        """Compute the motion from means of blocks of readings, which have little noise."""
-        speed, size = _means(intervals, intervals.speed_mps)
-        steering, _ = _means(intervals, intervals.steering_rad)
-        weight = np.abs(speed) / np.sum(np.abs(speed))
-
-        def beyond_noise(variance: float, noise: float) -> float:
-            return float(np.sqrt(max(variance - noise**2 / size, 0.0)))
-
-        middle = float(weight @ steering)
-        return DriveStatistics(
-            float(np.mean(np.abs(speed))),
-            beyond_noise(float(np.var(speed)), sigma.speed_mps),
-            middle,
-            beyond_noise(float(weight @ (steering - middle) ** 2), sigma.steering_rad),
+    steering_rad = float(weight @ steering)
+    varied_mps = beyond_noise(float(np.var(speed)), sigma.speed_mps)
+    varied_rad = beyond_noise(float(weight @ (steering - steering_rad) ** 2), sigma.steering_rad)
+    steered = varied_rad >= _VARIED_RAD
+    aside = abs(steering_rad) >= _ASIDE_RAD
+    if aside and not steered and not {"steering_gain", "steering_offset_rad"} & set(fixed):
+        problem = (
+            f"the steering stood at {steering_rad:.2f} rad all the time, where its gain "
+            "and its offset are one: drive eights, to both sides, or give --fix "
+            "steering_offset_rad"
         )
-
-    def cannot_tell(self, where: str, fixed: Sequence[str]) -> dict[str, str]:
-        """Name -> why this motion can't determine the parameter, whatever was seen.
-
-        Raises:
-            BadInput: the steering was turned and constant, so its gain and its offset are one.
-        """
-        steered = self.varied_rad >= _VARIED_RAD
-        aside = abs(self.steering_rad) >= _ASIDE_RAD
-        if aside and not steered and not {"steering_gain", "steering_offset_rad"} & set(fixed):
-            problem = (
-                f"the steering stood at {self.steering_rad:.2f} rad all the time, where its gain "
-                "and its offset are one: drive eights, to both sides, or give --fix "
-                "steering_offset_rad"
-            )
-            raise BadInput(where, problem)
-        reasons = {}
-        if not steered and not aside:
-            reasons["steering_gain"] = STEERED_LITTLE
-            reasons["wheelbase_m"] = _TURNED_LITTLE
-        if not steered and self.varied_mps < max(_VARIED_MPS, _VARIED_SHARE * self.speed_mps):
-            reasons["camera_delay_s"] = _CHANGED_LITTLE
-        return {name: why for name, why in reasons.items() if name not in fixed}
+        raise BadInput(where, problem)
+    reasons = {}
+    if not steered and not aside:
+        reasons["steering_gain"] = STEERED_LITTLE
+        reasons["wheelbase_m"] = _TURNED_LITTLE
+    speed_mps = float(np.mean(np.abs(speed)))
+    if not steered and varied_mps < max(_VARIED_MPS, _VARIED_SHARE * speed_mps):
+        reasons["camera_delay_s"] = _CHANGED_LITTLE
+    return {name: why for name, why in reasons.items() if name not in fixed}, steering_rad

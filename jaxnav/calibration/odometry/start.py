@@ -5,8 +5,6 @@ the present odometry best: Viterbi (1967). Between the chosen poses the course f
 and the remaining error is spread over it.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -14,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnav.calibration.odometry.drive import Course, Intervals, MarkerViews
-from jaxnav.calibration.odometry.model import NODE, corrected
+from jaxnav.calibration.odometry.model import NODE, corrected, padded
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import planar_from_T_world_vehicle
 from jaxnav.models.markers import MarkerMap
@@ -25,50 +23,33 @@ _MOST = 25.0  # largest cost of a view, or of a step between two: some detection
 _ANCHORS_APART_S = 0.2
 
 
-class Trust(NamedTuple):
-    """The allowed error of the odometry between two views in a row, whose own poses are rough.
-
-    Attributes:
-        step_m, step_rad: constant part.
-        per_m, per_rad: additional part for every metre driven and every radian turned.
-    """
-
-    step_m: float = 0.1
-    step_rad: float = 0.15
-    per_m: float = 0.2
-    per_rad: float = 0.2
-
-
-LOOSE = Trust()  # for parameters that are still wrong
-TIGHT = Trust(per_m=0.02, per_rad=0.02)  # for parameters that are nearly right
-
-
-class _Chosen(NamedTuple):
-    poses: np.ndarray  # (V, 3), one of the two of each view
-    good: np.ndarray  # (V,), true if the pose fits one of its neighbours
+# Between two views in a row, whose own poses are rough, the odometry may be off by so much, and by
+# a part of what it drove and turned: 0.2 with wrong parameters, 0.02 with nearly right ones.
+_STEP_M, _STEP_RAD = 0.1, 0.15
+LOOSE, TIGHT = 0.2, 0.02
 
 
 def start(
-    course: Course, rig: CameraRig, markers: MarkerMap, theta: np.ndarray, trust: Trust = LOOSE
+    course: Course, rig: CameraRig, markers: MarkerMap, theta: np.ndarray, error: float = LOOSE
 ) -> np.ndarray:
     """Find a first guess of the (N + 1, 5) nodes, see `model`.
 
     Args:
         theta: (5,), the present parameters.
-        trust: trust in the odometry with these parameters.
+        error: of the odometry with these parameters, as a part of what it drove and turned.
     """
     times_s = course.node_times_s
     led = _led(course.intervals, theta)
-    chosen = _branches(course, rig, markers, theta, times_s, led, trust)
+    chosen, good = _branches(course, rig, markers, theta, times_s, led, error)
     seen_s = course.views.time_s - theta[4]
     nodes = np.zeros((len(times_s), NODE))
     begins = np.concatenate([[0], np.flatnonzero(course.intervals.linked == 0) + 1])
     ends = np.concatenate([begins[1:], [len(times_s)]])
     for begin, end in zip(begins, ends, strict=True):
-        own = (course.views.first == begin) & chosen.good
+        own = (course.views.first == begin) & good
         if not own.any():
             own = course.views.first == begin
-        anchor_s, poses = _thinned(seen_s[own], chosen.poses[own])
+        anchor_s, poses = _thinned(seen_s[own], chosen[own])
         nodes[begin:end, :3] = _bent(times_s[begin:end], led[begin:end], anchor_s, poses)
     return nodes
 
@@ -87,8 +68,8 @@ def _led(intervals: Intervals, theta: np.ndarray) -> np.ndarray:
     extra = -len(intervals.dt_s) % 512  # drives of about one length share a program
     speed, steering = corrected(jnp.asarray(theta), intervals.speed_mps, intervals.steering_rad)
     columns = (speed, steering, np.where(intervals.linked > 0, intervals.dt_s, 0.0))
-    padded = [jnp.asarray(np.pad(column, (0, extra))) for column in columns]
-    moved = np.asarray(run(*padded, jnp.asarray(theta[3])))[: len(intervals.dt_s)]
+    rows = [jnp.asarray(np.pad(column, (0, extra))) for column in columns]
+    moved = np.asarray(run(*rows, jnp.asarray(theta[3])))[: len(intervals.dt_s)]
     return np.concatenate([np.zeros((1, 3)), moved])
 
 
@@ -99,9 +80,10 @@ def _branches(
     theta: np.ndarray,
     times_s: np.ndarray,
     led: np.ndarray,
-    trust: Trust,
-) -> _Chosen:
-    """Choose one of the two poses of every view, by the least total cost."""
+    error: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(V, 3): one of the two poses of each view, by the least total cost; and (V,), true where it
+    fits one of its neighbours."""
     views = course.views
     poses, cost = _both_poses(views, rig, markers)
     at = np.column_stack([np.interp(views.time_s - theta[4], times_s, c) for c in led.T])
@@ -110,7 +92,7 @@ def _branches(
     steps = np.zeros((len(at), 2, 2))
     for v in range(1, len(at)):
         if not new[v]:
-            steps[v] = _step_cost(at[v - 1], at[v], poses[v - 1], poses[v], trust)
+            steps[v] = _step_cost(at[v - 1], at[v], poses[v - 1], poses[v], error)
         through = total[:, None] + steps[v]
         came[v] = np.argmin(through, axis=0)
         total = through[came[v], [0, 1]] + cost[v]
@@ -124,17 +106,15 @@ def _branches(
     step_costs[new] = _MOST
     following = np.concatenate([step_costs[1:], [_MOST]])
     good = (own < _MOST) & (np.minimum(step_costs, following) < _MOST / 2)
-    return _Chosen(poses[rows, ways], good)
+    return poses[rows, ways], good
 
 
 def _both_poses(
     views: MarkerViews, rig: CameraRig, markers: MarkerMap
 ) -> tuple[np.ndarray, np.ndarray]:
     """(V, 2, 3) planar poses of the vehicle, and (V, 2) the costs of their corner residuals."""
-    extra = -len(views.camera) % 512
-    rows = np.concatenate([np.arange(len(views.camera)), np.zeros(extra, int)])
-    padded = jax.tree.map(lambda column: jnp.asarray(column[rows]), views)
-    poses, distance = jax.device_get(_poses_of_views(rig, markers, padded))
+    columns = jax.tree.map(jnp.asarray, MarkerViews(*padded(views)))
+    poses, distance = jax.device_get(_poses_of_views(rig, markers, columns))
     count = len(views.camera)
     cost = np.sum(distance[:count] ** 2, axis=2)
     cost = np.where(np.isfinite(cost), np.minimum(cost, _MOST), _MOST)
@@ -164,24 +144,23 @@ def _poses_of_views(
             distance = jnp.sqrt(jnp.sum(off_px**2, axis=1)) / view.sigma_px
             return planar_from_T_world_vehicle(T_world_vehicle), distance
 
-        poses, distance = jax.vmap(posed)(Ts_camera_marker.wxyz_xyz)
-        return poses, distance
+        return jax.vmap(posed)(Ts_camera_marker.wxyz_xyz)
 
-    poses, distance = jax.vmap(one)(views)
-    return poses, distance
+    return jax.vmap(one)(views)
 
 
 def _step_cost(
-    a: np.ndarray, b: np.ndarray, befores: np.ndarray, afters: np.ndarray, trust: Trust
+    a: np.ndarray, b: np.ndarray, befores: np.ndarray, afters: np.ndarray, error: float
 ) -> np.ndarray:
     """(2, 2): costs of the steps from each of two poses to each of the next two, by odometry."""
     turn = b[2] - a[2]
     led_m = _turned(b[:2] - a[:2], -a[2])
     seen_m = _turned(afters[None, :, :2] - befores[:, None, :2], -befores[:, None, 2])
     off_m = np.linalg.norm(seen_m - led_m, axis=-1)
-    off_rad = np.abs(_wrapped(afters[None, :, 2] - befores[:, None, 2] - turn))
-    off_m = off_m / (trust.step_m + trust.per_m * float(np.linalg.norm(led_m)))
-    off_rad = off_rad / (trust.step_rad + trust.per_rad * abs(turn))
+    off_rad = afters[None, :, 2] - befores[:, None, 2] - turn
+    off_rad = np.abs((off_rad + np.pi) % (2 * np.pi) - np.pi)
+    off_m = off_m / (_STEP_M + error * float(np.linalg.norm(led_m)))
+    off_rad = off_rad / (_STEP_RAD + error * abs(turn))
     return np.asarray(np.minimum(off_m**2 + off_rad**2, _MOST))
 
 
@@ -205,7 +184,6 @@ def _bent(
     psi = poses[:, 2] + 2 * np.pi * np.cumsum(
         np.round(np.diff(at[:, 2] - poses[:, 2], prepend=at[0, 2] - poses[0, 2]) / (2 * np.pi))
     )
-    bent = np.zeros_like(led)
     leg = np.clip(np.searchsorted(anchor_s, times_s, side="right") - 1, 0, len(anchor_s) - 1)
     following = np.minimum(leg + 1, len(anchor_s) - 1)
 
@@ -216,15 +194,10 @@ def _bent(
 
     span = np.maximum(anchor_s[following] - anchor_s[leg], 1e-9)
     share = np.clip((times_s - anchor_s[leg]) / span, 0.0, 1.0)[:, None]
-    bent = (1 - share) * from_anchor(leg) + share * from_anchor(following)
-    return np.asarray(bent)
+    return np.asarray((1 - share) * from_anchor(leg) + share * from_anchor(following))
 
 
 def _turned(vectors: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
     cosine, sine = np.cos(angle), np.sin(angle)
     x, y = vectors[..., 0], vectors[..., 1]
     return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -111,10 +111,8 @@ def calibrate_rig(
     Raises:
         BadInput: no sighting defines the world frame, or no camera can be linked.
     """
-    given = Ts_vehicle_camera(rig)
-    start = _start(views, rig, given, known, reference_camera, refine_lenses)
-    views, links, linker = start.views, start.links, start.linker
-    free = _free(views, rig, start, known, reference_camera, refine_lenses)
+    start = _start(views, rig, known, reference_camera, refine_lenses)
+    views, free = start.linker.views, start.free
     poses, turned, adjusted = start.poses, 0, None
     sigma_px = bundle.sigma_px_of(
         np.asarray(bundle.reprojection_residuals_px(poses, bundle.seen(rig, views, 1.0)))
@@ -122,59 +120,36 @@ def calibrate_rig(
     for _ in range(_ROUNDS):
         adjusted, used_px = _adjusted(rig, views, poses, free, sigma_px)
         sigma_px = bundle.sigma_px_of(np.asarray(adjusted.residuals_px))
-        poses, changed = other_branches(rig, linker, links, adjusted.poses, free, sigma_px)
+        poses, changed = other_branches(
+            rig, start.linker, start.links, adjusted.poses, free, sigma_px
+        )
         turned += changed
         if not changed:
             break
     assert adjusted is not None  # there is a round
-    return _calibration(views, rig, given, start, adjusted, free, used_px, turned)
-
-
-def _free(
-    views: RigViews,
-    rig: CameraRig,
-    start: "_Start",
-    known: Mapping[int, np.ndarray],
-    reference_camera: int | None,
-    refine_lenses: bool,
-) -> np.ndarray:
-    """(S, 6) mask of the shared unknowns that move, see `bundle.RigUnknowns`."""
-    C, M = len(rig), len(views.size_m)
-    sixes = (C, M, 2 * C if refine_lenses else 0)
-    cameras, markers, lenses = (np.zeros((count, 6), bool) for count in sixes)
-    if reference_camera is not None:
-        cameras[start.calibrated] = True
-        cameras[reference_camera] = False
-    markers[start.mapped] = True
-    markers[list(known)] = False
-    if refine_lenses:
-        for index in np.flatnonzero(start.calibrated):
-            camera = rig.cameras
-            lens = camera.lenses[int(camera.lens_index[index])]
-            figures = np.arange(12) < 4 + LENS_COEFFICIENTS[lens]
-            lenses[index], lenses[C + index] = figures[:6], figures[6:]
-    return np.concatenate([cameras, markers, lenses])
+    return _calibration(rig, start, adjusted, used_px, turned)
 
 
 @dataclass(frozen=True)
 class _Start:
-    views: RigViews
     links: Links
     linker: Linker
     poses: bundle.RigUnknowns
+    given: np.ndarray  # (C, 4, 4), T_vehicle_camera
     calibrated: np.ndarray
     mapped: np.ndarray
+    free: np.ndarray  # (S, 6), mask of the shared unknowns that move, see `bundle.RigUnknowns`
 
 
 def _start(
     views: RigViews,
     rig: CameraRig,
-    given: np.ndarray,
     known: Mapping[int, np.ndarray],
     reference_camera: int | None,
     refine_lenses: bool,
 ) -> _Start:
     """Link cameras and markers, and leave out those that can't be linked."""
+    given = Ts_vehicle_camera(rig)
     rays = rays_camera(rig, views)
     Ts_camera_marker = both_poses(rays, views.size_m[views.marker])
     sound = np.isfinite(Ts_camera_marker).all(axis=(1, 2, 3))
@@ -203,18 +178,31 @@ def _start(
 
     linker = linker.only(rows)
     Ts_vehicle_world = linker.sights(links).Ts_cameras_markers[:, 0]
+    C, M = len(rig), len(views.size_m)
+    sixes = (C, M, 2 * C if refine_lenses else 0)
+    free_cameras, free_markers, free_lenses = (np.zeros((count, 6), bool) for count in sixes)
+    if reference_camera is not None:
+        free_cameras[calibrated] = True
+        free_cameras[reference_camera] = False
+    free_markers[mapped] = True
+    free_markers[anchors] = False
+    for index in np.flatnonzero(calibrated) if refine_lenses else ():
+        lens = rig.cameras.lenses[int(rig.cameras.lens_index[index])]
+        figures = np.arange(12) < 4 + LENS_COEFFICIENTS[lens]
+        free_lenses[index], free_lenses[C + index] = figures[:6], figures[6:]
     return _Start(
-        linker.views,
         links,
         linker,
         bundle.RigUnknowns(
             wxyz_xyz(inverted(Ts_vehicle_world)),
             wxyz_xyz(np.where(calibrated[:, None, None], links.Ts_group_camera, given)),
             wxyz_xyz(links.Ts_group_marker),
-            bundle.lenses_of(rig.cameras)[: len(rig) if refine_lenses else 0],
+            bundle.lenses_of(rig.cameras)[: C if refine_lenses else 0],
         ),
+        given,
         calibrated,
         mapped,
+        np.concatenate([free_cameras, free_markers, free_lenses]),
     )
 
 
@@ -240,16 +228,9 @@ def _adjusted(
 
 
 def _calibration(
-    views: RigViews,
-    rig: CameraRig,
-    given: np.ndarray,
-    start: _Start,
-    adjusted: bundle.Adjusted,
-    free: np.ndarray,
-    used_px: float,
-    turned: int,
+    rig: CameraRig, start: _Start, adjusted: bundle.Adjusted, used_px: float, turned: int
 ) -> RigCalibration:
-    flat = free.reshape(-1)
+    views, flat = start.linker.views, start.free.reshape(-1)
     inverse = np.linalg.inv(np.asarray(adjusted.reduced.system))
     inverse = np.where(flat[:, None] & flat[None], (inverse + inverse.T) / 2, 0)
     residuals = np.asarray(adjusted.residuals_px)
@@ -262,7 +243,9 @@ def _calibration(
     return RigCalibration(
         views=views,
         Ts_vehicle_camera=np.where(
-            start.calibrated[:, None, None], matrices(adjusted.poses.Ts_vehicle_camera), given
+            start.calibrated[:, None, None],
+            matrices(adjusted.poses.Ts_vehicle_camera),
+            start.given,
         ),
         Ts_world_marker=matrices(adjusted.poses.Ts_world_marker),
         Ts_world_vehicle=matrices(adjusted.poses.Ts_world_vehicle),

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from jaxnav.errors import BadInput
+from jaxnav.files.poses import transform
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import wrap_angle
 
@@ -42,7 +43,6 @@ class DrivenFrame:
         speed_scale, steering_offset_rad, steering_gain: of the odometry, which had to be found
             with the frame: in a curve, a relative error of the gain moves the frame forward by
             that part of half the wheelbase.
-        pairs: number of pairs of frames used.
     """
 
     T_rig_level: np.ndarray
@@ -51,7 +51,6 @@ class DrivenFrame:
     speed_scale: float
     steering_offset_rad: float
     steering_gain: float
-    pairs: int
 
 
 def driven_frame(
@@ -99,9 +98,7 @@ def driven_frame(
         which = _NAMES[int(np.argmax(np.nan_to_num(sigma[:3] / limits, nan=np.inf)))]
         problem = f"this drive does not tell the vehicle's {which}: drive circles both ways, slowly"
         raise BadInput("--vehicle-frame drive", problem)
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec([0, 0, x[2]]).as_matrix()
-    turn[:2, 3] = x[:2]
+    turn = transform(Rotation.from_rotvec([0, 0, x[2]]).as_matrix(), [*x[:2], 0])
     # The shift was found in the level frame; a twist's is in the vehicle's own.
     R = turn[:2, :2].T
     to_twist = np.zeros((6, 3))
@@ -118,7 +115,6 @@ def driven_frame(
         speed_scale=float(np.exp(x[3])),
         steering_offset_rad=float(x[4]),
         steering_gain=float(np.exp(x[5])),
-        pairs=len(first),
     )
 
 
@@ -166,10 +162,7 @@ def _level(Ts_world_rig: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise BadInput("--vehicle-frame drive", problem)
     aside = np.eye(3)[np.argmin(np.abs(z))]
     x = np.cross(aside, z) / np.linalg.norm(np.cross(aside, z))
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    T[:3, 3] = -z * height
-    return T, weight
+    return transform(np.stack([x, np.cross(z, x), z], axis=1), -z * height), weight
 
 
 def _pairs(stamps_s: np.ndarray, odometry_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

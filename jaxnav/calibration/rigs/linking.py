@@ -56,17 +56,17 @@ class Links:
 
     def join_cameras(self, a: int, b: int, T_a_b: np.ndarray) -> None:
         """Merge the group b of cameras into the group a."""
-        inside = self.group_of_camera == b
-        others = self.Ts_group_camera[inside]
-        self.Ts_group_camera[inside] = T_a_b @ others
-        self.group_of_camera[inside] = a
+        _merge(self.group_of_camera, self.Ts_group_camera, a, b, T_a_b)
 
     def join_markers(self, a: int, b: int, T_a_b: np.ndarray) -> None:
         """Merge the group b of markers into the group a."""
-        inside = self.group_of_marker == b
-        others = self.Ts_group_marker[inside]
-        self.Ts_group_marker[inside] = T_a_b @ others
-        self.group_of_marker[inside] = a
+        _merge(self.group_of_marker, self.Ts_group_marker, a, b, T_a_b)
+
+
+def _merge(groups: np.ndarray, Ts: np.ndarray, a: int, b: int, T_a_b: np.ndarray) -> None:
+    inside = groups == b
+    Ts[inside] = T_a_b @ Ts[inside]
+    groups[inside] = a
 
 
 @dataclass(frozen=True)
@@ -107,16 +107,12 @@ class Linker:
         """Make all links that the recording supports, first from a part of the frames if many."""
         frames = self.views.frames
         if frames > 2 * _ENOUGH:
-            some = self.views.frame % (frames // _ENOUGH) == 0
-            self.only(some)._link_sure(links)
-        self._link_sure(links)
-        for least, part in _ROUNDS[1:]:
+            some = self.only(self.views.frame % (frames // _ENOUGH) == 0)
+            while some._link_all(links, *_ROUNDS[0]):
+                pass
+        for least, part in _ROUNDS:
             while self._link_all(links, least, part):
                 pass
-
-    def _link_sure(self, links: Links) -> None:
-        while self._link_all(links, *_ROUNDS[0]):
-            pass
 
     def _link_all(self, links: Links, least: float, part: float) -> bool:
         def alone(groups: np.ndarray) -> bool:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxnav.calibration.rigs.calibrate import RigCalibration
 from jaxnav.calibration.rigs.pose_arrays import inverted, turn_rad
 from jaxnav.calibration.rigs.views import RigViews, rays_camera
+from jaxnav.files.poses import transform
 from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.models.rig import CameraRig
 
@@ -151,10 +152,8 @@ def _laid_over(
         )
         to, fro = to.reshape(-1, 3), fro.reshape(-1, 3)
         turn, _ = Rotation.align_vectors(to - to.mean(axis=0), fro - fro.mean(axis=0))
-        T = np.eye(4)
-        T[:3, :3] = turn.as_matrix()
-        T[:3, 3] = to.mean(axis=0) - T[:3, :3] @ fro.mean(axis=0)
-        return T
+        R = turn.as_matrix()
+        return transform(R, to.mean(axis=0) - R @ fro.mean(axis=0))
 
     best, most = np.eye(4), np.zeros(len(given), bool)
     for one in range(len(given)):

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
+from jaxnav.files.poses import transform
 from jaxnav.models.geometry import cayley
 from jaxnav.models.rig import CameraRig
 
@@ -20,10 +21,7 @@ def wxyz_xyz(Ts: np.ndarray) -> jax.Array:
 def matrices(poses: jax.Array | np.ndarray) -> np.ndarray:
     """Convert wxyz_xyz (n, 7) to matrices (n, 4, 4)."""
     array = np.asarray(poses, float)
-    Ts = np.tile(np.eye(4), (len(array), 1, 1))
-    Ts[:, :3, :3] = Rotation.from_quat(array[:, [1, 2, 3, 0]]).as_matrix()
-    Ts[:, :3, 3] = array[:, 4:]
-    return Ts
+    return transform(Rotation.from_quat(array[:, [1, 2, 3, 0]]).as_matrix(), array[:, 4:])
 
 
 @jax.vmap
@@ -34,12 +32,8 @@ def retracted(wxyz_xyz: Float[Array, " 7"], xi: Float[Array, " 6"]) -> Float[Arr
 
 def inverted(T: np.ndarray) -> np.ndarray:
     """Inverses of rigid transforms (..., 4, 4)."""
-    inverse = np.zeros_like(T)
     R = np.swapaxes(T[..., :3, :3], -1, -2)
-    inverse[..., :3, :3] = R
-    inverse[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
-    inverse[..., 3, 3] = 1
-    return inverse
+    return transform(R, -(R @ T[..., :3, 3:])[..., 0])
 
 
 def turn_rad(T: np.ndarray, Ts: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from jaxnav.calibration.rigs.calibrate import RigCalibration
 from jaxnav.calibration.rigs.driven_frame import DrivenFrame, level_follows
 from jaxnav.calibration.rigs.pose_arrays import inverted
+from jaxnav.files.poses import transform
 
 # Sigmas of poses measured by tape and eye.
 _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 0.01, np.deg2rad(3)
@@ -105,7 +106,4 @@ def adjoint(T: np.ndarray) -> np.ndarray:
 
 
 def _rigid(x: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(x[3:]).as_matrix()
-    T[:3, 3] = x[:3]
-    return T
+    return transform(Rotation.from_rotvec(x[3:]).as_matrix(), x[:3])

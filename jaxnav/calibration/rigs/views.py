@@ -1,7 +1,7 @@
 """Sightings of markers by the cameras of a rig, with their rays and both of their poses."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -45,13 +45,12 @@ class RigViews:
     def only(self, kept: np.ndarray) -> "RigViews":
         """The rows in a mask, with only the frames that they have; markers keep their indices."""
         frames, frame = np.unique(self.frame[kept], return_inverse=True)
-        return RigViews(
+        return replace(
+            self,
             frame=frame,
             camera=self.camera[kept],
             marker=self.marker[kept],
             corners_px=self.corners_px[kept],
-            size_m=self.size_m,
-            marker_ids=self.marker_ids,
             stamps_ns=self.stamps_ns[frames],
         )
 

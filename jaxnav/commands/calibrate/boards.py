@@ -1,7 +1,6 @@
 """Calibration boards read from files and written to them."""
 
 from pathlib import Path
-from typing import Any
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.errors import BadInput
@@ -27,16 +26,4 @@ def write_board(path: Path, board: Board) -> None:
     Raises:
         BadInput: the file can't be written.
     """
-    grid: dict[str, Any] = {"columns": board.columns, "rows": board.rows}
-    ids = {"family": board.family, "first_id": board.first_id}
-    figures: dict[str, Any]
-    if board.kind == "charuco":
-        figures = grid | {"square_m": board.size_m, "marker_m": board.marker_m} | ids
-    elif board.kind == "aprilgrid":
-        figures = grid | {"tag_m": board.size_m, "spacing": board.spacing} | ids
-        figures["border_cells"] = board.border_cells
-    elif board.kind == "chessboard":
-        figures = grid | {"square_m": board.size_m}
-    else:
-        figures = {"size_m": board.size_m} | ids
-    boards.save_board(path, {"board": board.kind} | figures)
+    boards.save_board(path, vars(board))

@@ -8,15 +8,13 @@ from pathlib import Path
 from jaxnav.commands.calibrate.arguments.cameras import CalibrateConvert
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, wpilib
-from jaxnav.files.cameras import camera_file, choose_camera, named_by_topic
+from jaxnav.files.cameras import camera_file, choose_camera
 from jaxnav.files.figures import CameraFigures, MarkerFigures
 from jaxnav.files.kalibr import camchain_text
 from jaxnav.files.markers import MarkerFile, markers_left_out, markers_text
-from jaxnav.files.opencv_storage import opencv_text
-from jaxnav.files.photonvision import photonvision_text
+from jaxnav.files.matrix_cameras import camera_info_text, opencv_text, photonvision_text
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import place, rig_text
-from jaxnav.files.ros_camera_info import camera_info_text
 from jaxnav.files.validation import validate
 from jaxnav.files.writing import atomic_write_all, refuse_overwriting
 
@@ -71,7 +69,7 @@ def _read(args: CalibrateConvert) -> _Source:
         size_m = args.marker_size_m or wpilib.SIZE_M
         markers = tuple(wpilib.layout_figures(path, data, size_m, args.family or wpilib.FAMILY))
         return _Source("wpilib", (), markers, tuple(wpilib.layout_left_out(data)))
-    file = named_by_topic(path, data, camera_file(path, data))
+    file = camera_file(path, data, by_topic=True)
     return _Source(file.format, file.cameras, (), file.left_out)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.detection import find_board
-from jaxnav.calibration.boards.images import board_views, collect_views, source_files
+from jaxnav.calibration.boards.images import collect_views, source_files
 from jaxnav.calibration.boards.saddles import Places, fit_saddles
 from jaxnav.calibration.boards.sheets import sheet_of
 from jaxnav.errors import BadInput
@@ -156,7 +156,9 @@ def test_saddles_on_a_drawn_chequer() -> None:
         cv2.GaussianBlur(large, (0, 0), 20 * 0.8), (61, 61), None, 0, 0, cv2.INTER_AREA
     )
     along_px = 30 * np.array([[[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]])
-    places = Places(centre[None] + [[0.6, -0.8]], along_px, np.zeros((1, 2)), 1.0, 1.0)
+    places = Places(
+        centre[None] + [[0.6, -0.8]], along_px, np.zeros((1, 2)), np.ones(1), np.ones(1)
+    )
     found = fit_saddles(np.rint(image).astype(np.uint8), places, 7.0, 3.0)
     assert found.good.all()
     np.testing.assert_allclose(found.points_px[0], centre, atol=0.01)
@@ -199,7 +201,7 @@ def test_of_a_video_the_frames_that_move_are_taken(tmp_path: Path) -> None:
     for pose in (0, 0, 0, 1, 1, 2):
         writer.write(picture("charuco", pose))
     writer.release()
-    views = board_views(BOARDS["charuco"], [file]).views
+    views = collect_views(BOARDS["charuco"], [file]).views.views
     assert [view.name for view in views] == ["drive.avi#0", "drive.avi#3", "drive.avi#5"]
 
 
@@ -217,14 +219,14 @@ def test_of_a_video_the_frames_that_move_are_taken(tmp_path: Path) -> None:
 def test_another_board_gets_one_line(seen: str, board: Board, line: str, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), picture(seen, 0))
     with pytest.raises(BadInput, match=line) as caught:
-        board_views(board, [tmp_path])
+        collect_views(board, [tmp_path])
     assert "\n" not in str(caught.value)
 
 
 def test_images_of_two_sizes_are_refused_by_name(folder: Path) -> None:
     cv2.imwrite(str(folder / "3.png"), np.zeros((480, 640), np.uint8))
     with pytest.raises(BadInput, match=r"3\.png: is 640 x 480 pixels, but .*2\.png is 820 x 410"):
-        board_views(BOARDS["charuco"], [folder])
+        collect_views(BOARDS["charuco"], [folder])
 
 
 def test_what_is_no_image_is_refused_by_name(tmp_path: Path) -> None:
@@ -235,11 +237,11 @@ def test_what_is_no_image_is_refused_by_name(tmp_path: Path) -> None:
         source_files([tmp_path / "a.txt"])
     (tmp_path / "a.png").write_bytes(b"a")
     with pytest.raises(BadInput, match=r"a\.png: is not an image"):
-        board_views(BOARDS["charuco"], [tmp_path / "a.png"])
+        collect_views(BOARDS["charuco"], [tmp_path / "a.png"])
     with pytest.raises(BadInput, match=r"b\.png: can't be read"):
-        board_views(BOARDS["charuco"], [tmp_path / "b.png"])
+        collect_views(BOARDS["charuco"], [tmp_path / "b.png"])
     with pytest.raises(BadInput, match=r"b\.mp4: can't be read"):
-        board_views(BOARDS["charuco"], [tmp_path / "b.mp4"])
+        collect_views(BOARDS["charuco"], [tmp_path / "b.mp4"])
     (tmp_path / "c.avi").write_bytes(b"a")
     with pytest.raises(BadInput, match=r"c\.avi: is not a video"):
-        board_views(BOARDS["charuco"], [tmp_path / "c.avi"])
+        collect_views(BOARDS["charuco"], [tmp_path / "c.avi"])

@@ -12,8 +12,8 @@ from jaxnav.calibration.lenses.board_shape import check_board
 from jaxnav.calibration.lenses.choice import informative
 from jaxnav.calibration.lenses.fit import fit_lens
 from jaxnav.calibration.lenses.intrinsics import calibrate_lens
-from jaxnav.calibration.lenses.screening import screened
 from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
+from jaxnav.calibration.lenses.views import screened
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
 

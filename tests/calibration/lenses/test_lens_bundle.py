@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import NO_CUT, LensUnknowns
+from jaxnav.calibration.lenses.bundle import NO_CUT
 from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.models.camera import Camera
 
@@ -32,14 +32,13 @@ def some_views(lens, count=6, seed=0):
 
 
 def solved(lens, views, poses, fixed=(), weights=None, cut=NO_CUT):
-    seen = lens_bundle.padded_corners(views)
     start = np.array([1.03 * f for f in TRUTHS[lens][:2]] + [405.0, 207.0] + [0.0] * 5)
-    padded = lens_bundle.padded_poses(poses, len(seen.corners_px))
+    seen, unknowns = lens_bundle.padded(views, start, poses)
     if weights is None:
         weights = np.asarray(seen.present, float)
     return seen, lens_bundle.solve(
         lens,
-        LensUnknowns(jnp.asarray(start), jnp.asarray(padded)),
+        unknowns,
         seen,
         jnp.asarray(weights),
         jnp.asarray(lens_bundle.free_mask(lens, fixed)),

@@ -1,0 +1,346 @@
+"""Cameras as OpenCV's functions take them, K row by row and D, in the files of three tools.
+
+Each of them writes one camera a file:
+
+    ROS           camera_info YAML, as camera_calibration writes it
+    OpenCV        FileStorage YAML, with the keys of its samples or of its Python functions
+    PhotonVision  JSON of one camera at one resolution, as its calibration page exports and imports
+
+Source of ROS's: the documentation of sensor_msgs/CameraInfo: D is k1 k2 t1 t2 k3 for plumb_bob, k1
+to k4 for equidistant; R is the identity and P is [K 0] for a camera that is not one of a stereo
+pair. OpenCV 3 and 4 head their files with `%YAML:1.0`, 5 with `%YAML 1.2`; all three read either.
+PhotonVision keeps snapshots of the board and results from them (`observations`) in the same file.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+from pydantic import AliasChoices, Field, field_validator, model_validator
+
+from jaxnav.errors import BadInput
+from jaxnav.files.figures import CameraFigures, Lens, unread_keys
+from jaxnav.files.ranges import pinhole_problem, problem_of
+from jaxnav.files.validation import (
+    Count,
+    ForeignEntry,
+    ImageSize,
+    Number,
+    Pixels,
+    Text,
+    at,
+    show_value,
+)
+from jaxnav.files.writing import Quoted, yaml_text
+from jaxnav.models.camera import LENS_COEFFICIENTS
+
+_LENS: dict[str, Lens] = {
+    "plumb_bob": "radtan",
+    "rational_polynomial": "radtan",
+    "equidistant": "equidistant",
+}
+_MODEL: dict[Lens, str] = {
+    "none": "plumb_bob",
+    "radtan": "plumb_bob",
+    "rational": "rational_polynomial",
+    "equidistant": "equidistant",
+}
+_IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+_OPENCV_K = ("camera_matrix", "cameraMatrix", "K")
+_OPENCV_D = ("distortion_coefficients", "distCoeffs", "D")
+_OPENCV_SIZE = ("image_size", "imageSize", "image_width", "image_height")
+_PHOTONVISION_D = ("distCoeffs", "cameraExtrinsics")
+_PHOTONVISION_LENS = "LENSMODEL_OPENCV"
+_CV_64F = 6  # OpenCV's number for a matrix of doubles, the `type` of a matrix
+
+
+class MatrixEntry(ForeignEntry):
+    """A matrix as ROS, OpenCV and PhotonVision write it.
+
+    OpenCV 5 writes a vector with `sizes` alone.
+    """
+
+    rows: Count
+    cols: Count
+    data: Annotated[list[Number], Field(max_length=64)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_vector(cls, entry: Any) -> Any:
+        if isinstance(entry, dict) and "rows" not in entry and "sizes" in entry:
+            sizes = entry["sizes"]
+            if not isinstance(sizes, list) or len(sizes) != 1:
+                raise ValueError(f"sizes: must be one number, got {show_value(sizes)}")
+            return {**entry, "rows": sizes[0], "cols": 1}
+        return entry
+
+    @field_validator("data")
+    @classmethod
+    def _complete(cls, data: list[float], info: Any) -> list[float]:
+        rows, cols = info.data.get("rows"), info.data.get("cols")
+        if rows is not None and cols is not None and rows * cols != len(data):
+            raise ValueError(f"must have {rows} x {cols} numbers, got {len(data)}")
+        return data
+
+
+class MatrixCamera(ForeignEntry):
+    """The file of one camera.
+
+    Attributes:
+        told_by: the format's keys; a file that has one of them is of this format.
+        read: the keys that are read.
+    """
+
+    told_by: ClassVar[tuple[str, ...]]
+    read: ClassVar[tuple[str, ...]]
+
+    def figures(self, path: Path, name: str) -> CameraFigures:
+        """The camera under a given name.
+
+        Raises:
+            BadInput: one line naming file and key.
+        """
+        raise NotImplementedError
+
+    def left_out(self, data: dict[str, Any]) -> list[str]:
+        """The keys of the file that are not read and not empty, see `unread_keys`."""
+        return unread_keys(data, self.read)
+
+
+class CameraInfo(MatrixCamera):
+    """A camera in ROS's camera_info YAML."""
+
+    told_by = ("distortion_model",)
+    image_width: Pixels
+    image_height: Pixels
+    camera_matrix: MatrixEntry
+    distortion_model: Text
+    distortion_coefficients: MatrixEntry
+
+    def figures(self, path: Path, name: str) -> CameraFigures:
+        model = self.distortion_model
+        if model not in _LENS:
+            problem = f"must be one of {', '.join(_LENS)}, got {model!r}"
+            raise BadInput(at(path, "distortion_model"), problem)
+        return _figures_from_matrices(
+            name,
+            (self.image_width, self.image_height),
+            (at(path, "camera_matrix.data"), self.camera_matrix.data),
+            (at(path, "distortion_coefficients.data"), self.distortion_coefficients.data),
+            _LENS[model],
+        )
+
+    def left_out(self, data: dict[str, Any]) -> list[str]:
+        # A rectification is no part of a camera.
+        rectified = {
+            "rectification_matrix": _IDENTITY,
+            "projection_matrix": _projection(data["camera_matrix"]["data"]),
+        }
+        plain = [
+            key
+            for key, expected in rectified.items()
+            if isinstance(data.get(key), dict) and data[key].get("data") == expected
+        ]
+        return unread_keys(data, [*CameraInfo.model_fields, "camera_name", *plain])
+
+
+class OpenCVCamera(MatrixCamera):
+    """A camera in OpenCV's FileStorage."""
+
+    told_by = _OPENCV_K
+    read = (*_OPENCV_K, *_OPENCV_D, *_OPENCV_SIZE, "fisheye_model", "camera_name")
+    image_width: Pixels | None = None
+    image_height: Pixels | None = None
+    image_size: Annotated[
+        ImageSize | None, Field(validation_alias=AliasChoices(*_OPENCV_SIZE[:2]))
+    ] = None
+    camera_matrix: Annotated[MatrixEntry, Field(validation_alias=AliasChoices(*_OPENCV_K))]
+    distortion_coefficients: Annotated[
+        MatrixEntry, Field(validation_alias=AliasChoices(*_OPENCV_D))
+    ]
+    fisheye_model: Annotated[int, Field(strict=True, ge=0, le=1)] = 0
+
+    def figures(self, path: Path, name: str) -> CameraFigures:
+        size = self.image_size
+        if size is None:
+            if self.image_width is None or self.image_height is None:
+                missing = "image_width" if self.image_width is None else "image_height"
+                problem = "missing: for which image size are these figures?"
+                raise BadInput(at(path, missing), problem)
+            size = [self.image_width, self.image_height]
+        return _figures_from_matrices(
+            name,
+            size,
+            (at(path, "camera_matrix.data"), self.camera_matrix.data),
+            (at(path, "distortion_coefficients.data"), self.distortion_coefficients.data),
+            "equidistant" if self.fisheye_model else "radtan",
+        )
+
+
+_PhotonVisionSide = Annotated[float, Field(strict=True, ge=1, le=65536)]
+
+
+class Resolution(ForeignEntry):
+    """PhotonVision's image size."""
+
+    width: _PhotonVisionSide
+    height: _PhotonVisionSide
+
+    @field_validator("width", "height")
+    @classmethod
+    def _whole(cls, value: float) -> float:
+        if value != int(value):
+            raise ValueError(f"must be a whole number of pixels, got {value:g}")
+        return value
+
+
+class PhotonVisionCamera(MatrixCamera):
+    """PhotonVision's JSON of a camera; older versions wrote the lens under `cameraExtrinsics`."""
+
+    told_by = ("cameraIntrinsics",)
+    read = ("resolution", "cameraIntrinsics", "lensmodel", *_PHOTONVISION_D)
+    resolution: Resolution
+    cameraIntrinsics: MatrixEntry
+    distCoeffs: Annotated[MatrixEntry, Field(validation_alias=AliasChoices(*_PHOTONVISION_D))]
+    lensmodel: Text = _PHOTONVISION_LENS
+
+    def figures(self, path: Path, name: str) -> CameraFigures:
+        if "OPENCV" not in self.lensmodel:
+            problem = f"must be an OpenCV lens, got {self.lensmodel!r}"
+            raise BadInput(at(path, "lensmodel"), problem)
+        return _figures_from_matrices(
+            name,
+            (int(self.resolution.width), int(self.resolution.height)),
+            (at(path, "cameraIntrinsics.data"), self.cameraIntrinsics.data),
+            (at(path, "distCoeffs.data"), self.distCoeffs.data),
+            "radtan",
+        )
+
+
+def camera_info_text(camera: CameraFigures) -> str:
+    """The camera as the text of ROS's camera_info file."""
+    K, D = _pinhole_matrix(camera), _coefficients(camera)
+    data = {
+        "image_width": camera.image_size_px[0],
+        "image_height": camera.image_size_px[1],
+        "camera_name": Quoted(camera.name),
+        "camera_matrix": _matrix(3, 3, K),
+        "distortion_model": _MODEL[camera.lens],
+        "distortion_coefficients": _matrix(1, len(D), D),
+        "rectification_matrix": _matrix(3, 3, _IDENTITY),
+        "projection_matrix": _matrix(3, 4, _projection(K)),
+    }
+    return yaml_text(data)
+
+
+def opencv_text(camera: CameraFigures) -> str:
+    """The camera as the text of OpenCV's FileStorage file."""
+
+    def matrix(name: str, rows: int, cols: int, data: list[float]) -> str:
+        numbers = ", ".join(repr(number) for number in data)
+        head = f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n"
+        return f"{head}   data: [ {numbers} ]\n"
+
+    width, height = camera.image_size_px
+    D = _coefficients(camera)
+    return (
+        "%YAML:1.0\n---\n"
+        f"camera_name: {json.dumps(camera.name, ensure_ascii=False)}\n"
+        f"image_width: {width}\nimage_height: {height}\n"
+        f"fisheye_model: {int(camera.lens == 'equidistant')}\n"
+        + matrix("camera_matrix", 3, 3, _pinhole_matrix(camera))
+        + matrix("distortion_coefficients", len(D), 1, D)
+    )
+
+
+def photonvision_text(camera: CameraFigures) -> str:
+    """The camera as PhotonVision's JSON, with no snapshots.
+
+    Raises:
+        BadInput: a fisheye lens, which PhotonVision does not know.
+    """
+    if camera.lens == "equidistant":
+        raise BadInput(
+            f"--to photonvision: {camera.name}.lens",
+            "is equidistant, and PhotonVision knows radtan alone: calibrate again with radtan",
+        )
+    width, height = camera.image_size_px
+    D = _coefficients(camera)
+    data = {
+        "resolution": {"width": float(width), "height": float(height)},
+        "cameraIntrinsics": _matrix(3, 3, _pinhole_matrix(camera), type=_CV_64F),
+        "distCoeffs": _matrix(1, len(D), D, type=_CV_64F),
+        "calobjectWarp": [0.0, 0.0],
+        "observations": [],
+        "calobjectSize": {"width": 0.0, "height": 0.0},
+        "calobjectSpacing": 0.0,
+        "lensmodel": _PHOTONVISION_LENS,
+    }
+    return json.dumps(data, indent=2) + "\n"
+
+
+def _figures_from_matrices(
+    name: str,
+    image_size_px: Sequence[int],
+    matrix: tuple[str, Sequence[float]],
+    distortion: tuple[str, Sequence[float]],
+    lens: Lens,
+) -> CameraFigures:
+    """A camera from K and the lens's coefficients; each comes with its key in the file.
+
+    Raises:
+        BadInput: not calibrated, skewed, or a lens with more coefficients than ours.
+
+    Returns:
+        The camera; a `radtan` lens with more than five coefficients that matter is `rational`.
+    """
+    where, K = matrix
+    if len(K) != 9:
+        raise BadInput(where, f"must be 3 x 3, got {len(K)} numbers")
+    if K[0] == 0:
+        raise BadInput(f"{where}[0]", "is 0: this camera has not been calibrated")
+    for index in (0, 4):
+        if K[index] <= 0:
+            raise BadInput(f"{where}[{index}]", f"the focal length must be > 0, got {K[index]:g}")
+    if any(abs(K[index]) > 1e-9 * K[0] for index in (1, 3, 6, 7)) or K[8] != 1:
+        raise BadInput(where, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
+    pinhole_px = [K[index] for index in (0, 4, 2, 5)]
+    if problem := pinhole_problem(pinhole_px, image_size_px):
+        sizes = "image_width and image_height, or resolution"
+        raise BadInput(where, f"{problem} ({sizes})")
+    where, coefficients = distortion
+    if lens == "radtan" and any(coefficients[5:]):
+        lens = "rational"
+    most = LENS_COEFFICIENTS[lens]
+    if lens == "equidistant" and len(coefficients) != 4:
+        raise BadInput(where, f"must be k1 k2 k3 k4 for a fisheye lens, got {len(coefficients)}")
+    if any(coefficients[most:]):
+        raise BadInput(
+            where, "has thin prism or tilt coefficients that are not zero: calibrate again with "
+            "eight (rational) or five (plumb_bob, radtan)",
+        )  # fmt: skip
+    for index, value in enumerate(coefficients[:most]):
+        if problem := problem_of("distortion", value):
+            raise BadInput(f"{where}[{index}]", problem)
+    return CameraFigures.create(name, lens, pinhole_px, coefficients[:most], image_size_px)
+
+
+def _pinhole_matrix(camera: CameraFigures) -> list[float]:
+    """K of a camera, 9 numbers row by row."""
+    (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def _projection(K: list[float]) -> list[float]:
+    """[K 0], 12 numbers row by row."""
+    return [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
+
+
+def _coefficients(camera: CameraFigures) -> list[float]:
+    """D of a camera: k1 k2 p1 p2 k3 [k4 k5 k6], k1 k2 k3 k4 of a fisheye, zeros without a lens."""
+    return list(camera.distortion) if camera.lens != "none" else [0.0] * 5
+
+
+def _matrix(rows: int, cols: int, data: list[float], **also: int) -> dict[str, Any]:
+    return {"rows": rows, "cols": cols, **also, "data": list(data)}
