@@ -17,6 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
+from jaxnav.commands.doctor.sight import area_px2
 from jaxnav.detection.observe import CornerLanes
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -48,12 +49,8 @@ class Sighted:
     @staticmethod
     def of(rig: CameraRig, markers: MarkerMap, seen: CornerLanes, most: int) -> "Sighted":
         """The sightings of the `most` markers that look largest in any image."""
-        diagonals_px = seen.corners_px[..., :2, :] - seen.corners_px[..., 2:, :]
-        area_px2 = np.abs(
-            diagonals_px[..., 0, 0] * diagonals_px[..., 1, 1]
-            - diagonals_px[..., 0, 1] * diagonals_px[..., 1, 0]
-        )
-        largest = np.where(seen.visible, area_px2, 0).max(axis=0)
+        areas_px2 = np.abs(area_px2(seen.corners_px))
+        largest = np.where(seen.visible, areas_px2, 0).max(axis=0)
         count = min(int((largest > 0).sum()), most)
         kept = np.sort(np.argsort(-largest, kind="stable")[:count])
         chosen = MarkerMap(
