@@ -12,6 +12,7 @@ from typing import Any
 
 from jaxnav.commands.doctor.arguments import Doctor
 from jaxnav.commands.doctor.findings import Finding, Report, note
+from jaxnav.commands.kinds import key_values
 from jaxnav.errors import BadInput
 
 _CHECKS = "jaxnav.commands.doctor"
@@ -143,12 +144,11 @@ def _pictures(args: Doctor, patient: SimpleNamespace) -> Iterable[Finding]:
     if patient.rig is None or patient.markers is None:
         return [note("not looked at: rig and markers are needed")]
     images = {}
-    for text in args.frame:
-        name, _, path = text.partition("=")
+    for name, path in key_values("--frame", args.frame).items():
         if name not in patient.rig.names:
             known = ", ".join(patient.rig.names)
             problem = f"the rig has no camera {name!r}: expected one of {known}"
-            raise BadInput(f"--frame {text}", problem)
+            raise BadInput(f"--frame {name}={path}", problem)
         images[name] = read_image(Path(path))
     return examine_pictures(patient.rig, patient.markers, patient.route, images)
 
@@ -159,7 +159,7 @@ def _plug_ins(report: Report, args: Doctor, patient: SimpleNamespace) -> Iterabl
     from jaxnav.commands.doctor.plug_ins import plug_ins
     from jaxnav.loop.interfaces import Setup
 
-    options = dict(text.split("=", 1) for text in args.option)
+    options = key_values("--option", args.option)
     setup = Setup(
         patient.rig, patient.markers, patient.vehicle, patient.route.start_pose, options=options
     )
