@@ -13,8 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxnav.errors import BadInput
-from jaxnav.files.figures import to_se3
-from jaxnav.files.markers import MarkerFile, marker_map
+from jaxnav.files.markers import MarkerFile
 from jaxnav.files.reading import parse_yaml
 from jaxnav.files.rigs import RigFile
 from jaxnav.files.validation import FloorPlace
@@ -64,8 +63,8 @@ class Scenery:
         markers = _read(MarkerFile, header.get("markers"))
         route = _read(_RouteEntry, header.get("route")) or _RouteEntry()
         return Scenery(
-            rig=None if rig is None else _rig(rig),
-            markers=None if markers is None else _markers(markers),
+            rig=None if rig is None else rig.rig(),
+            markers=None if markers is None else markers.map(),
             waypoints_m=np.array(route.waypoints_m, float).reshape(-1, 2),
             waypoint_radius_m=route.waypoint_radius_m,
         )
@@ -86,21 +85,3 @@ def _read(model: type[_Model], value: Any) -> _Model | None:
         return model.model_validate(data)
     except (ValidationError, BadInput):
         return None
-
-
-def _rig(file: RigFile) -> CameraRig:
-    return CameraRig.create(
-        [entry.camera() for entry in file.cameras],
-        [to_se3(entry.T_camera_vehicle_pose()) for entry in file.cameras],
-        [entry.name for entry in file.cameras],
-        [(entry.image_size_px[0], entry.image_size_px[1]) for entry in file.cameras],
-    )
-
-
-def _markers(file: MarkerFile) -> MarkerMap:
-    return marker_map(
-        np.stack([entry.pose() for entry in file.markers]),
-        [entry.size_m for entry in file.markers],
-        [entry.id for entry in file.markers],
-        [entry.family for entry in file.markers],
-    )
