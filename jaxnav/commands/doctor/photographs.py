@@ -13,9 +13,17 @@ from collections.abc import Iterator, Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.commands.doctor.explanations import SIZE_SIGMA, explained, in_words
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
-from jaxnav.commands.doctor.fits import FileErrors, Sighted, StandingFit, fit, poses_by_each
+from jaxnav.commands.doctor.fits import (
+    SIZE_SIGMA,
+    FileErrors,
+    Sighted,
+    StandingFit,
+    explained,
+    fit,
+    in_words,
+    poses_by_each,
+)
 from jaxnav.commands.doctor.sight import area_px2
 from jaxnav.detection import Detections, make_detectors, observe
 from jaxnav.files import Route
