@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxnav.cli import main
-from jaxnav.commands.drive.status import WIDTH, status_line
+from jaxnav.commands.drive.observers import WIDTH, status_line
 from jaxnav.commands.process import configure_jax
 from jaxnav.files import Route, calib_dir, load_markers, load_route, poses, save_markers, write_tum
 from jaxnav.files.markers import MarkerFile, marker_data, marker_map

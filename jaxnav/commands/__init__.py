@@ -79,34 +79,32 @@ COMMANDS = {
         "tune.arguments:TuneController", "tune.controller", in_folder=_TUNED
     ),
     "calibrate board": Registered(
-        "calibrate.arguments.cameras:CalibrateBoard",
+        "calibrate.arguments:CalibrateBoard",
         "calibrate.board",
         in_folder=("board.pdf", "board.png", "board.yaml", "report.json"),
     ),
     "calibrate intrinsics": Registered(
-        "calibrate.arguments.cameras:CalibrateIntrinsics",
+        "calibrate.arguments:CalibrateIntrinsics",
         "calibrate.intrinsics",
         in_folder=("camera.yaml", *_REPORT),
     ),
     "calibrate rig": Registered(
-        "calibrate.arguments.recordings:CalibrateRig",
+        "calibrate.arguments:CalibrateRig",
         "calibrate.rig",
         in_folder=("rig.yaml", *_MAP),
     ),
     "calibrate markers": Registered(
-        "calibrate.arguments.recordings:CalibrateMarkers", "calibrate.markers", in_folder=_MAP
+        "calibrate.arguments:CalibrateMarkers", "calibrate.markers", in_folder=_MAP
     ),
     "calibrate check": Registered(
-        "calibrate.arguments.recordings:CalibrateCheck", "calibrate.check", in_folder=_MAP
+        "calibrate.arguments:CalibrateCheck", "calibrate.check", in_folder=_MAP
     ),
     "calibrate odometry": Registered(
-        "calibrate.arguments.recordings:CalibrateOdometry",
+        "calibrate.arguments:CalibrateOdometry",
         "calibrate.odometry",
         in_folder=("vehicle.yaml", *_REPORT),
     ),
-    "calibrate convert": Registered(
-        "calibrate.arguments.cameras:CalibrateConvert", "calibrate.convert"
-    ),
+    "calibrate convert": Registered("calibrate.arguments:CalibrateConvert", "calibrate.convert"),
 }
 GROUPS = {
     "tune": "Learn parameters by gradient, through the step that runs on the car.",

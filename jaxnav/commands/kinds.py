@@ -1,9 +1,11 @@
 """Kinds of values that several commands are told, and what is asked of them."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -35,6 +37,41 @@ CornerBackend = Literal["aruco", "apriltag"]
 Switch = tyro.conf.FlagCreatePairsOff[bool]
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of the values of a field that has this in its annotation.
+
+    Attributes:
+        check: called with flag and value; raises BadInput.
+    """
+
+    check: Callable[[str, Any], None]
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a command is told; BadInput where a value is not what its field's annotation asks for,
+    or where values don't go together."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            given = getattr(self, field.name)
+            for asked in getattr(field.type, "__metadata__", ()):
+                if isinstance(asked, Asked):
+                    for value in given if isinstance(given, tuple) else (given,):
+                        if value is not None:
+                            asked.check(flag_of(field.name), value)
+        self._check()
+
+    def _check(self) -> None:
+        """Raise BadInput where values don't go together."""
+
+
+def flag_of(name: str) -> str:
+    """The flag of a field."""
+    return f"--{name.replace('_', '-')}"
+
+
 def optional(
     metavar: str,
     without: str = "(optional)",
@@ -53,6 +90,60 @@ def optional(
         metavar=metavar, help_behavior_hint=without, constructor=constructor, help=help_text
     )
 
+
+def require(condition: bool, flag: str, problem: str) -> None:
+    """Raise BadInput where a condition does not hold."""
+    if not condition:
+        raise BadInput(flag, problem)
+
+
+def key_values(flag: str, texts: Sequence[str], expected: str = "KEY=VALUE") -> dict[str, str]:
+    """Key -> value of texts KEY=VALUE.
+
+    Raises:
+        BadInput: a text that is none, or a key that is given twice.
+    """
+    values: dict[str, str] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        require(bool(key and equals), flag, f"expected {expected}, got {text!r}")
+        require(key not in values, flag, f"{key} is given twice")
+        values[key] = value
+    return values
+
+
+def _require_at_least(flag: str, value: int, least: int) -> None:
+    bound = "not be negative" if least == 0 else f"be at least {least}"
+    require(value >= least, flag, f"must {bound}, got {value}")
+
+
+def _require_finite(flag: str, value: float, zero_allowed: bool = False) -> None:
+    large_enough = value >= 0 if zero_allowed else value > 0
+    bound = "not be negative" if zero_allowed else "be positive"
+    require(math.isfinite(value) and large_enough, flag, f"must {bound} and finite, got {value}")
+
+
+def _require_within(flag: str, value: float, name: str) -> None:
+    from jaxnav.files.ranges import RANGES, problem_of  # NumPy: not for --help
+
+    if RANGES[name].least > 0:
+        _require_finite(flag, value)
+    problem = problem_of(name, value)
+    require(problem is None, flag, problem or "")
+
+
+def within(name: str) -> Asked:
+    """What a file may hold of the same quantity, whose name stands in `jaxnav.files.ranges`."""
+    return Asked(partial(_require_within, name=name))
+
+
+POSITIVE = Asked(_require_finite)
+AT_LEAST_1 = Asked(partial(_require_at_least, least=1))
+Count = Annotated[int, AT_LEAST_1]
+Seed = Annotated[int, Asked(partial(_require_at_least, least=0))]
+Positive = Annotated[float, POSITIVE]
+NotNegative = Annotated[float, Asked(partial(_require_finite, zero_allowed=True))]
+CornerSigma = Annotated[float, within("corner_sigma_px")]
 
 _QCAR = "FILE", "(default: the QCar's)", None
 QCarFile = Annotated[Path | None, optional(*_QCAR)]
@@ -79,41 +170,8 @@ ResultsFolder = Annotated[Path, tyro.conf.arg(metavar="DIR", help="Folder for th
 
 
 @dataclass(frozen=True, kw_only=True)
-class Headless:
+class Headless(Told):
     """What every command is told that shows how far it is."""
 
     headless: Switch = False
     """No progress bar."""
-
-
-def require(condition: bool, flag: str, problem: str) -> None:
-    """Raise BadInput where a condition does not hold."""
-    if not condition:
-        raise BadInput(flag, problem)
-
-
-def require_at_least(least: int, flag: str, value: int) -> None:
-    """Raise BadInput where a number is too small."""
-    bound = "not be negative" if least == 0 else f"be at least {least}"
-    require(value >= least, flag, f"must {bound}, got {value}")
-
-
-def require_finite(flag: str, value: float, zero_allowed: bool = False) -> None:
-    """Raise BadInput where a number is not positive, or not finite."""
-    large_enough = value >= 0 if zero_allowed else value > 0
-    bound = "not be negative" if zero_allowed else "be positive"
-    require(math.isfinite(value) and large_enough, flag, f"must {bound} and finite, got {value}")
-
-
-def require_within(flag: str, value: float, name: str) -> None:
-    """Raise BadInput where a number is not what a file may hold of the same quantity.
-
-    Args:
-        name: of the quantity, in `jaxnav.files.ranges`.
-    """
-    from jaxnav.files.ranges import RANGES, problem_of  # NumPy: not for --help
-
-    if RANGES[name].least > 0:
-        require_finite(flag, value)
-    problem = problem_of(name, value)
-    require(problem is None, flag, problem or "")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.commands import COMMANDS, registered
-from jaxnav.commands.calibrate.arguments.cameras import CalibrateIntrinsics
+from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 
 _OUTPUTS = {"out", "json", "record"}  # fields of outputs
 

@@ -1,4 +1,4 @@
-"""Drawing for the commands: candidate poses in camera frames, and figures into files."""
+"""Drawing for the commands: normals of markers in images, and figures into files."""
 
 import warnings
 from collections.abc import Iterator
@@ -18,9 +18,6 @@ from jaxnav.files import atomic_path
 from jaxnav.models.camera import Camera
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import points_in_world
-from jaxnav.models.rig import CameraRig
-from jaxnav.navigator import Output
-from jaxnav.plots.localisation import AnnotatedFrame
 
 PNG_DPI = 110
 _NORMAL_SIDES = 0.8  # length of a drawn normal, in sides of the marker
@@ -61,52 +58,3 @@ def normals_px(
     foot = Ts_camera_marker.translation()
     tip = foot + length_m[:, None] * Ts_camera_marker.rotation().as_matrix()[:, :, 2]
     return np.asarray(camera.project(jnp.stack([foot, tip], axis=1)))
-
-
-def views_of(
-    rig: CameraRig,
-    T_world_marker: jaxlie.SE3,
-    sizes_m: jax.Array,
-    images: list[np.ndarray],
-    corners_px: np.ndarray,
-    visible: np.ndarray,
-    output: Output,
-    stamp_s: float,
-) -> list[AnnotatedFrame]:
-    """Views of every camera's frame, with the markers seen and the poses the navigator weighed.
-
-    Args:
-        T_world_marker: poses of the map, batch axis (M,).
-        sizes_m: (M,).
-        images: (H, W) of each camera.
-        corners_px: (C, M, 4, 2).
-        visible: (C, M).
-        output: the navigator's, on the host.
-        stamp_s: shown in the titles.
-    """
-    views = []
-    valid = np.flatnonzero(output.candidates.valid)
-    for c, image in enumerate(images):
-        T_camera_vehicle = jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[c])
-        sticks: dict[bool, list[np.ndarray]] = {True: [], False: []}
-        for m in np.flatnonzero(visible[c]):
-            for n in valid:
-                T_vehicle_world = jaxlie.SE3(
-                    jnp.asarray(output.candidates.T_vehicle_world.wxyz_xyz[n])
-                )
-                T_world_marker_m = jaxlie.SE3(T_world_marker.wxyz_xyz[m])
-                T_camera_marker = T_camera_vehicle @ T_vehicle_world @ T_world_marker_m
-                stick = normals_px(
-                    rig.camera(c), jaxlie.SE3(T_camera_marker.wxyz_xyz[None]), sizes_m[m][None]
-                )
-                sticks[n == output.selected].append(stick[0])
-        views.append(
-            AnnotatedFrame(
-                title=f"{rig.names[c]}, t = {stamp_s:.2f} s",
-                image=image,
-                detected_px=corners_px[c][visible[c]],
-                selected_px=np.asarray(sticks[True]).reshape(-1, 2, 2),
-                other_px=np.asarray(sticks[False]).reshape(-1, 2, 2),
-            )
-        )
-    return views

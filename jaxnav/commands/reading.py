@@ -1,13 +1,46 @@
-"""Reading of a recorded drive with a progress bar."""
+"""Reading of recorded drives, and of files that are given beside them."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
+from jaxnav.commands.kinds import flag_of
+from jaxnav.errors import BadInput
+from jaxnav.files import load_markers, load_rig, load_route, load_vehicle
 from jaxnav.recording.drive_log import DriveLog, read_drive
 
 _PATIENCE_S = 2.0
+_LOADS = {
+    "rig": (load_rig, "rig"),
+    "markers": (load_markers, "markers_file"),
+    "vehicle": (load_vehicle, "vehicle"),
+    "route": (load_route, "route"),
+}
+
+
+def given_files(args: Any, names: Sequence[str], bag: Path | None = None) -> dict[str, Any]:
+    """The content of the files that are given in place of a recording's own.
+
+    Args:
+        args: with the fields rig, markers_file, vehicle and route, as far as they are asked for.
+        names: those asked for: rig, markers, vehicle, route.
+        bag: a recording that holds none of them, so that all must be given.
+
+    Raises:
+        BadInput: a file that is not valid, or the flag of one that is missing.
+    """
+    content = {}
+    for name in names:
+        load, field = _LOADS[name]
+        path = getattr(args, field)
+        if path is not None:
+            content[name] = load(path)
+        elif bag is not None:
+            raise BadInput(flag_of(field), f"missing: a ROS bag ({bag}) does not hold it")
+    return content
 
 
 def read_shown(path: Path, headless: bool = False) -> DriveLog:

@@ -6,7 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxnav.calibration.rigs.calibrate import RigCalibration
 from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.models.rig import CameraRig
 from jaxnav.plots.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)
@@ -14,44 +16,36 @@ _ARROWS = 400  # residuals drawn for each camera
 
 
 def rig_report(
-    *,
-    names: Sequence[str],
-    image_sizes_px: Sequence[tuple[int, int]],
-    camera: np.ndarray,
-    centers_px: np.ndarray,
-    residuals_px: np.ndarray,
-    weight: np.ndarray,
+    calibration: RigCalibration,
+    rig: CameraRig,
+    given: np.ndarray,
     corners_world_m: np.ndarray,
     marker_ids: Sequence[int],
-    path_m: np.ndarray,
-    Ts_vehicle_camera: np.ndarray,
-    given: np.ndarray,
 ) -> Figure:
     """Draw the map and the rig from above, and every camera's residuals over its image.
 
     Args:
-        camera: (N,) index of the camera of each sighting.
-        centers_px: (N, 2) centre of each sighting in the image.
-        residuals_px: (N, 2) mean of its four corners' residuals.
-        weight: (N,) weight of each sighting, 1 for full weight.
-        corners_world_m: (M, 4, 3).
-        path_m: (F, 3) positions of the vehicle in the world.
-        Ts_vehicle_camera, given: (C, 4, 4), the calibrated and the previous poses.
+        rig: has the names and the image sizes of the cameras.
+        given: (C, 4, 4) T_vehicle_camera before calibration.
+        corners_world_m: (M, 4, 3) of the markers that were found.
+        marker_ids: theirs.
     """
+    names, views = rig.names, calibration.views
+    residuals_px = calibration.residuals_px.mean(axis=1)  # of each sighting's four corners
+    centers_px = views.corners_px.mean(axis=1)
     columns = max(2, min(4, len(names)))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(3.6 * columns, 4.6 + 2.9 * rows), layout="constrained")
     halves = figure.subfigures(2, 1, height_ratios=[4.6, 2.9 * rows], squeeze=False)
     top, bottom = halves[:, 0]
     world, vehicle = top.subplots(1, 2)
-    _draw_map(world, corners_world_m, marker_ids, path_m)
-    _draw_cameras(vehicle, names, Ts_vehicle_camera, given)
+    _draw_map(world, corners_world_m, marker_ids, calibration.Ts_world_vehicle[:, :3, 3])
+    _draw_cameras(vehicle, names, calibration.Ts_vehicle_camera, given)
     axes = np.ravel(bottom.subplots(rows, columns, squeeze=False))
     for index, (axis, name) in enumerate(zip(axes, names, strict=False)):
-        of = camera == index
-        _draw_residuals(
-            axis, name, image_sizes_px[index], centers_px[of], residuals_px[of], weight[of]
-        )
+        of = views.camera == index
+        seen = centers_px[of], residuals_px[of], calibration.weight[of]
+        _draw_residuals(axis, name, rig.image_sizes_px[index], *seen)
     for axis in axes[len(names) :]:
         axis.set_axis_off()
     return figure

@@ -1,7 +1,7 @@
 """Draw a fit: its losses, its parameters and its results on held-out drives."""
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -17,24 +17,27 @@ _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)
 _LINES = ("-", "--", ":")
 
 
-@runtime_checkable
-class EstimatorScores(Protocol):
-    """The scores of an estimator on drives that the fit has not used."""
+@dataclass(frozen=True)
+class EstimatorScores:
+    """The scores of an estimator on drives that had no part in the fit."""
 
-    @property
-    def anees(self) -> tuple[float, float, float]:
-        """The ANEES with its interval."""
-        ...
+    rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
+    anees: tuple[float, float, float]
+    band: tuple[float, float]  # in which ANEES is consistent, 99.9 %
+    error_m: np.ndarray  # of every judged frame
+    indefinite: int  # judged frames whose covariance is indefinite by rounding; not in ANEES
 
-    @property
-    def band(self) -> tuple[float, float]:
-        """The interval in which the ANEES is consistent."""
-        ...
 
-    @property
-    def error_m(self) -> np.ndarray:
-        """The position error of every frame."""
-        ...
+@dataclass(frozen=True)
+class ControllerScores:
+    """The results of a controller in one scenario, on seeds never trained on."""
+
+    loss: tuple[float, float, float]  # mean with its 95 % interval
+    parts: dict[str, float]
+    time_s: tuple[float, float, float]  # to the last waypoint
+    success: tuple[float, float, float]
+    poses: np.ndarray  # (frames, 3) of the first drive
+    waypoints_m: np.ndarray
 
 
 def tuning_report(
@@ -54,26 +57,6 @@ def tuning_report(
         _draw_errors(errors, name, before, after)
         _draw_anees(covariance, before, after)
     return figure
-
-
-@runtime_checkable
-class ControllerScores(Protocol):
-    """The results of a controller in one scenario."""
-
-    @property
-    def parts(self) -> dict[str, float]:
-        """The parts of the loss."""
-        ...
-
-    @property
-    def poses(self) -> np.ndarray:
-        """The poses (frames, 3) of one drive."""
-        ...
-
-    @property
-    def waypoints_m(self) -> np.ndarray:
-        """The waypoints (W, 2)."""
-        ...
 
 
 def controller_report(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from jaxnav import files
 from jaxnav.commands.calibrate import convert as calibrate_convert
-from jaxnav.commands.calibrate.arguments.cameras import CalibrateConvert
+from jaxnav.commands.calibrate.arguments import CalibrateConvert
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.cameras import camera_file

@@ -23,8 +23,7 @@ from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.plots.drive import drive_log_report
-from jaxnav.plots.drive_map import HEALTH_COLORS
+from jaxnav.plots.drive import HEALTH_COLORS, drive_log_report
 from jaxnav.plots.scenery import Scenery
 from jaxnav.recording.drive_log import DriveLog, read_drive
 from jaxnav.recording.messages import input_message

@@ -2,6 +2,7 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -9,12 +10,11 @@ from jaxnav import __version__
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.pages import PAPERS_MM, check_fit, largest
 from jaxnav.calibration.boards.sheets import sheet_of
-from jaxnav.commands.calibrate.arguments.cameras import CalibrateBoard
-from jaxnav.commands.calibrate.boards import write_board
+from jaxnav.commands.calibrate.arguments import CalibrateBoard
 from jaxnav.commands.process import configure_jax
 from jaxnav.detection import marker_cells
 from jaxnav.errors import BadInput
-from jaxnav.files import atomic_path, output_folder, write_json
+from jaxnav.files import atomic_path, boards, output_folder, write_json
 from jaxnav.models.markers import FAMILY_SIZES
 from jaxnav.plots.board import board_page
 
@@ -115,3 +115,25 @@ def _save(figure: Figure, path: Path, form: str, dpi: int) -> None:
     metadata = {"CreationDate": None} if form == "pdf" else None
     with atomic_path(path) as beside:
         figure.savefig(beside, dpi=dpi, format=form, metadata=metadata)
+
+
+def read_board(path: Path) -> Board:
+    """Read the board of a file.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    entry = boards.load_board(path)
+    try:
+        return Board(**entry.figures())
+    except ValueError as error:
+        raise BadInput(path, str(error)) from None
+
+
+def write_board(path: Path, board: Board) -> None:
+    """Write a board to a file that `read_board` reads.
+
+    Raises:
+        BadInput: the file can't be written.
+    """
+    boards.save_board(path, vars(board))

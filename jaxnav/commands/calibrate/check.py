@@ -8,7 +8,7 @@ from jaxnav.calibration.rigs.calibrate import calibrate_rig
 from jaxnav.calibration.rigs.marker_check import Check, Verdict, checked
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.calibration.rigs.vehicle_frame import moved_world
-from jaxnav.commands.calibrate.arguments.recordings import CalibrateCheck as Arguments
+from jaxnav.commands.calibrate.arguments import CalibrateCheck as Arguments
 from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import provenance, summary, write_files
 from jaxnav.commands.pictures import save_figure

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from jaxnav.commands.calibrate.arguments.cameras import CalibrateConvert
+from jaxnav.commands.calibrate.arguments import CalibrateConvert
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, wpilib
 from jaxnav.files.cameras import camera_file, choose_camera

@@ -12,8 +12,8 @@ from jaxnav.calibration.boards.images import CollectedViews
 from jaxnav.calibration.lenses.checks import cells, reach, rim_sigma_px, tilts_deg
 from jaxnav.calibration.lenses.images import calibrate_images
 from jaxnav.calibration.lenses.intrinsics import LensCalibration
-from jaxnav.commands.calibrate.arguments.cameras import CalibrateIntrinsics
-from jaxnav.commands.calibrate.boards import read_board
+from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
+from jaxnav.commands.calibrate.board import read_board
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput

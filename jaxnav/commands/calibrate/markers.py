@@ -2,7 +2,7 @@
 
 from jaxnav.calibration.rigs.calibrate import calibrate_rig
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
-from jaxnav.commands.calibrate.arguments.recordings import CalibrateMarkers as Arguments
+from jaxnav.commands.calibrate.arguments import CalibrateMarkers as Arguments
 from jaxnav.commands.calibrate.data import read_rig_data
 from jaxnav.commands.calibrate.rig import publish, refuse_wrong_sizes
 from jaxnav.commands.process import configure_jax

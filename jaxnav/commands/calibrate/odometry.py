@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
 from jaxnav.calibration.odometry.model import NAMES
-from jaxnav.commands.calibrate.arguments.recordings import CalibrateOdometry as Arguments
+from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.calibrate.odometry_recordings import RecordedDrives, read_recordings
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax

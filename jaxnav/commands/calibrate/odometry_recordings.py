@@ -1,20 +1,20 @@
 """Recorded drives as data for the calibration of odometry."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxnav.calibration.odometry.drive import Drive
-from jaxnav.commands.calibrate.arguments.recordings import CalibrateOdometry as Arguments
-from jaxnav.commands.reading import read_shown
+from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
+from jaxnav.commands.reading import given_files, read_shown
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.detection import Detections
 from jaxnav.detection.observe import observe
 from jaxnav.errors import BadInput
-from jaxnav.files import load_markers, load_rig, load_topics, load_vehicle
+from jaxnav.files import load_topics
 from jaxnav.files.ranges import is_within
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
@@ -68,26 +68,19 @@ def _own(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
                 problem = f"was driven with another {key} than {logs[0].path}: say which by {flag}"
                 raise BadInput(log.path, problem)
     setup = DriveSetup.of_header(logs[0].header, logs[0].path)
-    rig = setup.rig if args.rig is None else load_rig(args.rig)
-    markers = setup.markers if args.markers_file is None else load_markers(args.markers_file)
-    vehicle = setup.vehicle if args.vehicle is None else load_vehicle(args.vehicle)
+    setup = replace(setup, **given_files(args, _SHARED))
     drives = [
-        drive_of(str(log.path), log.inputs, rig, markers, setup.corner_sigma_px) for log in logs
+        drive_of(str(log.path), log.inputs, setup.rig, setup.markers, setup.corner_sigma_px)
+        for log in logs
     ]
-    return RecordedDrives(tuple(drives), rig, markers, vehicle, files)
+    return RecordedDrives(tuple(drives), setup.rig, setup.markers, setup.vehicle, files)
 
 
 def _ros(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
-    def needed(flag: str, path: Path | None, load: Callable[[Path], Any]) -> Any:
-        if path is None:
-            raise BadInput(flag, f"missing: a ROS bag ({args.recordings[0]}) does not hold it")
-        return load(path)
-
     assert args.topics is not None
-    rig: CameraRig = needed("--rig", args.rig, load_rig)
-    markers: MarkerMap = needed("--markers-file", args.markers_file, load_markers)
-    vehicle: Vehicle = needed("--vehicle", args.vehicle, load_vehicle)
+    given = given_files(args, _SHARED, bag=args.recordings[0])
     topics = load_topics(args.topics)
+    rig, markers, vehicle = (given[name] for name in _SHARED)
     drives = []
     for path in args.recordings:
         inputs = read_ros_drive(path, topics, rig, markers, vehicle, args.corner_backend)

@@ -9,7 +9,7 @@ from jaxnav.calibration.rigs.driven_frame import driven_frame
 from jaxnav.calibration.rigs.marker_check import sizes_m
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven, moved_to_places
-from jaxnav.commands.calibrate.arguments.recordings import CalibrateRig as Arguments
+from jaxnav.commands.calibrate.arguments import CalibrateRig as Arguments
 from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import (
     found_markers,
@@ -67,30 +67,12 @@ def publish(
     report = summary(data, calibration, given, calibrated)
     write_files(out, data, calibration, calibrated, with_rig)
     write_json(out / "report.json", report)
-    _write_picture(out, data, calibration, given)
+    markers, mapped = found_markers(data, calibration)
+    ids = [data.keys[index][1] for index in mapped]
+    figure = rig_report(calibration, data.rig, given, corners_in_world(markers), ids)
+    save_figure(figure, out / "report.png")
     print(text(report))
     print(f"{'rig, markers' if with_rig else 'markers'} and report in {visible(out)}")
-
-
-def _write_picture(
-    out: Path, data: RigData, calibration: RigCalibration, given: np.ndarray
-) -> None:
-    markers, mapped = found_markers(data, calibration)
-    views = calibration.views
-    figure = rig_report(
-        names=data.rig.names,
-        image_sizes_px=data.rig.image_sizes_px,
-        camera=views.camera,
-        centers_px=views.corners_px.mean(axis=1),
-        residuals_px=calibration.residuals_px.mean(axis=1),
-        weight=calibration.weight,
-        corners_world_m=corners_in_world(markers),
-        marker_ids=[data.keys[index][1] for index in mapped],
-        path_m=calibration.Ts_world_vehicle[:, :3, 3],
-        Ts_vehicle_camera=calibration.Ts_vehicle_camera,
-        given=given,
-    )
-    save_figure(figure, out / "report.png")
 
 
 def _reference_camera(args: Arguments, data: RigData) -> int:

@@ -14,13 +14,14 @@ from jaxnav.commands.kinds import (
     QCarMarkers,
     QCarRig,
     QCarVehicle,
+    Told,
+    key_values,
     optional,
-    require,
 )
 
 
 @dataclass(frozen=True)
-class Doctor:
+class Doctor(Told):
     """Check what a car will run with, and say what to do about each finding.
 
     Looked at are the computer (packages, OpenCV, JAX, clock, disk), the four files, pictures that
@@ -48,10 +49,6 @@ class Doctor:
     json: OptionalFile = None
     """Write all findings into this file too."""
 
-    def __post_init__(self) -> None:
-        for flag, texts in (("--option", self.option), ("--frame", self.frame)):
-            expected = "KEY=VALUE" if flag == "--option" else "CAMERA=IMAGE"
-            keys = [text.partition("=")[0] for text in texts]
-            for text, key in zip(texts, keys, strict=True):
-                require("=" in text and key != "", flag, f"expected {expected}, got {text!r}")
-                require(keys.count(key) == 1, flag, f"{key} is given twice")
+    def _check(self) -> None:
+        key_values("--option", self.option)
+        key_values("--frame", self.frame, "CAMERA=IMAGE")

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from jaxnav.commands.doctor.findings import Finding, listed, said
+from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, said, warning
 from jaxnav.loop.interfaces import Camera, Frame
 from jaxnav.testing.calls import Finish, start_call
 
@@ -58,8 +58,8 @@ def watch(cameras: Sequence[Camera]) -> list[Watched]:
     for look, into in zip(looks, watched, strict=True):
         try:
             look("read()", _PATIENCE_S + 2 * WATCH_S)
-        except (AssertionError, OSError) as error:
-            into.failure = str(error)
+        except (AssertionError, OSError) as failure:
+            into.failure = str(failure)
     return watched
 
 
@@ -68,8 +68,8 @@ def _look(camera: Camera, into: Watched) -> None:
     while time.monotonic() < until_s:
         try:
             frame = camera.read(0.2)
-        except OSError as error:
-            into.failure = said(error)
+        except OSError as failure:
+            into.failure = said(failure)
             time.sleep(0.05)
             continue
         if frame is None:
@@ -95,11 +95,9 @@ def judge_cameras(
         problems = [*_wrong_frames(camera), *_wrong_picture(camera, size_px)]
         yield from problems
         if not problems:
-            yield Finding(
-                "cameras",
-                "ok",
+            yield ok(
                 f"{camera.name}: {camera.rate_hz:.0f} Hz, {np.median(camera.ages_s) * 1e3:.0f} ms "
-                f"old{_light(camera)}",
+                f"old{_light(camera)}"
             )
     yield from skew(watched)
 
@@ -107,43 +105,31 @@ def judge_cameras(
 def _wrong_frames(camera: Watched) -> Iterator[Finding]:
     name = camera.name
     if camera.first is None:
-        yield Finding(
-            "cameras",
-            "error",
+        yield error(
             f"{name} gave no picture in {_PATIENCE_S:g} s"
             + (f": {camera.failure}" if camera.failure else ""),
             "is it plugged in? Does another program use it?",
         )
         return
     if camera.failure:
-        yield Finding(
-            "cameras", "warning", f"{name}: {camera.failure}", "look at its cable and its driver"
-        )
+        yield warning(f"{name}: {camera.failure}", "look at its cable and its driver")
     if min(camera.ages_s) < 0:
-        yield Finding(
-            "cameras",
-            "error",
+        yield error(
             f"{name}: stamps lie up to {-min(camera.ages_s):.3g} s in the future",
             "stamp_ns must be of time.monotonic_ns() of this computer",
         )
     elif (age_s := float(np.median(camera.ages_s))) > _LATE_S:
-        yield Finding(
-            "cameras",
-            "error" if age_s > _OLD_S else "warning",
+        yield (error if age_s > _OLD_S else warning)(
             f"{name}: pictures are {age_s:.3g} s old when they arrive",
             "let the driver drop what waits in its queue (appsink drop=true max-buffers=1)",
         )
     if camera.rate_hz < _LEAST_RATE_HZ:
-        yield Finding(
-            "cameras",
-            "warning",
+        yield warning(
             f"{name}: {camera.rate_hz:.1f} pictures a second",
             "shorten the exposure, or add light; choose a faster mode of the camera",
         )
     if len(camera.pictures) >= _FROZEN and len(set(camera.pictures)) == 1:
-        yield Finding(
-            "cameras",
-            "error",
+        yield error(
             f"{name}: {len(camera.pictures)} times the very same picture",
             "its driver repeats an old picture: plug it in again, start the driver anew",
         )
@@ -155,25 +141,19 @@ def _wrong_picture(camera: Watched, size_px: tuple[int, int]) -> Iterator[Findin
     image, name = np.asarray(camera.first.image), camera.name
     shape = image.shape
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
-        yield Finding(
-            "cameras",
-            "error",
+        yield error(
             f"{name} gives {image.dtype} of shape {shape}",
             "expected uint8, (H, W) or (H, W, 3) in BGR order",
         )
         return
     if (shape[1], shape[0]) != tuple(size_px):
-        yield Finding(
-            "cameras",
-            "error",
+        yield error(
             f"{name} gives {shape[1]} x {shape[0]} px, the rig says {size_px[0]} x {size_px[1]}",
             "set the camera to the size that it was calibrated at, or calibrate again",
         )
     mean, contrast = float(image.mean()), float(image.std())
     if not _DARK <= mean <= _BRIGHT or contrast < _LEAST_CONTRAST:
-        yield Finding(
-            "cameras",
-            "warning",
+        yield warning(
             f"{name}: mean grey {mean:.0f}, contrast {contrast:.0f}",
             "is the lens cap on, the light off, the exposure too long?",
         )
@@ -201,11 +181,9 @@ def skew(watched: Sequence[Watched]) -> Iterator[Finding]:
     shown = listed(f"{name} {value * 1e3:+.0f} ms" for name, value in apart_s.items())
     text = f"against {seen[0].name}: {shown}"
     if max(map(abs, apart_s.values())) > _SKEW_S:
-        yield Finding(
-            "cameras",
-            "note",
+        yield note(
             f"pictures are not taken together, {text}",
             "each frame counts at its own stamp; check that stamps are of the exposure",
         )
     else:
-        yield Finding("cameras", "ok", f"taken together, {text}")
+        yield ok(f"taken together, {text}")

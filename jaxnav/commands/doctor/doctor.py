@@ -11,7 +11,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from jaxnav.commands.doctor.arguments import Doctor
-from jaxnav.commands.doctor.findings import Finding, Report
+from jaxnav.commands.doctor.findings import Finding, Report, note
+from jaxnav.commands.kinds import key_values
 from jaxnav.errors import BadInput
 
 _CHECKS = "jaxnav.commands.doctor"
@@ -22,13 +23,13 @@ def run(args: Doctor) -> int:
     report = Report(lambda finding: print(finding, flush=True))
     _computer(report)
     patient = _files(report, args)
-    report.examine("compile cache", lambda: _cache(patient))
+    report.examine("compile cache", _cache, patient)
     if args.frame:
-        report.examine("picture", lambda: _pictures(args, patient))
+        report.examine("picture", _pictures, args, patient)
     if args.vehicle is not None or args.cameras is not None:
-        report.examine("plug-ins", lambda: _plug_ins(report, args, patient))
+        report.examine("plug-ins", _plug_ins, report, args, patient)
     if args.drive is not None:
-        report.examine("stamps", lambda: _check("stamps", "stamps")(args.drive))
+        report.examine("stamps", _check, "stamps", "stamps", args.drive)
     print(report.summary())
     if args.json is not None:
         from jaxnav.files import write_json
@@ -37,26 +38,27 @@ def run(args: Doctor) -> int:
     return report.exit_code
 
 
-def _check(module: str, name: str) -> Any:
-    """Import a module of checks and return one of its functions."""
-    return getattr(importlib.import_module(f"{_CHECKS}.{module}"), name)
+def _check(module: str, name: str, *told: Any) -> Iterable[Finding]:
+    """Import a module of checks and call one of its functions."""
+    check = getattr(importlib.import_module(f"{_CHECKS}.{module}"), name)
+    findings: Iterable[Finding] = check(*told)
+    return findings
 
 
 def _computer(report: Report) -> None:
-    report.examine("packages", lambda: _check("software", "packages")())
-    report.examine("OpenCV", lambda: _check("software", "opencv")())
+    report.examine("packages", _check, "software", "packages")
+    report.examine("OpenCV", _check, "software", "opencv")
     report.examine("JAX", _jax)
-    report.examine("clock", lambda: _check("machine", "clock")())
-    report.examine("CPU", lambda: _check("machine", "processor")())
-    report.examine("disk", lambda: _check("machine", "disk")(Path.cwd()))
+    report.examine("clock", _check, "machine", "clock")
+    report.examine("CPU", _check, "machine", "processor")
+    report.examine("disk", _check, "machine", "disk", Path.cwd())
 
 
 def _jax() -> Iterable[Finding]:
     """Examine JAX, configured as the car will be started: one thread, float64."""
     process = importlib.import_module("jaxnav.commands.process")
     process.configure_jax(float64=True, threads=1)
-    findings: Iterable[Finding] = _check("software", "jax_device")()
-    return findings
+    return _check("software", "jax_device")
 
 
 def _files(report: Report, args: Doctor) -> SimpleNamespace:
@@ -78,16 +80,16 @@ def _files(report: Report, args: Doctor) -> SimpleNamespace:
         patient.route = patient.route.relative_to(patient.markers.origin_m)
     rig, markers, vehicle, route = vars(patient).values()
     if rig is not None:
-        report.examine("rig", lambda: _check("rig_file", "rig_file")(paths["rig"], rig))
-    report.examine("markers", lambda: _check("markers_file", "measured_corners")(paths["markers"]))
+        report.examine("rig", _check, "rig_file", "rig_file", paths["rig"], rig)
+    report.examine("markers", _check, "markers_file", "measured_corners", paths["markers"])
     if markers is not None:
-        report.examine("markers", lambda: _check("markers_file", "placed")(markers))
+        report.examine("markers", _check, "markers_file", "placed", markers)
     if vehicle is not None:
-        report.examine("vehicle", lambda: _check("route_file", "vehicle_file")(vehicle))
+        report.examine("vehicle", _check, "route_file", "vehicle_file", vehicle)
     if None not in (route, vehicle, markers):
-        report.examine("route", lambda: _check("route_file", "route_file")(route, vehicle, markers))
+        report.examine("route", _check, "route_file", "route_file", route, vehicle, markers)
     if None not in (rig, route, markers):
-        report.examine("sight", lambda: _check("route_file", "sight_along")(rig, markers, route))
+        report.examine("sight", _check, "route_file", "sight_along", rig, markers, route)
     return patient
 
 
@@ -101,10 +103,8 @@ def _cache(patient: SimpleNamespace) -> Iterable[Finding]:
     if folder is not None and None not in vars(patient).values():
         compiled = _is_compiled(patient, folder)
     directory = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    findings: Iterable[Finding] = _check("software", "compile_cache")(
-        Path(directory) if directory else None, compiled, cache_refused()
-    )
-    return findings
+    directory = Path(directory) if directory else None
+    return _check("software", "compile_cache", directory, compiled, cache_refused())
 
 
 def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
@@ -142,26 +142,24 @@ def _pictures(args: Doctor, patient: SimpleNamespace) -> Iterable[Finding]:
     from jaxnav.files.images import read_image
 
     if patient.rig is None or patient.markers is None:
-        return [Finding("picture", "note", "not looked at: rig and markers are needed")]
+        return [note("not looked at: rig and markers are needed")]
     images = {}
-    for text in args.frame:
-        name, _, path = text.partition("=")
+    for name, path in key_values("--frame", args.frame).items():
         if name not in patient.rig.names:
-            raise BadInput(
-                f"--frame {text}",
-                f"the rig has no camera {name!r}: expected one of {', '.join(patient.rig.names)}",
-            )
+            known = ", ".join(patient.rig.names)
+            problem = f"the rig has no camera {name!r}: expected one of {known}"
+            raise BadInput(f"--frame {name}={path}", problem)
         images[name] = read_image(Path(path))
     return examine_pictures(patient.rig, patient.markers, patient.route, images)
 
 
 def _plug_ins(report: Report, args: Doctor, patient: SimpleNamespace) -> Iterable[Finding]:
     if None in vars(patient).values():
-        return [Finding("plug-ins", "note", "not opened: they need all four files")]
+        return [note("not opened: they need all four files")]
     from jaxnav.commands.doctor.plug_ins import plug_ins
     from jaxnav.loop.interfaces import Setup
 
-    options = dict(text.split("=", 1) for text in args.option)
+    options = key_values("--option", args.option)
     setup = Setup(
         patient.rig, patient.markers, patient.vehicle, patient.route.start_pose, options=options
     )

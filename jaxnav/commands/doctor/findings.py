@@ -6,7 +6,8 @@ This module imports nothing heavy: it must work where JAX, OpenCV or a driver do
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, TypeVar
 
 from jaxnav.errors import BadInput
@@ -28,7 +29,7 @@ class Finding:
     """The result of one check.
 
     Attributes:
-        name: of the thing that was checked.
+        name: of the thing that was checked; empty: the one that `Report.examine` was told.
         level: "ok"; "note", good to know; "warning", it may go wrong; "error", it will.
         what: the result in one line.
         do: what a person can do about it.
@@ -45,7 +46,8 @@ class Finding:
         return f"{line}\n{'':9}do: {_one_line(self.do)}" if self.do else line
 
 
-Check = Callable[[], Iterable[Finding]]
+# Called with `what` and `do`, or with `what` alone.
+error, warning, note, ok = (partial(Finding, "", level) for level in LEVELS)
 
 
 @dataclass
@@ -66,28 +68,23 @@ class Report:
         self.findings.append(finding)
         self.show(finding)
 
-    def examine(self, name: str, check: Check) -> None:
+    def examine(self, name: str, check: Callable[..., Iterable[Finding]], *told: Any) -> None:
         """Run a check, and keep what it found before it failed.
 
         Args:
-            name: of the finding that says that it failed.
-            check: may raise anything, as a broken installation does.
+            name: of findings without a name, and of the one that says that the check failed.
+            check: called with `told`; may raise anything, as a broken installation does.
         """
         try:
-            for finding in check():
-                self.add(finding)
-        except BadInput as error:
+            for finding in check(*told):
+                self.add(replace(finding, name=finding.name or name))
+        except BadInput as failure:
             self.unreadable = True
-            self.add(Finding(name, "error", str(error)))
-        except Exception as error:
-            self.add(
-                Finding(
-                    name,
-                    "error",
-                    f"could not be looked at: {said(error)}",
-                    "if the lines about packages are all ok, please report it",
-                )
-            )
+            self.add(Finding(name, "error", str(failure)))
+        except Exception as failure:
+            what = f"could not be looked at: {said(failure)}"
+            do = "if the lines about packages are all ok, please report it"
+            self.add(Finding(name, "error", what, do))
 
     def read(self, name: str, load: Callable[[], Loaded]) -> Loaded | None:
         """Load a file and return its content; None, and a finding, where it can't be read."""

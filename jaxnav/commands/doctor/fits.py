@@ -5,8 +5,9 @@ say, or a few of them are unknown too. Each unknown is measured in its prior sig
 so that only one small program has to be compiled for fits with different unknowns.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
@@ -17,12 +18,21 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
+from jaxnav.commands.doctor.sight import area_px2
 from jaxnav.detection.observe import CornerLanes
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.candidates import both_poses
 from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, sightings
 
+SIZE_SIGMA = 0.3  # of a logarithm
+_FOCAL_SIGMA = 0.1
+_MOVED_SIGMA = 1.0  # m and rad
+_TURNED_SIGMA_RAD = 0.1
+# The most an explanation may leave: a share of the chi-square, and an RMS error of the corners.
+_EXPLAINS, _MOST_PX = 0.1, 1.0
+_SCALED_ALIKE = 0.01  # sizes that a printer scaled agree this well
+_ALIKE = 6.0  # two explanations this close can't be told apart
 MOST_ERRORS = 6  # numbers that may be unknown beside the pose
 _HEIGHT_SIGMA_M = 0.01  # of a car on a floor that is nearly level,
 _TILT_SIGMA_RAD = np.deg2rad(0.5)  # and with a tape's errors in the cameras' places
@@ -48,12 +58,8 @@ class Sighted:
     @staticmethod
     def of(rig: CameraRig, markers: MarkerMap, seen: CornerLanes, most: int) -> "Sighted":
         """The sightings of the `most` markers that look largest in any image."""
-        diagonals_px = seen.corners_px[..., :2, :] - seen.corners_px[..., 2:, :]
-        area_px2 = np.abs(
-            diagonals_px[..., 0, 0] * diagonals_px[..., 1, 1]
-            - diagonals_px[..., 0, 1] * diagonals_px[..., 1, 0]
-        )
-        largest = np.where(seen.visible, area_px2, 0).max(axis=0)
+        areas_px2 = np.abs(area_px2(seen.corners_px))
+        largest = np.where(seen.visible, areas_px2, 0).max(axis=0)
         count = min(int((largest > 0).sum()), most)
         kept = np.sort(np.argsort(-largest, kind="stable")[:count])
         chosen = MarkerMap(
@@ -249,3 +255,113 @@ def _errors(
 
     J, (whitened, wxyz_xyz) = jax.jacfwd(errors, has_aux=True)(u)
     return whitened, J, wxyz_xyz
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """One error that a file may hold, with the best fit that allows for it.
+
+    Attributes:
+        kind: "size", "sizes", "moved", "focal" or "turned".
+        index: of the marker or the camera; None for all of them.
+        count: how many numbers it frees.
+        fit: the best fit with these numbers free.
+    """
+
+    kind: str
+    index: int | None
+    count: int
+    fit: StandingFit = field(repr=False)
+
+
+def explained(seen: Sighted, starts: Sequence[np.ndarray], whole: StandingFit) -> list[Explanation]:
+    """The errors that explain the corners best: up to three that can't be told apart, often none.
+
+    Args:
+        starts: level poses to begin at.
+        whole: the fit without any error.
+    """
+    tried = [
+        Explanation(kind, index, count, fit(seen, starts, prior_sigma))
+        for kind, index, count, prior_sigma in _errors_of_files(seen)
+    ]
+    good = [
+        each
+        for each in tried
+        if each.fit.cost < _EXPLAINS * whole.cost
+        and each.fit.error_px < _MOST_PX
+        and (each.kind != "sizes" or np.ptp(each.fit.value.size) < _SCALED_ALIKE)
+    ]
+    misfit = min((max(each.fit.cost / seen.numbers, 1.0) for each in good), default=1.0)
+
+    def price(each: Explanation) -> float:
+        """Schwarz's criterion (1978): the misfit left, and a penalty for each number freed."""
+        return each.fit.cost / misfit + each.count * math.log(seen.numbers)
+
+    good.sort(key=price)
+    return [each for each in good if price(each) < price(good[0]) + _ALIKE][:3]
+
+
+def _errors_of_files(seen: Sighted) -> Iterator[tuple[str, int | None, int, FileErrors]]:
+    """Each error that several markers can tell apart: kind, index, count, and prior sigmas."""
+    C, M = seen.visible.shape
+    used = np.flatnonzero(seen.visible.any(axis=1))[:MOST_ERRORS]
+
+    def of_pose(**others: np.ndarray) -> FileErrors:
+        return FileErrors.of_pose(seen, level=True, **others)
+
+    yield "sizes", None, M, of_pose(size=np.full(M, SIZE_SIGMA))
+    focal = np.where(np.isin(np.arange(C), used), _FOCAL_SIGMA, 0.0)
+    yield "focal", None, len(used), of_pose(focal=focal)
+    for m in range(M):
+        this = np.arange(M) == m
+        yield "size", m, 1, of_pose(size=np.where(this, SIZE_SIGMA, 0.0))
+        moved = np.where(this[:, None], _MOVED_SIGMA, 0.0) * np.ones(6)
+        yield "moved", m, 6, of_pose(moved=moved)
+    if len(used) > 1:
+        for c in used.tolist():
+            this = np.arange(C) == c
+            turned = np.where(this[:, None], _TURNED_SIGMA_RAD, 0.0) * np.ones(3)
+            yield "turned", c, 3, of_pose(turned=turned)
+
+
+def in_words(seen: Sighted, explanation: Explanation) -> tuple[str, str]:
+    """An explanation as text, and what to do about it."""
+    value, index = explanation.fit.value, explanation.index
+    ids, names = seen.markers.ids, seen.rig.names
+    if index is None:
+        if explanation.kind == "sizes":
+            factors = ", ".join(
+                f"{marker_id} {math.exp(float(size)):.3f}"
+                for marker_id, size in zip(ids, value.size, strict=True)
+            )
+            return (
+                f"markers have other sizes than in the map: {factors} times",
+                "measure the black squares: did the printer scale the page?",
+            )
+        factors = ", ".join(
+            f"{names[c]} {math.exp(float(value.focal[c])):.3f}"
+            for c in np.flatnonzero(seen.visible.any(axis=1))
+        )
+        return (
+            f"focal lengths are other than in the rig: {factors} times",
+            "calibrate the lenses again, at the image size that the car uses",
+        )
+    if explanation.kind == "size":
+        factor, size_m = math.exp(float(value.size[index])), float(seen.markers.size_m[index])
+        return (
+            f"marker {ids[index]} is {factor:.3f} of its size in the map",
+            f"measure its black square: is it {size_m * factor:.4f} m instead of {size_m:.4f}?",
+        )
+    if explanation.kind == "moved":
+        shift_m = float(np.linalg.norm(value.moved[index, :3]))
+        turn_deg = math.degrees(float(np.linalg.norm(value.moved[index, 3:])))
+        return (
+            f"marker {ids[index]} is moved by {shift_m:.3f} m and {turn_deg:.0f} deg",
+            f"measure the corners of marker {ids[index]} again",
+        )
+    turn_deg = math.degrees(float(np.linalg.norm(value.turned[index])))
+    return (
+        f"camera {names[index]} is turned by {turn_deg:.1f} deg",
+        f"measure yaw_deg, elevation_deg and roll_deg of {names[index]} again",
+    )

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxnav.commands.doctor.findings import Finding, listed
+from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 
 _SLEEPS = 100
 _SLEEP_S = 1e-3
@@ -40,17 +40,13 @@ def clock(clocks: Clocks | None = None) -> Iterator[Finding]:
     clocks = clocks or Clocks()
     resolution_s = _resolution_s(clocks)
     if resolution_s > _MAX_RESOLUTION_S:
-        yield Finding(
-            "clock",
-            "error",
+        yield error(
             f"the monotonic clock moves in steps of {resolution_s * 1e3:.3g} ms",
             "stamps of odometry and frames would be that wrong: use another kernel or clocksource",
         )
     drift_s = _drift_s(clocks)
     if abs(drift_s) > _MAX_DRIFT_S:
-        yield Finding(
-            "clock",
-            "warning",
+        yield warning(
             f"the wall clock moved {drift_s * 1e3:+.1f} ms against the monotonic one in "
             f"{_DRIFT_OVER_S:g} s",
             "wait until the clock is set (timedatectl); drivers must stamp by time.monotonic_ns()",
@@ -62,14 +58,12 @@ def clock(clocks: Clocks | None = None) -> Iterator[Finding]:
         f"(99 % of {_SLEEPS}), {max(late_s) * 1e3:.2f} ms at worst"
     )
     if share > _MAX_LATE_S:
-        yield Finding(
-            "clock",
-            "error" if share > _CYCLE_S else "warning",
+        yield (error if share > _CYCLE_S else warning)(
             f"{text}: the loop's tick is {_CYCLE_S * 1e3:.0f} ms",
             "stop what else runs on this computer, or give the loop `chrt -f 50` and a core",
         )
     else:
-        yield Finding("clock", "ok", text)
+        yield ok(text)
 
 
 def _resolution_s(clocks: Clocks) -> float:
@@ -111,18 +105,18 @@ def processor(folder: Path = Path("/sys/devices/system/cpu")) -> Iterator[Findin
     governors = sorted({name for core in cores if (name := _text(core / "scaling_governor"))})
     if not governors:
         count = os.cpu_count()
-        yield Finding("CPU", "ok", f"{count} cores; the kernel tells nothing of their frequency")
+        yield ok(f"{count} cores; the kernel tells nothing of their frequency")
         return
     allowed = [_share(core, "scaling_max_freq") for core in cores]
     text = f"{len(cores)} cores, governor {listed(governors)}"
     worst = min((share for share in allowed if share is not None), default=1.0)
     fast = "sudo cpupower frequency-set -g performance; on a Jetson: nvpmodel -m 0, jetson_clocks"
     if worst < _MIN_CLOCK_SHARE:
-        yield Finding("CPU", "warning", f"{text}, held at {worst:.0%} of the full frequency", fast)
+        yield warning(f"{text}, held at {worst:.0%} of the full frequency", fast)
     elif set(governors) & set(_SLOW_GOVERNORS):
-        yield Finding("CPU", "note", f"{text}: a step is slow until the core has sped up", fast)
+        yield note(f"{text}: a step is slow until the core has sped up", fast)
     else:
-        yield Finding("CPU", "ok", text)
+        yield ok(text)
 
 
 def _share(core: Path, name: str) -> float | None:
@@ -152,9 +146,7 @@ def disk(
     """
     free_mib = usage(folder)[2] / _MIB
     if free_mib < _LEAST_FREE_MIB:
-        yield Finding(
-            "disk",
-            "error" if free_mib < 4 * _WRITTEN_MIB else "warning",
+        yield (error if free_mib < 4 * _WRITTEN_MIB else warning)(
             f"{free_mib:.0f} MiB free in {folder}",
             "delete old recordings, or start from a folder of another disk",
         )
@@ -168,22 +160,18 @@ def disk(
                 file.write(block)
             file.flush()
             os.fsync(file.fileno())
-    except OSError as error:
-        yield Finding(
-            "disk",
-            "error",
-            f"{folder} can't be written: {error.strerror or error}",
+    except OSError as failure:
+        yield error(
+            f"{folder} can't be written: {failure.strerror or failure}",
             "start from another folder, or change its owner",
         )
         return
     speed = _WRITTEN_MIB / max((monotonic_ns() - begin_ns) / 1e9, 1e-9)
     text = f"{free_mib / 1024:.1f} GiB free in {folder}, {speed:.0f} MiB/s"
     if speed < _LEAST_SPEED_MIB_S:
-        yield Finding(
-            "disk",
-            "warning",
+        yield warning(
             f"{text}: recordings with pictures may lose messages",
             "record to another disk, or leave the pictures away",
         )
     else:
-        yield Finding("disk", "ok", text)
+        yield ok(text)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.commands.doctor.findings import Finding, listed
+from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
 from jaxnav.models.markers import MarkerMap
@@ -33,7 +33,7 @@ def measured_corners(path: Path) -> Iterator[Finding]:
             has_findings = True
             yield finding
     if checked and not has_findings:
-        yield Finding("markers", "ok", f"corners of {checked} are squares of their size within 1 %")
+        yield ok(f"corners of {checked} are squares of their size within 1 %")
 
 
 def _entries(path: Path) -> list[dict[str, Any]]:
@@ -60,18 +60,14 @@ def _square(name: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding
     diagonals_m = np.linalg.norm(corners_m[:2] - corners_m[2:], axis=1)
     side_m = float(sides_m.mean())
     if sides_m.max() > 1.2 * sides_m.min() and diagonals_m.min() < 0.9 * sides_m.max():
-        yield Finding(
-            "markers",
-            "error",
+        yield error(
             f"{name}: its corners make a bow tie, two of them are swapped",
             "corners_world_m are top-left, top-right, bottom-right, bottom-left, clockwise as the "
             "reader sees them",
         )
         return
     if abs(side_m / size_m - 1) > _MAX_ERROR:
-        yield Finding(
-            "markers",
-            "error" if abs(side_m / size_m - 1) > 3 * _MAX_ERROR else "warning",
+        yield (error if abs(side_m / size_m - 1) > 3 * _MAX_ERROR else warning)(
             f"{name}: its corners are {side_m:.4f} m apart, size_m says {size_m:.4f} "
             f"({size_m / side_m - 1:+.1%})",
             "measure the black square from edge to edge, without the white paper, and its corners",
@@ -79,9 +75,7 @@ def _square(name: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding
     spread_m = sides_m.max() - sides_m.min()
     askew_m = abs(diagonals_m[0] - diagonals_m[1])
     if max(spread_m, askew_m) > 2 * _MAX_ERROR * side_m:
-        yield Finding(
-            "markers",
-            "warning",
+        yield warning(
             f"{name}: its sides differ by {spread_m * 1e3:.1f} mm, its diagonals by "
             f"{askew_m * 1e3:.1f} mm",
             "measure its corners again, or give T_world_marker",
@@ -89,9 +83,7 @@ def _square(name: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding
     # The smallest extent of the four corners is the one across their plane.
     off_m = np.linalg.svd(corners_m - corners_m.mean(axis=0))[1][2] / 2
     if off_m > _MAX_ERROR * side_m:
-        yield Finding(
-            "markers",
-            "warning",
+        yield warning(
             f"{name}: its corners are {off_m * 1e3:.1f} mm off a plane",
             "is the paper curled? Glue it onto a board, and measure its corners again",
         )
@@ -109,23 +101,17 @@ def placed(markers: MarkerMap) -> Iterator[Finding]:
         turned_rad = np.arctan2(x_axis[2], y_axis[2])
         if size_m > _MOST_SIZE_M:
             has_findings = True
-            yield Finding(
-                "markers", "warning", f"{name} is {size_m:.3g} m wide", "lengths are in m"
-            )
+            yield warning(f"{name} is {size_m:.3g} m wide", "lengths are in m")
         if lowest_m < -_MAX_ERROR * size_m:
             has_findings = True
-            yield Finding(
-                "markers",
-                "warning",
+            yield warning(
                 f"{name} reaches {-lowest_m:.2f} m below the ground",
                 "z is measured upwards from the floor that the car drives on",
             )
         if abs(normal[2]) < _UPRIGHT and abs(turned_rad) > _TURNED_RAD:
             quarters = round(float(np.rad2deg(turned_rad)) / 90)
             has_findings = True
-            yield Finding(
-                "markers",
-                "note",
+            yield note(
                 f"{name} hangs turned by {90 * quarters} deg: its top-left corner is not the "
                 "upper left one",
                 "if the printed marker stands upright its corners are in the wrong order; "
@@ -134,4 +120,4 @@ def placed(markers: MarkerMap) -> Iterator[Finding]:
     if not has_findings:
         count = len(markers.ids)
         families = listed(sorted(set(markers.families)))
-        yield Finding("markers", "ok", f"{count} of {families}, upright or flat, above the ground")
+        yield ok(f"{count} of {families}, upright or flat, above the ground")

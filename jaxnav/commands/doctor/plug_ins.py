@@ -2,13 +2,13 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from jaxnav.commands.doctor.camera_frames import Watched, judge_cameras, watch
-from jaxnav.commands.doctor.findings import Finding, Report, said
+from jaxnav.commands.doctor.camera_frames import judge_cameras, watch
+from jaxnav.commands.doctor.findings import Finding, Report, error, ok, said, warning
 from jaxnav.errors import BadInput
 from jaxnav.loop import plugins
 from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
@@ -46,36 +46,30 @@ def plug_ins(
     vehicle: Any = Parked()
     if vehicle_name is not None:
         opened: list[Vehicle] = []
-        report.examine("vehicle", lambda: _open_vehicle(vehicle_name, setup, opened))
+        report.examine("vehicle", _open_vehicle, vehicle_name, setup, opened)
         if opened:
             vehicle = opened[0]
-            report.examine("odometry", lambda: _odometry(vehicle, Limits.of(setup.vehicle)))
+            report.examine("odometry", _odometry, vehicle, Limits.of(setup.vehicle))
         elif cameras_name is not None:
-            report.add(
-                Finding("cameras", "note", "opened beside a vehicle that stands still instead")
-            )
+            instead = "opened beside a vehicle that stands still instead"
+            report.add(Finding("cameras", "note", instead))
     if cameras_name is not None:
-        report.examine("cameras", lambda: _cameras(cameras_name, setup, vehicle))
+        report.examine("cameras", _cameras, cameras_name, setup, vehicle)
     if vehicle_name is not None and opened:
-        report.examine("vehicle", lambda: _close("vehicle", [vehicle]))
+        report.examine("vehicle", _close, [vehicle])
 
 
 def _open_vehicle(name: str, setup: Setup, opened: list[Vehicle]) -> Iterator[Finding]:
     plugins.load_factory("--vehicle", plugins.VEHICLES, name)
-    try:
-        vehicle = start_call(partial(plugins.open_vehicle, name, setup))(
-            "opening it", _OPENS_WITHIN_S
-        )
-    except (BadInput, OSError, AssertionError) as error:
-        yield _not_opened("vehicle", name, error)
+    vehicle, problems = _open("opening it", plugins.open_vehicle, name, setup)
+    yield from problems
+    if problems:
         return
     opened.append(vehicle)
-    yield Finding("vehicle", "ok", f"{name} opens")
+    yield ok(f"{name} opens")
     yield _guard(name)
     if not vehicle.timeout_s < math.inf:
-        yield Finding(
-            "vehicle",
-            "warning",
+        yield warning(
             f"{name} does not stop by itself when nothing is written any more",
             "a computer that fails as a whole leaves it driving: have a switch at hand that cuts "
             "its power",
@@ -105,19 +99,24 @@ def _guard(name: str) -> Finding:
     )
 
 
-def _not_opened(part: str, name: str, error: Exception) -> Finding:
-    problem = str(error) if isinstance(error, BadInput) else f"{name}: {said(error)}"
-    return Finding(
-        part, "error", problem, "is it plugged in, switched on, and free of other programs?"
-    )
+def _open(
+    what: str, open_plug_in: Callable[..., Any], name: str, *told: Any
+) -> tuple[Any, list[Finding]]:
+    """What a plug-in opens, or a finding that says why it does not."""
+    try:
+        return start_call(partial(open_plug_in, name, *told))(what, _OPENS_WITHIN_S), []
+    except (BadInput, OSError, AssertionError) as failure:
+        problem = str(failure) if isinstance(failure, BadInput) else f"{name}: {said(failure)}"
+        do = "is it plugged in, switched on, and free of other programs?"
+        return None, [error(problem, do)]
 
 
-def _close(part: str, things: Sequence[Any]) -> Iterator[Finding]:
+def _close(things: Sequence[Any]) -> Iterator[Finding]:
     for thing in things:
         try:
             start_call(thing.close)("close()", HANGS_S)
-        except Exception as error:
-            yield Finding(part, "warning", f"closing failed: {said(error)}", "the driver's author")
+        except Exception as failure:
+            yield warning(f"closing failed: {said(failure)}", "the driver's author")
 
 
 def _odometry(vehicle: Vehicle, limits: Limits) -> Iterator[Finding]:
@@ -151,9 +150,7 @@ def judge_odometry(
         failures: the errors of further attempts to read.
     """
     if failures:
-        yield Finding(
-            "odometry",
-            "warning" if readings else "error",
+        yield (warning if readings else error)(
             f"{len(failures)} of {len(failures) + len(readings)} readings failed: "
             f"{said(failures[-1])}",
             "look at the cable to the car's controller, and at its driver",
@@ -166,12 +163,10 @@ def judge_odometry(
         return
     stamps_ns = [reading.odometry.stamp_ns for reading in readings]
     last = readings[-1].odometry
-    yield Finding(
-        "odometry",
-        "ok",
+    yield ok(
         f"{len(readings)} readings at {_rate_hz(stamps_ns):.0f} Hz, "
         f"{max(_ages_s(readings)) * 1e3:.0f} ms old at most; "
-        f"{last.speed_mps:+.2f} m/s, steering {last.steering_rad:+.2f} rad",
+        f"{last.speed_mps:+.2f} m/s, steering {last.steering_rad:+.2f} rad"
     )
 
 
@@ -190,37 +185,27 @@ def _wrong_stamps(readings: Sequence[Reading]) -> Iterator[Finding]:
     rate_hz = _rate_hz([reading.odometry.stamp_ns for reading in readings])
     slow = sum(reading.took_s > _SLOW_S for reading in readings)
     if min(ages_s) < 0:
-        yield Finding(
-            "odometry",
-            "error",
+        yield error(
             f"stamps lie up to {-min(ages_s):.3g} s in the future",
             "stamp_ns must be of time.monotonic_ns() of this computer",
         )
     elif rate_hz == 0:
-        yield Finding(
-            "odometry",
-            "error",
+        yield error(
             f"{len(readings)} readings have one and the same stamp: nothing new is measured",
             "does the car's controller run? Is its cable in?",
         )
     elif max(ages_s) > _OLD_S:
-        yield Finding(
-            "odometry",
-            "error",
+        yield error(
             f"readings are up to {max(ages_s):.3g} s old, over {_OLD_S:g} s counts as none",
             "stamp_ns is of time.monotonic_ns(), when it was measured; read the driver's queue dry",
         )
     elif rate_hz < _LEAST_RATE_HZ:
-        yield Finding(
-            "odometry",
-            "warning",
+        yield warning(
             f"{rate_hz:.0f} readings a second",
             f"let the driver measure at {_LEAST_RATE_HZ:.0f} Hz or more",
         )
     if slow > len(readings) // 10:
-        yield Finding(
-            "odometry",
-            "warning",
+        yield warning(
             f"read() took over {_SLOW_S * 1e3:.0f} ms, {slow} of {len(readings)} times",
             "it must give the latest reading at once: read in a thread of the driver's own",
         )
@@ -230,16 +215,12 @@ def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Findi
     valid = [reading.odometry for reading in readings if reading.odometry.valid]
     finite = [o for o in valid if math.isfinite(o.speed_mps) and math.isfinite(o.steering_rad)]
     if len(valid) < len(readings):
-        yield Finding(
-            "odometry",
-            "warning" if valid else "error",
+        yield (warning if valid else error)(
             f"{len(readings) - len(valid)} of {len(readings)} readings are marked as not valid",
             "the driver says so itself: look at its messages",
         )
     if len(finite) < len(valid):
-        yield Finding(
-            "odometry",
-            "error",
+        yield error(
             f"{len(valid) - len(finite)} of {len(valid)} valid readings are no numbers",
             "the driver should say valid=False where it can't tell",
         )
@@ -249,9 +230,7 @@ def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Findi
     widest = max(finite, key=lambda o: abs(o.steering_rad))
     if abs(fastest.speed_mps) > _STANDS_MPS:
         same = len({(o.speed_mps, o.steering_rad) for o in finite}) == 1 < len(finite)
-        yield Finding(
-            "odometry",
-            "warning",
+        yield warning(
             f"it says {fastest.speed_mps:+.2f} m/s"
             + (f", {len(finite)} times the very same" if same else "")
             + ": does the car stand?",
@@ -259,9 +238,7 @@ def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Findi
             "repeats old values",
         )
     if abs(widest.steering_rad) > 1.1 * limits.steering_rad:
-        yield Finding(
-            "odometry",
-            "warning",
+        yield warning(
             f"steering reads {widest.steering_rad:+.2f} rad, its limit is "
             f"{limits.steering_rad:.2f}",
             "steering_rad is in rad, positive to the left",
@@ -270,16 +247,13 @@ def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Findi
 
 def _cameras(name: str, setup: Setup, vehicle: Vehicle) -> Iterator[Finding]:
     plugins.load_factory("--cameras", plugins.CAMERAS, name)
-    try:
-        cameras = start_call(partial(plugins.open_cameras, name, setup, vehicle))(
-            "opening them", _OPENS_WITHIN_S
-        )
-    except (BadInput, OSError, AssertionError) as error:
-        yield _not_opened("cameras", name, error)
+    cameras, problems = _open("opening them", plugins.open_cameras, name, setup, vehicle)
+    yield from problems
+    if problems:
         return
     try:
-        watched: list[Watched] = watch(cameras)
+        watched = watch(cameras)
     finally:
-        closing = list(_close("cameras", cameras))
+        closing = list(_close(cameras))
     yield from judge_cameras(watched, setup.rig.image_sizes_px)
     yield from closing

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
-from jaxnav.commands.doctor.findings import Finding, listed
+from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.commands.doctor.sight import sees_directions, through_lens
 from jaxnav.files.reading import read_mapping
 from jaxnav.models.rig import CameraRig
@@ -26,7 +26,7 @@ _DEGREES = np.arange(360)
 
 def rig_file(path: Path, rig: CameraRig) -> Iterator[Finding]:
     """Run all checks of a rig that was loaded from a file."""
-    yield Finding("rig", "ok", f"{len(rig)} cameras: {listed(rig.names)}")
+    yield ok(f"{len(rig)} cameras: {listed(rig.names)}")
     yield from rotations(path)
     yield from places(rig)
     yield from intrinsics(rig)
@@ -43,14 +43,12 @@ def rotations(path: Path) -> Iterator[Finding]:
         if deviation > worst:
             worst, where = deviation, key
     if worst > _ROUNDED:
-        yield Finding(
-            "rig",
-            "note",
+        yield note(
             f"{where} is a rotation but for {worst:.1g}, {np.rad2deg(worst / 2):.2g} deg",
             "write its numbers with more digits",
         )
     else:
-        yield Finding("rig", "ok", "rotations are orthonormal")
+        yield ok("rotations are orthonormal")
 
 
 def _matrices(data: Any, key: str) -> Iterator[tuple[str, Any]]:
@@ -73,33 +71,25 @@ def places(rig: CameraRig) -> Iterator[Finding]:
     for name, position_m, R in zip(rig.names, T[:, :3, 3], T[:, :3, :3], strict=True):
         height_m, distance_m = position_m[2], np.hypot(*position_m[:2])
         if not _LEAST_HEIGHT_M < height_m < _MOST_HEIGHT_M:
-            yield Finding(
-                "rig",
-                "error" if height_m <= 0 else "warning",
+            yield (error if height_m <= 0 else warning)(
                 f"{name} is {height_m:.3g} m above the ground",
                 "measure from the ground, in m; is T_vehicle_camera written where its inverse is "
                 "meant?",
             )
         elif distance_m > _MOST_DISTANCE_M:
-            yield Finding(
-                "rig",
-                "warning",
+            yield warning(
                 f"{name} is {distance_m:.3g} m from the middle of the vehicle",
                 "position_m is in m, from the point midway between the axles",
             )
         else:
             elevation_deg = np.rad2deg(np.arcsin(np.clip(R[2, 2], -1, 1)))
-            yield Finding(
-                "rig",
-                "ok",
+            yield ok(
                 f"{name} is {height_m:.3f} m above the ground, looks to "
                 f"{round(np.rad2deg(np.arctan2(R[1, 2], R[0, 2])))} deg, "
-                f"{round(elevation_deg):+d} up",
+                f"{round(elevation_deg):+d} up"
             )
         if R[2, 1] > 0:
-            yield Finding(
-                "rig",
-                "warning",
+            yield warning(
                 f"{name} is mounted upside down",
                 "if it is not: the camera's y axis points down (x right, y down, z forward)",
             )
@@ -107,9 +97,7 @@ def places(rig: CameraRig) -> Iterator[Finding]:
         for j in range(i):
             near = np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]) < _SAME_PLACE_M
             if near and T[i, :3, 2] @ T[j, :3, 2] > _SAME_DIRECTION:
-                yield Finding(
-                    "rig",
-                    "warning",
+                yield warning(
                     f"{rig.names[j]} and {rig.names[i]} look the same way from the same place",
                     "was an entry copied? Correct its yaw_deg and position_m",
                 )
@@ -135,29 +123,23 @@ def intrinsics(rig: CameraRig) -> Iterator[Finding]:
         shown = f"{name}: center_px ({center[0]:.0f}, {center[1]:.0f})"
         if off.max() > _MAX_OFF_CENTER:
             outside = bool(np.any((center < 0) | (center > size - 1)))
-            yield Finding(
-                "rig",
-                "error" if outside else "warning",
+            yield (error if outside else warning)(
                 f"{shown} is far from the middle of {size[0]:.0f} x {size[1]:.0f} px",
                 f"was it calibrated at {2 * center[0] + 1:.0f} x {2 * center[1] + 1:.0f} px? Then "
                 "calibrate at the size that the car uses",
             )
         if max(focal) > _MAX_ASPECT * min(focal):
-            yield Finding(
-                "rig",
-                "warning",
+            yield warning(
                 f"{name}: fx {focal[0]:.0f} and fy {focal[1]:.0f} px differ",
                 "pixels are nearly always squares: calibrate again, the board all over the image",
             )
         if not _FIELD_DEG[0] < fields_deg[index] < _FIELD_DEG[1]:
-            yield Finding(
-                "rig",
-                "warning",
+            yield warning(
                 f"{name}: focal_px {focal[0]:.0f} sees {fields_deg[index]:.3g} deg of the horizon",
                 "focal_px is in px of the images that the car uses, not in mm",
             )
         elif off.max() <= _MAX_OFF_CENTER:
-            yield Finding("rig", "ok", f"{shown}, {fields_deg[index]:.0f} deg from left to right")
+            yield ok(f"{shown}, {fields_deg[index]:.0f} deg from left to right")
 
 
 def lenses(rig: CameraRig) -> Iterator[Finding]:
@@ -173,15 +155,13 @@ def lenses(rig: CameraRig) -> Iterator[Finding]:
     for name, part in zip(rig.names, reach, strict=True):
         if part == 1:
             continue
-        yield Finding(
-            "rig",
-            "error" if part < 0.5 else "warning",
+        yield (error if part < 0.5 else warning)(
             f"{name}: the lens model can be inverted up to {part:.0%} of the way to the corners "
             "of the image only: it folds there",
             "calibrate with the board in the corners too, or with the other lens model",
         )
     if np.all(reach == 1):
-        yield Finding("rig", "ok", "lens models can be inverted in the whole image")
+        yield ok("lens models can be inverted in the whole image")
 
 
 def bearings(rig: CameraRig) -> Iterator[Finding]:
@@ -192,12 +172,10 @@ def bearings(rig: CameraRig) -> Iterator[Finding]:
     blind = spans(count == 0)
     twice = int((count > 1).sum())
     if not blind:
-        yield Finding("rig", "ok", f"all bearings are seen, {twice} of 360 deg by two and more")
+        yield ok(f"all bearings are seen, {twice} of 360 deg by two and more")
         return
     shown = listed(f"{begin} to {end} deg" for begin, end in blind)
-    yield Finding(
-        "rig",
-        "note" if (count > 0).any() else "error",
+    yield (note if (count > 0).any() else error)(
         f"no camera sees {shown} (0 forward, 90 left), {int((count == 0).sum())} of 360 deg",
         "a marker there is not seen: plan the route so, or turn a camera",
     )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
-from jaxnav.commands.doctor.findings import Finding, listed
+from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.commands.doctor.sight import PoseViews, views
 from jaxnav.files import Route
 from jaxnav.models.bicycle import Vehicle, curvature_per_m
@@ -59,12 +59,10 @@ def vehicle_file(vehicle: Vehicle) -> Iterator[Finding]:
     ]
     for wrong, what, do in problems:
         if wrong:
-            yield Finding("vehicle", "warning", what, do)
+            yield warning(what, do)
     if not any(wrong for wrong, _, _ in problems):
-        yield Finding(
-            "vehicle",
-            "ok",
-            f"{top_mps:.2g} m/s at full throttle, turns within {turning_radius_m(vehicle):.2f} m",
+        yield ok(
+            f"{top_mps:.2g} m/s at full throttle, turns within {turning_radius_m(vehicle):.2f} m"
         )
 
 
@@ -79,9 +77,7 @@ def route_file(route: Route, vehicle: Vehicle, markers: MarkerMap) -> Iterator[F
         leg_m, target = legs_m[number - 1], np.array(route.waypoints_m[number - 1])
         if leg_m <= radius_m:
             good = False
-            yield Finding(
-                "route",
-                "warning",
+            yield warning(
                 f"waypoint {number} is {leg_m:.2f} m from the place before: reached at once",
                 f"waypoints are apart by more than waypoint_radius_m ({radius_m:g} m)",
             )
@@ -90,18 +86,14 @@ def route_file(route: Route, vehicle: Vehicle, markers: MarkerMap) -> Iterator[F
         centers = pose[:2] + turn_m * np.array([left, -left])
         if np.linalg.norm(target - centers, axis=1).min() < turn_m - radius_m:
             good = False
-            yield Finding(
-                "route",
-                "note",
+            yield note(
                 f"waypoint {number} lies inside the smallest circle ({turn_m:.2f} m) of a car "
                 "that comes from the place before: it drives straight on first, then a loop",
                 "move the waypoint, or add one that leads there",
             )
     if radius_m < _LEAST_RADIUS_M:
         good = False
-        yield Finding(
-            "route",
-            "warning",
+        yield warning(
             f"waypoint_radius_m is {radius_m:g}: the car may pass by and turn round",
             "0.1 to 0.2 m suits a small car",
         )
@@ -111,18 +103,14 @@ def route_file(route: Route, vehicle: Vehicle, markers: MarkerMap) -> Iterator[F
     if low.any() and apart_m[:, low].min() < _NEAR_M:
         marker = markers.ids[int(np.flatnonzero(low)[apart_m[:, low].min(axis=0).argmin()])]
         good = False
-        yield Finding(
-            "route",
-            "warning",
+        yield warning(
             f"the route leads past marker {marker} at {apart_m[:, low].min():.2f} m",
             "the car would hit it: move the waypoints",
         )
     if good:
-        yield Finding(
-            "route",
-            "ok",
+        yield ok(
             f"{len(route.waypoints_m)} waypoints, {length_m:.1f} m, "
-            f"{apart_m.min():.1f} to {apart_m.min(axis=1).max():.1f} m from the nearest marker",
+            f"{apart_m.min():.1f} to {apart_m.min(axis=1).max():.1f} m from the nearest marker"
         )
 
 
@@ -134,9 +122,7 @@ def sight_along(rig: CameraRig, markers: MarkerMap, route: Route) -> Iterator[Fi
     heights_m = np.asarray(markers.Ts_world_marker.translation())[:, 2]
     apart_m = np.abs(heights_m[:, None] - Ts_vehicle_camera(rig)[:, 2, 3]).min(axis=1)
     if apart_m.min() > _HIGH_M:
-        yield Finding(
-            "sight",
-            "warning",
+        yield warning(
             f"all markers are {apart_m.min():.1f} m and more above or below the cameras",
             "heights are measured from the floor, in m, in both files",
         )
@@ -148,31 +134,23 @@ def sight_along(rig: CameraRig, markers: MarkerMap, route: Route) -> Iterator[Fi
     readable: np.ndarray = np.any(seen.side_px[len(arrivals) :] >= READABLE_PX, axis=(1, 2))
     blind_m = _longest(~readable) * length_m / (_ALONG - 1)
     if blind_m > _LONG_BLIND_M:
-        yield Finding(
-            "sight",
-            "warning",
+        yield warning(
             f"along {blind_m:.1f} m of the route no marker is {READABLE_PX:.0f} px wide: "
             "the odometer alone counts",
             "add a marker there, print it larger, or move the route nearer",
         )
     else:
-        yield Finding(
-            "sight", "ok", f"a readable marker is in view of {readable.mean():.0%} of the route"
-        )
+        yield ok(f"a readable marker is in view of {readable.mean():.0%} of the route")
 
 
 def _never_seen(seen: PoseViews, markers: MarkerMap) -> Finding:
     if seen.behind.all():
-        return Finding(
-            "sight",
-            "error",
+        return error(
             "start and route lie behind all markers",
             "corners_world_m are clockwise as the reader sees them, beginning top-left: are they "
             "written as seen from behind?",
         )
-    return Finding(
-        "sight",
-        "error",
+    return error(
         f"no marker of {listed(markers.ids)} is seen from the start or along the route",
         "compare heights and directions of cameras and markers",
     )
@@ -185,9 +163,7 @@ def _from_place(rig: CameraRig, markers: MarkerMap, seen: PoseViews, number: int
     camera, marker = np.unravel_index(int(sides_px.argmax()), sides_px.shape)
     side_px, range_m = float(sides_px[camera, marker]), seen.range_m[number, camera, marker]
     if side_px == 0:
-        return Finding(
-            "sight",
-            "warning" if number == 0 else "note",
+        return (warning if number == 0 else note)(
             f"{place}: no marker is in view",
             "the car knows its place again when it sees one"
             if number
@@ -198,13 +174,11 @@ def _from_place(rig: CameraRig, markers: MarkerMap, seen: PoseViews, number: int
         f"{rig.names[int(camera)]}, at {range_m:.1f} m"
     )
     if side_px < READABLE_PX:
-        return Finding(
-            "sight",
-            "warning",
+        return warning(
             f"{text}: it can be read from {range_m * side_px / READABLE_PX:.1f} m on",
             "begin nearer, or print it larger",
         )
-    return Finding("sight", "ok", text)
+    return ok(text)
 
 
 def along(route: Route) -> tuple[np.ndarray, float]:

@@ -64,6 +64,13 @@ def sees_directions(rig: CameraRig, directions_vehicle: np.ndarray) -> np.ndarra
     return np.asarray(_sees_directions(rig, jnp.asarray(directions_vehicle, float)))
 
 
+def area_px2(corners_px: np.ndarray) -> np.ndarray:
+    """The areas (...) of quadrilaterals (..., 4, 2) in an image, px^2: positive where the corners
+    run clockwise, as those of a marker seen from the front."""
+    a, b = np.moveaxis(corners_px[..., :2, :] - corners_px[..., 2:, :], -2, 0)
+    return np.asarray((a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) / 2)
+
+
 @dataclass(frozen=True)
 class PoseViews:
     """Views of every marker in every camera from P poses of the vehicle.
@@ -100,13 +107,8 @@ def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> PoseViews:
     corners_px, inside, Ts_world_vehicle = jax.device_get(
         _corners(rig, markers, jnp.asarray(poses, float))
     )
-    diagonals_px = corners_px[..., :2, :] - corners_px[..., 2:, :]
-    # Clockwise as the reader sees them, and y down in the image: positive from the front.
-    area_px2 = (
-        diagonals_px[..., 0, 0] * diagonals_px[..., 1, 1]
-        - diagonals_px[..., 0, 1] * diagonals_px[..., 1, 0]
-    ) / 2
-    side_px = np.sqrt(np.where(inside & (area_px2 > 0), area_px2, 0))
+    areas_px2 = area_px2(corners_px)
+    side_px = np.sqrt(np.where(inside & (areas_px2 > 0), areas_px2, 0))
     positions_world_m = np.einsum("pij,cj->pci", Ts_world_vehicle, Ts_vehicle_camera(rig)[:, :, 3])[
         ..., :3
     ]

@@ -9,7 +9,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from jaxnav.commands.doctor.findings import Finding, listed
+from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 
 _JETSON_MODEL = Path("/proc/device-tree/model")
 _MIB = 2**20
@@ -21,9 +21,7 @@ def packages(distribution: str = "jaxnav") -> Iterator[Finding]:
     metadata = importlib.metadata.metadata(distribution)
     python = platform.python_version()
     if not SpecifierSet(metadata["Requires-Python"]).contains(python, prereleases=True):
-        yield Finding(
-            "packages",
-            "error",
+        yield error(
             f"Python is {python}, {distribution} needs {metadata['Requires-Python']}",
             "make a virtual environment with another Python",
         )
@@ -42,18 +40,14 @@ def packages(distribution: str = "jaxnav") -> Iterator[Finding]:
                 f"{required.name} is {versions[required.name]}, expected {required.specifier}"
             )
     if wrong:
-        yield Finding(
-            "packages",
-            "error",
+        yield error(
             listed(wrong),
             f"pip install --upgrade {distribution}, in the environment that the car runs in",
         )
         return
-    yield Finding(
-        "packages",
-        "ok",
+    yield ok(
         f"Python {python}, {distribution} {metadata['Version']}, "
-        f"{len(versions)} packages in their ranges",
+        f"{len(versions)} packages in their ranges"
     )
 
 
@@ -64,24 +58,20 @@ def opencv() -> Iterator[Finding]:
     from jaxnav.vehicles.opencv_cameras import has_gstreamer
 
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
-        yield Finding(
-            "OpenCV",
-            "error",
+        yield error(
             f"{cv2.__version__} without aruco.ArucoDetector: no marker can be found",
             "pip install 'opencv-python-headless>=4.11', or build OpenCV with its objdetect module",
         )
         return
     threads = cv2.getNumThreads()
-    yield Finding("OpenCV", "ok", f"{cv2.__version__} with aruco, {threads} threads")
+    yield ok(f"{cv2.__version__} with aruco, {threads} threads")
     if not has_gstreamer():
-        yield Finding(
-            "OpenCV",
-            "note",
+        yield note(
             "built without GStreamer, as pip's is: CSI cameras can't be read by a pipeline",
             "only if your cameras need it: build OpenCV with GStreamer",
         )
     else:
-        yield Finding("OpenCV", "ok", "built with GStreamer")
+        yield ok("built with GStreamer")
 
 
 def jax_device(model_file: Path = _JETSON_MODEL) -> Iterator[Finding]:
@@ -99,23 +89,16 @@ def jax_device(model_file: Path = _JETSON_MODEL) -> Iterator[Finding]:
     jetson = _is_jetson(model_file)
     on_cpu = "set JAX_PLATFORMS=cpu"
     if device.platform != "cpu" and jetson:
-        yield Finding("JAX", "error", f"{text}: JAX has no kernels for a Jetson's GPU", on_cpu)
+        yield error(f"{text}: JAX has no kernels for a Jetson's GPU", on_cpu)
     elif device.platform != "cpu":
-        yield Finding(
-            "JAX", "warning", f"{text}: one car's step is faster on the processor", on_cpu
-        )
+        yield warning(f"{text}: one car's step is faster on the processor", on_cpu)
     elif precision != jnp.float64:
-        yield Finding(
-            "JAX",
-            "warning",
-            f"{text}: the step wants float64",
-            "unset JAX_ENABLE_X64",
-        )
+        yield warning(f"{text}: the step wants float64", "unset JAX_ENABLE_X64")
     else:
-        yield Finding("JAX", "ok", f"{text}{', a Jetson' if jetson else ''}")
+        yield ok(f"{text}{', a Jetson' if jetson else ''}")
     doubled = float(jnp.asarray(21.0) * 2)
     if doubled != 42:
-        yield Finding("JAX", "error", f"21 * 2 gave {doubled:g}", "install jax and jaxlib anew")
+        yield error(f"21 * 2 gave {doubled:g}", "install jax and jaxlib anew")
 
 
 def _is_jetson(model_file: Path) -> bool:
@@ -137,9 +120,7 @@ def compile_cache(
     """
     if directory is None or not os.access(_existing(directory), os.W_OK | os.X_OK):
         where = f"{directory} can't be written" if directory else "there is no folder for it"
-        yield Finding(
-            "compile cache",
-            "warning",
+        yield warning(
             f"{refused or where}: every start of the car compiles its step anew",
             "make ~/.cache a folder that you alone can write to, or set JAX_COMPILATION_CACHE_DIR "
             "to one",
@@ -149,18 +130,16 @@ def compile_cache(
     size_mib = sum(path.stat().st_size for path in files) / _MIB
     text = f"{directory}: {len(files)} files, {size_mib:.0f} MiB"
     if size_mib > _LARGE_CACHE_MIB:
-        yield Finding("compile cache", "note", text, f"rm -r {directory} if the disk is small")
+        yield note(text, f"rm -r {directory} if the disk is small")
     else:
-        yield Finding("compile cache", "ok", text)
+        yield ok(text)
     if compiled is False:
-        yield Finding(
-            "compile cache",
-            "note",
+        yield note(
             "the step for these files is not compiled yet: the first start will take longer",
             "start it once before it matters",
         )
     elif compiled:
-        yield Finding("compile cache", "ok", "the step for these files is compiled")
+        yield ok("the step for these files is compiled")
 
 
 def _existing(path: Path) -> Path:

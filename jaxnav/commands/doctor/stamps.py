@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from jaxnav.commands.doctor.findings import Finding
+from jaxnav.commands.doctor.findings import Finding, note, ok, warning
 from jaxnav.commands.drive.delay_watch import delays_of, describe_delay, warnings
 from jaxnav.loop.camera_delays import HARMLESS_S
 from jaxnav.recording.drive_log import read_drive
@@ -23,11 +23,11 @@ def stamps(path: Path) -> Iterator[Finding]:
     delays = delays_of(log, setup)
     for text in warnings(delays, setup):
         what, _, do = text.partition(": ")
-        yield Finding("stamps", "warning", what, do)
+        yield warning(what, do)
     for name, one in zip(setup.rig.names, delays.delays, strict=True):
         if not one.known:
             text = f"camera {name!r}: {path.name} does not tell how late it is"
-            yield Finding("stamps", "note", text, _DRIVE_EIGHTS)
+            yield note(text, _DRIVE_EIGHTS)
         elif not one.late:
             allowed = f"up to {HARMLESS_S * 1e3:.0f} ms is harmless"
-            yield Finding("stamps", "ok", f"camera {name!r} is {describe_delay(one)}; {allowed}")
+            yield ok(f"camera {name!r} is {describe_delay(one)}; {allowed}")

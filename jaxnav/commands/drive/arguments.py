@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxnav.commands.kinds import (
+    AT_LEAST_1,
+    POSITIVE,
     Believed,
     CornerBackend,
     Detector,
@@ -20,18 +22,19 @@ from jaxnav.commands.kinds import (
     QCarRig,
     QCarVehicle,
     ResultsFolder,
+    Seed,
     Selector,
     Switch,
+    Told,
+    flag_of,
     optional,
     require,
-    require_at_least,
-    require_finite,
-    require_within,
+    within,
 )
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(Told):
     """Drive a vehicle through its route.
 
     Everything is compiled before the vehicle is armed. The last that it hears, however this ends,
@@ -71,35 +74,27 @@ class Run:
     """Record the cameras' images too, as JPEG."""
     view: Switch = False
     """Open Rerun and look on. Needs the extra viz."""
-    duration_s: Annotated[float | None, optional("S", "(default: until the last waypoint)")] = None
+    duration_s: Annotated[
+        float | None, optional("S", "(default: until the last waypoint)"), POSITIVE
+    ] = None
     """End after this time, s."""
     period_s: float = 0.02
     """Between two readings of the odometer, s."""
     timeout_s: float = 0.2
     """So long after the last sign of life of any thread the vehicle has been stopped, s."""
     float64: Float64 = False
-    seed: int = 0
+    seed: Seed = 0
     """Of a simulated vehicle."""
     headless: Switch = False
     """No status line."""
 
-    def __post_init__(self) -> None:
-        require_at_least(0, "--seed", self.seed)
-        require(
-            0.002 <= self.period_s <= 0.1,
-            "--period-s",
-            f"must be from 0.002 to 0.1, got {self.period_s}",
-        )
-        require(
-            0.1 <= self.timeout_s <= 10,
-            "--timeout-s",
-            f"must be from 0.1 to 10, got {self.timeout_s}",
-        )
-        if self.duration_s is not None:
-            require_finite("--duration-s", self.duration_s)
-        require(
-            self.record is not None or not self.record_images, "--record-images", "needs --record"
-        )
+    def _check(self) -> None:
+        for name, least, most in (("period_s", 0.002, 0.1), ("timeout_s", 0.1, 10)):
+            value = getattr(self, name)
+            bounds = f"must be from {least} to {most}, got {value}"
+            require(least <= value <= most, flag_of(name), bounds)
+        recorded = self.record is not None or not self.record_images
+        require(recorded, "--record-images", "needs --record")
 
 
 @dataclass(frozen=True)
@@ -163,18 +158,12 @@ class ReplayRecording(Headless):
     ] = None
     """Which of the two poses of a marker is believed."""
     corner_sigma_px: Annotated[
-        float | None, optional("PX", "(default: as the recording tells)")
+        float | None, optional("PX", "(default: as the recording tells)"), within("corner_sigma_px")
     ] = None
     """Standard deviation of a corner coordinate."""
-    limit: Annotated[int | None, optional("N", "(default: all)", int)] = None
+    limit: Annotated[int | None, optional("N", "(default: all)", int), AT_LEAST_1] = None
     """Stop after N frames, of a drive after N inputs."""
     out: ResultsFolder = Path("out")
-
-    def __post_init__(self) -> None:
-        if self.limit is not None:
-            require_at_least(1, "--limit", self.limit)
-        if self.corner_sigma_px is not None:
-            require_within("--corner-sigma-px", self.corner_sigma_px, "corner_sigma_px")
 
 
 @dataclass(frozen=True)
@@ -191,7 +180,7 @@ class ViewDrive(Headless):
 
 
 @dataclass(frozen=True)
-class Locate:
+class Locate(Told):
     """Find markers in a photograph and print both poses of each.
 
     With each marker: reprojection errors, their ratio, the probability that the better pose is
@@ -202,7 +191,7 @@ class Locate:
     """Photograph, in any format that OpenCV reads."""
     camera: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Calibration: a rig file, a Kalibr camchain or a ROS camera_info YAML."""
-    marker_size_m: Annotated[float, tyro.conf.arg(metavar="S")]
+    marker_size_m: Annotated[float, tyro.conf.arg(metavar="S"), within("size_m")]
     """Side of the black square, m."""
     camera_name: OptionalName = None
     """Which camera of the file took it, where the file holds several."""
@@ -213,6 +202,3 @@ class Locate:
     """Print JSON instead of a table."""
     out: Annotated[Path | None, optional("PNG")] = None
     """Draw the markers and both poses into this file."""
-
-    def __post_init__(self) -> None:
-        require_within("--marker-size-m", self.marker_size_m, "size_m")

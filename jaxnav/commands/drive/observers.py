@@ -3,6 +3,7 @@
 None of them waits for a disk or a screen, and none raises: see `Observer`.
 """
 
+import math
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,12 +13,12 @@ import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
-from jaxnav.commands.drive.status import notice, status_line
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.loop import Observer
 from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.models.origin import ZERO
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.recording.message_schemas import OUTCOME
 from jaxnav.recording.messages import digest, input_message
@@ -27,6 +28,9 @@ from jaxnav.recording.recorder import Recorder
 if TYPE_CHECKING:
     from jaxnav.viewer.rerun_view import RerunView
 
+WIDTH = 100  # characters, at most
+_WIDEST_NAME = 14  # of a health
+_FAR = 12  # of a coordinate to the cm, 10 000 km from zero
 _STATUS_NS = 200_000_000
 _MARKER_NS = 200_000_000  # a marker counts as seen for this long
 
@@ -171,7 +175,7 @@ class StatusLine:
         if outcome.faults != self._faults:
             text, self._faults = notice(outcome, self._faults), outcome.faults
             if text is not None:
-                sys.stderr.write(f"\r{text:<100}\n")
+                sys.stderr.write(f"\r{text:<{WIDTH}}\n")
         elapsed_ns = given.now_ns - self._last_ns
         if elapsed_ns < _STATUS_NS:
             return
@@ -181,7 +185,7 @@ class StatusLine:
             latency_ms=(given.now_ns - outcome.stamp_ns) / 1e6,
             marker_seen=given.now_ns - self._marker_ns < _MARKER_NS,
         )
-        sys.stderr.write(f"\r{line:<100}")
+        sys.stderr.write(f"\r{line:<{WIDTH}}")
         sys.stderr.flush()
         self._last_ns, self._count = given.now_ns, 0
 
@@ -192,3 +196,69 @@ class StatusLine:
         """See `Onlooker`."""
         if self._last_ns:
             sys.stderr.write("\n")
+
+
+def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen: bool) -> str:
+    """Rate, latency, health, marker, flip probability, position, command: at most 100 characters.
+
+    Far from the world's origin a position takes up more of them, and the units are left out.
+
+        30 Hz   4.2 ms OK             marker flip  0.1% x  1.83 y -0.79 m 124 deg thr  0.037 ...
+
+    Every column has its place, so that the eye finds it again in the next line. A number that does
+    not fit its column is shown as `#`, one that is not finite as `?`, and no pose yet as `-`.
+
+    Args:
+        rate_hz: of the outcomes or frames that the caller counts.
+        latency_ms: from an exposure to its command.
+        marker_seen: whether a marker was seen lately.
+    """
+    output, far = outcome.output, outcome.origin_m != ZERO
+    x_m, y_m, psi_rad = (float(value) for value in outcome.pose)
+    width = _FAR if far else 6
+    places = [_fixed(x_m, width, 2), _fixed(y_m, width, 2), _fixed(math.degrees(psi_rad), 4, 0)]
+    x, y, psi = places if bool(output.located) else [f"{'-':>{len(place)}}" for place in places]
+    flip = _fixed(100 * float(output.flip_probability), 5, 1)
+    gap, m, deg = ("", "", "") if far else (" ", " m", " deg")
+    return " ".join(
+        (
+            f"{_fixed(rate_hz, 4, 0)}{gap}Hz",
+            f"{_fixed(latency_ms, 5, 1)}{gap}ms",
+            f"{outcome.health.name:<{_WIDEST_NAME}}",
+            "marker" if marker_seen else "  --  ",
+            f"flip{flip}%",
+            f"x{x} y{y}{m}{psi}{deg}",
+            f"thr {_fixed(outcome.throttle, 6, 3)}",
+            f"str {_fixed(math.degrees(outcome.steering_rad), 5, 1)}{deg}",
+        )
+    )
+
+
+def _fixed(value: float, width: int, decimals: int) -> str:
+    """A number in exactly `width` characters, `#` or `?` where it can't be shown."""
+    if not math.isfinite(value):
+        return f"{'?':>{width}}"
+    shown = f"{value:{width}.{decimals}f}"
+    return shown if len(shown) <= width else "#" * width
+
+
+def notice(outcome: Outcome, before: Fault) -> str | None:
+    """A notice of faults that a person should hear of as they begin; None without one.
+
+    Args:
+        before: the faults of the outcome before.
+    """
+    new = outcome.faults & ~before
+    reasons = []
+    if Fault.RELOCATED in new:
+        reasons.append(f"not where its wheels can have brought it: {outcome.restart_reason}")
+    if Fault.WAYS_DISPUTED in new:
+        reasons.append(
+            "corners and odometer tell of different ways: a marker moves, or wheels slip"
+        )
+    if Fault.ODOMETRY_DOUBTFUL in new:
+        reasons.append("no marker in view, and the odometer contradicts the throttle")
+    if Fault.MARKER_OUTVOTED in new and outcome.outvoted:
+        ids = ", ".join(map(str, outcome.outvoted))
+        reasons.append(f"marker {ids} is not where the others say: left out")
+    return "; ".join(reasons) or None

@@ -1,9 +1,10 @@
 """`jaxnav replay` of a drive: run the pilot on recorded inputs, and compare its outcomes."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,27 +12,23 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
-from jaxnav.commands.drive.track import Track, TrackRow
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.reading import read_shown
+from jaxnav.commands.reading import given_files, read_shown
 from jaxnav.configuration import step_folder
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     Params,
     atomic_path,
-    load_markers,
     load_params,
-    load_rig,
-    load_route,
     load_topics,
-    load_vehicle,
     output_folder,
     write_json,
     write_tum,
 )
-from jaxnav.loop.pilot import Input
+from jaxnav.loop.flags import Fault, Health, Reject, names
+from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.plots.localisation import localisation_report
 from jaxnav.recording.drive_format import PROFILE
 from jaxnav.recording.drive_log import DriveLog
@@ -50,11 +47,89 @@ from jaxnav.recording.plausible import keep_plausible
 from jaxnav.recording.recorder import Recorder
 
 EXIT_DIFFERS = 1
+_FILES = ("rig", "markers", "vehicle", "route")
 _FOR_DRIVES = ("vehicle", "route", "images", "record")
 _OVERRIDES = (
     *("rig", "markers_file", "vehicle", "route", "params"),
     *("selector", "corner_sigma_px", "images"),
 )
+
+
+@dataclass(frozen=True)
+class Track:
+    """The track of a drive that is driven again: N rows in the order of their outcomes.
+
+    Attributes:
+        now_ns: when each input reached the pilot, (N,).
+        poses: (N, 3), x_m y_m psi_rad.
+        Ts_world_vehicle: (N, 7) wxyz_xyz.
+        located, decided: (N,) bool.
+        health, faults, rejects: of each outcome.
+        restarts, restart_reason: at the end.
+    """
+
+    now_ns: np.ndarray
+    poses: np.ndarray
+    Ts_world_vehicle: np.ndarray
+    located: np.ndarray
+    decided: np.ndarray
+    health: Sequence[Health]
+    faults: Sequence[Fault]
+    rejects: Sequence[Reject]
+    restarts: int
+    restart_reason: str
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """Times since the first row, (N,) s."""
+        return np.asarray((self.now_ns - self.now_ns[0]) / 1e9)
+
+    @property
+    def positions_m(self) -> np.ndarray:
+        """Positions of the vehicle, (N, 3) m, NaN where not located."""
+        return np.where(self.located[:, None], self.Ts_world_vehicle[:, 4:], np.nan)
+
+    def summary(self) -> dict[str, Any]:
+        """Counts of faults and rejects, shares of health, and the last pose and restarts."""
+        count, healths = len(self.health), Counter(self.health)
+        return {
+            "states": count,
+            "duration_s": float(self.times_s[-1]),
+            "health_shares": {h.name: healths[h] / count for h in Health},
+            "located_share": float(np.mean(self.located)),
+            "decided_share": float(np.mean(self.decided)),
+            "faults": dict(Counter(name for one in self.faults for name in names(one))),
+            "rejects": dict(Counter(name for one in self.rejects for name in names(one))),
+            "final_pose": self.poses[-1] if self.located[-1] else None,
+            "restarts": self.restarts,
+            "restart_reason": self.restart_reason,
+        }
+
+    def distances_to(self, recorded: Outcomes) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (N,) m and (N,) rad to the recorded track, NaN where either has no pose."""
+        index = np.searchsorted(recorded.now_ns, self.now_ns)
+        known = index < len(recorded.now_ns)
+        index = np.where(known, index, 0)
+        if not len(recorded.now_ns):
+            return np.full(len(index), np.nan), np.full(len(index), np.nan)
+        known &= (recorded.now_ns[index] == self.now_ns) & recorded.located[index] & self.located
+        difference = self.poses - recorded.pose[index]
+        turn = np.abs(np.angle(np.exp(1j * difference[:, 2])))
+        shift_m = np.hypot(difference[:, 0], difference[:, 1])
+        return np.where(known, shift_m, np.nan), np.where(known, turn, np.nan)
+
+    def rms_differences(self, recorded: Outcomes) -> dict[str, Any]:
+        """Root mean square differences from the recorded track."""
+        shift_m, turn_rad = self.distances_to(recorded)
+        return {
+            "rms_position_difference_m": _rms(shift_m),
+            "rms_heading_difference_deg": np.rad2deg(_rms(turn_rad)),
+        }
+
+
+def _rms(values: np.ndarray) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
 def is_for(args: Arguments) -> bool:
@@ -126,7 +201,8 @@ _Drive = tuple[DriveLog | None, DriveSetup, Sequence[Input]]
 def _own_drive(args: Arguments, params: Params | None) -> _Drive:
     log = read_shown(args.recording, args.headless)
     configure_jax(float64=needs_float64(log.header, args.recording), threads=1)
-    setup = _overridden(DriveSetup.of_header(log.header, args.recording), args, params)
+    setup = DriveSetup.of_header(log.header, args.recording)
+    setup = _tuned(dataclasses.replace(setup, **given_files(args, _FILES)), args, params)
     if args.images:
         return log, setup, inputs_from_images(log, setup, args.corner_backend)[0]
     return log, setup, log.inputs
@@ -134,47 +210,25 @@ def _own_drive(args: Arguments, params: Params | None) -> _Drive:
 
 def _ros_drive(args: Arguments, params: Params | None) -> _Drive:
     configure_jax(float64=True, threads=1)
-    path = args.recording
-
-    def needed(name: str) -> Path:
-        given = getattr(args, name)
-        if given is None:
-            problem = f"missing: a ROS bag ({path}) does not hold it"
-            raise BadInput(f"--{name.replace('_', '-')}", problem)
-        return Path(given)
-
     assert args.topics is not None
-    setup = _overridden(
-        DriveSetup(
-            load_rig(needed("rig")),
-            load_markers(needed("markers_file")),
-            load_vehicle(needed("vehicle")),
-            load_route(needed("route")),
-            float64=True,
-        ),
-        dataclasses.replace(args, rig=None, markers_file=None, vehicle=None, route=None),
-        params,
-    )
+    files = given_files(args, _FILES, bag=args.recording)
+    setup = _tuned(DriveSetup(**files, float64=True), args, params)
     inputs = read_ros_drive(
-        path, load_topics(args.topics), setup.rig, setup.markers, setup.vehicle, args.corner_backend
+        args.recording,
+        load_topics(args.topics),
+        setup.rig,
+        setup.markers,
+        setup.vehicle,
+        args.corner_backend,
     )
     return None, setup, inputs
 
 
-def _overridden(setup: DriveSetup, args: Arguments, params: Params | None) -> DriveSetup:
-    changes: dict[str, Any] = {}
-    for field, path, load in (
-        ("rig", args.rig, load_rig),
-        ("markers", args.markers_file, load_markers),
-        ("vehicle", args.vehicle, load_vehicle),
-        ("route", args.route, load_route),
-    ):
-        if path is not None:
-            changes[field] = load(path)
-    for field in ("selector", "corner_sigma_px"):
-        if getattr(args, field) is not None:
-            changes[field] = getattr(args, field)
-    setup = dataclasses.replace(setup, **changes)
+def _tuned(setup: DriveSetup, args: Arguments, params: Params | None) -> DriveSetup:
+    """The setup with what the arguments give in place of its own figures."""
+    for name in ("selector", "corner_sigma_px"):
+        if getattr(args, name) is not None:
+            setup = dataclasses.replace(setup, **{name: getattr(args, name)})
     return setup if params is None else setup.with_params(params)
 
 
@@ -195,7 +249,7 @@ def _replayed(
         bar.set_postfix_str("compiling")
         for given, outcome in zip(inputs, outcomes, strict=True):
             bar.set_postfix_str("", refresh=False)
-            rows.append(TrackRow.of(outcome))
+            rows.append(_row(outcome))
             if comparison is not None:
                 comparison.look(outcome)
             if recorder is not None:
@@ -207,7 +261,37 @@ def _replayed(
             recorder.close(timeout_s=60.0)
             if recorder.failed is not None:
                 raise BadInput("--record", recorder.failed.replace(str(beside), str(path)))
-    return Track(rows)
+    columns: list[Any] = list(zip(*rows, strict=True))
+    now_ns, poses, Ts, located, decided, health, faults, rejects, restarts, reasons = columns
+    return Track(
+        np.array(now_ns, np.int64),
+        np.stack(poses),
+        np.stack(Ts),
+        np.array(located),
+        np.array(decided),
+        health,
+        faults,
+        rejects,
+        restarts[-1],
+        reasons[-1],
+    )
+
+
+def _row(outcome: Outcome) -> tuple[Any, ...]:
+    """The part of an outcome that a `Track` keeps, without its bank of hypotheses."""
+    output = outcome.output
+    return (
+        outcome.now_ns,
+        np.asarray(outcome.pose, float),
+        np.asarray(outcome.T_world_vehicle, float),
+        bool(output.located),
+        bool(output.decided),
+        outcome.health,
+        outcome.faults,
+        outcome.rejects,
+        outcome.restarts,
+        outcome.restart_reason,
+    )
 
 
 def _picture(setup: DriveSetup, track: Track, recorded: Outcomes | None, title: str) -> Figure:

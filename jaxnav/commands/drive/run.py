@@ -18,6 +18,7 @@ import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.observers import open_onlookers
+from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder
@@ -52,7 +53,7 @@ def run(args: Run, signals: Signals) -> int:
     """
     configure_jax(float64=args.float64, threads=1)
     keep_in(step_folder())
-    options = _options(args.option)
+    options = key_values("--option", args.option)
     setup = _setup(args, options)
     signals.check()
     if args.params is not None:
@@ -84,18 +85,6 @@ def run(args: Run, signals: Signals) -> int:
     if drive.unheard is not None:
         print(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {drive.unheard}")
     return EXIT_STOPPED if drive.loop.stopped or drive.unheard is not None else 0
-
-
-def _options(given: Sequence[str]) -> dict[str, str]:
-    options = {}
-    for text in given:
-        key, equals, value = text.partition("=")
-        if not equals or not key:
-            raise BadInput("--option", f"expected KEY=VALUE, got {text!r}")
-        if key in options:
-            raise BadInput("--option", f"{key} is given twice")
-        options[key] = value
-    return options
 
 
 def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:

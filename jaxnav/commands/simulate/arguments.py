@@ -7,23 +7,25 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
+    Count,
     Detector,
     Headless,
+    NotNegative,
     OptionalFile,
+    Positive,
     QCarBicycle,
     QCarFile,
     QCarMarkers,
     QCarRig,
     QCarVehicle,
     Scenario,
+    Seed,
     Selector,
     SimulatedSelector,
     Switch,
     optional,
     require,
-    require_at_least,
-    require_finite,
-    require_within,
+    within,
 )
 
 
@@ -36,9 +38,9 @@ class Demo(Headless):
     a mosaic of camera frames, summary.json, and trajectories in TUM format.
     """
 
-    seed: int = 0
+    seed: Seed = 0
     """Seed of every random number: first belief, image noise, odometry noise."""
-    seeds: int = 1
+    seeds: Count = 1
     """Drive this many times, with seeds counting up from --seed, and print the success rates."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("demo")
     """Folder for the report."""
@@ -53,22 +55,15 @@ class Demo(Headless):
     """Tuned parameters, for both methods: the noise of their filter is the same."""
     blur: bool = True
     """Integrate each image over its exposure while the car moves."""
-    exposure_ms: float = 10.0
+    exposure_ms: NotNegative = 10.0
     """Exposure time, ms."""
-    corner_noise_px: float = 0.0
+    corner_noise_px: NotNegative = 0.0
     """Spoil the detected corners by this much (standard deviation, px)."""
     rolling_shutter: bool = True
     """Expose the rows of an image one after the other."""
     corner_backend: Detector = "aruco"
-    duration_s: float = 30.0
+    duration_s: Positive = 30.0
     """Give up when the car has not arrived after this simulated time, s."""
-
-    def __post_init__(self) -> None:
-        require_at_least(0, "--seed", self.seed)
-        require_at_least(1, "--seeds", self.seeds)
-        require_finite("--exposure-ms", self.exposure_ms, zero_allowed=True)
-        require_finite("--corner-noise-px", self.corner_noise_px, zero_allowed=True)
-        require_finite("--duration-s", self.duration_s)
 
 
 @dataclass(frozen=True)
@@ -86,13 +81,15 @@ class Simulate(Headless):
     """What happens: the paper's drive, or one with trouble in it."""
     selector: tuple[SimulatedSelector, ...] = ("multi-hypothesis",)
     """Which pose is believed; several names, or `all`."""
-    corner_noise_px: tuple[float, ...] = (1.0,)
+    corner_noise_px: Annotated[tuple[float, ...], within("corner_sigma_px")] = (1.0,)
     """Standard deviation of the corners, one or several."""
-    told_noise_px: Annotated[float | None, optional("PX", "(default: the truth)")] = None
+    told_noise_px: Annotated[
+        float | None, optional("PX", "(default: the truth)"), within("corner_sigma_px")
+    ] = None
     """What the navigator is told of it."""
-    seeds: int = 100
+    seeds: Count = 100
     """How many drives."""
-    seed: int = 0
+    seed: Seed = 0
     """The first seed."""
     rig: QCarRig = None
     markers: QCarMarkers = None
@@ -104,13 +101,7 @@ class Simulate(Headless):
     resume: Switch = False
     """Keep the rows that --json holds already."""
 
-    def __post_init__(self) -> None:
-        require_at_least(1, "--seeds", self.seeds)
-        require_at_least(0, "--seed", self.seed)
+    def _check(self) -> None:
         require(bool(self.selector), "--selector", "names no selector")
         require(bool(self.corner_noise_px), "--corner-noise-px", "holds no number")
-        for value in self.corner_noise_px:
-            require_within("--corner-noise-px", value, "corner_sigma_px")
-        if self.told_noise_px is not None:
-            require_within("--told-noise-px", self.told_noise_px, "corner_sigma_px")
         require(not self.resume or self.json is not None, "--resume", "needs --json")

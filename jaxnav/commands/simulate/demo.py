@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.belief.ambiguity import LowestReprojection
-from jaxnav.belief.selectors import make_selector
-from jaxnav.commands.pictures import corners_in_world, save_figure, views_of
+from jaxnav.commands.pictures import corners_in_world, normals_px, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
@@ -27,7 +26,8 @@ from jaxnav.files import (
 )
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.origin import planar_in_world, points_in_world, poses_in_world
-from jaxnav.plots.localisation import Trajectory, camera_mosaic, drive_report
+from jaxnav.plots.localisation import AnnotatedFrame, Trajectory, camera_mosaic, drive_report
+from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.drive import (
     DriveFrame,
     DriveSettings,
@@ -49,8 +49,8 @@ def run(args: Demo) -> int:
     configure_jax(float64=True, threads=1)
     world = RenderedWorld.load(args)
     navigators = {
-        OURS: world.navigator(make_selector(args.selector)),
-        METHOD_A: world.navigator(LowestReprojection()),
+        OURS: world.navigator(args.selector),
+        METHOD_A: world.navigator("lowest-reprojection"),
     }
     out = output_folder(args.out)
     if world.params is not None:
@@ -92,7 +92,7 @@ class Record:
 
 def _drive(args: Demo, world: RenderedWorld, methods: Methods, seed: int) -> Record:
     rng = np.random.default_rng(seed)
-    start = np.asarray(world.route.start_pose) + START_SPREAD * rng.uniform(-1, 1, 3)
+    start = np.asarray(world.setup.route_on_map.start_pose) + START_SPREAD * rng.uniform(-1, 1, 3)
     settings = DriveSettings(
         start_pose=(float(start[0]), float(start[1]), float(start[2])),
         duration_s=args.duration_s,
@@ -109,22 +109,22 @@ def _drive(args: Demo, world: RenderedWorld, methods: Methods, seed: int) -> Rec
         bar_format="{desc}: {n:.1f} of at most {total:.0f} s [{elapsed}]{postfix}",
     ) as bar:
         bar.set_postfix_str("compiling")
-        for frame in drive(methods, world.vehicle, cameras.look, settings, seed):
+        for frame in drive(methods, world.setup.vehicle, cameras.look, settings, seed):
             if len(frames) % KEEP_EVERY == 0:
                 kept[len(frames)] = cameras.images
             frames.append(frame)
             bar.update(settings.frame_period_s)
-            pose = planar_in_world(frame.outputs[OURS].pose, world.markers.origin_m)
+            pose = planar_in_world(frame.outputs[OURS].pose, world.setup.markers.origin_m)
             x_m, y_m, psi_rad = pose
             bar.set_postfix_str(f"at ({x_m:.2f}, {y_m:.2f}) m, {np.rad2deg(psi_rad):.0f} deg")
     return Record(frames, kept)
 
 
 def _summary(args: Demo, world: RenderedWorld, record: Record, seed: int) -> dict[str, Any]:
-    passed = waypoints_passed(record.true_poses, np.asarray(world.route.waypoints_m))
+    passed = waypoints_passed(record.true_poses, np.asarray(world.setup.route_on_map.waypoints_m))
     finished = bool(record.frames[-1].outputs[OURS].done)
     return {
-        "reached": finished and passed == len(world.route.waypoints_m),
+        "reached": finished and passed == len(world.setup.route_on_map.waypoints_m),
         "believes_done": finished,
         "waypoints_passed": passed,
         "duration_s": record.frames[-1].stamp_s,
@@ -175,7 +175,7 @@ def _overall(summaries: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _write(folder: Path, world: RenderedWorld, record: Record, summary: dict[str, Any]) -> None:
     times_s = np.array([frame.stamp_s for frame in record.frames])
-    origin_m = world.markers.origin_m
+    setup, origin_m = world.setup, world.setup.markers.origin_m
     poses = {"truth": record.true_poses} | {name: record.poses(name) for name in (OURS, METHOD_A)}
     for name, rows in poses.items():
         known = np.isfinite(rows[:, 0])
@@ -187,33 +187,52 @@ def _write(folder: Path, world: RenderedWorld, record: Record, summary: dict[str
         times_s,
         Trajectory("truth", poses["truth"]),
         [Trajectory(LABELS[name], poses[name]) for name in (OURS, METHOD_A)],
-        np.asarray(points_in_world(world.route.waypoints_m, origin_m)),
-        world.route.waypoint_radius_m,
-        corners_in_world(world.markers),
+        np.asarray(points_in_world(setup.route_on_map.waypoints_m, origin_m)),
+        setup.route.waypoint_radius_m,
+        corners_in_world(setup.markers),
         title=_one_line(summary),
     )
     save_figure(report, folder / "report.png")
     numbers = sorted(record.kept)
     chosen = [numbers[round(i)] for i in np.linspace(0, len(numbers) - 1, MOSAIC_ROWS)]
-    rows_of_views = [
-        views_of(
-            world.rig,
-            world.markers.Ts_world_marker,
-            world.markers.size_m,
-            record.kept[number],
-            np.asarray(record.frames[number].observation.corners_px),
-            np.asarray(record.frames[number].observation.visible),
-            record.frames[number].outputs[OURS],
-            record.frames[number].stamp_s,
-        )
-        for number in dict.fromkeys(chosen)
-    ]
     mosaic = camera_mosaic(
-        rows_of_views,
+        [_views(setup, record.kept[n], record.frames[n]) for n in dict.fromkeys(chosen)],
         title="detected marker: green; normal of the pose taken: blue, of the other pose: orange",
     )
     save_figure(mosaic, folder / "mosaic.png")
     write_json(folder / "summary.json", summary)
+
+
+def _views(setup: DriveSetup, images: list[np.ndarray], frame: DriveFrame) -> list[AnnotatedFrame]:
+    """Views of every camera's image, with the markers seen and the poses our method weighed."""
+    rig, markers, output = setup.rig, setup.markers, frame.outputs[OURS]
+    views = []
+    corners_px = np.asarray(frame.observation.corners_px)
+    visible = np.asarray(frame.observation.visible)
+    valid = np.flatnonzero(output.candidates.valid)
+    for c, image in enumerate(images):
+        T_camera_vehicle = jaxlie.SE3(rig.Ts_camera_vehicle.wxyz_xyz[c])
+        sticks: dict[bool, list[np.ndarray]] = {True: [], False: []}
+        for m in np.flatnonzero(visible[c]):
+            for n in valid:
+                T_vehicle_world = jaxlie.SE3(
+                    jnp.asarray(output.candidates.T_vehicle_world.wxyz_xyz[n])
+                )
+                T_world_marker = jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[m])
+                T_camera_marker = T_camera_vehicle @ T_vehicle_world @ T_world_marker
+                alone = jaxlie.SE3(T_camera_marker.wxyz_xyz[None])
+                stick = normals_px(rig.camera(c), alone, markers.size_m[m][None])
+                sticks[n == output.selected].append(stick[0])
+        views.append(
+            AnnotatedFrame(
+                title=f"{rig.names[c]}, t = {frame.stamp_s:.2f} s",
+                image=image,
+                detected_px=corners_px[c][visible[c]],
+                selected_px=np.asarray(sticks[True]).reshape(-1, 2, 2),
+                other_px=np.asarray(sticks[False]).reshape(-1, 2, 2),
+            )
+        )
+    return views
 
 
 def _one_line(summary: dict[str, Any]) -> str:

@@ -1,19 +1,16 @@
 """The world of a demo: objects built from its files, and cameras that render the scene."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.belief.ambiguity import Selector
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.detection import Detections, Detector, make_detectors, observe
 from jaxnav.errors import BadInput
 from jaxnav.files import (
     Params,
-    Route,
-    apply_params,
     calib_dir,
     load_markers,
     load_params,
@@ -21,11 +18,11 @@ from jaxnav.files import (
     load_route,
     load_vehicle,
 )
-from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator, Output
+from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.drive import DriveSettings, PoseAt
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
@@ -41,10 +38,7 @@ FLOOR_M = 5.0  # side of the floor around start, waypoints and markers, at least
 class RenderedWorld:
     """The objects of a demo, built from its files, with a renderer and marker detectors."""
 
-    rig: CameraRig
-    markers: MarkerMap
-    vehicle: Vehicle
-    route: Route  # in the coordinates of the markers
+    setup: DriveSetup  # without the parameters
     params: Params | None
     renderer: Renderer
     detectors: list[Detector]
@@ -66,41 +60,29 @@ class RenderedWorld:
                 f"the last row would be read after the command is due "
                 f"({DriveSettings.latency_s * 1e3:.0f} ms after the stamp), got {args.exposure_ms}",
             )
+        vehicle = load_vehicle(args.vehicle or qcar / "vehicle.yaml")
+        route = load_route(args.route or qcar / "route.yaml")
         return RenderedWorld(
-            rig=rig,
-            markers=markers,
-            vehicle=load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
-            route=load_route(args.route or qcar / "route.yaml").relative_to(markers.origin_m),
+            DriveSetup(rig, markers, vehicle, route, float64=True),
             params=None if args.params is None else load_params(args.params),
             renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, SENSOR),
             detectors=make_detectors(markers, args.corner_backend),
         )
 
-    def navigator(self, selector: Selector) -> Navigator:
-        """A navigator for this world.
+    def navigator(self, selector: str) -> Navigator:
+        """A navigator for this world, with one of `PILOT_SELECTORS`.
 
         Raises:
             BadInput: a parameter that does not fit it.
         """
-        navigator = Navigator(
-            rig=self.rig,
-            markers=self.markers,
-            vehicle=self.vehicle,
-            waypoints_m=self.route.waypoints_m,
-            waypoint_radius_m=self.route.waypoint_radius_m,
-            selector=selector,
-        )
-        return navigator if self.params is None else apply_params(navigator, self.params)
+        setup = replace(self.setup, selector=selector)
+        return (setup if self.params is None else setup.with_params(self.params)).navigator()
 
     def floor_m(self) -> tuple[float, float, float, float]:
         """The floor that the car may use: x_min, x_max, y_min, y_max, m."""
-        points = np.vstack(
-            [
-                self.route.waypoints_m,
-                [self.route.start_pose[:2]],
-                np.asarray(self.markers.corners_world_m)[..., :2].reshape(-1, 2),
-            ]
-        )
+        route = self.setup.route_on_map
+        corners_m = np.asarray(self.setup.markers.corners_world_m)[..., :2].reshape(-1, 2)
+        points = np.vstack([route.waypoints_m, [route.start_pose[:2]], corners_m])
         center, half = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0) / 2
         half = np.maximum(half + 1.0, FLOOR_M / 2)
         low, high = center - half, center + half
@@ -120,28 +102,29 @@ class RenderedCameras:
         self, T_world_vehicle_at: PoseAt, stamp_s: float, believed: Output | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Corners (C, M, 4, 2), visibility (C, M) and sigmas (C, M, 4) at one instant."""
-        world = self.world
+        world, setup = self.world, self.world.setup
         self.images = world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)
         predicted_px, expected = self._predicted(believed)
         detections = [
             Detections.concatenate(
                 [
-                    detector.detect(image, world.rig.camera(c), predicted_px[c][expected[c]])
+                    detector.detect(image, setup.rig.camera(c), predicted_px[c][expected[c]])
                     for detector in world.detectors
                 ]
             )
             for c, image in enumerate(self.images)
         ]
-        observed = observe(detections, world.markers)
+        observed = observe(detections, setup.markers)
         noise_px = self.corner_noise_px * self.rng.standard_normal(observed.corners_px.shape)
         sigma_px = np.hypot(observed.sigma_px, self.corner_noise_px)
         return observed.corners_px + noise_px, observed.visible, sigma_px
 
     def _predicted(self, believed: Output | None) -> tuple[np.ndarray, np.ndarray]:
-        lanes = (len(self.world.rig), len(self.world.markers.ids))
+        rig, markers = self.world.setup.rig, self.world.setup.markers
+        lanes = (len(rig), len(markers.ids))
         if believed is None or not believed.located:
             return np.zeros((*lanes, 4, 2)), np.zeros(lanes, bool)
-        return jax.device_get(_expect(self.world.rig, self.world.markers, believed.pose))
+        return jax.device_get(_expect(rig, markers, believed.pose))
 
 
 @jax.jit

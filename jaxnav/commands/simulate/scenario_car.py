@@ -1,28 +1,17 @@
 """The car that drives in the scenarios of `simulate` and `tune`, from its files."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
 
 from jaxnav.belief.ambiguity import Selector
 from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.commands.simulate.arguments import Simulate
+from jaxnav.commands.tune.arguments import TuneController, TuneFilter
 from jaxnav.files import Params, apply_params, calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.scenarios import Scenario
-
-
-class _Files(Protocol):
-    """Arguments that name a car's files; None stands for the QCar's."""
-
-    @property
-    def rig(self) -> Path | None: ...
-    @property
-    def markers(self) -> Path | None: ...
-    @property
-    def vehicle(self) -> Path | None: ...
 
 
 @dataclass(frozen=True)
@@ -35,7 +24,9 @@ class ScenarioCar:
     params: Params | None
 
     @staticmethod
-    def load(files: _Files, params: Params | None = None) -> "ScenarioCar":
+    def load(
+        files: Simulate | TuneFilter | TuneController, params: Params | None = None
+    ) -> "ScenarioCar":
         """Load a car from its files.
 
         Raises:

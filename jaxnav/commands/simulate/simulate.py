@@ -20,6 +20,7 @@ from jaxnav.files import limits, load_params, write_json
 from jaxnav.files.locking import sole_writer
 from jaxnav.files.reading import parse_json, read_text
 from jaxnav.files.validation import ForeignEntry, validate
+from jaxnav.files.writing import plain_data
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
@@ -98,11 +99,7 @@ def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[
         "corner_noise_px": noise_px,
         "told_noise_px": told_noise_px if args.told_noise_px is None else args.told_noise_px,
         "seeds": [args.seed, args.seed + args.seeds - 1],
-        "rig": None if args.rig is None else str(args.rig),
-        "markers": None if args.markers is None else str(args.markers),
-        "vehicle": None if args.vehicle is None else str(args.vehicle),
-        "params": None if args.params is None else str(args.params),
-    }
+    } | {name: plain_data(getattr(args, name)) for name in ("rig", "markers", "vehicle", "params")}
 
 
 def _resumed(args: Arguments) -> list[dict[str, Any]]:

@@ -7,13 +7,15 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
+    AT_LEAST_1,
+    Count,
     Headless,
     ResultsFolder,
+    Seed,
     Selector,
     StudyKind,
     optional,
     require,
-    require_at_least,
 )
 
 
@@ -33,21 +35,18 @@ class RunStudy(Headless):
     """YAML file with `trials`, `axes` and what is fixed; or a name; or `list`."""
     out: Annotated[Path | None, optional("STORE", "(default: out/CONFIG.zarr)")] = None
     """Where the result goes, or goes on."""
-    workers: Annotated[int | None, optional("N", "(default: this process)", int)] = None
+    workers: Annotated[int | None, optional("N", "(default: this process)", int), AT_LEAST_1] = None
     """Start so many Dask workers on this machine."""
     scheduler: Annotated[str | None, optional("ADDRESS", constructor=str)] = None
     """Run on the Dask cluster with its scheduler there, e.g. tcp://127.0.0.1:8786."""
-    chunk_trials: Annotated[int | None, optional("N", "(default: 65536, or 256 drives)", int)] = (
-        None
-    )
+    chunk_trials: Annotated[
+        int | None, optional("N", "(default: 65536, or 256 drives)", int), AT_LEAST_1
+    ] = None
     """How many trials are run and written at a time. Changes no result."""
 
-    def __post_init__(self) -> None:
-        if self.chunk_trials is not None:
-            require_at_least(1, "--chunk-trials", self.chunk_trials)
-        if self.workers is not None:
-            require_at_least(1, "--workers", self.workers)
-            require(self.scheduler is None, "--scheduler", "brings its own workers")
+    def _check(self) -> None:
+        own = self.workers is None or self.scheduler is None
+        require(own, "--scheduler", "brings its own workers")
 
 
 @dataclass(frozen=True)
@@ -78,12 +77,8 @@ class StudyReliability(Headless):
     """Folder, ROS 1 bag (.bag, .bag.bz2) or .npz."""
     selector: Selector = "multi-hypothesis"
     """Whose probabilities, on a recording."""
-    frames: int = 165_000
+    frames: Count = 165_000
     """How many random views."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the random views."""
     out: ResultsFolder = Path("out")
-
-    def __post_init__(self) -> None:
-        require_at_least(1, "--frames", self.frames)
-        require_at_least(0, "--seed", self.seed)

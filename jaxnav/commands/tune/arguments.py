@@ -8,18 +8,20 @@ import tyro
 
 from jaxnav.commands.kinds import (
     Believed,
+    CornerSigma,
+    Count,
     Headless,
+    NotNegative,
     OptionalFile,
+    Positive,
     QCarBicycle,
     QCarMarkers,
     QCarRig,
     ResultsFolder,
     Scenario,
+    Seed,
     optional,
     require,
-    require_at_least,
-    require_finite,
-    require_within,
 )
 
 _Names = Annotated[tuple[str, ...], optional("NAME", "")]
@@ -50,13 +52,13 @@ class TuneFilter(Headless):
     """What part of every recording is learned from; the rest is held against the result."""
     scenario: Scenario = "paper"
     """What happens in simulated drives."""
-    corner_noise_px: float = 1.0
+    corner_noise_px: CornerSigma = 1.0
     """Of simulated drives."""
-    seeds: int = 64
+    seeds: Count = 64
     """Simulated drives to learn from."""
-    held_out_seeds: int = 32
+    held_out_seeds: Count = 32
     """Simulated drives that decide when to stop."""
-    test_seeds: int = 200
+    test_seeds: Count = 200
     """Simulated drives for the report."""
     seed: int = 0
     """The first seed; test drives count from a million on."""
@@ -71,19 +73,17 @@ class TuneFilter(Headless):
     params: OptionalFile = None
     """Where to start: a file of parameters."""
     selector: Believed = "multi-hypothesis"
-    steps: int = 150
+    steps: Count = 150
     """At most so many evaluations."""
     rig: QCarRig = None
     markers: QCarMarkers = None
     vehicle: QCarBicycle = None
     out: ResultsFolder = Path("tuned")
 
-    def __post_init__(self) -> None:
-        _require_counts(self)
+    def _check(self) -> None:
         require(0 <= self.seed < 10**6, "--seed", f"must be from 0 to 999999, got {self.seed}")
         most = 10**6 - self.seed - self.seeds
         require(self.held_out_seeds <= most, "--seeds", "test drives count from a million on")
-        require_within("--corner-noise-px", self.corner_noise_px, "corner_sigma_px")
         begin, end = self.part
         bounds = f"must be two parts of 1, the first below the second, got {begin:g} {end:g}"
         require(0 <= begin < end <= 1, "--part", bounds)
@@ -108,55 +108,39 @@ class TuneController(Headless):
     """What happens in the drives to learn from."""
     test_scenario: tuple[Scenario, ...] = ("paper", "slip", "miscalibrated")
     """What happens in the drives for the report."""
-    corner_noise_px: float = 1.0
+    corner_noise_px: CornerSigma = 1.0
     """Standard deviation of the corners."""
-    seeds: int = 256
+    seeds: Count = 256
     """Drives a step; from 256 on they run on all cores, in a program that compiles for minutes."""
-    held_out_seeds: int = 128
+    held_out_seeds: Count = 128
     """Drives that decide when to stop, the same in every step."""
-    test_seeds: int = 200
+    test_seeds: Count = 200
     """Drives of each scenario for the report."""
-    seed: int = 0
+    seed: Seed = 0
     """Of all drives."""
-    time: float = 0.03
+    time: NotNegative = 0.03
     """Weight of the time to the last waypoint, 1/s."""
-    cross_track: float = 2.0
+    cross_track: NotNegative = 2.0
     """Weight of the RMS distance from the straight lines, 1/m."""
-    effort: float = 0.13
+    effort: NotNegative = 0.13
     """Weight of the squared commands, in parts of their limits, over time, 1/s."""
-    smoothness: float = 0.045
+    smoothness: NotNegative = 0.045
     """Weight of the squared changes of the commands from frame to frame."""
     train: _Names = ()
     """Parameters to learn; by default p1, p2, its bound, look-ahead and slowing down in turns."""
     params: OptionalFile = None
     """Where to start: a file of parameters."""
     selector: Believed = "multi-hypothesis"
-    steps: int = 40
+    steps: Count = 40
     """At most so many."""
-    learning_rate: float = 0.25
+    learning_rate: Positive = 0.25
     """Of Adam, at the first step; a tenth of it at the last."""
     rig: QCarRig = None
     markers: QCarMarkers = None
     vehicle: QCarBicycle = None
     out: ResultsFolder = Path("tuned")
 
-    def __post_init__(self) -> None:
-        _require_counts(self)
-        require_at_least(0, "--seed", self.seed)
+    def _check(self) -> None:
         require(bool(self.test_scenario), "--test-scenario", "names no scenario")
-        for flag, value in (
-            ("--time", self.time),
-            ("--cross-track", self.cross_track),
-            ("--effort", self.effort),
-            ("--smoothness", self.smoothness),
-        ):
-            require_finite(flag, value, zero_allowed=True)
         total = self.time + self.cross_track + self.effort + self.smoothness
         require(total > 0, "--time", "is 0 as all other weights are: there is nothing to lower")
-        require_within("--corner-noise-px", self.corner_noise_px, "corner_sigma_px")
-        require_finite("--learning-rate", self.learning_rate)
-
-
-def _require_counts(args: TuneFilter | TuneController) -> None:
-    for name in ("seeds", "held_out_seeds", "test_seeds", "steps"):
-        require_at_least(1, f"--{name.replace('_', '-')}", getattr(args, name))

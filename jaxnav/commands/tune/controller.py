@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -12,16 +11,15 @@ from jaxtyping import Array, Key
 from tqdm import tqdm
 
 from jaxnav.belief.selectors import make_selector
-from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneController as Arguments
-from jaxnav.commands.tune.fit import Fitting, measure, plain_key, summary_of
-from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
-from jaxnav.files import Params, load_params, output_folder, write_json
+from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
+from jaxnav.errors import BadInput
+from jaxnav.files import Params, load_params, output_folder
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
-from jaxnav.plots.tuning import controller_report
+from jaxnav.plots.tuning import ControllerScores, controller_report
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
@@ -55,28 +53,18 @@ def run(args: Arguments) -> int:
     navigator = loop.rollout.navigator
     space = gains_of(args, navigator)
     gains = Gains(args, loop, dict(zip(_tests(args), tests, strict=True)), space)
+    known = parameters_of(navigator)
     out = output_folder(args.out)
     key = plain_key("tune controller", args)
-    fitting = Fitting(out, key, gains.problem(), space, named=args.train)
-    try:
-        fit = fitting.run(args.headless)
-        results = gains.test(fit)
-    except KeyboardInterrupt:
-        print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
-        return EXIT_INTERRUPTED
-    known = parameters_of(navigator)
-    summary = summary_of(
-        key,
-        fit,
-        {name: known[name] for name in space.free},
-        space.values(fit.best_x),
-        {name: (_as_json(before), _as_json(after)) for name, (before, after) in results.items()},
+    return run_fit(
+        Fitting(out, key, gains.problem(), space, named=args.train),
+        args.headless,
+        before={name: known[name] for name in space.free},
+        test=gains.test,
+        as_json=_as_json,
+        draw=controller_report,
+        text=_text,
     )
-    write_json(out / "summary.json", summary)
-    save_figure(controller_report(fit, space, results), out / "report.png")
-    print(_text(summary))
-    print(f"parameters and report in {visible(out)}")
-    return 0
 
 
 def _tests(args: Arguments) -> list[str]:
@@ -113,18 +101,6 @@ def gains_of(args: Arguments, navigator: Navigator) -> Space:
     return Space.of(navigator, dict.fromkeys(args.train or GAINS, True))
 
 
-@dataclass(frozen=True)
-class ControllerTest:
-    """Results of a controller in one scenario, on seeds never trained on."""
-
-    loss: tuple[float, float, float]  # mean with its 95 % interval
-    parts: dict[str, float]
-    time_s: tuple[float, float, float]  # to the last waypoint
-    success: tuple[float, float, float]
-    poses: np.ndarray  # (frames, 3) of the first drive
-    waypoints_m: np.ndarray
-
-
 class Gains:
     """The loss of simulated drives as a problem for a fit, and tests of its result."""
 
@@ -147,7 +123,7 @@ class Gains:
             same_batch=False,
         )
 
-    def test(self, fit: TuningFit) -> dict[str, tuple[ControllerTest, ControllerTest]]:
+    def test(self, fit: TuningFit) -> dict[str, tuple[ControllerScores, ControllerScores]]:
         """Test results before and after the fit, by scenario."""
         count = self._args.test_seeds
         with tqdm(
@@ -194,7 +170,7 @@ class Gains:
 
     def _test(
         self, loop: ClosedLoop, values: Mapping[str, Array], progress: Callable[[int], object]
-    ) -> ControllerTest:
+    ) -> ControllerScores:
         """Drive with the scenario's own car: only what the seed draws is random."""
         nominal = dataclasses.replace(loop, rollout=dataclasses.replace(loop.rollout, spread=None))
         keys = _keys(_TEST_SEED, self._args.test_seeds)
@@ -204,7 +180,7 @@ class Gains:
         rate = float(np.mean(success))
         low, high = wilson_interval(np.array(rate), np.array(len(success)))
         own = np.asarray(trace.active)[0]
-        return ControllerTest(
+        return ControllerScores(
             loss=bootstrap_mean(losses, once),
             parts={name: float(np.mean(p)) for name, p in loop.loss.parts(costs).items()},
             time_s=bootstrap_mean(np.asarray(costs.time_s), once),
@@ -219,7 +195,7 @@ def _keys(first: int, count: int) -> Key[Array, " S"]:
     return keys
 
 
-def _as_json(tested: ControllerTest) -> dict[str, Any]:
+def _as_json(tested: ControllerScores) -> dict[str, Any]:
     return {
         "loss": measure(tested.loss),
         "parts": tested.parts,

@@ -1,7 +1,6 @@
 """`jaxnav tune filter`: learn Q and R from recordings or simulated drives."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -11,16 +10,15 @@ from tqdm import tqdm
 
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
 from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
-from jaxnav.commands.tune.fit import Fitting, measure, plain_key, summary_of
-from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
-from jaxnav.files import Params, apply_params, load_params, output_folder, write_json
+from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
+from jaxnav.errors import BadInput
+from jaxnav.files import Params, apply_params, load_params, output_folder
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of, with_parameters
-from jaxnav.plots.tuning import tuning_report
+from jaxnav.plots.tuning import EstimatorScores, tuning_report
 from jaxnav.simulation.statistics import anees_band, bootstrap_mean
 from jaxnav.tuning.branches import estimate_sequences
 from jaxnav.tuning.descent import Smooth
@@ -45,25 +43,15 @@ def run(args: Arguments) -> int:
     out = output_folder(args.out)
     problem = _problem(args, cost, objective, data)
     key = plain_key("tune filter", args)
-    fitting = Fitting(out, key, problem, space, objective.prior_sigma, named=args.train)
-    try:
-        fit = fitting.run(args.headless)
-    except KeyboardInterrupt:
-        print(f"interrupted: the best so far is in {visible(out)}; the same command goes on")
-        return EXIT_INTERRUPTED
-    results = _tested(args, data, params, space, fit)
-    summary = summary_of(
-        key,
-        fit,
-        space.values(space.start),
-        space.values(fit.best_x),
-        {name: (_as_json(before), _as_json(after)) for name, (before, after) in results.items()},
+    return run_fit(
+        Fitting(out, key, problem, space, objective.prior_sigma, named=args.train),
+        args.headless,
+        before=space.values(space.start),
+        test=lambda fit: _tested(args, data, params, space, fit),
+        as_json=_as_json,
+        draw=tuning_report,
+        text=_text,
     )
-    write_json(out / "summary.json", summary)
-    save_figure(tuning_report(fit, space, results), out / "report.png")
-    print(_text(summary))
-    print(f"parameters and report in {visible(out)}")
-    return 0
 
 
 def space_of(args: Arguments, navigator: Navigator, learned: FrameSequences) -> Space:
@@ -117,20 +105,9 @@ def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: Tuni
     )
 
 
-@dataclass(frozen=True)
-class FilterTest:
-    """Results of an estimator on drives that had no part in the tuning."""
-
-    rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
-    anees: tuple[float, float, float]
-    band: tuple[float, float]  # in which ANEES is consistent, 99.9 %
-    error_m: np.ndarray  # of every judged frame
-    indefinite: int  # judged frames whose covariance is indefinite by rounding; not in ANEES
-
-
 def _tested(
     args: Arguments, data: TuningData, params: Params | None, space: Space, fit: TuningFit
-) -> dict[str, tuple[FilterTest, FilterTest]]:
+) -> dict[str, tuple[EstimatorScores, EstimatorScores]]:
     """Results before and after the fit, by the name of the test."""
     results = {}
     for test in data.tests:
@@ -151,7 +128,7 @@ def _tested(
 
 def _test(
     navigator: Navigator, test: FrameSequences, progress: Callable[[int], object]
-) -> FilterTest:
+) -> EstimatorScores:
     size, parts = min(len(test), AT_A_TIME), []
     for begin in range(0, len(test), size):
         rows = np.minimum(np.arange(begin, begin + size), len(test) - 1)
@@ -168,7 +145,7 @@ def _test(
 
     rmse_m = tuple(float(np.sqrt(value)) for value in mean(square_m2, judged))
     freedom = 3 if isinstance(navigator.motion, BicycleKalman) else 6
-    return FilterTest(
+    return EstimatorScores(
         rmse_m=(rmse_m[0], rmse_m[1], rmse_m[2]),
         anees=mean(nees, definite),
         band=anees_band(len(test), freedom),
@@ -177,7 +154,7 @@ def _test(
     )
 
 
-def _as_json(tested: FilterTest) -> dict[str, Any]:
+def _as_json(tested: EstimatorScores) -> dict[str, Any]:
     return {
         "position_median_m": float(np.median(tested.error_m)),
         "position_rmse_m": measure(tested.rmse_m),

@@ -10,20 +10,24 @@ import zlib
 from collections.abc import Callable, Collection, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from jaxnav.errors import BadInput
-from jaxnav.files import write_params
+from jaxnav.commands.pictures import save_figure
+from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
+from jaxnav.files import write_json, write_params
 from jaxnav.files.locking import sole_writer
 from jaxnav.files.npz import read_npz
 from jaxnav.files.writing import atomic_write, plain_data
 from jaxnav.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
 from jaxnav.tuning.unconstrained import Space
+
+Scores = TypeVar("Scores")
 
 # Arguments on which a fit doesn't depend.
 _OF_THE_REPORT = ("out", "headless", "test", "test_seeds")
@@ -38,29 +42,6 @@ def plain_key(command: str, args: Any) -> dict[str, Any]:
     }
     versions = {name: version(name) for name in ("jaxnav", "jax", "optimistix", "optax")}
     return {"command": command} | settings | {"versions": versions}
-
-
-def summary_of(
-    key: dict[str, Any],
-    fit: TuningFit,
-    before: Mapping[str, Array],
-    after: Mapping[str, Array],
-    test: Mapping[str, tuple[Any, Any]],
-) -> dict[str, Any]:
-    """The summary of a fit: parameters by name, and each test's results before and after."""
-
-    def plain(values: Mapping[str, Array]) -> dict[str, Any]:
-        return {name: np.asarray(value).tolist() for name, value in values.items()}
-
-    return {
-        "run": key,
-        "steps": fit.step,
-        "stages": fit.stage + 1,
-        "ended": fit.ended,
-        "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
-        "parameters": {"before": plain(before), "after": plain(after)},
-        "test": {name: {"before": was, "after": now} for name, (was, now) in test.items()},
-    }
 
 
 def measure(value: tuple[float, float, float]) -> dict[str, Any]:
@@ -96,14 +77,14 @@ class Fitting:
         report: Callable[[str], object] = print,
         named: Collection[str] | None = None,
     ):
-        self._folder, self._key, self._problem = folder, key, problem
-        self._space, self._prior_sigma, self._report = space, prior_sigma, report
+        self.folder, self.key, self._problem = folder, key, problem
+        self.space, self._prior_sigma, self._report = space, prior_sigma, report
         self._named = set(space.labels if named is None else named)
 
     @property
     def checkpoint(self) -> Path:
         """The file that holds the state of the fit."""
-        return self._folder / "checkpoint.npz"
+        return self.folder / "checkpoint.npz"
 
     def run(self, headless: bool) -> TuningFit:
         """Run the fit to its end, from its checkpoint where there is one.
@@ -117,7 +98,7 @@ class Fitting:
             return self._run(headless)
 
     def _run(self, headless: bool) -> TuningFit:
-        fit = TuningFit.begin(self._space.start, self._problem)
+        fit = TuningFit.begin(self.space.start, self._problem)
         kept = self._kept(fit)
         if kept is not None:
             fit = kept
@@ -143,11 +124,11 @@ class Fitting:
 
     def write(self, fit: TuningFit) -> None:
         """Write the best parameters so far to params.yaml."""
-        values = {name: np.asarray(value) for name, value in self._space.values(fit.best_x).items()}
-        write_params(self._folder / "params.yaml", values, self._provenance(fit))
+        values = {name: np.asarray(value) for name, value in self.space.values(fit.best_x).items()}
+        write_params(self.folder / "params.yaml", values, self._provenance(fit))
 
     def _provenance(self, fit: TuningFit) -> dict[str, Any]:
-        return self._key | {
+        return self.key | {
             "step": fit.step,
             "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
             "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -161,23 +142,23 @@ class Fitting:
         place = self._problem.explain(x, batch, softness)
         if place is None:
             return f"step {step + 1}: the loss is not finite; not stepped on"
-        return place.describe(self._space.labels, step + 1)
+        return place.describe(self.space.labels, step + 1)
 
     def _refuse_without_gradient(self, fit: TuningFit) -> None:
         """Raise BadInput where the loss does not depend on a parameter at all."""
         batch = self._problem.batch(fit.stage_x, 0, 0)
-        x, slope = self._space.start, fit.descent.gradient
+        x, slope = self.space.start, fit.descent.gradient
         prior = x / self._prior_sigma**2 / batch.frames
         of_frames = np.asarray(slope - prior)
         tiny = 1e-6 * np.maximum(np.abs(np.asarray(prior)), 1e-12)
-        labels = np.array(self._space.labels)
+        labels = np.array(self.space.labels)
         for name in sorted(self._named):
             if np.all(np.abs(of_frames[labels == name]) <= tiny[labels == name]):
                 raise BadInput("--train", f"the loss does not depend on {name}")
 
     def _keep(self, fit: TuningFit) -> None:
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, run=json.dumps(self._key), **arrays_of(fit))
+        np.savez(buffer, allow_pickle=False, run=json.dumps(self.key), **arrays_of(fit))
         atomic_write(self.checkpoint, buffer.getvalue())
 
     def _kept(self, like: TuningFit) -> TuningFit | None:
@@ -188,11 +169,11 @@ class Fitting:
             key = dict(json.loads(str(arrays.pop("run"))))
         except _DAMAGED as error:
             raise self._damaged(error) from None
-        for name in self._key | key:
-            if self._key.get(name) != key.get(name):
+        for name in self.key | key:
+            if self.key.get(name) != key.get(name):
                 problem = (
                     f"is of another run, whose {name} is {key.get(name)!r} and not "
-                    f"{self._key.get(name)!r}: choose another --out"
+                    f"{self.key.get(name)!r}: choose another --out"
                 )
                 raise BadInput(self.checkpoint, problem)
         try:
@@ -202,3 +183,50 @@ class Fitting:
 
     def _damaged(self, error: Exception) -> BadInput:
         return BadInput(self.checkpoint, f"is damaged ({error}): delete it to begin anew")
+
+
+def run_fit(
+    fitting: Fitting,
+    headless: bool,
+    *,
+    before: Mapping[str, Array],
+    test: Callable[[TuningFit], Mapping[str, tuple[Scores, Scores]]],
+    as_json: Callable[[Scores], dict[str, Any]],
+    draw: Callable[[TuningFit, Space, Mapping[str, tuple[Scores, Scores]]], Figure],
+    text: Callable[[dict[str, Any]], str],
+) -> int:
+    """Run a fit and its tests, write summary.json and report.png, and print the summary.
+
+    Args:
+        before: values of the parameters at the start, by name.
+        test: scores before and after the fit, by the name of the test.
+        text: the summary in lines.
+    """
+    folder, space = visible(fitting.folder), fitting.space
+    try:
+        fit = fitting.run(headless)
+        results = test(fit)
+    except KeyboardInterrupt:
+        print(f"interrupted: the best so far is in {folder}; the same command goes on")
+        return EXIT_INTERRUPTED
+    values = {"before": before, "after": space.values(fit.best_x)}
+    summary = {
+        "run": fitting.key,
+        "steps": fit.step,
+        "stages": fit.stage + 1,
+        "ended": fit.ended,
+        "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
+        "parameters": {
+            when: {name: np.asarray(value).tolist() for name, value in of.items()}
+            for when, of in values.items()
+        },
+        "test": {
+            name: {"before": as_json(was), "after": as_json(now)}
+            for name, (was, now) in results.items()
+        },
+    }
+    write_json(fitting.folder / "summary.json", summary)
+    save_figure(draw(fit, space, results), fitting.folder / "report.png")
+    print(text(summary))
+    print(f"parameters and report in {folder}")
+    return 0

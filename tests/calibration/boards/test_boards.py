@@ -14,7 +14,7 @@ from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.detection import find_board
 from jaxnav.calibration.boards.pages import centre_mm, check_fit, largest, room_mm
 from jaxnav.calibration.boards.sheets import sheet_of
-from jaxnav.commands.calibrate.boards import read_board, write_board
+from jaxnav.commands.calibrate.board import read_board, write_board
 from jaxnav.detection.families import dictionary
 from jaxnav.errors import BadInput
 

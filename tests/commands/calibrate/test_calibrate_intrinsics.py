@@ -17,8 +17,8 @@ from jaxnav.calibration.lenses import comparison as lens_comparison
 from jaxnav.calibration.lenses.images import calibrate_images
 from jaxnav.calibration.lenses.simulated_views import simulated_views
 from jaxnav.commands.calibrate import intrinsics as calibrate_intrinsics
-from jaxnav.commands.calibrate.arguments.cameras import CalibrateIntrinsics
-from jaxnav.commands.calibrate.boards import write_board
+from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
+from jaxnav.commands.calibrate.board import write_board
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.reading import read_mapping

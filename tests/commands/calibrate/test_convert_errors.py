@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from jaxnav import cli, files
-from jaxnav.commands.calibrate.arguments.cameras import CalibrateConvert
+from jaxnav.commands.calibrate.arguments import CalibrateConvert
 from jaxnav.errors import BadInput
 from jaxnav.files.figures import CameraFigures
 from jaxnav.files.rigs import rig_text

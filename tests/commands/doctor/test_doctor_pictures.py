@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from jaxnav.commands.doctor.fits import Sighted
-from jaxnav.commands.doctor.orders import in_their_order
-from jaxnav.commands.doctor.photographs import examine_pictures
+from jaxnav.commands.doctor.photographs import examine_pictures, in_their_order
 from jaxnav.detection import CornerLanes
 from jaxnav.files import Route
 from jaxnav.models.markers import MarkerMap

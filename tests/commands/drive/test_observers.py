@@ -10,8 +10,13 @@ import pytest
 from jaxnav import cli
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
-from jaxnav.commands.drive.observers import DriveRecorder, LiveView, StatusLine, open_onlookers
-from jaxnav.commands.drive.status import WIDTH
+from jaxnav.commands.drive.observers import (
+    WIDTH,
+    DriveRecorder,
+    LiveView,
+    StatusLine,
+    open_onlookers,
+)
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.loop.flags import Fault

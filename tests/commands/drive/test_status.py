@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.commands.drive.status import WIDTH, notice, status_line
+from jaxnav.commands.drive.observers import WIDTH, notice, status_line
 from jaxnav.loop.flags import Fault, Health
 from tests.helpers.drives import make_outcome
 

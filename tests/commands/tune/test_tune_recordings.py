@@ -10,14 +10,17 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.commands.tune.drives import (
+from jaxnav.commands.tune.sequences import (
+    GAP_S,
     Event,
+    NamedSequences,
     believed_events,
+    join_sequences,
+    navigator_of,
     sequences_of_drive,
     sequences_of_inputs,
+    sequences_of_recording,
 )
-from jaxnav.commands.tune.recordings import GAP_S, navigator_of, sequences_of_recording
-from jaxnav.commands.tune.sequences import NamedSequences, join_sequences
 from jaxnav.datasets.recording import Recording
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.errors import BadInput

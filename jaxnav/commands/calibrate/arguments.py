@@ -1,4 +1,4 @@
-"""What `jaxnav calibrate board`, `intrinsics` and `convert` can be told."""
+"""What `jaxnav calibrate` can be told."""
 
 import math
 import re
@@ -9,25 +9,53 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxnav.commands.kinds import (
+    POSITIVE,
+    CornerBackend,
     Headless,
     OptionalFile,
+    Positive,
+    QCarFile,
     ResultsFolder,
     Switch,
+    Told,
+    flag_of,
     optional,
     require,
-    require_finite,
-    require_within,
+    within,
 )
 
 CalibrationFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision", "wpilib"]
 WPILibFamily = Literal["tag16h5", "tag25h9", "tag36h11"]
 
+_Angle = Annotated[float, within("angle_deg")]
 _NAMED = re.compile(r"([A-Za-z_][\w.\-]{0,99})=(.+)")
 _Count = Annotated[int | None, optional("INT", "(default: as the target and the paper suggest)")]
+Recordings = Annotated[
+    tyro.conf.Positional[tuple[Path, ...]],
+    tyro.conf.arg(
+        metavar="RECORDING",
+        help="Drives (.mcap), folders of TagSLAM, .npz, ROS 1 bags with --rig.",
+    ),
+]
+MarkerSize = Annotated[
+    float | None,
+    tyro.conf.arg(
+        metavar="S",
+        constructor=float,
+        help_behavior_hint="(default: as of the known ones)",
+        help="Side of the markers that are not in that file.",
+    ),
+    within("size_m"),
+]
+Family = Annotated[str, tyro.conf.arg(help="Marker family, where the recording does not tell.")]
+OdometryParameter = Literal[
+    "speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "camera_delay_s"
+]
+_RecordedFile = Annotated[Path | None, optional("FILE", "(default: the recording's)")]
 
 
 @dataclass(frozen=True)
-class CalibrateBoard:
+class CalibrateBoard(Told):
     """Print a calibration target at true scale, with rulers on it to check the print.
 
     A charuco board is the best for a single camera: it may be cut off by the image's edge, so its
@@ -48,11 +76,11 @@ class CalibrateBoard:
     rows: _Count = None
     """Squares or tags one above the other."""
     size_mm: Annotated[
-        float | None, optional("FLOAT", "(default: the largest round size that fits)")
+        float | None, optional("FLOAT", "(default: the largest round size that fits)"), POSITIVE
     ] = None
     """Side of a square, or of the black outline of a tag or marker."""
     marker_mm: Annotated[
-        float | None, optional("FLOAT", "(default: a cell of white around it)")
+        float | None, optional("FLOAT", "(default: a cell of white around it)"), POSITIVE
     ] = None
     """Of a charuco board, the side of its markers."""
     spacing: float = 0.3
@@ -69,7 +97,7 @@ class CalibrateBoard:
     """Pixels an inch of the PNG."""
     out: ResultsFolder = Path("calibrated")
 
-    def __post_init__(self) -> None:
+    def _check(self) -> None:
         named = self.paper.lower() in ("a4", "a3", "letter")
         known = named or self.paper_size_mm is not None
         require(
@@ -78,9 +106,6 @@ class CalibrateBoard:
         if self.paper_size_mm is not None:
             fits = all(50 <= side <= 5000 for side in self.paper_size_mm)
             require(fits, "--paper", f"must be from 50 to 5000 mm a side, got {self.paper}")
-        for flag, value in (("--size-mm", self.size_mm), ("--marker-mm", self.marker_mm)):
-            if value is not None:
-                require_finite(flag, value)
         charuco = self.target == "charuco" or self.marker_mm is None
         require(charuco, "--marker-mm", f"goes with charuco, not with {self.target}")
         alone = self.target != "marker" or (self.columns is None and self.rows is None)
@@ -128,7 +153,7 @@ class CalibrateIntrinsics(Headless):
     """A rig file that says where the cameras are; its other cameras go along unchanged."""
     out: ResultsFolder = Path("calibrated")
 
-    def __post_init__(self) -> None:
+    def _check(self) -> None:
         require(bool(self.sources), "SOURCE", "give images, a folder of images or a video")
         require(self.max_views >= 8, "--max-views", f"must be at least 8, got {self.max_views}")
         require(
@@ -155,7 +180,7 @@ class CalibrateIntrinsics(Headless):
 
 
 @dataclass(frozen=True)
-class CalibrateConvert:
+class CalibrateConvert(Told):
     """Convert cameras and marker maps between jaxnav's files and those of other tools.
 
     Which tool wrote SOURCE, its keys tell. Numbers are carried over as they are written; what the
@@ -172,37 +197,153 @@ class CalibrateConvert:
     one of its own, their folder."""
     camera_name: Annotated[str | None, optional("NAME")] = None
     """Which camera, where SOURCE has several; what to call it, where SOURCE has one."""
-    position_m: Annotated[tuple[float, float, float] | None, optional("X Y Z")] = None
+    position_m: Annotated[
+        tuple[float, float, float] | None, optional("X Y Z"), within("position_m")
+    ] = None
     """Where the camera is on the vehicle, if SOURCE does not say so: forward, left, up."""
-    yaw_deg: float = 0.0
+    yaw_deg: _Angle = 0.0
     """With --position-m: 0 looks forward, 90 to the left."""
-    elevation_deg: float = 0.0
+    elevation_deg: _Angle = 0.0
     """With --position-m: positive looks up."""
-    roll_deg: float = 0.0
+    roll_deg: _Angle = 0.0
     """With --position-m: positive is clockwise as seen from behind the camera."""
-    marker_size_m: Annotated[float | None, optional("FLOAT", "(default: FIRST's, 0.1651)")] = None
+    marker_size_m: Annotated[
+        float | None, optional("FLOAT", "(default: FIRST's, 0.1651)"), within("size_m")
+    ] = None
     """Side of the black square of every tag in a WPILib layout, which does not tell."""
     family: Annotated[
         WPILibFamily | None, optional("{tag16h5,tag25h9,tag36h11}", "(default: FIRST's, tag36h11)")
     ] = None
     """Of the tags in a WPILib layout, which does not tell."""
     field_size_m: Annotated[
-        tuple[float, float] | None, optional("LENGTH WIDTH", "(default: what the map spans)")
+        tuple[float, float] | None,
+        optional("LENGTH WIDTH", "(default: what the map spans)"),
+        POSITIVE,
     ] = None
     """Of the field in a WPILib layout to be written."""
 
-    def __post_init__(self) -> None:
-        for flag, angle_deg in (
-            ("--yaw-deg", self.yaw_deg),
-            ("--elevation-deg", self.elevation_deg),
-            ("--roll-deg", self.roll_deg),
-        ):
-            require_within(flag, angle_deg, "angle_deg")
-            require(self.position_m is not None or angle_deg == 0, flag, "needs --position-m")
-        for coordinate in self.position_m or ():
-            require_within("--position-m", coordinate, "position_m")
-        for size_m in self.field_size_m or ():
-            require_finite("--field-size-m", size_m)
+    def _check(self) -> None:
+        for name in ("yaw_deg", "elevation_deg", "roll_deg"):
+            placed = self.position_m is not None or getattr(self, name) == 0
+            require(placed, flag_of(name), "needs --position-m")
         require(self.camera_name != "", "--camera-name", "must not be empty")
-        if self.marker_size_m is not None:
-            require_within("--marker-size-m", self.marker_size_m, "size_m")
+
+
+@dataclass(frozen=True)
+class _Seen(Told):
+    """What those are told that find places by what the cameras saw."""
+
+    recordings: Recordings
+
+    def _check(self) -> None:
+        require(len(self.recordings) > 0, "RECORDING", "missing: what has the rig seen?")
+
+
+@dataclass(frozen=True)
+class CalibrateRig(_Seen):
+    """Find where the cameras of a rig are, without common views, and the markers with them.
+
+    Drive or carry the rig past markers, so that one camera after another sees them; two markers in
+    view now and then, by any cameras, link everything. No start is needed: both poses of every
+    sighting are weighed until all frames agree, then all poses are adjusted at once, and sightings
+    that nothing explains count less.
+
+    Written to --out: rig.yaml and markers.yaml, which every other command takes, with sigmas;
+    report.json; report.png; trajectory.tum.
+    """
+
+    rig: OptionalFile = None
+    """Cameras: their lenses, and about where they are, in place of the recording's own."""
+    markers_file: OptionalFile = None
+    """Markers whose places are known, one at least: they tie the world down. By default those that
+    a drive brings along; without any the world is the frame of the marker seen most."""
+    marker_size_m: MarkerSize = None
+    family: Family = "tag36h11"
+    refine_lenses: Switch = False
+    """Adjust focal lengths, centres and lenses as well, from where the rig has them."""
+    vehicle_frame: Annotated[str, tyro.conf.arg(metavar="places|drive|CAMERA")] = "places"
+    """What ties the vehicle frame down: the given places of all cameras together; a drive with
+    straight lines and circles; or the given place of one camera."""
+    vehicle: QCarFile = None
+    """Vehicle file, whose wheelbase a drive needs."""
+    out: ResultsFolder = Path("calibrated")
+
+
+@dataclass(frozen=True)
+class CalibrateMarkers(_Seen):
+    """Find where the markers are, with a rig that is calibrated.
+
+    As `calibrate rig`, but the cameras stay where the rig file has them.
+
+    Written to --out: markers.yaml with sigmas; report.json; report.png; trajectory.tum.
+    """
+
+    rig: OptionalFile = None
+    """Cameras, in place of the recording's own."""
+    markers_file: OptionalFile = None
+    """Markers whose places are known, one at least. By default those that a drive brings along;
+    without any the world is the frame of the marker seen most."""
+    marker_size_m: MarkerSize = None
+    family: Family = "tag36h11"
+    out: ResultsFolder = Path("calibrated")
+
+
+@dataclass(frozen=True)
+class CalibrateCheck(_Seen):
+    """Find markers that are not where the map says.
+
+    All markers are looked for anew, with a rig that is calibrated. The map is laid over what was
+    found so that as many as can agree; the others have moved, or were entered wrongly. The exit
+    code is 1 where there is one.
+
+    Written to --out: markers.yaml, the map as it was found; report.json; report.png.
+    """
+
+    rig: OptionalFile = None
+    """Cameras, in place of the recording's own."""
+    markers_file: OptionalFile = None
+    """Map to be checked, in place of the one that a drive brings along."""
+    family: Family = "tag36h11"
+    tolerance_m: Positive = 0.02
+    """A marker that is no further off than this, and no more than its sigma explains, is right."""
+    tolerance_deg: Positive = 3.0
+    """The same for how it is turned."""
+    out: ResultsFolder = Path("checked")
+
+
+@dataclass(frozen=True)
+class CalibrateOdometry(Headless):
+    """Find the scale of the speed, the steering's gain and offset, wheelbase and cameras' delay.
+
+    From drives past markers whose places are known: eights in front of one, at full lock and half,
+    at several speeds, with stops between. A minute suffices. What the drives don't tell is kept as
+    it was, and named.
+
+    Written to --out: vehicle.yaml, which demo, run and replay take; report.png; report.json.
+    """
+
+    recordings: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RECORDING")
+    ]
+    """Drives recorded by `jaxnav run --record` (.mcap), or ROS bags with --topics."""
+    rig: _RecordedFile = None
+    """Cameras: a rig file or a Kalibr camchain."""
+    markers_file: _RecordedFile = None
+    """Marker map."""
+    vehicle: _RecordedFile = None
+    """The vehicle as it stands: limits, wheelbase, and where the search starts."""
+    topics: OptionalFile = None
+    """Which topic of a ROS bag is what."""
+    corner_backend: CornerBackend = "aruco"
+    """Who finds the markers in a ROS bag's images."""
+    fix: Annotated[tuple[OdometryParameter, ...], tyro.conf.arg(help_behavior_hint="")] = ()
+    """What is not looked for: it stays as it is in --vehicle."""
+    wheelbase_sigma_m: Annotated[float | None, optional("M"), within("size_m")] = None
+    """How well the wheelbase in --vehicle was measured; by default nothing is known of it."""
+    out: ResultsFolder = Path("calibrated")
+
+    def _check(self) -> None:
+        require(bool(self.recordings), "RECORDING", "names no recording")
+        if self.wheelbase_sigma_m is not None:
+            problem = "goes with a wheelbase that is looked for: leave it out of --fix"
+            require("wheelbase_m" not in self.fix, "--wheelbase-sigma-m", problem)
