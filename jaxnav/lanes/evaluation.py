@@ -12,7 +12,17 @@ from jax.extend import core
 
 from jaxnav.lanes.rules import ELEMENTWISE, NUMPY, RULES, VIEWS, elementwise
 from jaxnav.lanes.strips import CALLS, STRIP, by_itself, in_strips
-from jaxnav.lanes.values import CHEAP, DEAR, Lane, Value, known, rows_of, scan_rows, write_out
+from jaxnav.lanes.values import (
+    CHEAP,
+    DEAR,
+    Lane,
+    Params,
+    Value,
+    known,
+    rows_of,
+    scan_rows,
+    write_out,
+)
 
 
 def evaluate(
@@ -29,21 +39,21 @@ class _Evaluation(NamedTuple):
     lanes: int
     block: int
 
-    def run(self, jaxpr: Any, consts: Sequence[Value], args: Sequence[Value]) -> list[Value]:
+    def run(self, jaxpr: core.Jaxpr, consts: Sequence[Value], args: Sequence[Value]) -> list[Value]:
         """Evaluate a jaxpr: its outputs."""
         uses = collections.Counter(
             var for eqn in jaxpr.eqns for var in eqn.invars if not isinstance(var, core.Literal)
         )
         uses.update(var for var in jaxpr.outvars if not isinstance(var, core.Literal))
-        env: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
+        env: dict[core.Var, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
 
-        def keep(var: Any, value: Value) -> None:
+        def keep(var: core.Var, value: Value) -> None:
             env[var] = write_out(value, CHEAP if uses[var] > 1 else DEAR)
 
         for var, value in zip(jaxpr.invars, args, strict=True):
             keep(var, value)
 
-        def read(var: Any) -> Value:
+        def read(var: core.Var | core.Literal) -> Value:
             return np.asarray(var.val) if isinstance(var, core.Literal) else env[var]
 
         for eqn in jaxpr.eqns:
@@ -52,7 +62,7 @@ class _Evaluation(NamedTuple):
                 keep(var, value)
         return [read(var) for var in jaxpr.outvars]
 
-    def _apply(self, eqn: Any, args: list[Value]) -> list[Value]:
+    def _apply(self, eqn: core.JaxprEqn, args: list[Value]) -> list[Value]:
         name, params = eqn.primitive.name, eqn.params
         if name in CALLS:
             closed = params[CALLS[name]]
@@ -86,14 +96,14 @@ class _Evaluation(NamedTuple):
         outs = rule(args, params, self.lanes) if rule else None
         return self._generic(eqn.primitive, args, params) if outs is None else outs
 
-    def _generic(self, primitive: Any, args: list[Value], params: dict[str, Any]) -> list[Value]:
+    def _generic(self, primitive: core.Primitive, args: list[Value], params: Params) -> list[Value]:
         """Evaluate a primitive by `vmap`'s own batching rule."""
         axes = [-1 if isinstance(arg, Lane) else None for arg in args]
         arrays = [arg.rows if isinstance(arg, Lane) else arg for arg in args]
         outs = jax.vmap(lambda *a: primitive.bind(*a, **params), in_axes=axes, out_axes=-1)(*arrays)
         return [Lane(out) for out in (outs if primitive.multiple_results else [outs])]
 
-    def _while(self, args: list[Value], params: dict[str, Any]) -> list[Value]:
+    def _while(self, args: list[Value], params: Params) -> list[Value]:
         """Run a loop until the last lane ends; a lane that has ended keeps its carry."""
         n_cond, n_body = params["cond_nconsts"], params["body_nconsts"]
         cond_consts, body_consts = args[:n_cond], args[n_cond : n_cond + n_body]
@@ -125,14 +135,16 @@ class _Evaluation(NamedTuple):
         start = [rows_of(arg, self.lanes) for arg in args[n_cond + n_body :]]
         return [Lane(out) for out in lax.while_loop(any_goes, step, start)]
 
-    def _scan(self, args: list[Value], params: dict[str, Any]) -> list[Value]:
+    def _scan(self, args: list[Value], params: Params) -> list[Value]:
         n_consts, n_carry = params["num_consts"], params["num_carry"]
         consts = args[:n_consts]
         carry = [rows_of(arg, self.lanes) for arg in args[n_consts : n_consts + n_carry]]
         xs = [rows_of(arg, self.lanes) for arg in args[n_consts + n_carry :]]
         closed = params["jaxpr"]
 
-        def body(carry: list[jax.Array], xs: list[jax.Array]) -> tuple[list[Any], list[Any]]:
+        def body(
+            carry: list[jax.Array], xs: list[jax.Array]
+        ) -> tuple[list[jax.Array], list[jax.Array]]:
             outs = self.run(
                 closed.jaxpr,
                 [known(c) for c in closed.consts],
@@ -151,11 +163,11 @@ class _Evaluation(NamedTuple):
         )
         return [Lane(out) for out in [*carry, *ys]]
 
-    def _cond(self, args: list[Value], params: dict[str, Any]) -> list[Value]:
+    def _cond(self, args: list[Value], params: Params) -> list[Value]:
         index, *operands = args
         branches = params["branches"]
 
-        def branch(closed: Any, lanes: int) -> Callable[..., list[jax.Array]]:
+        def branch(closed: core.ClosedJaxpr, lanes: int) -> Callable[..., list[jax.Array]]:
             def run(operands: list[Value]) -> list[jax.Array]:
                 outs = _Evaluation(lanes, self.block).run(
                     closed.jaxpr, [known(c) for c in closed.consts], operands

@@ -16,10 +16,10 @@ not fit, `vmap` itself is taken, with one warning.
 import warnings
 from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 # Without barriers XLA for the CPU computes anew, at every use, the values that `over_lanes` writes
 # to memory once. Its costly passes double the compile time and buy nothing.
@@ -31,7 +31,7 @@ COMPILER_OPTIONS = {
 _DOES_NOT_FIT = ImportError, AttributeError, LookupError, TypeError, ValueError, NotImplementedError
 
 
-def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
+def over_lanes(fn: Callable[..., PyTree], block: int = 64) -> Callable[..., PyTree]:
     """`jax.vmap(fn, in_axes=-1, out_axes=-1)`, evaluated as the module docstring says.
 
     Args:
@@ -39,7 +39,7 @@ def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
         block: number of lanes in each block of a `cond`'s branch, however few lanes chose it.
     """
 
-    def batched(*args: Any) -> Any:
+    def batched(*args: PyTree) -> PyTree:
         leaves, tree = jax.tree.flatten(args)
         one = [jax.ShapeDtypeStruct(leaf.shape[:-1], leaf.dtype) for leaf in leaves]
         closed, out = jax.make_jaxpr(
@@ -47,13 +47,13 @@ def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
         )(*one)
 
         @jax.custom_jvp
-        def evaluated(consts: list[Any], leaves: list[Any]) -> list[jax.Array]:
+        def evaluated(consts: list[jax.Array], leaves: list[jax.Array]) -> list[jax.Array]:
             from jaxnav.lanes.evaluation import evaluate
 
             return evaluate(closed.jaxpr, consts, leaves, block)
 
         @evaluated.defjvp
-        def _(primals: Any, tangents: Any) -> Any:
+        def _(primals: PyTree, tangents: PyTree) -> PyTree:
             return jax.jvp(
                 jax.vmap(
                     lambda consts, leaves: jax.core.eval_jaxpr(closed.jaxpr, consts, *leaves),
@@ -81,11 +81,11 @@ def _warn(reason: str) -> None:
     warnings.warn(f"{problem}: vmap takes its place, several times as slow", stacklevel=3)
 
 
-def lanes_last(tree: Any) -> Any:
+def lanes_last(tree: PyTree) -> PyTree:
     """Move the batch axis of every leaf from first to last: (L, ...) to (..., L)."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), tree)
 
 
-def lanes_first(tree: Any) -> Any:
+def lanes_first(tree: PyTree) -> PyTree:
     """Move the batch axis of every leaf from last to first: (..., L) to (L, ...)."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), tree)

@@ -11,7 +11,6 @@ No step is taken on a loss or gradient that is not finite: the state stays, with
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,7 +19,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
-Loss = Callable[[Float[Array, " n"], Any, Float[Array, ""]], Float[Array, ""]]
+Loss = Callable[[Float[Array, " n"], PyTree, Float[Array, ""]], Float[Array, ""]]
 
 
 class Descent(eqx.Module):
@@ -49,11 +48,11 @@ class Smooth(eqx.Module):
     def _solver(self) -> optx.BFGS:
         return optx.BFGS(self.rtol, self.atol)
 
-    def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
+    def init(self, x: Float[Array, " n"], batch: PyTree, softness: Array) -> Descent:
         """The state at x, before any evaluation."""
         return _smooth_init(self, x, batch, softness)
 
-    def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
+    def step(self, state: Descent, batch: PyTree, softness: Array) -> Descent:
         """Evaluate once more; the point is kept if it lowers the loss enough."""
         return _smooth_step(self, state, batch, softness)
 
@@ -65,7 +64,7 @@ class Noisy(eqx.Module):
     """
 
     # (x, batch, softness) -> loss and gradient; not compiled here.
-    evaluate: Callable[[Array, Any, Array], tuple[Array, Array]]
+    evaluate: Callable[[Array, PyTree, Array], tuple[Array, Array]]
     learning_rate: float = 0.05
     steps: int = 100  # the learning rate is a tenth after so many
     longest: float = 1.0  # the norm to which a longer gradient is clipped
@@ -75,11 +74,11 @@ class Noisy(eqx.Module):
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=0.1)
         return optax.chain(optax.clip_by_global_norm(self.longest), optax.adam(rate, b2=0.99))
 
-    def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
+    def init(self, x: Float[Array, " n"], batch: PyTree, softness: Array) -> Descent:
         """The state at x, before any evaluation."""
         return _unknown(x, self._solver.init(x))
 
-    def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
+    def step(self, state: Descent, batch: PyTree, softness: Array) -> Descent:
         """Take one step along the gradient of this batch."""
         loss, gradient = self.evaluate(state.x, batch, softness)
         return _moved(self._solver, state, loss, gradient)
@@ -95,7 +94,7 @@ def _fn(loss: Loss) -> Callable[..., tuple[Array, None]]:
 
 
 @eqx.filter_jit
-def _smooth_init(smooth: Smooth, x: Array, batch: Any, softness: Array) -> Descent:
+def _smooth_init(smooth: Smooth, x: Array, batch: PyTree, softness: Array) -> Descent:
     scalar = jax.ShapeDtypeStruct((), x.dtype)
     state = smooth._solver.init(
         _fn(smooth.loss), x, (batch, softness), {}, scalar, None, frozenset()
@@ -104,7 +103,7 @@ def _smooth_init(smooth: Smooth, x: Array, batch: Any, softness: Array) -> Desce
 
 
 @eqx.filter_jit
-def _smooth_step(smooth: Smooth, state: Descent, batch: Any, softness: Array) -> Descent:
+def _smooth_step(smooth: Smooth, state: Descent, batch: PyTree, softness: Array) -> Descent:
     solver, args, tags = smooth._solver, (batch, softness), frozenset[object]()
     fn, scalar = _fn(smooth.loss), jax.ShapeDtypeStruct((), state.x.dtype)
     form = solver.init(fn, state.x, args, {}, scalar, None, tags)
