@@ -52,7 +52,7 @@ def main(duration_s: float = 20.0):
     for frame, (time_s, error_m, out) in enumerate(drive(make_navigator(), duration_s)):
         if frame % 10 == 0 or out.done:
             doubt = f"off by {100 * error_m:4.1f} cm  P(flip) {out.flip_probability:7.1e}"
-            print(f"{time_s:5.2f} s  {doubt}  at x, y, psi = {out.pose.round(2)} m, m, rad")
+            print(f"{time_s:5.2f} s  {doubt}", " at {:.2f} m {:.2f} m {:.2f} rad".format(*out.pose))
     return time_s, error_m, out
 
 

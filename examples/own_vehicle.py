@@ -1,7 +1,7 @@
 """A vehicle of one's own, as a plug-in of the loop that drives: see `jaxnav.loop.interfaces`.
 
     python examples/own_vehicle.py                  # does it keep what a vehicle promises?
-    cd examples && jaxnav run --vehicle own_vehicle:MyCar --cameras sim
+    PYTHONPATH=examples jaxnav run --vehicle own_vehicle:MyCar --cameras sim
 
 Here it talks to a simulated world, at which the cameras look too; a real one to its hardware.
 """
