@@ -45,16 +45,11 @@ def main(duration_s: float = 20.0) -> dict[str, dict[str, float]]:
     """Drive with both; return what each made of it."""
     told = {}
     for name, selector in {"default": None, "SteadyHeading": SteadyHeading()}.items():
-        frames = list(drive(make_navigator(selector), duration_s))
-        errors_m = [np.linalg.norm(out.pose[:2] - true[:2]) for _, true, out in frames]
-        told[name] = {
-            "median_error_m": float(np.median(errors_m)),
-            "time_s": frames[-1][0],
-            "done": bool(frames[-1][2].done),
-        }
-        ended = "arrived after" if told[name]["done"] else "had not arrived after"
-        error_cm = 100 * told[name]["median_error_m"]
-        print(f"{name:14} {ended} {frames[-1][0]:.1f} s, median position error {error_cm:.1f} cm")
+        times_s, errors_m, outputs = zip(*drive(make_navigator(selector), duration_s), strict=True)
+        median_m, done = float(np.median(errors_m)), bool(outputs[-1].done)
+        told[name] = {"time_s": times_s[-1], "median_error_m": median_m, "done": done}
+        ended = f"{'arrived' if done else 'had not arrived'} after {times_s[-1]:.1f} s"
+        print(f"{name:14} {ended}, median position error {100 * median_m:.1f} cm")
     return told
 
 

@@ -49,9 +49,9 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a command is told; BadInput where a value is not what its field's annotation asks for,
-    or where values don't go together."""
+class Checked:
+    """The arguments of a command; BadInput where a value is not what its field's annotation asks
+    for, or where values don't go together."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -170,7 +170,7 @@ ResultsFolder = Annotated[Path, tyro.conf.arg(metavar="DIR", help="Folder for th
 
 
 @dataclass(frozen=True, kw_only=True)
-class Headless(Told):
+class Headless(Checked):
     """What every command is told that shows how far it is."""
 
     headless: Switch = False

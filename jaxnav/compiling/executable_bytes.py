@@ -9,25 +9,28 @@ import hashlib
 import json
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.tree_util import PyTreeDef
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 _CHECKSUM_BYTES = 32  # at the beginning: the checksum of all that follows
 _LENGTH = struct.Struct("<Q")  # then the length of the JSON, the JSON, and the machine code
 _OURS = ("jaxnav", "jaxlie")  # packages whose classes a tree may contain
 
-Run = Callable[[list[Any]], list[Any]]
+Run = Callable[[Sequence[ArrayLike]], list[jax.Array]]
 
 
 class NotStorableError(ValueError):
     """A program, or the tree that it returns, can't be converted to bytes."""
 
 
-def to_bytes(compiled: Any, returned: Any) -> bytes:
+def to_bytes(compiled: Any, returned: PyTree) -> bytes:
     """Convert a compiled program to the bytes that `from_bytes` reads.
 
     Args:
@@ -63,7 +66,7 @@ def to_bytes(compiled: Any, returned: Any) -> bytes:
     return _checksum(content) + content
 
 
-def from_bytes(raw: bytes, inputs: list[Any]) -> tuple[Run, Any]:
+def from_bytes(raw: bytes, inputs: list[jax.ShapeDtypeStruct]) -> tuple[Run, PyTreeDef]:
     """Load a program; return it, ready to be called, and the structure of the tree it returns.
 
     Args:
@@ -118,7 +121,7 @@ def _small_program() -> Any:
     return compiled._executable._unloaded_executable  # type: ignore[attr-defined]
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: PyTree) -> Any:
     """Convert a tree, with its fields and the placeholders of its leaves, to JSON values."""
     kind = type(value)
     if value is None or kind in (bool, int, float, str):
@@ -136,7 +139,7 @@ def _plain(value: Any) -> Any:
     return [name, {field: _plain(getattr(value, field)) for field in fields if _has(value, field)}]
 
 
-def _tree(plain: Any) -> Any:
+def _tree(plain: Any) -> PyTree:
     """The inverse of `_plain`. It calls no constructor, but sets the fields of each object."""
     if not isinstance(plain, list):
         return plain
@@ -172,7 +175,7 @@ def _class(name: str) -> Any:
     raise NotStorableError(f"{name} is no class of jaxnav's that consists of fields")
 
 
-def _has(value: Any, field: str) -> bool:
+def _has(value: object, field: str) -> bool:
     try:
         getattr(value, field)
     except AttributeError:

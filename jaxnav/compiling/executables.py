@@ -14,16 +14,17 @@ import os
 import platform
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from functools import cache, update_wrapper
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import PyTreeDef
+from jaxtyping import PyTree
 
 from jaxnav.compiling.executable_bytes import NotStorableError, Run, from_bytes, to_bytes
 from jaxnav.files.private import NotPrivateError, PrivateFolder
@@ -54,13 +55,13 @@ def keep_in(folder: Path | None) -> None:
 class kept:
     """`jax.jit` of one of jaxnav's own functions of arrays and trees, with a kept executable."""
 
-    def __init__(self, function: Callable[..., Any]):
+    def __init__(self, function: Callable[..., PyTree]):
         self.jitted = jax.jit(function)
         self._function = function
-        self._ready: dict[Any, tuple[Any, Any]] = {}
+        self._ready: dict[Hashable, tuple[Run, PyTreeDef]] = {}
         update_wrapper(self, function)
 
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
+    def __call__(self, *arguments: PyTree, **named: PyTree) -> PyTree:
         leaves, given = jax.tree.flatten(arguments)
         if not _folders or named or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.jitted(*arguments, **named)
@@ -72,8 +73,8 @@ class kept:
 
 
 def program(
-    function: Callable[..., Any], arguments: tuple[Any, ...], folder: Path
-) -> tuple[Run, Any]:
+    function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path
+) -> tuple[Run, PyTreeDef]:
     """The executable of a function on its arguments' leaves, and the structure of its result.
 
     Loaded if another process has kept it, else compiled and kept.
@@ -83,7 +84,7 @@ def program(
     return _loaded(folder, name, inputs) or _compiled(function, folder, name, given, inputs)
 
 
-def is_kept(function: Callable[..., Any], arguments: tuple[Any, ...], folder: Path) -> bool:
+def is_kept(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path) -> bool:
     """Whether `program` finds the executable in the folder."""
     given, inputs = _asked(arguments)
     with suppress(OSError, NotPrivateError), PrivateFolder(folder) as files:
@@ -103,21 +104,25 @@ def sources_digest(package: Path, without: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
-def _asked(arguments: tuple[Any, ...]) -> tuple[Any, list[Any]]:
+def _asked(arguments: tuple[PyTree, ...]) -> tuple[PyTreeDef, list[jax.ShapeDtypeStruct]]:
     leaves, given = jax.tree.flatten(arguments)
     return given, jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
 
 
-def _name(function: Callable[..., Any], given: Any) -> str:
+def _name(function: Callable[..., PyTree], given: PyTreeDef) -> str:
     return str((f"{function.__module__}.{function.__qualname__}", given))
 
 
 def _compiled(
-    function: Callable[..., Any], folder: Path, name: str, given: Any, inputs: list[Any]
-) -> tuple[Run, Any]:
-    seen: list[Any] = []
+    function: Callable[..., PyTree],
+    folder: Path,
+    name: str,
+    given: PyTreeDef,
+    inputs: list[jax.ShapeDtypeStruct],
+) -> tuple[Run, PyTreeDef]:
+    seen: list[PyTree] = []
 
-    def flat(leaves: list[Any]) -> list[Any]:
+    def flat(leaves: list[jax.Array]) -> list[jax.Array]:
         returned = function(*jax.tree.unflatten(given, leaves))
         seen.append(returned)
         return jax.tree.leaves(returned)
@@ -133,7 +138,9 @@ def _compiled(
     return run, jax.tree.structure(seen[0])
 
 
-def _loaded(folder: Path, name: str, inputs: list[Any]) -> tuple[Run, Any] | None:
+def _loaded(
+    folder: Path, name: str, inputs: list[jax.ShapeDtypeStruct]
+) -> tuple[Run, PyTreeDef] | None:
     try:
         with PrivateFolder(folder) as files:
             raw = files.read(name)
@@ -155,7 +162,7 @@ def _keep(folder: Path, name: str, raw: bytes) -> None:
             files.remove(old)
 
 
-def _file(structures: str, leaves: list[Any]) -> str:
+def _file(structures: str, leaves: list[jax.ShapeDtypeStruct]) -> str:
     """The file name of an executable: a hash of all on which it depends."""
     device = jax.devices()[0]
     depends_on = [

@@ -7,11 +7,14 @@ tree = packed.unpack()
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import PyTreeDef
+from jaxtyping import PyTree
+
+Vector = jax.Array | np.ndarray
 
 
 @dataclass(frozen=True)
@@ -33,12 +36,12 @@ class LeafPlace:
 class PackedLayout:
     """A tree with places as leaves. Layouts are equal if structure, shapes and types are."""
 
-    places: Any
+    places: PyTree
     precision: str
     key: str = field(repr=False)
 
     @staticmethod
-    def of(tree: Any) -> "PackedLayout":
+    def of(tree: PyTree) -> "PackedLayout":
         """The layout of a tree of floats of one precision, integers in int32's range, and bools."""
         leaves, structure = jax.tree.flatten(tree)
         places, ends, precision = [], [0, 0], "float32"
@@ -51,7 +54,7 @@ class PackedLayout:
             jax.tree.unflatten(structure, places), precision, f"{structure} {places}"
         )
 
-    def pack(self, tree: Any) -> "Packed":
+    def pack(self, tree: PyTree) -> "Packed":
         """Pack a tree of this layout."""
         floats, integers = [jnp.zeros(0, self.precision)], [jnp.zeros(0, jnp.int32)]
         places = jax.tree.leaves(self.places)
@@ -60,21 +63,21 @@ class PackedLayout:
             part.append(jnp.ravel(leaf).astype(part[0].dtype))
         return Packed(jnp.concatenate(floats), jnp.concatenate(integers), self)
 
-    def unpack(self, floats: Any, integers: Any) -> Any:
+    def unpack(self, floats: Vector, integers: Vector) -> PyTree:
         """The tree of packed vectors."""
         leaves = self._views(floats, integers)
         for index, dtype in self._casts:
             leaves[index] = leaves[index].astype(dtype)
         return jax.tree.unflatten(self._structure, leaves)
 
-    def room(self) -> tuple["Packed", Any]:
+    def room(self) -> tuple["Packed", PyTree]:
         """Vectors of NumPy zeros, and a tree of writable views of them, with bools as integers."""
         integers, floats = self._sizes
         packed = Packed(np.zeros(floats, self.precision), np.zeros(integers, np.int32), self)
         views = self._views(packed.floats, packed.integers)
         return packed, jax.tree.unflatten(self._structure, views)
 
-    def _views(self, floats: Any, integers: Any) -> list[Any]:
+    def _views(self, floats: Vector, integers: Vector) -> list[jax.Array | np.ndarray]:
         parts = integers, floats
         return [
             parts[is_float][where] if shape is None else parts[is_float][where].reshape(shape)
@@ -107,7 +110,7 @@ class PackedLayout:
         return integers, floats
 
     @cached_property
-    def _structure(self) -> Any:
+    def _structure(self) -> PyTreeDef:
         return jax.tree.structure(self.places)
 
     def __eq__(self, other: object) -> bool:
@@ -126,11 +129,11 @@ class PackedLayout:
 class Packed:
     """The numbers of a tree in two vectors, JAX's or NumPy's."""
 
-    floats: Any  # (n,)
-    integers: Any  # (m,) int32
+    floats: Vector  # (n,)
+    integers: Vector  # (m,) int32
     layout: PackedLayout
 
-    def unpack(self) -> Any:
+    def unpack(self) -> PyTree:
         """The tree of these numbers."""
         return self.layout.unpack(self.floats, self.integers)
 

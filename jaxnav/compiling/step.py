@@ -4,14 +4,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+from jax.tree_util import PyTreeDef
+from jaxtyping import PyTree
 
 from jaxnav.compiling import executables
+from jaxnav.compiling.executable_bytes import Run
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Navigator, Step, jitted_step
@@ -28,8 +30,8 @@ def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
 
 
 def compile_or_load(
-    function: Callable[..., Any], navigator: Navigator, folder: Path | None
-) -> Callable[..., Any]:
+    function: Callable[..., PyTree], navigator: Navigator, folder: Path | None
+) -> Callable[..., PyTree]:
     """`jax.jit(function)` of a navigator, whose first call loads what another process has compiled.
 
     Executables hold none of the navigator's numbers: a car that was calibrated anew loads what it
@@ -48,9 +50,10 @@ def compile_or_load(
     if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
         return partial(_jitted(function), navigator)
     numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
-    ready: dict[Any, tuple[Any, Any]] = {}  # a program for each structure of the arguments
+    # A program for each structure of the arguments.
+    ready: dict[PyTreeDef, tuple[Run, PyTreeDef]] = {}
 
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: PyTree) -> PyTree:
         leaves, given = jax.tree.flatten(arguments)
         if given not in ready:
             ready[given] = executables.program(function, (navigator, *arguments), folder)
@@ -61,7 +64,7 @@ def compile_or_load(
 
 
 def is_compiled(
-    function: Callable[..., Any], navigator: Navigator, folder: Path, *arguments: Any
+    function: Callable[..., PyTree], navigator: Navigator, folder: Path, *arguments: PyTree
 ) -> bool:
     """Whether `compile_or_load(function, navigator, folder)(*told)` finds its executable."""
     return executables.is_kept(function, (strip_static(navigator), *arguments), folder)
@@ -71,7 +74,7 @@ def strip_static(navigator: Navigator) -> Navigator:
     """The navigator without its vehicle's sensor corrections and its map's origin: these numbers
     are static fields, not leaves, and nothing is computed with them."""
 
-    def without(part: Any) -> Any:
+    def without(part: PyTree) -> PyTree:
         if isinstance(part, MarkerMap):
             return part.without_origin()
         if not isinstance(part, Vehicle):
@@ -90,16 +93,16 @@ def strip_static(navigator: Navigator) -> Navigator:
 
 
 @cache
-def _jitted(function: Callable[..., Any]) -> Callable[..., Any]:
+def _jitted(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """`jax.jit(function)`, cached: one program for all navigators of a structure."""
     return jax.jit(function)
 
 
-def _is_ours(part: Any) -> bool:
+def _is_ours(part: object) -> bool:
     return isinstance(part, jaxlie.MatrixLieGroup) or type(part).__module__.startswith("jaxnav.")
 
 
-def _parts(module: Any) -> Iterator[Any]:
+def _parts(module: object) -> Iterator[object]:
     """Yield a module and all modules inside it."""
     yield module
     parts = jax.tree.leaves(

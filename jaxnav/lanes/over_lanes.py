@@ -8,21 +8,18 @@ A `cond` whose index differs between the lanes sorts them by branch: each branch
 its own lanes and costs only those blocks.
 
 A lane's result does not depend on the other lanes. Derivatives are those of `vmap`.
+
+The evaluation leans on internals of JAX (README.md has them). Where those of the installed JAX do
+not fit, `vmap` itself is taken, with one warning.
 """
 
-import collections
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+import warnings
+from collections.abc import Callable
+from functools import cache
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import lax
-from jax.extend import core
-
-from jaxnav.lanes.rules import ELEMENTWISE, NUMPY, RULES, VIEWS, elementwise
-from jaxnav.lanes.strips import CALLS, STRIP, by_itself, in_strips
-from jaxnav.lanes.values import CHEAP, DEAR, Lane, Value, known, rows_of, scan_rows, write_out
+from jaxtyping import PyTree
 
 # Without barriers XLA for the CPU computes anew, at every use, the values that `over_lanes` writes
 # to memory once. Its costly passes double the compile time and buy nothing.
@@ -30,9 +27,11 @@ COMPILER_OPTIONS = {
     "xla_disable_hlo_passes": "cse_barrier_expander",
     "xla_backend_optimization_level": 1,
 }
+# What an internal that is missing, or has other parameters, makes the evaluation raise.
+_DOES_NOT_FIT = ImportError, AttributeError, LookupError, TypeError, ValueError, NotImplementedError
 
 
-def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
+def over_lanes(fn: Callable[..., PyTree], block: int = 64) -> Callable[..., PyTree]:
     """`jax.vmap(fn, in_axes=-1, out_axes=-1)`, evaluated as the module docstring says.
 
     Args:
@@ -40,23 +39,21 @@ def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
         block: number of lanes in each block of a `cond`'s branch, however few lanes chose it.
     """
 
-    def batched(*args: Any) -> Any:
+    def batched(*args: PyTree) -> PyTree:
         leaves, tree = jax.tree.flatten(args)
-        lanes = leaves[0].shape[-1]
         one = [jax.ShapeDtypeStruct(leaf.shape[:-1], leaf.dtype) for leaf in leaves]
         closed, out = jax.make_jaxpr(
             lambda *a: fn(*jax.tree.unflatten(tree, a)), return_shape=True
         )(*one)
 
         @jax.custom_jvp
-        def evaluate(consts: list[Any], leaves: list[Any]) -> list[jax.Array]:
-            outs = _Evaluation(lanes, block).run(
-                closed.jaxpr, [known(c) for c in consts], [Lane(leaf) for leaf in leaves]
-            )
-            return [rows_of(value, lanes) for value in outs]
+        def evaluated(consts: list[jax.Array], leaves: list[jax.Array]) -> list[jax.Array]:
+            from jaxnav.lanes.evaluation import evaluate
 
-        @evaluate.defjvp
-        def _(primals: Any, tangents: Any) -> Any:
+            return evaluate(closed.jaxpr, consts, leaves, block)
+
+        @evaluated.defjvp
+        def _(primals: PyTree, tangents: PyTree) -> PyTree:
             return jax.jvp(
                 jax.vmap(
                     lambda consts, leaves: jax.core.eval_jaxpr(closed.jaxpr, consts, *leaves),
@@ -67,232 +64,28 @@ def over_lanes(fn: Callable[..., Any], block: int = 64) -> Callable[..., Any]:
                 tangents,
             )
 
-        return jax.tree.unflatten(jax.tree.structure(out), evaluate(closed.consts, leaves))
+        try:  # `fn` itself has been traced: what fails now is the evaluation
+            outs = evaluated(closed.consts, leaves)
+        except _DOES_NOT_FIT as error:
+            _warn(f"{type(error).__name__}: {error}")
+            return jax.vmap(fn, in_axes=-1, out_axes=-1)(*args)
+        return jax.tree.unflatten(jax.tree.structure(out), outs)
 
     return batched
 
 
-def lanes_last(tree: Any) -> Any:
+@cache
+def _warn(reason: str) -> None:
+    """Warn once for each reason."""
+    problem = f"jaxnav.lanes does not fit jax {jax.__version__} ({reason})"
+    warnings.warn(f"{problem}: vmap takes its place, several times as slow", stacklevel=3)
+
+
+def lanes_last(tree: PyTree) -> PyTree:
     """Move the batch axis of every leaf from first to last: (L, ...) to (..., L)."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), tree)
 
 
-def lanes_first(tree: Any) -> Any:
+def lanes_first(tree: PyTree) -> PyTree:
     """Move the batch axis of every leaf from last to first: (..., L) to (L, ...)."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), tree)
-
-
-class _Evaluation(NamedTuple):
-    lanes: int
-    block: int
-
-    def run(self, jaxpr: Any, consts: Sequence[Value], args: Sequence[Value]) -> list[Value]:
-        """Evaluate a jaxpr: its outputs."""
-        uses = collections.Counter(
-            var for eqn in jaxpr.eqns for var in eqn.invars if not isinstance(var, core.Literal)
-        )
-        uses.update(var for var in jaxpr.outvars if not isinstance(var, core.Literal))
-        env: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
-
-        def keep(var: Any, value: Value) -> None:
-            env[var] = write_out(value, CHEAP if uses[var] > 1 else DEAR)
-
-        for var, value in zip(jaxpr.invars, args, strict=True):
-            keep(var, value)
-
-        def read(var: Any) -> Value:
-            return np.asarray(var.val) if isinstance(var, core.Literal) else env[var]
-
-        for eqn in jaxpr.eqns:
-            outs = self._apply(eqn, [read(var) for var in eqn.invars])
-            for var, value in zip(eqn.outvars, outs, strict=True):
-                keep(var, value)
-        return [read(var) for var in jaxpr.outvars]
-
-    def _apply(self, eqn: Any, args: list[Value]) -> list[Value]:
-        name, params = eqn.primitive.name, eqn.params
-        if name in CALLS:
-            closed = params[CALLS[name]]
-            return self.run(closed.jaxpr, [known(c) for c in closed.consts], args)
-        if name == "platform_index":
-            return [_platform_index(params["platforms"])]
-        if name in ("cond", "while", "scan"):
-            for arg in args:  # fetched before another trace begins
-                _ = arg.rows if isinstance(arg, Lane) else arg
-        if name == "cond":
-            return self._cond(args, params)
-        if all(isinstance(arg, np.ndarray) for arg in args) and name in NUMPY:
-            return [np.asarray(NUMPY[name](*args, **params))]
-        if not any(isinstance(arg, Lane) for arg in args):
-            outs = eqn.primitive.bind(*args, **params)
-            return list(outs) if eqn.primitive.multiple_results else [outs]
-        if name == "while" and self.lanes > STRIP and by_itself(eqn):
-            strip, fixed = _Evaluation(STRIP, self.block), len(args) - len(eqn.outvars)
-            start = [rows_of(arg, self.lanes) for arg in args[fixed:]]
-            outs = in_strips(lambda args: strip._while(args, params), args[:fixed], start)
-            return [Lane(out) for out in outs]
-        if name == "while":
-            return self._while(args, params)
-        if name == "scan":
-            return self._scan(args, params)
-        if name in ELEMENTWISE and name not in RULES:
-            return [elementwise(eqn.primitive, args, params, self.lanes)]
-        if name not in VIEWS:  # a sum reads every term once
-            args = [write_out(arg, CHEAP if name == "reduce_sum" else 0) for arg in args]
-        rule = RULES.get(name)
-        outs = rule(args, params, self.lanes) if rule else None
-        return self._generic(eqn.primitive, args, params) if outs is None else outs
-
-    def _generic(self, primitive: Any, args: list[Value], params: dict[str, Any]) -> list[Value]:
-        """Evaluate a primitive by `vmap`'s own batching rule."""
-        axes = [-1 if isinstance(arg, Lane) else None for arg in args]
-        arrays = [arg.rows if isinstance(arg, Lane) else arg for arg in args]
-        outs = jax.vmap(lambda *a: primitive.bind(*a, **params), in_axes=axes, out_axes=-1)(*arrays)
-        return [Lane(out) for out in (outs if primitive.multiple_results else [outs])]
-
-    def _while(self, args: list[Value], params: dict[str, Any]) -> list[Value]:
-        """Run a loop until the last lane ends; a lane that has ended keeps its carry."""
-        n_cond, n_body = params["cond_nconsts"], params["body_nconsts"]
-        cond_consts, body_consts = args[:n_cond], args[n_cond : n_cond + n_body]
-        cond, body = params["cond_jaxpr"], params["body_jaxpr"]
-
-        def goes(carry: list[jax.Array]) -> Value:
-            consts = [known(c) for c in cond.consts]
-            return self.run(cond.jaxpr, consts, [*cond_consts, *(Lane(c) for c in carry)])[0]
-
-        def any_goes(carry: list[jax.Array]) -> jax.Array:
-            still = goes(carry)
-            return jnp.any(still.rows) if isinstance(still, Lane) else jnp.asarray(still)
-
-        def step(carry: list[jax.Array]) -> list[jax.Array]:
-            outs = self.run(
-                body.jaxpr,
-                [known(c) for c in body.consts],
-                [*body_consts, *(Lane(c) for c in carry)],
-            )
-            moved, still = [rows_of(out, self.lanes) for out in outs], goes(carry)
-            if not isinstance(still, Lane):  # one condition for all: the body freezes lanes
-                return moved
-            # (*batch, L): a `vmap` inside `fn` put its axes first.
-            return [
-                jnp.where(_spread(still.rows, old.ndim), new, old)
-                for new, old in zip(moved, carry, strict=True)
-            ]
-
-        start = [rows_of(arg, self.lanes) for arg in args[n_cond + n_body :]]
-        return [Lane(out) for out in lax.while_loop(any_goes, step, start)]
-
-    def _scan(self, args: list[Value], params: dict[str, Any]) -> list[Value]:
-        n_consts, n_carry = params["num_consts"], params["num_carry"]
-        consts = args[:n_consts]
-        carry = [rows_of(arg, self.lanes) for arg in args[n_consts : n_consts + n_carry]]
-        xs = [rows_of(arg, self.lanes) for arg in args[n_consts + n_carry :]]
-        closed = params["jaxpr"]
-
-        def body(carry: list[jax.Array], xs: list[jax.Array]) -> tuple[list[Any], list[Any]]:
-            outs = self.run(
-                closed.jaxpr,
-                [known(c) for c in closed.consts],
-                [*consts, *(Lane(c) for c in carry), *(Lane(x) for x in xs)],
-            )
-            rows = [rows_of(out, self.lanes) for out in outs]
-            return rows[:n_carry], rows[n_carry:]
-
-        carry, ys = lax.scan(
-            body,
-            carry,
-            xs,
-            length=params["length"],
-            reverse=params["reverse"],
-            unroll=params["unroll"],
-        )
-        return [Lane(out) for out in [*carry, *ys]]
-
-    def _cond(self, args: list[Value], params: dict[str, Any]) -> list[Value]:
-        index, *operands = args
-        branches = params["branches"]
-
-        def branch(closed: Any, lanes: int) -> Callable[..., list[jax.Array]]:
-            def run(operands: list[Value]) -> list[jax.Array]:
-                outs = _Evaluation(lanes, self.block).run(
-                    closed.jaxpr, [known(c) for c in closed.consts], operands
-                )
-                return [rows_of(out, lanes) for out in outs]
-
-            return run
-
-        if isinstance(index, np.ndarray):
-            closed = branches[int(np.clip(index, 0, len(branches) - 1))]
-            return self.run(closed.jaxpr, [known(c) for c in closed.consts], operands)
-        if not isinstance(index, Lane):
-            runs = [branch(closed, self.lanes) for closed in branches]
-            return [Lane(o) for o in lax.switch(index, [lambda r=r: r(operands) for r in runs])]
-        block = min(self.block, self.lanes)
-        chosen = jnp.clip(index.rows.astype(jnp.int32), 0, len(branches) - 1)
-        return [
-            Lane(out)
-            for out in _sorted_switch(
-                chosen,
-                [branch(closed, block) for closed in branches],
-                operands,
-                branches[0].out_avals,
-                block,
-            )
-        ]
-
-
-def _sorted_switch(
-    chosen: jax.Array,
-    branches: list[Callable[[list[Value]], list[jax.Array]]],
-    operands: list[Value],
-    shapes: Sequence[Any],
-    block: int,
-) -> list[jax.Array]:
-    """Run each branch over blocks of the lanes that chose it; the last block repeats a lane."""
-    lanes, count = chosen.shape[0], len(branches)
-    is_in = chosen[None] == jnp.arange(count)[:, None]
-    running = scan_rows(is_in.astype(jnp.int32), 1, lax.add, 0, False)
-    members = running[:, -1]
-    blocks = -(-members // block)
-    first_block = jnp.cumsum(blocks) - blocks
-    order = jnp.argsort(chosen, stable=True)
-    first = jnp.cumsum(members) - members
-    place = jnp.sum(jnp.where(is_in, running - 1, 0), axis=0)
-    slot = first_block[chosen] * block + place
-    slots = (lanes // block + count) * block
-
-    def gather(at: jax.Array) -> list[Value]:
-        return [Lane(o.rows, 0, at) if isinstance(o, Lane) else o for o in operands]
-
-    buffers = [jnp.zeros((*aval.shape, slots), aval.dtype) for aval in shapes]
-    for number, branch in enumerate(branches):
-        last = jnp.maximum(first[number] + members[number] - 1, 0)
-
-        def body(
-            j: jax.Array,
-            buffers: list[jax.Array],
-            number: int = number,
-            branch: Callable[[list[Value]], list[jax.Array]] = branch,
-            last: jax.Array = last,
-        ) -> list[jax.Array]:
-            at = order[jnp.minimum(first[number] + j * block + jnp.arange(block), last)]
-            outs = branch(gather(at))
-            start = (first_block[number] + j) * block
-            return [
-                lax.dynamic_update_slice_in_dim(b, out, start, b.ndim - 1)
-                for b, out in zip(buffers, outs, strict=True)
-            ]
-
-        buffers = lax.fori_loop(0, blocks[number], body, buffers)
-    return [b.at[..., slot].get(mode="promise_in_bounds") for b in buffers]
-
-
-def _spread(rows: jax.Array, ndim: int) -> jax.Array:
-    """Reshape (*batch, L) to `ndim` axes, to broadcast against (*batch, ..., L)."""
-    return rows.reshape(rows.shape[:-1] + (1,) * (ndim - rows.ndim) + rows.shape[-1:])
-
-
-def _platform_index(platforms: Sequence[Sequence[str] | None]) -> np.ndarray:
-    here = jax.default_backend()
-    fits = [i for i, names in enumerate(platforms) if names is None or here in names]
-    return np.asarray(fits[0], np.int32)

@@ -4,6 +4,7 @@ A rule takes (arguments, parameters, lanes) and returns the outputs, or None to 
 `vmap`'s own batching rule.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,12 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend import core
 
 from jaxnav.lanes.tables import arg_extreme, dynamic_slice, gather, scatter, sort, top_k
 from jaxnav.lanes.values import (
     DEAR,
     UNROLLED,
+    Combine,
     Lane,
+    Params,
     Value,
     at_place,
     join_rows,
@@ -27,7 +31,7 @@ from jaxnav.lanes.values import (
 )
 
 
-def elementwise(primitive: Any, args: list[Any], params: dict[str, Any], lanes: int) -> Lane:
+def elementwise(primitive: core.Primitive, args: list[Value], params: Params, lanes: int) -> Lane:
     shape = np.broadcast_shapes(*(arg.shape for arg in args))
     full = (*shape, lanes)
 
@@ -48,7 +52,7 @@ def elementwise(primitive: Any, args: list[Any], params: dict[str, Any], lanes: 
     return Lane(primitive.bind(*[met(arg) for arg in args], **params), work + own)
 
 
-def _atan2(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def _atan2(args: list[Value], params: Params, lanes: int) -> list[Value] | None:
     """atan2 in float32 as a polynomial, to 2 ulp; XLA's own calls the C library for every number.
 
     Source: Moshier (1989), "Methods and programs for mathematical functions" (Cephes, atanf).
@@ -71,35 +75,36 @@ def _atan2(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] |
     return [Lane(jnp.where(jnp.isnan(x) | jnp.isnan(y), jnp.nan, angle), DEAR + 1)]
 
 
-def _same(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _same(args: list[Lane], params: Params, lanes: int) -> list[Value]:
     return [args[0]]
 
 
-def _any_lane(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _any_lane(args: list[Lane], params: Params, lanes: int) -> list[Value]:
     return [jnp.any(args[0].rows)]
 
 
-def _broadcast_in_dim(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _broadcast_in_dim(args: list[Value], params: Params, lanes: int) -> list[Value]:
     shape, dims = params["shape"], params["broadcast_dimensions"]
     expands = math.prod(shape) > math.prod(args[0].shape)
-    arg: Any = write_out(args[0], 0) if expands else args[0]
+    arg = write_out(args[0], 0) if expands else args[0]
+    assert isinstance(arg, Lane)  # the one that differs between lanes
     return [Lane(lax.broadcast_in_dim(arg.rows, (*shape, lanes), (*dims, len(shape))), arg.work)]
 
 
-def _reshape(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _reshape(args: list[Lane], params: Params, lanes: int) -> list[Value]:
     return [Lane(args[0].rows.reshape(*params["new_sizes"], lanes), args[0].work)]
 
 
-def _squeeze(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _squeeze(args: list[Lane], params: Params, lanes: int) -> list[Value]:
     return [Lane(lax.squeeze(args[0].rows, params["dimensions"]), args[0].work)]
 
 
-def _transpose(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _transpose(args: list[Lane], params: Params, lanes: int) -> list[Value]:
     permutation = params["permutation"]
     return [Lane(lax.transpose(args[0].rows, (*permutation, len(permutation))), args[0].work)]
 
 
-def _slice(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _slice(args: list[Lane], params: Params, lanes: int) -> list[Value]:
     strides, arg = params["strides"], args[0]
     if arg.at is not None and strides is None:
         first = lax.slice(
@@ -121,17 +126,17 @@ def _slice(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
     ]
 
 
-def _concatenate(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _concatenate(args: list[Value], params: Params, lanes: int) -> list[Value]:
     return [join_rows([rows_of(arg, lanes) for arg in args], params["dimension"])]
 
 
-def _stack(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _stack(args: list[Value], params: Params, lanes: int) -> list[Value]:
     axis = params["axis"]
     rows = [lax.expand_dims(rows_of(arg, lanes), (axis,)) for arg in args]
     return [join_rows(rows, axis)]
 
 
-def _split(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _split(args: list[Lane], params: Params, lanes: int) -> list[Value]:
     axis, ends = params["axis"], np.cumsum(params["sizes"])
     return [
         Lane(lax.slice_in_dim(args[0].rows, int(end - size), int(end), axis=axis), args[0].work)
@@ -139,43 +144,41 @@ def _split(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
     ]
 
 
-def _pad(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def _pad(args: list[Value], params: Params, lanes: int) -> list[Value] | None:
     if isinstance(args[1], Lane):
         return None
     value = jnp.asarray(args[1])
     return [Lane(lax.pad(rows_of(args[0], lanes), value, (*params["padding_config"], (0, 0, 0))))]
 
 
-def _rev(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+def _rev(args: list[Lane], params: Params, lanes: int) -> list[Value]:
     return [Lane(lax.rev(args[0].rows, params["dimensions"]))]
 
 
-def _reduce(combine: Callable[[Any, Any], Any]) -> Callable[..., list[Value] | None]:
-    def rule(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def _reduce(combine: Combine) -> Callable[..., list[Value] | None]:
+    def rule(args: list[Lane], params: Params, lanes: int) -> list[Value] | None:
         axes, rows = tuple(map(int, params["axes"])), args[0].rows
         terms = math.prod(rows.shape[axis] for axis in axes)
         if not 0 < terms <= UNROLLED:
             return None
-        total: Any = None
-        for index in np.ndindex(*(rows.shape[axis] for axis in axes)):
-            term = at_place(rows, dict(zip(axes, index, strict=True)))
-            total = term if total is None else combine(total, term)
-        return [Lane(total, terms)]
+        places = np.ndindex(*(rows.shape[axis] for axis in axes))
+        addends = (at_place(rows, dict(zip(axes, index, strict=True))) for index in places)
+        return [Lane(functools.reduce(combine, addends), terms)]
 
     return rule
 
 
-def _running(combine: Callable[[Any, Any], Any], neutral: int) -> Callable[..., list[Value]]:
+def _running(combine: Combine, neutral: int) -> Callable[..., list[Value]]:
     """The rule of a cumulative sum or product, by doubling: XLA's cost is quadratic in length."""
 
-    def rule(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value]:
+    def rule(args: list[Lane], params: Params, lanes: int) -> list[Value]:
         axis, rows = params["axis"], args[0].rows
         return [Lane(scan_rows(rows, axis, combine, neutral, params["reverse"]))]
 
     return rule
 
 
-def _dot_general(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def _dot_general(args: list[Value], params: Params, lanes: int) -> list[Value] | None:
     (left_k, right_k), (left_b, right_b) = params["dimension_numbers"]
     left, right = args
     shapes = [a.shape for a in args]
@@ -186,7 +189,7 @@ def _dot_general(args: list[Any], params: dict[str, Any], lanes: int) -> list[Va
     sizes = [shapes[0][d] for d in left_k]
     if math.prod(sizes) == 0:
         return None
-    total: Any = None
+    total: jax.Array | None = None
     batch = [shapes[0][d] for d in left_b]
     kept_left = [shapes[0][d] for d in free[0]]
     kept_right = [shapes[1][d] for d in free[1]]
@@ -196,8 +199,13 @@ def _dot_general(args: list[Any], params: dict[str, Any], lanes: int) -> list[Va
     right_dims = (*range(nb), *range(nb + nl, nb + nl + nr))
 
     def term(
-        value: Any, k: Sequence[Any], b: Sequence[Any], f: list[Any], at: Any, dims: Any
-    ) -> Any:
+        value: Value,
+        k: Sequence[int],
+        b: Sequence[int],
+        f: list[int],
+        at: tuple[int, ...],
+        dims: tuple[int, ...],
+    ) -> jax.Array | None:
         index = dict(zip(k, at, strict=True))
         rest = [d for d in range(len(value.shape)) if d not in index]
         perm = [rest.index(d) for d in (*b, *f)]
@@ -205,10 +213,10 @@ def _dot_general(args: list[Any], params: dict[str, Any], lanes: int) -> list[Va
             chosen = lax.transpose(at_place(value.rows, index), (*perm, len(perm)))
             return lax.broadcast_in_dim(chosen, out_shape, (*dims, nb + nl + nr))
         if isinstance(value, np.ndarray):
-            chosen = value[tuple(index.get(d, slice(None)) for d in range(value.ndim))]
-            if not np.any(chosen):
+            entries = value[tuple(index.get(d, slice(None)) for d in range(value.ndim))]
+            if not np.any(entries):
                 return None
-            chosen = jnp.asarray(chosen.transpose(perm))
+            chosen = jnp.asarray(entries.transpose(perm))
         else:
             chosen = lax.transpose(at_place(jnp.asarray(value), index), perm)
         return lax.broadcast_in_dim(chosen, out_shape, dims)

@@ -7,13 +7,13 @@ until its own slowest lane ends, not the slowest of the block.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend import core
 
 from jaxnav.lanes.rules import ELEMENTWISE, RULES
 from jaxnav.lanes.values import Lane, Value, one_kernel, rows_of
@@ -32,7 +32,7 @@ _LOOPS = {"while": ("cond_jaxpr", "body_jaxpr"), "scan": ("jaxpr",)}
 _FITTING = ELEMENTWISE | RULES.keys() | {"iota", "select_if_vmap"}
 
 
-def by_itself(eqn: Any) -> bool:
+def by_itself(eqn: core.JaxprEqn) -> bool:
     """Whether an equation can become part of a single kernel on this backend."""
     name, params = eqn.primitive.name, eqn.params
     inner = _LOOPS.get(name, (CALLS[name],) if name in CALLS else ())

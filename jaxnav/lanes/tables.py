@@ -13,18 +13,30 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxnav.lanes.values import DEAR, UNROLLED, Lane, Value, at_place, barrier, rows_of
+from jaxnav.lanes.values import (
+    DEAR,
+    UNROLLED,
+    Combine,
+    Lane,
+    Params,
+    Value,
+    at_place,
+    barrier,
+    rows_of,
+)
+
+Dims = Sequence[Any]  # JAX's integers: Python's, NumPy's, or a literal's
 
 
 def _windows(
-    shape: Sequence[Any],
+    shape: Dims,
     index: np.ndarray,
-    slice_sizes: Sequence[Any],
-    window_dims: Sequence[Any],
-    collapsed: Sequence[Any],
-    start_map: Sequence[Any],
-    operand_batch: Sequence[Any],
-    index_batch: Sequence[Any],
+    slice_sizes: Dims,
+    window_dims: Dims,
+    collapsed: Dims,
+    start_map: Dims,
+    operand_batch: Dims,
+    index_batch: Dims,
 ) -> np.ndarray | None:
     """The flat positions in the operand that a gather reads or a scatter writes.
 
@@ -56,7 +68,7 @@ def _windows(
     return flat.transpose([source[d] for d in range(rank)])
 
 
-def gather(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def gather(args: list[Value], params: Params, lanes: int) -> list[Value] | None:
     operand, index = args
     dn, sizes = params["dimension_numbers"], params["slice_sizes"]
     if isinstance(index, np.ndarray) and isinstance(operand, Lane):
@@ -97,43 +109,43 @@ def gather(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] |
         out[position] = size
     out_shape = (*out, lanes)
     at = lax.broadcast_in_dim(at, out_shape, (*others, rank))
-    chosen: Any = None
-    for k in range(shape[axis]):
+
+    def row(k: int) -> jax.Array:
         if isinstance(operand, Lane):
-            row = lax.broadcast_in_dim(
+            return lax.broadcast_in_dim(
                 at_place(operand.rows, {axis: k}), out_shape, (*dn.offset_dims, rank)
             )
-        else:
-            row = lax.broadcast_in_dim(
-                at_place(jnp.asarray(operand), {axis: k}), out_shape, tuple(dn.offset_dims)
-            )
-        chosen = row if chosen is None else lax.select(at >= k, row, chosen)
+        return lax.broadcast_in_dim(
+            at_place(jnp.asarray(operand), {axis: k}), out_shape, tuple(dn.offset_dims)
+        )
+
+    chosen = row(0)
+    for k in range(1, shape[axis]):
+        chosen = lax.select(at >= k, row(k), chosen)
     return [Lane(chosen, shape[axis])]
 
 
-def dynamic_slice(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def dynamic_slice(args: list[Value], params: Params, lanes: int) -> list[Value] | None:
     operand, *starts = args
     moving = [d for d, s in enumerate(starts) if not isinstance(s, np.ndarray)]
     if any(np.any(s) for s in starts if isinstance(s, np.ndarray)) or len(moving) != 1:
         return None
     axis, shape, sizes = moving[0], operand.shape, params["slice_sizes"]
-    if sizes[axis] != 1 or shape[axis] > UNROLLED or not isinstance(starts[axis], Lane):
+    start = starts[axis]
+    if sizes[axis] != 1 or shape[axis] > UNROLLED or not isinstance(start, Lane):
         return None
     rows = rows_of(operand, lanes)
     rows = lax.slice(rows, (0,) * rows.ndim, (*(shape[d] if d == axis else sizes[d]
                                                 for d in range(len(shape))), lanes))  # fmt: skip
-    chosen: Any = None
-    for k in range(shape[axis]):
+    chosen = lax.slice_in_dim(rows, 0, 1, axis=axis)
+    for k in range(1, shape[axis]):
         row = lax.slice_in_dim(rows, k, k + 1, axis=axis)
-        if chosen is None:
-            chosen = row
-        else:
-            at = lax.broadcast_in_dim(starts[axis].rows, row.shape, (row.ndim - 1,))
-            chosen = lax.select(at >= k, row, chosen)
+        at = lax.broadcast_in_dim(start.rows, row.shape, (row.ndim - 1,))
+        chosen = lax.select(at >= k, row, chosen)
     return [Lane(chosen, shape[axis])]
 
 
-def scatter(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def scatter(args: list[Value], params: Params, lanes: int) -> list[Value] | None:
     operand, index, updates = args
     if not isinstance(index, np.ndarray):
         return None
@@ -185,8 +197,8 @@ def _rows_at(rows: jax.Array, flat: np.ndarray) -> jax.Array:
     return out.reshape(*flat.shape, lanes)
 
 
-def arg_extreme(better: Callable[[Any, Any], Any]) -> Callable[..., list[Value] | None]:
-    def rule(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def arg_extreme(better: Combine) -> Callable[..., list[Value] | None]:
+    def rule(args: list[Lane], params: Params, lanes: int) -> list[Value] | None:
         (axis,), rows = tuple(map(int, params["axes"])), args[0].rows
         count = rows.shape[axis]
         if count > UNROLLED:
@@ -238,7 +250,7 @@ def _placed(ranks: jax.Array, values: jax.Array, places: int) -> jax.Array:
     return out
 
 
-def sort(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def sort(args: list[Value], params: Params, lanes: int) -> list[Value] | None:
     axis, rows = params["dimension"], [rows_of(arg, lanes) for arg in args]
     if params["num_keys"] != 1 or not params["is_stable"] or rows[0].shape[axis] > UNROLLED:
         return None
@@ -247,7 +259,7 @@ def sort(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | N
     return [Lane(jnp.moveaxis(_placed(ranks, r, r.shape[0]), 0, axis)) for r in rows]
 
 
-def top_k(args: list[Any], params: dict[str, Any], lanes: int) -> list[Value] | None:
+def top_k(args: list[Lane], params: Params, lanes: int) -> list[Value] | None:
     rows, axis = args[0].rows, params.get("axis", len(args[0].shape) - 1)
     if rows.shape[axis] > UNROLLED:
         return None

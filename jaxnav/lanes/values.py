@@ -1,7 +1,7 @@
 """Represent the values of `over_lanes`: those that differ between lanes, and those that don't."""
 
 import contextvars
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -80,6 +80,8 @@ class Lane:
 
 # A value that differs between lanes; one that does not; one that is known at trace time.
 Value = Lane | jax.Array | np.ndarray
+Params = Mapping[str, Any]  # of a primitive, by JAX's names
+Combine = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 def write_out(value: Value, cheap: int) -> Value:
@@ -106,7 +108,7 @@ def rows_of(value: Value, lanes: int) -> jax.Array:
     return lax.broadcast_in_dim(value, (*value.shape, lanes), tuple(range(value.ndim)))
 
 
-def at_place(rows: jax.Array, index: dict[Any, Any]) -> jax.Array:
+def at_place(rows: jax.Array, index: Mapping[int, int]) -> jax.Array:
     """The rows at one index along each of some axes, which are dropped."""
     start = [index.get(axis, 0) for axis in range(rows.ndim)]
     stop = [index[a] + 1 if a in index else size for a, size in enumerate(rows.shape)]
@@ -114,7 +116,7 @@ def at_place(rows: jax.Array, index: dict[Any, Any]) -> jax.Array:
 
 
 def scan_rows(
-    rows: jax.Array, axis: int, combine: Callable[[Any, Any], Any], neutral: int, reverse: bool
+    rows: jax.Array, axis: int, combine: Combine, neutral: int, reverse: bool
 ) -> jax.Array:
     size, step = rows.shape[axis], 1
     while step < size:

@@ -235,8 +235,8 @@ class ImplicitGradient(optx.AbstractAdjoint):
 
     def apply(
         self,
-        primal_fn: Callable[..., Any],
-        rewrite_fn: Callable[..., Any],
+        primal_fn: Callable[..., PyTree],
+        rewrite_fn: Callable[..., PyTree],
         inputs: PyTree,
         tags: frozenset[object],
     ) -> PyTree:

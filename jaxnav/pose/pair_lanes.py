@@ -551,5 +551,5 @@ def _over_blocks(
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: corners_n.shape[0]], pairs)
 
 
-def _empty(dtype: Any) -> PosePair:
+def _empty(dtype: jnp.dtype) -> PosePair:
     return PosePair(jaxlie.SE3(jnp.zeros((0, 2, 7), dtype)), jnp.zeros((0, 2), dtype))

@@ -5,8 +5,9 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import equinox as eqx
+from jaxtyping import PyTree
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable[..., PyTree])
 
 jit_with = cast(Any, eqx.filter_jit)  # its types lack `compiler_options`
 _LEVEL = "xla_backend_optimization_level"

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Key, PyTree
 
 from jaxnav.numerics.trees import where
 from jaxnav.simulation.traces import DriveTraces
@@ -18,8 +18,8 @@ from jaxnav.simulation.traces import DriveTraces
 
 def run_lanes(
     keys: Key[Array, " S"],
-    start: Callable[[Key[Array, " lanes"]], Any],
-    advance: Callable[[Any], tuple[Any, Any]],
+    start: Callable[[Key[Array, " lanes"]], PyTree],
+    advance: Callable[[PyTree], tuple[PyTree, PyTree]],
     lanes: int,
     threads: int,
     kept: DriveTraces,

@@ -7,12 +7,11 @@ without its images. The car of a finished drive stands still, and its frames are
 import dataclasses
 import os
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from jaxnav.belief.kalman import nis
 from jaxnav.control import Command
@@ -52,7 +51,8 @@ class Trace(eqx.Module):
     done: Bool[Array, "*S"]  # in the navigator's belief
 
 
-Keep = Callable[[DriveState, DriveState], Any]  # (world before a frame, world after it) -> record
+# (world before a frame, world after it) -> record
+Keep = Callable[[DriveState, DriveState], PyTree]
 
 
 def nothing(before: DriveState, after: DriveState) -> None:
@@ -98,7 +98,7 @@ class Rollout(eqx.Module):
         keys: Key[Array, " S"],
         keep: Keep,
         progress: Callable[[int], object] = lambda ended: None,
-    ) -> tuple[Trace, Any]:
+    ) -> tuple[Trace, PyTree]:
         """`run`, and `keep`'s record of every frame; after a drive's end its last is repeated."""
         if len(keys) < self.many:
             lanes, threads, advance = min(self.lanes, len(keys)), 1, self._advance
@@ -124,10 +124,10 @@ class Rollout(eqx.Module):
         return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), worlds)
 
     @eqx.filter_jit
-    def _advance(self, worlds: DriveState, keep: Keep) -> tuple[DriveState, tuple[Trace, Any]]:
+    def _advance(self, worlds: DriveState, keep: Keep) -> tuple[DriveState, tuple[Trace, PyTree]]:
         """Advance every lane by `chunk_frames`, under `vmap`."""
         step = self.navigator.step
-        advanced: tuple[DriveState, tuple[Trace, Any]] = jax.vmap(
+        advanced: tuple[DriveState, tuple[Trace, PyTree]] = jax.vmap(
             lambda world: jax.lax.scan(
                 lambda w, _: self._kept(w, step, keep), world, length=self.chunk_frames
             )
@@ -135,7 +135,9 @@ class Rollout(eqx.Module):
         return advanced
 
     @jit_with(compiler_options=COMPILER_OPTIONS)
-    def _advance_many(self, worlds: DriveState, keep: Keep) -> tuple[DriveState, tuple[Trace, Any]]:
+    def _advance_many(
+        self, worlds: DriveState, keep: Keep
+    ) -> tuple[DriveState, tuple[Trace, PyTree]]:
         """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
         step = step_by_regime(self.navigator)
         frame = over_lanes(lambda world: self._kept(world, step, keep))
@@ -146,7 +148,7 @@ class Rollout(eqx.Module):
 
     def _kept(
         self, world: DriveState, step: Step, keep: Keep
-    ) -> tuple[DriveState, tuple[Trace, Any]]:
+    ) -> tuple[DriveState, tuple[Trace, PyTree]]:
         after, trace = self.frame(world, step)
         return after, (trace, keep(world, after))
 

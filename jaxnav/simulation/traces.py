@@ -1,9 +1,8 @@
 """Collect the records of many drives that end at different times into arrays."""
 
-from typing import Any
-
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 
 class DriveTraces:
@@ -12,9 +11,9 @@ class DriveTraces:
     def __init__(self, count: int, chunk_frames: int):
         self.chunks = np.zeros(count, int)  # number of chunks so far, per drive
         self.chunk_frames = chunk_frames
-        self.pieces: list[tuple[np.ndarray, np.ndarray, Any]] = []
+        self.pieces: list[tuple[np.ndarray, np.ndarray, PyTree]] = []
 
-    def add(self, owner: np.ndarray, trace: Any) -> None:
+    def add(self, owner: np.ndarray, trace: PyTree) -> None:
         """Add one chunk, leaves (lanes, frames, ...); `owner` is each lane's drive, -1 for none."""
         lanes = np.flatnonzero(owner >= 0)
         drive = owner[lanes]
@@ -22,7 +21,7 @@ class DriveTraces:
         self.pieces.append((drive, self.chunks[drive], piece))
         self.chunks[drive] += 1
 
-    def stack(self) -> tuple[Any, np.ndarray]:
+    def stack(self) -> tuple[PyTree, np.ndarray]:
         """Stack drives of unequal lengths; an ended drive repeats its last frame.
 
         Returns:

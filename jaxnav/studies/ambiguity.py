@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief
@@ -178,7 +178,7 @@ def _numbers(cell: Cell, rig: CameraRig) -> list[float]:
 
 
 @functools.lru_cache(maxsize=64)
-def _program(selectors: tuple[str, ...], max_steps: int) -> Callable[..., Any]:
+def _program(selectors: tuple[str, ...], max_steps: int) -> Callable[..., PyTree]:
     return functools.partial(_frame, selectors, max_steps)
 
 
@@ -292,5 +292,5 @@ def _judged(
     }
 
 
-def _is_none(leaf: Any) -> bool:
+def _is_none(leaf: object) -> bool:
     return leaf is None

@@ -112,7 +112,7 @@ def difference(wanted: Mapping[str, Any], other: Mapping[str, Any], prefix: str 
     return differing
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     if value is None:
         return "nothing"
     text = str(value)

@@ -11,14 +11,15 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
 
 BATCH = 2048
 Tree = TypeVar("Tree")
 
 
 def run_lanes(
-    program: Callable[..., Any],
-    shared: tuple[Any, ...],
+    program: Callable[..., PyTree],
+    shared: tuple[PyTree, ...],
     lanes: tuple[np.ndarray, ...],
     precision: str,
 ) -> dict[str, np.ndarray]:
@@ -59,15 +60,15 @@ def in_precision(tree: Tree, precision: str) -> Tree:
 
 @functools.lru_cache(maxsize=64)
 def _compiled(
-    program: Callable[..., Any], devices: tuple[jax.Device, ...]
-) -> tuple[Callable[..., Any], NamedSharding]:
+    program: Callable[..., PyTree], devices: tuple[jax.Device, ...]
+) -> tuple[Callable[..., PyTree], NamedSharding]:
     mesh = Mesh(np.array(devices), ("lane",))
     lane, everywhere = PartitionSpec("lane"), PartitionSpec()
 
-    def on_one_device(shared: tuple[Any, ...], *lanes: jax.Array) -> Any:
+    def on_one_device(shared: tuple[PyTree, ...], *lanes: jax.Array) -> PyTree:
         return jax.vmap(lambda *one: program(*shared, *one))(*lanes)
 
-    def batch(shared: tuple[Any, ...], *lanes: jax.Array) -> Any:
+    def batch(shared: tuple[PyTree, ...], *lanes: jax.Array) -> PyTree:
         if len(devices) == 1:
             return on_one_device(shared, *lanes)
         return jax.shard_map(

@@ -11,7 +11,6 @@ No step is taken on a loss or gradient that is not finite: the state stays, with
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,7 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxnav.numerics.trees import where
 
-Loss = Callable[[Float[Array, " n"], Any, Float[Array, ""]], Float[Array, ""]]
+Loss = Callable[[Float[Array, " n"], PyTree, Float[Array, ""]], Float[Array, ""]]
 
 
 class Descent(eqx.Module):
@@ -51,18 +50,18 @@ class Smooth(eqx.Module):
     def _solver(self) -> optx.BFGS:
         return optx.BFGS(self.rtol, self.atol)
 
-    def _fn(self, x: Array, args: tuple[Any, Array]) -> tuple[Array, None]:
+    def _fn(self, x: Array, args: tuple[PyTree, Array]) -> tuple[Array, None]:
         return self.loss(x, *args), None
 
     @eqx.filter_jit
-    def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
+    def init(self, x: Float[Array, " n"], batch: PyTree, softness: Array) -> Descent:
         """The state at x, before any evaluation."""
         scalar = jax.ShapeDtypeStruct((), x.dtype)
         state = self._solver.init(self._fn, x, (batch, softness), {}, scalar, None, frozenset())
         return _unknown(x, eqx.filter(state, eqx.is_array))
 
     @eqx.filter_jit
-    def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
+    def step(self, state: Descent, batch: PyTree, softness: Array) -> Descent:
         """Evaluate once more; the point is kept if it lowers the loss enough."""
         solver, args, tags = self._solver, (batch, softness), frozenset[object]()
         scalar = jax.ShapeDtypeStruct((), state.x.dtype)
@@ -84,7 +83,7 @@ class Noisy(eqx.Module):
     """
 
     # (x, batch, softness) -> loss and gradient; not compiled here.
-    evaluate: Callable[[Array, Any, Array], tuple[Array, Array]]
+    evaluate: Callable[[Array, PyTree, Array], tuple[Array, Array]]
     learning_rate: float = 0.05
     steps: int = 100  # the learning rate is a tenth after so many
     longest: float = 1.0  # the norm to which a longer gradient is clipped
@@ -94,11 +93,11 @@ class Noisy(eqx.Module):
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=0.1)
         return optax.chain(optax.clip_by_global_norm(self.longest), optax.adam(rate, b2=0.99))
 
-    def init(self, x: Float[Array, " n"], batch: Any, softness: Array) -> Descent:
+    def init(self, x: Float[Array, " n"], batch: PyTree, softness: Array) -> Descent:
         """The state at x, before any evaluation."""
         return _unknown(x, self._solver.init(x))
 
-    def step(self, state: Descent, batch: Any, softness: Array) -> Descent:
+    def step(self, state: Descent, batch: PyTree, softness: Array) -> Descent:
         """Take one step along the gradient of this batch."""
         loss, gradient = self.evaluate(state.x, batch, softness)
         return _moved(self._solver, state, loss, gradient)

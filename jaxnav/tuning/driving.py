@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
 from jaxnav.navigator import Step
@@ -42,7 +42,7 @@ class DriveSlopes(eqx.Module):
 
     world: DriveState
     costs: Costs
-    slopes: Any  # leaves (P, ...): derivatives of the world's moving part, and of the costs
+    slopes: PyTree  # leaves (P, ...): derivatives of the world's moving part, and of the costs
 
     @property
     def ended(self) -> Bool[Array, "*L"]:
@@ -133,7 +133,7 @@ class ClosedLoop(eqx.Module):
     @eqx.filter_jit
     def _start(self, x: Array, space: Space, keys: Key[Array, " lanes"]) -> DriveSlopes:
         def first(key: Array) -> DriveSlopes:
-            def moving(x: Array) -> tuple[Any, DriveState]:
+            def moving(x: Array) -> tuple[PyTree, DriveState]:
                 world = _strong(self._softened(x, space).first(key))
                 return (_moving(world)[0], no_costs(world.car.pose.dtype)), world
 
@@ -175,7 +175,7 @@ class ClosedLoop(eqx.Module):
         before, costs_of_frame = drive.world, CostsOfFrame(self.rollout.scenario)
         moving, still = _moving(before)
 
-        def after(x: Array, moving: Any, costs: Costs) -> tuple[Any, DriveState]:
+        def after(x: Array, moving: PyTree, costs: Costs) -> tuple[PyTree, DriveState]:
             rollout = self._softened(x, space)
             world = eqx.combine(moving, still)
             after = _strong(rollout.frame(world, step(rollout))[0])
@@ -219,7 +219,9 @@ def _moving(world: DriveState) -> tuple[DriveState, DriveState]:
     return moving, still
 
 
-def _pushed(fn: Callable[..., tuple[Any, DriveState]], primals: Any, tangents: Any) -> Any:
+def _pushed(
+    fn: Callable[..., tuple[PyTree, DriveState]], primals: PyTree, tangents: PyTree
+) -> PyTree:
     """The value of fn, its derivatives along P directions at once, and its auxiliary output."""
     return jax.vmap(
         lambda along: jax.jvp(fn, primals, along, has_aux=True), out_axes=(None, 0, None)

@@ -5,23 +5,23 @@ drive; the items are batched, and split over the devices of the process.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, PartitionSpec
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 # (x, one item, softness of its discrete choices) -> cost of each of its T frames.
-Cost = Callable[[Float[Array, " n"], Any, Float[Array, ""]], Float[Array, " T"]]
+Cost = Callable[[Float[Array, " n"], PyTree, Float[Array, ""]], Float[Array, " T"]]
 
 
 class Batch(NamedTuple):
     """Items, leading axis (B,), and the number of frames by which the sum is divided."""
 
-    items: Any
+    items: PyTree
     frames: Float[Array, ""]
 
 
@@ -41,12 +41,12 @@ class Objective(eqx.Module):
         prior = jnp.sum(x**2) / (2 * self.prior_sigma**2)
         return (self.total(x, batch.items, softness) + prior) / batch.frames
 
-    def total(self, x: Float[Array, " n"], items: Any, softness: Float[Array, ""]) -> Array:
+    def total(self, x: Float[Array, " n"], items: PyTree, softness: Float[Array, ""]) -> Array:
         """The sum of the costs over all frames of all items."""
         devices = jax.devices()
         count = jax.tree.leaves(items)[0].shape[0]
 
-        def over(x: Array, items: Any, softness: Array) -> Array:
+        def over(x: Array, items: PyTree, softness: Array) -> Array:
             return jnp.sum(jax.vmap(self.cost, in_axes=(None, 0, None))(x, items, softness))
 
         if len(devices) == 1 or count % len(devices):
@@ -82,12 +82,12 @@ class NotFinite(NamedTuple):
 
 
 def where_not_finite(
-    cost: Cost, x: Float[Array, " n"], items: Any, softness: Float[Array, ""]
+    cost: Cost, x: Float[Array, " n"], items: PyTree, softness: Float[Array, ""]
 ) -> NotFinite | None:
     """The first entry and item whose gradient is not finite, or None."""
 
     @jax.jit
-    def gradients(x: Array, items: Any) -> Array:
+    def gradients(x: Array, items: PyTree) -> Array:
         return jax.vmap(jax.grad(lambda x, item: jnp.sum(cost(x, item, softness))), (None, 0))(
             x, items
         )

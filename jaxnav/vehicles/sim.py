@@ -159,15 +159,16 @@ setattr(open_vehicle, "shares_process", True)  # noqa: B010  (mypy: a function h
 
 
 def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
-    """Open the cameras of the simulated car.
+    """Open the cameras of the simulated car, or of any vehicle that has a `world: SimWorld`.
 
     Options: rate_hz (30), images (false).
     """
-    if not isinstance(vehicle, SimVehicle):
-        raise BadInput("--cameras", "sim looks at the world of --vehicle sim alone")
+    world = getattr(vehicle, "world", None)
+    if not isinstance(world, SimWorld):
+        raise BadInput("--cameras", "sim looks at the `world` of a vehicle, and this one lacks it")
     renderer = None
     if choice(setup.options, "images", ("false", "true")) == "true":
         renderer = RenderingProcess(setup.rig, setup.markers, setup.seed)
     rate_hz = number(setup.options, "rate_hz", 30.0, 1.0, 240.0)
-    shutter = _Shutter(vehicle.world, rate_hz, renderer)
+    shutter = _Shutter(world, rate_hz, renderer)
     return [SimCamera(name, c, shutter) for c, name in enumerate(setup.rig.names)]

@@ -1,11 +1,16 @@
 """`over_lanes` against `jax.vmap`, lane by lane."""
 
+import sys
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
 
+from jaxnav.lanes import over_lanes as door
+from jaxnav.lanes import rules
 from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
 from jaxnav.numerics.small_matrices import cho_solve, cholesky, sandwich
 
@@ -240,3 +245,44 @@ def test_axes_are_moved_there_and_back():
     assert last["a"].shape == (2, 2, 3)
     back = lanes_first(last)
     jax.tree.map(np.testing.assert_array_equal, back, tree)
+
+
+def _without_metadata(monkeypatch):
+    """A JAX that lacks a function which the folder imports."""
+    monkeypatch.delattr("jax.experimental.xla_metadata.set_xla_metadata")
+    for name in list(sys.modules):
+        if name.startswith("jaxnav.lanes.") and name != door.__name__:
+            monkeypatch.delitem(sys.modules, name)
+
+
+def _with_renamed_parameters(monkeypatch):
+    """A JAX whose `dot_general` has parameters of other names."""
+    rule = rules.RULES["dot_general"]
+    monkeypatch.setitem(
+        rules.RULES,
+        "dot_general",
+        lambda args, params, lanes: rule(args, {f"{k}_2": v for k, v in params.items()}, lanes),
+    )
+
+
+@pytest.mark.parametrize("differ", [_without_metadata, _with_renamed_parameters])
+def test_another_jax_gives_the_results_of_vmap_with_one_warning(monkeypatch, differ):
+    door._warn.cache_clear()
+    which, A = np.resize([0, 1, 2], LANES), jnp.asarray(drawn(4, 4))
+    differ(monkeypatch)
+    with pytest.warns(UserWarning, match=r"does not fit jax .*: vmap takes its place"):
+        out = jax.jit(over_lanes(branching))(which, A)
+    expected = jax.jit(jax.vmap(branching, in_axes=-1, out_axes=-1))(which, A)
+    jax.tree.map(np.testing.assert_array_equal, out, expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.jit(over_lanes(branching))(which, A)
+    door._warn.cache_clear()
+
+
+def test_an_error_of_the_function_itself_stays_an_error():
+    def wrong(x):
+        raise KeyError("of the caller")
+
+    with pytest.raises(KeyError, match="of the caller"):
+        over_lanes(wrong)(jnp.ones(LANES))

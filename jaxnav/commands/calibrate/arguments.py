@@ -10,6 +10,7 @@ import tyro
 
 from jaxnav.commands.kinds import (
     POSITIVE,
+    Checked,
     CornerBackend,
     Headless,
     OptionalFile,
@@ -17,7 +18,6 @@ from jaxnav.commands.kinds import (
     QCarFile,
     ResultsFolder,
     Switch,
-    Told,
     flag_of,
     optional,
     require,
@@ -55,7 +55,7 @@ _RecordedFile = Annotated[Path | None, optional("FILE", "(default: the recording
 
 
 @dataclass(frozen=True)
-class CalibrateBoard(Told):
+class CalibrateBoard(Checked):
     """Print a calibration target at true scale, with rulers on it to check the print.
 
     A charuco board is the best for a single camera: it may be cut off by the image's edge, so its
@@ -180,7 +180,7 @@ class CalibrateIntrinsics(Headless):
 
 
 @dataclass(frozen=True)
-class CalibrateConvert(Told):
+class CalibrateConvert(Checked):
     """Convert cameras and marker maps between jaxnav's files and those of other tools.
 
     Which tool wrote SOURCE, its keys tell. Numbers are carried over as they are written; what the
@@ -230,7 +230,7 @@ class CalibrateConvert(Told):
 
 
 @dataclass(frozen=True)
-class _Seen(Told):
+class _Seen(Checked):
     """What those are told that find places by what the cameras saw."""
 
     recordings: Recordings

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
+    Checked,
     KeyValues,
     OptionalFile,
     OptionalName,
@@ -14,14 +15,13 @@ from jaxnav.commands.kinds import (
     QCarMarkers,
     QCarRig,
     QCarVehicle,
-    Told,
     key_values,
     optional,
 )
 
 
 @dataclass(frozen=True)
-class Doctor(Told):
+class Doctor(Checked):
     """Check what a car will run with, and say what to do about each finding.
 
     Looked at are the computer (packages, OpenCV, JAX, clock, disk), the four files, pictures that

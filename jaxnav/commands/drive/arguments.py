@@ -10,6 +10,7 @@ from jaxnav.commands.kinds import (
     AT_LEAST_1,
     POSITIVE,
     Believed,
+    Checked,
     CornerBackend,
     Detector,
     Float64,
@@ -25,7 +26,6 @@ from jaxnav.commands.kinds import (
     Seed,
     Selector,
     Switch,
-    Told,
     flag_of,
     optional,
     require,
@@ -34,7 +34,7 @@ from jaxnav.commands.kinds import (
 
 
 @dataclass(frozen=True)
-class Run(Told):
+class Run(Checked):
     """Drive a vehicle through its route.
 
     Everything is compiled before the vehicle is armed. The last that it hears, however this ends,
@@ -180,7 +180,7 @@ class ViewDrive(Headless):
 
 
 @dataclass(frozen=True)
-class Locate(Told):
+class Locate(Checked):
     """Find markers in a photograph and print both poses of each.
 
     With each marker: reprojection errors, their ratio, the probability that the better pose is
