@@ -29,12 +29,11 @@ os.environ.setdefault(
     "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"
     + (" --xla_cpu_max_isa=SSE4_2" if platform.machine() == "x86_64" else ""),
 )
-# Who runs the same tests again and again may name a folder that keeps their compiled programs.
-if kept := os.environ.get("JAXNAV_TEST_CACHE"):
-    jax.config.update("jax_compilation_cache_dir", kept)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-else:
-    jax.config.update("jax_enable_compilation_cache", False)  # not even its keys
+# The workers share the programs that they compile, and the next run finds them: what a program is
+# called by is its text, the compiler and its flags.
+kept = os.environ.get("JAXNAV_TEST_CACHE") or Path(__file__).parents[1] / ".pytest_cache/compiled"
+jax.config.update("jax_compilation_cache_dir", str(kept))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 # Nor does anybody look where in the sources an operation is from, children neither.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 jax.config.update("jax_traceback_in_locations_limit", 0)

@@ -114,15 +114,21 @@ def _add_detections(detections: TopicDetections, message: Any) -> None:
 def _add_transforms(
     transforms: dict[tuple[str, str], dict[int, tuple[float, ...]]], message: Any
 ) -> None:
+    rows = []
     for stamped in message.transforms:
-        edge = (stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/"))
         q, p = stamped.transform.rotation, stamped.transform.translation
-        pose = (q.w, q.x, q.y, q.z, p.x, p.y, p.z)
-        if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[:4]) - 1) > 1e-3:
+        rows.append((q.w, q.x, q.y, q.z, p.x, p.y, p.z))
+    poses = np.array(rows, float).reshape(-1, 7)
+    off_unit = np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1)
+    rigid = np.asarray(np.isfinite(poses).all(axis=1) & (off_unit <= 1e-3))
+    near = np.asarray(is_within("position_m", poses[:, 4:]).all(axis=1))
+    for index, stamped in enumerate(message.transforms):
+        edge = (stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/"))
+        if not rigid[index]:
             raise ValueError(f"the transform from {edge[1]} to {edge[0]} is not rigid")
-        if not is_within("position_m", pose[4:]).all():
+        if not near[index]:
             raise ValueError(f"the transform from {edge[1]} to {edge[0]} leads out of the world")
-        transforms.setdefault(edge, {})[ros_messages.stamp_ns(stamped)] = pose
+        transforms.setdefault(edge, {})[ros_messages.stamp_ns(stamped)] = rows[index]
 
 
 def list_topics(recorded: Sequence[Bag]) -> str:
