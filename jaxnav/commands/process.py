@@ -1,5 +1,6 @@
 """JAX's settings in a command's own process."""
 
+import gc
 import warnings
 
 from jaxnav.configuration import configure
@@ -17,3 +18,11 @@ def configure_jax(float64: bool, threads: int | None = None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         configure(float64=float64, threads=threads)
+
+
+def collect_garbage_rarely() -> None:
+    """Look for cyclic garbage a thousand times less often, in a command that compiles large
+    programs: tracing makes millions of objects that stay, and looking through them again and again
+    takes a fourth of the time. No command that drives a car calls this: a search takes longer then.
+    """
+    gc.set_threshold(1_000_000, 50, 100)

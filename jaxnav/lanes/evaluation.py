@@ -1,7 +1,7 @@
 """Evaluate a jaxpr for `over_lanes`: what differs between lanes as rows, the rest once."""
 
 import collections
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend import core
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from jaxnav.lanes.rules import ELEMENTWISE, NUMPY, RULES, VIEWS, elementwise
 from jaxnav.lanes.strips import CALLS, STRIP, by_itself, in_strips
 from jaxnav.lanes.values import (
     CHEAP,
     DEAR,
+    UNROLLED,
     Lane,
     Params,
     Value,
@@ -24,6 +26,9 @@ from jaxnav.lanes.values import (
     write_out,
 )
 
+# Arguments and results of the equations evaluated so far, by `_key`.
+Known = dict[Hashable, tuple[list[Value], list[Value]]]
+
 
 def evaluate(
     jaxpr: core.Jaxpr, consts: Sequence[Any], leaves: Sequence[jax.Array], block: int
@@ -31,7 +36,9 @@ def evaluate(
     """The outputs (*shape, L) of a jaxpr, whose arguments (*shape, L) have L lanes."""
     lanes = leaves[0].shape[-1]
     args = [Lane(leaf) for leaf in leaves]
-    outs = _Evaluation(lanes, block).run(jaxpr, [known(c) for c in consts], args)
+    # What nobody reads, also inside of branches and loops, would be compiled all the same.
+    needed = dce_jaxpr(jaxpr, True, instantiate=True)[0]
+    outs = _Evaluation(lanes, block).run(needed, [known(c) for c in consts], args)
     return [rows_of(value, lanes) for value in outs]
 
 
@@ -39,8 +46,20 @@ class _Evaluation(NamedTuple):
     lanes: int
     block: int
 
-    def run(self, jaxpr: core.Jaxpr, consts: Sequence[Value], args: Sequence[Value]) -> list[Value]:
-        """Evaluate a jaxpr: its outputs."""
+    def run(
+        self,
+        jaxpr: core.Jaxpr,
+        consts: Sequence[Value],
+        args: Sequence[Value],
+        known_outs: Known | None = None,
+    ) -> list[Value]:
+        """Evaluate a jaxpr: its outputs.
+
+        Args:
+            known_outs: results of the equations evaluated so far in this trace, by equation and
+                arguments: derivatives compute much of a function again.
+        """
+        known_outs = {} if known_outs is None else known_outs
         uses = collections.Counter(
             var for eqn in jaxpr.eqns for var in eqn.invars if not isinstance(var, core.Literal)
         )
@@ -57,16 +76,23 @@ class _Evaluation(NamedTuple):
             return np.asarray(var.val) if isinstance(var, core.Literal) else env[var]
 
         for eqn in jaxpr.eqns:
-            outs = self._apply(eqn, [read(var) for var in eqn.invars])
+            ins = [read(var) for var in eqn.invars]
+            key = _key(eqn, ins)
+            if key in known_outs:
+                env.update(zip(eqn.outvars, known_outs[key][1], strict=True))
+                continue
+            outs = self._apply(eqn, ins, known_outs)
             for var, value in zip(eqn.outvars, outs, strict=True):
                 keep(var, value)
+            if key is not None:  # with its arguments, or another object could get their identity
+                known_outs[key] = ins, [env[var] for var in eqn.outvars]
         return [read(var) for var in jaxpr.outvars]
 
-    def _apply(self, eqn: core.JaxprEqn, args: list[Value]) -> list[Value]:
+    def _apply(self, eqn: core.JaxprEqn, args: list[Value], known_outs: Known) -> list[Value]:
         name, params = eqn.primitive.name, eqn.params
         if name in CALLS:
             closed = params[CALLS[name]]
-            return self.run(closed.jaxpr, [known(c) for c in closed.consts], args)
+            return self.run(closed.jaxpr, [known(c) for c in closed.consts], args, known_outs)
         if name == "platform_index":
             return [_platform_index(params["platforms"])]
         if name in ("cond", "while", "scan"):
@@ -240,6 +266,24 @@ def _sorted_switch(
 
         buffers = lax.fori_loop(0, blocks[number], body, buffers)
     return [b.at[..., slot].get(mode="promise_in_bounds") for b in buffers]
+
+
+def _key(eqn: core.JaxprEqn, args: list[Value]) -> Hashable | None:
+    """A key that two equations share if they compute the same; None for one that is to be apart."""
+    if eqn.primitive.name in CALLS or eqn.effects:
+        return None
+    same = [
+        (arg.dtype, arg.shape, arg.tobytes())
+        if isinstance(arg, np.ndarray) and arg.size <= UNROLLED
+        else id(arg)
+        for arg in args
+    ]
+    key = (eqn.primitive, *same, *sorted(eqn.params.items(), key=lambda item: item[0]))
+    try:
+        hash(key)
+    except TypeError:  # an array among the parameters
+        return None
+    return key
 
 
 def _spread(rows: jax.Array, ndim: int) -> jax.Array:

@@ -68,15 +68,15 @@ def run_lanes(
                 progress(int(over.sum()))
 
     threads = max(1, min(threads, -(-len(keys) // lanes)))
-    if threads == 1:
-        work()
-        return kept
     float64 = jnp.zeros(()).dtype == jnp.float64  # a new thread does not inherit it
 
     def work_alike(number: int) -> None:
         with jax.enable_x64(float64), jax.default_device(devices[number % len(devices)]):
             work()
 
+    if threads == 1:  # with the same settings, or what is compiled would not serve both
+        work_alike(0)
+        return kept
     with ThreadPoolExecutor(threads) as pool:
         working = [pool.submit(work_alike, number) for number in range(threads)]
         try:

@@ -55,7 +55,10 @@ class ClosedLoop(eqx.Module):
 
     rollout: Rollout
     loss: DriveLoss = eqx.field(static=True, default=DriveLoss())
-    softness_m: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.03)
+    # Of a strong type whatever is given, so that one program serves all softnesses.
+    softness_m: Float[Array, ""] = eqx.field(
+        converter=lambda m: jnp.asarray(m, float), default=0.03
+    )
     many: int = eqx.field(static=True, default=256)  # least number of drives for `over_lanes`
     many_lanes: int = eqx.field(static=True, default=256)  # per thread
 
@@ -84,15 +87,18 @@ class ClosedLoop(eqx.Module):
         space: Space,
         keys: Key[Array, " B"],
         progress: Callable[[int], object] = lambda ended: None,
+        compiled_for: int | None = None,
     ) -> tuple[Float[Array, " B"], Float[Array, "B n"]]:
         """The loss (B,) of every drive with the soft switch, and its gradients (B, n).
 
         Args:
             x: unconstrained parameters in `space`.
             keys: one for each drive.
+            compiled_for: the number of drives whose program runs them; by default that of `keys`.
         """
-        lanes, threads, advance = min(self.rollout.lanes, len(keys)), 1, self._advance
-        if len(keys) >= self.many:
+        count = len(keys) if compiled_for is None else compiled_for
+        lanes, threads, advance = min(self.rollout.lanes, count), 1, self._advance
+        if count >= self.many:
             lanes, threads, advance = self.many_lanes, self.rollout.threads, self._advance_many
         kept = run_lanes(
             keys,
@@ -106,6 +112,24 @@ class ClosedLoop(eqx.Module):
         sums, _ = kept.stack()
         costs, slopes = jax.tree.map(lambda leaf: jnp.asarray(leaf[:, -1]), sums)
         return self._losses(costs, slopes)
+
+    def hard_losses(
+        self, x: Float[Array, " n"], space: Space, keys: Key[Array, " B"], beside: int
+    ) -> np.ndarray:
+        """The losses (B,) of `value`, where possible without another program to compile.
+
+        A switch of no width is the hard one, so the program that differentiates many drives runs
+        these as well.
+
+        Args:
+            x: unconstrained parameters in `space`.
+            keys: one for each drive.
+            beside: the number of drives that are differentiated in the same process.
+        """
+        if beside < self.many:
+            return self.value(space.values(x), keys)[0]
+        hard = dataclasses.replace(self, softness_m=jnp.zeros_like(self.softness_m))
+        return np.asarray(hard.value_and_grad(x, space, keys, compiled_for=beside)[0])
 
     def first_not_finite(
         self, x: Float[Array, " n"], space: Space, key: Key[Array, ""]

@@ -239,6 +239,24 @@ def test_derivatives_are_those_of_vmap():
     np.testing.assert_allclose(mapped[1], jax.grad(theirs, 1)(A, 1.5), rtol=1e-10)
 
 
+def test_nothing_is_computed_twice_or_for_nobody():
+    """Not even in another branch's output; XLA would find it only after minutes, or never."""
+    A = jnp.asarray(drawn(4, 4))
+
+    def sines(fn):
+        return jax.jit(over_lanes(fn)).lower(A).as_text().count("stablehlo.sine")
+
+    def chosen(A):
+        return lax.cond(A[0, 0] > 0, lambda: (A, jnp.sin(A)), lambda: (-A, jnp.sin(2 * A)))
+
+    assert sines(chosen) == 2
+    assert sines(lambda A: chosen(A)[0]) == 0
+    assert sines(lambda A: jnp.sin(A) + jax.jit(jnp.sin)(A)) == 1
+    assert sines(lambda A: jnp.sin(A) + jnp.sin(A + 0.0)) == 2
+    both = same(lambda A: (A + 1.0, A + 2.0, A[0] * 2.0, A[1] * 2.0, A + 1), A)
+    np.testing.assert_array_equal(both[0], both[4])
+
+
 def test_axes_are_moved_there_and_back():
     tree = {"a": jnp.arange(12.0).reshape(3, 2, 2), "b": jnp.arange(3)}
     last = lanes_last(tree)

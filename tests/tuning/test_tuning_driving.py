@@ -210,6 +210,13 @@ def test_many_drives_are_those_of_few(tame):
     one, other = (closed.value_and_grad(space.start, space, seeds) for closed in (few, many))
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    # The hard losses of fewer drives, by the program that differentiates so many.
+    hard, _, _ = few.value(space.values(space.start), seeds[:5])
+    programs = ClosedLoop._advance_many._cached._cache_size()
+    by_the_same = many.hard_losses(space.start, space, seeds[:5], beside=20)
+    assert ClosedLoop._advance_many._cached._cache_size() == programs
+    np.testing.assert_allclose(by_the_same, hard, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(few.hard_losses(space.start, space, seeds[:5], beside=20), hard)
 
 
 def test_a_drive_without_arrival_pays_for_all_its_time():

@@ -12,7 +12,8 @@ from pydantic import Field
 from tqdm import tqdm
 
 from jaxnav.belief.selectors import SELECTORS, make_selector
-from jaxnav.commands.process import configure_jax
+from jaxnav.commands.bars import update_after_compiling
+from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.errors import BadInput
@@ -35,6 +36,7 @@ def run(args: Arguments) -> int:
 
 def _run(args: Arguments) -> int:
     configure_jax(float64=False)
+    collect_garbage_rarely()
     names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
     wanted = list(itertools.product(names, args.corner_noise_px))
     done = _resumed(args)
@@ -84,7 +86,7 @@ def _drive(args: Arguments, car: ScenarioCar, key: dict[str, Any]) -> dict[str, 
         leave=False,
     ) as bar:
         keys = jax.vmap(jax.random.key)(args.seed + jnp.arange(args.seeds))
-        trace = rollout.run(keys, bar.update)
+        trace = rollout.run(keys, update_after_compiling(bar))
     return Drives.of(trace, scenario).summary()
 
 

@@ -11,7 +11,8 @@ from jaxtyping import Array, Key
 from tqdm import tqdm
 
 from jaxnav.belief.selectors import make_selector
-from jaxnav.commands.process import configure_jax
+from jaxnav.commands.bars import update_after_compiling
+from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneController as Arguments
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
@@ -48,18 +49,18 @@ _HELD_OUT_SEED, _TEST_SEED = 10**8, 10**9
 def run(args: Arguments) -> int:
     """Learn the gains, write parameters and report, and print a summary."""
     configure_jax(float64=False)
+    collect_garbage_rarely()
     params = None if args.params is None else load_params(args.params)
     loop, *tests = (closed_loop(args, name, params) for name in (args.scenario, *_tests(args)))
     navigator = loop.rollout.navigator
     space = gains_of(args, navigator)
     gains = Gains(args, loop, dict(zip(_tests(args), tests, strict=True)), space)
-    known = parameters_of(navigator)
     out = output_folder(args.out)
     key = plain_key("tune controller", args)
     return run_fit(
         Fitting(out, key, gains.problem(), space, named=args.train),
         args.headless,
-        before={name: known[name] for name in space.free},
+        before=gains.before,
         test=gains.test,
         as_json=_as_json,
         draw=controller_report,
@@ -109,6 +110,12 @@ class Gains:
     ):
         self._args, self._loop, self._tests, self._space = args, loop, tests, space
 
+    @property
+    def before(self) -> dict[str, Array]:
+        """The values of the gains before they are learned."""
+        known = parameters_of(self._loop.rollout.navigator)
+        return {name: known[name] for name in self._space.free}
+
     def problem(self) -> Problem:
         """The problem of the fit: new seeds in every step, the same seeds held out."""
         args = self._args
@@ -124,7 +131,10 @@ class Gains:
         )
 
     def test(self, fit: TuningFit) -> dict[str, tuple[ControllerScores, ControllerScores]]:
-        """Test results before and after the fit, by scenario."""
+        """Test results before and after the fit, by scenario.
+
+        Both pass their gains as arrays, so that one program drives with either.
+        """
         count = self._args.test_seeds
         with tqdm(
             total=2 * count * len(self._tests),
@@ -135,7 +145,7 @@ class Gains:
         ) as bar:
             return {
                 name: (
-                    self._test(loop, {}, bar.update),
+                    self._test(loop, self.before, update_after_compiling(bar)),
                     self._test(loop, self._space.values(fit.best_x), bar.update),
                 )
                 for name, loop in self._tests.items()
@@ -166,7 +176,7 @@ class Gains:
 
     def _held_out(self, x: Array) -> float:
         keys = _keys(_HELD_OUT_SEED, self._args.held_out_seeds)
-        return float(np.mean(self._loop.value(self._space.values(x), keys)[0]))
+        return float(np.mean(self._loop.hard_losses(x, self._space, keys, self._args.seeds)))
 
     def _test(
         self, loop: ClosedLoop, values: Mapping[str, Array], progress: Callable[[int], object]

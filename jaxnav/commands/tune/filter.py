@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.commands.process import configure_jax
+from jaxnav.commands.bars import update_after_compiling
+from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
 from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
@@ -34,6 +35,7 @@ _STAGES = 4
 def run(args: Arguments) -> int:
     """Learn the parameters, write them and a report, and print a summary."""
     configure_jax(float64=False)
+    collect_garbage_rarely()
     params = None if args.params is None else load_params(args.params)
     data = read_data(args)
     navigator = data.navigator if params is None else apply_params(data.navigator, params)
@@ -114,13 +116,13 @@ def _tested(
         with tqdm(
             total=3 * test.size, unit="drive", desc="test", disable=args.headless, leave=False
         ) as bar:
-            recorded = test.recorded(bar.update)
+            recorded = test.recorded(update_after_compiling(bar))
             before = test.navigator if params is None else apply_params(test.navigator, params)
             # As arrays, like those after the fit, so that one program estimates with both.
             before = with_parameters(before, parameters_of(before))
             after = with_parameters(before, space.values(fit.best_x))
             results[test.name] = (
-                _test(before, recorded, bar.update),
+                _test(before, recorded, update_after_compiling(bar)),
                 _test(after, recorded, bar.update),
             )
     return results

@@ -98,15 +98,16 @@ class Fitting:
             return self._run(headless)
 
     def _run(self, headless: bool) -> TuningFit:
-        fit = TuningFit.begin(self.space.start, self._problem)
-        kept = self._kept(fit)
-        if kept is not None:
-            fit = kept
-            self._report(f"{self.checkpoint}: going on after step {fit.step}")
-        with tqdm(
-            total=self._problem.steps, initial=fit.step, unit="step", disable=headless
-        ) as bar:
+        with tqdm(total=self._problem.steps, unit="step", disable=headless) as bar:
             bar.set_postfix_str("compiling")
+            fit = TuningFit.begin(self.space.start, self._problem)
+            kept = self._kept(fit)
+            if kept is not None:
+                fit = kept
+                bar.clear()
+                self._report(f"{self.checkpoint}: going on after step {fit.step}")
+                bar.initial = bar.n = fit.step
+                bar.refresh()
             while not fit.over:
                 before, fit = fit, take_step(fit, self._problem)
                 if fit.step == 1:
