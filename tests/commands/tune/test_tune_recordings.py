@@ -149,7 +149,7 @@ def test_all_markers_together_are_frame_after_frame(test_7):
 
 def test_a_frame_without_a_reference_is_not_judged(test_7):
     valid = np.zeros(len(test_7), bool)
-    known = dataclasses.replace(test_7.reference, valid=valid)
+    known = test_7.reference._replace(valid=valid)
     for reference in (known, None):
         recorded = sequences_of_recording(
             dataclasses.replace(test_7, reference=reference), True, (0, 0.5)
