@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxnav.detection import marker_cells
 from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES
@@ -37,8 +38,8 @@ class Tag:
     """
 
     id: int
-    cells: np.ndarray
-    corners_board_m: np.ndarray
+    cells: Float[np.ndarray, "n n"]
+    corners_board_m: Float[np.ndarray, "4 2"]
     turns: int
 
 
@@ -157,7 +158,7 @@ class Board:
         return self.rows - 1 if self.kind in ("charuco", "chessboard") else 2 * self.rows
 
     @cached_property
-    def points_board_m(self) -> np.ndarray:
+    def points_board_m(self) -> Float[np.ndarray, "P 3"]:
         """(P, 3), all points in the board's frame, m."""
         if self.kind in ("charuco", "chessboard"):
             x = (np.arange(1, self.columns) - self.columns / 2) * self.size_m
@@ -168,7 +169,7 @@ class Board:
         return np.column_stack([xy, np.zeros(len(xy))])
 
     @cached_property
-    def grid(self) -> np.ndarray:
+    def grid(self) -> Int[np.ndarray, "P 2"]:
         """(P, 2) int, each point's column and row in the grid of points, from the top left."""
         _, columns = np.unique(
             _rounded(self.points_board_m[:, 0], self.size_m), return_inverse=True
@@ -207,7 +208,7 @@ class Board:
         return Tag(marker_id, cells, centre + side_m / 2 * CORNER_SIGNS[:, :2], turns)
 
     @cached_property
-    def dark_top_left(self) -> np.ndarray:
+    def dark_top_left(self) -> Bool[np.ndarray, " P"]:
         """(P,) bool, true where a saddle is black at its top left and bottom right."""
         if self.kind in ("charuco", "chessboard"):
             return np.asarray(self.grid.sum(axis=1) % 2 == 0)

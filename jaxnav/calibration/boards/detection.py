@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxnav.calibration.boards.board import MIN_POINTS, Board
 from jaxnav.calibration.boards.places import (
@@ -55,7 +56,10 @@ class BoardLook:
 
 
 def find_board(
-    board: Board, image: np.ndarray, name: str, camera: Camera | None = None
+    board: Board,
+    image: UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"],
+    name: str,
+    camera: Camera | None = None,
 ) -> BoardView | None:
     """Find the board's points in an image; None if the board is not seen, or too little of it.
 
@@ -72,7 +76,12 @@ def find_board(
     return look_at(board, image, name, camera).view
 
 
-def look_at(board: Board, image: np.ndarray, name: str, camera: Camera | None = None) -> BoardLook:
+def look_at(
+    board: Board,
+    image: UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"],
+    name: str,
+    camera: Camera | None = None,
+) -> BoardLook:
     """Do what `find_board` does, and also return the ids of the markers that were seen."""
     levels = grey(image)
     if board.kind == "marker":

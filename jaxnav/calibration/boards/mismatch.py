@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.detection import BoardLook
@@ -17,7 +18,9 @@ _FAMILIES = (
 _MANY = 4  # markers in an image; fewer may be chance
 
 
-def what_is_seen(board: Board, looks: Sequence[BoardLook], examples: Sequence[np.ndarray]) -> str:
+def what_is_seen(
+    board: Board, looks: Sequence[BoardLook], examples: Sequence[UInt8[np.ndarray, "rows columns"]]
+) -> str:
     """Explain to a person in one line why the board is not found, and what to do.
 
     Args:

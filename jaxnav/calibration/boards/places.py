@@ -7,6 +7,7 @@ in its row and its column.
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.saddles import Places
@@ -17,14 +18,17 @@ _SPREAD = 2.0  # most pitches by which the other known points are further away
 _LONGEST_REACH = 2.6  # most pitches to a neighbour in a row or column
 
 
-def no_places(board: Board) -> tuple[np.ndarray, Places]:
+def no_places(board: Board) -> tuple[Int[np.ndarray, " found"], Places]:
     """No ids and no places."""
     return np.zeros(0, int), _places(board, np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
 
 def predicted_places(
-    board: Board, wanted: np.ndarray, known_m: np.ndarray, known_px: np.ndarray
-) -> tuple[np.ndarray, Places]:
+    board: Board,
+    wanted: Int[np.ndarray, " W"],
+    known_m: Float[np.ndarray, "N 2"],
+    known_px: Float[np.ndarray, "N 2"],
+) -> tuple[Int[np.ndarray, " found"], Places]:
     """Ids and places of the wanted points (W,), each by the homography of the known points (N, 2)
     near it; points without enough known ones near are left out."""
     ids, points_px, along_px = [], [], []
@@ -46,13 +50,15 @@ def predicted_places(
     return np.array(ids), _places(board, np.array(points_px), np.array(along_px))
 
 
-def straight_places(board: Board, ids: np.ndarray, points_px: np.ndarray) -> Places:
+def straight_places(
+    board: Board, ids: Int[np.ndarray, " N"], points_px: Float[np.ndarray, "N 2"]
+) -> Places:
     """Places with edges in the directions to their neighbours; not bent."""
     steps, _ = _steps_and_bends(board, ids, points_px)
     return _places(board, points_px, steps)
 
 
-def bent_places(board: Board, ids: np.ndarray, places: Places) -> Places:
+def bent_places(board: Board, ids: Int[np.ndarray, " N"], places: Places) -> Places:
     """The places with edges along parabolas through their neighbours."""
     steps, bends = _steps_and_bends(board, ids, places.points_px)
     known = np.isfinite(steps).all(axis=2)
@@ -66,7 +72,9 @@ def _places(board: Board, points_px: np.ndarray, along_px: np.ndarray) -> Places
     return Places(points_px, along_px, np.zeros((len(points_px), 2)), clear, cross)
 
 
-def mapped(source: np.ndarray, target: np.ndarray, at: np.ndarray) -> np.ndarray | None:
+def mapped(
+    source: Float[np.ndarray, "N 2"], target: Float[np.ndarray, "N 2"], at: Float[np.ndarray, "M 2"]
+) -> Float[np.ndarray, "M 2"] | None:
     """Map points (M, 2) by the homography that best takes source (N, 2) to target (N, 2)."""
     H, _ = cv2.findHomography(source, target)
     if H is None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.special import erf
 
 _STEPS = 20
@@ -37,13 +38,13 @@ class Places(NamedTuple):
         cross: (N,), part of a step off both edges beyond which there may be other ink.
     """
 
-    points_px: np.ndarray
-    along_px: np.ndarray
-    bend_px: np.ndarray
-    clear: np.ndarray
-    cross: np.ndarray
+    points_px: Float[np.ndarray, "N 2"]
+    along_px: Float[np.ndarray, "N 2 2"]
+    bend_px: Float[np.ndarray, "N 2"]
+    clear: Float[np.ndarray, " N"]
+    cross: Float[np.ndarray, " N"]
 
-    def only(self, which: np.ndarray) -> "Places":
+    def only(self, which: Int[np.ndarray, " K"] | Bool[np.ndarray, " N"]) -> "Places":
         """The places at some indices or in a mask."""
         return Places(*(column[which] for column in self))
 
@@ -58,13 +59,15 @@ class Saddles(NamedTuple):
         good: (N,) bool, true if the fit converged on a saddle.
     """
 
-    points_px: np.ndarray
-    amplitude: np.ndarray
-    sigma_px: np.ndarray
-    good: np.ndarray
+    points_px: Float[np.ndarray, "N 2"]
+    amplitude: Float[np.ndarray, " N"]
+    sigma_px: Float[np.ndarray, "N 2"]
+    good: Bool[np.ndarray, " N"]
 
 
-def fit_saddles(image: np.ndarray, places: Places, radius_px: float, max_move_px: float) -> Saddles:
+def fit_saddles(
+    image: UInt8[np.ndarray, "rows columns"], places: Places, radius_px: float, max_move_px: float
+) -> Saddles:
     """Fit saddles near the given places.
 
     Args:

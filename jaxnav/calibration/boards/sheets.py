@@ -5,6 +5,7 @@ from fractions import Fraction
 from math import lcm
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxnav.calibration.boards.board import Board
 
@@ -20,7 +21,7 @@ class Sheet:
         module_m: side of a module.
     """
 
-    ink: np.ndarray
+    ink: Bool[np.ndarray, "rows columns"]
     module_m: float
 
     @property
@@ -31,7 +32,7 @@ class Sheet:
     def height_m(self) -> float:
         return self.ink.shape[0] * self.module_m
 
-    def rectangles_m(self) -> np.ndarray:
+    def rectangles_m(self) -> Float[np.ndarray, "N 4"]:
         """(N, 4), x y width height of black rectangles without overlap; x y is their lower left."""
         rows = len(self.ink)
         runs: list[tuple[int, int, int, int]] = []

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.detection.families import dictionary
@@ -11,7 +12,9 @@ _FEW = 0.5
 _MAX_CORRECTION = 0.4  # part of the bits that a family can correct
 
 
-def read_tags(board: Board, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+def read_tags(
+    board: Board, image: UInt8[np.ndarray, "rows columns"]
+) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N 4 2"], tuple[int, ...]]:
     """Read the tags of a charuco board or an aprilgrid in an image (H, W) by OpenCV's decoder.
 
     Returns:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxnav.calibration.lenses.views import BoardViews
 from jaxnav.calibration.rigs.pose_arrays import retracted
@@ -53,17 +53,17 @@ class Bundle(eqx.Module):
     unknowns: LensUnknowns
     residual_px: Float[Array, "V P 2"]  # predicted - seen; 0 for points not seen
     blocks: Blocks  # in pixels, weighted as in the fit
-    steps: Array
-    converged: Array
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
 
 
-def free_mask(lens: str, fixed: tuple[str, ...] = ()) -> np.ndarray:
+def free_mask(lens: str, fixed: tuple[str, ...] = ()) -> Bool[np.ndarray, " 9"]:
     """(9,) bool: true for shared unknowns that the fit may change."""
     names = NAMES[lens]
     return np.array([i < len(names) and names[i] not in fixed for i in range(COUNT)])
 
 
-def camera_of(lens: str, parameters: Array) -> Camera:
+def camera_of(lens: str, parameters: Float[Array, " 9"]) -> Camera:
     """The camera with these nine parameters."""
     coefficients = jnp.pad(parameters[4:], (0, MOST_COEFFICIENTS + 4 - COUNT))
     return Camera(parameters[:2], parameters[2:4], coefficients, jnp.asarray(0), (lens,))
@@ -81,7 +81,9 @@ def padded_corners(views: BoardViews) -> BoardCorners:
 
 
 def padded(
-    views: BoardViews, parameters: np.ndarray, Ts_camera_board: np.ndarray
+    views: BoardViews,
+    parameters: Float[np.ndarray, " 9"],
+    Ts_camera_board: Float[np.ndarray, "V 7"],
 ) -> tuple[BoardCorners, LensUnknowns]:
     """The views, and unknowns to start from, padded with empty views.
 
@@ -201,7 +203,9 @@ def _predicted(lens: str, y: LensUnknowns, seen: BoardCorners) -> Float[Array, "
     return jax.vmap(view)(y.Ts_camera_board)
 
 
-def linearised(lens: str, y: LensUnknowns, seen: BoardCorners) -> tuple[Array, Array, Array]:
+def linearised(
+    lens: str, y: LensUnknowns, seen: BoardCorners
+) -> tuple[Float[Array, "V P 2"], Float[Array, "V P 2 9"], Float[Array, "V P 2 6"]]:
     """Residuals (V, P, 2), their Jacobians by the nine (V, P, 2, 9) and by xi (V, P, 2, 6)."""
 
     def pixel(parameters: Array, point_camera: Array) -> tuple[Array, Array]:
@@ -226,7 +230,12 @@ def linearised(lens: str, y: LensUnknowns, seen: BoardCorners) -> tuple[Array, A
     return projected - seen.corners_px, of_lens, of_pose
 
 
-def normal_equations(residual_px: Array, of_lens: Array, of_pose: Array, counts: Array) -> Blocks:
+def normal_equations(
+    residual_px: Float[Array, "V P 2"],
+    of_lens: Float[Array, "V P 2 R"],
+    of_pose: Float[Array, "V P 2 6"],
+    counts: Float[Array, "V P"],
+) -> Blocks:
     """Normal equations of the residuals, each multiplied by its factor in `counts` (V, P)."""
     views = residual_px.shape[0]
     r = (counts[..., None] * residual_px).reshape(views, -1)

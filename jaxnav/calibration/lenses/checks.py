@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +17,7 @@ _CELLS_WIDE = 8
 _RIM_POINTS = 9  # along each side of the image
 
 
-def border_px(image_size_px: tuple[int, int]) -> np.ndarray:
+def border_px(image_size_px: tuple[int, int]) -> Float[np.ndarray, "N 2"]:
     """(N, 2) pixels along the image's border."""
     w, h = np.array(image_size_px) - 1.0
     part = np.linspace(0, 1, _RIM_POINTS)
@@ -84,9 +84,9 @@ class Cells:
         p_value: of the cells' means if they were noise alone.
     """
 
-    corners: np.ndarray
-    mean_px: np.ndarray
-    middle_px: np.ndarray
+    corners: Int[np.ndarray, "h w"]
+    mean_px: Float[np.ndarray, "h w 2"]
+    middle_px: Float[np.ndarray, "h w 2"]
     systematic_px: float
     p_value: float
 

@@ -6,6 +6,7 @@ raises the determinant of the information most.
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
 from jaxnav.calibration.lenses.start import board_poses
@@ -15,7 +16,9 @@ _WRONG = 10.0  # times the median view's error: a view beyond it tells nothing a
 _NO_CURVE = 1e-9  # of the total information, so that the first views have a determinant
 
 
-def informative(views: BoardViews, lens: str, parameters: np.ndarray, most: int) -> tuple[int, ...]:
+def informative(
+    views: BoardViews, lens: str, parameters: Float[np.ndarray, " 9"], most: int
+) -> tuple[int, ...]:
     """Indices, in order, of the at most `most` views that tell most about the lens.
 
     Args:

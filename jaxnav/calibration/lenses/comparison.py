@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
 from jaxnav.calibration.lenses.bundle import COUNT, LensUnknowns
@@ -31,11 +32,11 @@ class HeldOut:
         rms_px: root mean square of `view_px`.
     """
 
-    view_px: np.ndarray
+    view_px: Float[np.ndarray, " V"]
     rms_px: float
 
 
-def held_out(fit: LensFit, weights: np.ndarray) -> HeldOut:
+def held_out(fit: LensFit, weights: Float[np.ndarray, "V P"]) -> HeldOut:
     """The error of every view under the lens fitted without it.
 
     Args:

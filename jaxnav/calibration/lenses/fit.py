@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 from scipy import stats
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
@@ -54,14 +55,14 @@ class LensFit:
 
     lens: str
     views: BoardViews
-    parameters: np.ndarray
-    covariance: np.ndarray
+    parameters: Float[np.ndarray, " 9"]
+    covariance: Float[np.ndarray, "9 9"]
     fixed: tuple[str, ...]
-    Ts_camera_board: np.ndarray
-    residual_px: np.ndarray
-    used: np.ndarray
-    view_weights: np.ndarray
-    view_sigma_px: np.ndarray
+    Ts_camera_board: Float[np.ndarray, "V 7"]
+    residual_px: Float[np.ndarray, "V P 2"]
+    used: Bool[np.ndarray, "V P"]
+    view_weights: Float[np.ndarray, " V"]
+    view_sigma_px: Float[np.ndarray, " V"]
     sigma_px: float
     converged: bool
 
@@ -76,7 +77,7 @@ class LensFit:
         return lens_bundle.camera_of(self.lens, jnp.asarray(self.parameters, float))
 
     @property
-    def sigma(self) -> np.ndarray:
+    def sigma(self) -> Float[np.ndarray, " 9"]:
         """(9,) standard deviations of the parameters; 0 for fixed ones."""
         return np.sqrt(np.diag(self.covariance))
 
@@ -86,7 +87,7 @@ class LensFit:
         return float(np.sqrt(np.mean(np.sum(self.residual_px[self.used] ** 2, axis=-1))))
 
     @property
-    def weights(self) -> np.ndarray:
+    def weights(self) -> Float[np.ndarray, "V P"]:
         """(V, P) the weight of every corner."""
         return self.used * self.view_weights[:, None]
 
@@ -95,7 +96,7 @@ def fit_lens(
     views: BoardViews,
     lens: str,
     fixed: tuple[str, ...] = (),
-    start: np.ndarray | None = None,
+    start: Float[np.ndarray, " 9"] | None = None,
 ) -> LensFit:
     """Fit the lens and the pose of every view, and find the corners and views that are wrong.
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.lenses.views import BoardView, BoardViews
@@ -13,7 +14,7 @@ from jaxnav.models.geometry import transform_points
 _FACING = np.diag([1.0, -1.0, -1.0])  # R_camera_board of a board that hangs upright, seen head-on
 
 
-def grid_points_m(columns: int, rows: int, pitch_m: float) -> np.ndarray:
+def grid_points_m(columns: int, rows: int, pitch_m: float) -> Float[np.ndarray, "P 3"]:
     """(columns * rows, 3) points of a board centred at 0, row by row from the top, m."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows)[::-1])
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1) * pitch_m
@@ -23,7 +24,7 @@ def grid_points_m(columns: int, rows: int, pitch_m: float) -> np.ndarray:
 def simulated_views(
     camera: Camera,
     image_size_px: tuple[int, int],
-    points_board_m: np.ndarray,
+    points_board_m: Float[np.ndarray, "P 3"],
     count: int,
     rng: np.random.Generator,
     sigma_px: float = 0.1,
@@ -31,7 +32,7 @@ def simulated_views(
     most_tilt_deg: float = 50.0,
     reach: float = 1.0,
     fewest: int = 12,
-) -> tuple[BoardViews, np.ndarray]:
+) -> tuple[BoardViews, Float[np.ndarray, "V 7"]]:
     """Simulate `count` views; return them and the true T_camera_board, (count, 7) wxyz_xyz.
 
     The board's middle is anywhere in the image, its normal anywhere within a cone about the line of
@@ -64,9 +65,9 @@ def simulated_views(
 def seen_from(
     camera: Camera,
     image_size_px: tuple[int, int],
-    points_board_m: np.ndarray,
-    T_camera_board: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    points_board_m: Float[np.ndarray, "P 3"],
+    T_camera_board: Float[np.ndarray, " 7"],
+) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, " P"]]:
     """Project the board's points to pixels (P, 2) without noise; (P,) true for those in the image.
 
     Args:

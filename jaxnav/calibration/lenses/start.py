@@ -12,7 +12,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.lenses import bundle as lens_bundle
@@ -24,7 +24,7 @@ _WIDEST = np.tan(np.deg2rad(80.0))  # from the middle of a view; steeper rays we
 _FEWEST = 4  # points a pose can be found from
 
 
-def lens_start(views: BoardViews, lens: str) -> tuple[np.ndarray, float]:
+def lens_start(views: BoardViews, lens: str) -> tuple[Float[np.ndarray, " 9"], float]:
     """Find (9,) fx fy cx cy and coefficients that explain most of the corners roughly.
 
     Also return the median distance of a corner from its prediction, px.
@@ -41,8 +41,11 @@ def lens_start(views: BoardViews, lens: str) -> tuple[np.ndarray, float]:
 
 
 def board_poses(
-    views: BoardViews, lens: str, parameters: np.ndarray, chosen: Sequence[int] | None = None
-) -> np.ndarray:
+    views: BoardViews,
+    lens: str,
+    parameters: Float[np.ndarray, " 9"],
+    chosen: Sequence[int] | None = None,
+) -> Float[np.ndarray, "V 7"]:
     """(V, 7) T_camera_board of every view, found from that view alone; NaN where none is found.
 
     Corners become rays, and the rays are projected into a pinhole camera that looks at their
@@ -121,7 +124,7 @@ def _opencv(views: BoardViews, lens: str) -> Iterator[np.ndarray]:
 
 def opencv_calibration(
     views: BoardViews, usable: Sequence[BoardView], lens: str
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " coefficients"]]:
     """Calibrate by cv2.calibrateCamera or cv2.fisheye.calibrate: matrix (3, 3) and coefficients.
 
     Raises:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 FEWEST_CORNERS = 4
 _SAME_PX = 0.02  # two photographs of one scene differ by more noise than that
@@ -22,8 +23,8 @@ class BoardView:
     """
 
     name: str
-    ids: np.ndarray
-    corners_px: np.ndarray
+    ids: Int[np.ndarray, " N"]
+    corners_px: Float[np.ndarray, "N 2"]
     edge_width_px: float = float("nan")
 
 
@@ -37,7 +38,7 @@ class BoardViews:
         views: one entry for each image in which the board was found.
     """
 
-    points_board_m: np.ndarray
+    points_board_m: Float[np.ndarray, "P 3"]
     image_size_px: tuple[int, int]
     views: tuple[BoardView, ...]
 

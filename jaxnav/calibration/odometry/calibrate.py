@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxnav.calibration.odometry.drive import (
     Course,
@@ -90,15 +91,15 @@ class OdometryCalibration:
     value: dict[str, float]
     sigma: dict[str, float]
     fixed: dict[str, str]
-    correlation: np.ndarray
+    correlation: Float[np.ndarray, "p p"]
     chi2_per_dof: float
     rms_px: float
-    outliers: np.ndarray
-    views_px: np.ndarray
-    view_times_s: np.ndarray
-    node_times_s: np.ndarray
-    poses: np.ndarray
-    read: np.ndarray
+    outliers: Bool[np.ndarray, " V"]
+    views_px: Float[np.ndarray, "V 4 2"]
+    view_times_s: Float[np.ndarray, " V"]
+    node_times_s: Float[np.ndarray, " nodes"]
+    poses: Float[np.ndarray, "nodes 3"]
+    read: Float[np.ndarray, "nodes-1 2"]
     reading_sigma: ReadingSigma
     way_m: float
     duration_s: float

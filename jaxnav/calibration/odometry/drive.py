@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxnav.errors import BadInput
 
@@ -37,14 +38,14 @@ class Drive:
     """
 
     name: str
-    reading_stamps_ns: np.ndarray
-    speed_mps: np.ndarray
-    steering_rad: np.ndarray
-    view_stamps_ns: np.ndarray
-    camera: np.ndarray
-    marker: np.ndarray
-    corners_px: np.ndarray
-    sigma_px: np.ndarray
+    reading_stamps_ns: Int[np.ndarray, " K"]
+    speed_mps: Float[np.ndarray, " K"]
+    steering_rad: Float[np.ndarray, " K"]
+    view_stamps_ns: Int[np.ndarray, " V"]
+    camera: Int[np.ndarray, " V"]
+    marker: Int[np.ndarray, " V"]
+    corners_px: Float[np.ndarray, "V 4 2"]
+    sigma_px: Float[np.ndarray, "V 4"]
     left_out: int = 0
 
 
@@ -99,7 +100,7 @@ class Course(NamedTuple):
     views: MarkerViews
 
     @property
-    def node_times_s(self) -> np.ndarray:
+    def node_times_s(self) -> Float[np.ndarray, " nodes"]:
         """(N + 1,) times of the nodes on the common time axis."""
         ends = self.intervals.begin_s[-1:] + self.intervals.dt_s[-1:]
         return np.concatenate([self.intervals.begin_s, ends])

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from jaxnav.calibration.odometry.model import NEXT, NODE, Blocks, Model
@@ -30,8 +31,8 @@ class Prior:
         information: (5,), one over the variance; 0 if nothing is known.
     """
 
-    mean: np.ndarray
-    information: np.ndarray
+    mean: Float[np.ndarray, " 5"]
+    information: Float[np.ndarray, " 5"]
 
 
 @dataclass(frozen=True)
@@ -46,18 +47,18 @@ class OdometryFit:
         converged: true if no step lowers the cost any more.
     """
 
-    nodes: np.ndarray
-    theta: np.ndarray
-    information: np.ndarray
+    nodes: Float[np.ndarray, "nodes 5"]
+    theta: Float[np.ndarray, " 5"]
+    information: Float[np.ndarray, "p p"]
     blocks: Blocks
     converged: bool
 
 
 def fit(
     model: Model,
-    nodes: np.ndarray,
-    theta: np.ndarray,
-    free: np.ndarray,
+    nodes: Float[np.ndarray, "nodes 5"],
+    theta: Float[np.ndarray, " 5"],
+    free: Bool[np.ndarray, " 5"],
     prior: Prior,
     progress: Callable[[], object] = lambda: None,
 ) -> OdometryFit:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 from jaxnav.calibration.odometry.drive import Course, Intervals, MarkerViews, ReadingSigma
 from jaxnav.models.bicycle import advance
@@ -48,10 +48,10 @@ class Blocks(NamedTuple):
     """
 
     cost: float
-    information: np.ndarray
-    gradient: np.ndarray
-    view_chi2: np.ndarray
-    views_px: np.ndarray
+    information: Float[np.ndarray, "N 13 13"]
+    gradient: Float[np.ndarray, "N 13"]
+    view_chi2: Float[np.ndarray, " V"]
+    views_px: Float[np.ndarray, "V 4 2"]
 
 
 class Model:
@@ -70,7 +70,7 @@ class Model:
         self._data = jax.tree.map(jnp.asarray, (intervals, views, used))
         self._world = rig, markers, jnp.asarray(sigma)
 
-    def blocks(self, nodes: np.ndarray, theta: np.ndarray) -> Blocks:
+    def blocks(self, nodes: Float[np.ndarray, "nodes 5"], theta: Float[np.ndarray, " 5"]) -> Blocks:
         """Compute the blocks at (N + 1, 5) nodes and (5,) parameters, on the host."""
         intervals, views = self._count
         size = len(self._data[0].dt_s) + 1
@@ -88,7 +88,7 @@ class Model:
         )
 
 
-def view_weights(chi2: Array | np.ndarray) -> Array:
+def view_weights(chi2: Float[Array | np.ndarray, " V"]) -> Float[Array, " V"]:
     """The weights of views: 1 up to `FULL_WEIGHT`, beyond it `FULL_WEIGHT` / chi2."""
     return jnp.where(chi2 <= FULL_WEIGHT, 1.0, FULL_WEIGHT / jnp.maximum(chi2, FULL_WEIGHT))
 
@@ -193,7 +193,7 @@ def _blocks(
     return cost, information, gradient, chi2, px.reshape(-1, 4, 2)
 
 
-def padded(columns: Intervals | MarkerViews) -> list[np.ndarray]:
+def padded(columns: Intervals | MarkerViews) -> list[Shaped[np.ndarray, "rows ..."]]:
     """Pad columns to a multiple of `_PADDED` rows by repeating the last row."""
     extra = -len(columns[0]) % _PADDED
     return [np.concatenate([column, np.repeat(column[-1:], extra, axis=0)]) for column in columns]

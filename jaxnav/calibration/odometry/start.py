@@ -30,8 +30,12 @@ LOOSE, TIGHT = 0.2, 0.02
 
 
 def start(
-    course: Course, rig: CameraRig, markers: MarkerMap, theta: np.ndarray, error: float = LOOSE
-) -> np.ndarray:
+    course: Course,
+    rig: CameraRig,
+    markers: MarkerMap,
+    theta: Float[np.ndarray, " 5"],
+    error: float = LOOSE,
+) -> Float[np.ndarray, "nodes 5"]:
     """Find a first guess of the (N + 1, 5) nodes, see `model`.
 
     Args:

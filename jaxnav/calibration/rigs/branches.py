@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxnav.calibration.rigs import bundle
 from jaxnav.calibration.rigs.linking import Linker, Links
@@ -22,7 +23,7 @@ def other_branches(
     linker: Linker,
     links: Links,
     poses: bundle.RigUnknowns,
-    free: np.ndarray,
+    free: Bool[np.ndarray, "S 6"],
     sigma_px: float,
 ) -> tuple[bundle.RigUnknowns, int]:
     """Move frames and markers to other poses that their sightings admit, if those cost less.

@@ -280,12 +280,12 @@ def _weight(distance2: Array) -> Array:
     return jnp.minimum(1, FAR / jnp.maximum(distance2, FAR))
 
 
-def sigma_px_of(residuals_px: np.ndarray) -> float:
+def sigma_px_of(residuals_px: Float[np.ndarray, "N 4 2"]) -> float:
     """Standard deviation of a corner's coordinate; up to a fourth of the sightings may be wrong."""
     distance2 = np.sum(residuals_px**2, axis=(1, 2))
     return float(np.sqrt(np.quantile(distance2, _QUANTILE) / stats.chi2.ppf(_QUANTILE, 8)))
 
 
-def losses(residuals_px: np.ndarray, sigma_px: float) -> np.ndarray:
+def losses(residuals_px: Float[np.ndarray, "N 4 2"], sigma_px: float) -> Float[np.ndarray, " N"]:
     """(N,) the cost of every sighting."""
     return np.asarray(_loss(_distance2(jnp.asarray(residuals_px), jnp.asarray(sigma_px))))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from jaxnav.calibration.rigs import bundle
 from jaxnav.calibration.rigs.branches import other_branches
@@ -56,17 +56,17 @@ class RigCalibration:
     """
 
     views: RigViews
-    Ts_vehicle_camera: np.ndarray
-    Ts_world_marker: np.ndarray
-    Ts_world_vehicle: np.ndarray
-    calibrated: np.ndarray
-    mapped: np.ndarray
+    Ts_vehicle_camera: Float[np.ndarray, "C 4 4"]
+    Ts_world_marker: Float[np.ndarray, "M 4 4"]
+    Ts_world_vehicle: Float[np.ndarray, "F 4 4"]
+    calibrated: Bool[np.ndarray, " C"]
+    mapped: Bool[np.ndarray, " M"]
     cameras: Camera
     sigma_px: float
-    residuals_px: np.ndarray
-    weight: np.ndarray
-    covariance: np.ndarray
-    frames_follow: np.ndarray
+    residuals_px: Float[np.ndarray, "N 4 2"]
+    weight: Float[np.ndarray, " N"]
+    covariance: Float[np.ndarray, "R R"]
+    frames_follow: Float[np.ndarray, "F 6 R"]
     inflation: float
     turned: int
 
@@ -74,12 +74,12 @@ class RigCalibration:
         """RMS residual of a corner's coordinate over all sightings, outliers included, px."""
         return float(np.sqrt(np.mean(self.residuals_px**2)))
 
-    def sigmas(self) -> np.ndarray:
+    def sigmas(self) -> Float[np.ndarray, "placed 6"]:
         """(C + M, 6) standard deviations along and about the camera's or marker's axes, m, rad."""
         placed = len(self.calibrated) + len(self.mapped)
         return self._sixes()[:placed]
 
-    def lens_sigmas(self) -> np.ndarray:
+    def lens_sigmas(self) -> Float[np.ndarray, "C 12"]:
         """(C, 12) standard deviations of fx fy cx cy, px, and of the eight coefficients."""
         C = len(self.calibrated)
         lenses = self._sixes()[C + len(self.mapped) :]
@@ -94,7 +94,7 @@ class RigCalibration:
 def calibrate_rig(
     views: RigViews,
     rig: CameraRig,
-    known: Mapping[int, np.ndarray],
+    known: Mapping[int, Float[np.ndarray, "4 4"]],
     reference_camera: int | None,
     refine_lenses: bool = False,
 ) -> RigCalibration:

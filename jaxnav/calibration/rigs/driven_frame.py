@@ -45,20 +45,20 @@ class DrivenFrame:
             that part of half the wheelbase.
     """
 
-    T_rig_level: np.ndarray
-    T_level_vehicle: np.ndarray
-    covariance: np.ndarray
+    T_rig_level: Float[np.ndarray, "4 4"]
+    T_level_vehicle: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
     speed_scale: float
     steering_offset_rad: float
     steering_gain: float
 
 
 def driven_frame(
-    stamps_s: np.ndarray,
-    Ts_world_rig: np.ndarray,
-    odometry_s: np.ndarray,
-    speed_mps: np.ndarray,
-    steering_rad: np.ndarray,
+    stamps_s: Float[np.ndarray, " F"],
+    Ts_world_rig: Float[np.ndarray, "F 4 4"],
+    odometry_s: Float[np.ndarray, " O"],
+    speed_mps: Float[np.ndarray, " O"],
+    steering_rad: Float[np.ndarray, " O"],
     wheelbase_m: float,
 ) -> DrivenFrame:
     """Find the vehicle frame from the rig's poses and the odometry of a drive.
@@ -118,7 +118,9 @@ def driven_frame(
     )
 
 
-def level_follows(Ts_world_rig: np.ndarray, frames_follow: np.ndarray) -> np.ndarray:
+def level_follows(
+    Ts_world_rig: Float[np.ndarray, "F 4 4"], frames_follow: Float[np.ndarray, "F 6 R"]
+) -> Float[np.ndarray, "6 R"]:
     """(6, R): derivative of the twist of T_rig_level by the unknowns that all frames share.
 
     The known markers define the ground. Their poses relative to the others, and so to where the rig

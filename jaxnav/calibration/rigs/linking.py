@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxnav.calibration.rigs.pose_arrays import inverted, turn_rad
 from jaxnav.calibration.rigs.views import RigViews
@@ -26,7 +27,7 @@ _VOTERS = 30  # frames that vote on a link
 _ROUNDS = ((5.0, 0.5), (2.0, 0.3), (0.5, 0.0), (0.0, 0.0))
 
 # Votes, number of frames that see both, the two groups a and b, and T_a_b.
-Proposal = tuple[float, int, int, int, np.ndarray]
+Proposal = tuple[float, int, int, int, Float[np.ndarray, "4 4"]]
 
 
 @dataclass
@@ -39,10 +40,10 @@ class Links:
         Ts_group_marker: (M, 4, 4), pose of each marker in the frame of its group.
     """
 
-    group_of_camera: np.ndarray
-    Ts_group_camera: np.ndarray
-    group_of_marker: np.ndarray
-    Ts_group_marker: np.ndarray
+    group_of_camera: Int[np.ndarray, " C"]
+    Ts_group_camera: Float[np.ndarray, "C 4 4"]
+    group_of_marker: Int[np.ndarray, " M"]
+    Ts_group_marker: Float[np.ndarray, "M 4 4"]
 
     @staticmethod
     def none(cameras: int, markers: int) -> "Links":
@@ -54,11 +55,11 @@ class Links:
             np.tile(np.eye(4), (markers, 1, 1)),
         )
 
-    def join_cameras(self, a: int, b: int, T_a_b: np.ndarray) -> None:
+    def join_cameras(self, a: int, b: int, T_a_b: Float[np.ndarray, "4 4"]) -> None:
         """Merge the group b of cameras into the group a."""
         _merge(self.group_of_camera, self.Ts_group_camera, a, b, T_a_b)
 
-    def join_markers(self, a: int, b: int, T_a_b: np.ndarray) -> None:
+    def join_markers(self, a: int, b: int, T_a_b: Float[np.ndarray, "4 4"]) -> None:
         """Merge the group b of markers into the group a."""
         _merge(self.group_of_marker, self.Ts_group_marker, a, b, T_a_b)
 
@@ -79,17 +80,22 @@ class Sights:
         row: (S,) index of the sighting that appears largest.
     """
 
-    frame: np.ndarray
-    cameras: np.ndarray
-    markers: np.ndarray
-    Ts_cameras_markers: np.ndarray
-    row: np.ndarray
+    frame: Int[np.ndarray, " S"]
+    cameras: Int[np.ndarray, " S"]
+    markers: Int[np.ndarray, " S"]
+    Ts_cameras_markers: Float[np.ndarray, "S 2 4 4"]
+    row: Int[np.ndarray, " S"]
 
 
 class Linker:
     """Links cameras and markers by the sightings of a recording."""
 
-    def __init__(self, views: RigViews, rays: np.ndarray, Ts_camera_marker: np.ndarray):
+    def __init__(
+        self,
+        views: RigViews,
+        rays: Float[np.ndarray, "N 4 3"],
+        Ts_camera_marker: Float[np.ndarray, "N 2 4 4"],
+    ):
         """Args:
         rays: (N, 4, 3), unit rays through the corners, in the camera's frame.
         Ts_camera_marker: (N, 2, 4, 4), both poses of every sighting.
@@ -99,7 +105,7 @@ class Linker:
         self.corners = views.corners_marker_m()
         self.width_rad = np.linalg.norm(rays[:, 0] - rays[:, 2], axis=1)
 
-    def only(self, kept: np.ndarray) -> "Linker":
+    def only(self, kept: Bool[np.ndarray, " N"]) -> "Linker":
         """The linker of these rows alone."""
         return Linker(self.views.only(kept), self.rays[kept], self.Ts_camera_marker[kept])
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.rigs.calibrate import RigCalibration
@@ -63,7 +64,7 @@ class Check:
     """
 
     verdicts: dict[int, Verdict]
-    T_map_world: np.ndarray
+    T_map_world: Float[np.ndarray, "4 4"]
     agreeing: int
 
 
@@ -71,7 +72,7 @@ def checked(
     calibration: RigCalibration,
     views: RigViews,
     rig: CameraRig,
-    given: Mapping[int, np.ndarray],
+    given: Mapping[int, Float[np.ndarray, "4 4"]],
     tolerance_m: float,
     tolerance_rad: float,
 ) -> Check:

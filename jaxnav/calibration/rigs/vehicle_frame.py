@@ -8,6 +8,7 @@ uncertainty.
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -20,7 +21,9 @@ from jaxnav.files.poses import transform
 _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 0.01, np.deg2rad(3)
 
 
-def moved_to_places(calibration: RigCalibration, given: np.ndarray) -> RigCalibration:
+def moved_to_places(
+    calibration: RigCalibration, given: Float[np.ndarray, "C 4 4"]
+) -> RigCalibration:
     """Move the calibration to the vehicle frame in which the cameras fit their given poses best.
 
     Args:
@@ -66,7 +69,9 @@ def moved_to_driven(calibration: RigCalibration, driven: DrivenFrame) -> RigCali
 
 
 def moved(
-    calibration: RigCalibration, T_tied_vehicle: np.ndarray, covariance: np.ndarray
+    calibration: RigCalibration,
+    T_tied_vehicle: Float[np.ndarray, "4 4"],
+    covariance: Float[np.ndarray, "R R"],
 ) -> RigCalibration:
     """Express a calibration in another vehicle frame; cameras that were not calibrated stay."""
     Ts = np.where(
@@ -82,7 +87,7 @@ def moved(
     )
 
 
-def moved_world(calibration: RigCalibration, move: np.ndarray) -> RigCalibration:
+def moved_world(calibration: RigCalibration, move: Float[np.ndarray, "4 4"]) -> RigCalibration:
     """Express a calibration in another world frame; covariances stay, as twists are body-fixed.
 
     Args:
@@ -95,7 +100,7 @@ def moved_world(calibration: RigCalibration, move: np.ndarray) -> RigCalibration
     )
 
 
-def adjoint(T: np.ndarray) -> np.ndarray:
+def adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
     """(6, 6) A in T exp(xi) = exp(A xi) T, twists ordered (translation, rotation)."""
     R, t = T[:3, :3], T[:3, 3]
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])

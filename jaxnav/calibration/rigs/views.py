@@ -7,7 +7,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.models.camera import Camera
 from jaxnav.models.markers import CORNER_SIGNS
@@ -42,7 +42,7 @@ class RigViews:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def only(self, kept: np.ndarray) -> "RigViews":
+    def only(self, kept: Bool[np.ndarray, " N"]) -> "RigViews":
         """The rows in a mask, with only the frames that they have; markers keep their indices."""
         frames, frame = np.unique(self.frame[kept], return_inverse=True)
         return replace(
@@ -75,7 +75,9 @@ def rays_camera(rig: CameraRig, views: RigViews) -> Float[np.ndarray, "N 4 3"]:
     return rays
 
 
-def both_poses(rays: Float[np.ndarray, "N 4 3"], size_m: np.ndarray) -> np.ndarray:
+def both_poses(
+    rays: Float[np.ndarray, "N 4 3"], size_m: Float[np.ndarray, " N"]
+) -> Float[np.ndarray, "N 2 4 4"]:
     """Both poses of every row's marker, T_camera_marker (N, 2, 4, 4), the better fit first.
 
     They are found in a pinhole camera that looks straight at the marker, so that no lens is too
