@@ -154,21 +154,21 @@ class BicycleKalman(Motion):
             posterior=(jnp.append(pose, bank.mean[3:] + correction[3:]), sandwich(to_world, P)),
         )
 
-    def difference(self, mean: Array, base: Array) -> Array:
+    def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " n"]:
         """mean - base, (6,), with the heading wrapped."""
         apart = mean - base
         return apart.at[2].set(wrap_angle(apart[2]))
 
-    def moved(self, base: Array, error: Array) -> Array:
+    def moved(self, base: Float[Array, " 6"], error: Float[Array, " 6"]) -> Float[Array, " 6"]:
         """base + error, (6,), with the heading wrapped."""
         mean = base + error
         return mean.at[2].set(wrap_angle(mean[2]))
 
-    def on_ground(self, mean: Array) -> tuple[Array, Array]:
+    def on_ground(self, mean: Float[Array, " 6"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
         """The two halves of the state: pose and velocity, (3,) each."""
         return mean[:3], mean[3:]
 
-    def planar(self, mean: Array, covariance: Array) -> Planar:
+    def planar(self, mean: Float[Array, " 6"], covariance: Float[Array, "6 6"]) -> Planar:
         """Pose and velocity as they stand in the state, which is planar."""
         return Planar(mean[:3], covariance[:3, :3], mean[3:], covariance[3:, 3:])
 

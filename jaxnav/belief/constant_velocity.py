@@ -133,17 +133,19 @@ class ConstantVelocity(Motion):
             posterior=(jnp.append(T.wxyz_xyz, bank.mean[7:] + correction[6:]), P),
         )
 
-    def difference(self, mean: Array, base: Array) -> Array:
+    def difference(
+        self, mean: Float[Array, " 13"], base: Float[Array, " 13"]
+    ) -> Float[Array, " 12"]:
         """(xi, difference of the twists), (12,): mean = base * cay(xi), in the axes of `base`."""
         T_base_other = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
         return jnp.append(inverse_cayley(T_base_other), mean[7:] - base[7:])
 
-    def moved(self, base: Array, error: Array) -> Array:
+    def moved(self, base: Float[Array, " 13"], error: Float[Array, " 12"]) -> Float[Array, " 13"]:
         """The mean (13,) at an error (12,): base * cay(xi), and the twist plus its error."""
         T = (jaxlie.SE3(base[:7]) @ cayley(error[:6])).normalize()
         return jnp.append(T.wxyz_xyz, base[7:] + error[6:])
 
-    def on_ground(self, mean: Array) -> tuple[Array, Array]:
+    def on_ground(self, mean: Float[Array, " 13"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
         """(x, y, psi) and (v_x, v_y, psi_dot) in the world: pose and motion seen from above."""
         T_world_vehicle = jaxlie.SE3(mean[:7])
         R_world_vehicle = rotation_matrix(T_world_vehicle.rotation())

@@ -85,8 +85,9 @@ class Offer(NamedTuple):
     """One hypothesis as a measured pose would start or correct it; `apply_gate` chooses."""
 
     innovation: Float[Array, " m"]  # of the pose, whitened
-    first: tuple[Array, Array]  # mean and covariance where the pose starts the hypothesis
-    posterior: tuple[Array, Array]  # mean and covariance where the hypothesis takes the pose
+    # Mean and covariance where the pose starts the hypothesis, and where the hypothesis takes it.
+    first: tuple[Float[Array, " n"], Float[Array, "d d"]]
+    posterior: tuple[Float[Array, " n"], Float[Array, "d d"]]
     gate_nis: Float[Array, ""] | float  # a larger NIS is a contradiction, and counted
     log_likelihood: Float[Array, ""]  # of what was measured given the prediction
     inflation: Float[Array, ""] | float = 1.0  # a NIS above inflation * gate_nis is not fused
@@ -290,7 +291,7 @@ def follow_pose(
     P: Float[Array, "n n"],
     T_world_prior: jaxlie.SE3,
     T_world_vehicle: jaxlie.SE3,
-    covariance: Array,
+    covariance: Float[Array, "6 6"],
     freedom: Float[Array, "6 d"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The whole state after its pose was corrected: the rest follows by regression on the pose.
@@ -333,8 +334,8 @@ def follow_pose(
 def merge_heirs(
     bank: Bank,
     heir: Int[Array, " K"],
-    difference: Callable[[Array, Array], Array],
-    moved: Callable[[Array, Array], Array],
+    difference: Callable[[Float[Array, " n"], Float[Array, " n"]], Float[Array, " d"]],
+    moved: Callable[[Float[Array, " n"], Float[Array, " d"]], Float[Array, " n"]],
 ) -> Bank:
     """The bank with hypotheses of one heir replaced by one Gaussian of the same two moments.
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axis import Axis, Tick
 from matplotlib.figure import Figure
@@ -45,14 +46,14 @@ def _words(artist: Artist) -> Iterator[Text]:
             yield from _words(child)
 
 
-def corners_in_world(markers: MarkerMap) -> np.ndarray:
+def corners_in_world(markers: MarkerMap) -> Float[np.ndarray, "M 4 3"]:
     """Corners (M, 4, 3) of a map in the world of its file, m, float64."""
     return np.asarray(points_in_world(markers.corners_world_m, markers.origin_m), float)
 
 
 def normals_px(
-    camera: Camera, Ts_camera_marker: jaxlie.SE3, sizes_m: np.ndarray | jax.Array
-) -> np.ndarray:
+    camera: Camera, Ts_camera_marker: jaxlie.SE3, sizes_m: Float[np.ndarray | jax.Array, " N"]
+) -> Float[np.ndarray, "N 2 2"]:
     """The normals of N markers in an image, (N, 2, 2): foot and tip, x y, px."""
     length_m = _NORMAL_SIDES * jnp.asarray(sizes_m)
     foot = Ts_camera_marker.translation()

@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 from jax.interpreters.partial_eval import dce_jaxpr
+from jaxtyping import Shaped
 
 from jaxnav.lanes.rules import ELEMENTWISE, NUMPY, RULES, VIEWS, elementwise
 from jaxnav.lanes.strips import CALLS, STRIP, by_itself, in_strips
@@ -31,8 +32,11 @@ Known = dict[Hashable, tuple[list[Value], list[Value]]]
 
 
 def evaluate(
-    jaxpr: core.Jaxpr, consts: Sequence[Any], leaves: Sequence[jax.Array], block: int
-) -> list[jax.Array]:
+    jaxpr: core.Jaxpr,
+    consts: Sequence[Any],
+    leaves: Sequence[Shaped[jax.Array, "... L"]],
+    block: int,
+) -> list[Shaped[jax.Array, "... L"]]:
     """The outputs (*shape, L) of a jaxpr, whose arguments (*shape, L) have L lanes."""
     lanes = leaves[0].shape[-1]
     args = [Lane(leaf) for leaf in leaves]

@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
+from jaxtyping import Shaped
 
 from jaxnav.lanes.rules import ELEMENTWISE, RULES
 from jaxnav.lanes.values import Lane, Value, one_kernel, rows_of
@@ -43,8 +44,10 @@ def by_itself(eqn: core.JaxprEqn) -> bool:
 
 
 def in_strips(
-    loop: Callable[[list[Value]], list[Value]], fixed: Sequence[Value], start: list[jax.Array]
-) -> list[jax.Array]:
+    loop: Callable[[list[Value]], list[Value]],
+    fixed: Sequence[Value],
+    start: list[Shaped[jax.Array, "... L"]],
+) -> list[Shaped[jax.Array, "... L"]]:
     """Run a loop `STRIP` lanes at a time; the last strip repeats lanes if they don't divide evenly.
 
     Args:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Int, Shaped
 
 UNROLLED = 32  # the most terms of a sum, or rows of a table, that are written out
 # Operations per number: the most worth computing twice, and those worth a pass over memory.
@@ -29,7 +30,7 @@ def one_kernel() -> Iterator[None]:
         _in_kernel.reset(token)
 
 
-def barrier(rows: jax.Array) -> jax.Array:
+def barrier(rows: Shaped[jax.Array, "*shape"]) -> Shaped[jax.Array, "*shape"]:
     """The same rows, computed once and not anew at every use.
 
     Inside a kernel XLA knows no barriers; a call, which LLVM makes a copy, serves as one there.
@@ -44,7 +45,7 @@ def _same(rows: jax.Array) -> jax.Array:
     return rows
 
 
-def join_rows(rows: list[jax.Array], axis: int) -> "Lane":
+def join_rows(rows: list[Shaped[jax.Array, "..."]], axis: int) -> "Lane":
     """Concatenate rows along an existing axis.
 
     Inside a kernel it is kept unfused: fused, it would look up the source of every single number.
@@ -61,7 +62,12 @@ class Lane:
     the value is some lanes of a longer row, fetched when `rows` is first read.
     """
 
-    def __init__(self, source: jax.Array, work: int = 0, at: jax.Array | None = None):
+    def __init__(
+        self,
+        source: Shaped[jax.Array, "... L"],
+        work: int = 0,
+        at: Int[jax.Array, " M"] | None = None,
+    ):
         self.source, self.work, self.at = source, work, at
 
     @property
@@ -70,7 +76,7 @@ class Lane:
         return self.source.shape[:-1]
 
     @property
-    def rows(self) -> jax.Array:
+    def rows(self) -> Shaped[jax.Array, "... L"]:
         """The array (*shape, L)."""
         if self.at is not None:
             fetched = self.source.at[..., self.at].get(mode="promise_in_bounds")
@@ -81,7 +87,9 @@ class Lane:
 # A value that differs between lanes; one that does not; one that is known at trace time.
 Value = Lane | jax.Array | np.ndarray
 Params = Mapping[str, Any]  # of a primitive, by JAX's names
-Combine = Callable[[jax.Array, jax.Array], jax.Array]
+Combine = Callable[
+    [Shaped[jax.Array, "*shape"], Shaped[jax.Array, "*shape"]], Shaped[jax.Array, "*shape"]
+]
 
 
 def write_out(value: Value, cheap: int) -> Value:
@@ -100,7 +108,7 @@ def known(value: Any) -> Value:
     return np.asarray(value)
 
 
-def rows_of(value: Value, lanes: int) -> jax.Array:
+def rows_of(value: Value, lanes: int) -> Shaped[jax.Array, "... L"]:
     """The value broadcast to (*shape, L), whether or not the lanes differ."""
     if isinstance(value, Lane):
         return value.rows
@@ -108,7 +116,7 @@ def rows_of(value: Value, lanes: int) -> jax.Array:
     return lax.broadcast_in_dim(value, (*value.shape, lanes), tuple(range(value.ndim)))
 
 
-def at_place(rows: jax.Array, index: Mapping[int, int]) -> jax.Array:
+def at_place(rows: Shaped[jax.Array, "..."], index: Mapping[int, int]) -> Shaped[jax.Array, "..."]:
     """The rows at one index along each of some axes, which are dropped."""
     start = [index.get(axis, 0) for axis in range(rows.ndim)]
     stop = [index[a] + 1 if a in index else size for a, size in enumerate(rows.shape)]
@@ -116,8 +124,8 @@ def at_place(rows: jax.Array, index: Mapping[int, int]) -> jax.Array:
 
 
 def scan_rows(
-    rows: jax.Array, axis: int, combine: Combine, neutral: int, reverse: bool
-) -> jax.Array:
+    rows: Shaped[jax.Array, "*shape"], axis: int, combine: Combine, neutral: int, reverse: bool
+) -> Shaped[jax.Array, "*shape"]:
     size, step = rows.shape[axis], 1
     while step < size:
         config = [(0, 0, 0)] * rows.ndim

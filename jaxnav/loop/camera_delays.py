@@ -157,7 +157,7 @@ class CameraDelays:
         corners_px, sigma_px = data.corners_px[camera, marker], data.sigma_px[camera, marker]
         self._views.append(_View(stamp_ns, camera, marker, corners_px, sigma_px))
 
-    def add_pose(self, now_ns: int, pose: np.ndarray) -> None:
+    def add_pose(self, now_ns: int, pose: Float[np.ndarray, " 3"]) -> None:
         """Begin a stretch at the car's approximate pose, if it is time for one."""
         if now_ns >= self._next_ns:
             self._open.append((now_ns, pose))

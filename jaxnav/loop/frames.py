@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxnav.detection.observe import CornerLanes, observe
 from jaxnav.detection.types import Detections
@@ -18,9 +19,9 @@ _NO_FAULT = Fault(0)
 _MOST_PX = RANGES["corner_px"].most  # beyond, a corner is as good as infinite
 _NONE = Detections.concatenate([])
 
-# Whether a camera shows an old picture. Arguments: camera, stamp_ns, now_ns, corners_px
-# (M, 4, 2), visible (M,), their sigma_px; see `Standstill.is_frozen`.
-Frozen = Callable[[int, int, int, np.ndarray, np.ndarray, float], bool]
+# Whether a camera shows an old picture. Arguments: camera, stamp_ns, now_ns, corners_px, visible,
+# their sigma_px; see `Standstill.is_frozen`.
+Frozen = Callable[[int, int, int, Float[np.ndarray, "M 4 2"], Bool[np.ndarray, " M"], float], bool]
 
 
 @dataclass(frozen=True)

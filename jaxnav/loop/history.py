@@ -9,6 +9,7 @@ but only a part of them is kept to be fused again.
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxnav.compiling.packing import Packed
 from jaxnav.loop.stamps import OLD_NS
@@ -25,9 +26,9 @@ class EventData:
     """The data of an event: odometry, corners of some cameras, or both."""
 
     odometry: tuple[float, float] | None = None  # speed_mps, steering_rad
-    corners_px: np.ndarray | None = None  # (C, M, 4, 2), finite
-    visible: np.ndarray | None = None  # (C, M)
-    sigma_px: np.ndarray | None = None  # (C, M, 4), positive
+    corners_px: Float[np.ndarray, "C M 4 2"] | None = None  # finite
+    visible: Bool[np.ndarray, "C M"] | None = None
+    sigma_px: Float[np.ndarray, "C M 4"] | None = None  # positive
 
 
 @dataclass

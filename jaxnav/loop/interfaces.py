@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:  # plug-ins import this file in the guard's process, which has none of these
     import numpy as np
+    from jaxtyping import UInt8
 
     from jaxnav.detection.types import Detections
     from jaxnav.files import Route
@@ -73,7 +74,7 @@ class Frame:
     """
 
     stamp_ns: int
-    image: np.ndarray | None = None
+    image: UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"] | None = None
     detections: Detections | None = None
 
 

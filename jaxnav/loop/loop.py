@@ -14,6 +14,7 @@ from typing import Protocol
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxnav.loop.expect import Expected, expect_corners
 from jaxnav.loop.flags import Fault
@@ -51,8 +52,10 @@ class Observer(Protocol):
 class Statistics:
     """Histograms of durations, ms, in logarithmic bins: their memory does not grow."""
 
-    edges_ms: np.ndarray = field(default_factory=lambda: np.geomspace(0.01, 10_000, 241))
-    counts: dict[str, np.ndarray] = field(default_factory=dict)
+    edges_ms: Float[np.ndarray, " edges"] = field(
+        default_factory=lambda: np.geomspace(0.01, 10_000, 241)
+    )
+    counts: dict[str, Int[np.ndarray, " bins"]] = field(default_factory=dict)
     deadlines_missed: int = 0
     handled: int = 0
 

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxnav.loop.history import EventData
 from jaxnav.pose.consistency import LEAST_MARKERS
@@ -20,7 +21,7 @@ class MarkerVotes:
         self._ids = ids
         self._times = np.zeros(len(ids), int)
 
-    def count(self, data: EventData, outvoted: np.ndarray) -> tuple[int, ...]:
+    def count(self, data: EventData, outvoted: Bool[np.ndarray, " M"]) -> tuple[int, ...]:
         """Count the votes of a frame; return the ids of the markers outvoted in it.
 
         Args:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.belief.estimate import Belief
@@ -76,12 +77,12 @@ class Outcome:
     origin_m: Origin = ZERO  # see `MarkerMap`
 
     @property
-    def pose(self) -> np.ndarray:
+    def pose(self) -> Float[np.ndarray, " 3"]:
         """The pose in the world: (3,) x_m, y_m, psi_rad."""
         return np.asarray(planar_in_world(self.output.pose, self.origin_m))
 
     @property
-    def T_world_vehicle(self) -> np.ndarray:
+    def T_world_vehicle(self) -> Float[np.ndarray, " 7"]:
         """The pose of the vehicle in the world: (7,) wxyz_xyz."""
         return np.asarray(poses_in_world(self.output.T_world_vehicle.wxyz_xyz, self.origin_m))
 

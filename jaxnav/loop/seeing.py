@@ -12,6 +12,7 @@ from functools import partial
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.types import Detections, Detector, RegionDetector
@@ -44,8 +45,8 @@ class SearchedFrame:
 class Region:
     """The expected places of K markers in an image: corners (K, 4, 2) and search radii (K,)."""
 
-    quads_px: np.ndarray
-    radius_px: np.ndarray
+    quads_px: Float[np.ndarray, "K 4 2"]
+    radius_px: Float[np.ndarray, " K"]
 
 
 class Search:

@@ -22,14 +22,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxnav.loop.expect import expect_corners
 from jaxnav.navigator import Navigator
 
 Place = tuple[float, float, float]  # x_m, y_m, psi_rad
-# The corners before and after a motion (x_m, y_m, psi_rad, in the vehicle's earlier axes),
-# (C, M, 4, 2) each; None: the pose of the vehicle is not known.
-Due = Callable[[Place], tuple[np.ndarray, np.ndarray] | None]
+# The corners before and after a motion (x_m, y_m, psi_rad, in the vehicle's earlier axes);
+# None: the pose of the vehicle is not known.
+Due = Callable[[Place], tuple[Float[np.ndarray, "C M 4 2"], Float[np.ndarray, "C M 4 2"]] | None]
 
 _MOVED_PX, _MOVED_SIGMAS = 1.0, 6.0  # more than noise moves any corner of some markers
 _MIN_SIGMA_PX = 0.05  # detectors report less, but lens models are not that accurate
@@ -195,8 +196,8 @@ class Standstill:
         camera: int,
         stamp_ns: int,
         now_ns: int,
-        corners_px: np.ndarray,
-        visible: np.ndarray,
+        corners_px: Float[np.ndarray, "M 4 2"],
+        visible: Bool[np.ndarray, " M"],
         sigma_px: float,
         due: Due,
     ) -> bool:
@@ -271,8 +272,8 @@ def _withheld(due_px: np.ndarray, seen_px: np.ndarray, sigma_px: float) -> bool:
 
 
 def due_px(
-    navigator: Navigator, pose: np.ndarray | None, motion: Place
-) -> tuple[np.ndarray, np.ndarray] | None:
+    navigator: Navigator, pose: Float[np.ndarray, " 3"] | None, motion: Place
+) -> tuple[Float[np.ndarray, "C M 4 2"], Float[np.ndarray, "C M 4 2"]] | None:
     """Corners before and after a motion, (C, M, 4, 2) each; None where the pose is not known.
 
     Args:

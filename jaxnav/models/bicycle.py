@@ -63,7 +63,9 @@ def sideslip_rad(steering_rad: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.arctan(jnp.tan(steering_rad) / 2)
 
 
-def curvature_per_m(steering_rad: Float[Array, ""], wheelbase_m: Float[Array, ""]) -> Array:
+def curvature_per_m(
+    steering_rad: Float[Array, ""], wheelbase_m: Float[Array, ""]
+) -> Float[Array, ""]:
     """Curvature of the path, 1/m: 1 / R_r = cos(beta) tan(steering) / l (Eq. 5).
 
     It is finite when driving straight; l is the wheelbase.

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.models.geometry import on_last_axis, safe_norm
 from jaxnav.models.lenses import LENSES, MOST_COEFFICIENTS, bearing_of, image_of
@@ -122,7 +122,7 @@ class Camera(eqx.Module):
         normalised = (pixels - center_px) / focal_px
         return self._select([bearing_of(lens, normalised, self.distortion) for lens in self.lenses])
 
-    def in_front(self, points_camera: Float[Array, "*batch 3"]) -> Array:
+    def in_front(self, points_camera: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
         """Whether a point lies in front of the lens, where it can be seen at all, (*batch) bool."""
         depth_ratio = points_camera[..., 2] / jnp.maximum(safe_norm(points_camera), 1e-12)
         return self._select([depth_ratio > LENSES[lens].least_depth_ratio for lens in self.lenses])

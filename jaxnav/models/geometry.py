@@ -230,6 +230,8 @@ def turn_and_shift(
     return sum((points[..., k : k + 1] * columns[k] for k in range(3)), on_last_axis(t, points))
 
 
-def on_last_axis(vector: Shaped[Array, " n"], like: Shaped[Array, "*batch m"]) -> Array:
+def on_last_axis(
+    vector: Shaped[Array, " n"], like: Shaped[Array, "*batch m"]
+) -> Shaped[Array, "... n"]:
     """A vector with leading axes of length 1, which broadcasts along the last axis of `like`."""
     return vector.reshape((1,) * (like.ndim - 1) + vector.shape)

@@ -30,8 +30,10 @@ class LensModel(NamedTuple):
     """A kind of lens: its coefficients, its projection and the inverse."""
 
     coefficients: tuple[str, ...]
-    image: Callable[[Array, Array], Image]  # of points (3, ...), with the slope
-    bearing: Callable[[Array, Array], Array]  # unit vectors (..., 3) through images (..., 2)
+    # Of points and coefficients, with the slope.
+    image: Callable[[Float[Array, "3 ..."], Float[Array, "k ..."]], Image]
+    # Unit vectors through images.
+    bearing: Callable[[Float[Array, "*batch 2"], Float[Array, " k"]], Float[Array, "*batch 3"]]
     least_depth_ratio: float  # depth over distance of the last point that can be seen
 
 

@@ -15,6 +15,7 @@ every map within `NEAR_M`, values are returned as they are.
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 Origin = tuple[float, float, float]  # x_m, y_m, z_m in the world
 
@@ -25,7 +26,7 @@ NEAR_M = 1000.0
 GRID_M = 100.0
 
 
-def origin_near(positions_m: np.ndarray) -> Origin:
+def origin_near(positions_m: Float[np.ndarray, "N 3"]) -> Origin:
     """The origin for places (N, 3): on each axis zero within `NEAR_M`, else a multiple of `GRID_M`.
 
     A car's ground, z = 0 of its coordinates, is thus at the origin's z.

@@ -89,7 +89,7 @@ class NielsenLM(LanewiseSolver):
     """
 
     @abstractmethod
-    def solved(self, normal: PyTree, damping: Array) -> Move:
+    def solved(self, normal: PyTree, damping: Float[Array, "*N"]) -> Move:
         """The step that solves the damped normal equations; a damping of 0 is none yet."""
 
     @abstractmethod
@@ -159,14 +159,17 @@ class NielsenLM(LanewiseSolver):
         options: dict[str, Any],
         state: LMState,
         tags: frozenset[object],
-    ) -> tuple[Array, optx.RESULTS]:
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether all problems are done."""
         return jnp.all(state.done), cast(optx.RESULTS, optx.RESULTS.successful)
 
 
 def adapted(
-    damping: Array | float, growth: Array | float, accept: Array | bool, gained: Array | float
-) -> tuple[Array, Array]:
+    damping: Float[Array, "*N"] | float,
+    growth: Float[Array, "*N"] | float,
+    accept: Bool[Array, "*N"] | bool,
+    gained: Float[Array, "*N"] | float,
+) -> tuple[Float[Array, "*N"], Float[Array, "*N"]]:
     """Lambda for the next step, and the factor on it should that one not be accepted.
 
     Args:
@@ -203,9 +206,9 @@ class NormalEquationsLM(NielsenLM):
     rtol: float
     atol: float
     initial_damping: float = 1e-5  # times the largest diagonal entry of J'J
-    norm: Callable[[PyTree], Array] = optx.max_norm
+    norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
 
-    def solved(self, normal: NormalEquations, damping: Array) -> Move:
+    def solved(self, normal: NormalEquations, damping: Float[Array, " N"]) -> Move:
         """The step of every problem; none where its equations can't be solved."""
         information, gradient = normal.information, normal.gradient
         diagonal = jnp.stack([information[i, i] for i in range(gradient.shape[0])])
@@ -219,7 +222,7 @@ class NormalEquationsLM(NielsenLM):
         move = jnp.where(jnp.isfinite(move), move, 0)
         return Move(move, jnp.sum(move * (damping[None] * move - gradient), axis=0), damping)
 
-    def moved(self, y: Array, move: Array) -> Array:
+    def moved(self, y: Float[Array, "n N"], move: Float[Array, "n N"]) -> Float[Array, "n N"]:
         """The unknowns after a move."""
         return y + move
 
@@ -258,8 +261,12 @@ def _gradient(y: Array, _: PyTree, inputs: PyTree) -> Array:
 
 @eqx.filter_custom_jvp
 def moving_with(
-    root: Array, inputs: PyTree, *, gradient: Callable[..., Array], residual: PyTree
-) -> Array:
+    root: Float[Array, "n N"],
+    inputs: PyTree,
+    *,
+    gradient: Callable[..., Float[Array, "n N"]],
+    residual: PyTree,
+) -> Float[Array, "n N"]:
     """The root of gradient(root, residual, inputs) = 0, with its derivative by `inputs`."""
     return root
 

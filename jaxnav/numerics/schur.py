@@ -93,12 +93,12 @@ class SchurLM(NielsenLM):
 
     rtol: float
     atol: float
-    norm: Callable[[PyTree], Array]
-    retract: Callable[[PyTree, Array, Array], PyTree]
+    norm: Callable[[PyTree], Float[Array, ""]]
+    retract: Callable[[PyTree, Float[Array, "F n"], Float[Array, " R"]], PyTree]
     free: Bool[Array, " R"]
     initial_damping: float = 1e-4  # of J'J's diagonal
 
-    def solved(self, normal: Blocks, damping: Array) -> Move:
+    def solved(self, normal: Blocks, damping: Float[Array, ""]) -> Move:
         """The moves of the blocks and of the shared unknowns; none where they can't be solved."""
         damping = jnp.where(damping > 0, jnp.clip(damping, 1e-12, 1e12), self.initial_damping)
         reduced = reduce(normal, self.free, damping)
@@ -118,6 +118,6 @@ class SchurLM(NielsenLM):
         )
         return Move((own, shared), jnp.where(sound, promised, jnp.inf), damping)
 
-    def moved(self, y: PyTree, move: tuple[Array, Array]) -> PyTree:
+    def moved(self, y: PyTree, move: tuple[Float[Array, "F n"], Float[Array, " R"]]) -> PyTree:
         """The unknowns after a move."""
         return self.retract(y, *move)

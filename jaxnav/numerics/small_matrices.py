@@ -57,7 +57,7 @@ def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.stack([jnp.stack(row) for row in L])
 
 
-def solve_lower(L: Float[Array, "n n"], b: Array) -> Array:
+def solve_lower(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """L^-1 b, for a lower triangular L; b is (n,) or (n, m)."""
     inverse = 1 / jnp.diagonal(L)
     x: list[Array] = []
@@ -69,7 +69,7 @@ def solve_lower(L: Float[Array, "n n"], b: Array) -> Array:
     return jnp.stack(x)
 
 
-def solve_upper(L: Float[Array, "n n"], b: Array) -> Array:
+def solve_upper(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """L'^-1 b, for a lower triangular L; b is (n,) or (n, m)."""
     n = L.shape[0]
     inverse = 1 / jnp.diagonal(L)
@@ -82,7 +82,7 @@ def solve_upper(L: Float[Array, "n n"], b: Array) -> Array:
     return jnp.stack(x)
 
 
-def cho_solve(L: Float[Array, "n n"], b: Array) -> Array:
+def cho_solve(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """A^-1 b, from L with A = L L'."""
     return solve_upper(L, solve_lower(L, b))
 
@@ -94,7 +94,7 @@ def log_det(L: Float[Array, "n n"]) -> Float[Array, ""]:
 
 def solve_positive(
     A: Float[Array, "n n ..."], b: Float[Array, "n ..."], ridge: Float[Array, "..."] | float = 0
-) -> Array:
+) -> Float[Array, "n ..."]:
     """(A + ridge I)^-1 b for all lanes along the trailing axes; NaN if not positive definite.
 
     Every entry is an array of its own: in matrices XLA would compute each column of the factor anew

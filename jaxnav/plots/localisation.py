@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
@@ -33,7 +34,7 @@ class Trajectory:
     """A trajectory to draw: poses (N, 3) of x_m, y_m, psi_rad; NaN where unknown."""
 
     label: str
-    poses: np.ndarray
+    poses: Float[np.ndarray, "N 3"]
 
 
 @dataclass(frozen=True)
@@ -41,19 +42,19 @@ class AnnotatedFrame:
     """One camera frame with its detections and candidate poses."""
 
     title: str
-    image: np.ndarray  # (H, W) or (H, W, 3) RGB
-    detected_px: np.ndarray  # (K, 4, 2) corners
-    selected_px: np.ndarray  # (P, 2, 2) marker normals of the candidate taken, foot and tip
-    other_px: np.ndarray  # (Q, 2, 2) of all other candidates
+    image: UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"]  # grey or RGB
+    detected_px: Float[np.ndarray, "K 4 2"]  # corners
+    selected_px: Float[np.ndarray, "P 2 2"]  # marker normals of the candidate taken, foot and tip
+    other_px: Float[np.ndarray, "Q 2 2"]  # of all other candidates
 
 
 def drive_report(
-    times_s: np.ndarray,
+    times_s: Float[np.ndarray, " N"],
     truth: Trajectory,
     methods: Sequence[Trajectory],
-    waypoints_m: np.ndarray,
+    waypoints_m: Float[np.ndarray, "W 2"],
     waypoint_radius_m: float,
-    markers_m: np.ndarray,
+    markers_m: Float[np.ndarray, "M 4 3"],
     title: str = "",
 ) -> Figure:
     """Draw the paper's two figures of a drive: x, y, yaw against time, and the X-Y plane.
@@ -97,11 +98,11 @@ def drive_report(
 
 
 def localisation_report(
-    times_s: np.ndarray,
-    estimate_m: np.ndarray,
-    reference_m: np.ndarray | None,
-    errors: Mapping[str, np.ndarray],
-    markers_m: np.ndarray,
+    times_s: Float[np.ndarray, " N"],
+    estimate_m: Float[np.ndarray, "N 3"],
+    reference_m: Float[np.ndarray, "N 3"] | None,
+    errors: Mapping[str, Float[np.ndarray, " N"]],
+    markers_m: Float[np.ndarray, "M 4 3"],
     title: str = "",
     connected: bool = True,
 ) -> Figure:
@@ -185,10 +186,10 @@ def photo_with_poses(view: AnnotatedFrame) -> Figure:
 
 
 def reliability_diagram(
-    predicted: np.ndarray,
-    observed: np.ndarray,
-    intervals: tuple[np.ndarray, np.ndarray],
-    counts: np.ndarray,
+    predicted: Float[np.ndarray, " B"],
+    observed: Float[np.ndarray, " B"],
+    intervals: tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]],
+    counts: Int[np.ndarray, " B"],
     title: str = "",
 ) -> Figure:
     """Draw observed frequencies against predicted probabilities.
@@ -238,14 +239,14 @@ def _fit_view(axes: Axes, points: np.ndarray) -> None:
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
 
 
-def draw_markers(axes: Axes, markers_m: np.ndarray) -> None:
+def draw_markers(axes: Axes, markers_m: Float[np.ndarray, "M 4 3"]) -> None:
     """Draw markers on a map seen from above: (M, 4, 3) corners in the world."""
     for index, corners in enumerate(markers_m):
         label = "marker" if index == 0 else None
         axes.plot(corners[:, 0], corners[:, 1], color=VERMILION, lw=5, label=label)
 
 
-def draw_waypoints(axes: Axes, waypoints_m: np.ndarray, radius_m: float) -> None:
+def draw_waypoints(axes: Axes, waypoints_m: Float[np.ndarray, "W 2"], radius_m: float) -> None:
     """Draw waypoints (W, 2) on a map, each with the circle within which it is reached."""
     circle = np.linspace(0, 2 * np.pi, 60)
     for number, (x_m, y_m) in enumerate(waypoints_m, 1):

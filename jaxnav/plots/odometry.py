@@ -3,6 +3,7 @@
 import textwrap
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -13,7 +14,7 @@ _GROUPS = 60  # groups of views whose means are drawn
 
 
 def odometry_report(
-    calibration: OdometryCalibration, corners_world_m: np.ndarray, figures: str
+    calibration: OdometryCalibration, corners_world_m: Float[np.ndarray, "M 4 3"], figures: str
 ) -> Figure:
     """Draw the drive on the map, residuals and readings over time, and the figures with advice.
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -18,8 +19,8 @@ _ARROWS = 400  # residuals drawn for each camera
 def rig_report(
     calibration: RigCalibration,
     rig: CameraRig,
-    given: np.ndarray,
-    corners_world_m: np.ndarray,
+    given: Float[np.ndarray, "C 4 4"],
+    corners_world_m: Float[np.ndarray, "M 4 3"],
     marker_ids: Sequence[int],
 ) -> Figure:
     """Draw the map and the rig from above, and every camera's residuals over its image.
@@ -53,9 +54,9 @@ def rig_report(
 
 def map_check(
     *,
-    given: np.ndarray,
-    estimate: np.ndarray,
-    size_m: np.ndarray,
+    given: Float[np.ndarray, "M 4 4"],
+    estimate: Float[np.ndarray, "M 4 4"],
+    size_m: Float[np.ndarray, " M"],
     ids: Sequence[int],
     wrong: Sequence[bool],
 ) -> Figure:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxnav.errors import BadInput
@@ -36,11 +37,11 @@ class Scenery:
 
     rig: CameraRig | None
     markers: MarkerMap | None
-    waypoints_m: np.ndarray
+    waypoints_m: Float[np.ndarray, "W 2"]
     waypoint_radius_m: float
 
     @property
-    def markers_m(self) -> np.ndarray:
+    def markers_m(self) -> Float[np.ndarray, "M 4 3"]:
         """The markers' corners (M, 4, 3) in the world."""
         if self.markers is None:
             return np.zeros((0, 4, 3))
@@ -52,7 +53,7 @@ class Scenery:
         """The origin of the markers' coordinates, see `MarkerMap`."""
         return ZERO if self.markers is None else self.markers.origin_m
 
-    def on_map_m(self, places_m: np.ndarray) -> np.ndarray:
+    def on_map_m(self, places_m: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Points (N, 2) in the world, in the markers' coordinates."""
         return np.asarray(points_in_world(places_m, opposite(self.origin_m)))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -24,7 +25,7 @@ class EstimatorScores:
     rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
     anees: tuple[float, float, float]
     band: tuple[float, float]  # in which ANEES is consistent, 99.9 %
-    error_m: np.ndarray  # of every judged frame
+    error_m: Float[np.ndarray, " N"]  # of every judged frame
     indefinite: int  # judged frames whose covariance is indefinite by rounding; not in ANEES
 
 
@@ -36,8 +37,8 @@ class ControllerScores:
     parts: dict[str, float]
     time_s: tuple[float, float, float]  # to the last waypoint
     success: tuple[float, float, float]
-    poses: np.ndarray  # (frames, 3) of the first drive
-    waypoints_m: np.ndarray
+    poses: Float[np.ndarray, "frames 3"]  # of the first drive
+    waypoints_m: Float[np.ndarray, "W 2"]
 
 
 def tuning_report(

@@ -94,7 +94,7 @@ def wrench(
     return jnp.sum(force, axis=1), jnp.sum(cross_product(points, force), axis=1)
 
 
-def cross_product(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Array:
+def cross_product(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
     """a x b, coordinates first."""
     return jnp.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]

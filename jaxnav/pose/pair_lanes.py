@@ -321,7 +321,7 @@ class LaneLM(LanewiseSolver):
 
     rtol: float
     atol: float
-    norm: Callable[[PyTree], Array] = optx.max_norm
+    norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
 
     def init(
         self,
@@ -379,7 +379,7 @@ class LaneLM(LanewiseSolver):
         options: dict[str, Any],
         state: _State,
         tags: frozenset[object],
-    ) -> tuple[Array, optx.RESULTS]:
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether all lanes are done, or no step is left."""
         over = jnp.all(state.trace.done) | (state.left <= 0)
         return over, cast(optx.RESULTS, optx.RESULTS.successful)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief
@@ -126,7 +126,9 @@ class AmbiguityStudy(Study):
         super().__init__(config)
         self.rig = None if rig is None else in_precision(rig, config.precision)
 
-    def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
+    def run(
+        self, cells: Sequence[Cell], trials: range
+    ) -> dict[str, Shaped[np.ndarray, "cells ... trials"]]:
         programs: dict[tuple[Any, ...], list[int]] = {}
         for index, cell in enumerate(cells):
             key = (cell["cameras"], cell["baseline_m"], cell["max_lm_steps"])

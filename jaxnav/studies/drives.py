@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Shaped
 
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.selectors import SELECTORS, make_selector
@@ -110,7 +111,9 @@ class DriveStudy(Study):
         """Whether the study takes the fast path: by its trials and not by those of a box."""
         return self.config.trials >= Rollout.many
 
-    def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
+    def run(
+        self, cells: Sequence[Cell], trials: range
+    ) -> dict[str, Shaped[np.ndarray, "cells ... trials"]]:
         with jax.enable_x64(self.config.precision == "float64"):
             scored = [self._cell(cell, trials) for cell in cells]
         return {name: np.stack([one[name] for one in scored]) for name in SCHEMA.variables}

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import PyTree
+from jaxtyping import Num, PyTree, Shaped
 
 BATCH = 2048
 Tree = TypeVar("Tree")
@@ -20,9 +20,9 @@ Tree = TypeVar("Tree")
 def run_lanes(
     program: Callable[..., PyTree],
     shared: tuple[PyTree, ...],
-    lanes: tuple[np.ndarray, ...],
+    lanes: tuple[Num[np.ndarray, "L ..."], ...],
     precision: str,
-) -> dict[str, np.ndarray]:
+) -> dict[str, Shaped[np.ndarray, "L ..."]]:
     """Run program(*shared, *lane) -> dict of arrays for every lane; the results are on the host.
 
     Args:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Shaped
 
 from jaxnav.errors import BadInput
 from jaxnav.studies.store import Box, StudyStore, versions
@@ -109,7 +110,7 @@ class OtherVersions(RuntimeError):
 
 def run_box(
     study: Study, cells: list[Cell], trials: range, wanted: Mapping[str, str] | None = None
-) -> dict[str, np.ndarray]:
+) -> dict[str, Shaped[np.ndarray, "cells ... trials"]]:
     """Run the trials of one box: every variable's values by name.
 
     Args:

@@ -19,6 +19,7 @@ import jax
 import numpy as np
 import xarray as xr
 import zarr
+from jaxtyping import Shaped
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.errors import ZarrUserWarning
 
@@ -67,7 +68,9 @@ class StudyStore:
         for index in np.argwhere(done != 1):
             yield tuple(int(i) for i in index)
 
-    def write(self, box: Box, results: Mapping[str, np.ndarray]) -> None:
+    def write(
+        self, box: Box, results: Mapping[str, Shaped[np.ndarray, "cells ... trials"]]
+    ) -> None:
         """Write the results of one box, and mark it as done.
 
         Raises:

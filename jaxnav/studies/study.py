@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from jaxtyping import Shaped
 
 from jaxnav.studies.config import Config
 from jaxnav.studies.parameters import Parameter, Value
@@ -91,7 +92,9 @@ class Study(abc.ABC):
         return self.schema.box_trials
 
     @abc.abstractmethod
-    def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
+    def run(
+        self, cells: Sequence[Cell], trials: range
+    ) -> dict[str, Shaped[np.ndarray, "cells ... trials"]]:
         """Run trials of cells: variables (cells, trials) or (cells, selectors, trials). A trial's
         bits depend on its cell and its number alone.
         """

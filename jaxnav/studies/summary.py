@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Float, Float32, Int
 
 from jaxnav.simulation.statistics import wilson_interval
 from jaxnav.studies.layout import BoxLayout
@@ -16,7 +17,7 @@ from jaxnav.studies.study import Grid, Variable
 
 SHARES = {"median": 0.5, "p95": 0.95}
 RELIABILITY_BINS = 20
-Blocks = Callable[[], Iterator[np.ndarray]]  # float32 (cells, trials), NaN where missing
+Blocks = Callable[[], Iterator[Float32[np.ndarray, "cells trials"]]]  # NaN where missing
 
 
 def summarise(
@@ -125,7 +126,9 @@ def _rows(array: xr.DataArray, index: tuple[slice, ...], span: slice) -> np.ndar
     return values.reshape(-1, values.shape[-1])
 
 
-def order_statistic(blocks: Blocks, share: float, counted: np.ndarray, passes: int) -> np.ndarray:
+def order_statistic(
+    blocks: Blocks, share: float, counted: Int[np.ndarray, " cells"], passes: int
+) -> Float[np.ndarray, " cells"]:
     """The number of each row below which a share of its numbers lies; NaN for a row of none.
 
     Several blocks are never held together: two passes count the upper and then the lower halves of

@@ -54,14 +54,14 @@ class Smooth(eqx.Module):
         return self.loss(x, *args), None
 
     @eqx.filter_jit
-    def init(self, x: Float[Array, " n"], batch: PyTree, softness: Array) -> Descent:
+    def init(self, x: Float[Array, " n"], batch: PyTree, softness: Float[Array, ""]) -> Descent:
         """The state at x, before any evaluation."""
         scalar = jax.ShapeDtypeStruct((), x.dtype)
         state = self._solver.init(self._fn, x, (batch, softness), {}, scalar, None, frozenset())
         return _unknown(x, eqx.filter(state, eqx.is_array))
 
     @eqx.filter_jit
-    def step(self, state: Descent, batch: PyTree, softness: Array) -> Descent:
+    def step(self, state: Descent, batch: PyTree, softness: Float[Array, ""]) -> Descent:
         """Evaluate once more; the point is kept if it lowers the loss enough."""
         solver, args, tags = self._solver, (batch, softness), frozenset[object]()
         scalar = jax.ShapeDtypeStruct((), state.x.dtype)
@@ -83,7 +83,9 @@ class Noisy(eqx.Module):
     """
 
     # (x, batch, softness) -> loss and gradient; not compiled here.
-    evaluate: Callable[[Array, PyTree, Array], tuple[Array, Array]]
+    evaluate: Callable[
+        [Float[Array, " n"], PyTree, Float[Array, ""]], tuple[Float[Array, ""], Float[Array, " n"]]
+    ]
     learning_rate: float = 0.05
     steps: int = 100  # the learning rate is a tenth after so many
     longest: float = 1.0  # the norm to which a longer gradient is clipped
@@ -93,11 +95,11 @@ class Noisy(eqx.Module):
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps, alpha=0.1)
         return optax.chain(optax.clip_by_global_norm(self.longest), optax.adam(rate, b2=0.99))
 
-    def init(self, x: Float[Array, " n"], batch: PyTree, softness: Array) -> Descent:
+    def init(self, x: Float[Array, " n"], batch: PyTree, softness: Float[Array, ""]) -> Descent:
         """The state at x, before any evaluation."""
         return _unknown(x, self._solver.init(x))
 
-    def step(self, state: Descent, batch: PyTree, softness: Array) -> Descent:
+    def step(self, state: Descent, batch: PyTree, softness: Float[Array, ""]) -> Descent:
         """Take one step along the gradient of this batch."""
         loss, gradient = self.evaluate(state.x, batch, softness)
         return _moved(self._solver, state, loss, gradient)

@@ -64,10 +64,10 @@ class ClosedLoop(eqx.Module):
 
     def value(
         self,
-        values: Mapping[str, Array],
+        values: Mapping[str, Float[Array, "..."]],
         keys: Key[Array, " B"],
         progress: Callable[[int], object] = lambda ended: None,
-    ) -> tuple[np.ndarray, Costs, Trace]:
+    ) -> tuple[Float[np.ndarray, " B"], Costs, Trace]:
         """Drive with the hard controller, as the car does: losses (B,), costs (B,), the traces.
 
         Args:
@@ -115,7 +115,7 @@ class ClosedLoop(eqx.Module):
 
     def hard_losses(
         self, x: Float[Array, " n"], space: Space, keys: Key[Array, " B"], beside: int
-    ) -> np.ndarray:
+    ) -> Float[np.ndarray, " B"]:
         """The losses (B,) of `value`, where possible without another program to compile.
 
         A switch of no width is the hard one, so the program that differentiates many drives runs

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 from jaxnav.tuning.descent import Descent, Noisy, Smooth
 from jaxnav.tuning.objective import Batch, NotFinite
@@ -41,9 +41,11 @@ class Problem:
     """
 
     optimiser: Smooth | Noisy
-    batch: Callable[[Array, int, int], Batch]
-    held_out: Callable[[Array, Array, int], float]
-    explain: Callable[[Array, Batch, Array], NotFinite | None] = lambda x, batch, softness: None
+    batch: Callable[[Float[Array, " n"], int, int], Batch]
+    held_out: Callable[[Float[Array, " n"], Float[Array, " n"], int], float]
+    explain: Callable[[Float[Array, " n"], Batch, Float[Array, ""]], NotFinite | None] = (
+        lambda x, batch, softness: None
+    )
     softness: Callable[[int], float] = lambda step: 0.0
     steps: int = 100
     stages: int = 1
@@ -70,7 +72,7 @@ class TuningFit:
     refused: int = 0  # steps not taken because a gradient was not finite
     over: bool = False
     ended: str = ""  # the reason
-    history: tuple[np.ndarray, ...] = field(default=())
+    history: tuple[Float[np.ndarray, " columns"], ...] = field(default=())
 
     @staticmethod
     def begin(x: Float[Array, " n"], problem: Problem) -> "TuningFit":
@@ -157,7 +159,7 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
-def arrays_of(fit: TuningFit) -> dict[str, np.ndarray]:
+def arrays_of(fit: TuningFit) -> dict[str, Shaped[np.ndarray, "..."]]:
     """A fit as named arrays, to be written to a file."""
     leaves = jax.tree.leaves(fit.descent)
     inner = {f"descent_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
@@ -165,7 +167,7 @@ def arrays_of(fit: TuningFit) -> dict[str, np.ndarray]:
     return inner | plain | {"history": np.array(fit.history)}
 
 
-def fit_of(arrays: dict[str, np.ndarray], like: TuningFit) -> TuningFit:
+def fit_of(arrays: dict[str, Shaped[np.ndarray, "..."]], like: TuningFit) -> TuningFit:
     """The fit from which `arrays_of` made these arrays.
 
     Args:

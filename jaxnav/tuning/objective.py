@@ -41,7 +41,9 @@ class Objective(eqx.Module):
         prior = jnp.sum(x**2) / (2 * self.prior_sigma**2)
         return (self.total(x, batch.items, softness) + prior) / batch.frames
 
-    def total(self, x: Float[Array, " n"], items: PyTree, softness: Float[Array, ""]) -> Array:
+    def total(
+        self, x: Float[Array, " n"], items: PyTree, softness: Float[Array, ""]
+    ) -> Float[Array, ""]:
         """The sum of the costs over all frames of all items."""
         devices = jax.devices()
         count = jax.tree.leaves(items)[0].shape[0]

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.markers import MarkerMap
@@ -33,7 +33,7 @@ class FrameSequences(eqx.Module):
     def __len__(self) -> int:
         return len(self.used)
 
-    def rows(self, rows: slice | np.ndarray) -> "FrameSequences":
+    def rows(self, rows: slice | Int[np.ndarray, " rows"]) -> "FrameSequences":
         """Some of the sequences."""
         some: FrameSequences = jax.tree.map(lambda leaf: leaf[rows], self)
         return some

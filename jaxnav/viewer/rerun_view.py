@@ -24,6 +24,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jaxnav.errors import BadInput
 from jaxnav.loop.pilot import Outcome
@@ -52,7 +53,7 @@ class RerunView:
         self,
         rig: CameraRig | None,
         markers: MarkerMap | None,
-        waypoints_m: np.ndarray,
+        waypoints_m: Float[np.ndarray, "W 2"],
         live: bool,
         save: Path | None,
         waits: bool = False,
@@ -119,8 +120,11 @@ class RerunView:
         self,
         camera_name: str,
         stamp_ns: int,
-        image: bytes | np.ndarray | None,
-        corners_px: np.ndarray | None,
+        image: bytes
+        | UInt8[np.ndarray, "rows columns"]
+        | UInt8[np.ndarray, "rows columns 3"]
+        | None,
+        corners_px: Float[np.ndarray, "N 4 2"] | None,
     ) -> None:
         """Show a frame of a camera. Never raises.
 

@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jaxnav.files import poses
 from jaxnav.loop.flags import Fault, Health, Reject, names
@@ -40,7 +41,7 @@ class RerunScene:
         stream: Any,
         rig: CameraRig | None,
         markers: MarkerMap | None,
-        waypoints_m: np.ndarray,
+        waypoints_m: Float[np.ndarray, "W 2"],
     ):
         """Args:
         rerun: the module.
@@ -97,8 +98,11 @@ class RerunScene:
         self,
         camera: str,
         stamp_ns: int,
-        image: bytes | np.ndarray | None,
-        corners_px: np.ndarray | None,
+        image: bytes
+        | UInt8[np.ndarray, "rows columns"]
+        | UInt8[np.ndarray, "rows columns 3"]
+        | None,
+        corners_px: Float[np.ndarray, "N 4 2"] | None,
     ) -> None:
         """Log a camera's frame: JPEG or BGR or grey pixels, and detected corners (N, 4, 2). None
         leaves either unchanged."""

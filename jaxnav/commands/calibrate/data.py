@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.calibration.rigs.views import RigViews
 from jaxnav.datasets.sightings import RecordedSightings, read_sightings
@@ -36,7 +37,7 @@ class RigData:
     views: RigViews
     markers: MarkerMap | None
     keys: tuple[MarkerKey, ...]
-    known: dict[int, np.ndarray]
+    known: dict[int, Float[np.ndarray, "4 4"]]
     parts: tuple[RecordedSightings, ...]
     anchored: bool
 

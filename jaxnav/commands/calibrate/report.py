@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 import jaxnav
@@ -80,7 +81,7 @@ def with_unseen(data: RigData, markers: MarkerMap) -> tuple[MarkerMap, int]:
     ), len(unseen)
 
 
-def axes_sigmas(calibration: RigCalibration) -> np.ndarray:
+def axes_sigmas(calibration: RigCalibration) -> Float[np.ndarray, "bodies 6"]:
     """Sigmas (C + M, 6) of cameras and markers, m and deg, along and about the axes of the vehicle
     for cameras and of the world for markers."""
     Ts = np.concatenate([calibration.Ts_vehicle_camera, calibration.Ts_world_marker])
@@ -167,7 +168,10 @@ def _lens(data: RigData, calibration: RigCalibration, camera: int) -> dict[str, 
 
 
 def summary(
-    data: RigData, calibration: RigCalibration, given: np.ndarray, calibrated: Calibrated
+    data: RigData,
+    calibration: RigCalibration,
+    given: Float[np.ndarray, "C 4 4"],
+    calibrated: Calibrated,
 ) -> dict[str, Any]:
     """The content of report.json.
 
@@ -239,7 +243,7 @@ def summary(
     }
 
 
-def coverage(corners_px: np.ndarray, image_size_px: tuple[int, int]) -> float:
+def coverage(corners_px: Float[np.ndarray, "N 4 2"], image_size_px: tuple[int, int]) -> float:
     """The share of an image's cells, 8 of them across, in which corners were seen."""
     width, height = image_size_px
     across, down = _CELLS, max(1, round(_CELLS * height / width))
@@ -248,7 +252,9 @@ def coverage(corners_px: np.ndarray, image_size_px: tuple[int, int]) -> float:
     return len(np.unique(inside, axis=0)) / (across * down)
 
 
-def advice(data: RigData, calibration: RigCalibration, sigmas: np.ndarray) -> list[str]:
+def advice(
+    data: RigData, calibration: RigCalibration, sigmas: Float[np.ndarray, "bodies 6"]
+) -> list[str]:
     """Advice in sentences: what to record next, and what to check."""
     findings = []
     rows = data.views

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.calibration.rigs.calibrate import RigCalibration, calibrate_rig
 from jaxnav.calibration.rigs.driven_frame import driven_frame
@@ -51,7 +52,11 @@ def run(args: Arguments) -> int:
 
 
 def publish(
-    folder: Path, data: RigData, calibration: RigCalibration, given: np.ndarray, with_rig: bool
+    folder: Path,
+    data: RigData,
+    calibration: RigCalibration,
+    given: Float[np.ndarray, "C 4 4"],
+    with_rig: bool,
 ) -> None:
     """Write all files, and print in a few lines what they hold.
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
 from jaxnav.commands.doctor.sight import area_px2
@@ -51,9 +52,9 @@ class Sighted:
 
     rig: CameraRig
     markers: MarkerMap
-    corners_px: np.ndarray
-    visible: np.ndarray
-    sigma_px: np.ndarray
+    corners_px: Float[np.ndarray, "C M 4 2"]
+    visible: Bool[np.ndarray, "C M"]
+    sigma_px: Float[np.ndarray, "C M 4"]
 
     @staticmethod
     def of(rig: CameraRig, markers: MarkerMap, seen: CornerLanes, most: int) -> "Sighted":
@@ -99,14 +100,14 @@ class Sighted:
 class FileErrors(eqx.Module):
     """Differences from the files, or their sigmas, where 0 says that a number is known."""
 
-    pose: np.ndarray  # (6,) xi in T_world_vehicle * exp(xi)
-    size: np.ndarray  # (M,) logarithm of true over written
-    moved: np.ndarray  # (M, 6) xi in T_world_marker * exp(xi)
-    focal: np.ndarray  # (C,) logarithm of true over written
-    turned: np.ndarray  # (C, 3) rotation vector of each camera in its own frame, rad
+    pose: Float[np.ndarray, " 6"]  # xi in T_world_vehicle * exp(xi)
+    size: Float[np.ndarray, " M"]  # logarithm of true over written
+    moved: Float[np.ndarray, "M 6"]  # xi in T_world_marker * exp(xi)
+    focal: Float[np.ndarray, " C"]  # logarithm of true over written
+    turned: Float[np.ndarray, "C 3"]  # rotation vector of each camera in its own frame, rad
 
     @staticmethod
-    def of_pose(seen: Sighted, level: bool, **others: np.ndarray) -> "FileErrors":
+    def of_pose(seen: Sighted, level: bool, **others: Float[np.ndarray, "..."]) -> "FileErrors":
         """Prior sigmas of a pose anywhere in space, or level on the ground, and of `others`."""
         C, M = seen.visible.shape
         on_ground = [_HEIGHT_SIGMA_M, _TILT_SIGMA_RAD, _TILT_SIGMA_RAD]
@@ -134,12 +135,12 @@ class StandingFit:
         pose_covariance: (6, 6), of xi in T_world_vehicle * exp(xi).
     """
 
-    T_world_vehicle: np.ndarray
+    T_world_vehicle: Float[np.ndarray, "4 4"]
     cost: float
     error_px: float
     value: FileErrors
     sigma: FileErrors
-    pose_covariance: np.ndarray
+    pose_covariance: Float[np.ndarray, "6 6"]
 
     @property
     def planar(self) -> tuple[float, float, float]:
@@ -153,7 +154,7 @@ class StandingFit:
         return float(np.arccos(np.clip(self.T_world_vehicle[2, 2], -1, 1)))
 
 
-def poses_by_each(seen: Sighted) -> list[np.ndarray]:
+def poses_by_each(seen: Sighted) -> list[Float[np.ndarray, " 7"]]:
     """Both T_world_vehicle, (7,) wxyz_xyz each, by each marker in each camera."""
     both = np.asarray(_both(seen.rig, seen.markers, seen.corners_px, seen.visible))
     return list(both[seen.visible.reshape(-1)].reshape(-1, 7))
@@ -168,7 +169,9 @@ def _both(
     return both_poses(snapshot).inverse().wxyz_xyz
 
 
-def fit(seen: Sighted, starts: Iterable[np.ndarray], prior_sigma: FileErrors) -> StandingFit:
+def fit(
+    seen: Sighted, starts: Iterable[Float[np.ndarray, " 7"]], prior_sigma: FileErrors
+) -> StandingFit:
     """The best fit from several starts.
 
     Args:
@@ -274,7 +277,9 @@ class Explanation:
     fit: StandingFit = field(repr=False)
 
 
-def explained(seen: Sighted, starts: Sequence[np.ndarray], whole: StandingFit) -> list[Explanation]:
+def explained(
+    seen: Sighted, starts: Sequence[Float[np.ndarray, " 7"]], whole: StandingFit
+) -> list[Explanation]:
     """The errors that explain the corners best: up to three that can't be told apart, often none.
 
     Args:

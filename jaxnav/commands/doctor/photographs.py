@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.commands.doctor.fits import (
@@ -53,7 +54,10 @@ _CLEARLY = 2.0  # sigma
 
 
 def examine_pictures(
-    rig: CameraRig, markers: MarkerMap, route: Route | None, images: Mapping[str, np.ndarray]
+    rig: CameraRig,
+    markers: MarkerMap,
+    route: Route | None,
+    images: Mapping[str, UInt8[np.ndarray, "rows columns ..."]],
 ) -> Iterator[Finding]:
     """Run all checks of pictures of one standing car.
 
@@ -74,7 +78,9 @@ def examine_pictures(
     yield from together(seen, poses, route)
 
 
-def usable(rig: CameraRig, images: Mapping[str, np.ndarray]) -> Iterator[Finding]:
+def usable(
+    rig: CameraRig, images: Mapping[str, UInt8[np.ndarray, "rows columns ..."]]
+) -> Iterator[Finding]:
     """Report pictures of another size than their camera was calibrated at."""
     for name, image in images.items():
         width_px, height_px = rig.image_sizes_px[rig.names.index(name)]

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
@@ -181,7 +182,7 @@ def bearings(rig: CameraRig) -> Iterator[Finding]:
     )
 
 
-def spans(bearings: np.ndarray) -> list[tuple[int, int]]:
+def spans(bearings: Bool[np.ndarray, " 360"]) -> list[tuple[int, int]]:
     """Runs of True on the circle: the first and last whole degree of each, in (-180, 180].
 
     Args:

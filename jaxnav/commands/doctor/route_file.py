@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
@@ -181,7 +182,7 @@ def _from_place(rig: CameraRig, markers: MarkerMap, seen: PoseViews, number: int
     return ok(text)
 
 
-def along(route: Route) -> tuple[np.ndarray, float]:
+def along(route: Route) -> tuple[Float[np.ndarray, "N 3"], float]:
     """Poses (N, 3), evenly along straight lines through start and waypoints, and the length, m."""
     places = np.array([route.start_pose[:2], *route.waypoints_m], float)
     legs = np.diff(places, axis=0)

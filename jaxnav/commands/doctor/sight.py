@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
 from jaxnav.models.camera import Camera
@@ -28,7 +29,9 @@ def _through_lens(cameras: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Ar
     return jax.vmap(one)(cameras, pixels)
 
 
-def through_lens(rig: CameraRig, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def through_lens(
+    rig: CameraRig, pixels: Float[np.ndarray, "C N 2"]
+) -> tuple[Float[np.ndarray, "C N 3"], Float[np.ndarray, "C N"]]:
     """The rays of pixels, and their reprojection errors.
 
     Args:
@@ -59,12 +62,14 @@ def _sees_directions(rig: CameraRig, directions_vehicle: jax.Array) -> jax.Array
     return jax.vmap(one)(rig.cameras, rig.Ts_camera_vehicle, sizes_px)
 
 
-def sees_directions(rig: CameraRig, directions_vehicle: np.ndarray) -> np.ndarray:
+def sees_directions(
+    rig: CameraRig, directions_vehicle: Float[np.ndarray, "N 3"]
+) -> Bool[np.ndarray, "C N"]:
     """Which cameras see far objects in unit directions (N, 3) of the vehicle: (C, N) bool."""
     return np.asarray(_sees_directions(rig, jnp.asarray(directions_vehicle, float)))
 
 
-def area_px2(corners_px: np.ndarray) -> np.ndarray:
+def area_px2(corners_px: Float[np.ndarray, "*batch 4 2"]) -> Float[np.ndarray, "*batch"]:
     """The areas (...) of quadrilaterals (..., 4, 2) in an image, px^2: positive where the corners
     run clockwise, as those of a marker seen from the front."""
     a, b = np.moveaxis(corners_px[..., :2, :] - corners_px[..., 2:, :], -2, 0)
@@ -82,9 +87,9 @@ class PoseViews:
         range_m: (P, C, M), from camera to marker.
     """
 
-    side_px: np.ndarray
-    behind: np.ndarray
-    range_m: np.ndarray
+    side_px: Float[np.ndarray, "P C M"]
+    behind: Bool[np.ndarray, "P M"]
+    range_m: Float[np.ndarray, "P C M"]
 
 
 @jax.jit
@@ -102,7 +107,7 @@ def _corners(
     return jax.vmap(one)(poses)
 
 
-def views(rig: CameraRig, markers: MarkerMap, poses: np.ndarray) -> PoseViews:
+def views(rig: CameraRig, markers: MarkerMap, poses: Float[np.ndarray, "P 3"]) -> PoseViews:
     """`PoseViews` from planar poses (P, 3): x m, y m, psi rad."""
     corners_px, inside, Ts_world_vehicle = jax.device_get(
         _corners(rig, markers, jnp.asarray(poses, float))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -68,11 +69,11 @@ class Track:
         restarts, restart_reason: at the end.
     """
 
-    now_ns: np.ndarray
-    poses: np.ndarray
-    Ts_world_vehicle: np.ndarray
-    located: np.ndarray
-    decided: np.ndarray
+    now_ns: Int[np.ndarray, " N"]
+    poses: Float[np.ndarray, "N 3"]
+    Ts_world_vehicle: Float[np.ndarray, "N 7"]
+    located: Bool[np.ndarray, " N"]
+    decided: Bool[np.ndarray, " N"]
     health: Sequence[Health]
     faults: Sequence[Fault]
     rejects: Sequence[Reject]
@@ -80,12 +81,12 @@ class Track:
     restart_reason: str
 
     @property
-    def times_s(self) -> np.ndarray:
+    def times_s(self) -> Float[np.ndarray, " N"]:
         """Times since the first row, (N,) s."""
         return np.asarray((self.now_ns - self.now_ns[0]) / 1e9)
 
     @property
-    def positions_m(self) -> np.ndarray:
+    def positions_m(self) -> Float[np.ndarray, "N 3"]:
         """Positions of the vehicle, (N, 3) m, NaN where not located."""
         return np.where(self.located[:, None], self.Ts_world_vehicle[:, 4:], np.nan)
 
@@ -105,7 +106,9 @@ class Track:
             "restart_reason": self.restart_reason,
         }
 
-    def distances_to(self, recorded: Outcomes) -> tuple[np.ndarray, np.ndarray]:
+    def distances_to(
+        self, recorded: Outcomes
+    ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
         """Distances (N,) m and (N,) rad to the recorded track, NaN where either has no pose."""
         index = np.searchsorted(recorded.now_ns, self.now_ns)
         known = index < len(recorded.now_ns)

@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Float, UInt8
 from tqdm import tqdm
 
 from jaxnav.commands.pictures import corners_in_world, normals_px, save_figure
@@ -77,14 +78,14 @@ class Record:
     """A finished drive: its N frames, and the images that were kept."""
 
     frames: list[DriveFrame]
-    kept: dict[int, list[np.ndarray]]  # frame number -> images
+    kept: dict[int, list[UInt8[np.ndarray, "rows columns"]]]  # frame number -> images
 
     @property
-    def true_poses(self) -> np.ndarray:
+    def true_poses(self) -> Float[np.ndarray, "N 3"]:
         """True planar poses (N, 3): x m, y m, psi rad."""
         return np.array([frame.true_pose for frame in self.frames])
 
-    def poses(self, method: str) -> np.ndarray:
+    def poses(self, method: str) -> Float[np.ndarray, "N 3"]:
         """A method's planar poses (N, 3): x m, y m, psi rad; NaN where it has none."""
         outputs = [frame.outputs[method] for frame in self.frames]
         return np.array([o.pose if o.located else np.full(3, np.nan) for o in outputs])

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, UInt8
 
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.detection import Detections, Detector, make_detectors, observe
@@ -96,11 +97,12 @@ class RenderedCameras:
     world: RenderedWorld
     rng: np.random.Generator
     corner_noise_px: float = 0.0  # on top of the detection's errors
-    images: list[np.ndarray] = field(default_factory=list)  # the latest, one a camera
+    # The latest, one a camera.
+    images: list[UInt8[np.ndarray, "rows columns"]] = field(default_factory=list)
 
     def look(
         self, T_world_vehicle_at: PoseAt, stamp_s: float, believed: Output | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[Float[np.ndarray, "C M 4 2"], Bool[np.ndarray, "C M"], Float[np.ndarray, "C M 4"]]:
         """Corners (C, M, 4, 2), visibility (C, M) and sigmas (C, M, 4) at one instant."""
         world, setup = self.world, self.world.setup
         self.images = world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)

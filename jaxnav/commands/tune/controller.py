@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 from tqdm import tqdm
 
 from jaxnav.belief.selectors import make_selector
@@ -111,7 +111,7 @@ class Gains:
         self._args, self._loop, self._tests, self._space = args, loop, tests, space
 
     @property
-    def before(self) -> dict[str, Array]:
+    def before(self) -> dict[str, Float[Array, "..."]]:
         """The values of the gains before they are learned."""
         known = parameters_of(self._loop.rollout.navigator)
         return {name: known[name] for name in self._space.free}

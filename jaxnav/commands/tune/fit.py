@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -190,7 +190,7 @@ def run_fit(
     fitting: Fitting,
     headless: bool,
     *,
-    before: Mapping[str, Array],
+    before: Mapping[str, Float[Array, "..."]],
     test: Callable[[TuningFit], Mapping[str, tuple[Scores, Scores]]],
     as_json: Callable[[Scores], dict[str, Any]],
     draw: Callable[[TuningFit, Space, Mapping[str, tuple[Scores, Scores]]], Figure],
