@@ -125,7 +125,7 @@ class RecordingSource:
     rows: Rows
     rig: CameraRig
     markers: Callable[[], MarkerMap]
-    reference: Callable[[], dict[int, np.ndarray] | None] = lambda: None
+    reference: Callable[[], dict[int, Float[np.ndarray, " 7"]] | None] = lambda: None
 
 
 def assemble(
@@ -133,7 +133,7 @@ def assemble(
     rows: Rows,
     rig: CameraRig,
     markers: MarkerMap,
-    poses: dict[int, np.ndarray] | None = None,
+    poses: dict[int, Float[np.ndarray, " 7"]] | None = None,
 ) -> Recording:
     """Make a recording of a table of detections.
 

@@ -233,7 +233,9 @@ def frames_in_view(seen: Bool[np.ndarray, "F tracks"]) -> Int[np.ndarray, "F tra
     return np.where(seen, frame - last_unseen, 0)
 
 
-def errors(replay: Replay, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+def errors(
+    replay: Replay, recording: Recording
+) -> tuple[Float[np.ndarray, "F tracks"], Float[np.ndarray, "F tracks"]]:
     """Position errors (m) and rotation errors (deg), (F, tracks); NaN without either pose."""
     reference = recording.reference
     assert reference is not None

@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxnav.detection.types import Detections
 from jaxnav.files.images import decode_image
@@ -102,7 +103,7 @@ def odometry(kind: str, message: Any, twists: TwistReader) -> Odometry:
     return Odometry(stamp_ns(message), *twists.read(float(twist.linear.x), float(twist.angular.z)))
 
 
-def grey_image(kind: str, message: Any) -> np.ndarray | None:
+def grey_image(kind: str, message: Any) -> UInt8[np.ndarray, "rows columns"] | None:
     """The image in a message of `IMAGE` or `COMPRESSED`, (H, W) uint8; None where it is broken.
 
     Raises:

@@ -3,6 +3,7 @@
 import importlib
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from jaxnav.detection.families import dictionary
 from jaxnav.detection.types import Detections, grey, refine_detections
@@ -39,9 +40,9 @@ class AprilTagDetector:
 
     def detect(
         self,
-        image: np.ndarray,
+        image: Shaped[np.ndarray, "..."],
         camera: Camera | None = None,
-        predicted_corners_px: np.ndarray | None = None,
+        predicted_corners_px: Float[np.ndarray, "K 4 2"] | None = None,
     ) -> Detections:
         """Detect all markers of the family in the image: see `Detector.detect`.
 

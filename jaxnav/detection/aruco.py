@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import dictionary
@@ -44,9 +45,9 @@ class ArucoDetector:
 
     def detect(
         self,
-        image: np.ndarray,
+        image: Shaped[np.ndarray, "..."],
         camera: Camera | None = None,
-        predicted_corners_px: np.ndarray | None = None,
+        predicted_corners_px: Float[np.ndarray, "K 4 2"] | None = None,
     ) -> Detections:
         """Detect all markers of the family in the image: see `Detector.detect`."""
         image = grey(image)
@@ -72,10 +73,10 @@ class ArucoDetector:
 
     def detect_near(
         self,
-        image: np.ndarray,
+        image: Shaped[np.ndarray, "..."],
         camera: Camera | None,
-        quads_px: np.ndarray,
-        radius_px: np.ndarray,
+        quads_px: Float[np.ndarray, "K 4 2"],
+        radius_px: Float[np.ndarray, " K"],
     ) -> Detections:
         """Detect markers near their expected places: see `RegionDetector`."""
         image = grey(image)

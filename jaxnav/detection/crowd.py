@@ -8,6 +8,7 @@ everything but the surroundings of the best is erased from the image.
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxnav.detection.families import all_cells
 from jaxnav.detection.read import codes_of
@@ -26,7 +27,9 @@ _HALF_WINDOW_PX, _SPECK, _OUTLINE_PX = 11, np.ones((2, 2), np.uint8), 8
 _MARGIN_SIDES, _MARGIN_PX = 0.25, 4
 
 
-def thin_crowd(image: np.ndarray, family: str, least_perimeter_px: float) -> np.ndarray:
+def thin_crowd(
+    image: UInt8[np.ndarray, "rows columns"], family: str, least_perimeter_px: float
+) -> UInt8[np.ndarray, "rows columns"]:
     """The image; if it is crowded, a copy that shows nothing but the likeliest markers.
 
     Args:

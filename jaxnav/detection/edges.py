@@ -48,13 +48,13 @@ _MAX_STEP = 0.1
 class EdgeFit(NamedTuple):
     """The result of the fit, in paper coordinates."""
 
-    M: Array  # (3, 3), rays to paper
-    blur_px2: Array  # (3,) xx, xy, yy of S
-    covariance: Array  # (8, 8) of D in (I + D) M, by rows without the last entry
-    noise: Array  # standard deviation of the residual, grey levels
-    contrast: Array  # white minus black, grey levels
-    residual: Array  # (N,), grey levels
-    converged: Array
+    M: Float[Array, "3 3"]  # rays to paper
+    blur_px2: Float[Array, " 3"]  # xx, xy, yy of S
+    covariance: Float[Array, "8 8"]  # of D in (I + D) M, by rows without the last entry
+    noise: Float[Array, ""]  # standard deviation of the residual, grey levels
+    contrast: Float[Array, ""]  # white minus black, grey levels
+    residual: Float[Array, " N"]  # grey levels
+    converged: Bool[Array, ""]
 
 
 class _Patch(NamedTuple):
@@ -78,7 +78,7 @@ class _State(NamedTuple):
     converged: Array
 
 
-def step_corners(cells: np.ndarray) -> np.ndarray:
+def step_corners(cells: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n+1 n+1"]:
     """The matrix K (n + 1, n + 1) of a pattern of cells (n, n), 1 white, 0 black."""
     return np.diff(np.diff(np.pad(1 - cells, 1), axis=0), axis=1)
 

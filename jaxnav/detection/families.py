@@ -4,6 +4,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import FAMILY_SIZES, opencv_dictionary_name
@@ -21,7 +22,7 @@ def dictionary(family: str) -> cv2.aruco.Dictionary:
 
 
 @cache
-def all_cells(family: str) -> np.ndarray:
+def all_cells(family: str) -> Float[np.ndarray, "ids n n"]:
     """Cells of all markers of a family with their black frames, (ids, n, n) float."""
     codes = dictionary(family)
     n = codes.markerSize + 2
@@ -32,6 +33,6 @@ def all_cells(family: str) -> np.ndarray:
     return np.array(cells, float)
 
 
-def marker_cells(family: str, marker_id: int) -> np.ndarray:
+def marker_cells(family: str, marker_id: int) -> Float[np.ndarray, "n n"]:
     """Cells of a marker with its black frame, (n, n) float: 1 white, 0 black, top row first."""
     return all_cells(family)[marker_id]

@@ -1,6 +1,7 @@
 """Detection of a map's markers, of all its families, in the images of a rig."""
 
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxnav.detection import Detections, make_detectors
 from jaxnav.models.camera import Camera
@@ -22,7 +23,9 @@ class ImageSearch:
         self._detectors = make_detectors(markers, corner_backend)
         self._lenses: dict[int, Camera] = {}
 
-    def detections(self, camera: int, image: np.ndarray) -> Detections:
+    def detections(
+        self, camera: int, image: UInt8[np.ndarray, "rows columns *channels"]
+    ) -> Detections:
         """Detect all markers of the map's families in a camera's image.
 
         Args:
@@ -37,7 +40,9 @@ class ImageSearch:
         )
 
 
-def size_problem(rig: CameraRig, camera: int, image: np.ndarray) -> str | None:
+def size_problem(
+    rig: CameraRig, camera: int, image: UInt8[np.ndarray, "rows columns *channels"]
+) -> str | None:
     """Say in words how the image's size differs from the camera's; None if it doesn't."""
     height, width = image.shape[:2]
     expected = rig.image_sizes_px[camera]

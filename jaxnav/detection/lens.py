@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
+from jaxtyping import Float, Num
 
 from jaxnav.compiling.executables import kept
 from jaxnav.detection.edges import PIXELS
@@ -32,7 +33,9 @@ class Lens:
 
     camera: Camera | None = None
 
-    def rays(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rays(
+        self, pixels: Num[np.ndarray, "N 2"]
+    ) -> tuple[Float[np.ndarray, "3 N"], Float[np.ndarray, "2 3 N"]]:
         """Rays (3, N) through pixels (N, 2), and their derivatives (2, 3, N), per px.
 
         N is at most PIXELS.
@@ -48,7 +51,7 @@ class Lens:
         )
         return rays.T, jacobian.T
 
-    def pixels(self, rays: np.ndarray) -> np.ndarray:
+    def pixels(self, rays: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
         """Project rays (N, 3) to pixels (N, 2). Compiles once for each N."""
         if self.camera is None:
             return rays[:, :2] / rays[:, 2:]

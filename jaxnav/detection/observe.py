@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxnav.detection.types import Detections
 from jaxnav.models.markers import MarkerMap
@@ -23,9 +24,9 @@ class CornerLanes(NamedTuple):
         duplicates: number of detections dropped because their image shows their id elsewhere too.
     """
 
-    corners_px: np.ndarray
-    visible: np.ndarray
-    sigma_px: np.ndarray
+    corners_px: Float[np.ndarray, "C M 4 2"]
+    visible: Bool[np.ndarray, "C M"]
+    sigma_px: Float[np.ndarray, "C M 4"]
     unknown: int
     duplicates: int
 

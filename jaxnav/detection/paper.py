@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 Numbers = Any  # a NumPy or a JAX array; functions return the kind they get
 
@@ -58,13 +59,13 @@ def blur_on_paper(xy_px: Numbers, S: Numbers) -> Numbers:
     return _library(xy_px).stack([xx, yy, xy])
 
 
-def homography(rays: np.ndarray) -> np.ndarray:
+def homography(rays: Float[np.ndarray, "4 3"]) -> Float[np.ndarray, "3 3"]:
     """The homography M (3, 3) that takes the corner rays (4, 3), TL TR BR BL, to the paper."""
     M = _basis(np.column_stack([SQUARE, np.ones(4)])) @ np.linalg.inv(_basis(rays))
     return M / (M @ rays.mean(axis=0))[2]
 
 
-def rays_of(M: np.ndarray, xy: np.ndarray) -> np.ndarray:
+def rays_of(M: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
     """Rays (N, 3) through points (N, 2) on the paper."""
     return np.linalg.solve(M, np.vstack([xy.T, np.ones(len(xy))])).T
 

@@ -9,6 +9,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jaxnav.detection.edges import PIXEL_VARIANCE_PX2
 from jaxnav.detection.families import all_cells
@@ -31,7 +32,10 @@ _MAX_NOISE = 0.15  # of the contrast, after the fit of the whole marker
 
 
 def read_marker(
-    image: np.ndarray, corners_px: np.ndarray, family: str, lens: Lens
+    image: UInt8[np.ndarray, "rows columns"],
+    corners_px: Float[np.ndarray, "4 2"],
+    family: str,
+    lens: Lens,
 ) -> tuple[int, RefinedMarker] | None:
     """Read id and corners of the marker in a quadrilateral; None if there is no marker.
 
@@ -63,7 +67,7 @@ def read_marker(
 
 
 @cache
-def codes_of(family: str) -> np.ndarray:
+def codes_of(family: str) -> Float[np.ndarray, "codes cells"]:
     """Ink inside the frame, (4 * ids, cells): each marker after 0..3 quarter turns."""
     inner = 1 - all_cells(family)[:, 1:-1, 1:-1]
     # After k clockwise turns, the marker's own top-left corner is corner k of the image.
@@ -117,7 +121,9 @@ def _cells_in_image(fitted: MarkerFit, n: int, lens: Lens) -> np.ndarray:
     return (rows[:, None] * columns[None]).reshape(n * n, -1)
 
 
-def frames_first(image: np.ndarray, quads: list[np.ndarray]) -> list[np.ndarray]:
+def frames_first(
+    image: UInt8[np.ndarray, "rows columns"], quads: list[Float[np.ndarray, "4 2"]]
+) -> list[Float[np.ndarray, "4 2"]]:
     """The quadrilaterals that are darker inside their edges than outside, the clearest first.
 
     Levels are sampled a little inside and outside of the edges, for all quadrilaterals at once.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import jax
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 
 from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges, step_corners
 from jaxnav.detection.lens import Lens
@@ -26,8 +27,8 @@ _MODEL_SIGMA_PX = 0.006
 class MarkerFit:
     """A fit and its pixels. M takes the lens's rays to the paper."""
 
-    M: np.ndarray
-    pixels: np.ndarray  # (N, 2) int
+    M: Float[np.ndarray, "3 3"]
+    pixels: Int[np.ndarray, "N 2"]
     edges: EdgeFit
 
 
@@ -43,17 +44,17 @@ class RefinedMarker:
         fitted: the fit; None if it failed.
     """
 
-    corners_px: np.ndarray
-    sigma_px: np.ndarray
+    corners_px: Float[np.ndarray, "4 2"]
+    sigma_px: Float[np.ndarray, " 4"]
     noise: float
     good: bool
     fitted: MarkerFit | None
 
 
 def refine_corners(
-    image: np.ndarray,
-    corners_px: np.ndarray,
-    cells: np.ndarray,
+    image: UInt8[np.ndarray, "rows columns"],
+    corners_px: Float[np.ndarray, "4 2"],
+    cells: Float[np.ndarray, "n n"],
     lens: Lens,
     whole: bool = False,
 ) -> RefinedMarker:
@@ -92,7 +93,11 @@ def refine_corners(
 
 
 def fit_marker(
-    image: np.ndarray, corners_px: np.ndarray, cells: np.ndarray, lens: Lens, whole: bool
+    image: UInt8[np.ndarray, "rows columns"],
+    corners_px: Float[np.ndarray, "4 2"],
+    cells: Float[np.ndarray, "n n"],
+    lens: Lens,
+    whole: bool,
 ) -> MarkerFit | None:
     """Fit the marker and return the fit, good or not; None if the image shows too little of it."""
     M = homography(lens.rays(corners_px)[0].T)
@@ -112,12 +117,12 @@ def fit_marker(
     return MarkerFit(np.asarray(fit.M, float) @ M, pixels, fit)
 
 
-def mean_side_px(corners_px: np.ndarray) -> float:
+def mean_side_px(corners_px: Float[np.ndarray, "4 2"]) -> float:
     """Mean length of the four sides of a quadrilateral (4, 2), px."""
     return float(np.mean(np.linalg.norm(corners_px - np.roll(corners_px, 1, 0), axis=1)))
 
 
-def corners_of(M: np.ndarray, lens: Lens) -> np.ndarray:
+def corners_of(M: Float[np.ndarray, "3 3"], lens: Lens) -> Float[np.ndarray, "4 2"]:
     """Pixels (4, 2) of the corners, TL TR BR BL, of the marker with homography M."""
     return lens.pixels(rays_of(M, SQUARE))
 

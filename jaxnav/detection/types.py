@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.lens import Lens
@@ -27,10 +28,10 @@ class Detections:
         families: the family of each marker.
     """
 
-    ids: np.ndarray
-    corners_px: np.ndarray
-    sigma_px: np.ndarray
-    refined: np.ndarray
+    ids: Int[np.ndarray, " N"]
+    corners_px: Float[np.ndarray, "N 4 2"]
+    sigma_px: Float[np.ndarray, "N 4"]
+    refined: Bool[np.ndarray, " N"]
     families: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -55,9 +56,9 @@ class Detector(Protocol):
 
     def detect(
         self,
-        image: np.ndarray,
+        image: UInt8[np.ndarray, "rows columns *channels"],
         camera: Camera | None = None,
-        predicted_corners_px: np.ndarray | None = None,
+        predicted_corners_px: Float[np.ndarray, "K 4 2"] | None = None,
     ) -> Detections:
         """Detect all markers of the family in the image.
 
@@ -79,10 +80,10 @@ class RegionDetector(Protocol):
 
     def detect_near(
         self,
-        image: np.ndarray,
+        image: UInt8[np.ndarray, "rows columns *channels"],
         camera: Camera | None,
-        quads_px: np.ndarray,
-        radius_px: np.ndarray,
+        quads_px: Float[np.ndarray, "K 4 2"],
+        radius_px: Float[np.ndarray, " K"],
     ) -> Detections:
         """Detect markers near their expected places, and nowhere else.
 
@@ -94,7 +95,7 @@ class RegionDetector(Protocol):
         ...
 
 
-def grey(image: np.ndarray) -> np.ndarray:
+def grey(image: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "rows columns"]:
     """The image in grey levels, (H, W) uint8.
 
     Raises:
@@ -111,8 +112,8 @@ def grey(image: np.ndarray) -> np.ndarray:
 
 
 def refine_detections(
-    image: np.ndarray,
-    markers: Sequence[tuple[int, np.ndarray]],
+    image: UInt8[np.ndarray, "rows columns"],
+    markers: Sequence[tuple[int, Float[np.ndarray, "4 2"]]],
     family: str,
     camera: Camera | None,
 ) -> Detections:

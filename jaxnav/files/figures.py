@@ -12,6 +12,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.files import poses
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
@@ -40,7 +41,7 @@ class CameraFigures:
     center_px: tuple[float, float]
     distortion: tuple[float, ...]
     image_size_px: tuple[int, int]
-    T_camera_vehicle: np.ndarray | None = None
+    T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None
 
     @staticmethod
     def create(
@@ -49,7 +50,7 @@ class CameraFigures:
         pinhole_px: Sequence[float],
         distortion: Sequence[float],
         image_size_px: Sequence[int],
-        T_camera_vehicle: np.ndarray | None = None,
+        T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None,
     ) -> "CameraFigures":
         """A camera from fx fy cx cy and coefficients; missing last coefficients are zero."""
         fx, fy, cx, cy = (float(value) for value in pinhole_px)
@@ -80,7 +81,7 @@ class MarkerFigures:
     id: int
     family: str
     size_m: float
-    T_world_marker: np.ndarray
+    T_world_marker: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"]
 
 
 def rig_from_figures(cameras: Sequence[CameraFigures]) -> CameraRig:
@@ -116,7 +117,7 @@ def figures_of_rig(rig: CameraRig) -> list[CameraFigures]:
     return figures
 
 
-def to_se3(pose: np.ndarray) -> jaxlie.SE3:
+def to_se3(pose: Float[np.ndarray, " 7"]) -> jaxlie.SE3:
     """A pose (7,) as jaxlie's, in the process's precision."""
     return jaxlie.SE3(jnp.asarray(pose, float))
 

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxnav.errors import BadInput, libraries_silenced
 from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
 
 
-def decode_image(raw: bytes | np.ndarray, flags: int = cv2.IMREAD_COLOR) -> np.ndarray | None:
+def decode_image(
+    raw: bytes | UInt8[np.ndarray, " N"], flags: int = cv2.IMREAD_COLOR
+) -> UInt8[np.ndarray, "rows columns *channels"] | None:
     """Decode an image to uint8, by default (H, W, 3) in BGR order; None where that fails.
 
     Args:
@@ -31,7 +34,9 @@ def decode_image(raw: bytes | np.ndarray, flags: int = cv2.IMREAD_COLOR) -> np.n
     return None if image is None else np.asarray(image)
 
 
-def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
+def read_image(
+    path: Path, flags: int = cv2.IMREAD_COLOR
+) -> UInt8[np.ndarray, "rows columns *channels"]:
     """Read the image in a file; see `decode_image`.
 
     Raises:
@@ -49,7 +54,7 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
     return image
 
 
-def image_problem(raw: bytes | np.ndarray) -> str | None:
+def image_problem(raw: bytes | UInt8[np.ndarray, " N"]) -> str | None:
     """The reason why an image is not to be decoded; None where decoding can be tried."""
     if len(raw) > limits.IMAGE_BYTES:
         return f"is larger than {limits.IMAGE_BYTES // limits.MIB} MiB"

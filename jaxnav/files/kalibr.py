@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from jaxtyping import Float
 from pydantic import Field, field_validator, model_validator
 
 from jaxnav.errors import BadInput
@@ -101,7 +102,11 @@ class KalibrCamera(ForeignEntry):
             raise ValueError(f"intrinsics, resolution: {problem}")
         return self
 
-    def figures(self, name: str, T_camera_vehicle: np.ndarray | None = None) -> CameraFigures:
+    def figures(
+        self,
+        name: str,
+        T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None,
+    ) -> CameraFigures:
         """The camera under a given name at a given place."""
         lens = _LENS[self.distortion_model]
         coefficients = [] if lens == "none" else self.distortion_coeffs

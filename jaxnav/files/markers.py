@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Float
 from pydantic import Field, field_validator, model_validator
 
 from jaxnav.files import poses
@@ -128,7 +129,7 @@ def load_markers(path: str | Path) -> MarkerMap:
 
 
 def marker_map(
-    Ts_world_marker: np.ndarray,
+    Ts_world_marker: Float[np.ndarray, "M 7"],
     size_m: list[float],
     ids: list[int],
     families: list[str],
@@ -220,7 +221,7 @@ def markers_left_out(file: MarkerFile) -> list[str]:
     return left_out + ([f"sigma (of {sigmas} markers)"] if sigmas else [])
 
 
-def fit_square(corners_m: np.ndarray, size_m: float) -> np.ndarray:
+def fit_square(corners_m: Float[np.ndarray, "4 3"], size_m: float) -> Float[np.ndarray, " 7"]:
     """The pose (7,) wxyz_xyz of the square marker that fits measured corners (4, 3) best.
 
     Any square of the right side is a marker facing one way or the other; a bow tie, a rectangle

@@ -11,13 +11,16 @@ from pathlib import Path
 from typing import IO, cast
 
 import numpy as np
+from jaxtyping import Shaped
 
 from jaxnav.files import limits
 
 _PIECE = 2**20  # the most bytes read at once, by zip too for its list of files
 
 
-def read_npz(path: Path, keys: Collection[str] | None = None) -> Mapping[str, np.ndarray]:
+def read_npz(
+    path: Path, keys: Collection[str] | None = None
+) -> Mapping[str, Shaped[np.ndarray, "..."]]:
     """Read the arrays of an .npz: all of them, or those of some keys that it has.
 
     Raises:

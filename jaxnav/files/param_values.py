@@ -8,6 +8,7 @@ import math
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.errors import BadInput
 from jaxnav.files.validation import show_value
@@ -19,7 +20,7 @@ _LEAST_EIGENVALUE = 1e-6
 _SYMMETRY = 1e-6  # relative to the geometric mean of the two variances: what float32 leaves
 
 
-def param_array(value: Any, where: str, may_be_matrix: bool) -> np.ndarray:
+def param_array(value: Any, where: str, may_be_matrix: bool) -> Float[np.ndarray, "..."]:
     """Check a parameter's numbers and return them unchanged as an array (), (d,) or (d, d).
 
     Args:

@@ -22,6 +22,7 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 import numpy as np
 import yaml
+from jaxtyping import Float
 from pydantic import Field
 
 from jaxnav.errors import BadInput
@@ -53,7 +54,7 @@ class Params:
         prefix: the key in the file that holds `parameters`; empty where none does.
     """
 
-    values: dict[str, np.ndarray]
+    values: dict[str, Float[np.ndarray, "..."]]
     provenance: dict[str, Any]
     path: Path
     prefix: str = field(default="", kw_only=True)

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 # Rounding in a file is repaired up to this deviation; beyond, the matrix is no rotation.
 _MAX_DEVIATION = 1e-3
@@ -43,7 +44,9 @@ def check_quaternion(wxyz: list[float]) -> list[float]:
     return wxyz
 
 
-def pose_from_matrix(T: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+def pose_from_matrix(
+    T: Sequence[Sequence[float]] | np.ndarray,
+) -> Float[np.ndarray, " 7"]:
     """The pose (7,) of a 4x4 that `check_matrix` accepts; R becomes the nearest rotation.
 
     Source: Shepperd (1978), "Quaternion from rotation matrix".
@@ -76,21 +79,25 @@ def pose_from_matrix(T: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
 
 def pose_from_quaternion(
     wxyz: Sequence[float] | np.ndarray, xyz_m: Sequence[float] | np.ndarray
-) -> np.ndarray:
+) -> Float[np.ndarray, " 7"]:
     """The pose (7,), normalised only if the length is off by more than float32's rounding."""
     q = np.asarray(wxyz, float)
     length = np.linalg.norm(q)
     return np.concatenate([q if abs(length - 1) < 1e-6 else q / length, np.asarray(xyz_m, float)])
 
 
-def pose_as_read(written: np.ndarray) -> np.ndarray:
+def pose_as_read(
+    written: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, " 7"]:
     """The pose (7,) of a pose as it is written, (7,) or (4, 4)."""
     if written.shape == (4, 4):
         return pose_from_matrix(written)
     return pose_from_quaternion(written[:4], written[4:])
 
 
-def matrix_as_read(written: np.ndarray) -> np.ndarray:
+def matrix_as_read(
+    written: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "4 4"]:
     """The 4x4 of a pose as it is written, (7,) or (4, 4)."""
     return written if written.shape == (4, 4) else matrix(written)
 
@@ -107,7 +114,9 @@ def quaternion_product(p: Sequence[float], q: Sequence[float]) -> list[float]:
     ]
 
 
-def pose_from_rotation_vector(rotation_rad: Sequence[float], xyz_m: Sequence[float]) -> np.ndarray:
+def pose_from_rotation_vector(
+    rotation_rad: Sequence[float], xyz_m: Sequence[float]
+) -> Float[np.ndarray, " 7"]:
     """The pose (7,) of a rotation vector, rad, and a translation, m."""
     rotation = np.asarray(rotation_rad, float)
     half = np.linalg.norm(rotation) / 2
@@ -117,14 +126,17 @@ def pose_from_rotation_vector(rotation_rad: Sequence[float], xyz_m: Sequence[flo
     )
 
 
-def transform(R: np.ndarray, translation_m: np.ndarray | Sequence[float]) -> np.ndarray:
+def transform(
+    R: Float[np.ndarray, "*batch 3 3"],
+    translation_m: np.ndarray | Sequence[float],
+) -> Float[np.ndarray, "*batch 4 4"]:
     """The 4x4 of a rotation (..., 3, 3) and a translation (..., 3), m."""
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, translation_m, 1
     return T
 
 
-def matrix(pose: np.ndarray) -> np.ndarray:
+def matrix(pose: Float[np.ndarray, " 7"]) -> Float[np.ndarray, "4 4"]:
     """The 4x4 of a pose (7,)."""
     w, x, y, z = pose[:4] / np.linalg.norm(pose[:4])
     R = [
@@ -135,18 +147,22 @@ def matrix(pose: np.ndarray) -> np.ndarray:
     return transform(np.array(R), pose[4:])
 
 
-def inverse(pose: np.ndarray) -> np.ndarray:
+def inverse(pose: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
     """The pose T_b_a of T_a_b."""
     translation = -matrix(pose)[:3, :3].T @ pose[4:]
     return np.concatenate([pose[:4] * [1, -1, -1, -1], translation])
 
 
-def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
+def compose(
+    T_a_b: Float[np.ndarray, " 7"], T_b_c: Float[np.ndarray, " 7"]
+) -> Float[np.ndarray, " 7"]:
     """The pose T_a_c."""
     return pose_from_matrix(matrix(T_a_b) @ matrix(T_b_c))
 
 
-def rotation_towards(yaw_deg: float, elevation_deg: float, roll_deg: float) -> np.ndarray:
+def rotation_towards(
+    yaw_deg: float, elevation_deg: float, roll_deg: float
+) -> Float[np.ndarray, "3 3"]:
     """The rotation R_vehicle_camera (3, 3) of a camera that looks in a direction.
 
     Args:

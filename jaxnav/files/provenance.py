@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Shaped
 from pydantic import Field
 
 from jaxnav.errors import BadInput
@@ -27,7 +28,7 @@ class Calibrated(Entry):
     data_sha256: Annotated[str, Field(strict=True, pattern=r"^[0-9a-f]{64}$")]
 
 
-def calibrated_now(tool: str, data: Iterable[Path | np.ndarray]) -> Calibrated:
+def calibrated_now(tool: str, data: Iterable[Path | Shaped[np.ndarray, "..."]]) -> Calibrated:
     """The provenance of a calibration made today.
 
     Args:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 from pydantic import AfterValidator
 
 REFUSED = "refused"
@@ -113,7 +114,7 @@ def outside(allowed: Range, value: float) -> str:
     return f"must be from {allowed.least:.9g} to {allowed.most:.9g}{unit}, got {got}"
 
 
-def is_within(name: str, values: Any) -> np.ndarray:
+def is_within(name: str, values: Any) -> Bool[np.ndarray, "..."]:
     """Which of an array's numbers are in the range; NaN and infinities are not."""
     inside: np.ndarray = np.asarray(RANGES[name].holds(np.asarray(values)))
     return inside

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from jaxtyping import Float
 from pydantic import Field, field_validator, model_validator
 
 from jaxnav.errors import BadInput
@@ -255,7 +256,7 @@ def rig_left_out(file: RigFile) -> list[str]:
     return left_out + [f"cameras.{entry.name}.sigma" for entry in file.cameras if entry.sigma]
 
 
-def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> np.ndarray:
+def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> Float[np.ndarray, " 7"]:
     """The pose T_camera_vehicle, (7,) wxyz_xyz, of a camera by its position and direction.
 
     Args:
@@ -266,14 +267,18 @@ def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> np.ndarra
     return poses.inverse(poses.pose_from_matrix(T_vehicle_camera))
 
 
-def written_pose(pose: QuaternionPose | Sequence[Sequence[float]]) -> np.ndarray:
+def written_pose(
+    pose: QuaternionPose | Sequence[Sequence[float]],
+) -> Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"]:
     """A pose as it is written, with the numbers of the file: (7,) wxyz_xyz or (4, 4)."""
     if isinstance(pose, QuaternionPose):
         return np.array([*pose.wxyz, *pose.xyz_m], float)
     return np.array(pose, float)
 
 
-def plain_pose(written: np.ndarray) -> dict[str, list[float]] | list[list[float]]:
+def plain_pose(
+    written: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"],
+) -> dict[str, list[float]] | list[list[float]]:
     """A pose in the plain values that we write."""
     if written.shape == (4, 4):
         rows: list[list[float]] = written.tolist()

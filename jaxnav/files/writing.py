@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from jaxtyping import Float
 
 from jaxnav.errors import BadInput
 from jaxnav.files.locking import create_temporary, naming_written, sweep
@@ -143,7 +144,11 @@ def write_json(path: str | Path, data: Any) -> None:
     atomic_write(path, json.dumps(plain_data(data), indent=2, allow_nan=False) + "\n")
 
 
-def write_tum(path: str | Path, stamps_s: np.ndarray, Ts_world_vehicle: np.ndarray) -> None:
+def write_tum(
+    path: str | Path,
+    stamps_s: Float[np.ndarray, " F"],
+    Ts_world_vehicle: Float[np.ndarray, "poses 7"],
+) -> None:
     """Write a trajectory in TUM's format: `stamp_s x y z qx qy qz qw` a line, which `evo` reads.
 
     Args:

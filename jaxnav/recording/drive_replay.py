@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxnav.detection import Detections
 from jaxnav.detection.image_search import ImageSearch, size_problem
@@ -170,7 +171,9 @@ def _words(value: Any) -> str:
     return value.name if isinstance(value, enum.Enum) else str(value)
 
 
-def recorded_pixels(log: DriveLog, image: RecordedImage, rig: CameraRig, camera: int) -> np.ndarray:
+def recorded_pixels(
+    log: DriveLog, image: RecordedImage, rig: CameraRig, camera: int
+) -> UInt8[np.ndarray, "rows columns 3"]:
     """The pixels of an image.
 
     Raises:

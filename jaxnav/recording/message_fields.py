@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
+from jaxtyping import Float, Shaped
 from pydantic import BeforeValidator, Field, WithJsonSchema
 from pydantic_core import core_schema
 
@@ -69,7 +70,7 @@ class Rows:
     in_world: Callable[[Any], Any] | None = None  # to the world's coordinates
 
     @property
-    def values(self) -> np.ndarray:
+    def values(self) -> Shaped[np.ndarray, "..."]:
         """The rows as an array."""
         rows = self.array[self.which]
         return np.asarray(rows if self.in_world is None else self.in_world(rows))
@@ -128,7 +129,7 @@ def _bytes(value: Any) -> bytes:
         raise ValueError("must be base64") from None
 
 
-def square(array: np.ndarray) -> np.ndarray:
+def square(array: Float[np.ndarray, " entries"]) -> Float[np.ndarray, "side side"]:
     """The square matrix of these values.
 
     Raises:

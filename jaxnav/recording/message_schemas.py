@@ -14,6 +14,7 @@ import json
 from typing import Annotated, Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from pydantic import BaseModel, Field, model_validator
 
 from jaxnav.files import limits
@@ -41,11 +42,11 @@ class SightedMessage(Entry):
     camera: Count
     stamp_ns: Stamp
     usable: Flag
-    ids: Annotated[np.ndarray, Array("integer")]
+    ids: Annotated[Int[np.ndarray, " N"], Array("integer")]
     families: list[Word]
-    corners_px: Annotated[np.ndarray, Array("number", (-1, 4, 2))]
-    sigma_px: Annotated[np.ndarray, Array("number", (-1, 4))]
-    refined: Annotated[np.ndarray, Array("boolean")]
+    corners_px: Annotated[Float[np.ndarray, "N 4 2"], Array("number", (-1, 4, 2))]
+    sigma_px: Annotated[Float[np.ndarray, "N 4"], Array("number", (-1, 4))]
+    refined: Annotated[Bool[np.ndarray, " N"], Array("boolean")]
     faults: Faults
 
     @model_validator(mode="after")

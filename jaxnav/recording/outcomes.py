@@ -12,6 +12,7 @@ from operator import attrgetter
 from typing import Annotated, Any, get_type_hints
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 from pydantic import AfterValidator, create_model, model_validator
 
 from jaxnav.belief.bicycle_kalman import planar_poses
@@ -66,7 +67,9 @@ class Column:
         value = self.of(outcome)
         return value.values if isinstance(value, Rows) else value
 
-    def column(self, values: Sequence[Any], where: str) -> np.ndarray | tuple[Any, ...]:
+    def column(
+        self, values: Sequence[Any], where: str
+    ) -> Shaped[np.ndarray, "..."] | tuple[Any, ...]:
         """The column of the messages' values.
 
         Raises:
@@ -171,40 +174,51 @@ class Outcomes:
         outvoted: N lists, ids of markers that were left out; older drives have none.
     """
 
-    now_ns: Annotated[np.ndarray, _field(Now, "now_ns", np.int64)]
-    stamp_ns: Annotated[np.ndarray, _field(Stamp, "stamp_ns", np.int64, default=None, missing=-1)]
-    health: Annotated[np.ndarray, _field(_HEALTH, "health", int, slack=0)]
-    faults: Annotated[np.ndarray, _field(Faults, "faults", int, slack=0)]
-    rejects: Annotated[np.ndarray, _field(_REJECTS, "rejects", int, slack=0)]
-    steering_rad: Annotated[np.ndarray, _field(Real, "steering_rad", float, slack=1)]
-    throttle: Annotated[np.ndarray, _field(Real, "throttle", float, slack=1)]
-    restarts: Annotated[np.ndarray, _field(Count, "restarts", int, slack=0)]
+    now_ns: Annotated[Int[np.ndarray, " N"], _field(Now, "now_ns", np.int64)]
+    stamp_ns: Annotated[
+        Int[np.ndarray, " N"], _field(Stamp, "stamp_ns", np.int64, default=None, missing=-1)
+    ]
+    health: Annotated[Int[np.ndarray, " N"], _field(_HEALTH, "health", int, slack=0)]
+    faults: Annotated[Int[np.ndarray, " N"], _field(Faults, "faults", int, slack=0)]
+    rejects: Annotated[Int[np.ndarray, " N"], _field(_REJECTS, "rejects", int, slack=0)]
+    steering_rad: Annotated[Float[np.ndarray, " N"], _field(Real, "steering_rad", float, slack=1)]
+    throttle: Annotated[Float[np.ndarray, " N"], _field(Real, "throttle", float, slack=1)]
+    restarts: Annotated[Int[np.ndarray, " N"], _field(Count, "restarts", int, slack=0)]
     reason: Annotated[tuple[str, ...], _field(Word, "restart_reason", None)]
     digest: Annotated[tuple[str, ...], _field(Word, lambda one: "", None)]
-    pose: Annotated[np.ndarray, _array((3,), _world_pose)]
-    covariance: Annotated[np.ndarray, _array((0, 0), lambda one: Rows(_covariance(one)), _SQUARE)]
-    located: Annotated[np.ndarray, _flag("output.located")]
-    decided: Annotated[np.ndarray, _flag("output.decided")]
-    done: Annotated[np.ndarray, _flag("output.done")]
-    flip_probability: Annotated[np.ndarray, _number("output.flip_probability", slack=1)]
-    nis: Annotated[np.ndarray, _number("output.nis", slack=_NIS_SLACK)]
-    hypothesis: Annotated[np.ndarray, _index("output.hypothesis")]
-    hypotheses: Annotated[tuple[np.ndarray, ...], _ragged((3,), _hypotheses)]
+    pose: Annotated[Float[np.ndarray, "N 3"], _array((3,), _world_pose)]
+    covariance: Annotated[
+        Float[np.ndarray, "N d d"],
+        _array((0, 0), lambda one: Rows(_covariance(one)), _SQUARE),
+    ]
+    located: Annotated[Bool[np.ndarray, " N"], _flag("output.located")]
+    decided: Annotated[Bool[np.ndarray, " N"], _flag("output.decided")]
+    done: Annotated[Bool[np.ndarray, " N"], _flag("output.done")]
+    flip_probability: Annotated[
+        Float[np.ndarray, " N"], _number("output.flip_probability", slack=1)
+    ]
+    nis: Annotated[Float[np.ndarray, " N"], _number("output.nis", slack=_NIS_SLACK)]
+    hypothesis: Annotated[Int[np.ndarray, " N"], _index("output.hypothesis")]
+    hypotheses: Annotated[tuple[Float[np.ndarray, "K 3"], ...], _ragged((3,), _hypotheses)]
     log_weight: Annotated[
-        tuple[np.ndarray, ...], _ragged((), lambda one: Rows(_log_weight(one), _initialised(one)))
+        tuple[Float[np.ndarray, " K"], ...],
+        _ragged((), lambda one: Rows(_log_weight(one), _initialised(one))),
     ]
-    Ts_vehicle_world: Annotated[tuple[np.ndarray, ...], _ragged((7,), _Ts_vehicle_world)]
+    Ts_vehicle_world: Annotated[
+        tuple[Float[np.ndarray, "M 7"], ...], _ragged((7,), _Ts_vehicle_world)
+    ]
     costs: Annotated[
-        tuple[np.ndarray, ...], _ragged((), lambda one: Rows(_costs(one), _valid(one)))
+        tuple[Float[np.ndarray, " M"], ...],
+        _ragged((), lambda one: Rows(_costs(one), _valid(one))),
     ]
-    selected: Annotated[np.ndarray, _index(_selected)]
+    selected: Annotated[Int[np.ndarray, " N"], _index(_selected)]
     outvoted: Annotated[
         tuple[list[int], ...],
         _field(list[Count], lambda one: list(one.outvoted) or None, None, default=[], missing=[]),
     ]
 
     @cached_property
-    def times_s(self) -> np.ndarray:
+    def times_s(self) -> Float[np.ndarray, " N"]:
         """Time since the first outcome, (N,)."""
         return np.asarray((self.now_ns - self.now_ns[:1]) / 1e9)
 

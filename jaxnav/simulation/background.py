@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.simulation.scene import TEXTURE_LEVELS, TEXTURE_SIZE, Scene, Surface
 from jaxnav.simulation.viewing import BACKGROUND_PX, CELL_PX, MovingCamera
@@ -18,7 +19,7 @@ _BAND_PX = 32  # rows shaded at a time: few enough for the processor's cache
 _TINY = np.float32(1e-12)
 
 
-def render_background(scene: Scene, view: MovingCamera) -> np.ndarray:
+def render_background(scene: Scene, view: MovingCamera) -> Float[np.ndarray, "rows columns"]:
     """Render surfaces and sky: light (H, W) float32."""
     lens = view.lens
     image = np.full((lens.rows, lens.columns), np.float32(scene.sky_grey))
@@ -85,8 +86,16 @@ class _Plane:
 
 
 def meet(
-    surface: Surface, H: np.ndarray, height: np.ndarray, rays: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    surface: Surface,
+    H: Float[np.ndarray, "*batch 3 3"],
+    height: Float[np.ndarray, "*batch"],
+    rays: Float[np.ndarray, "*batch 3 W"],
+) -> tuple[
+    Float[np.ndarray, "*batch W"],
+    Float[np.ndarray, "*batch W"],
+    Float[np.ndarray, "*batch W"],
+    Float[np.ndarray, "*batch W"],
+]:
     """Intersect rays (..., 3, W) with a surface: x, y in m, 1 / n.r, 1 / distance (0: no hit)."""
     hit = H @ rays
     W = hit[..., 2, :]

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jaxnav.models.camera import Camera
@@ -36,7 +37,7 @@ class BoardRenderer:
         self,
         camera: Camera,
         image_size_px: tuple[int, int],
-        ink: np.ndarray,
+        ink: Bool[np.ndarray, "rows columns"],
         module_m: float,
         sensor: Sensor | None = None,
         shutter: Shutter | None = None,
@@ -63,18 +64,22 @@ class BoardRenderer:
         sheet = Print.centred(np.eye(4), module_m, grey)
         self._renderer = Renderer(scene, rig, shutter, sensor, prints=(sheet,))
 
-    def render(self, T_camera_board: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def render(
+        self, T_camera_board: Float[np.ndarray, "4 4"], rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "rows columns"]:
         """The image (H, W) uint8 of a board at rest at the pose (4, 4)."""
         return self._renderer.render_still(_wxyz_xyz(np.linalg.inv(T_camera_board)), rng)[0]
 
-    def render_moving(self, T_board_camera_at: PoseAt, rng: np.random.Generator) -> np.ndarray:
+    def render_moving(
+        self, T_board_camera_at: PoseAt, rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "rows columns"]:
         """The image of a moving camera: see `Renderer.render`, with `stamp_s` = 0."""
         return self._renderer.render(T_board_camera_at, 0.0, rng)[0]
 
 
 def facing_pose(
     position_m: Sequence[float], tilt_deg: Sequence[float], roll_deg: float = 0.0
-) -> np.ndarray:
+) -> Float[np.ndarray, "4 4"]:
     """T_camera_board (4, 4) of a board rotated from the pose that faces the camera squarely.
 
     Args:

@@ -11,6 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief.evaluation import Branch, judge_branch
 from jaxnav.control import Command
@@ -24,10 +25,18 @@ from jaxnav.simulation.plant import CarState, OdometryNoise, move_through, read_
 PASSED_M = 0.30  # a waypoint counts as passed when the true car came this close
 _SUBSTEPS = 8  # between two events: some 5 ms each
 
-PoseAt = Callable[[np.ndarray], np.ndarray]  # times_s (N,) -> T_world_vehicle (N, 7), wxyz_xyz
+# times_s -> T_world_vehicle, wxyz_xyz
+PoseAt = Callable[[Float[np.ndarray, " N"]], Float[np.ndarray, "N 7"]]
 # The true motion around a stamp, the stamp, and what the driver believes (None at first) ->
-# corners (C, M, 4, 2), visible (C, M), sigma (C, M, 4) or None.
-Look = Callable[[PoseAt, float, Output | None], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
+# corners, visible, sigma or None.
+Look = Callable[
+    [PoseAt, float, Output | None],
+    tuple[
+        Float[np.ndarray, "C M 4 2"],
+        Bool[np.ndarray, "C M"],
+        Float[np.ndarray, "C M 4"] | None,
+    ],
+]
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,7 @@ class DriveFrame:
     """One step of a drive: the truth, and every method's output for the same observation."""
 
     stamp_s: float
-    true_pose: np.ndarray  # (3,)
+    true_pose: Float[np.ndarray, " 3"]
     observation: Observation
     outputs: Mapping[str, Output]
     branches: Mapping[str, Branch]
@@ -78,7 +87,7 @@ class Methods:
         return next(iter(self._navigators))
 
     def step(
-        self, observation: Observation, true_pose: jax.Array
+        self, observation: Observation, true_pose: Float[Array, " 3"]
     ) -> tuple[dict[str, Output], dict[str, Branch]]:
         """All outputs, on the host, and each choice judged against the truth."""
         outputs, branches = {}, {}
@@ -145,7 +154,9 @@ def drive(
         motion.command = believed.command
 
 
-def waypoints_passed(true_poses: np.ndarray, waypoints_m: np.ndarray) -> int:
+def waypoints_passed(
+    true_poses: Float[np.ndarray, "N 3"], waypoints_m: Float[np.ndarray, "W 2"]
+) -> int:
     """The number of waypoints, taken in order, that the true car came within 0.30 m of."""
     passed = 0
     for pose in true_poses:

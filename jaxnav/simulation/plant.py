@@ -8,7 +8,7 @@ vmapped and differentiated.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from jaxnav.control import Command
 from jaxnav.models import bicycle
@@ -66,7 +66,7 @@ def move_through(
 def read_odometry(
     state: CarState,
     noise: OdometryNoise,
-    key: Array,
+    key: Key[Array, ""],
     speed_scale: Float[Array, ""] | float | None = None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(speed_mps, steering_rad) as the sensors report them; the scale is `noise`'s by default."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.simulation.background import meet
 from jaxnav.simulation.scene import QUIET_ZONE_MODULES, Scene, Surface
@@ -29,14 +30,18 @@ _AHEAD = np.float32(1e-6)  # the least cosine between a ray and the normal of wh
 class Print:
     """A sheet of paper printed with a marker or any other grid of modules."""
 
-    T_world_marker: np.ndarray  # (4, 4)
-    T_world_sheet: np.ndarray  # (4, 4): x right, y down, z into the paper, from its top left
+    T_world_marker: Float[np.ndarray, "4 4"]
+    T_world_sheet: Float[np.ndarray, "4 4"]  # x right, y down, z into the paper, from its top left
     module_m: float
     radius_m: float  # of the paper, from the marker's centre
-    sheet: np.ndarray  # (rows, columns) grey
+    sheet: Float[np.ndarray, "rows columns"]  # grey
 
     @staticmethod
-    def centred(T_world_marker: np.ndarray, module_m: float, sheet: np.ndarray) -> "Print":
+    def centred(
+        T_world_marker: Float[np.ndarray, "4 4"],
+        module_m: float,
+        sheet: Float[np.ndarray, "rows columns"],
+    ) -> "Print":
         """The print whose middle is the origin of a marker's or a board's frame."""
         half_height_m, half_width_m = module_m * np.array(sheet.shape) / 2
         T_marker_sheet = np.diag([1.0, -1, -1, 1])
@@ -58,7 +63,10 @@ def prints_of(scene: Scene) -> list[Print]:
 
 
 def render_print(
-    marker: Print, surfaces: tuple[Surface, ...], view: MovingCamera, image: np.ndarray
+    marker: Print,
+    surfaces: tuple[Surface, ...],
+    view: MovingCamera,
+    image: Float[np.ndarray, "rows columns"],
 ) -> None:
     """Render one marker into an image of light, (H, W) float32, in place."""
     _, position = view.pose_at(np.zeros(()))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jaxnav.errors import BadInput
 from jaxnav.models.rig import CameraRig
@@ -20,7 +21,8 @@ from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor, Shutter
 from jaxnav.simulation.viewing import MovingCamera, PixelRays, PosePath
 
-PoseAt = Callable[[np.ndarray], np.ndarray]  # times_s (N,) -> T_world_vehicle (N, 7), wxyz_xyz
+# times_s -> T_world_vehicle, wxyz_xyz
+PoseAt = Callable[[Float[np.ndarray, " N"]], Float[np.ndarray, "N 7"]]
 
 _POSES = 33  # instants at which the motion is sampled, over one image
 _MAX_ROTATION_RAD = 0.01  # between two of them: linear interpolation is then 1.2e-5 rad off
@@ -66,7 +68,7 @@ class Renderer:
 
     def render(
         self, T_world_vehicle_at: PoseAt, stamp_s: float, rng: np.random.Generator
-    ) -> list[np.ndarray]:
+    ) -> list[UInt8[np.ndarray, "rows columns"]]:
         """One image of every camera.
 
         Args:
@@ -83,17 +85,21 @@ class Renderer:
         return self._for_all(lambda index: self.sensor.read_out(lights[index], streams[index]))
 
     def render_still(
-        self, T_world_vehicle: np.ndarray, rng: np.random.Generator
-    ) -> list[np.ndarray]:
+        self, T_world_vehicle: Float[np.ndarray, " 7"], rng: np.random.Generator
+    ) -> list[UInt8[np.ndarray, "rows columns"]]:
         """One image of every camera from a vehicle at rest at the pose (7,), wxyz_xyz."""
         return self.render(_at_rest(T_world_vehicle), 0.0, rng)
 
-    def light(self, T_world_vehicle_at: PoseAt, stamp_s: float) -> list[np.ndarray]:
+    def light(
+        self, T_world_vehicle_at: PoseAt, stamp_s: float
+    ) -> list[Float[np.ndarray, "rows columns"]]:
         """The light on the sensors, before noise, gain and rounding: (H, W) float32 each."""
         poses = self._poses_around(T_world_vehicle_at, stamp_s)
         return self._for_all(lambda index: self._one_camera(index, poses))
 
-    def light_still(self, T_world_vehicle: np.ndarray) -> list[np.ndarray]:
+    def light_still(
+        self, T_world_vehicle: Float[np.ndarray, " 7"]
+    ) -> list[Float[np.ndarray, "rows columns"]]:
         """`light` for a vehicle at rest at the pose (7,), wxyz_xyz."""
         return self.light(_at_rest(T_world_vehicle), 0.0)
 

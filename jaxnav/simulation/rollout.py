@@ -152,7 +152,7 @@ class Rollout(eqx.Module):
         after, trace = self.frame(world, step)
         return after, (trace, keep(world, after))
 
-    def first(self, key: Array) -> DriveState:
+    def first(self, key: Key[Array, ""]) -> DriveState:
         """The world of a drive before its first frame."""
         scenario = self.scenario
         key, start_key, rig_key = jax.random.split(key, 3)

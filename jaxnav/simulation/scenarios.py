@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Key
 
 from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.plant import CarState, OdometryNoise
@@ -60,7 +60,7 @@ class Scenario:
         shift = jnp.where(now, jnp.asarray(self.kidnapped_by, car.pose.dtype), 0)
         return eqx.tree_at(lambda c: c.pose, car, car.pose + shift)
 
-    def true_rig(self, rig: CameraRig, key: Array) -> CameraRig:
+    def true_rig(self, rig: CameraRig, key: Key[Array, ""]) -> CameraRig:
         """The true rig, if the navigator believes `rig`."""
         turn_rad, shift_m = self.extrinsics_off
         if turn_rad == 0 and shift_m == 0:
@@ -74,7 +74,7 @@ class Scenario:
         return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, jaxlie.SE3(wxyz_xyz))
 
     def other_sensors(
-        self, car: CarState, T_world_vehicle: jaxlie.SE3, key: Array
+        self, car: CarState, T_world_vehicle: jaxlie.SE3, key: Key[Array, ""]
     ) -> dict[str, Any]:
         """The further measurements that only `OrientationGiven` and `Oracle` use."""
         error = jax.random.normal(key, (), car.pose.dtype)

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import FAMILY_SIZES, MarkerMap, opencv_dictionary_name
@@ -31,12 +32,12 @@ class Surface:
     Its frame is x right, y up, z out of the plane towards the viewer, as a marker's.
     """
 
-    T_world_surface: np.ndarray  # (4, 4)
+    T_world_surface: Float[np.ndarray, "4 4"]
     bounds_m: tuple[float, float, float, float]  # x_min, x_max, y_min, y_max in its own frame
     mean_grey: float
     contrast_grey: float  # standard deviation of the texture
     texel_m: float  # the finest structure is about four of them wide
-    atlas: np.ndarray  # see `texture_atlas`
+    atlas: Float[np.ndarray, "rows columns"]  # see `texture_atlas`
     offset_m: tuple[float, float] = (0.0, 0.0)
 
 
@@ -46,7 +47,8 @@ class Scene:
 
     markers: MarkerMap
     surfaces: tuple[Surface, ...]
-    sheets: tuple[np.ndarray, ...]  # per marker, (modules, modules) grey, row 0 on top
+    # Per marker, grey, row 0 on top.
+    sheets: tuple[Float[np.ndarray, "modules modules"], ...]
     sky_grey: float = 165.0
 
     @staticmethod
@@ -87,7 +89,7 @@ def walls_behind(
     margin_m: float = 3.0,
     height_m: float = 2.5,
     floor: bool = True,
-    atlas: np.ndarray | None = None,
+    atlas: Float[np.ndarray, "rows columns"] | None = None,
 ) -> list[Surface]:
     """One wall in the plane of each marker; markers in one plane share a wall.
 
@@ -171,7 +173,7 @@ def _black_and_white(family: str, marker_id: int) -> np.ndarray:
     return cv2.aruco.generateImageMarker(dictionary, marker_id, modules) > 0
 
 
-def marker_sheet(family: str, marker_id: int) -> np.ndarray:
+def marker_sheet(family: str, marker_id: int) -> Float[np.ndarray, "modules modules"]:
     """The printed sheet of a marker in grey: one element per module, quiet zone included.
 
     Args:
@@ -186,7 +188,7 @@ def marker_sheet(family: str, marker_id: int) -> np.ndarray:
     return np.where(pattern, PAPER_GREY, INK_GREY).astype(np.float32)
 
 
-def plaster(rng: np.random.Generator) -> np.ndarray:
+def plaster(rng: np.random.Generator) -> Float[np.ndarray, "side side"]:
     """A tileable texture of a rough wall: 1 / frequency noise, (TEXTURE_SIZE,) * 2."""
     frequency = _frequency_cycles()
     spectrum = np.fft.fft2(rng.standard_normal((TEXTURE_SIZE, TEXTURE_SIZE)))
@@ -195,7 +197,7 @@ def plaster(rng: np.random.Generator) -> np.ndarray:
     return np.fft.ifft2(np.where(band, spectrum / np.maximum(frequency, 1), 0)).real
 
 
-def tiles(rng: np.random.Generator, per_side: int = 4) -> np.ndarray:
+def tiles(rng: np.random.Generator, per_side: int = 4) -> Float[np.ndarray, "side side"]:
     """A tileable texture of square floor tiles with dark joints, each of its own brightness."""
     side = TEXTURE_SIZE // per_side
     tone = np.kron(0.5 * rng.standard_normal((per_side, per_side)), np.ones((side, side)))
@@ -206,7 +208,7 @@ def tiles(rng: np.random.Generator, per_side: int = 4) -> np.ndarray:
     return np.fft.ifft2(np.fft.fft2(sharp) * _gaussian_response(_frequency_cycles(), 1.0)).real
 
 
-def texture_atlas(texture: np.ndarray) -> np.ndarray:
+def texture_atlas(texture: Float[np.ndarray, "side side"]) -> Float[np.ndarray, "rows columns"]:
     """All levels of a texture below one another in one image: zero mean, unit deviation.
 
     Level l is the texture without the detail that its texels cannot represent. Its texel i is at

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxnav.simulation.rollout import Trace
 from jaxnav.simulation.scenarios import Scenario
@@ -24,16 +25,16 @@ _POOLED_RESAMPLES = 100  # of all frames of all drives
 class Drives:
     """The scores of finished drives of one navigator in one scenario: (S,) or (S, frames)."""
 
-    counted: np.ndarray  # frames that have a pose
-    decided: np.ndarray  # counted frames whose branch is decided
-    late: np.ndarray  # counted frames after the first two seconds
-    wrong: np.ndarray
-    yaw_error_rad: np.ndarray  # not negative
-    position_error_m: np.ndarray
-    nees: np.ndarray
-    duration_s: np.ndarray
-    time_to_decide_s: np.ndarray
-    success: np.ndarray
+    counted: Bool[np.ndarray, "S frames"]  # frames that have a pose
+    decided: Bool[np.ndarray, "S frames"]  # counted frames whose branch is decided
+    late: Bool[np.ndarray, "S frames"]  # counted frames after the first two seconds
+    wrong: Bool[np.ndarray, "S frames"]
+    yaw_error_rad: Float[np.ndarray, "S frames"]  # not negative
+    position_error_m: Float[np.ndarray, "S frames"]
+    nees: Float[np.ndarray, "S frames"]
+    duration_s: Float[np.ndarray, " S"]
+    time_to_decide_s: Float[np.ndarray, " S"]
+    success: Bool[np.ndarray, " S"]
 
     @staticmethod
     def of(drives: Trace, scenario: Scenario) -> "Drives":

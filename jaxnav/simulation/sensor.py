@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jaxnav.errors import BadInput
 
@@ -25,7 +26,7 @@ class Shutter:
             if not (np.isfinite(getattr(self, key)) and getattr(self, key) >= 0):
                 raise BadInput(f"Shutter.{key}", "must be finite and not negative")
 
-    def row_times_s(self, rows: int) -> np.ndarray:
+    def row_times_s(self, rows: int) -> Float[np.ndarray, " rows"]:
         """The middle of each row's exposure, relative to the stamp, (rows,)."""
         return (np.arange(rows) - (rows - 1) / 2) * self.row_time_s
 
@@ -61,7 +62,9 @@ class Sensor:
             if not low < getattr(self, key) < high:
                 raise BadInput(f"Sensor.{key}", f"must be {wanted}, got {getattr(self, key)}")
 
-    def illuminate(self, light: np.ndarray, center_px: np.ndarray) -> np.ndarray:
+    def illuminate(
+        self, light: Float[np.ndarray, "rows columns"], center_px: Float[np.ndarray, " 2"]
+    ) -> Float[np.ndarray, "rows columns"]:
         """The scene's light after the lens's blur and vignetting, (H, W) float32."""
         if self.psf_sigma_px > 0:
             light = cv2.GaussianBlur(light, (0, 0), self.psf_sigma_px)
@@ -73,7 +76,9 @@ class Sensor:
             light = light * (1 - np.float32(self.vignetting) * r2 / r2.max())
         return light
 
-    def read_out(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def read_out(
+        self, light: Float[np.ndarray, "rows columns"], rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "rows columns"]:
         """The grey values of an image of light, (H, W) uint8."""
         grey = np.float32(self.gain) * light
         if self.noise:

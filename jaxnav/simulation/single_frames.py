@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import rotation_from_matrix
@@ -89,7 +89,11 @@ def T_vehicle_world_of(view: MarkerView, rig: CameraRig) -> jaxlie.SE3:
 
 
 def simulate_observation(
-    view: MarkerView, errors: CornerErrors, rig: CameraRig, markers: MarkerMap, key: Array
+    view: MarkerView,
+    errors: CornerErrors,
+    rig: CameraRig,
+    markers: MarkerMap,
+    key: Key[Array, ""],
 ) -> tuple[Observation, jaxlie.SE3]:
     """The observation of the marker, and T_world_vehicle, of one view (no batch axis)."""
     T_world_vehicle = T_vehicle_world_of(view, rig).inverse()
@@ -99,7 +103,7 @@ def simulate_observation(
 
 
 def corner_errors_px(
-    errors: CornerErrors, shape: tuple[int, ...], dtype: jnp.dtype, key: Array
+    errors: CornerErrors, shape: tuple[int, ...], dtype: jnp.dtype, key: Key[Array, ""]
 ) -> Float[Array, "C M 4 2"]:
     """Draw the errors to add to exact corners, shape (C, M, 4, 2)."""
     noise_key, bias_key, blur_key, streak_key = jax.random.split(key, 4)

@@ -3,12 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Num
 from scipy.stats import chi2
 
 _Z = 1.959963984540054  # 95 % of a normal distribution lies within
 
 
-def wilson_interval(rate: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def wilson_interval(
+    rate: Float[np.ndarray, "*S"], count: Num[np.ndarray, "*S"]
+) -> tuple[np.ndarray, np.ndarray]:
     """The ends of the 95 % interval of a proportion observed in `count` trials.
 
     Source: Wilson (1927).
@@ -22,12 +25,14 @@ def wilson_interval(rate: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np
 class Reliability:
     """Predicted and observed frequencies in bins of equal width."""
 
-    predicted: np.ndarray  # mean prediction of each bin
-    observed: np.ndarray
-    counts: np.ndarray
+    predicted: Float[np.ndarray, " bins"]  # mean prediction of each bin
+    observed: Float[np.ndarray, " bins"]
+    counts: Int[np.ndarray, " bins"]
 
     @staticmethod
-    def of(probability: np.ndarray, happened: np.ndarray, bins: int = 20) -> "Reliability":
+    def of(
+        probability: Float[np.ndarray, " N"], happened: Bool[np.ndarray, " N"], bins: int = 20
+    ) -> "Reliability":
         """Bin predictions in [0, 1], without empty bins."""
         index = np.minimum((probability * bins).astype(int), bins - 1)
         counts = np.bincount(index, minlength=bins)
@@ -37,7 +42,7 @@ class Reliability:
         return Reliability(predicted, observed, counts[used])
 
     @property
-    def intervals(self) -> tuple[np.ndarray, np.ndarray]:
+    def intervals(self) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]]:
         """The ends of the 95 % interval of every bin's frequency."""
         return wilson_interval(self.observed, self.counts)
 
@@ -52,7 +57,7 @@ class Reliability:
 
 
 def bootstrap_mean(
-    sums: np.ndarray, counts: np.ndarray, draws: int = 1000
+    sums: Num[np.ndarray, " S"], counts: Num[np.ndarray, " S"], draws: int = 1000
 ) -> tuple[float, float, float]:
     """The mean over the frames of all drives, and its 95 % interval by bootstrap over drives.
 

@@ -2,7 +2,7 @@
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Bool, Int, PyTree
 
 
 class DriveTraces:
@@ -13,7 +13,7 @@ class DriveTraces:
         self.chunk_frames = chunk_frames
         self.pieces: list[tuple[np.ndarray, np.ndarray, PyTree]] = []
 
-    def add(self, owner: np.ndarray, trace: PyTree) -> None:
+    def add(self, owner: Int[np.ndarray, " lanes"], trace: PyTree) -> None:
         """Add one chunk, leaves (lanes, frames, ...); `owner` is each lane's drive, -1 for none."""
         lanes = np.flatnonzero(owner >= 0)
         drive = owner[lanes]
@@ -21,7 +21,7 @@ class DriveTraces:
         self.pieces.append((drive, self.chunks[drive], piece))
         self.chunks[drive] += 1
 
-    def stack(self) -> tuple[PyTree, np.ndarray]:
+    def stack(self) -> tuple[PyTree, Bool[np.ndarray, "S frames"]]:
         """Stack drives of unequal lengths; an ended drive repeats its last frame.
 
         Returns:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
@@ -29,22 +30,23 @@ class PixelRays:
 
     rows: int
     columns: int
-    rays: np.ndarray  # (H, 3, W) float32 unit vectors through the pixels' centres
-    rays_dx: np.ndarray  # (H, 3, W) their change one pixel to the right
-    rays_dy: np.ndarray  # (H, 3, W) their change one pixel down
-    background_rays: np.ndarray  # (H, 4, 3, W) through the samples of the background
-    valid: np.ndarray  # (H, W) bool: pixels that have a ray
-    center_px: np.ndarray  # (2,) the principal point
+    rays: Float[np.ndarray, "rows 3 columns"]  # float32 unit vectors through the pixels' centres
+    rays_dx: Float[np.ndarray, "rows 3 columns"]  # their change one pixel to the right
+    rays_dy: Float[np.ndarray, "rows 3 columns"]  # their change one pixel down
+    # Through the samples of the background.
+    background_rays: Float[np.ndarray, "rows 4 3 columns"]
+    valid: Bool[np.ndarray, "rows columns"]  # pixels that have a ray
+    center_px: Float[np.ndarray, " 2"]  # the principal point
     pixel_rad: float  # the typical angle between neighbouring pixels
     finest_rad: float  # that angle where the lens resolves best
 
     @property
-    def nodes_y(self) -> np.ndarray:
+    def nodes_y(self) -> Int[np.ndarray, " nodes"]:
         """The rows of a coarse grid that spans the image."""
         return np.minimum(np.arange(0, self.rows + CELL_PX, CELL_PX), self.rows - 1)
 
     @property
-    def nodes_x(self) -> np.ndarray:
+    def nodes_x(self) -> Int[np.ndarray, " nodes"]:
         """The columns of a coarse grid that spans the image."""
         return np.minimum(np.arange(0, self.columns + CELL_PX, CELL_PX), self.columns - 1)
 
@@ -105,12 +107,12 @@ def _unproject_rows(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.A
 class PosePath:
     """The poses of the vehicle at a few instants, with linear interpolation between them."""
 
-    times_s: np.ndarray  # (N,) relative to the stamp
-    Rs_world_vehicle: np.ndarray  # (N, 3, 3)
-    positions_world_m: np.ndarray  # (N, 3)
+    times_s: Float[np.ndarray, " N"]  # relative to the stamp
+    Rs_world_vehicle: Float[np.ndarray, "N 3 3"]
+    positions_world_m: Float[np.ndarray, "N 3"]
 
     @staticmethod
-    def create(times_s: np.ndarray, wxyz_xyz: np.ndarray) -> "PosePath":
+    def create(times_s: Float[np.ndarray, " N"], wxyz_xyz: Float[np.ndarray, "N 7"]) -> "PosePath":
         """The motion of T_world_vehicle (N, 7), w x y z, x y z, at evenly spaced times."""
         wxyz = wxyz_xyz[:, :4] / np.linalg.norm(wxyz_xyz[:, :4], axis=1, keepdims=True)
         w, v = wxyz[:, 0, None, None], wxyz[:, 1:]
@@ -119,17 +121,19 @@ class PosePath:
         return PosePath(times_s, R, wxyz_xyz[:, 4:])
 
     @property
-    def rotation_steps_rad(self) -> np.ndarray:
+    def rotation_steps_rad(self) -> Float[np.ndarray, " steps"]:
         """The angle between neighbouring poses, (N-1,)."""
         chord = np.linalg.norm(np.diff(self.Rs_world_vehicle, axis=0), axis=(1, 2)) / np.sqrt(8)
         return 2 * np.arcsin(np.clip(chord, 0, 1))
 
     @property
-    def travel_steps_m(self) -> np.ndarray:
+    def travel_steps_m(self) -> Float[np.ndarray, " steps"]:
         """The distance between neighbouring poses, (N-1,)."""
         return np.linalg.norm(np.diff(self.positions_world_m, axis=0), axis=1)
 
-    def at(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at(
+        self, times_s: Float[np.ndarray, "*batch"]
+    ) -> tuple[Float[np.ndarray, "*batch 3 3"], Float[np.ndarray, "*batch 3"]]:
         """The rotation (..., 3, 3) and position (..., 3) in the world at any times (...)."""
         if len(self.times_s) == 1:
             shape = np.shape(times_s)
@@ -152,7 +156,11 @@ class MovingCamera:
     """One camera during one image: its motion, and the speed of its picture."""
 
     def __init__(
-        self, lens: PixelRays, motion: PosePath, T_vehicle_camera: np.ndarray, shutter: Shutter
+        self,
+        lens: PixelRays,
+        motion: PosePath,
+        T_vehicle_camera: Float[np.ndarray, "4 4"],
+        shutter: Shutter,
     ):
         self.lens, self._motion, self._T_vehicle_camera = lens, motion, T_vehicle_camera
         self.exposure_s = shutter.exposure_s
@@ -167,7 +175,9 @@ class MovingCamera:
             self._travel_m = float(np.max((travels_m + lever_m * turns_rad) / steps_s))
             self._travel_m *= self.exposure_s
 
-    def pose_at(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def pose_at(
+        self, times_s: Float[np.ndarray, "*batch"]
+    ) -> tuple[Float[np.ndarray, "*batch 3 3"], Float[np.ndarray, "*batch 3"]]:
         """T_world_camera at times (...) after the stamp: R (..., 3, 3) and position (..., 3)."""
         R, p = self._motion.at(times_s)
         T = self._T_vehicle_camera
@@ -178,8 +188,11 @@ class MovingCamera:
         return (self._turn_rad + self._travel_m / max(distance_m, 1e-3)) / self.lens.finest_rad
 
     def homographies(
-        self, T_world_surface: np.ndarray, rows: slice | np.ndarray, instants: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self,
+        T_world_surface: Float[np.ndarray, "4 4"],
+        rows: slice | Int[np.ndarray, " rows"],
+        instants: Float[np.ndarray, " K"],
+    ) -> tuple[Float[np.ndarray, "rows K 3 3"], Float[np.ndarray, "rows K"]]:
         """The homographies from camera rays to a surface, for each row at each instant.
 
         Args:

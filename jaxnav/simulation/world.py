@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxnav.control import Command
 from jaxnav.models.bicycle import Vehicle
@@ -36,7 +36,7 @@ class Spread:
     odometer_scale: tuple[float, float] = (0.95, 1.05)
     latency_s: tuple[float, float] = (-0.02, 0.03)
 
-    def draw(self, key: Array, truth: Truth, longest_s: float) -> Truth:
+    def draw(self, key: Key[Array, ""], truth: Truth, longest_s: float) -> Truth:
         """Draw a car around the nominal one.
 
         Args:
@@ -66,7 +66,7 @@ class Spread:
 class DriveState(eqx.Module):
     """The quantities that one seed drew, and the state of its drive."""
 
-    key: Array
+    key: Key[Array, ""]
     rig: CameraRig  # the true one
     truth: Truth
     bias: Float[Array, "C M 4 2"]  # directions in the image

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
@@ -63,7 +64,9 @@ def detections(edit: Callable[[Detections], Detections]) -> EditFrame:
     return edited
 
 
-def corners(edit: Callable[[np.ndarray], np.ndarray]) -> EditFrame:
+def corners(
+    edit: Callable[[Float[np.ndarray, "N 4 2"]], Float[np.ndarray, "N 4 2"]],
+) -> EditFrame:
     """Edit the corners (N, 4, 2) of frames."""
     return detections(
         lambda sightings: dataclasses.replace(sightings, corners_px=edit(sightings.corners_px))

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.loop.camera_delays import CameraDelays
 from jaxnav.loop.flags import Fault
@@ -36,7 +37,7 @@ class Step:
 
     input: Input
     outcome: Outcome
-    truth: np.ndarray
+    truth: Float[np.ndarray, " 5"]
 
 
 # An input -> the inputs that reach the pilot instead, each at its own time, not before.

@@ -8,6 +8,7 @@ import multiprocessing
 from multiprocessing.connection import Connection
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -17,7 +18,7 @@ _SPREAD_S = 0.02  # the track covers this time before and after a stamp
 _POSES = 9
 
 
-def track_times_s() -> np.ndarray:
+def track_times_s() -> Float[np.ndarray, " poses"]:
     """The instants of a track's poses relative to the stamp, s."""
     return np.linspace(-_SPREAD_S, _SPREAD_S, _POSES)
 
@@ -36,7 +37,9 @@ class RenderingProcess:
         theirs.close()
         self.render(np.tile([0.0, 0.0, 0.0], (_POSES, 1)))
 
-    def render(self, poses: np.ndarray) -> list[np.ndarray]:
+    def render(
+        self, poses: Float[np.ndarray, "poses 3"]
+    ) -> list[UInt8[np.ndarray, "rows columns"]]:
         """Render the image of every camera.
 
         Args:

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxnav.compiling.executables import kept
 from jaxnav.control import Command
@@ -102,7 +103,7 @@ class SimWorld:
             self.markers = eqx.tree_at(lambda m: m.size_m, self.markers, size_m)
             self.markers = eqx.tree_at(lambda m: m.Ts_world_marker.wxyz_xyz, self.markers, moved)
 
-    def state(self, at_ns: int) -> np.ndarray:
+    def state(self, at_ns: int) -> Float[np.ndarray, " 5"]:
         """(x_m, y_m, psi_rad, speed_mps, steering_rad) at an instant of the last two seconds."""
         with self._lock:
             self._advance(at_ns)
@@ -116,7 +117,7 @@ class SimWorld:
         share = (at_ns - older[0]) / (newer[0] - older[0])
         return np.asarray(older[1] + share * (newer[1] - older[1]))
 
-    def pose(self, at_ns: int) -> np.ndarray:
+    def pose(self, at_ns: int) -> Float[np.ndarray, " 7"]:
         """T_world_vehicle at an instant, (7,) wxyz_xyz."""
         x_m, y_m, psi_rad = self.state(at_ns)[:3]
         return np.array([np.cos(psi_rad / 2), 0, 0, np.sin(psi_rad / 2), x_m, y_m, 0])
