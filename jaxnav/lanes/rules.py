@@ -127,7 +127,7 @@ def _slice(args: list[Lane], params: Params, lanes: int) -> list[Value]:
 
 
 def _concatenate(args: list[Value], params: Params, lanes: int) -> list[Value]:
-    return [join_rows([rows_of(arg, lanes) for arg in args], params["dimension"])]
+    return [join_rows([rows_of(arg, lanes) for arg in args], int(params["dimension"]))]
 
 
 def _stack(args: list[Value], params: Params, lanes: int) -> list[Value]:
