@@ -24,7 +24,6 @@ from typing import IO, Any, cast
 
 import cv2
 import numpy as np
-from jaxtyping import Shaped
 from mcap.writer import Writer
 
 from jaxnav.errors import BadInput
@@ -113,7 +112,7 @@ class Recorder:
         """
         self._offer(topic, stamp_ns, message.get("now_ns", stamp_ns), message, is_image=False)
 
-    def image(self, topic: str, stamp_ns: int, image: bytes | Shaped[np.ndarray, "..."]) -> None:
+    def image(self, topic: str, stamp_ns: int, image: bytes | np.ndarray) -> None:
         """Record an image. Never waits, never raises.
 
         Args:
