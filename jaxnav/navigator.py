@@ -205,11 +205,8 @@ class Navigator(eqx.Module):
         command, done, log = None, jnp.asarray(False), None
         if self.controller is not None and control is not None:
             obs, pose = obs.usable(), estimate.pose
-            odometry = (
-                obs.steering_rad,
-                obs.dt_s,
-                jnp.where(obs.has_odometry, obs.speed_mps, jnp.nan),
-            )
+            measured_mps = jnp.where(obs.has_odometry, obs.speed_mps, jnp.nan)
+            odometry = obs.steering_rad, obs.dt_s, measured_mps
             steering_rad, dt_s, speed_mps = (jnp.asarray(x, pose.dtype) for x in odometry)
             nearest_m = self.markers.nearest_m(estimate.T_world_vehicle)
             control, command, done, log = self.controller(
