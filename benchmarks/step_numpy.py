@@ -59,11 +59,11 @@ class Result(NamedTuple):
 
 def memory(state: State) -> Memory:
     """A copy of jaxnav's state."""
-    belief, control = state.belief, state.control
+    bank, control = state.belief.bank, state.control
     assert control is not None
     return Memory(
-        *(np.asarray(leaf, float) for leaf in (belief.mean, belief.covariance, belief.log_weight)),
-        np.asarray(belief.initialised),
+        *(np.asarray(leaf, float) for leaf in (bank.mean, bank.covariance, bank.log_weight)),
+        np.asarray(bank.initialised),
         int(control.waypoint_index),
         float(control.integral_ms),
         float(control.explored_s),
