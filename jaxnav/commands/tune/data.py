@@ -15,11 +15,11 @@ from jaxnav.commands.bars import update_after_compiling
 from jaxnav.commands.reading import read_shown
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
+from jaxnav.commands.tune.drives import sequences_of_drive
 from jaxnav.commands.tune.sequences import (
     NamedSequences,
     join_sequences,
     navigator_of,
-    sequences_of_drive,
     sequences_of_recording,
 )
 from jaxnav.datasets.recordings import read_recording

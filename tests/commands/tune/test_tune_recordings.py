@@ -10,15 +10,17 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.commands.tune.sequences import (
-    GAP_S,
+from jaxnav.commands.tune.drives import (
     Event,
-    NamedSequences,
     believed_events,
-    join_sequences,
-    navigator_of,
     sequences_of_drive,
     sequences_of_inputs,
+)
+from jaxnav.commands.tune.sequences import (
+    GAP_S,
+    NamedSequences,
+    join_sequences,
+    navigator_of,
     sequences_of_recording,
 )
 from jaxnav.datasets.recording import Recording
