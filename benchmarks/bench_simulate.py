@@ -23,7 +23,7 @@ from jaxnav.belief.selectors import make_selector
 from jaxnav.configuration import configure
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.navigator import Navigator
-from jaxnav.simulation.rollout import Rollout
+from jaxnav.simulation.rollout import Rollout, nothing
 from jaxnav.simulation.scenarios import scenarios
 
 SELECTORS = ("paper-cost", "lowest-reprojection", "multi-hypothesis")
@@ -58,10 +58,10 @@ def timed(drives: Rollout, seeds: int) -> tuple[float, float, int]:
 def start(drives: Rollout, chunks: int = 1) -> float:
     """Steps a second of one thread in the first second, when the bank is full."""
     worlds = drives.start(_keys(drives.many_lanes))
-    jax.block_until_ready(drives._advance_many(worlds))  # compiled for this thread
+    jax.block_until_ready(drives._advance_many(worlds, nothing))  # compiled for this thread
     begin = time.perf_counter()
     for _ in range(chunks):
-        worlds, _ = drives._advance_many(worlds)
+        worlds, _ = drives._advance_many(worlds, nothing)
     jax.block_until_ready(worlds)
     return drives.many_lanes * drives.chunk_frames * chunks / (time.perf_counter() - begin)
 

@@ -18,9 +18,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.belief.ambiguity import Selector
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.evaluation import Branch, judge_branch
+from jaxnav.belief.kalman import nis
 from jaxnav.datasets.recording import Recording
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, limits
+from jaxnav.models.geometry import inverse_cayley
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import opposite, poses_in_world
 from jaxnav.models.rig import CameraRig
@@ -40,7 +42,9 @@ class Replay:
     T_world_vehicle: Float[np.ndarray, "F tracks 7"]
     seen: Bool[np.ndarray, "F tracks"]  # a marker of the track was in view
     located: Bool[np.ndarray, "F tracks"]
+    decided: Bool[np.ndarray, "F tracks"]
     flip_probability: Float[np.ndarray, "F tracks"]
+    nees: Float[np.ndarray, "F tracks"]  # of the pose, 6 dof; meaningless without a reference
     branch: Branch  # leaves (F, tracks); meaningless where there is no reference
     frames_per_second: float  # compilation excluded
     corner_sigma_px: float  # the filter's
@@ -109,19 +113,9 @@ def replay(
         chunks.append(jax.device_get(outputs))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
-    wxyz_xyz, seen, located, flip_probability, branch = jax.tree.map(
-        lambda *leaves: np.concatenate(leaves)[:total], *chunks
-    )
+    wxyz_xyz, *told = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *chunks)
     Ts_world_vehicle = np.asarray(poses_in_world(wxyz_xyz, recording.markers.origin_m))
-    return Replay(
-        Ts_world_vehicle,
-        seen,
-        located,
-        flip_probability,
-        branch,
-        total / elapsed_s,
-        corner_sigma_px,
-    )
+    return Replay(Ts_world_vehicle, *told, total / elapsed_s, corner_sigma_px)
 
 
 def estimate_corner_sigma_px(recording: Recording) -> float:
@@ -155,8 +149,8 @@ def _best_e1_px2(
     return jnp.min(jnp.where(candidates.valid, candidates.e1_px2, jnp.inf))
 
 
-# Of a frame: poses (tracks, 7), whether one was selected, located, the probability, the branch.
-_Told = tuple[Array, Array, Array, Array, Branch]
+# Of a frame: poses (tracks, 7), and the next six fields of `Replay`.
+_Told = tuple[Array, Array, Array, Array, Array, Array, Branch]
 
 
 @functools.partial(jax.jit, static_argnums=3)
@@ -171,8 +165,11 @@ def _run_chunk(
         state, out = eqx.tree_at(lambda n: n.markers, navigator, markers).step(state, obs)
         truth = jaxlie.SE3(frame.T_world_vehicle_true)
         branch = judge_branch(out.candidates, out.selected, truth)
-        pose = out.T_world_vehicle.wxyz_xyz
-        return state, (pose, out.selected >= 0, out.located, out.flip_probability, branch)
+        error = inverse_cayley(out.T_world_vehicle.inverse() @ truth)
+        nees = nis(error, out.covariance[:6, :6])
+        pose, seen = out.T_world_vehicle.wxyz_xyz, out.selected >= 0
+        told = (pose, seen, out.located, out.decided, out.flip_probability, nees, branch)
+        return state, told
 
     def step(state: State, frame: _Frames) -> tuple[State, _Told]:
         def alone(state: State, marker: Array) -> tuple[State, _Told]:

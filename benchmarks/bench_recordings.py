@@ -1,0 +1,85 @@
+"""Score selectors on recordings with a reference, every marker by itself.
+
+    python benchmarks/bench_recordings.py [NAME ...] [--frames N]
+
+The recordings are the folders of `JAXNAV_DATA`/tagslam, or of ../shared/data/tagslam. A pose of a
+marker is judged as `jaxnav replay --markers one-at-a-time` does: wrong where another candidate is
+nearer to the reference in angle, an outlier where none is within 10 degrees.
+"""
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+from jaxnav.configuration import configure
+
+configure(float64=True)  # before the first array, as the commands do
+
+import numpy as np  # noqa: E402
+
+from jaxnav.belief.selectors import make_selector  # noqa: E402
+from jaxnav.datasets.recordings import Recording, read_recording  # noqa: E402
+from jaxnav.datasets.replay import Replay, replay  # noqa: E402
+
+DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/data")) / "tagslam"
+CLAIM = 1e-3  # a flip probability below it is a claim to be sure
+# The log score of a probability of 0 that is wrong is infinite: none is taken for less than this.
+LEAST_PROBABILITY = 1e-6
+
+
+def score(recording: Recording, result: Replay) -> dict[str, float]:
+    """The shares of wrong poses and of claims, the log score, and ANEES, of one replay."""
+    assert recording.reference is not None
+    judged = result.seen & recording.reference.valid[:, None]
+    wrong = np.asarray(result.branch.wrong)[judged]
+    outlier = np.asarray(result.branch.outlier)[judged]
+    doubt = result.flip_probability[judged]
+    claimed = (doubt < CLAIM) & result.decided[judged]
+    probability = np.clip(doubt, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)[~outlier]
+    log_score = -np.where(wrong[~outlier], np.log(probability), np.log1p(-probability))
+    nees = result.nees[judged & result.located]
+    constant = max(float(np.mean(wrong[~outlier])), 1e-12)
+    return {
+        "poses": len(wrong),
+        "wrong %": 100 * np.mean(wrong),
+        "outliers %": 100 * np.mean(outlier),
+        "claimed %": 100 * np.mean(claimed),
+        "wrong of those %": 100 * np.mean(wrong[claimed]) if claimed.any() else np.nan,
+        "log score": float(np.mean(log_score)),
+        "of a constant": -(constant * np.log(constant) + (1 - constant) * np.log1p(-constant)),
+        "ANEES": float(np.mean(nees)),
+        "NEES median": float(np.median(nees)),
+    }
+
+
+def main() -> None:
+    """Print a row for each recording and selector."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", help="folders of tagslam; all of them by default")
+    parser.add_argument("--frames", type=int, default=3000, help="at most so many of each")
+    parser.add_argument(
+        "--selectors", nargs="*", default=["lowest-reprojection", "multi-hypothesis"]
+    )
+    args = parser.parse_args()
+    head_is_printed = False
+    for folder in sorted(DATA.glob("test_*"), key=lambda path: int(path.name[5:])):
+        if args.names and folder.name not in args.names:
+            continue
+        recording = read_recording(folder).first(args.frames)
+        for name in args.selectors:
+            begin = time.perf_counter()
+            result = replay(recording, make_selector(name), one_at_a_time=True)
+            row = score(recording, result)
+            if not head_is_printed:
+                head = ["recording", "selector", *row, "s"]
+                print("| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
+                head_is_printed = True
+            cells = [folder.name, name, *(f"{value:.4g}" for value in row.values())]
+            print(f"| {' | '.join(cells)} | {time.perf_counter() - begin:.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
