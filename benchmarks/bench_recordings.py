@@ -8,6 +8,7 @@ nearer to the reference in angle, an outlier where none is within 10 degrees.
 """
 
 import argparse
+import dataclasses
 import os
 import time
 from pathlib import Path
@@ -16,6 +17,7 @@ from jaxnav.configuration import configure
 
 configure(float64=True)  # before the first array, as the commands do
 
+import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 from jaxnav.belief.selectors import make_selector  # noqa: E402
@@ -63,12 +65,20 @@ def main() -> None:
     parser.add_argument(
         "--selectors", nargs="*", default=["lowest-reprojection", "multi-hypothesis"]
     )
+    parser.add_argument("--camera-sigma", type=float, nargs=2, metavar=("DEG", "M"),
+                        help="of a camera's direction and place; 0 0: exact ones")  # fmt: skip
     args = parser.parse_args()
     head_is_printed = False
     for folder in sorted(DATA.glob("test_*"), key=lambda path: int(path.name[5:])):
         if args.names and folder.name not in args.names:
             continue
         recording = read_recording(folder).first(args.frames)
+        if args.camera_sigma is not None:
+            turn_rad, shift_m = np.deg2rad(args.camera_sigma[0]), args.camera_sigma[1]
+            sigma = np.repeat([[shift_m] * 3 + [turn_rad] * 3], len(recording.rig), axis=0)
+            known = None if not sigma.any() else jnp.asarray(sigma)
+            rig = dataclasses.replace(recording.rig, extrinsics_sigma=known)
+            recording = dataclasses.replace(recording, rig=rig)
         for name in args.selectors:
             begin = time.perf_counter()
             result = replay(recording, make_selector(name), one_at_a_time=True)

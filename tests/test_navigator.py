@@ -219,7 +219,8 @@ def test_the_first_two_steps_by_hand():
     assert out.command.throttle == pytest.approx(float(throttle))
 
     state, out = step(nav, state, at(obs, 1))
-    x, P = kalman.predict(x, P, DT_S, np.asarray(motion.acceleration_density))
+    told = SPEED_MPS, STEERING_RAD, WHEELBASE_M
+    x, P = kalman.predict(x, P, DT_S, np.asarray(motion.acceleration_density), told)
     R_pose = reference_pose_covariance(nav, truth[1], 0.25) + floor
     x, P, nis = kalman.update(x, P, truth[1], R_pose, SPEED_MPS, STEERING_RAD, *noise)
     np.testing.assert_allclose(state.belief.bank.mean[0], x, atol=2e-3)

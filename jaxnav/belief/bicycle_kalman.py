@@ -78,11 +78,15 @@ class BicycleKalman(Motion):
     def predict(self, bank: Bank, obs: Observation) -> Bank:
         """x = A x, P = A P A' + Q (Eq. 9), then the odometry (Eqs. 10 and 11).
 
+        Speed and steering change at an unknown instant inside the interval: with the difference d
+        (3,) between the velocity measured now and the one believed before, the pose gets the
+        noise D D', D = d dt / sqrt(12), the standard deviation of d t for a uniform t in (0, dt).
+
         A hypothesis that the gate has contradicted too often or too long is forgotten.
         """
-        mean, covariance = jax.vmap(lambda x, P: self._with_odometry(*self._later(x, P, obs), obs))(
-            bank.mean, bank.covariance
-        )
+        mean, covariance = jax.vmap(
+            lambda x, P: self._with_odometry(*self._later(x, P, obs), obs, obs.dt_s)
+        )(bank.mean, bank.covariance)
         predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, (mean, covariance))
         return forget_lost(predicted, self.lost(bank), obs.dt_s)
 
@@ -193,8 +197,14 @@ class BicycleKalman(Motion):
         mean = mean.at[2].set(wrap_angle(mean[2]))
         return mean, kalman.predict_covariance(P, A, Q)
 
-    def _with_odometry(self, mean: Array, P: Array, obs: Observation) -> tuple[Array, Array]:
-        """The state after speed and steering were measured, at its own heading."""
+    def _with_odometry(
+        self, mean: Array, P: Array, obs: Observation, since_s: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """The state after speed and steering were measured, at its own heading.
+
+        Args:
+            since_s: time of the prediction, in which the velocity has changed.
+        """
         dtype = mean.dtype
         speed_mps, steering_rad = (
             jnp.asarray(value, dtype) for value in (obs.speed_mps, obs.steering_rad)
@@ -205,8 +215,11 @@ class BicycleKalman(Motion):
         turned_velocity = jnp.stack([-velocity[1], velocity[0], jnp.zeros_like(speed_mps)])
         H = jnp.eye(3, 6, k=3, dtype=dtype).at[:, 2].set(-turned_velocity)
         R = sandwich(_turn(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(dtype)
-        present = jnp.full(3, jnp.asarray(obs.has_odometry, dtype))
-        seen = kalman.hide_rows(velocity - mean[3:], H, R, present)
+        present = jnp.asarray(obs.has_odometry, dtype)
+        change = velocity - mean[3:]
+        D = present * change * (jnp.asarray(since_s, dtype) / np.sqrt(12))
+        P = P.at[:3, :3].add(D[:, None] * D[None])
+        seen = kalman.hide_rows(change, H, R, jnp.full(3, present))
         correction, P, _ = kalman.update(P, *seen)
         return self.moved(mean, correction), P
 

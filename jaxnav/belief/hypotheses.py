@@ -63,7 +63,7 @@ class MultiHypothesis(eqx.Module):
     merge_distance: float = 0.6  # Mahalanobis, between two means that become one
     linear_rad: float = float(np.deg2rad(3.0))  # means this close merge; times the range for shifts
     forget_log_weight: float = -20.0  # lighter hypotheses are dropped
-    outlier_log_evidence: float = -12.0  # bounds what one frame subtracts from a log-weight
+    outlier_log_evidence: float = -5.0  # bounds what one frame subtracts from a log-weight
     max_inflation: float = 10.0  # largest factor on covariances where all hypotheses misfit
     max_misfit: float = np.inf  # largest factor on the corners' sigma where no pose fits them
     gate: float = 30.0  # excess cost over the best candidate; above it the frame is an outlier
@@ -75,6 +75,13 @@ class MultiHypothesis(eqx.Module):
         least = CANDIDATES + 2
         if self.hypotheses < least:
             raise ValueError(f"hypotheses must be at least {least}: a fan and the candidates")
+        evidence, mass = self.outlier_log_evidence, self.decided_mass
+        known = isinstance(evidence, float) and isinstance(mass, float) and mass > 0
+        if known and evidence <= np.log(mass):
+            raise ValueError(
+                f"a single frame would decide: exp(outlier_log_evidence), {np.exp(evidence):.2g}, "
+                f"must be above decided_mass, {mass:.2g}"
+            )
 
     def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
         """Correct the pose of each hypothesis by the corners, and weigh it by its evidence.

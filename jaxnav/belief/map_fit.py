@@ -32,10 +32,10 @@ from jaxnav.numerics.small_matrices import (
     product,
     sandwich,
     solve_lower,
-    solve_positive,
     solve_upper,
 )
-from jaxnav.pose.linearised import cross_product, reprojection_rows, turn_arms, wrench
+from jaxnav.pose.linearised import answers, cross_product, reprojection_rows, turn_arms, wrench
+from jaxnav.pose.nuisance import Nuisance, camera_errors
 from jaxnav.pose.observation import Snapshot, log_sigmas
 
 
@@ -136,16 +136,16 @@ def _linearised(
     R = jnp.moveaxis(jax.vmap(rotation_matrix)(T_prior_world.rotation()), 0, -1)
     shift = T_prior_world.translation().T[:, None]
     corners = jnp.sum(R[:, :, None] * corners_world.T[None, :, :, None], axis=1) + shift
-    log_nuisance = jnp.zeros_like(corners[0, 0])
+    # Nuisances are small: residuals are linear in them.
+    cameras = camera_errors(snapshot.rig, snapshot.markers, snapshot.seen)
+    errors = [] if cameras is None else [cameras]
     if nuisance.shape[1]:
-        # The nuisance is small: residuals are linear in it.
         _, slope = rows(corners)
-        J_t = -jnp.sum(_answers(slope, corners)[:, None] * nuisance[:, :, None, None], axis=0)
-        eye = jnp.eye(nuisance.shape[1], dtype=R.dtype)
-        information = gram(J_t) + eye[:, :, None]
-        best_t = solve_positive(information[:, :, None], J_t)
-        factors = jax.vmap(cholesky, in_axes=-1)(information)
-        log_nuisance = -jax.vmap(log_det)(factors) / 2
+        J_t = -jnp.sum(answers(slope, corners)[:, None] * nuisance[:, :, None, None], axis=0)
+        for other in errors:
+            J_t = other.eliminated(J_t)
+        errors.append(Nuisance.of(J_t[:, :, None]))
+    log_nuisance = sum((e.log_share for e in errors), jnp.zeros_like(corners[0, 0]))
 
     def linearised(u: Array) -> tuple[Array, NormalEquations]:
         xi = jnp.sum(spread * u[None], axis=1)
@@ -158,20 +158,14 @@ def _linearised(
         along = along - cross_product(shift[:, None] / 2, turn)
         twist = jnp.concatenate([along, turn])
         residual, slope = rows(moved)
-        J = -jnp.sum(_answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
+        J = -jnp.sum(answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
         r = residual.reshape(J.shape[1:])
-        if nuisance.shape[1]:
-            # In the best nuisance, whose own prior pays for it. J and r each by itself: the
-            # gradient follows from r and the wrench alone, and so do its derivatives.
-            best = -jnp.sum(best_t.reshape(-1, *residual.shape) * residual[None], axis=(1, 2))
-            best_J = -jnp.sum(best_t[None] * J[:, None], axis=2)
-            J = jnp.concatenate(
-                [J + jnp.sum(best_J[:, :, None] * J_t[None], axis=1), best_J], axis=1
-            )
-            shifted = jnp.sum(best[:, None] * J_t, axis=0)
-            residual = residual + shifted.reshape(residual.shape)
-            r = jnp.concatenate([r + shifted, best])
-        w = jnp.concatenate(wrench((residual, slope), moved))
+        # J and r each by itself: the gradient follows from r and the wrench alone, and so do its
+        # derivatives.
+        for error in errors:
+            r, J = error.eliminated(r), error.eliminated(J)
+        left = r[: residual[..., 0].size].reshape(residual.shape)
+        w = jnp.concatenate(wrench((left, slope), moved))
         return r, NormalEquations(gram(J), -jnp.sum(twist * w[:, None], axis=0))
 
     return linearised, log_nuisance
@@ -181,12 +175,6 @@ def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
     """cay(xi) shifts by more than `shift`, since it turns meanwhile: the difference, (3, ...)."""
     swing = cross_product(half, shift)
     return (swing + cross_product(half, swing)) / (1 + jnp.sum(half**2, axis=0))[None]
-
-
-def _answers(slope: Float[Array, "3 2 P K"], points: Float[Array, "3 P K"]) -> Array:
-    """Derivative (6, 2 P, K) of residuals by a shift and a turn of all corners about the origin."""
-    answers = jnp.concatenate([slope, cross_product(points[:, None], slope)])
-    return answers.reshape(6, -1, answers.shape[-1])
 
 
 def _fused(

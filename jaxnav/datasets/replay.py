@@ -113,9 +113,9 @@ def replay(
         chunks.append(jax.device_get(outputs))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
-    wxyz_xyz, *told = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *chunks)
-    Ts_world_vehicle = np.asarray(poses_in_world(wxyz_xyz, recording.markers.origin_m))
-    return Replay(Ts_world_vehicle, *told, total / elapsed_s, corner_sigma_px)
+    told: _Told = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *chunks)
+    poses = np.asarray(poses_in_world(told[0], recording.markers.origin_m))
+    return Replay(poses, *told[1:], total / elapsed_s, corner_sigma_px)
 
 
 def estimate_corner_sigma_px(recording: Recording) -> float:

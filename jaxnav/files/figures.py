@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxnav.files import poses
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
-from jaxnav.models.rig import CameraRig
+from jaxnav.models.rig import PLACED_BY_HAND, CameraRig
 
 Lens = Literal["none", "radtan", "rational", "equidistant"]
 
@@ -33,6 +33,8 @@ class CameraFigures:
         image_size_px: width, height.
         T_camera_vehicle: a pose as it is written, (7,) or (4, 4), see `jaxnav.files.poses`; None
             where the file does not place the camera.
+        sigma: (6,) of its place along the vehicle's axes, m, and of its direction about them, rad;
+            None where the file does not say.
     """
 
     name: str
@@ -42,6 +44,7 @@ class CameraFigures:
     distortion: tuple[float, ...]
     image_size_px: tuple[int, int]
     T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None
+    sigma: Float[np.ndarray, " 6"] | None = None
 
     @staticmethod
     def create(
@@ -51,6 +54,7 @@ class CameraFigures:
         distortion: Sequence[float],
         image_size_px: Sequence[int],
         T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None,
+        sigma: Float[np.ndarray, " 6"] | None = None,
     ) -> "CameraFigures":
         """A camera from fx fy cx cy and coefficients; missing last coefficients are zero."""
         fx, fy, cx, cy = (float(value) for value in pinhole_px)
@@ -63,6 +67,7 @@ class CameraFigures:
             distortion=(*(float(value) for value in distortion), *(0.0,) * missing),
             image_size_px=(int(image_size_px[0]), int(image_size_px[1])),
             T_camera_vehicle=T_camera_vehicle,
+            sigma=sigma,
         )
 
     def camera(self) -> Camera:
@@ -85,7 +90,10 @@ class MarkerFigures:
 
 
 def rig_from_figures(cameras: Sequence[CameraFigures]) -> CameraRig:
-    """The rig of some cameras, in the process's precision; every camera must have a place."""
+    """The rig of some cameras, in the process's precision; every camera must have a place.
+
+    A place without a standard deviation has that of one measured by hand.
+    """
     Ts_camera_vehicle = []
     for camera in cameras:
         assert camera.T_camera_vehicle is not None
@@ -95,7 +103,15 @@ def rig_from_figures(cameras: Sequence[CameraFigures]) -> CameraRig:
         Ts_camera_vehicle,
         [camera.name for camera in cameras],
         [camera.image_size_px for camera in cameras],
+        _sigmas(cameras),
     )
+
+
+def _sigmas(cameras: Sequence[CameraFigures]) -> Float[np.ndarray, "C 6"] | None:
+    """The standard deviations of the cameras' places; None where all are 0."""
+    sigmas = np.stack([PLACED_BY_HAND if c.sigma is None else c.sigma for c in cameras])
+    # Degrees and radians give back the same numbers where these are float32's.
+    return np.asarray(sigmas, np.float32).astype(float) if sigmas.any() else None
 
 
 def figures_of_rig(rig: CameraRig) -> list[CameraFigures]:
@@ -104,6 +120,8 @@ def figures_of_rig(rig: CameraRig) -> list[CameraFigures]:
     for index, name in enumerate(rig.names):
         camera = rig.camera(index)
         lens: Any = rig.cameras.lenses[int(camera.lens_index)]
+        known = rig.extrinsics_sigma
+        sigma = np.zeros(6) if known is None else np.asarray(known[index], float)
         figures.append(
             CameraFigures.create(
                 name,
@@ -112,6 +130,7 @@ def figures_of_rig(rig: CameraRig) -> list[CameraFigures]:
                 np.asarray(camera.distortion)[: LENS_COEFFICIENTS[lens]].tolist(),
                 rig.image_sizes_px[index],
                 np.asarray(rig.Ts_camera_vehicle.wxyz_xyz[index], float),
+                sigma,
             )
         )
     return figures

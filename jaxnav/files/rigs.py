@@ -11,8 +11,10 @@
         yaw_deg: 0.0                     # elevation_deg (up) and roll_deg (clockwise from behind)
 
 The place of a camera may also be `T_vehicle_camera` or its inverse `T_camera_vehicle`, each
-either 4x4 or `{wxyz: [...], xyz_m: [...]}`. A calibrated camera may have standard deviations
-(`sigma`), and the file a provenance (`calibrated`, see `jaxnav.files.provenance`).
+either 4x4 or `{wxyz: [...], xyz_m: [...]}`. A camera may have standard deviations (`sigma`): those
+of its place (`position_m`, `rotation_deg`) are what the estimator allows for, 5 mm and 0.5 degrees
+where the file does not say. The file may have a provenance (`calibrated`, see
+`jaxnav.files.provenance`).
 """
 
 import re
@@ -47,7 +49,6 @@ from jaxnav.files.validation import (
     Name,
     Number,
     Pair,
-    Point,
     PositivePair,
     QuaternionPose,
     at,
@@ -57,15 +58,35 @@ from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.camera import LENS_COEFFICIENTS
 from jaxnav.models.rig import CameraRig
 
+# One that is larger says that nobody knows where the camera is, or was written in another unit.
+_MOST_SIGMA_M, _MOST_SIGMA_DEG = 0.5, 15.0
+SigmaM = Annotated[Number, Field(ge=0, le=_MOST_SIGMA_M)]
+SigmaDeg = Annotated[Number, Field(ge=0, le=_MOST_SIGMA_DEG)]
+_Three = Field(min_length=3, max_length=3)
+
 
 class CameraSigma(Entry):
-    """One standard deviation of each figure of a camera that was calibrated."""
+    """One standard deviation of each figure of a camera."""
 
     focal_px: Pair | None = None
     center_px: Pair | None = None
     distortion: list[Number] | None = None
-    position_m: Point | None = None  # of the camera, along the axes of the vehicle
-    rotation_deg: Point | None = None  # of the camera, about the axes of the vehicle
+    # Of the camera, along the axes of the vehicle and about them.
+    position_m: Annotated[list[SigmaM], _Three] | None = None
+    rotation_deg: Annotated[list[SigmaDeg], _Three] | None = None
+
+    @model_validator(mode="after")
+    def _of_a_whole_place(self) -> "CameraSigma":
+        if (self.position_m is None) != (self.rotation_deg is None):
+            missing = "position_m" if self.position_m is None else "rotation_deg"
+            raise ValueError(f"{missing} is missing: it goes with the other sigma of a place")
+        return self
+
+    def of_place(self) -> Float[np.ndarray, " 6"] | None:
+        """Sigmas of the place, m, and of the direction, rad; None where they are not given."""
+        if self.position_m is None or self.rotation_deg is None:
+            return None
+        return np.concatenate([self.position_m, np.deg2rad(self.rotation_deg)])
 
 
 class CameraEntry(Entry):
@@ -130,9 +151,14 @@ class CameraEntry(Entry):
             assert self.position_m is not None  # _placed_once
             angles_deg = (self.yaw_deg or 0.0, self.elevation_deg or 0.0, self.roll_deg or 0.0)
             T_camera_vehicle = place(self.position_m, angles_deg)
-        pinhole_px = [*self.focal_px, *self.center_px]
         return CameraFigures.create(
-            self.name, self.lens, pinhole_px, self.distortion, self.image_size_px, T_camera_vehicle
+            self.name,
+            self.lens,
+            [*self.focal_px, *self.center_px],
+            self.distortion,
+            self.image_size_px,
+            T_camera_vehicle,
+            None if self.sigma is None else self.sigma.of_place(),
         )
 
 
@@ -199,7 +225,7 @@ def save_rig(
     """
     data = rig_data(rig)
     for entry, sigma in zip(data["cameras"], sigmas or (), strict=bool(sigmas)):
-        entry["sigma"] = sigma.model_dump(exclude_none=True)
+        entry["sigma"] = entry.get("sigma", {}) | sigma.model_dump(exclude_none=True)
     atomic_write(path, yaml_text(with_provenance(data, calibrated)))
 
 
@@ -229,6 +255,9 @@ def camera_data(cameras: Sequence[CameraFigures]) -> dict[str, Any]:
                 "T_camera_vehicle": plain_pose(camera.T_camera_vehicle),
             }
         )
+        if camera.sigma is not None:
+            place = {"position_m": camera.sigma[:3], "rotation_deg": np.rad2deg(camera.sigma[3:])}
+            entries[-1]["sigma"] = {name: sigma.tolist() for name, sigma in place.items()}
     return {"cameras": entries}
 
 
@@ -253,7 +282,11 @@ def rig_text(cameras: Sequence[CameraFigures]) -> str:
 def rig_left_out(file: RigFile) -> list[str]:
     """The names of the entries of a rig file that `CameraFigures` don't hold."""
     left_out = ["calibrated"] if file.calibrated else []
-    return left_out + [f"cameras.{entry.name}.sigma" for entry in file.cameras if entry.sigma]
+    of_lens = {"focal_px", "center_px", "distortion"}
+    for entry in file.cameras:
+        if entry.sigma and entry.sigma.model_dump(include=of_lens, exclude_none=True):
+            left_out.append(f"cameras.{entry.name}.sigma")
+    return left_out
 
 
 def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> Float[np.ndarray, " 7"]:

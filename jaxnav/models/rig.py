@@ -9,10 +9,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.models.camera import Camera, stack_cameras
 from jaxnav.models.geometry import on_last_axis, transform_points
+
+# Of cameras that were placed by hand, or by a calibration that does not say how well.
+POSITION_SIGMA_M, ROTATION_SIGMA_RAD = 0.005, float(np.deg2rad(0.5))
+PLACED_BY_HAND = np.repeat([POSITION_SIGMA_M, ROTATION_SIGMA_RAD], 3)
 
 
 class CameraRig(eqx.Module):
@@ -22,6 +27,9 @@ class CameraRig(eqx.Module):
     Ts_camera_vehicle: jaxlie.SE3  # batch axis (C,)
     names: tuple[str, ...] = eqx.field(static=True)
     image_sizes_px: tuple[tuple[int, int], ...] = eqx.field(static=True)  # (width, height)
+    # Standard deviations of each camera's place along the vehicle's axes, m, and of its direction
+    # about them, rad; None: the cameras are exactly where `Ts_camera_vehicle` says.
+    extrinsics_sigma: Float[Array, "C 6"] | None = None
 
     @staticmethod
     def create(
@@ -29,6 +37,7 @@ class CameraRig(eqx.Module):
         Ts_camera_vehicle: Sequence[jaxlie.SE3],
         names: Sequence[str],
         image_sizes_px: Sequence[tuple[int, int]],
+        extrinsics_sigma: Float[Array | np.ndarray, "C 6"] | None = None,
     ) -> "CameraRig":
         """A rig from its cameras, one entry each in every sequence."""
         return CameraRig(
@@ -36,6 +45,9 @@ class CameraRig(eqx.Module):
             Ts_camera_vehicle=jaxlie.SE3(jnp.stack([T.wxyz_xyz for T in Ts_camera_vehicle])),
             names=tuple(names),
             image_sizes_px=tuple((int(w), int(h)) for w, h in image_sizes_px),
+            extrinsics_sigma=None
+            if extrinsics_sigma is None
+            else jnp.asarray(extrinsics_sigma, float),
         )
 
     def __len__(self) -> int:
@@ -47,11 +59,10 @@ class CameraRig(eqx.Module):
 
     def first(self, count: int) -> "CameraRig":
         """The rig with its first cameras alone."""
-        kept = jax.tree.map(lambda leaf: leaf[:count], (self.cameras, self.Ts_camera_vehicle))
-        cameras, Ts_camera_vehicle = kept
-        return CameraRig(
-            cameras, Ts_camera_vehicle, self.names[:count], self.image_sizes_px[:count]
-        )
+        arrays = self.cameras, self.Ts_camera_vehicle, self.extrinsics_sigma
+        cameras, Ts_camera_vehicle, sigma = jax.tree.map(lambda leaf: leaf[:count], arrays)
+        names, sizes_px = self.names[:count], self.image_sizes_px[:count]
+        return CameraRig(cameras, Ts_camera_vehicle, names, sizes_px, sigma)
 
     def with_focal_px(self, mean_px: Float[Array, ""] | float) -> "CameraRig":
         """The rig with all focal lengths scaled to this mean."""

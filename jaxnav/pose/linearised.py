@@ -94,6 +94,14 @@ def wrench(
     return jnp.sum(force, axis=1), jnp.sum(cross_product(points, force), axis=1)
 
 
+def answers(
+    slope: Float[Array, "3 2 P N"], points: Float[Array, "3 P N"]
+) -> Float[Array, "6 2*P N"]:
+    """Derivative of residuals by a shift and a turn of all points about the origin."""
+    both = jnp.concatenate([slope, cross_product(points[:, None], slope)])
+    return both.reshape(6, -1, both.shape[-1])
+
+
 def cross_product(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
     """a x b, coordinates first."""
     return jnp.stack(

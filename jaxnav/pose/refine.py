@@ -39,6 +39,7 @@ from jaxnav.pose.linearised import (
     turn_arms,
     wrench,
 )
+from jaxnav.pose.nuisance import Nuisance, camera_errors
 from jaxnav.pose.observation import Sightings, sightings
 from jaxnav.pose.pair_lanes import solve_pairs
 
@@ -128,14 +129,16 @@ def refine_sightings(
     constrained = jnp.full(start.scale.shape, any_visible)
     if wanted is not None:
         constrained = constrained & wanted
-    T, solution = _minimise(start, rows, free, constrained, max_steps)
+
+    nuisance = camera_errors(rig, markers, seen)
+    T, solution = _minimise(start, rows, free, constrained, max_steps, nuisance)
     chart = _chart(T, corners_world, center_world)
-    residual, normal = chart.linearised(rows, free)(
+    residual, normal = chart.linearised(rows, free, nuisance)(
         jnp.zeros_like(chart.pivot, shape=(free.shape[1], chart.scale.size))
     )
     cost = jnp.sum(residual**2, axis=0)
     sigma_px = jnp.tile(seen.sigma_px.reshape(-1), 2)[:, None]
-    e1_px2 = jnp.sum((residual * sigma_px) ** 2, axis=0)
+    e1_px2 = jnp.sum((residual[: sigma_px.shape[0]] * sigma_px) ** 2, axis=0)
     covariance = jax.vmap(partial(_body_covariance, free=free), in_axes=(-1, -1, -1))(
         chart.pivot, chart.scale, normal.information
     )
@@ -166,9 +169,15 @@ class _Chart(eqx.Module):
     scale: Float[Array, " N"]  # m
 
     def linearised(
-        self, rows: Callable[[Array], Rows], free: Float[Array, "6 n"]
+        self,
+        rows: Callable[[Array], Rows],
+        free: Float[Array, "6 n"],
+        nuisance: Nuisance | None = None,
     ) -> Callable[[Float[Array, "n N"]], tuple[Array, NormalEquations]]:
-        """Residuals (m, N) of the points moved by free @ y, and their normal equations."""
+        """Residuals (m, N) of the points moved by free @ y, and their normal equations.
+
+        With a nuisance they are the residuals in its most probable value, and its prior's rows.
+        """
 
         def at(y: Array) -> tuple[Array, NormalEquations]:
             y = jnp.sum(free[:, :, None] * y[None], axis=1)
@@ -178,12 +187,16 @@ class _Chart(eqx.Module):
             about = in_chart(cross_product(arms[:, None], slope), half[:, None, None])
             J = jnp.concatenate([self.scale[None, None, None] * slope, about])
             J = J.reshape(6, -1, J.shape[-1])
+            r = residual.reshape(J.shape[1:])
+            if nuisance is not None:
+                r, J = nuisance.eliminated(r), nuisance.eliminated(J)
+                residual = r[: residual[..., 0].size].reshape(residual.shape)
             force, torque = wrench((residual, slope), arms)
             gradient = jnp.concatenate([self.scale[None] * force, in_chart(torque, half)])
             if free.shape[1] < 6:
                 J = jnp.sum(J[:, None] * free[:, :, None, None], axis=0)
                 gradient = jnp.sum(gradient[:, None] * free[:, :, None], axis=0)
-            return residual.reshape(-1, residual.shape[-1]), NormalEquations(gram(J), gradient)
+            return r, NormalEquations(gram(J), gradient)
 
         def in_chart(about: Array, half: Array) -> Array:
             """Derivatives by a turn from here on, converted to derivatives by `half`."""
@@ -220,13 +233,14 @@ def _minimise(
     free: Float[Array, "6 n"],
     constrained: Bool[Array, " N"],
     max_steps: int,
+    nuisance: Nuisance | None = None,
 ) -> tuple[jaxlie.SE3, LMState]:
     """Minimise by LM from the chart's poses: the poses found, and the solver's state.
 
     Gradients are those of the implicit function at the minimum: right only where `done`, and
     independent of the start.
     """
-    linearised = chart.linearised(rows, free)
+    linearised = chart.linearised(rows, free, nuisance)
     n, dtype = free.shape[1], chart.pivot.dtype
 
     def fn(y: Array, args: None) -> tuple[Any, NormalEquations]:

@@ -39,6 +39,7 @@ EXACT = MultiHypothesis(
     floor_m=0.0,
     floor_rad=0.0,
     outlier_log_evidence=-1e9,
+    decided_mass=0.0,
     max_inflation=1.0,
     gate=1e9,
     forget_log_weight=-1e9,

@@ -320,7 +320,7 @@ def test_uneven_noise_is_the_world_s_at_that_heading(psi_rad):
         )
         D = D if D.ndim == 2 else np.diag(D)
         odometry = odometry if odometry.ndim == 2 else np.diag(odometry**2)
-        x, moved = textbook.predict(mean, P, dt_s, np.zeros(3))
+        x, moved = textbook.predict(mean, P, dt_s, np.zeros(3), (0.3, 0.2, 0.256))
         Q = np.kron([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]], R @ D @ R.T)
         np.testing.assert_allclose(
             np.asarray(white_acceleration(jnp.asarray(R @ D @ R.T), dt_s)), Q, atol=1e-15

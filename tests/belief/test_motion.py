@@ -100,7 +100,8 @@ def test_200_steps_are_the_textbook_s(with_pose):
     for _ in range(200):
         dt_s, speed, steering = rng.uniform(0.01, 0.2), rng.uniform(-0.5, 1), rng.uniform(-0.5, 0.5)
         root = 0.03 * rng.normal(size=(6, 6))
-        x, P = kalman.predict(x, P, dt_s, np.asarray(motion.acceleration_density))
+        told = speed, steering, WHEELBASE_M
+        x, P = kalman.predict(x, P, dt_s, np.asarray(motion.acceleration_density), told)
         pose = x[:3] + rng.normal(0, 0.05, 3)
         sees = with_pose and rng.uniform() < 2 / 3
         R_pose = planar_part(root @ root.T, pose[2]) + floor
@@ -141,6 +142,7 @@ def test_the_heading_s_column_of_H_is_the_derivative():
         np.asarray(belief.covariance[0]),
         0.3,
         np.asarray(motion.acceleration_density),
+        (speed, steering, WHEELBASE_M),
     )
 
     def residual(x):

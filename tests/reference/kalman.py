@@ -14,8 +14,13 @@ def wrap(angle_rad):
     return np.arctan2(np.sin(angle_rad), np.cos(angle_rad))
 
 
-def predict(x, P, dt_s, density):
-    """Eq. 9 with the noise of a white acceleration."""
+def predict(x, P, dt_s, density, odometry=None):
+    """Eq. 9 with the noise of a white acceleration.
+
+    `odometry` is (speed_mps, steering_rad, wheelbase_m): the velocity has become that at an unknown
+    instant of the interval, so a pose that counts on the old one is off by a share of the
+    difference, evenly distributed between 0 and dt_s.
+    """
     A = np.eye(6)
     Q = np.zeros((6, 6))
     for i in range(3):
@@ -25,7 +30,12 @@ def predict(x, P, dt_s, density):
         Q[i + 3, i + 3] = density[i] * dt_s
     x = A @ x
     x[2] = wrap(x[2])
-    return x, A @ P @ A.T + Q
+    P = A @ P @ A.T + Q
+    if odometry is not None:
+        speed_mps, steering_rad, wheelbase_m = odometry
+        change = velocity(speed_mps, steering_rad, x[2], wheelbase_m) - x[3:]
+        P[:3, :3] += np.outer(change, change) * dt_s**2 / 12
+    return x, P
 
 
 def update(x, P, pose, R_pose, speed_mps, steering_rad, wheelbase_m, odometry_sigma):

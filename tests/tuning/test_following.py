@@ -34,7 +34,9 @@ RIG, MARKERS, CAR = worlds.qcar_rig().first(1), worlds.paper_markers(), worlds.q
 SIGMA_PX, DECIDES, FRAMES = 0.5, 3, 12
 NAVIGATOR = Navigator(
     RIG, MARKERS, CAR, corner_sigma_px=SIGMA_PX, max_candidates=2,
-    selector=MultiHypothesis(hypotheses=6, decided_mass=0.02, decided_sigma_rad=0.3),
+    selector=MultiHypothesis(
+        hypotheses=6, outlier_log_evidence=-3.0, decided_mass=0.02, decided_sigma_rad=0.3
+    ),
 )  # fmt: skip
 SPACE = Space.of(
     NAVIGATOR,

@@ -46,6 +46,7 @@ def calibrated_rig(data: RigData, calibration: RigCalibration) -> CameraRig:
         jaxlie.SE3(jnp.asarray(np.stack(poses), float)),
         data.rig.names,
         data.rig.image_sizes_px,
+        data.rig.extrinsics_sigma,
     )
 
 
