@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from jaxnav.belief.ambiguity import RatioTest as RatioTest
     from jaxnav.belief.ambiguity import Selection as Selection
     from jaxnav.belief.ambiguity import Selector as Selector
+    from jaxnav.belief.ambiguity import Ungated as Ungated
     from jaxnav.belief.bicycle_kalman import BicycleKalman as BicycleKalman
     from jaxnav.belief.constant_velocity import ConstantVelocity as ConstantVelocity
     from jaxnav.belief.estimate import Belief as Belief
@@ -91,6 +92,7 @@ _MODULE_OF = {
     "Selector": "belief.ambiguity",
     "Snapshot": "pose.observation",
     "State": "navigator",
+    "Ungated": "belief.ambiguity",
     "Vehicle": "models.bicycle",
     "configure": "configuration",
     "e1": "pose.residuals",

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.belief.ambiguity import Selector
+from jaxnav.belief.ambiguity import Selector, Ungated
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief, Estimate, Evidence
@@ -97,6 +97,9 @@ class Navigator(eqx.Module):
     ):
         """See the fields of `Controller`, `Snapshot`, `find_candidates` and the motion models.
 
+        Args:
+            selector: by default the bank; an `Ungated` one takes the gate from the motion model.
+
         Raises:
             ValueError: waypoints without a vehicle, or of the wrong shape.
         """
@@ -104,6 +107,9 @@ class Navigator(eqx.Module):
         self.markers = markers
         self.selector = selector or MultiHypothesis()
         self.motion = motion or (BicycleKalman(vehicle) if vehicle else ConstantVelocity())
+        if isinstance(selector, Ungated):
+            self.selector = selector.rule
+            self.motion = eqx.tree_at(lambda m: m.gate_nis, self.motion, float("inf"))
         self.controller = None
         if len(waypoints_m) > 0:
             self.controller = Controller.along(

@@ -1,10 +1,11 @@
-"""The numbers of a navigator that drives and recordings can teach, by name.
+"""The numbers of a navigator that a file of parameters may hold, by name.
 
     values = parameters_of(navigator)                 # {"motion.odometry_sigma": ..., ...}
     navigator = with_parameters(navigator, values)    # others stay as they are
 
-A name is the path of the attribute. Everything else about a navigator is known otherwise: cameras
-and wheelbase are measured, limits are the vehicle's.
+A name is the path of the attribute. Drives and recordings can teach all but the guards. Everything
+else about a navigator is known otherwise: cameras and wheelbase are measured, limits are the
+vehicle's.
 """
 
 from collections.abc import Iterator, Mapping
@@ -31,12 +32,15 @@ class Tunable:
         matrix: None for numbers that are positive each by itself. Else the number may be a matrix,
             symmetric and positive definite, instead of the vector whose entries are, "sigma", the
             square roots of its diagonal or, "variance", that diagonal itself.
+        guard: whether it only bounds what is believed. No gradient teaches such a number, and a
+            file may hold an infinite one, which bounds nothing.
     """
 
     meaning: str
     unit: str
     typical: float
     matrix: str | None = None
+    guard: bool = False
 
 
 TUNABLES: dict[str, Tunable] = {
@@ -63,6 +67,9 @@ TUNABLES: dict[str, Tunable] = {
     ),
     "motion.tilt_sigma_rad": Tunable("roll and pitch of the cameras", "rad", 0.005),
     "motion.height_sigma_m": Tunable("height of the cameras", "m", 0.002),
+    "motion.gate_nis": Tunable(
+        "largest NIS of a pose that is fused; .inf: no gate, and no restart", "1", 20.0, guard=True
+    ),
     "selector.floor_m": Tunable("R: what successive frames get wrong alike", "m", 1e-3),
     "selector.floor_rad": Tunable("R: what successive frames get wrong alike", "rad", 1e-3),
     "corner_sigma_px": Tunable("R: corners that come without a sigma of their own", "px", 1.0),

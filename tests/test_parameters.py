@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.ambiguity import LowestReprojection, PaperCost, Ungated
+from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.control import ControlState
 from jaxnav.models.bicycle import sideslip_rad
@@ -64,6 +65,22 @@ def test_only_what_is_named_changes(navigator):
     for name, value in parameters_of(everything).items():
         np.testing.assert_array_equal(value, values[name])
     assert with_parameters(navigator, {}) is navigator
+
+
+@pytest.mark.parametrize("motion", [None, BicycleKalman(CAR, gate_nis=5.0), ConstantVelocity()])
+def test_an_ungated_rule_is_the_rule_on_a_filter_without_gate(motion):
+    """And nothing else of the navigator is another."""
+    rule = PaperCost(length_unit_m=0.02)
+    gated, ungated = (
+        Navigator(RIG, MARKERS, CAR, worlds.WAYPOINTS_M, selector=selector, motion=motion)
+        for selector in (rule, Ungated(rule))
+    )
+    assert jax.tree.structure(ungated) == jax.tree.structure(gated)
+    before, after = leaf_paths(gated), leaf_paths(ungated)
+    assert np.isfinite(before.pop("motion.gate_nis"))
+    assert after.pop("motion.gate_nis") == np.inf
+    for name, leaf in before.items():
+        np.testing.assert_array_equal(leaf, after[name])
 
 
 @pytest.mark.parametrize("navigator", [DRIVER, HANDHELD], ids=["car", "hand-held"])

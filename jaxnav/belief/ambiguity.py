@@ -253,6 +253,25 @@ class Oracle(eqx.Module):
         return _cheapest(prior, candidates, snapshot, turns, doubts=jnp.zeros_like(turns))
 
 
+class Ungated(eqx.Module):
+    """A rule on a filter without gate and restart, as its authors write it.
+
+    It selects what its rule selects. `Navigator` takes the rule out of it and sets the motion
+    model's `gate_nis` to inf: every selected pose is fused, however far from the prediction, and no
+    contradiction starts the filter anew (see docs/design.md, Gate).
+    """
+
+    rule: Selector
+
+    @property
+    def hypotheses(self) -> int:
+        """Those of the rule."""
+        return self.rule.hypotheses
+
+    def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
+        return self.rule(prior, candidates, snapshot)
+
+
 def _cheapest(
     prior: PoseBelief,
     candidates: Candidates,

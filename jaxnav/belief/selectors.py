@@ -9,22 +9,25 @@ from jaxnav.belief.ambiguity import (
     PaperCost,
     RatioTest,
     Selector,
+    Ungated,
 )
 from jaxnav.belief.hypotheses import MultiHypothesis
 
-SELECTORS: dict[str, type] = {
-    "multi-hypothesis": MultiHypothesis,
-    "lowest-reprojection": LowestReprojection,
-    "ratio-test": RatioTest,
-    "object-space": ObjectSpace,
-    "paper-cost": PaperCost,
-    "mahalanobis": Mahalanobis,
-    "orientation-given": OrientationGiven,
-    "oracle": Oracle,
+# With their default parameters. `Ungated`: on a filter without gate and restart.
+SELECTORS: dict[str, Selector] = {
+    "multi-hypothesis": MultiHypothesis(),
+    "lowest-reprojection": LowestReprojection(),
+    "lowest-reprojection-ungated": Ungated(LowestReprojection()),
+    "ratio-test": RatioTest(),
+    "object-space": ObjectSpace(),
+    "paper-cost": PaperCost(),
+    "paper-cost-ungated": Ungated(PaperCost()),
+    "mahalanobis": Mahalanobis(),
+    "orientation-given": OrientationGiven(),
+    "oracle": Oracle(),
 }
 
 
 def make_selector(name: str) -> Selector:
-    """A selector with its default parameters."""
-    selector: Selector = SELECTORS[name]()
-    return selector
+    """The selector of a name, to be given to `Navigator`."""
+    return SELECTORS[name]

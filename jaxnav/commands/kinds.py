@@ -14,9 +14,11 @@ from jaxnav.errors import BadInput
 Selector = Literal[
     "multi-hypothesis",
     "lowest-reprojection",
+    "lowest-reprojection-ungated",
     "ratio-test",
     "object-space",
     "paper-cost",
+    "paper-cost-ungated",
     "mahalanobis",
 ]
 # These need what only a simulation has: another sensor, the truth.

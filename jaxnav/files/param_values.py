@@ -1,7 +1,7 @@
 """Validation of a tuned parameter's value: a number, a list of them, or a matrix as its rows.
 
-Every number must be positive, and a matrix a covariance: symmetric and positive definite. The
-navigator decides how many entries there must be.
+Every number must be positive, and a matrix a covariance: symmetric and positive definite. One that
+only bounds what is believed may be infinite. The navigator decides how many entries there must be.
 """
 
 import math
@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxnav.errors import BadInput
 from jaxnav.files.validation import show_value
+from jaxnav.parameters import Tunable
 
 _LEAST, _MOST = 1e-18, 1e9  # bounds of a number, so that float32 holds its square
 _MOST_ENTRIES = 64  # of a list, and rows of a matrix
@@ -20,18 +21,22 @@ _LEAST_EIGENVALUE = 1e-6
 _SYMMETRY = 1e-6  # relative to the geometric mean of the two variances: what float32 leaves
 
 
-def param_array(value: Any, where: str, may_be_matrix: bool) -> Float[np.ndarray, "..."]:
+def param_array(value: Any, where: str, tunable: Tunable) -> Float[np.ndarray, "..."]:
     """Check a parameter's numbers and return them unchanged as an array (), (d,) or (d, d).
 
     Args:
         value: plain, or an array.
         where: file and key, for the message.
-        may_be_matrix: whether it may be (d, d).
+        tunable: what the parameter may be.
 
     Raises:
         BadInput: the value is anything else; names its place in the list.
     """
     value = _plain(value)
+    if tunable.guard and isinstance(value, float) and not math.isfinite(value):
+        if value != math.inf:
+            raise BadInput(where, f"must be > 0 and finite, or .inf for none, got {value}")
+        return np.array(value)
     if not isinstance(value, list):
         return np.array(_positive(value, where))
     if not 1 <= len(value) <= _MOST_ENTRIES:
@@ -39,7 +44,7 @@ def param_array(value: Any, where: str, may_be_matrix: bool) -> Float[np.ndarray
         raise BadInput(where, f"must have {bound} entries, got {len(value)}")
     if not any(isinstance(entry, list) for entry in value):
         return np.array([_positive(entry, f"{where}[{i}]") for i, entry in enumerate(value)])
-    if not may_be_matrix:
+    if tunable.matrix is None:
         raise BadInput(where, "can't be a matrix: it is a number, or a list of them")
     for i, row in enumerate(value):
         if not isinstance(row, list) or len(row) != len(value):

@@ -8,8 +8,8 @@
       loss: 0.12
 
 `jaxnav.parameters.TUNABLES` has the names, units and meanings. Parameters that are not named stay
-as they are: so a number that is infinite in a navigator, which no file may hold, is left out. The
-provenance is kept and shown, and decides nothing.
+as they are: so a number that is infinite in a navigator is left out. Only `motion.gate_nis` may be
+`.inf`, which is no gate. The provenance is kept and shown, and decides nothing.
 """
 
 import json
@@ -80,7 +80,7 @@ class Params:
             where = params.where(name)
             if name not in TUNABLES:
                 raise BadInput(where, f"unknown: expected one of {', '.join(TUNABLES)}")
-            params.values[name] = param_array(value, where, TUNABLES[name].matrix is not None)
+            params.values[name] = param_array(value, where, TUNABLES[name])
         return params
 
     def where(self, name: str) -> str:
@@ -154,8 +154,9 @@ def apply_params(navigator: Navigator, params: Params) -> Navigator:
     """The navigator with these parameters; all others stay as they are.
 
     One file serves the car, a simulation of it and every selector, so these are passed over:
-    `controller.*` where nothing is driven, and `selector.*` that this selector does not have. A
-    `motion.*` that the motion model does not have is of another body, and an error.
+    `controller.*` where nothing is driven, `selector.*` that this selector does not have, and the
+    gate where the navigator has none. A `motion.*` that the motion model does not have is of
+    another body, and an error.
 
     Raises:
         BadInput: a parameter that this navigator does not have, or not in this shape; names file
@@ -171,6 +172,8 @@ def apply_params(navigator: Navigator, params: Params) -> Navigator:
                 verb = "have" if known[name].ndim else "be"
                 problem = f"must {verb} {expected}, got {_counted(value.shape)}"
                 raise BadInput(params.where(name), problem)
+            if TUNABLES[name].guard and not np.isfinite(known[name]):
+                continue
             values[name] = jnp.asarray(value, known[name].dtype)
         elif not _is_passed_over(name, navigator):
             model = type(navigator.motion).__name__

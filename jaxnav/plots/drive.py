@@ -4,7 +4,9 @@ One function returns one Figure; nothing is shown or saved here.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,7 +16,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import MaxNLocator
 
+from jaxnav.belief.ambiguity import Ungated
 from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.selectors import SELECTORS
 from jaxnav.files import poses
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.plots.localisation import (
@@ -49,6 +53,8 @@ _LETTER = 0.012  # width of a letter as a fraction of the time axis
 _SMALLEST_FLIP = 1e-6  # lower end of the axis of the flip probability
 _WIDTH_IN, _MAP_IN, _LANE_IN, _PANEL_IN = 8.0, 4.7, 0.17, 1.05
 
+_Panel = Callable[[Axes, Outcomes], None]
+
 
 def drive_log_report(log: DriveLog, title: str = "") -> Figure:
     """Draw a recorded drive: its map, and health, doubts, commands and ages over time.
@@ -65,7 +71,8 @@ def drive_log_report(log: DriveLog, title: str = "") -> Figure:
         raise ValueError("a drive without outcomes can't be drawn")
     lanes = list(_lanes(outcomes))
     ages = list(_ages_ms(log))
-    panels = [_draw_doubt, _draw_nis, _draw_commands, _draw_sigma]
+    draw_nis = partial(_draw_nis, gate_nis=_gate_nis(log.header))
+    panels: list[_Panel] = [_draw_doubt, draw_nis, _draw_commands, _draw_sigma]
     heights = [_MAP_IN, 0.35 + _LANE_IN * len(lanes), *[_PANEL_IN] * (len(panels) + bool(ages))]
     figure = Figure(figsize=(_WIDTH_IN, sum(heights) + 0.5), layout="constrained")
     figure.suptitle(title, fontsize=10)
@@ -154,16 +161,29 @@ def _draw_doubt(axes: Axes, outcomes: Outcomes) -> None:
     right.yaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
 
 
-def _draw_nis(axes: Axes, outcomes: Outcomes) -> None:
-    gate = float(BicycleKalman.gate_nis)
+def _gate_nis(header: dict[str, Any]) -> float:
+    """The gate of the filter that drove, the default one where the header tells none; inf: none."""
+    if isinstance(SELECTORS.get(str(header.get("selector"))), Ungated):
+        return math.inf
+    parameters = header.get("parameters")
+    told = parameters.get("motion.gate_nis") if isinstance(parameters, dict) else None
+    if isinstance(told, int | float) and told > 0:
+        return float(told)
+    return float(BicycleKalman.gate_nis)
+
+
+def _draw_nis(axes: Axes, outcomes: Outcomes, gate_nis: float) -> None:
     fused = outcomes.nis > 0
-    above = outcomes.nis > gate
+    above = outcomes.nis > gate_nis
     for which, style in ((fused & ~above, {"color": BLUE}), (above, {"color": VERMILION})):
         nis = np.minimum(outcomes.nis[which], 1e6)
         axes.semilogy(outcomes.times_s[which], nis, ".", ms=3, **style)
-    axes.axhline(gate, color=BLACK, lw=1, ls="--")
-    axes.text(0.005, gate * 1.3, f"gate {gate:g}", fontsize=7, transform=axes.get_yaxis_transform())
-    axes.set_ylim(1e-2, max(300.0, 3 * float(np.max(outcomes.nis[above], initial=0.0))))
+    if math.isfinite(gate_nis):
+        axes.axhline(gate_nis, color=BLACK, lw=1, ls="--")
+        at_left = axes.get_yaxis_transform()
+        name = f"gate {gate_nis:g}"
+        axes.text(0.005, gate_nis * 1.3, name, fontsize=7, transform=at_left, clip_on=True)
+    axes.set_ylim(1e-2, max(300.0, 3 * float(np.max(outcomes.nis[fused], initial=0.0))))
     axes.set_ylabel("NIS")
 
 

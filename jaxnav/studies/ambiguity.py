@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from jaxnav.belief import kalman
-from jaxnav.belief.ambiguity import PoseBelief
+from jaxnav.belief.ambiguity import OrientationGiven, PoseBelief, Ungated
 from jaxnav.belief.evaluation import judge_branch, position_error_m
 from jaxnav.belief.selectors import SELECTORS, make_selector
 from jaxnav.models.geometry import inverse_cayley, rotation_error_rad, safe_sqrt
@@ -76,7 +76,12 @@ PARAMETERS = {
         "which pose is taken",
         "",
         "lowest-reprojection",
-        choices=tuple(name for name in SELECTORS if name != "orientation-given"),
+        # A single frame has no other sensor, and no filter to be gated.
+        choices=tuple(
+            name
+            for name, selector in SELECTORS.items()
+            if not isinstance(selector, OrientationGiven | Ungated)
+        ),
         static=True,
     ),
 }

@@ -24,6 +24,7 @@ from jaxnav.belief.ambiguity import (
     RatioTest,
     Selection,
     Selector,
+    Ungated,
 )
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.models.markers import MarkerMap
@@ -40,6 +41,7 @@ SELECTORS = [
     ObjectSpace(),
     PaperCost(),
     PaperCost(length_unit_m=1.0),
+    Ungated(PaperCost()),
     Mahalanobis(),
     OrientationGiven(),
     Oracle(),

@@ -316,6 +316,30 @@ def test_ten_rejections_in_a_row_start_it_anew(kind):
 
 
 @pytest.mark.parametrize("kind", ["car", "free"])
+def test_without_a_gate_every_pose_is_fused_and_nothing_starts_anew(kind):
+    """Poses that run away ever faster: each is far off, all to one side, for longer than a row of
+    rejections may last. The gain is the scalar one, P / (P + R), along x."""
+    motion, step = outlier_steps(kind, gate_nis=np.inf, max_rejected_s=0.3)
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    R = 1e-4 + float(motion.vision_floor[0]) ** 2
+    for count in range(1, 3 * motion.max_rejections):
+        pose_m = 0.1 * count**2
+        prior, belief, nis = step(belief, pose_m)
+        predicted_m, fused_m = (
+            float(motion.poses(bank).T_world_vehicle.translation()[0, 0])
+            for bank in (prior, belief)
+        )
+        P = float(prior.covariance[0, 0, 0])
+        assert nis[0] == pytest.approx((pose_m - predicted_m) ** 2 / (P + R))
+        assert nis[0] > 30  # above either gate
+        assert fused_m == pytest.approx(predicted_m + P / (P + R) * (pose_m - predicted_m))
+        assert prior.initialised[0]
+        assert (belief.rejections.count[0], belief.rejections.duration_s[0]) == (0, 0)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
 def test_rejections_that_contradict_each_other_start_nothing(kind):
     """A reflection here, then there (docs/design.md, Restart): only later it starts anew."""
     patience = 30  # steps of 0.02 s

@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.belief.ambiguity import PaperCost
+from jaxnav.belief.ambiguity import PaperCost, Ungated
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, calib_dir, load_params, write_params
 from jaxnav.navigator import Navigator
@@ -72,6 +72,8 @@ def tuned(navigator: Navigator) -> st.SearchStrategy[dict]:
         )
         if TUNABLES[name].matrix is not None:
             known[name] |= covariances(value.shape[0])
+        if TUNABLES[name].guard:
+            known[name] |= st.just(np.array(math.inf))
     return st.fixed_dictionaries({}, optional=known).filter(len)
 
 
@@ -140,6 +142,23 @@ def test_what_is_written_says_what_it_means(tmp_path):
     )
 
 
+def test_a_gate_may_be_none_and_stays_none(tmp_path):
+    """In a file that a person writes, in one that is written, and of a rule that has none."""
+    assert [name for name, tunable in TUNABLES.items() if tunable.guard] == ["motion.gate_nis"]
+    params = load_params(written(tmp_path, "parameters: {motion.gate_nis: .inf}"))
+    for navigator in NAVIGATORS.values():
+        assert apply_params(navigator, params).motion.gate_nis == np.inf
+    write_params(tmp_path / "p.yaml", {"motion.gate_nis": jnp.asarray(jnp.inf)})
+    assert "restart [1]\n  motion.gate_nis: .inf\n" in (tmp_path / "p.yaml").read_text()
+    values = {"motion.gate_nis": 30, "model_sigma_px": 0.2}
+    for selector, gate_nis in ((PaperCost(), 30), (Ungated(PaperCost()), np.inf)):
+        navigator = apply_params(
+            Navigator(RIG, MARKERS, QCAR, selector=selector), Params.of(values, WHERE)
+        )
+        assert float(navigator.motion.gate_nis) == gate_nis
+        assert float(navigator.model_sigma_px) == 0.2
+
+
 plain = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**20), 10**20) | st.text(max_size=8)
     | st.floats(allow_nan=False, allow_infinity=False)
@@ -186,6 +205,7 @@ def test_provenance_is_kept_and_shown(tmp_path):
 
 NAMES = ", ".join(TUNABLES)
 FLOOR = "parameters.motion.vision_floor"
+GATE = "parameters.motion.gate_nis"
 
 
 @pytest.mark.parametrize(
@@ -206,6 +226,11 @@ FLOOR = "parameters.motion.vision_floor"
         (f"{{corner_sigma_px: 1{400 * '0'}}}", "parameters.corner_sigma_px: must be from -1e+09"),
         ("{corner_sigma_px: .nan}", "parameters.corner_sigma_px: must be finite, got nan"),
         ("{controller.lookahead_m: .inf}", "parameters.controller.lookahead_m: must be finite"),
+        ("{motion.gate_nis: .nan}", f"{GATE}: must be > 0 and finite, or .inf for none, got nan"),
+        ("{motion.gate_nis: -.inf}", f"{GATE}: must be > 0 and finite, or .inf for none, got -inf"),
+        ("{motion.gate_nis: 0}", f"{GATE}: must be > 0, got 0"),
+        ("{motion.gate_nis: -3}", f"{GATE}: must be > 0, got -3"),
+        ("{motion.gate_nis: [1, .inf]}", f"{GATE}[1]: must be finite, got inf"),
         ("{motion.vision_floor: []}", f"{FLOOR}: must have 1 to 64 entries, got 0"),
         (f"{{motion.vision_floor: {[1] * 65}}}", f"{FLOOR}: must have 1 to 64 entries, got 65"),
         ("{motion.vision_floor: [1, -1, 1]}", f"{FLOOR}[1]: must be > 0, got -1"),

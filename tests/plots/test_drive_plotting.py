@@ -141,6 +141,28 @@ def test_flags_are_bars_from_when_they_rise_until_they_fall(log):
     np.testing.assert_allclose(sorted(found["health"]), [(0, 3), (3, 6), (6, 19.9)])
 
 
+@pytest.mark.parametrize(
+    ("header", "gate_nis"),
+    [
+        ({}, 21.1),
+        ({"selector": "paper-cost", "parameters": 3}, 21.1),
+        ({"parameters": {"motion.gate_nis": 50.0}}, 50.0),
+        ({"parameters": {"motion.gate_nis": math.inf}}, math.inf),
+        ({"selector": "paper-cost-ungated", "parameters": {"motion.gate_nis": 50.0}}, math.inf),
+    ],
+)
+def test_the_gate_is_that_of_the_filter_that_drove(log, header, gate_nis):
+    """And every NIS is in view, those above it in a colour of their own."""
+    nis = np.geomspace(0.1, 1000, COUNT)
+    figure = drive_log_report(dataclasses.replace(changed(log, nis=nis), header=header))
+    [axes] = [axes for axes in figure.axes if axes.get_ylabel() == "NIS"]
+    below, above, *gates = (np.unique(line.get_ydata()) for line in axes.lines)
+    np.testing.assert_allclose(below, nis[nis <= gate_nis])
+    np.testing.assert_allclose(above, nis[nis > gate_nis])
+    assert gates == ([gate_nis] if math.isfinite(gate_nis) else [])
+    assert axes.get_ylim()[1] > 1000
+
+
 def test_the_track_has_the_colour_of_its_health(log):
     health = np.full(COUNT, int(Health.OK))
     health[100:] = Health.STOP

@@ -77,6 +77,7 @@ parameters = st.fixed_dictionaries(
     {},
     optional={
         "controller.proportional_per_m": sound,
+        "motion.gate_nis": sound | st.just(math.inf),
         "motion.odometry_sigma": st.lists(sound, min_size=3, max_size=3),
         "motion.vision_floor": st.tuples(sound, sound, sound).map(lambda d: np.diag(d).tolist()),
     },
@@ -162,6 +163,16 @@ def test_parameters_reach_the_navigator_and_come_with_the_header():
     }
     with pytest.raises(BadInput, match=r"^drive.mcap: parameters.motion.vision_floor: must have 3"):
         setup.with_params(Params.of({"motion.vision_floor": [1] * 6}, WHERE))
+
+
+def test_a_rule_without_a_gate_drives_without_one():
+    """Also where its header has the gate that other rules were given."""
+    tuned = qcar_setup().with_params(Params.of({"motion.gate_nis": 30}, WHERE))
+    for selector, gate_nis in (("paper-cost", 30), ("paper-cost-ungated", math.inf)):
+        header = dataclasses.replace(tuned, selector=selector).header()
+        navigator = DriveSetup.of_header(decode(encode(header)), WHERE).navigator()
+        assert type(navigator.selector).__name__ == "PaperCost"
+        assert float(navigator.motion.gate_nis) == gate_nis
 
 
 def _without(header: dict, key: str) -> dict:

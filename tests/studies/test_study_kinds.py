@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from jaxnav.belief.selectors import SELECTORS
 from jaxnav.cli import main
 from jaxnav.commands.study.studies import load_study, shipped_configs
 from jaxnav.models.markers import CORNER_SIGNS
@@ -92,6 +93,16 @@ def test_markers_flip_as_often_as_opencv_says(
     sigma = np.sqrt(rate * (1 - rate) * (1 / told + 1 / count)) + 1 / count
     assert abs(ours - rate) < 3.5 * sigma
     assert (rate > 0.1) == (range_m > 2)
+
+
+def test_a_gate_is_a_matter_of_drives_alone() -> None:
+    """Of single frames an ungated rule would be the rule itself."""
+    ungated = {"lowest-reprojection-ungated", "paper-cost-ungated"}
+    of_frames, of_drives = (
+        set(schema.parameters["selector"].choices) for schema in (SCHEMA, DriveStudy.schema)
+    )
+    assert of_drives == set(SELECTORS)
+    assert of_drives - of_frames == ungated | {"orientation-given"}
 
 
 def test_selectors_are_told_apart(frames: tuple[xr.Dataset, xr.Dataset]) -> None:

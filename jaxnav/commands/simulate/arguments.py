@@ -33,9 +33,10 @@ from jaxnav.commands.kinds import (
 class Demo(Headless):
     """Drive the paper's experiment: a simulated car, four rendered cameras, one marker.
 
-    The car is driven by the method of --selector alone; Method A (the pose of lowest reprojection
-    error) with the same filter runs alongside on the same frames. Written to --out: report.png,
-    a mosaic of camera frames, summary.json, and trajectories in TUM format.
+    The car is driven by the method of --selector alone. The paper's Method A (the pose of lowest
+    reprojection error, fused by a filter without gate and restart) runs alongside on the same
+    frames. Written to --out: report.png, a mosaic of camera frames, summary.json, and trajectories
+    in TUM format.
     """
 
     seed: Seed = 0

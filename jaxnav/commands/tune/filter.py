@@ -18,7 +18,7 @@ from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, load_params, output_folder
 from jaxnav.navigator import Navigator
-from jaxnav.parameters import parameters_of, with_parameters
+from jaxnav.parameters import TUNABLES, parameters_of, with_parameters
 from jaxnav.plots.tuning import EstimatorScores, tuning_report
 from jaxnav.simulation.statistics import anees_band, bootstrap_mean
 from jaxnav.tuning.branches import estimate_sequences
@@ -60,14 +60,19 @@ def space_of(args: Arguments, navigator: Navigator, learned: FrameSequences) -> 
     """The space of the parameters to be learned, starting at a navigator's values.
 
     Raises:
-        BadInput: a name that the navigator does not have.
+        BadInput: a name that the filter does not have, or can't learn.
     """
     names = args.train or _by_default(navigator, learned)
+    known = [
+        name
+        for name in parameters_of(navigator)
+        if not name.startswith("controller.") and not TUNABLES[name].guard
+    ]
     for flag, given in (("--train", args.train), ("--full", args.full)):
         for name in given:
-            if name not in parameters_of(navigator) or name.startswith("controller."):
-                known = [n for n in parameters_of(navigator) if not n.startswith("controller.")]
-                problem = f"there is no {name} in this filter: expected one of {', '.join(known)}"
+            if name not in known:
+                expected = ", ".join(known)
+                problem = f"there is no {name} to learn in this filter: expected one of {expected}"
                 raise BadInput(flag, problem)
     try:
         return Space.of(navigator, dict.fromkeys(names, True), frozenset(args.full))

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
+from jaxnav.commands.simulate.rendered_world import RenderedWorld
 from jaxnav.files import calib_dir, write_params
+from jaxnav.navigator import Navigator
 
 QCAR = calib_dir() / "qcar"
 
@@ -18,8 +20,19 @@ def keep_the_compile_cache(monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
 
 
-def test_the_paper_experiment_from_images(tmp_path, capsys):
+def test_the_paper_experiment_from_images(tmp_path, capsys, monkeypatch):
+    """Beside our method, on the same frames, the paper's as it is written."""
+    made = {}
+
+    def navigator(world: RenderedWorld, selector: str) -> Navigator:
+        made[selector] = navigator_of(world, selector)
+        return made[selector]
+
+    navigator_of = RenderedWorld.navigator
+    monkeypatch.setattr(RenderedWorld, "navigator", navigator)
     assert main(["demo", "--out", str(tmp_path), "--headless"]) == 0
+    assert list(made) == ["multi-hypothesis", "lowest-reprojection-ungated"]
+    assert [np.isfinite(one.motion.gate_nis) for one in made.values()] == [True, False]
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["reached"] is True
     assert summary["steps"] == pytest.approx(summary["duration_s"] * 15 + 1, abs=0.01)
@@ -37,7 +50,10 @@ def test_the_paper_experiment_from_images(tmp_path, capsys):
     assert np.linalg.norm(truth[-1, 1:3] - [0.5, 0.65]) < 0.2
     for picture in ("report.png", "mosaic.png"):
         assert cv2.imread(str(tmp_path / picture)).shape[1] > 800
-    assert "reached all waypoints" in capsys.readouterr().out
+    paper_s_m = summary["methods"]["method_a_kf"]["position_rmse_m"]
+    line = capsys.readouterr().out
+    assert "reached all waypoints" in line
+    assert f"(the paper's Method A + KF {paper_s_m:.3f} m)" in line
 
 
 def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):

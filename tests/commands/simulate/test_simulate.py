@@ -4,15 +4,19 @@ import json
 import os
 import subprocess
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from jaxnav.belief.selectors import SELECTORS
 from jaxnav.cli import main
+from jaxnav.commands.kinds import Selector, SimulatedSelector
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
 from jaxnav.commands.simulate.simulate import _load, _navigator
 from jaxnav.files import write_params
 from jaxnav.parameters import parameters_of
+from jaxnav.recording.drive_setup import PILOT_SELECTORS
 from jaxnav.simulation.rollout import Trace
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
@@ -165,6 +169,17 @@ def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
     assert float(found["motion.height_sigma_m"]) == 0.25
 
 
+def test_a_name_without_a_gate_is_its_rule_on_a_filter_that_has_none():
+    car = _load(Arguments())
+    for name in ("lowest-reprojection", "paper-cost"):
+        gated, ungated = (
+            _navigator(car, "paper", name + ending, 1.0) for ending in ("", "-ungated")
+        )
+        assert type(ungated.selector) is type(gated.selector)
+        gates = [float(one.motion.gate_nis) for one in (gated, ungated)]
+        assert gates == [pytest.approx(21.1), np.inf]
+
+
 MEASURED = (
     "success_rate",
     "wrong_branch_fraction_after_2s",
@@ -201,6 +216,22 @@ def test_numbers_that_are_missing_are_kept(tmp_path, capsys):
     code, out, _ = kept(tmp_path, capsys)
     assert code == 0
     assert out.splitlines()[-1] == "| oracle | 1 | nan% | nan% | nan / nan | nan% | nan | nan |"
+
+
+def test_all_selectors_have_a_row_and_a_name_on_the_command_line(capsys, monkeypatch):
+    def drive(_args, _car, key: dict) -> dict:
+        missing = {"value": None}
+        return dict.fromkeys(MEASURED, missing) | {
+            "time_to_decide_s": {"median": missing, "p95": missing}
+        }
+
+    monkeypatch.setattr("jaxnav.commands.simulate.simulate._drive", drive)
+    assert main(["simulate", "--selector", "all", "--headless"]) == 0
+    rows = [line.split(" | ")[0].strip("| ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert rows == list(SELECTORS)
+    assert {"paper-cost-ungated", "lowest-reprojection-ungated"} < set(rows)
+    assert {*get_args(SimulatedSelector)} == {*rows, "all"}
+    assert {*get_args(Selector)} == {*PILOT_SELECTORS}
 
 
 def test_a_result_that_lacks_something_is_not_resumed(tmp_path, capsys):
