@@ -32,11 +32,12 @@ class OdometryNoise(eqx.Module):
     steering_offset_rad: float = 0.0  # what the sensor reports with the wheels straight ahead
     spin: float = 0.0  # 0.5: while the wheels spin, the odometer reports another 50 % more
     spin_s: float = 1.0  # how long they spin
-    spin_period_s: float = 3.0  # from the begin of one spin to that of the next, the first at 0 s
+    spin_period_s: float = 3.0  # from the begin of one spin to that of the next
+    spin_from_s: float = 2.0  # when one begins; 0: as the car starts off
 
     def scale_at(self, stamp_s: Float[Array, ""] | float) -> Float[Array, ""] | float:
         """What the spinning wheels multiply the reported speed by at a time."""
-        return 1 + self.spin * (stamp_s % self.spin_period_s < self.spin_s)
+        return 1 + self.spin * ((stamp_s - self.spin_from_s) % self.spin_period_s < self.spin_s)
 
 
 def move(vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""]) -> CarState:

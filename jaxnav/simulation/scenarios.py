@@ -145,7 +145,8 @@ def _everything() -> Scenario:
 
     Corners are 25 ms late, which stands for blur as well, and drift by 0.25 px; each camera is off
     by 0.5 degrees and 5 mm; wheels slip by 5 %, spin by another 25 %, and the steering is off by
-    0.5 degrees. The white noise of the corners is as told.
+    0.5 degrees. Spins begin 2 s after the start, when the branch is decided. The white noise of the
+    corners is as told.
     """
     return dataclasses.replace(
         _paper(),

@@ -69,6 +69,7 @@ PARAMETERS = {
         "what the odometer reports over what is true", "", None, low=0.1, high=10.0, static=True
     ),
     "wheel_spin": _error("share of the speed that is reported too much, 1 s of 3", "", 10.0),
+    "wheel_spin_from_s": _error("when a spin begins, 0: as the car starts off", "s", 3.0),
     "steering_offset_deg": _error("reported straight ahead", "deg", 45.0, low=-45.0),
     "laps": Parameter(
         "before the marker; 0: the scenario's route",
@@ -165,6 +166,7 @@ class DriveStudy(Study):
                 scenario.odometry,
                 speed_scale=value["odometer_scale"],
                 spin=value["wheel_spin"],
+                spin_from_s=value["wheel_spin_from_s"],
                 steering_offset_rad=_radians(value["steering_offset_deg"]),
             ),
             extrinsics_off=(

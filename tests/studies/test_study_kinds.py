@@ -183,6 +183,7 @@ def test_a_drive_study_varies_errors_that_repeat(tmp_path: Path) -> None:
     (tmp_path / "s.yaml").write_text(
         "trials: 2\naxes: {scenario: [paper, everything]}\n"
         "fixed: {corner_drift_px: 0.7, corner_correlation: 1, corner_lag_s: 0.06, wheel_spin: 0.2,"
+        " wheel_spin_from_s: 0,"
         " cameras_off_deg: 2, steering_offset_deg: -3, laps: 2}\n"
     )
     study = load_study("drive", tmp_path / "s.yaml")
@@ -194,7 +195,8 @@ def test_a_drive_study_varies_errors_that_repeat(tmp_path: Path) -> None:
         assert (scenario.corner_correlation, scenario.corner_lag_s) == (1, 0.06)
         assert scenario.extrinsics_off == pytest.approx((np.deg2rad(2), usual.extrinsics_off[1]))
         odometry = scenario.odometry
-        assert (odometry.spin, odometry.speed_scale) == (0.2, usual.odometry.speed_scale)
+        assert (odometry.spin, odometry.spin_from_s) == (0.2, 0)
+        assert odometry.speed_scale == usual.odometry.speed_scale
         assert odometry.steering_offset_rad == pytest.approx(np.deg2rad(-3))
         assert float(study.rollout(cell, scenario).corner_drift_px) == pytest.approx(0.7)
     (tmp_path / "s.yaml").write_text("trials: 2\naxes: {corner_lag_s: [0.05, 0.1]}\n")
