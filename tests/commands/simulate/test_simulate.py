@@ -151,7 +151,7 @@ def test_parameters_drive_and_are_what_a_result_belongs_to(tmp_path, capsys, mon
     assert result["run"]["told_noise_px"] == 3.0
     assert result["success_rate"]["value"] == 0  # it hardly moves
 
-    def drive(_args, _world, key: dict) -> dict:
+    def drive(_args, _car, _scenario, key: dict) -> dict:
         driven.append(key)
         return {name: value for name, value in result.items() if name != "run"}
 
