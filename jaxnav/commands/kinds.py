@@ -33,6 +33,11 @@ Scenario = Literal[
     "slip",
     "miscalibrated",
     "blur",
+    "late",
+    "drifting-corners",
+    "each-camera-off",
+    "uneven-wheels",
+    "everything",
 ]
 StudyKind = Literal["ambiguity", "drive"]
 CornerBackend = Literal["aruco", "apriltag"]
@@ -142,7 +147,8 @@ def within(name: str) -> Asked:
 POSITIVE = Asked(_require_finite)
 AT_LEAST_1 = Asked(partial(_require_at_least, least=1))
 Count = Annotated[int, AT_LEAST_1]
-Seed = Annotated[int, Asked(partial(_require_at_least, least=0))]
+NotNegativeCount = Annotated[int, Asked(partial(_require_at_least, least=0))]
+Seed = NotNegativeCount
 Positive = Annotated[float, POSITIVE]
 NotNegative = Annotated[float, Asked(partial(_require_finite, zero_allowed=True))]
 CornerSigma = Annotated[float, within("corner_sigma_px")]

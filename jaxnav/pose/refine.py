@@ -57,7 +57,9 @@ class RefinedPose(eqx.Module):
 
     T_vehicle_world: jaxlie.SE3
     cost: Float[Array, "*N"]  # sum of (residual / sigma)^2
-    e1_px2: Float[Array, "*N"]  # the paper's, Eq. 3: every sigma is 1 px
+    # The paper's, Eq. 3: every sigma is 1 px. Of a rig with sigmas: in the cameras' most probable
+    # errors, and what these cost.
+    e1_px2: Float[Array, "*N"]
     covariance: Float[Array, "*N 6 6"]  # of xi in T_world_vehicle * exp(xi): vehicle axes, (m, rad)
     steps: Int[Array, "*N"]
     converged: Bool[Array, "*N"]
@@ -138,7 +140,10 @@ def refine_sightings(
     )
     cost = jnp.sum(residual**2, axis=0)
     sigma_px = jnp.tile(seen.sigma_px.reshape(-1), 2)[:, None]
-    e1_px2 = jnp.sum((residual[: sigma_px.shape[0]] * sigma_px) ** 2, axis=0)
+    corners, errors = residual[: sigma_px.shape[0]], residual[sigma_px.shape[0] :]
+    # What a nuisance costs in px^2, by the mean variance of the corners in view.
+    unit_px2 = jnp.sum(weight * seen.sigma_px**2) / jnp.maximum(4 * jnp.sum(weight), 1)
+    e1_px2 = jnp.sum((corners * sigma_px) ** 2, axis=0) + unit_px2 * jnp.sum(errors**2, axis=0)
     covariance = jax.vmap(partial(_body_covariance, free=free), in_axes=(-1, -1, -1))(
         chart.pivot, chart.scale, normal.information
     )

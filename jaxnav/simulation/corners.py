@@ -1,9 +1,12 @@
-"""Project markers to corners without images or a detector. Pure, for rollouts under vmap."""
+"""Project markers to corners without images or a detector, and let their errors drift.
+
+Pure, for rollouts under vmap.
+"""
 
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Key
 
 from jaxnav.models.geometry import rotation_matrix
 from jaxnav.models.markers import MarkerMap
@@ -30,3 +33,18 @@ def see(
     diagonals = corners_px[:, :, :2] - corners_px[:, :, 2:]
     area_px2 = jnp.abs(jnp.cross(diagonals[:, :, 0], diagonals[:, :, 1])) / 2
     return corners_px, inside & faces & (area_px2 > MIN_SIDE_PX**2)
+
+
+def drifted(
+    drift: Float[Array, "*batch"], correlation: float, key: Key[Array, ""]
+) -> Float[Array, "*batch"]:
+    """A drift one frame later: a first-order Gauss-Markov process of unit variance.
+
+    drift' = a drift + sqrt(1 - a^2) e, with e ~ N(0, 1) of every element and frame for itself.
+
+    Args:
+        drift: drawn from N(0, 1) at first.
+        correlation: a, from 0 (white) to 1 (constant).
+    """
+    fresh = jax.random.normal(key, drift.shape, drift.dtype)
+    return correlation * drift + (1 - correlation**2) ** 0.5 * fresh

@@ -134,7 +134,9 @@ def drive(
         true = motion.state_at(stamp_s)
         corners_px, visible, sigma_px = look(motion.poses_at, stamp_s, believed)
         key, odometry_key = jax.random.split(key)
-        speed_mps, steering_rad = read_odometry(true, settings.odometry, odometry_key)
+        speed_mps, steering_rad = read_odometry(
+            true, settings.odometry, odometry_key, stamp_s=stamp_s
+        )
         observation = Observation(
             corners_px=jnp.asarray(corners_px, float),
             visible=jnp.asarray(visible),

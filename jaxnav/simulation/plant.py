@@ -29,6 +29,15 @@ class OdometryNoise(eqx.Module):
     speed_sigma_mps: float = 0.01
     steering_sigma_rad: float = 0.005
     speed_scale: float = 1.0  # 1.1: the odometer reports 10 % too much
+    steering_offset_rad: float = 0.0  # what the sensor reports with the wheels straight ahead
+    spin: float = 0.0  # 0.5: while the wheels spin, the odometer reports another 50 % more
+    spin_s: float = 1.0  # how long they spin
+    spin_period_s: float = 3.0  # from the begin of one spin to that of the next
+    spin_from_s: float = 2.0  # when one begins; 0: as the car starts off
+
+    def scale_at(self, stamp_s: Float[Array, ""] | float) -> Float[Array, ""] | float:
+        """What the spinning wheels multiply the reported speed by at a time."""
+        return 1 + self.spin * ((stamp_s - self.spin_from_s) % self.spin_period_s < self.spin_s)
 
 
 def move(vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""]) -> CarState:
@@ -68,11 +77,17 @@ def read_odometry(
     noise: OdometryNoise,
     key: Key[Array, ""],
     speed_scale: Float[Array, ""] | float | None = None,
+    stamp_s: Float[Array, ""] | float = 0.0,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(speed_mps, steering_rad) as the sensors report them; the scale is `noise`'s by default."""
+    """(speed_mps, steering_rad) as the sensors report them at a time since the start.
+
+    The scale is `noise`'s by default; that of spinning wheels comes on top.
+    """
     speed_scale = noise.speed_scale if speed_scale is None else speed_scale
+    if noise.spin:
+        speed_scale = speed_scale * noise.scale_at(stamp_s)
     speed_error, steering_error = jax.random.normal(key, (2,), state.speed_mps.dtype)
     return (
         speed_scale * state.speed_mps + noise.speed_sigma_mps * speed_error,
-        state.steering_rad + noise.steering_sigma_rad * steering_error,
+        state.steering_rad + noise.steering_offset_rad + noise.steering_sigma_rad * steering_error,
     )

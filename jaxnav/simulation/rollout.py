@@ -22,13 +22,12 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.observation import Observation
 from jaxnav.simulation.batch_jit import jit_with
-from jaxnav.simulation.corners import see
+from jaxnav.simulation.corners import drifted, see
 from jaxnav.simulation.drive import PASSED_M
 from jaxnav.simulation.plant import CarState, move_through, read_odometry
 from jaxnav.simulation.queue import run_lanes
 from jaxnav.simulation.regimes import step_by_regime
 from jaxnav.simulation.scenarios import Scenario
-from jaxnav.simulation.single_frames import directions
 from jaxnav.simulation.traces import DriveTraces
 from jaxnav.simulation.world import DriveState, Spread, nominal
 
@@ -72,8 +71,7 @@ class Rollout(eqx.Module):
     markers: MarkerMap
     scenario: Scenario = eqx.field(static=True)
     corner_noise_px: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    # Each corner of each camera has its own direction, the same in all frames of a drive.
-    corner_bias_px: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)
+    corner_drift_px: Float[Array, ""] | None = None  # None: the scenario's
     start_pose: Float[Array, " 3"] | None = None  # None: the scenario's
     spread: Spread | None = eqx.field(static=True, default=None)  # None: all cars are nominal
     lanes: int = eqx.field(static=True, default=128)
@@ -162,8 +160,8 @@ class Rollout(eqx.Module):
             start_key, (3,), spread.dtype, -1, 1
         )
         zero = jnp.zeros_like(start[0])
-        corners = (len(self.navigator.rig), len(self.markers.ids), 4)
-        turns = jax.random.uniform(jax.random.fold_in(rig_key, 1), corners, start.dtype)
+        corners = (len(self.navigator.rig), len(self.markers.ids), 4, 2)
+        drift = jax.random.normal(jax.random.fold_in(rig_key, 1), corners, start.dtype)
         truth = nominal(self.vehicle, scenario, start.dtype)
         if self.spread is not None:
             truth_key = jax.random.fold_in(rig_key, 2)
@@ -172,7 +170,7 @@ class Rollout(eqx.Module):
             key=key,
             rig=scenario.true_rig(self.navigator.rig, rig_key),
             truth=truth,
-            bias=directions(turns),
+            drift=drift,
             start_pose=start,
             car=CarState(start, zero, zero),
             acting=Command(zero, zero),
@@ -199,16 +197,21 @@ class Rollout(eqx.Module):
         car = scenario.displaced(car, stamp_s, period_s)
         key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, world.frame))
 
-        # Smear shifts the corners to their positions a little earlier.
-        smear = scenario.corner_lag_s / scenario.frame_period_s
-        seen_from = car.pose + smear * (world.car.pose - car.pose)
+        # Late corners lie where they were a part of a frame period earlier.
+        part = scenario.corner_lag_s / scenario.frame_period_s
+        earlier = scenario.displaced(world.car, stamp_s, period_s)
+        seen_from = car.pose + part * (earlier.pose - car.pose)
         corners_px, visible = see(world.rig, self.markers, T_world_vehicle_from_planar(seen_from))
         noise_px = self.corner_noise_px * jax.random.normal(key_corners, corners_px.shape, dtype)
-        noise_px = noise_px + self.corner_bias_px * world.bias
+        drift = drifted(
+            world.drift, scenario.corner_correlation, jax.random.fold_in(key_corners, 1)
+        )
+        given_px = self.corner_drift_px
+        noise_px = noise_px + drift * (scenario.corner_drift_px if given_px is None else given_px)
         visible = visible & ~scenario.hidden(stamp_s)
         corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
         speed_mps, steering_rad = read_odometry(
-            car, scenario.odometry, key_odometry, world.truth.odometer_scale
+            car, scenario.odometry, key_odometry, world.truth.odometer_scale, stamp_s
         )
         truth = T_world_vehicle_from_planar(car.pose)
         obs = Observation(
@@ -253,6 +256,7 @@ class Rollout(eqx.Module):
             ended = ended | out.done
         return dataclasses.replace(
             world,
+            drift=drift,
             car=car,
             acting=world.command,
             command=command,

@@ -35,6 +35,8 @@ class Drives:
     duration_s: Float[np.ndarray, " S"]
     time_to_decide_s: Float[np.ndarray, " S"]
     success: Bool[np.ndarray, " S"]
+    times_s: Float[np.ndarray, " frames"]
+    scored_after_s: tuple[float, ...]
 
     @staticmethod
     def of(drives: Trace, scenario: Scenario) -> "Drives":
@@ -60,6 +62,8 @@ class Drives:
             duration_s=trace.active.sum(axis=1) * scenario.frame_period_s,
             time_to_decide_s=np.where(decided.any(axis=1), times_s[decided.argmax(axis=1)], np.inf),
             success=trace.on_floor.all(axis=1) & (passed if scenario.drives else right_at_last),
+            times_s=times_s,
+            scored_after_s=scenario.scored_after_s,
         )
 
     def summary(self) -> dict[str, Any]:
@@ -75,11 +79,24 @@ class Drives:
                 "median": _bootstrap(self.time_to_decide_s, 0.5),
                 "p95": _bootstrap(self.time_to_decide_s, 0.95),
             },
-            "median_position_error_m": self._pooled(
-                self.position_error_m, lambda x: _quantile(x, 0.5)
-            ),
-            "anees": self._pooled(self.nees, lambda x: float(np.mean(x)) if len(x) else np.nan),
+            **self._errors(self.decided, ""),
             "duration_s": {"median": _bootstrap(self.duration_s, 0.5)},
+        } | self._later_errors()
+
+    def _later_errors(self) -> dict[str, Any]:
+        errors: dict[str, Any] = {}
+        for after_s in self.scored_after_s:
+            errors |= self._errors(self.decided & (self.times_s >= after_s), f"_after_{after_s:g}s")
+        return errors
+
+    def _errors(self, frames: Bool[np.ndarray, "S frames"], suffix: str) -> dict[str, Any]:
+        return {
+            f"median_position_error_m{suffix}": self._pooled(
+                self.position_error_m, frames, lambda x: _quantile(x, 0.5)
+            ),
+            f"anees{suffix}": self._pooled(
+                self.nees, frames, lambda x: float(np.mean(x)) if len(x) else np.nan
+            ),
         }
 
     def _fraction(self, frames: np.ndarray) -> dict[str, Any]:
@@ -92,10 +109,13 @@ class Drives:
             high = 1 - 0.05 ** (1 / len(wrong))
         return _measure(wrong.sum() / max(int(counted.sum()), 1), (low, high))
 
+    @staticmethod
     def _pooled(
-        self, values: np.ndarray, statistic: Callable[[np.ndarray], float]
+        values: np.ndarray, frames: np.ndarray, statistic: Callable[[np.ndarray], float]
     ) -> dict[str, Any]:
-        drives = [v[frames] for v, frames in zip(values, self.decided, strict=True)]
+        if not frames.any():
+            return _measure(np.nan, (np.nan, np.nan))
+        drives = [v[chosen] for v, chosen in zip(values, frames, strict=True)]
         resampled = [
             statistic(np.concatenate([drives[i] for i in picks]))
             for picks in _resamples(len(drives), _POOLED_RESAMPLES)

@@ -69,7 +69,7 @@ class DriveState(eqx.Module):
     key: Key[Array, ""]
     rig: CameraRig  # the true one
     truth: Truth
-    bias: Float[Array, "C M 4 2"]  # directions in the image
+    drift: Float[Array, "C M 4 2"]  # of the corners, in standard deviations
     start_pose: Float[Array, " 3"]
     car: CarState
     acting: Command  # in effect until the latency of `command` is over

@@ -21,7 +21,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.rollout import Rollout, Trace
-from jaxnav.simulation.scenarios import Scenario, scenarios
+from jaxnav.simulation.scenarios import Scenario, on_laps, scenarios
 from jaxnav.simulation.scores import Drives
 from jaxnav.studies.config import Config
 from jaxnav.studies.lanes import in_precision
@@ -34,6 +34,12 @@ LANES = 128
 _MANY_TRIALS = 8192
 
 
+def _error(description: str, unit: str, high: float, low: float = 0.0) -> Parameter:
+    """A parameter for an error that the navigator is not told, by default the scenario's."""
+    described = f"{description}; else the scenario's"
+    return Parameter(described, unit, None, low=low, high=high, static=True)
+
+
 PARAMETERS = {
     "scenario": Parameter("what happens", "", "paper", choices=tuple(scenarios()), static=True),
     "selector": Parameter(
@@ -41,9 +47,13 @@ PARAMETERS = {
     ),
     "cameras": cameras("the first ones of the rig; by default all"),
     "corner_noise_px": Parameter("standard deviation of a corner coordinate", "px", 1.0, low=0.0),
-    "corner_bias_px": Parameter(
-        "of every corner, in a direction of its own through all of a drive", "px", 0.0, low=0.0
+    "corner_drift_px": Parameter(
+        "of what stays or drifts beside it; else the scenario's", "px", None, low=0.0
     ),
+    "corner_correlation": _error("of that from frame to frame, 1: it stays", "", 1.0),
+    "corner_lag_s": _error("how late corners are", "s", scenarios()["paper"].frame_period_s),
+    "cameras_off_deg": _error("each camera is turned by this, its own way", "deg", 180.0),
+    "cameras_off_m": _error("each camera is moved by this, its own way", "m", 10.0),
     "told_noise_px": positive("sigma the estimator is told (R); else the noise", "px", None),
     "marker_size_m": positive("side of every marker; by default the map's", "m", None),
     "focal_px": positive("mean of the cameras' focal lengths; else the rig's", "px", None),
@@ -57,6 +67,18 @@ PARAMETERS = {
     "start_heading_deg": Parameter("of the start; by default the scenario's", "deg", None),
     "odometer_scale": Parameter(
         "what the odometer reports over what is true", "", None, low=0.1, high=10.0, static=True
+    ),
+    "wheel_spin": _error("share of the speed that is reported too much, 1 s of 3", "", 10.0),
+    "wheel_spin_from_s": _error("when a spin begins, 0: as the car starts off", "s", 3.0),
+    "steering_offset_deg": _error("reported straight ahead", "deg", 45.0, low=-45.0),
+    "laps": Parameter(
+        "before the marker; 0: the scenario's route",
+        "",
+        0,
+        low=0,
+        high=100,
+        whole=True,
+        static=True,
     ),
     "duration_s": Parameter(
         "a drive ends after this", "s", None, low=0.1, high=3600.0, static=True
@@ -135,12 +157,27 @@ class DriveStudy(Study):
         """The scenario of a cell."""
         value: dict[str, Any] = dict(cell)
         scenario = scenarios()[value["scenario"]]
-        if value["odometer_scale"] is not None:
-            odometry = dataclasses.replace(scenario.odometry, speed_scale=value["odometer_scale"])
-            scenario = dataclasses.replace(scenario, odometry=odometry)
-        if value["duration_s"] is not None:
-            scenario = dataclasses.replace(scenario, duration_s=value["duration_s"])
-        return scenario
+        if value["laps"] and scenario.drives:
+            scenario = on_laps(scenario, value["laps"])
+        turn_rad, shift_m = scenario.extrinsics_off
+        changed: Scenario = _replaced(
+            scenario,
+            odometry=_replaced(
+                scenario.odometry,
+                speed_scale=value["odometer_scale"],
+                spin=value["wheel_spin"],
+                spin_from_s=value["wheel_spin_from_s"],
+                steering_offset_rad=_radians(value["steering_offset_deg"]),
+            ),
+            extrinsics_off=(
+                _given(_radians(value["cameras_off_deg"]), turn_rad),
+                _given(value["cameras_off_m"], shift_m),
+            ),
+            corner_lag_s=value["corner_lag_s"],
+            corner_correlation=value["corner_correlation"],
+            duration_s=value["duration_s"],
+        )
+        return changed
 
     def rollout(self, cell: Cell, scenario: Scenario) -> Rollout:
         """The simulation of a cell's drives."""
@@ -172,22 +209,15 @@ class DriveStudy(Study):
             integral_per_ms=value["integral_per_ms"],
             corner_sigma_px=told_px,
         )
-        starts = [value["start_x_m"], value["start_y_m"], value["start_heading_deg"]]
-        start = [
-            usual if given is None else given
-            for given, usual in zip(
-                [*starts[:2], None if starts[2] is None else np.deg2rad(starts[2])],
-                scenario.start_pose,
-                strict=True,
-            )
-        ]
+        starts = (value["start_x_m"], value["start_y_m"], _radians(value["start_heading_deg"]))
+        start = list(map(_given, starts, scenario.start_pose))
         return Rollout(
             navigator,
             self.vehicle,
             markers,
             scenario,
             value["corner_noise_px"],
-            value["corner_bias_px"],
+            jnp.asarray(_given(value["corner_drift_px"], scenario.corner_drift_px), float),
             jnp.asarray(start, float),
             lanes=min(LANES, self.config.trials),
             many=1 if self._many else sys.maxsize,
@@ -202,6 +232,19 @@ class DriveStudy(Study):
             sizes_m = jnp.full_like(markers.size_m, value["marker_size_m"])
             markers = eqx.tree_at(lambda m: m.size_m, markers, sizes_m)
         return rig, markers
+
+
+def _given(value: float | None, usual: float) -> float:
+    return usual if value is None else value
+
+
+def _radians(value_deg: float | None) -> float | None:
+    return None if value_deg is None else float(np.deg2rad(value_deg))
+
+
+def _replaced(whole: Any, **fields: Any) -> Any:
+    """A dataclass with those fields replaced that are not None."""
+    return dataclasses.replace(whole, **{k: v for k, v in fields.items() if v is not None})
 
 
 def _scores(trace: Trace, scenario: Scenario) -> dict[str, np.ndarray]:

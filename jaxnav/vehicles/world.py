@@ -127,9 +127,10 @@ class SimWorld:
         noise, state = self.settings.odometry, self.state(at_ns)
         with self._lock:
             errors = self.rng.standard_normal(2)
+        scale = noise.speed_scale * float(noise.scale_at(at_ns * 1e-9))
         return (
-            float(noise.speed_scale * state[3] + noise.speed_sigma_mps * errors[0]),
-            float(state[4] + noise.steering_sigma_rad * errors[1]),
+            float(scale * state[3] + noise.speed_sigma_mps * errors[0]),
+            float(state[4] + noise.steering_offset_rad + noise.steering_sigma_rad * errors[1]),
         )
 
     def detections(self, at_ns: int) -> list[Detections]:

@@ -59,10 +59,10 @@ def test_no_command_takes_the_car_beyond_its_limits(steering, throttle, speed, a
 
 def test_odometry_is_noisy_and_scaled():
     state = CarState(jnp.zeros(3), jnp.asarray(0.5), jnp.asarray(0.1))
-    noise = OdometryNoise(speed_sigma_mps=0.02, steering_sigma_rad=0.01, speed_scale=1.1)
+    noise = OdometryNoise(0.02, 0.01, speed_scale=1.1, steering_offset_rad=0.03)
     keys = jax.random.split(jax.random.key(0), 4000)
     speed, steering = jax.vmap(lambda key: read_odometry(state, noise, key))(keys)
     assert np.mean(speed) == pytest.approx(0.55, abs=4 * 0.02 / np.sqrt(4000))
     assert np.std(speed) == pytest.approx(0.02, rel=0.06)
-    assert np.mean(steering) == pytest.approx(0.1, abs=4 * 0.01 / np.sqrt(4000))
+    assert np.mean(steering) == pytest.approx(0.13, abs=4 * 0.01 / np.sqrt(4000))
     assert np.std(steering) == pytest.approx(0.01, rel=0.06)

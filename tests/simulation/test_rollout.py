@@ -1,7 +1,6 @@
 """Rollouts at corner level: their observations, and the events of each scenario."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,63 +8,14 @@ import numpy as np
 import pytest
 
 from jaxnav.belief.ambiguity import PaperCost
-from jaxnav.control import Command
 from jaxnav.models.geometry import planar_from_T_world_vehicle
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.corners import MIN_SIDE_PX, see
-from jaxnav.simulation.plant import OdometryNoise
-from jaxnav.simulation.rollout import Rollout, Trace
-from jaxnav.simulation.scenarios import HEADING_SIGMA_RAD, Scenario, scenarios
+from jaxnav.simulation.rollout import Rollout
+from jaxnav.simulation.scenarios import HEADING_SIGMA_RAD, scenarios
 from tests import worlds
+from tests.helpers.spying import CAR, MARKERS, QUIET, RIG, SEEDS, Spy, keys, run, short
 from tests.reference import paper
-
-RIG, MARKERS, CAR = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()
-QUIET = OdometryNoise(speed_sigma_mps=0.0, steering_sigma_rad=0.0)
-SEEDS = jnp.asarray([3, 5, 8])
-keys = jax.vmap(jax.random.key)
-
-
-class Spy:
-    """In place of a navigator: sends one command, and tells through the trace what it was given.
-
-    `told(obs)` becomes `flip_probability`; `located` says whether anything was in view.
-    """
-
-    rig = RIG
-
-    def __init__(self, throttle=0.0, steering_rad=0.0, told=lambda obs: obs.speed_mps):
-        self.throttle, self.steering_rad, self.told = throttle, steering_rad, told
-
-    # Of strong types all, or every program would be compiled twice.
-    def init(self):
-        return jnp.zeros((), int)
-
-    def step(self, frame, obs):
-        one = SimpleNamespace(valid=jnp.ones(1, bool), steps=jnp.ones(1, int))
-        return frame + 1, SimpleNamespace(
-            candidates=one,
-            pose=planar_from_T_world_vehicle(obs.T_world_vehicle_true),
-            covariance=jnp.eye(6),
-            located=jnp.any(obs.visible),
-            decided=jnp.asarray(True),
-            flip_probability=self.told(obs),
-            done=jnp.asarray(False),
-            command=Command(
-                jnp.asarray(self.steering_rad, float), jnp.asarray(self.throttle, float)
-            ),
-        )
-
-
-def run(navigator, scenario: Scenario, noise_px=0.0, seeds=SEEDS, chunk_frames=15) -> Trace:
-    """The whole rollout, leading axes (seeds, frames)."""
-    rollout = Rollout(navigator, CAR, MARKERS, scenario, noise_px, chunk_frames=chunk_frames)
-    return rollout.run(keys(seeds))
-
-
-def short(name: str, **changes) -> Scenario:
-    """A scenario from where it starts, without the spread of the start and odometry noise."""
-    changes = {"duration_s": 1.0, "start_spread": (0.0, 0.0, 0.0), "odometry": QUIET} | changes
-    return dataclasses.replace(scenarios()[name], **changes)
 
 
 def test_corners_are_what_the_cameras_see():
@@ -129,6 +79,28 @@ def test_a_seed_s_drive_does_not_depend_on_the_others(real):
         np.testing.assert_array_equal(a, b[[3, 0, 2]])
     assert not np.allclose(first.true_pose[0], first.true_pose[1])
     assert not np.allclose(first.pose[0] - first.true_pose[0], 0)
+
+
+def test_a_seed_draws_what_it_always_drew():
+    """Start, corner noise and odometer: figures are kept by seed."""
+
+    def told(obs):
+        return obs.corners_px[0, 0, 0, 0] + 1000 * obs.speed_mps
+
+    scenario = dataclasses.replace(scenarios()["paper"], duration_s=1.0)
+    trace = run(Spy(throttle=0.05, told=told), scenario, 1.0)
+    starts = [
+        [1.980457314121, -1.018542189995, 2.101630870133],
+        [1.939298361826, -1.00734215694, 2.15005870793],
+        [2.091889978389, -1.047823478801, 2.346960326744],
+    ]
+    drawn = [
+        [333.433910183174, 736.847615198157, 817.567972967497],
+        [385.90858361589, 756.502441721687, 858.161781255728],
+        [430.230539962741, 804.01755377159, 897.077325334529],
+    ]
+    np.testing.assert_allclose(trace.true_pose[:, 0], starts, rtol=1e-9)
+    np.testing.assert_allclose(trace.flip_probability[:, ::7], drawn, rtol=1e-7)
 
 
 def test_a_lane_takes_the_next_seed_where_its_drive_has_ended():

@@ -16,8 +16,10 @@ import xarray as xr
 from jaxnav.belief.selectors import SELECTORS
 from jaxnav.cli import main
 from jaxnav.commands.study.studies import load_study, shipped_configs
+from jaxnav.errors import BadInput
 from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.simulation.rollout import Rollout
+from jaxnav.simulation.scenarios import on_laps, scenarios
 from jaxnav.simulation.scores import Drives
 from jaxnav.studies import lanes
 from jaxnav.studies.ambiguity import FLIPPED, INVALID, RIGHT, SCHEMA, UNSEEN
@@ -186,6 +188,36 @@ def test_drives_are_those_of_simulate(tmp_path: Path) -> None:
     decided = [e[d] for e, d in zip(drives.position_error_m, drives.decided, strict=True)]
     medians = [np.median(e) if len(e) else np.nan for e in decided]
     np.testing.assert_allclose(found["position_error_m"][1], medians, rtol=1e-5)
+
+
+def test_a_drive_study_varies_errors_that_repeat(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text(
+        "trials: 2\naxes: {scenario: [paper, everything]}\n"
+        "fixed: {corner_drift_px: 0.7, corner_correlation: 1, corner_lag_s: 0.06, wheel_spin: 0.2,"
+        " wheel_spin_from_s: 0,"
+        " cameras_off_deg: 2, steering_offset_deg: -3, laps: 2}\n"
+    )
+    study = load_study("drive", tmp_path / "s.yaml")
+    assert isinstance(study, DriveStudy)
+    for index, name in enumerate(("paper", "everything")):
+        cell, usual = study.grid.cell((index,)), scenarios()[name]
+        scenario = study.scenario(cell)
+        assert scenario.waypoints_m == on_laps(usual, 2).waypoints_m
+        assert (scenario.corner_correlation, scenario.corner_lag_s) == (1, 0.06)
+        assert scenario.extrinsics_off == pytest.approx((np.deg2rad(2), usual.extrinsics_off[1]))
+        odometry = scenario.odometry
+        assert (odometry.spin, odometry.spin_from_s) == (0.2, 0)
+        assert odometry.speed_scale == usual.odometry.speed_scale
+        assert odometry.steering_offset_rad == pytest.approx(np.deg2rad(-3))
+        assert float(study.rollout(cell, scenario).corner_drift_px) == pytest.approx(0.7)
+    (tmp_path / "s.yaml").write_text("trials: 2\naxes: {corner_lag_s: [0.05, 0.1]}\n")
+    with pytest.raises(BadInput, match=r"axes\.corner_lag_s\[1\]: must be >= 0 and <= 0\.0666"):
+        load_study("drive", tmp_path / "s.yaml")
+    (tmp_path / "s.yaml").write_text("trials: 2\naxes: {scenario: [drifting-corners]}\n")
+    own = load_study("drive", tmp_path / "s.yaml")
+    assert isinstance(own, DriveStudy)
+    cell = own.grid.cell((0,))
+    assert float(own.rollout(cell, own.scenario(cell)).corner_drift_px) == 0.5
 
 
 def command(*args: object, **environment: str) -> "subprocess.Popen[str]":

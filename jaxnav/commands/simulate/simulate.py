@@ -24,7 +24,7 @@ from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.files.writing import plain_data
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.rollout import Rollout
-from jaxnav.simulation.scenarios import scenarios
+from jaxnav.simulation.scenarios import Scenario, on_laps, scenarios
 from jaxnav.simulation.scores import Drives
 
 
@@ -40,43 +40,56 @@ def _run(args: Arguments) -> int:
     names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
     wanted = list(itertools.product(names, args.corner_noise_px))
     done = _resumed(args)
-    car = _load(args)
+    scenario = _scenario(args)
+    car = _load(args, scenario)
     if car.params is not None:
         print(car.params.describe())
-    print(_HEADER)
+    print(_header(scenario))
     for name, noise_px in wanted:
         key = _key(args, car, name, noise_px)
-        # A result of a version without parameters has no such key.
-        matches = [one for one in done if {"params": None} | one["run"] == key]
-        result = matches[0] if matches else {"run": key} | _drive(args, car, key)
+        # A result of a version without parameters or laps has no such key.
+        matches = [one for one in done if {"params": None, "laps": 0} | one["run"] == key]
+        result = matches[0] if matches else {"run": key} | _drive(args, car, scenario, key)
         if not matches:
             done.append(result)
         if args.json is not None:
             several = len(wanted) > 1 or len(done) > 1
             write_json(args.json, {"runs": done} if several else result)
-        print(_row(result), flush=True)
+        print(_row(result, scenario), flush=True)
     return 0
 
 
-def _load(args: Arguments) -> ScenarioCar:
+def _scenario(args: Arguments) -> Scenario:
+    scenario = scenarios()[args.scenario]
+    if args.laps == 0:
+        return scenario
+    if not scenario.drives:
+        raise BadInput("--laps", f"nothing drives in {args.scenario}")
+    return on_laps(scenario, args.laps)
+
+
+def _load(args: Arguments, scenario: Scenario) -> ScenarioCar:
     params = None if args.params is None else load_params(args.params)
     car = ScenarioCar.load(args, params)
-    _navigator(car, args.scenario, "multi-hypothesis", told_noise_px=1.0)  # raises on bad input
+    _navigator(car, scenario, "multi-hypothesis", told_noise_px=1.0)  # raises on bad input
     return car
 
 
-def _navigator(car: ScenarioCar, scenario: str, selector: str, told_noise_px: float) -> Navigator:
+def _navigator(
+    car: ScenarioCar, scenario: Scenario, selector: str, told_noise_px: float
+) -> Navigator:
     """The navigator, with the told corner sigma whatever its parameters say."""
-    navigator = car.navigator(scenarios()[scenario], make_selector(selector))
+    navigator = car.navigator(scenario, make_selector(selector))
     told_sigma_px = jnp.asarray(told_noise_px, navigator.corner_sigma_px.dtype)
     return eqx.tree_at(lambda n: n.corner_sigma_px, navigator, told_sigma_px)
 
 
-def _drive(args: Arguments, car: ScenarioCar, key: dict[str, Any]) -> dict[str, Any]:
+def _drive(
+    args: Arguments, car: ScenarioCar, scenario: Scenario, key: dict[str, Any]
+) -> dict[str, Any]:
     """Run all drives of one row of the table, and return their summary."""
     name, noise_px = key["selector"], key["corner_noise_px"]
-    scenario = scenarios()[args.scenario]
-    navigator = _navigator(car, args.scenario, name, key["told_noise_px"])
+    navigator = _navigator(car, scenario, name, key["told_noise_px"])
     rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px)
     with tqdm(
         total=args.seeds,
@@ -97,6 +110,7 @@ def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[
         told_noise_px = float(car.params.values["corner_sigma_px"])
     return {
         "scenario": args.scenario,
+        "laps": args.laps,
         "selector": name,
         "corner_noise_px": noise_px,
         "told_noise_px": told_noise_px if args.told_noise_px is None else args.told_noise_px,
@@ -146,27 +160,43 @@ class _Kept(ForeignEntry):
     time_to_decide_s: _Quantiles
     median_position_error_m: _Measure
     anees: _Measure
+    # On laps alone: of two and more the first two, of four and more the others.
+    median_position_error_m_after_20s: _Measure | None = None
+    anees_after_20s: _Measure | None = None
+    median_position_error_m_after_60s: _Measure | None = None
+    anees_after_60s: _Measure | None = None
 
 
-_HEADER = (
-    "| selector | noise px | success | wrong after 2 s | decided s, median / 95 % | "
-    "wrong once decided | position error cm | ANEES |\n|---|---|---|---|---|---|---|---|"
-)
+def _header(scenario: Scenario) -> str:
+    titles = (
+        "| selector | noise px | success | wrong after 2 s | decided s, median / 95 % | "
+        "wrong once decided | position error cm | ANEES |"
+    )
+    for after_s in scenario.scored_after_s:
+        titles += f" cm after {after_s:g} s | ANEES after {after_s:g} s |"
+    return f"{titles}\n|{'---|' * (titles.count('|') - 1)}"
 
 
-def _row(result: dict[str, Any]) -> str:
+def _row(result: dict[str, Any], scenario: Scenario) -> str:
     run, decide = result["run"], result["time_to_decide_s"]
 
     def number(measure: dict[str, Any]) -> float:
         value = measure["value"]
         return math.nan if value is None else float(value)
 
-    return (
+    def errors(suffix: str) -> str:
+        position_m, anees = (
+            number(result.get(f"{name}{suffix}") or {"value": None})
+            for name in ("median_position_error_m", "anees")
+        )
+        return f"{position_m * 100:.2f} | {anees:.2f} |"
+
+    row = (
         f"| {run['selector']} | {run['corner_noise_px']:g} | "
         f"{number(result['success_rate']):.1%} | "
         f"{number(result['wrong_branch_fraction_after_2s']):.3%} | "
         f"{number(decide['median']):.2f} / {number(decide['p95']):.2f} | "
         f"{number(result['wrong_once_decided_fraction']):.3%} | "
-        f"{number(result['median_position_error_m']) * 100:.2f} | "
-        f"{number(result['anees']):.2f} |"
+        f"{errors('')}"
     )
+    return row + "".join(f" {errors(f'_after_{s:g}s')}" for s in scenario.scored_after_s)

@@ -11,14 +11,14 @@ import pytest
 
 from jaxnav.belief.selectors import SELECTORS
 from jaxnav.cli import main
-from jaxnav.commands.kinds import Selector, SimulatedSelector
+from jaxnav.commands.kinds import Scenario, Selector, SimulatedSelector
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
 from jaxnav.commands.simulate.simulate import _load, _navigator
 from jaxnav.files import write_params
 from jaxnav.parameters import parameters_of
 from jaxnav.recording.drive_setup import PILOT_SELECTORS
 from jaxnav.simulation.rollout import Trace
-from jaxnav.simulation.scenarios import scenarios
+from jaxnav.simulation.scenarios import on_laps, scenarios
 from jaxnav.simulation.scores import Drives
 from jaxnav.simulation.statistics import Reliability
 
@@ -102,6 +102,20 @@ def test_calibration_error_is_the_weighted_gap():
     assert found.expected_calibration_error == pytest.approx((30 * 0.02 + 10 * 0.18) / 40)
 
 
+def test_errors_after_twenty_seconds_count_apart():
+    times_s = np.arange(330) / 15
+    pose = np.zeros((4, 330, 3))
+    pose[..., 0] = np.where(times_s < 20 - 1e-9, 0.05, 0.01)
+    nees = np.broadcast_to(np.where(times_s < 20 - 1e-9, 3.0, 9.0), (4, 330))
+    drives = trace(frames=330, pose=pose, nees=nees)
+    summary = Drives.of(drives, on_laps(SCENARIO, 4)).summary()
+    assert summary["median_position_error_m"]["value"] == pytest.approx(0.05)
+    assert summary["median_position_error_m_after_20s"]["value"] == pytest.approx(0.01)
+    assert summary["anees_after_20s"]["value"] == pytest.approx(9)
+    assert np.isnan(summary["anees_after_60s"]["value"])  # no drive lasts so long
+    assert not any("after_20s" in name for name in Drives.of(drives, SCENARIO).summary())
+
+
 def simulate(*arguments: str) -> str:
     """The last line that the command prints. A process of its own: it chooses the precision."""
     code = "import sys; from jaxnav.cli import main; sys.exit(main())"
@@ -139,7 +153,7 @@ def test_parameters_drive_and_are_what_a_result_belongs_to(tmp_path, capsys, mon
     assert result["run"]["told_noise_px"] == 3.0
     assert result["success_rate"]["value"] == 0  # it hardly moves
 
-    def drive(_args, _world, key: dict) -> dict:
+    def drive(_args, _car, _scenario, key: dict) -> dict:
         driven.append(key)
         return {name: value for name, value in result.items() if name != "run"}
 
@@ -162,8 +176,8 @@ def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
         tmp_path / "p.yaml",
         {"corner_sigma_px": 3.0, "motion.tilt_sigma_rad": 0.5, "motion.height_sigma_m": 0.25},
     )
-    car = _load(Arguments(params=tmp_path / "p.yaml"))
-    found = parameters_of(_navigator(car, "paper", "mahalanobis", px))
+    car = _load(Arguments(params=tmp_path / "p.yaml"), SCENARIO)
+    found = parameters_of(_navigator(car, SCENARIO, "mahalanobis", px))
     assert float(found["corner_sigma_px"]) == px
     assert float(found["motion.tilt_sigma_rad"]) == 0.5  # before what the scenario tells
     assert float(found["motion.height_sigma_m"]) == 0.25
@@ -178,6 +192,37 @@ def test_a_name_without_a_gate_is_its_rule_on_a_filter_that_has_none():
         assert type(ungated.selector) is type(gated.selector)
         gates = [float(one.motion.gate_nis) for one in (gated, ungated)]
         assert gates == [pytest.approx(21.1), np.inf]
+
+
+def test_every_scenario_can_be_named(capsys):
+    assert set(get_args(Scenario)) == set(scenarios())
+    assert main(["simulate", "--help"]) == 0
+    help_text = capsys.readouterr().out
+    for name in ("late", "drifting-corners", "each-camera-off", "uneven-wheels", "everything"):
+        assert name in help_text
+    assert "--laps" in help_text
+
+
+def test_laps_are_driven_and_their_later_errors_shown(tmp_path, capsys):
+    file = tmp_path / "s.json"
+    arguments = ["--seeds", "2", "--selector", "oracle", "--json", str(file), "--headless"]
+    arguments += ["--laps", "2", "--resume"]
+    assert main(["simulate", *arguments]) == 0
+    titles, rule, row = capsys.readouterr().out.splitlines()
+    assert titles.endswith("| ANEES | cm after 20 s | ANEES after 20 s |")
+    assert titles.count("|") == rule.count("|") == row.count("|") == 11
+    assert row.startswith("| oracle | 1 | 100.0% |")
+    assert "nan" not in row
+    result = json.loads(file.read_text())
+    assert result["run"]["laps"] == 2
+    assert 30 < result["duration_s"]["median"]["value"] < 40
+    assert 0 < result["median_position_error_m_after_20s"]["value"] < 0.1
+    assert main(["simulate", *arguments]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == row
+    del result["anees_after_20s"]
+    file.write_text(json.dumps(result))
+    assert main(["simulate", *arguments]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith("| nan |")
 
 
 MEASURED = (
@@ -251,6 +296,9 @@ def test_a_result_that_lacks_something_is_not_resumed(tmp_path, capsys):
         (["simulate", "--told-noise-px", "0"], "--told-noise-px"),
         (["simulate", "--resume"], "--resume"),
         (["simulate", "--scenario", "moon"], "moon"),
+        (["simulate", "--laps", "-1"], "--laps"),
+        (["simulate", "--laps", "101"], "--laps"),
+        (["simulate", "--laps", "1", "--scenario", "static"], "--laps: nothing drives in static"),
         (["simulate", "--markers", "nowhere.yaml"], "nowhere.yaml"),
         (["simulate", "--params", "nowhere.yaml"], "nowhere.yaml"),
         (["reliability", "--frames", "0"], "--frames"),

@@ -1,0 +1,62 @@
+"""Rollouts with a spy in place of the navigator, which tells what it was given."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+
+from jaxnav.control import Command
+from jaxnav.models.geometry import planar_from_T_world_vehicle
+from jaxnav.simulation.plant import OdometryNoise
+from jaxnav.simulation.rollout import Rollout, Trace
+from jaxnav.simulation.scenarios import Scenario, scenarios
+from tests import worlds
+
+RIG, MARKERS, CAR = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()
+QUIET = OdometryNoise(speed_sigma_mps=0.0, steering_sigma_rad=0.0)
+SEEDS = jnp.asarray([3, 5, 8])
+keys = jax.vmap(jax.random.key)
+
+
+class Spy:
+    """In place of a navigator: sends one command, and tells through the trace what it was given.
+
+    `told(obs)` becomes `flip_probability`; `located` says whether anything was in view.
+    """
+
+    rig = RIG
+
+    def __init__(self, throttle=0.0, steering_rad=0.0, told=lambda obs: obs.speed_mps):
+        self.throttle, self.steering_rad, self.told = throttle, steering_rad, told
+
+    # Of strong types all, or every program would be compiled twice.
+    def init(self):
+        return jnp.zeros((), int)
+
+    def step(self, frame, obs):
+        one = SimpleNamespace(valid=jnp.ones(1, bool), steps=jnp.ones(1, int))
+        return frame + 1, SimpleNamespace(
+            candidates=one,
+            pose=planar_from_T_world_vehicle(obs.T_world_vehicle_true),
+            covariance=jnp.eye(6),
+            located=jnp.any(obs.visible),
+            decided=jnp.asarray(True),
+            flip_probability=self.told(obs),
+            done=jnp.asarray(False),
+            command=Command(
+                jnp.asarray(self.steering_rad, float), jnp.asarray(self.throttle, float)
+            ),
+        )
+
+
+def run(navigator, scenario: Scenario, noise_px=0.0, seeds=SEEDS, chunk_frames=15) -> Trace:
+    """The whole rollout, leading axes (seeds, frames)."""
+    rollout = Rollout(navigator, CAR, MARKERS, scenario, noise_px, chunk_frames=chunk_frames)
+    return rollout.run(keys(seeds))
+
+
+def short(name: str, **changes) -> Scenario:
+    """A scenario from where it starts, without the spread of the start and odometry noise."""
+    changes = {"duration_s": 1.0, "start_spread": (0.0, 0.0, 0.0), "odometry": QUIET} | changes
+    return dataclasses.replace(scenarios()[name], **changes)
