@@ -16,7 +16,7 @@ from jaxnav.files.ranges import is_within, pinhole_problem, problem_of
 from jaxnav.models.camera import LENS_COEFFICIENTS
 from jaxnav.models.conventions import APRILTAG_CORNERS
 from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
+from jaxnav.models.rig import PLACED_BY_CALIBRATION, CameraRig
 
 # name -> shape and kind (i: whole numbers, f: numbers, U: text); letters are sizes that must agree
 _KEYS: dict[str, tuple[tuple[str | int, ...], str]] = {
@@ -191,8 +191,10 @@ def _rig(path: Path, stored: dict[str, np.ndarray]) -> CameraRig:
         name = str(stored["cam_names"][index])
         cameras.append(CameraFigures.create(name, lens, K, distortion[:count], size_px))
     Ts = [_pose(path, f"T_rig_cam[{index}]", T) for index, T in enumerate(stored["T_rig_cam"])]
+    placed = zip(cameras, Ts, strict=True)
     return rig_from_figures(
-        [replace(c, T_camera_vehicle=poses.inverse(T)) for c, T in zip(cameras, Ts, strict=True)]
+        [replace(camera, T_camera_vehicle=poses.inverse(T)) for camera, T in placed],
+        PLACED_BY_CALIBRATION,
     )
 
 

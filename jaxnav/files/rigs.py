@@ -12,9 +12,9 @@
 
 The place of a camera may also be `T_vehicle_camera` or its inverse `T_camera_vehicle`, each
 either 4x4 or `{wxyz: [...], xyz_m: [...]}`. A camera may have standard deviations (`sigma`): those
-of its place (`position_m`, `rotation_deg`) are what the estimator allows for, 5 mm and 0.5 degrees
-where the file does not say. The file may have a provenance (`calibrated`, see
-`jaxnav.files.provenance`).
+of its place (`position_m`, `rotation_deg`) are what the estimator allows for: where the file does
+not say, 5 mm and 0.5 degrees, and for a camchain, which was calibrated, 2 mm and 0.2 degrees. The
+file may have a provenance (`calibrated`, see `jaxnav.files.provenance`).
 """
 
 import re
@@ -56,7 +56,7 @@ from jaxnav.files.validation import (
 )
 from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.camera import LENS_COEFFICIENTS
-from jaxnav.models.rig import CameraRig
+from jaxnav.models.rig import PLACED_BY_CALIBRATION, CameraRig
 
 # One that is larger says that nobody knows where the camera is, or was written in another unit.
 _MOST_SIGMA_M, _MOST_SIGMA_DEG = 0.5, 15.0
@@ -199,12 +199,11 @@ def load_rig(path: str | Path) -> CameraRig:
             if camera.T_camera_vehicle is None:
                 problem = "missing: where is this camera on the vehicle (imu := vehicle)?"
                 raise BadInput(at(path, camera.name, "T_cam_imu"), problem)
-        return rig_from_figures(
-            [
-                replace(camera, name=entry.tagtopic or camera.name)
-                for camera, entry in zip(cameras, chain.values(), strict=True)
-            ]
-        )
+        named = [
+            replace(camera, name=entry.tagtopic or camera.name)
+            for camera, entry in zip(cameras, chain.values(), strict=True)
+        ]
+        return rig_from_figures(named, PLACED_BY_CALIBRATION)
     raise BadInput(path, "is neither a rig (`cameras:`) nor a Kalibr camchain (`cam0:`)")
 
 

@@ -15,9 +15,10 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.models.camera import Camera, stack_cameras
 from jaxnav.models.geometry import on_last_axis, transform_points
 
-# Of cameras that were placed by hand, or by a calibration that does not say how well.
-POSITION_SIGMA_M, ROTATION_SIGMA_RAD = 0.005, float(np.deg2rad(0.5))
-PLACED_BY_HAND = np.repeat([POSITION_SIGMA_M, ROTATION_SIGMA_RAD], 3)
+# Standard deviations of a camera's place, m, and direction, rad, where nobody says: measured by
+# hand, and by a calibration that does not tell its own.
+PLACED_BY_HAND = np.repeat([0.005, np.deg2rad(0.5)], 3)
+PLACED_BY_CALIBRATION = np.repeat([0.002, np.deg2rad(0.2)], 3)
 
 
 class CameraRig(eqx.Module):
