@@ -6,6 +6,7 @@ Source: Liu, Schofield, Shan (2023), Algorithm 1.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -21,11 +22,10 @@ from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.motion import (
     Bank,
     Motion,
-    heaviest,
-    mixture_log_mean,
     renumber_if_empty,
     restart_broken,
 )
+from jaxnav.belief.repeats import RepeatedErrors
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
@@ -59,9 +59,7 @@ class Navigator(eqx.Module):
     With a vehicle and waypoints it commands the vehicle. Without them it only localises, with the
     motion model of the body, `ConstantVelocity()` by default.
 
-    Coordinates of waypoints, states and outputs count from `markers.origin_m`, which is zero unless
-    the map is far from it. `Route.relative_to` converts waypoints, `planar_in_world` and
-    `poses_in_world` convert outputs (see docs/design.md, Far origins).
+    Coordinates count from `markers.origin_m` (see docs/design.md, Far origins).
     """
 
     rig: CameraRig
@@ -71,6 +69,7 @@ class Navigator(eqx.Module):
     controller: Controller | None
     corner_sigma_px: Float[Array, ""]
     model_sigma_px: Float[Array, ""]
+    repeated_errors: RepeatedErrors
     max_sightings: int | None = eqx.field(static=True)
     max_candidates: int = eqx.field(static=True)
     max_lm_steps: int = eqx.field(static=True)
@@ -90,6 +89,7 @@ class Navigator(eqx.Module):
         integral_limit_ms: float = 5.0,
         corner_sigma_px: float = 1.0,
         model_sigma_px: float = MODEL_SIGMA_PX,
+        repeated_errors: RepeatedErrors | None = None,
         max_sightings: int | None = None,
         max_candidates: int = 4,
         max_lm_steps: int = 12,
@@ -97,8 +97,7 @@ class Navigator(eqx.Module):
     ):
         """See the fields of `Controller`, `Snapshot`, `find_candidates` and the motion models.
 
-        Args:
-            selector: by default the bank; an `Ungated` one takes the gate from the motion model.
+        An `Ungated` selector takes the gate from the motion model.
 
         Raises:
             ValueError: waypoints without a vehicle, or of the wrong shape.
@@ -119,6 +118,7 @@ class Navigator(eqx.Module):
             )  # fmt: skip
         self.corner_sigma_px = jnp.asarray(corner_sigma_px, float)
         self.model_sigma_px = jnp.asarray(model_sigma_px, float)
+        self.repeated_errors = repeated_errors or RepeatedErrors()
         self.max_sightings = max_sightings
         self.max_candidates = max_candidates
         self.max_lm_steps = max_lm_steps
@@ -134,8 +134,12 @@ class Navigator(eqx.Module):
 
     def init(self) -> State:
         """The state before the first observation, at the first waypoint."""
-        belief = Belief.begin(self.motion.init(self.selector.hypotheses))
+        belief = self.believe(self.motion.init(self.selector.hypotheses))
         return State(belief, None if self.controller is None else self.controller.init())
+
+    def believe(self, bank: Bank) -> Belief:
+        """The belief in these hypotheses of one who has seen nothing yet."""
+        return Belief.begin(bank, len(self.rig), len(self.markers.ids))
 
     def step(self, state: State, obs: Observation) -> tuple[State, Output]:
         """One pass of Algorithm 1: sense, then act.
@@ -173,25 +177,16 @@ class Navigator(eqx.Module):
     def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
         motion, obs = self.motion, seen.snapshot.obs
+        snapshot, repeats = self.repeated_errors.weighed(belief.repeats, seen.snapshot)
         prior = renumber_if_empty(belief.bank)
         predicted = motion.poses(prior)
-        selection = self.selector(predicted, seen.candidates, seen.snapshot)
+        selection = self.selector(predicted, seen.candidates, snapshot)
         updated = motion.update(prior, selection, obs)
         bank = self._sound(updated.bank)
-
-        best = heaviest(bank)
+        belief = replace(belief, repeats=repeats)
         belief = belief.after(bank, selection.decided, selection.flip_probability)
-        evidence = Evidence(
-            candidates=seen.candidates,
-            costs=selection.costs,
-            selected=selection.selected,
-            accepted=updated.accepted[best] & (selection.selected >= 0),
-            nis=jnp.where(bank.initialised[best], updated.nis[best], 0),
-            gate_nis=jnp.asarray(predicted.gate_nis, bank.mean.dtype),
-            outvoted=seen.outvoted,
-            log_likelihood=mixture_log_mean(prior, updated.log_likelihood),
-        )
-        return belief, evidence
+        evidence = Evidence.of(seen.candidates, seen.outvoted, prior, selection, updated)
+        return belief, replace(evidence, gate_nis=jnp.asarray(predicted.gate_nis, bank.mean.dtype))
 
     def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
         """The predicted belief as the next one, where no marker is in view."""

@@ -9,7 +9,9 @@ import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.belief.motion import Bank, Motion, heaviest
+from jaxnav.belief.ambiguity import Selection
+from jaxnav.belief.motion import Bank, BankUpdate, Motion, heaviest, mixture_log_mean
+from jaxnav.belief.repeats import Repeats
 from jaxnav.pose.candidates import Candidates
 
 
@@ -20,12 +22,14 @@ class Belief(eqx.Module):
     decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
     flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
     restarts: Int[Array, ""]  # how often all hypotheses were forgotten so far
+    repeats: Repeats
 
     @staticmethod
-    def begin(bank: Bank) -> "Belief":
-        """The belief before the first observation, with an empty bank."""
+    def begin(bank: Bank, cameras: int, markers: int) -> "Belief":
+        """The belief of a rig of cameras in a map of markers before the first observation."""
         nothing = jnp.zeros((), bank.mean.dtype)
-        return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32))
+        repeats = Repeats.none(cameras, markers, bank.mean.dtype)
+        return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32), repeats)
 
     def with_prediction(self, bank: Bank) -> "Belief":
         """The belief with its bank predicted; a restart is counted where no hypothesis is left."""
@@ -37,7 +41,7 @@ class Belief(eqx.Module):
     ) -> "Belief":
         """The belief after an observation, which keeps the number of restarts."""
         flip_probability = flip_probability.astype(self.flip_probability.dtype)
-        return Belief(bank, decided, flip_probability, self.restarts)
+        return replace(self, bank=bank, decided=decided, flip_probability=flip_probability)
 
 
 class BeliefReport(eqx.Module):
@@ -83,6 +87,28 @@ class Evidence(eqx.Module):
     outvoted: Bool[Array, " M"]  # markers that the others in view contradict
     # log p(corners | prediction of the whole bank), up to a constant; 0 at a start.
     log_likelihood: Float[Array, ""]
+
+    @staticmethod
+    def of(
+        candidates: Candidates,
+        outvoted: Bool[Array, " M"],
+        prior: Bank,
+        selection: Selection,
+        updated: BankUpdate,
+    ) -> "Evidence":
+        """The evidence of a selection and of the update that it led to, under no gate."""
+        bank = updated.bank
+        best = heaviest(bank)
+        return Evidence(
+            candidates=candidates,
+            costs=selection.costs,
+            selected=selection.selected,
+            accepted=updated.accepted[best] & (selection.selected >= 0),
+            nis=jnp.where(bank.initialised[best], updated.nis[best], 0),
+            gate_nis=jnp.asarray(jnp.inf, bank.mean.dtype),
+            outvoted=outvoted,
+            log_likelihood=mixture_log_mean(prior, updated.log_likelihood),
+        )
 
     @staticmethod
     def none(candidates: Candidates, markers: int, dtype: DTypeLike) -> "Evidence":

@@ -44,10 +44,11 @@ class MultiHypothesis(eqx.Module):
 
     where A is J'J of the corners in units of the prediction's sigma.
 
-    `flip_probability` is the mass farther than `far_rad` from the reported pose, with the tails of
-    every hypothesis. The bank is `decided` when hypotheses farther off than `far_rad` weigh less
-    than `decided_mass` and the orientation is known to `decided_sigma_rad`; until then the car
-    explores (see `control.Exploration` and docs/design.md, Ambiguity).
+    `flip_probability` is the mass farther than `far_rad` from the reported pose, or nearer to
+    another candidate than to the selected one, with the tails of every hypothesis. The bank is
+    `decided` when hypotheses farther off than `far_rad` weigh less than `decided_mass` and the
+    orientation is known to `decided_sigma_rad`; until then the car explores (see
+    `control.Exploration` and docs/design.md, Ambiguity).
 
     The bank can't decide while the vehicle stands and both poses fit the image equally well. It
     takes the corner errors of different frames for independent: the corners' sigma has to include
@@ -57,7 +58,7 @@ class MultiHypothesis(eqx.Module):
     """
 
     hypotheses: int = eqx.field(static=True, default=24)  # >= 5
-    max_steps: int = eqx.field(static=True, default=6)
+    max_steps: int = eqx.field(static=True, default=60)  # few frames need more than 6
     floor_m: float = 0.0001  # sigma of the error that successive frames share
     floor_rad: float = 0.0001
     merge_distance: float = 0.6  # Mahalanobis, between two means that become one
@@ -66,7 +67,7 @@ class MultiHypothesis(eqx.Module):
     outlier_log_evidence: float = -5.0  # bounds what one frame subtracts from a log-weight
     max_inflation: float = 10.0  # largest factor on covariances where all hypotheses misfit
     max_misfit: float = np.inf  # largest factor on the corners' sigma where no pose fits them
-    gate: float = 30.0  # excess cost over the best candidate; above it the frame is an outlier
+    gate: float = 30.0  # excess cost over the best candidate; above it a frame fits no hypothesis
     far_rad: float = float(np.deg2rad(20.0))
     decided_mass: float = 3e-5
     decided_sigma_rad: float = float(np.deg2rad(12.0))
@@ -110,8 +111,10 @@ class MultiHypothesis(eqx.Module):
         )
         alive = bank.initialised & fits.finite
         inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
-        posteriors = _inflated(fits.posterior, inflation)
-        evidence = self._evidence(fits, inflation, alive, candidates, starts)
+        free_cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+        posteriors = _contradicted(_inflated(fits.posterior, inflation), fits.cost - free_cost)
+        fits_one = starts | (jnp.min(jnp.where(alive, fits.cost, jnp.inf)) - free_cost < self.gate)
+        evidence = self._evidence(fits, inflation, alive, fits_one)
         log_weight = normalise(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
         alive = alive & (log_weight > self.forget_log_weight)
 
@@ -124,11 +127,16 @@ class MultiHypothesis(eqx.Module):
         sigmas_rad = safe_sqrt(jnp.trace(after.covariance[:, 3:, 3:], axis1=1, axis2=2))
         mass = jnp.where(alive, jnp.exp(log_weight), 0)
         far = jnp.sum(jnp.where(apart_rad > self.far_rad, mass, 0))
-        flip_probability = jnp.sum(mass * _beyond(self.far_rad, apart_rad, sigmas_rad))
         to_best_rad = jax.vmap(lambda T: rotation_error_rad(T.inverse(), T_best))(
             candidates.T_vehicle_world
         )
         costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
+        wrong = jnp.maximum(
+            _beyond(self.far_rad, apart_rad, sigmas_rad),
+            _nearer_to_another(after, candidates, jnp.argmin(costs)),
+        )
+        flip_probability = jnp.sum(mass * wrong)
+        flip_probability = jnp.where(fits_one, flip_probability, _doubtful(flip_probability))
         located = jnp.any(alive)
         own = heir = jnp.arange(count)
         if count > 1:
@@ -182,17 +190,13 @@ class MultiHypothesis(eqx.Module):
         fits: PoseFit,
         inflation: Float[Array, ""],
         alive: Bool[Array, " K"],
-        candidates: Candidates,
-        starts: Array,
+        fits_one: Bool[Array, ""],
     ) -> Float[Array, " K"]:
         """Bounded change of each log-weight by this frame; zeros where it fits no hypothesis."""
         forgiven = jnp.where(alive, _nis(fits.posterior), 0) * (1 - 1 / inflation) / 2
         log_evidence = fits.log_evidence + forgiven
         best = jnp.max(jnp.where(alive, log_evidence, -jnp.inf))
         bounded = jnp.maximum(log_evidence - best, self.outlier_log_evidence)
-        free_cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
-        least = jnp.min(jnp.where(alive, fits.cost, jnp.inf))
-        fits_one = starts | (least - free_cost < self.gate)
         return jnp.where(alive & fits_one, bounded, 0)
 
     def _heirs(
@@ -268,6 +272,27 @@ def _inflated(posteriors: PosePosterior, inflation: Float[Array, ""]) -> PosePos
     )
 
 
+def _contradicted(posteriors: PosePosterior, excess: Float[Array, " K"]) -> PosePosterior:
+    """The posteriors with a NIS of at least their excess cost over the best candidate.
+
+    Where residuals are linear the NIS is that excess, plus what the prediction pays. In the wrong
+    one of two minima it is small as long as the prediction is wide, but the image contradicts it.
+    """
+    nis = _nis(posteriors)
+    more = (excess > nis) & (nis > 0)
+    growth = jnp.sqrt(jnp.where(more, excess / jnp.where(more, nis, 1), 1))
+    return eqx.tree_at(lambda p: p.innovation, posteriors, posteriors.innovation * growth[:, None])
+
+
+def _doubtful(flip_probability: Float[Array, ""]) -> Float[Array, ""]:
+    """The flip probability after a frame that fits no hypothesis: by Bayes' rule at least 9 %.
+
+    One frame in a hundred is spoilt, and one bank in a thousand has lost the true pose.
+    """
+    spoilt, lost = 0.01, 0.001
+    return jnp.maximum(flip_probability, lost / (lost + spoilt))
+
+
 def _excess(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:
     """Ratio of a sum of squares to its chi-square's mean plus three sigmas; 1 below it.
 
@@ -301,6 +326,29 @@ def _apart(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, 
     sine = w * v_other - w_other * v - jnp.cross(v, v_other)
     shift = matvec(rotation_matrix(jaxlie.SO3(base[:4])).T, other[4:] - base[4:])
     return jnp.append(shift, 2 * jnp.where(cosine < 0, -1, 1) * sine)
+
+
+def _nearer_to_another(
+    poses: _Poses, candidates: Candidates, selected: Int[Array, ""]
+) -> Float[Array, " K"]:
+    """Probability that a candidate is nearer in angle than the selected one, for each hypothesis.
+
+    Between two candidates lies a bisector: a pose is nearer to the other one beyond it.
+    """
+    base = poses.T_world_vehicle.wxyz_xyz
+    other = jax.vmap(lambda T: T.inverse().wxyz_xyz)(candidates.T_vehicle_world)
+    turns = jax.vmap(jax.vmap(_apart, (None, 0)), (0, None))(base, other)[..., 3:]  # (K, N, 3)
+    own = turns[:, selected]
+    across = turns - own[:, None]
+    length = safe_norm(across)
+    direction = across / jnp.where(length > 0, length, 1)[..., None]
+    gap = jnp.sum(turns**2, axis=2) - jnp.sum(own**2, axis=1)[:, None]
+    gap_rad = gap / jnp.where(length > 0, 2 * length, 1)
+    P = poses.covariance[:, None, 3:, 3:]
+    variance = jnp.sum(direction[..., None] * P * direction[..., None, :], axis=(2, 3))
+    sigma_rad = jnp.maximum(safe_sqrt(jnp.maximum(variance, 0)), 1e-6)
+    nearer = jax.scipy.special.erfc(gap_rad / (np.sqrt(2) * sigma_rad)) / 2
+    return jnp.max(jnp.where(candidates.valid[None] & (length > 0), nearer, 0), axis=1)
 
 
 def _beyond(

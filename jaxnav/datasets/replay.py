@@ -101,8 +101,10 @@ def replay(
             f"{len(recording)} frames of {tracks} markers are more than {limits.TRACKED_POSES}"
         )
         raise BadInput("--markers one-at-a-time", f"{problem} poses: take fewer frames (--limit)")
+    alone = _with_markers(navigator, _single(navigator.markers, jnp.asarray(0)))
     state = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)), navigator.init()
+        lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)),
+        (alone if one_at_a_time else navigator).init(),
     )
     total = len(recording)
     run_chunk = _run_chunk.lower(navigator, state, _frames(recording, 0), one_at_a_time).compile()
@@ -113,9 +115,20 @@ def replay(
         chunks.append(jax.device_get(outputs))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
-    told: _Told = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *chunks)
-    poses = np.asarray(poses_in_world(told[0], recording.markers.origin_m))
-    return Replay(poses, *told[1:], total / elapsed_s, corner_sigma_px)
+    wxyz_xyz, seen, located, decided, flip_probability, nees, branch = jax.tree.map(
+        lambda *leaves: np.concatenate(leaves)[:total], *chunks
+    )
+    return Replay(
+        np.asarray(poses_in_world(wxyz_xyz, recording.markers.origin_m)),
+        seen,
+        located,
+        decided,
+        flip_probability,
+        nees,
+        branch,
+        total / elapsed_s,
+        corner_sigma_px,
+    )
 
 
 def estimate_corner_sigma_px(recording: Recording) -> float:
@@ -162,7 +175,7 @@ def _run_chunk(
 
     def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, _Told]:
         obs = Observation(frame.corners_px, frame.visible, dt_s=frame.dt_s)
-        state, out = eqx.tree_at(lambda n: n.markers, navigator, markers).step(state, obs)
+        state, out = _with_markers(navigator, markers).step(state, obs)
         truth = jaxlie.SE3(frame.T_world_vehicle_true)
         branch = judge_branch(out.candidates, out.selected, truth)
         error = inverse_cayley(out.T_world_vehicle.inverse() @ truth)
@@ -188,6 +201,10 @@ def _run_chunk(
         return jax.vmap(alone if one_at_a_time else together)(state, tracks)
 
     return jax.lax.scan(step, state, chunk)
+
+
+def _with_markers(navigator: Navigator, markers: MarkerMap) -> Navigator:
+    return eqx.tree_at(lambda n: n.markers, navigator, markers)
 
 
 def _single(markers: MarkerMap, index: Array) -> MarkerMap:

@@ -82,7 +82,7 @@ def follow(navigator: Navigator, start: Bank, recorded: FrameSequences) -> Filte
         )
 
     frames = (recorded.obs, recorded.used, recorded.T_world_vehicle_true, recorded.judged)
-    return jax.lax.scan(frame, Belief.begin(start), frames)[1]
+    return jax.lax.scan(frame, local.believe(start), frames)[1]
 
 
 class _Trusts(Navigator):

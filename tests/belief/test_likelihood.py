@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.belief.bicycle_kalman import BicycleKalman
-from jaxnav.belief.estimate import Belief
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.kalman import white_acceleration
 from jaxnav.belief.map_fit import fit_poses
@@ -62,7 +61,7 @@ def look(nav: Navigator, belief: Bank, obs: Observation):
 
 
 def looked(nav: Navigator, belief: Bank, obs: Observation):
-    after, estimate = nav.sense(Belief.begin(belief), obs)
+    after, estimate = nav.sense(nav.believe(belief), obs)
     return estimate.log_likelihood, after.bank
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxnav.belief.estimate import Belief
 from jaxnav.belief.motion import Bank, Rejections
+from jaxnav.belief.repeats import Repeats
 from jaxnav.control import Command
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault, Health, Reject
@@ -114,7 +115,8 @@ def make_belief(rng: np.random.Generator, dtype: type = float) -> Belief:
         number=jnp.arange(4),
     )
     decided, restarts = jnp.asarray(True), jnp.asarray(1, jnp.int32)
-    return _as_numpy(Belief(bank, decided, random(), restarts))
+    repeats = Repeats(random(2, 3, 4, 2), random(2, 3))
+    return _as_numpy(Belief(bank, decided, random(), restarts, repeats))
 
 
 @functools.cache
