@@ -106,7 +106,7 @@ def test_the_form_s_gradient_is_the_dense_one(groups):
 
 
 def pixels_of(T_camera_vehicle: np.ndarray, points_vehicle: np.ndarray, camera) -> np.ndarray:
-    """Of an equidistant lens without coefficients: the angle off the axis times the focal length."""
+    """Of an equidistant lens: the angle off the axis times the focal length."""
     x, y, z = T_camera_vehicle[:3, :3] @ points_vehicle.T + T_camera_vehicle[:3, 3:]
     angle, across = np.arctan2(np.hypot(x, y), z), np.hypot(x, y)
     image = np.stack([x, y], axis=1) * (angle / across)[:, None]
@@ -263,7 +263,7 @@ def of_the_vehicle(rig: CameraRig, index: int) -> np.ndarray:
 
 
 def test_one_camera_s_error_is_the_vehicle_s_error():
-    """Frontal and on the axis, where the corners' distance is as it is taken: exactly Ad Sigma Ad'."""
+    """Ad Sigma Ad', exactly: a frontal marker on the axis is as far as its sides tell."""
     rig = worlds.qcar_rig()
     height_m = 0.0953  # of the cameras
     markers = worlds.marker_map([(worlds.upright(-np.pi / 2), [0.0, 1.5, height_m])], [0.172])
