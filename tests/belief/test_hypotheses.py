@@ -608,10 +608,11 @@ def test_a_short_drive_across_decides_for_the_truth(across):
     assert not np.any(jumped & sure[:, :-1])
 
 
-def test_wheels_that_slip_choose_no_branch():
+@pytest.mark.parametrize("seed", [1, 3])
+def test_wheels_that_slip_choose_no_branch(seed):
     """They turn a car a tenth less than they say, so that all branches are contradicted alike."""
     poses = arc((2.0, -1.0, np.deg2rad(125.0)), 0.5, -0.4)
-    slipping = sensed(poses, 1.1 * 0.5, -0.4)
+    slipping = sensed(poses, 1.1 * 0.5, -0.4, seed=seed)
 
     def wrong_once_decided(max_inflation: float) -> np.ndarray:
         nav = eqx.tree_at(lambda n: n.selector.max_inflation, car(), max_inflation)
@@ -670,10 +671,11 @@ def test_the_reported_pose_s_own_tails_are_part_of_the_flip_probability():
     )
     prior = priors(NEAR)
     only = eqx.tree_at(lambda p: p.initialised, prior, jnp.arange(8) == 3)
+    decides = eqx.tree_at(lambda s: s.decided_mass, EXACT, MultiHypothesis().decided_mass)
     for sigma_deg in (2.0, 10.0, 40.0):
         P = np.diag([0.05, 0.05, 0, 0, 0, np.deg2rad(sigma_deg)]) ** 2
         wide = eqx.tree_at(lambda p: p.covariance, only, jnp.tile(jnp.asarray(P), (8, 1, 1)))
-        selection = select(EXACT, wide, find(nothing), nothing)
+        selection = select(decides, wide, find(nothing), nothing)
         expected = 2 * scipy.stats.norm.sf(far_deg / sigma_deg)
         assert float(selection.flip_probability) == pytest.approx(expected, rel=1e-3, abs=1e-12)
         assert bool(selection.decided) == (sigma_deg < 12)
@@ -682,6 +684,20 @@ def test_the_reported_pose_s_own_tails_are_part_of_the_flip_probability():
 def test_a_bank_without_room_for_a_fan_is_refused():
     with pytest.raises(ValueError, match="at least 5"):
         MultiHypothesis(hypotheses=4)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "mass"), [(-12.0, 3e-5), (float(np.log(3e-5)), 3e-5), (-5.0, 0.01)]
+)
+def test_a_bank_in_which_one_frame_would_decide_is_refused(evidence, mass):
+    with pytest.raises(ValueError, match="a single frame would decide") as caught:
+        MultiHypothesis(outlier_log_evidence=evidence, decided_mass=mass)
+    assert f"decided_mass, {mass:.2g}" in str(caught.value)
+
+
+def test_a_bank_that_never_decides_or_needs_two_frames_is_made():
+    MultiHypothesis(outlier_log_evidence=-1e9, decided_mass=0.0)
+    MultiHypothesis(outlier_log_evidence=float(np.log(3e-5)) + 1e-6, decided_mass=3e-5)
 
 
 @pytest.fixture(scope="module")

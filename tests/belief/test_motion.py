@@ -243,6 +243,47 @@ def test_nis_of_a_matched_filter_is_chi_square():
     assert stats.kstest(values, stats.chi2(3).cdf).pvalue > 1e-3
 
 
+ONSETS = {"into a turn": ((0.4, 0.0), (0.4, 0.45)), "a start": ((0.0, 0.0), (0.5, 0.3)),
+          "a brake": ((0.6, -0.3), (0.0, -0.3))}  # fmt: skip
+
+
+@pytest.mark.parametrize(("before", "after"), ONSETS.values(), ids=ONSETS)
+def test_a_velocity_that_changed_inside_an_interval_surprises_nobody(before, after):
+    """At its onset the NIS of the true pose is that of three numbers, whenever it changed.
+
+    What the prediction would say of the truth without that noise, the textbook's filter tells.
+    """
+    motion = BicycleKalman(worlds.qcar(), gate_nis=np.inf)
+    dt_s, start, density = 0.1, np.array([0.5, -0.3, 0.7]), np.asarray(motion.acceleration_density)
+    sharp = np.diag([1e-3, 1e-3, 0, 0, 0, 1e-3]) ** 2 + 1e-18 * np.eye(6)
+    R_pose = planar_part(sharp, start[2]) + np.diag(np.asarray(motion.vision_floor) ** 2)
+    odometry = np.asarray(motion.odometry_sigma)
+    belief, pose = motion.init(), start
+    for _ in range(20):  # settled in the old velocity
+        told = reading(*before, dt_s=dt_s)
+        _, belief, _ = drive_step(motion, belief, jnp.asarray(pose), jnp.asarray(sharp), True, told)
+        pose = paper.drive(pose, *before, dt_s, WHEELBASE_M)[-1]
+    begun = paper.drive(start, *before, 19 * dt_s, WHEELBASE_M)[-1]
+    x, P = np.asarray(belief.mean[0]), np.asarray(belief.covariance[0])
+
+    with_change, without = [], []
+    for share in (np.arange(10) + 0.5) / 10:
+        truth = begun
+        for command, part in ((before, share), (after, 1 - share)):
+            truth = paper.drive(truth, *command, part * dt_s, WHEELBASE_M)[-1]
+        told = reading(*after, dt_s=dt_s)
+        *_, nis = drive_step(motion, belief, jnp.asarray(truth), jnp.asarray(sharp), True, told)
+        with_change.append(float(nis[0]))
+        x_later, P_later = kalman.predict(x, P, dt_s, density)
+        without.append(
+            kalman.update(x_later, P_later, truth, R_pose, *after, WHEELBASE_M, odometry)[2]
+        )
+    # Nothing but the instant is unknown here: one number of the three.
+    assert 0.5 < np.mean(with_change) < 3
+    assert np.max(with_change) < stats.chi2(3).ppf(0.95)
+    assert np.max(without) > stats.chi2(3).ppf(0.9999)
+
+
 def outlier_steps(kind: str, **options):
     """A step of one hypothesis of either model with a planar pose, at rest."""
     car = kind == "car"

@@ -49,8 +49,8 @@ def run_banks_fast(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "frames", "selector", "median_m", "p95_m"),
     [
-        ("test_5", 1200, "lowest-reprojection", 0.004, 0.015),  # of 2751
-        ("test_7", 454, "multi-hypothesis", 0.005, 0.045),  # all
+        ("test_5", 1200, "lowest-reprojection", 0.0029, 0.0125),  # of 2751
+        ("test_7", 454, "multi-hypothesis", 0.0015, 0.0041),  # all
     ],
 )
 def test_all_markers_locate_the_rig_to_millimetres(
@@ -63,7 +63,7 @@ def test_all_markers_locate_the_rig_to_millimetres(
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["position_error_m"]["median"] <= median_m
     assert summary["position_error_m"]["p95"] <= p95_m
-    assert summary["rotation_error_deg"]["median"] <= 0.3
+    assert summary["rotation_error_deg"]["median"] <= 0.06
     assert summary["wrong_branch_fraction"] == 0
     assert summary["outlier_fraction"] < 0.01
     assert summary["frames"] == frames
@@ -80,11 +80,11 @@ def test_one_marker_at_a_time_takes_few_wrong_branches(test_7, alone):
     judged = result.seen & test_7.reference.valid[:, None]
     assert judged.sum() > 2600
     np.testing.assert_array_equal(result.seen, test_7.visible.any(axis=1))
-    assert (result.branch.wrong & judged).sum() / judged.sum() <= 0.009
-    assert (result.branch.outlier & judged).sum() / judged.sum() <= 0.01
+    assert (result.branch.wrong & judged).sum() / judged.sum() <= 0.006
+    assert (result.branch.outlier & judged).sum() / judged.sum() <= 0.004
     position_m, rotation_deg = errors(result, test_7)
-    assert np.nanmedian(position_m) < 0.012
-    assert np.nanmedian(rotation_deg) < 0.6
+    assert np.nanmedian(position_m) < 0.0105
+    assert np.nanmedian(rotation_deg) < 0.52
 
 
 def test_the_bank_halves_the_wrong_branches_at_least(test_7, alone, run_banks_fast):
@@ -142,12 +142,12 @@ def test_a_recording_without_a_reference_gives_a_track_and_no_errors(
 
 def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
     folder = str(data_dir / "tagslam" / "test_7")
-    args = ["--markers", "one-at-a-time", "--selector", "lowest-reprojection", "--limit", "150"]
+    args = ["--markers", "one-at-a-time", "--selector", "lowest-reprojection", "--limit", "300"]
     assert main(["replay", folder, "--out", str(tmp_path), "--headless", *args]) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["frames"] == 150
+    assert summary["frames"] == 300
     assert summary["poses"] > summary["frames_located"]
-    # The one wrong choice came late, so it is one of fewer.
+    # Nearly all wrong choices come late, so they are a larger share of fewer.
     settled = summary["wrong_branch_fraction_after_5_frames"]
     assert 0 < summary["wrong_branch_fraction"] < settled < 0.01
     assert len(list(tmp_path.glob("trajectory_marker_*.tum"))) == 9

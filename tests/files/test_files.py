@@ -18,6 +18,8 @@ from jaxnav import files
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.images import decode_image
+from jaxnav.files.rigs import CameraSigma
+from jaxnav.models.rig import PLACED_BY_HAND
 
 QCAR = files.calib_dir() / "qcar"
 LOADERS: dict[str, Callable[[Path], Any]] = {
@@ -118,6 +120,64 @@ def test_a_saved_rig_reads_back_bit_for_bit(precision, tmp_path):
     assert (again.names, again.image_sizes_px) == (rig.names, rig.image_sizes_px)
 
 
+def test_sigmas_of_places_read_back_bit_for_bit(precision, tmp_path):
+    """Stated, left out, and exact: read, written and read again."""
+    text = yaml.safe_load((QCAR / "rig.yaml").read_text())
+    stated = {"position_m": [0.001, 0.0023, 0.5], "rotation_deg": [0.1, 0.37, 14.9]}
+    text["cameras"][0]["sigma"] = stated
+    text["cameras"][2]["sigma"] = {"position_m": [0] * 3, "rotation_deg": [0] * 3}
+    text["cameras"][3]["sigma"] = {"focal_px": [0.1, 0.1]}  # says nothing of the place
+    rig = files.load_rig(write(tmp_path, text))
+    assert rig.extrinsics_sigma is not None
+    assert rig.extrinsics_sigma.dtype == precision
+    sigma = np.asarray(rig.extrinsics_sigma)
+    np.testing.assert_allclose(sigma[0, :3], stated["position_m"], rtol=1e-7)
+    np.testing.assert_allclose(np.rad2deg(sigma[0, 3:]), stated["rotation_deg"], rtol=1e-6)
+    np.testing.assert_array_equal(sigma[2], 0)
+    for index in (1, 3):
+        np.testing.assert_allclose(sigma[index], PLACED_BY_HAND, rtol=1e-7)
+    files.save_rig(tmp_path / "again.yaml", rig)
+    again = files.load_rig(tmp_path / "again.yaml")
+    assert again.extrinsics_sigma is not None
+    np.testing.assert_array_equal(again.extrinsics_sigma, sigma)
+    assert leaves_equal(rig, again)
+
+
+def test_where_nobody_says_the_format_tells_how_well_cameras_are_placed(tmp_path):
+    by_hand, calibrated = (
+        files.load_rig(path).extrinsics_sigma
+        for path in (QCAR / "rig.yaml", write(tmp_path, KALIBR))
+    )
+    np.testing.assert_allclose(by_hand, [[0.005] * 3 + [np.deg2rad(0.5)] * 3] * 4, rtol=1e-7)
+    np.testing.assert_allclose(calibrated, [[0.002] * 3 + [np.deg2rad(0.2)] * 3] * 2, rtol=1e-7)
+
+
+def test_cameras_whose_sigmas_are_all_0_are_exact(tmp_path):
+    text = yaml.safe_load((QCAR / "rig.yaml").read_text())
+    for camera in text["cameras"]:
+        camera["sigma"] = {"position_m": [0] * 3, "rotation_deg": [0.0] * 3}
+    rig = files.load_rig(write(tmp_path, text))
+    assert rig.extrinsics_sigma is None
+    files.save_rig(tmp_path / "again.yaml", rig)
+    assert files.load_rig(tmp_path / "again.yaml").extrinsics_sigma is None
+
+
+def test_a_calibration_s_sigmas_are_those_of_the_rig_it_saves(tmp_path):
+    """In place of those that the rig came with."""
+    rig = files.load_rig(QCAR / "rig.yaml")
+    found = [
+        CameraSigma(position_m=[0.001 * (1 + c)] * 3, rotation_deg=[0.1 * (1 + c)] * 3)
+        for c in range(3)
+    ]
+    of_lens = CameraSigma(focal_px=[0.3, 0.4])
+    files.save_rig(tmp_path / "rig.yaml", rig, sigmas=[*found, of_lens])
+    sigma = np.asarray(files.load_rig(tmp_path / "rig.yaml").extrinsics_sigma)
+    expected = [[0.001 * (1 + c)] * 3 + [np.deg2rad(0.1 * (1 + c))] * 3 for c in range(3)]
+    np.testing.assert_allclose(sigma, [*expected, PLACED_BY_HAND], rtol=1e-6)
+    written = yaml.safe_load((tmp_path / "rig.yaml").read_text())["cameras"][3]["sigma"]
+    assert written["focal_px"] == [0.3, 0.4]
+
+
 def test_a_saved_map_reads_back_bit_for_bit(precision, tmp_path):
     tilted = poses.rotation_towards(20.0, 30.0, 40.0)
     corners = (np.array([1.0, 2.0, 3.0]) + 0.1 * _SQUARE @ tilted.T).tolist()
@@ -193,6 +253,10 @@ def write(folder: Path, data: Any, name: str = "rig.yaml") -> Path:
     return path
 
 
+def sigma_of(position_m: list[float], rotation_deg: list[float]) -> dict[str, Any]:
+    return {"sigma": {"position_m": position_m, "rotation_deg": rotation_deg}}
+
+
 MIRROR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
 BAD_CAMERAS = [
     ({"focal_px": [0, 319]}, "cameras.front.focal_px[0]: must be > 0, got 0"),
@@ -239,6 +303,15 @@ BAD_CAMERAS = [
         {"position_m": None, "T_vehicle_camera": {"wxyz": [1, 1, 0, 0], "xyz_m": [0, 0, 0]}},
         "cameras.front.T_vehicle_camera.wxyz: must have length 1, got 1.41421",
     ),
+    (sigma_of([-0.01, 0, 0], [0] * 3), "front.sigma.position_m[0]: must be >= 0, got -0.01"),
+    (sigma_of([0, 0.51, 0], [0] * 3), "front.sigma.position_m[1]: must be <= 0.5, got 0.51"),
+    (sigma_of([0] * 3, [0, 0, -1]), "front.sigma.rotation_deg[2]: must be >= 0, got -1"),
+    (sigma_of([0] * 3, [0, 15.1, 0]), "front.sigma.rotation_deg[1]: must be <= 15, got 15.1"),
+    (sigma_of([0] * 3, [0, float("nan"), 0]), "front.sigma.rotation_deg[1]: must be finite"),
+    (sigma_of([0] * 3, [0] * 2), "sigma.rotation_deg: must have at least 3 entries, got 2"),
+    (sigma_of([0] * 4, [0] * 3), "sigma.position_m: must have at most 3 entries, got 4"),
+    ({"sigma": {"position_m": [0.01] * 3}}, "front.sigma: rotation_deg is missing: it goes with"),
+    ({"sigma": {"rotation_deg": [0.5] * 3}}, "front.sigma: position_m is missing: it goes with"),
 ]
 
 

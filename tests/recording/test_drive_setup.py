@@ -127,6 +127,18 @@ def test_a_setup_comes_back_bit_for_bit(double):
         check()
 
 
+def test_how_well_cameras_are_placed_comes_back():
+    """Different for each of them; an exact one among them; a file of its own gives the same."""
+    sigma = np.float32(np.linspace(0.0, 0.2, 24).reshape(4, 6))
+    sigma[2] = 0
+    rig = dataclasses.replace(worlds.qcar_rig(), extrinsics_sigma=jnp.asarray(sigma, float))
+    setup = qcar_setup(rig=rig)
+    again = DriveSetup.of_header(decode(encode(setup.header())), WHERE)
+    np.testing.assert_array_equal(again.rig.extrinsics_sigma, sigma)
+    assert bits(again) == bits(setup)
+    assert bits(qcar_setup()) != bits(setup)
+
+
 def test_a_header_says_who_recorded_it():
     setup = qcar_setup(timeouts=Timeouts(stop_s=math.inf), corner_sigma_px=0.25)
     header = decode(encode(setup.header()))
