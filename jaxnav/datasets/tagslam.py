@@ -23,7 +23,7 @@ from jaxnav.files.markers import marker_map
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import Count, ForeignEntry, Size, Vector, at, validate
 from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import PLACED_BY_CALIBRATION, CameraRig
+from jaxnav.models.rig import CameraRig
 
 _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 
@@ -128,7 +128,7 @@ def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: Edges, body: 
                 raise BadInput(at(file, key), f"missing, and no /tf from {body} to {key} either")
             T_body_camera = validate(_CameraPoseEntry, written[key], file, key).pose.pose()
         cameras.append(entry.figures(key, poses.inverse(T_body_camera)))
-    return rig_from_figures(cameras, PLACED_BY_CALIBRATION)
+    return rig_from_figures(cameras)
 
 
 def _markers(path: Path, edges: Edges) -> MarkerMap:

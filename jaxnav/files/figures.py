@@ -89,13 +89,10 @@ class MarkerFigures:
     T_world_marker: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"]
 
 
-def rig_from_figures(
-    cameras: Sequence[CameraFigures], unstated: Float[np.ndarray, " 6"] = PLACED_BY_HAND
-) -> CameraRig:
+def rig_from_figures(cameras: Sequence[CameraFigures]) -> CameraRig:
     """The rig of some cameras, in the process's precision; every camera must have a place.
 
-    Args:
-        unstated: standard deviations of a place that comes without.
+    A place without standard deviations has those of one measured by hand.
     """
     Ts_camera_vehicle = []
     for camera in cameras:
@@ -106,15 +103,13 @@ def rig_from_figures(
         Ts_camera_vehicle,
         [camera.name for camera in cameras],
         [camera.image_size_px for camera in cameras],
-        _sigmas(cameras, unstated),
+        _sigmas(cameras),
     )
 
 
-def _sigmas(
-    cameras: Sequence[CameraFigures], unstated: Float[np.ndarray, " 6"]
-) -> Float[np.ndarray, "C 6"] | None:
+def _sigmas(cameras: Sequence[CameraFigures]) -> Float[np.ndarray, "C 6"] | None:
     """The standard deviations of the cameras' places; None where all are 0."""
-    sigmas = np.stack([unstated if c.sigma is None else c.sigma for c in cameras])
+    sigmas = np.stack([PLACED_BY_HAND if c.sigma is None else c.sigma for c in cameras])
     # Degrees and radians give back the same numbers where these are float32's.
     return np.asarray(sigmas, np.float32).astype(float) if sigmas.any() else None
 

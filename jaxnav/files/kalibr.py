@@ -31,6 +31,7 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import yaml_text
+from jaxnav.models.rig import PLACED_BY_CALIBRATION
 
 _LENS: dict[str, Lens] = {
     "radtan": "radtan",
@@ -107,11 +108,12 @@ class KalibrCamera(ForeignEntry):
         name: str,
         T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None,
     ) -> CameraFigures:
-        """The camera under a given name at a given place."""
+        """The camera under a given name at a given place, which Kalibr has calibrated."""
         lens = _LENS[self.distortion_model]
         coefficients = [] if lens == "none" else self.distortion_coeffs
+        sigma = None if T_camera_vehicle is None else PLACED_BY_CALIBRATION
         return CameraFigures.create(
-            name, lens, self.intrinsics, coefficients, self.resolution, T_camera_vehicle
+            name, lens, self.intrinsics, coefficients, self.resolution, T_camera_vehicle, sigma
         )
 
 

@@ -56,7 +56,7 @@ from jaxnav.files.validation import (
 )
 from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.camera import LENS_COEFFICIENTS
-from jaxnav.models.rig import PLACED_BY_CALIBRATION, CameraRig
+from jaxnav.models.rig import CameraRig
 
 # One that is larger says that nobody knows where the camera is, or was written in another unit.
 _MOST_SIGMA_M, _MOST_SIGMA_DEG = 0.5, 15.0
@@ -199,11 +199,12 @@ def load_rig(path: str | Path) -> CameraRig:
             if camera.T_camera_vehicle is None:
                 problem = "missing: where is this camera on the vehicle (imu := vehicle)?"
                 raise BadInput(at(path, camera.name, "T_cam_imu"), problem)
-        named = [
-            replace(camera, name=entry.tagtopic or camera.name)
-            for camera, entry in zip(cameras, chain.values(), strict=True)
-        ]
-        return rig_from_figures(named, PLACED_BY_CALIBRATION)
+        return rig_from_figures(
+            [
+                replace(camera, name=entry.tagtopic or camera.name)
+                for camera, entry in zip(cameras, chain.values(), strict=True)
+            ]
+        )
     raise BadInput(path, "is neither a rig (`cameras:`) nor a Kalibr camchain (`cam0:`)")
 
 
@@ -255,7 +256,8 @@ def camera_data(cameras: Sequence[CameraFigures]) -> dict[str, Any]:
             }
         )
         if camera.sigma is not None:
-            place = {"position_m": camera.sigma[:3], "rotation_deg": np.rad2deg(camera.sigma[3:])}
+            turn_deg = np.minimum(np.rad2deg(camera.sigma[3:]), _MOST_SIGMA_DEG)  # once rounded
+            place = {"position_m": camera.sigma[:3], "rotation_deg": turn_deg}
             entries[-1]["sigma"] = {name: sigma.tolist() for name, sigma in place.items()}
     return {"cameras": entries}
 

@@ -123,7 +123,7 @@ def test_a_saved_rig_reads_back_bit_for_bit(precision, tmp_path):
 def test_sigmas_of_places_read_back_bit_for_bit(precision, tmp_path):
     """Stated, left out, and exact: read, written and read again."""
     text = yaml.safe_load((QCAR / "rig.yaml").read_text())
-    stated = {"position_m": [0.001, 0.0023, 0.5], "rotation_deg": [0.1, 0.37, 14.9]}
+    stated = {"position_m": [0.001, 0.0023, 0.5], "rotation_deg": [0.1, 0.37, 15.0]}
     text["cameras"][0]["sigma"] = stated
     text["cameras"][2]["sigma"] = {"position_m": [0] * 3, "rotation_deg": [0] * 3}
     text["cameras"][3]["sigma"] = {"focal_px": [0.1, 0.1]}  # says nothing of the place
