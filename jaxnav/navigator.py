@@ -96,7 +96,6 @@ class Navigator(eqx.Module):
         ground_plane: bool = False,
     ):
         """See the fields of `Controller`, `Snapshot`, `find_candidates` and the motion models.
-
         An `Ungated` selector takes the gate from the motion model.
 
         Raises:
