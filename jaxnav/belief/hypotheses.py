@@ -64,7 +64,7 @@ class MultiHypothesis(eqx.Module):
     merge_distance: float = 0.6  # Mahalanobis, between two means that become one
     linear_rad: float = float(np.deg2rad(3.0))  # means this close merge; times the range for shifts
     forget_log_weight: float = -20.0  # lighter hypotheses are dropped
-    outlier_log_evidence: float = -5.0  # bounds what one frame subtracts from a log-weight
+    outlier_log_evidence: float = -7.0  # bounds what one frame subtracts from a log-weight
     max_inflation: float = 10.0  # largest factor on covariances where all hypotheses misfit
     max_misfit: float = np.inf  # largest factor on the corners' sigma where no pose fits them
     gate: float = 30.0  # excess cost over the best candidate; above it a frame fits no hypothesis
@@ -136,7 +136,6 @@ class MultiHypothesis(eqx.Module):
             _nearer_to_another(after, candidates, jnp.argmin(costs)),
         )
         flip_probability = jnp.sum(mass * wrong)
-        flip_probability = jnp.where(fits_one, flip_probability, _doubtful(flip_probability))
         located = jnp.any(alive)
         own = heir = jnp.arange(count)
         if count > 1:
@@ -282,15 +281,6 @@ def _contradicted(posteriors: PosePosterior, excess: Float[Array, " K"]) -> Pose
     more = (excess > nis) & (nis > 0)
     growth = jnp.sqrt(jnp.where(more, excess / jnp.where(more, nis, 1), 1))
     return eqx.tree_at(lambda p: p.innovation, posteriors, posteriors.innovation * growth[:, None])
-
-
-def _doubtful(flip_probability: Float[Array, ""]) -> Float[Array, ""]:
-    """The flip probability after a frame that fits no hypothesis: by Bayes' rule at least 9 %.
-
-    One frame in a hundred is spoilt, and one bank in a thousand has lost the true pose.
-    """
-    spoilt, lost = 0.01, 0.001
-    return jnp.maximum(flip_probability, lost / (lost + spoilt))
 
 
 def _excess(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:

@@ -41,9 +41,13 @@ class Repeats(eqx.Module):
 
 
 class RepeatedErrors(eqx.Module):
-    """The share of a corner's variance that repeats, and how far an image moves until it is new."""
+    """The share of a corner's variance that repeats, and how far an image moves until it is new.
 
-    share: float = 0.1
+    None repeats by default: with a share of 0.1 recordings are judged more honestly, but a picture
+    that freezes leads a car farther astray before it is noticed.
+    """
+
+    share: float = 0.0
     renewal_px: float = 40.0  # by which corners have moved when 1 / e of their errors is the same
 
     def weighed(self, repeats: Repeats, snapshot: Snapshot) -> tuple[Snapshot, Repeats]:

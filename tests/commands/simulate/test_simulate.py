@@ -184,7 +184,7 @@ def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
 
 
 def test_a_name_without_a_gate_is_its_rule_on_a_filter_that_has_none():
-    car = _load(Arguments())
+    car = _load(Arguments(), SCENARIO)
     for name in ("lowest-reprojection", "paper-cost"):
         gated, ungated = (
             _navigator(car, "paper", name + ending, 1.0) for ending in ("", "-ungated")
@@ -264,7 +264,7 @@ def test_numbers_that_are_missing_are_kept(tmp_path, capsys):
 
 
 def test_all_selectors_have_a_row_and_a_name_on_the_command_line(capsys, monkeypatch):
-    def drive(_args, _car, key: dict) -> dict:
+    def drive(_args, _car, _scenario, key: dict) -> dict:
         missing = {"value": None}
         return dict.fromkeys(MEASURED, missing) | {
             "time_to_decide_s": {"median": missing, "p95": missing}
