@@ -133,7 +133,8 @@ class MultiHypothesis(eqx.Module):
         costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
         wrong = jnp.maximum(
             _beyond(self.far_rad, apart_rad, sigmas_rad),
-            _nearer_to_another(after, candidates, jnp.argmin(costs)),
+            # Candidates of a spoilt frame are of no branch.
+            jnp.where(fits_one, _nearer_to_another(after, candidates, jnp.argmin(costs)), 0),
         )
         flip_probability = jnp.sum(mass * wrong)
         located = jnp.any(alive)

@@ -187,7 +187,7 @@ def test_a_name_without_a_gate_is_its_rule_on_a_filter_that_has_none():
     car = _load(Arguments(), SCENARIO)
     for name in ("lowest-reprojection", "paper-cost"):
         gated, ungated = (
-            _navigator(car, "paper", name + ending, 1.0) for ending in ("", "-ungated")
+            _navigator(car, SCENARIO, name + ending, 1.0) for ending in ("", "-ungated")
         )
         assert type(ungated.selector) is type(gated.selector)
         gates = [float(one.motion.gate_nis) for one in (gated, ungated)]
