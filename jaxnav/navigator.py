@@ -25,7 +25,7 @@ from jaxnav.belief.motion import (
     renumber_if_empty,
     restart_broken,
 )
-from jaxnav.belief.repeats import RepeatedErrors
+from jaxnav.belief.repeats import RepeatedErrors, Repeats
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
@@ -69,7 +69,7 @@ class Navigator(eqx.Module):
     controller: Controller | None
     corner_sigma_px: Float[Array, ""]
     model_sigma_px: Float[Array, ""]
-    repeated_errors: RepeatedErrors
+    repeated_errors: RepeatedErrors | None
     max_sightings: int | None = eqx.field(static=True)
     max_candidates: int = eqx.field(static=True)
     max_lm_steps: int = eqx.field(static=True)
@@ -96,7 +96,6 @@ class Navigator(eqx.Module):
         ground_plane: bool = False,
     ):
         """See the fields of `Controller`, `Snapshot`, `find_candidates` and the motion models.
-        An `Ungated` selector takes the gate from the motion model.
 
         Raises:
             ValueError: waypoints without a vehicle, or of the wrong shape.
@@ -117,7 +116,7 @@ class Navigator(eqx.Module):
             )  # fmt: skip
         self.corner_sigma_px = jnp.asarray(corner_sigma_px, float)
         self.model_sigma_px = jnp.asarray(model_sigma_px, float)
-        self.repeated_errors = repeated_errors or RepeatedErrors()
+        self.repeated_errors = repeated_errors
         self.max_sightings = max_sightings
         self.max_candidates = max_candidates
         self.max_lm_steps = max_lm_steps
@@ -137,8 +136,9 @@ class Navigator(eqx.Module):
         return State(belief, None if self.controller is None else self.controller.init())
 
     def believe(self, bank: Bank) -> Belief:
-        """The belief in these hypotheses of one who has seen nothing yet."""
-        return Belief.begin(bank, len(self.rig), len(self.markers.ids))
+        """The belief in these hypotheses before the first observation."""
+        repeats = None if self.repeated_errors is None else Repeats.none(self.rig, self.markers)
+        return Belief.begin(bank, repeats)
 
     def step(self, state: State, obs: Observation) -> tuple[State, Output]:
         """One pass of Algorithm 1: sense, then act.
@@ -175,17 +175,17 @@ class Navigator(eqx.Module):
 
     def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
-        motion, obs = self.motion, seen.snapshot.obs
-        snapshot, repeats = self.repeated_errors.weighed(belief.repeats, seen.snapshot)
+        motion, snapshot, repeats = self.motion, seen.snapshot, belief.repeats
+        if self.repeated_errors is not None and repeats is not None:
+            snapshot, repeats = self.repeated_errors.weighed(repeats, snapshot)
         prior = renumber_if_empty(belief.bank)
         predicted = motion.poses(prior)
         selection = self.selector(predicted, seen.candidates, snapshot)
-        updated = motion.update(prior, selection, obs)
-        bank = self._sound(updated.bank)
-        belief = replace(belief, repeats=repeats)
-        belief = belief.after(bank, selection.decided, selection.flip_probability)
-        evidence = Evidence.of(seen.candidates, seen.outvoted, prior, selection, updated)
-        return belief, replace(evidence, gate_nis=jnp.asarray(predicted.gate_nis, bank.mean.dtype))
+        updated = motion.update(prior, selection, snapshot.obs)
+        updated = updated._replace(bank=self._sound(updated.bank))
+        belief = belief.after(updated.bank, selection.decided, selection.flip_probability)
+        evidence = Evidence.of(seen, prior, selection, updated, predicted.gate_nis)
+        return replace(belief, repeats=repeats), evidence
 
     def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
         """The predicted belief as the next one, where no marker is in view."""

@@ -13,6 +13,7 @@ from jaxnav.belief.ambiguity import Selection
 from jaxnav.belief.motion import Bank, BankUpdate, Motion, heaviest, mixture_log_mean
 from jaxnav.belief.repeats import Repeats
 from jaxnav.pose.candidates import Candidates
+from jaxnav.pose.consistency import ConsistentSnapshot
 
 
 class Belief(eqx.Module):
@@ -22,13 +23,12 @@ class Belief(eqx.Module):
     decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
     flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
     restarts: Int[Array, ""]  # how often all hypotheses were forgotten so far
-    repeats: Repeats
+    repeats: Repeats | None  # None: no error is taken to repeat
 
     @staticmethod
-    def begin(bank: Bank, cameras: int, markers: int) -> "Belief":
-        """The belief of a rig of cameras in a map of markers before the first observation."""
+    def begin(bank: Bank, repeats: Repeats | None = None) -> "Belief":
+        """The belief before the first observation, with an empty bank."""
         nothing = jnp.zeros((), bank.mean.dtype)
-        repeats = Repeats.none(cameras, markers, bank.mean.dtype)
         return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32), repeats)
 
     def with_prediction(self, bank: Bank) -> "Belief":
@@ -90,23 +90,23 @@ class Evidence(eqx.Module):
 
     @staticmethod
     def of(
-        candidates: Candidates,
-        outvoted: Bool[Array, " M"],
+        seen: ConsistentSnapshot,
         prior: Bank,
         selection: Selection,
         updated: BankUpdate,
+        gate_nis: Float[Array, ""] | float,
     ) -> "Evidence":
-        """The evidence of a selection and of the update that it led to, under no gate."""
+        """The evidence of what was seen, by the selection and the update that it led to."""
         bank = updated.bank
         best = heaviest(bank)
         return Evidence(
-            candidates=candidates,
+            candidates=seen.candidates,
             costs=selection.costs,
             selected=selection.selected,
             accepted=updated.accepted[best] & (selection.selected >= 0),
             nis=jnp.where(bank.initialised[best], updated.nis[best], 0),
-            gate_nis=jnp.asarray(jnp.inf, bank.mean.dtype),
-            outvoted=outvoted,
+            gate_nis=jnp.asarray(gate_nis, bank.mean.dtype),
+            outvoted=seen.outvoted,
             log_likelihood=mixture_log_mean(prior, updated.log_likelihood),
         )
 

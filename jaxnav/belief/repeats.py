@@ -21,9 +21,10 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.pose.observation import Observation, Snapshot
 
 
@@ -34,20 +35,20 @@ class Repeats(eqx.Module):
     count: Float[Array, "C M"]
 
     @staticmethod
-    def none(cameras: int, markers: int, dtype: DTypeLike) -> "Repeats":
+    def none(rig: CameraRig, markers: MarkerMap) -> "Repeats":
         """Nothing was seen yet."""
-        lanes = cameras, markers
+        lanes, dtype = (len(rig), len(markers.ids)), rig.cameras.focal_px.dtype
         return Repeats(jnp.zeros((*lanes, 4, 2), dtype), jnp.zeros(lanes, dtype))
 
 
 class RepeatedErrors(eqx.Module):
     """The share of a corner's variance that repeats, and how far an image moves until it is new.
 
-    None repeats by default: with a share of 0.1 recordings are judged more honestly, but a picture
-    that freezes leads a car farther astray before it is noticed.
+    A navigator has none by default: with a share of 0.1 recordings are judged more honestly, but a
+    picture that freezes leads a car farther astray before it is noticed.
     """
 
-    share: float = 0.0
+    share: float = 0.1
     renewal_px: float = 40.0  # by which corners have moved when 1 / e of their errors is the same
 
     def weighed(self, repeats: Repeats, snapshot: Snapshot) -> tuple[Snapshot, Repeats]:

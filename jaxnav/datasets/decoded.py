@@ -191,10 +191,9 @@ def _rig(path: Path, stored: dict[str, np.ndarray]) -> CameraRig:
         name = str(stored["cam_names"][index])
         cameras.append(CameraFigures.create(name, lens, K, distortion[:count], size_px))
     Ts = [_pose(path, f"T_rig_cam[{index}]", T) for index, T in enumerate(stored["T_rig_cam"])]
-    sigma = PLACED_BY_CALIBRATION
     return rig_from_figures(
         [
-            replace(camera, T_camera_vehicle=poses.inverse(T), sigma=sigma)
+            replace(camera, T_camera_vehicle=poses.inverse(T), sigma=PLACED_BY_CALIBRATION)
             for camera, T in zip(cameras, Ts, strict=True)
         ]
     )

@@ -639,7 +639,10 @@ def test_one_gross_outlier_changes_nothing():
         assert np.all(spoilt.rejections[:, frame] == 1)
         assert np.all(spoilt.rejections[:, frame + 1] == 0)
         assert np.all(spoilt.decided[:, frame:])
-        assert np.all(spoilt.flip_probability[:, frame] < 1e-4)
+        assert np.all(spoilt.flip_probability[:, frame] < 1e-6)
+        # Later two poses of the marker come close, and it is in doubt which one is nearer anyway.
+        more = np.asarray(spoilt.flip_probability) - np.asarray(clean.flip_probability)
+        assert np.max(more[:, frame:]) < 1e-3
         gaps_m, gaps_rad = errors_of(spoilt, np.asarray(clean.pose))
         assert np.max(gaps_m) < 0.01
         assert np.max(gaps_rad) < np.deg2rad(0.5)

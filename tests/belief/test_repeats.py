@@ -28,8 +28,8 @@ def snapshot(shift_px=0.0, visible=True) -> Snapshot:
     return Snapshot.create(rig, markers, obs, SIGMA_PX)
 
 
-def nothing(dtype=None) -> Repeats:
-    return Repeats.none(4, 1, dtype or jnp.zeros(0).dtype)
+def nothing() -> Repeats:
+    return Repeats.none(worlds.qcar_rig(), worlds.paper_markers())
 
 
 @jax.jit
@@ -91,6 +91,6 @@ def test_derivatives_are_finite_where_nothing_moves():
 
 @in_float32
 def test_it_works_in_float32(precision):
-    weighed, after = MODEL.weighed(nothing(precision), snapshot())
+    weighed, after = MODEL.weighed(nothing(), snapshot())
     assert after.count.dtype == precision
     assert weighed.seen.sigma_px.dtype == precision

@@ -13,7 +13,6 @@ import pytest
 
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.map_fit import fit_poses
-from jaxnav.control import Command
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import cayley, planar_from_T_world_vehicle
 from jaxnav.navigator import Navigator
@@ -29,6 +28,7 @@ from jaxnav.tuning.following import FilterScores, follow, trust_corners
 from jaxnav.tuning.recorded import FrameSequences, simulate_sequences
 from jaxnav.tuning.unconstrained import Space
 from tests import worlds
+from tests.helpers.spying import Spy
 
 RIG, MARKERS, CAR = worlds.qcar_rig().first(1), worlds.paper_markers(), worlds.qcar()
 SIGMA_PX, DECIDES, FRAMES = 0.5, 3, 12
@@ -51,26 +51,15 @@ SPACE = Space.of(
 )  # fmt: skip
 
 
-class Drives:
-    """In place of a navigator: the same command in every frame, decided from one frame on."""
+class Drives(Spy):
+    """In place of a navigator: the same command in every frame, decided in one frame."""
 
     rig, markers = RIG, MARKERS
 
-    def init(self):
-        return jnp.zeros((), int)
-
     def step(self, frame, obs):
-        one = SimpleNamespace(valid=jnp.ones(1, bool), steps=jnp.ones(1, int))
-        return frame + 1, SimpleNamespace(
-            candidates=one,
-            pose=planar_from_T_world_vehicle(obs.T_world_vehicle_true),
-            covariance=jnp.eye(6),
-            located=jnp.asarray(True),
-            decided=frame == DECIDES,
-            flip_probability=jnp.zeros(()),
-            done=jnp.asarray(False),
-            command=Command(jnp.asarray(0.25, float), jnp.asarray(0.06, float)),
-        )
+        after, out = super().step(frame, obs)
+        out.located, out.decided = jnp.asarray(True), frame == DECIDES
+        return after, out
 
 
 @functools.cache
@@ -80,7 +69,7 @@ def recorded() -> FrameSequences:
         scenarios()["paper"], start_pose=(0.9, -0.6, 2.2), start_spread=(0.0,) * 3,
         frame_period_s=0.2, duration_s=0.2 * FRAMES - 0.1,
     )  # fmt: skip
-    rollout = Rollout(Drives(), CAR, MARKERS, scenario, SIGMA_PX)
+    rollout = Rollout(Drives(throttle=0.06, steering_rad=0.25), CAR, MARKERS, scenario, SIGMA_PX)
     return simulate_sequences(rollout, jax.vmap(jax.random.key)(jnp.arange(3)))
 
 

@@ -15,6 +15,7 @@ from jaxnav.loop.flags import Fault, Health
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Ending, HasOwnFiles, Odometry, Vehicle
 from jaxnav.loop.pilot import Input
+from jaxnav.models.rig import PLACED_BY_HAND
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.messages import input_message
 from jaxnav.recording.outcomes import Outcomes
@@ -347,7 +348,10 @@ def test_the_real_loop_comes_to_what_was_recorded(tmp_path, capsys):
     assert np.median(off_m / sigma_m) < 0.3
     assert log.outcomes.health[-1] == Health.OK
     cameras = log.header["rig"]["cameras"]
-    assert all(camera.pop("sigma") for camera in cameras)  # the recording is older than sigmas are
+    sigmas = [camera.pop("sigma") for camera in cameras]  # the recording is older than these
+    for sigma in sigmas:
+        by_hand = np.append(sigma["position_m"], np.deg2rad(sigma["rotation_deg"]))
+        np.testing.assert_allclose(by_hand, PLACED_BY_HAND, rtol=1e-6)
     assert cameras == whole.header["rig"]["cameras"]
     assert log.header["route"] == whole.header["route"]
 
