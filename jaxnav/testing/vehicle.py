@@ -117,7 +117,8 @@ class _Check:
 
         driving = self._driver.begin(drive)
         try:
-            until_s, took_s = time.monotonic() + _BUSY_S, []
+            until_s = time.monotonic() + _BUSY_S
+            took_s: list[float] = []
             while time.monotonic() < until_s or len(took_s) < _STOPS:
                 took_s.append(self._timed_stop(_BESIDE))
                 time.sleep(0.005)
