@@ -19,12 +19,7 @@ from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief, Estimate, Evidence
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.motion import (
-    Bank,
-    Motion,
-    renumber_if_empty,
-    restart_broken,
-)
+from jaxnav.belief.motion import Bank, Motion, renumber_if_empty, restart_broken
 from jaxnav.belief.repeats import RepeatedErrors, Repeats
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.models.bicycle import Vehicle
@@ -107,6 +102,7 @@ class Navigator(eqx.Module):
         if isinstance(selector, Ungated):
             self.selector = selector.rule
             self.motion = eqx.tree_at(lambda m: m.gate_nis, self.motion, float("inf"))
+        self.motion = self.motion.for_rig(rig, self.selector.hypotheses)
         self.controller = None
         if len(waypoints_m) > 0:
             self.controller = Controller.along(

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
 from jaxnav.models.geometry import (
     planar_from_T_world_vehicle,
     rotation_error_rad,
@@ -45,6 +46,7 @@ class PoseBelief(eqx.Module):
     nuisance: Float[Array, "6 t"]
     # The filter rejects measured poses whose NIS exceeds this.
     gate_nis: Float[Array, ""] | float
+    errors: CameraErrors | None = None  # None: the filter keeps no errors of cameras
 
 
 class PoseMeasurement(eqx.Module):
@@ -71,6 +73,7 @@ class PosePosterior(eqx.Module):
     inflation: Float[Array, "*K"]
     log_likelihood: Float[Array, "*K"]  # of the corners given the prediction, up to a constant
     valid: Bool[Array, "*K"]
+    errors: ErrorsPosterior | None = None
 
 
 class Selection(eqx.Module):

@@ -1,24 +1,40 @@
 """The paper's filter for a car: six states, one measured pose, odometry."""
 
+import dataclasses
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
+from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
 from jaxnav.belief.motion import (
     Bank,
+    Moments,
     Motion,
     Offer,
     Planar,
+    camera_states,
     contradicted,
     empty_bank,
     follow_pose,
     forget_lost,
+    heaviest,
+    known_to,
 )
-from jaxnav.models import bicycle
+from jaxnav.belief.sensor_errors import (
+    SENSORS_END,
+    SIX,
+    from_seen,
+    read_velocity,
+    seen_pose,
+    seen_slope,
+)
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import (
     OFF_GROUND,
@@ -28,7 +44,8 @@ from jaxnav.models.geometry import (
     planar_from_T_world_vehicle,
     wrap_angle,
 )
-from jaxnav.numerics.small_matrices import cholesky, log_det, sandwich
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.small_matrices import cholesky, log_det, product, sandwich
 from jaxnav.pose.observation import Observation
 
 
@@ -46,12 +63,16 @@ class BicycleKalman(Motion):
       the heading turns the velocity along and the drift of the position corrects the heading.
     * Q and the odometry's noise are given in the vehicle's axes, since wheels slip along and across
       themselves: numbers learned on one course are valid on another.
+    * Errors that repeat are states behind the six: four of the sensors (`sensor_errors.py`) and
+      three of each camera (`camera_errors.py`), where vehicle and rig say that there are any. The
+      corners show the pose x - tau v.
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
       floor, since errors of successive frames are correlated.
 
     Source: Liu, Schofield, Shan (2023), Eqs. 8-11.
     """
 
+    states: ClassVar[int] = SIX
     vehicle: Vehicle
     acceleration_density: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.1**2, 0.1**2, 0.3**2])
@@ -67,13 +88,17 @@ class BicycleKalman(Motion):
     )  # before the first odometry, m/s m/s rad/s
     tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
     height_sigma_m: float = 0.002
+    camera_states: int = eqx.field(static=True, default=0)  # see `for_rig`
+    learn_sigma_rad: float = 0.035  # sigma of the heading below which sensor errors are estimated
     gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 %; inf: no gate
     max_rejections: int = eqx.field(static=True, default=10)  # in a row that agree: forgotten
     max_rejected_s: float = 7.0  # of rejections, whether they agree or not: forgotten
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
-        return empty_bank(jnp.zeros(6, self.vehicle.wheelbase_m.dtype), 6, 3, hypotheses)
+        dtype = self.vehicle.wheelbase_m.dtype
+        variance = jnp.append(jnp.ones(SIX, dtype), self._error_variance())
+        return empty_bank(jnp.zeros_like(variance), jnp.diag(variance), 3, hypotheses)
 
     def predict(self, bank: Bank, obs: Observation) -> Bank:
         """x = A x, P = A P A' + Q (Eq. 9), then the odometry (Eqs. 10 and 11).
@@ -96,23 +121,31 @@ class BicycleKalman(Motion):
 
     def poses(self, bank: Bank) -> PoseBelief:
         """Poses level on the ground (Eq. 12); height, roll and pitch are nuisances with a sigma."""
-        T_world_vehicle = T_world_vehicle_from_planar(bank.mean[:, :3])
+        seen = jax.vmap(seen_pose)(bank.mean)
         dtype = bank.mean.dtype
         freedom = jnp.asarray(ON_GROUND, dtype)
         tilt = [self.height_sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad]
         nuisance = jnp.asarray(OFF_GROUND, dtype) * jnp.asarray(tilt, dtype)[None]
 
-        def body_covariance(pose: Array, P: Array) -> Array:
-            return sandwich(freedom, sandwich(_turn(-pose[2]), P[:3, :3]))
+        def in_body(mean: Array, P: Array) -> tuple[Array, Array]:
+            H = product(freedom, product(_turn(-seen_pose(mean)[2]), seen_slope(mean)))
+            of_pose = product(H, P)
+            return kalman.symmetrise(product(of_pose, H.T)), of_pose[:, SENSORS_END:]
 
+        covariance, cross = jax.vmap(in_body)(bank.mean, bank.covariance)
+        errors = None
+        if self.camera_states:
+            of_cameras = bank.covariance[:, SENSORS_END:, SENSORS_END:]
+            errors = CameraErrors(bank.mean[:, SENSORS_END:], of_cameras, cross)
         return PoseBelief(
-            T_world_vehicle,
-            jax.vmap(body_covariance)(bank.mean, bank.covariance),
+            T_world_vehicle_from_planar(seen),
+            covariance,
             bank.log_weight,
             bank.initialised,
             freedom,
             nuisance,
             self.gate_nis,
+            errors,
         )
 
     def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
@@ -125,82 +158,122 @@ class BicycleKalman(Motion):
         fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
         log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
         R = R + kalman.as_covariance(self.vision_floor)
-        innovation = self.difference(pose, bank.mean[:3])
-        correction, posterior, S = kalman.update(P, innovation, jnp.eye(3, 6, dtype=P.dtype), R)
+        innovation = self.difference(pose, seen_pose(bank.mean))
+        correction, posterior, S = kalman.update(P, innovation, seen_slope(bank.mean), R)
         return Offer(
             kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
-            first=self._first(pose, R, obs),
+            first=self._first(pose, R, obs, None),
             posterior=(self.moved(bank.mean, correction), posterior),
         )
 
     def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has corrected its pose, in 3 dof."""
         T = measured.T_world_vehicle
-        pose = planar_from_T_world_vehicle(T)
-        eye = jnp.eye(6, dtype=bank.mean.dtype)
-        to_body = eye.at[:3, :3].set(_turn(-bank.mean[2]))
-        to_world = eye.at[:3, :3].set(_turn(pose[2]))
+        pose, seen = planar_from_T_world_vehicle(T), seen_pose(bank.mean)
+        in_body = product(_turn(-seen[2]), seen_slope(bank.mean))
+        predicted = kalman.replace_first(bank.covariance, in_body)
+        freedom = jnp.asarray(ON_GROUND, pose.dtype)
         correction, P = follow_pose(
-            jnp.where(bank.initialised, sandwich(to_body, bank.covariance), eye),
-            T_world_vehicle_from_planar(bank.mean[:3]),
-            T,
-            measured.covariance,
-            jnp.asarray(ON_GROUND, eye.dtype),
+            jnp.where(bank.initialised, predicted, jnp.eye(predicted.shape[0], dtype=pose.dtype)),
+            T_world_vehicle_from_planar(seen),
+            measured,
+            freedom,
         )
+        P = kalman.replace_first(
+            P, jnp.eye(3, P.shape[0], dtype=P.dtype).at[:, :3].set(_turn(pose[2]))
+        )
+        posterior = self._at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P)
+        started = planar_covariance(T, measured.covariance)
         return Offer(
             measured.innovation,
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
-            first=self._first(pose, planar_covariance(T, measured.covariance), obs),
-            posterior=(jnp.append(pose, bank.mean[3:] + correction[3:]), sandwich(to_world, P)),
+            first=self._first(pose, started, obs, measured.errors),
+            posterior=posterior,
         )
 
+    def for_rig(self, rig: CameraRig, hypotheses: int) -> "BicycleKalman":
+        """The model with the errors of cameras and sensors; the paper's six states for one rule."""
+        vehicle = self.vehicle
+        if hypotheses == 1 and vehicle.sensor_sigma is not None:
+            vehicle = eqx.tree_at(lambda v: v.sensor_sigma, vehicle, None)
+        count = camera_states(rig, hypotheses)
+        return dataclasses.replace(self, vehicle=vehicle, camera_states=count)
+
+    def learns(self, bank: Bank) -> Bool[Array, ""]:
+        """Whether the heading is known to `learn_sigma_rad`."""
+        apart = wrap_angle(bank.mean[:, 2] - bank.mean[heaviest(bank), 2])
+        return known_to(bank, apart, bank.covariance[:, 2, 2]) < self.learn_sigma_rad**2
+
     def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " n"]:
-        """mean - base, (6,), with the heading wrapped."""
+        """mean - base, (n,), with the heading wrapped."""
         apart = mean - base
         return apart.at[2].set(wrap_angle(apart[2]))
 
-    def moved(self, base: Float[Array, " 6"], error: Float[Array, " 6"]) -> Float[Array, " 6"]:
-        """base + error, (6,), with the heading wrapped."""
+    def moved(self, base: Float[Array, " n"], error: Float[Array, " n"]) -> Float[Array, " n"]:
+        """base + error, (n,), with the heading wrapped."""
         mean = base + error
         return mean.at[2].set(wrap_angle(mean[2]))
 
-    def on_ground(self, mean: Float[Array, " 6"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+    def T_world_vehicle(self, mean: Float[Array, " n"]) -> jaxlie.SE3:
+        """The pose of a mean, level on the ground."""
+        return T_world_vehicle_from_planar(mean[:3])
+
+    def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
         """The two halves of the state: pose and velocity, (3,) each."""
-        return mean[:3], mean[3:]
+        return mean[:3], mean[3:SIX]
 
-    def planar(self, mean: Float[Array, " 6"], covariance: Float[Array, "6 6"]) -> Planar:
+    def planar(self, mean: Float[Array, " n"], covariance: Float[Array, "n n"]) -> Planar:
         """Pose and velocity as they stand in the state, which is planar."""
-        return Planar(mean[:3], covariance[:3, :3], mean[3:], covariance[3:, 3:])
+        return Planar(mean[:3], covariance[:3, :3], mean[3:SIX], covariance[3:SIX, 3:SIX])
 
-    def _first(self, pose: Array, covariance: Array, obs: Observation) -> tuple[Array, Array]:
-        """Mean and covariance of a hypothesis that starts at a pose, moving as measured."""
-        zero = jnp.zeros((3, 3), pose.dtype)
-        velocity = jnp.diag(self.initial_velocity_sigma**2)
-        return self._with_odometry(
-            jnp.append(pose, jnp.zeros(3, pose.dtype)),
-            jnp.block([[covariance, zero], [zero, velocity]]),
-            obs,
-        )
+    def _first(
+        self, pose: Array, covariance: Array, obs: Observation, errors: ErrorsPosterior | None
+    ) -> Moments:
+        """A hypothesis that starts at a pose, moving as measured, with errors as likely as not."""
+        velocity = jnp.asarray(self.initial_velocity_sigma, pose.dtype) ** 2
+        variance = jnp.concatenate([jnp.zeros(3, pose.dtype), velocity, self._error_variance()])
+        P = jnp.diag(variance).at[:3, :3].set(covariance)
+        if errors is not None:
+            # d q / d (x, y, psi) in the world, of the errors in view
+            slope = product(errors.slope, _turn(-pose[2]))
+            cross = product(covariance, product(slope.T, errors.rows))
+            P = P.at[:3, SENSORS_END:].set(cross).at[SENSORS_END:, :3].set(cross.T)
+        start = jnp.append(pose, jnp.zeros_like(variance[3:]))
+        return self._at_stamp(*self._with_odometry(start, P, obs))
 
-    def _later(self, mean: Array, P: Array, obs: Observation) -> tuple[Array, Array]:
+    def _at_stamp(self, seen: Array, P: Array) -> Moments:
+        """A state at its stamp, of one whose first three entries are the seen pose."""
+        mean, slope = from_seen(seen)
+        return mean.at[2].set(wrap_angle(mean[2])), kalman.replace_first(P, slope)
+
+    def _error_variance(self) -> Array:
+        """Variances (p,) of the errors that the state holds behind pose and velocity."""
+        sigma, dtype = self.vehicle.sensor_sigma, self.vehicle.wheelbase_m.dtype
+        if sigma is None and not self.camera_states:
+            return jnp.zeros(0, dtype)
+        of_sensors = jnp.zeros(4, dtype) if sigma is None else jnp.asarray(sigma, dtype) ** 2
+        return jnp.append(of_sensors, jnp.ones(self.camera_states, dtype))
+
+    def _later(self, mean: Array, P: Array, obs: Observation) -> Moments:
         """The state `dt_s` later (Eq. 9)."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
-        eye, zero = jnp.eye(3, dtype=dtype), jnp.zeros((3, 3), dtype)
-        A = jnp.block([[eye, dt_s * eye], [zero, eye]])
+        A = jnp.eye(3, mean.shape[0], dtype=dtype).at[:, 3:SIX].set(dt_s * jnp.eye(3, dtype=dtype))
         density = sandwich(_turn(mean[2]), kalman.as_matrix(self.acceleration_density))
         Q = kalman.white_acceleration(density, dt_s).astype(dtype)
-        mean = jnp.sum(A * mean[None], axis=1)
-        mean = mean.at[2].set(wrap_angle(mean[2]))
-        return mean, kalman.predict_covariance(P, A, Q)
+        P = kalman.replace_first(P, A).at[:SIX, :SIX].add(Q)
+        pose = mean[:3] + dt_s * mean[3:SIX]
+        return mean.at[:3].set(pose.at[2].set(wrap_angle(pose[2]))), P
 
     def _with_odometry(
         self, mean: Array, P: Array, obs: Observation, since_s: Array | float = 0.0
-    ) -> tuple[Array, Array]:
+    ) -> Moments:
         """The state after speed and steering were measured, at its own heading.
+
+        What the sensors read says nothing of their own errors, which are only considered.
 
         Args:
             since_s: time of the prediction, in which the velocity has changed.
@@ -209,19 +282,22 @@ class BicycleKalman(Motion):
         speed_mps, steering_rad = (
             jnp.asarray(value, dtype) for value in (obs.speed_mps, obs.steering_rad)
         )
-        velocity = bicycle.velocity_world(
-            speed_mps, steering_rad, mean[2], self.vehicle.wheelbase_m
+        read = read_velocity(speed_mps, steering_rad, mean, self.vehicle.wheelbase_m)
+        H = jnp.eye(3, mean.shape[0], k=3, dtype=dtype)
+        H = (
+            H.at[:, 2]
+            .set(-read.by_heading)
+            .at[:, SIX : SIX + read.by_errors.shape[1]]
+            .set(-read.by_errors)
         )
-        turned_velocity = jnp.stack([-velocity[1], velocity[0], jnp.zeros_like(speed_mps)])
-        H = jnp.eye(3, 6, k=3, dtype=dtype).at[:, 2].set(-turned_velocity)
         R = sandwich(_turn(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(dtype)
         present = jnp.asarray(obs.has_odometry, dtype)
-        change = velocity - mean[3:]
+        change = read.velocity - mean[3:SIX]
         D = present * change * (jnp.asarray(since_s, dtype) / np.sqrt(12))
         P = P.at[:3, :3].add(D[:, None] * D[None])
         seen = kalman.hide_rows(change, H, R, jnp.full(3, present))
-        correction, P, _ = kalman.update(P, *seen)
-        return self.moved(mean, correction), P
+        correction, after, _ = kalman.update(P, *seen)
+        return self.considered(jnp.asarray(False), (mean, P), (self.moved(mean, correction), after))
 
 
 def planar_poses(

@@ -1,5 +1,8 @@
 """A filter for bodies that move freely: pose on SE(3) and twist."""
 
+import dataclasses
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,22 +11,29 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
+from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
 from jaxnav.belief.motion import (
     Bank,
+    Moments,
     Motion,
     Offer,
+    camera_states,
     contradicted,
     empty_bank,
     follow_pose,
     forget_lost,
+    heaviest,
+    known_to,
 )
 from jaxnav.models.geometry import (
     cayley,
     inverse_cayley,
     planar_from_T_world_vehicle,
+    rotation_error_rad,
     rotation_matrix,
 )
-from jaxnav.numerics.small_matrices import cholesky, log_det, matvec
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.small_matrices import cholesky, log_det, matvec, product
 from jaxnav.pose.observation import Observation
 
 
@@ -37,6 +47,7 @@ class ConstantVelocity(Motion):
     Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
     """
 
+    states: ClassVar[int] = 12
     acceleration_density: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0**2] * 3 + [2.0**2] * 3)
     )  # (m/s^2)^2/Hz three times, (rad/s^2)^2/Hz three times; or the matrix
@@ -46,6 +57,8 @@ class ConstantVelocity(Motion):
     initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
     )  # m/s and rad/s
+    camera_states: int = eqx.field(static=True, default=0)  # see `for_rig`
+    learn_sigma_rad: float = 0.035  # sigma of the orientation below which errors are estimated
     lost_sigma_m: float = 0.5  # a hypothesis whose position is less certain is forgotten
     gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 %; inf: no gate
     max_rejections: int = eqx.field(static=True, default=10)  # in a row that agree: forgotten
@@ -53,8 +66,9 @@ class ConstantVelocity(Motion):
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
-        mean = jnp.zeros(13, self.acceleration_density.dtype).at[0].set(1)
-        return empty_bank(mean, 12, 6, hypotheses)
+        dtype = self.acceleration_density.dtype
+        mean = jnp.zeros(13 + self.camera_states, dtype).at[0].set(1)
+        return empty_bank(mean, jnp.eye(12 + self.camera_states, dtype=dtype), 6, hypotheses)
 
     def predict(self, bank: Bank, obs: Observation) -> Bank:
         """T = T exp(twist dt), P = F P F' + Q with F = [Ad(exp(-twist dt)), dt I; 0, I].
@@ -63,17 +77,15 @@ class ConstantVelocity(Motion):
         position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
         """
         dtype, dt_s = bank.mean.dtype, jnp.asarray(obs.dt_s, bank.mean.dtype)
-        eye, zero = jnp.eye(6, dtype=dtype), jnp.zeros((6, 6), dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
 
         def one(mean: Array, P: Array) -> tuple[Array, Array]:
-            motion = jaxlie.SE3.exp(mean[7:] * dt_s)
+            motion = jaxlie.SE3.exp(mean[7:13] * dt_s)
             T_world_vehicle = (jaxlie.SE3(mean[:7]) @ motion).normalize()
-            F = jnp.block([[motion.inverse().adjoint(), dt_s * eye], [zero, eye]])
-            return (
-                jnp.append(T_world_vehicle.wxyz_xyz, mean[7:]),
-                kalman.predict_covariance(P, F, Q),
-            )
+            F = jnp.zeros((6, P.shape[0]), dtype).at[:, :6].set(motion.inverse().adjoint())
+            F = F.at[:, 6:12].set(dt_s * jnp.eye(6, dtype=dtype))
+            P = kalman.replace_first(P, F).at[:12, :12].add(Q)
+            return jnp.append(T_world_vehicle.wxyz_xyz, mean[7:]), P
 
         mean, covariance = jax.vmap(one)(bank.mean, bank.covariance)
         variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
@@ -96,7 +108,14 @@ class ConstantVelocity(Motion):
             jnp.eye(6, dtype=bank.mean.dtype),
             jnp.zeros((6, 0), bank.mean.dtype),
             self.gate_nis,
+            self._camera_errors(bank),
         )
+
+    def _camera_errors(self, bank: Bank) -> CameraErrors | None:
+        if not self.camera_states:
+            return None
+        P = bank.covariance
+        return CameraErrors(bank.mean[:, 13:], P[:, 12:, 12:], P[:, :6, 12:])
 
     def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has chosen a candidate, in 6 dof."""
@@ -105,12 +124,14 @@ class ConstantVelocity(Motion):
         log_volume = log_det(cholesky(measured.covariance)) / 2
         R = measured.covariance + kalman.as_covariance(self.vision_floor)
         innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
-        correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, 12, dtype=P.dtype), R)
+        correction, posterior, S = kalman.update(
+            P, innovation, jnp.eye(6, P.shape[0], dtype=P.dtype), R
+        )
         return Offer(
             kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
-            first=self._first(wxyz_xyz, R),
+            first=self._first(wxyz_xyz, R, None),
             posterior=(self.moved(mean, correction), posterior),
         )
 
@@ -120,8 +141,7 @@ class ConstantVelocity(Motion):
         correction, P = follow_pose(
             bank.covariance,
             jaxlie.SE3(bank.mean[:7]),
-            T,
-            measured.covariance,
+            measured,
             jnp.eye(6, dtype=bank.mean.dtype),
         )
         return Offer(
@@ -129,36 +149,53 @@ class ConstantVelocity(Motion):
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
-            first=self._first(T.wxyz_xyz, measured.covariance),
+            first=self._first(T.wxyz_xyz, measured.covariance, measured.errors),
             posterior=(jnp.append(T.wxyz_xyz, bank.mean[7:] + correction[6:]), P),
         )
 
-    def difference(
-        self, mean: Float[Array, " 13"], base: Float[Array, " 13"]
-    ) -> Float[Array, " 12"]:
+    def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
         """(xi, difference of the twists), (12,): mean = base * cay(xi), in the axes of `base`."""
         T_base_other = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
         return jnp.append(inverse_cayley(T_base_other), mean[7:] - base[7:])
 
-    def moved(self, base: Float[Array, " 13"], error: Float[Array, " 12"]) -> Float[Array, " 13"]:
+    def moved(self, base: Float[Array, " n"], error: Float[Array, " d"]) -> Float[Array, " n"]:
         """The mean (13,) at an error (12,): base * cay(xi), and the twist plus its error."""
         T = (jaxlie.SE3(base[:7]) @ cayley(error[:6])).normalize()
         return jnp.append(T.wxyz_xyz, base[7:] + error[6:])
 
-    def on_ground(self, mean: Float[Array, " 13"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+    def T_world_vehicle(self, mean: Float[Array, " n"]) -> jaxlie.SE3:
+        """The pose of a mean."""
+        return jaxlie.SE3(mean[:7])
+
+    def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
         """(x, y, psi) and (v_x, v_y, psi_dot) in the world: pose and motion seen from above."""
         T_world_vehicle = jaxlie.SE3(mean[:7])
         R_world_vehicle = rotation_matrix(T_world_vehicle.rotation())
-        v_mps, w_radps = matvec(R_world_vehicle, mean[7:10]), matvec(R_world_vehicle, mean[10:])
+        v_mps, w_radps = matvec(R_world_vehicle, mean[7:10]), matvec(R_world_vehicle, mean[10:13])
         # psi is the direction of the x axis, which moves by w x (R e_x).
         x, y, up = R_world_vehicle[:, 0]
         level = jnp.maximum(x**2 + y**2, jnp.finfo(mean.dtype).eps)
         turn_radps = w_radps[2] - up * (x * w_radps[0] + y * w_radps[1]) / level
         return planar_from_T_world_vehicle(T_world_vehicle), jnp.append(v_mps[:2], turn_radps)
 
-    def _first(self, wxyz_xyz: Array, covariance: Array) -> tuple[Array, Array]:
-        """Mean and covariance of a hypothesis that starts at a pose, with an unknown velocity."""
-        zero = jnp.zeros((6, 6), wxyz_xyz.dtype)
-        velocity = jnp.diag(self.initial_velocity_sigma**2)
-        P = jnp.block([[covariance, zero], [zero, velocity]])
-        return jnp.append(wxyz_xyz, jnp.zeros(6, wxyz_xyz.dtype)), P
+    def for_rig(self, rig: CameraRig, hypotheses: int) -> "ConstantVelocity":
+        """The model with the errors of the rig's cameras among its states."""
+        return dataclasses.replace(self, camera_states=camera_states(rig, hypotheses))
+
+    def learns(self, bank: Bank) -> Bool[Array, ""]:
+        """Whether the orientation is known to `learn_sigma_rad`."""
+        best = jaxlie.SE3(bank.mean[heaviest(bank), :7])
+        apart = jax.vmap(lambda mean: rotation_error_rad(jaxlie.SE3(mean[:7]), best))(bank.mean)
+        variance = jnp.trace(bank.covariance[:, 3:6, 3:6], axis1=1, axis2=2)
+        return known_to(bank, apart, variance) < self.learn_sigma_rad**2
+
+    def _first(self, wxyz_xyz: Array, covariance: Array, errors: ErrorsPosterior | None) -> Moments:
+        """A hypothesis that starts at a pose, with an unknown velocity."""
+        velocity = jnp.asarray(self.initial_velocity_sigma, wxyz_xyz.dtype) ** 2
+        ones = jnp.ones(self.camera_states, wxyz_xyz.dtype)
+        variance = jnp.concatenate([jnp.zeros_like(velocity), velocity, ones])
+        P = jnp.diag(variance).at[:6, :6].set(covariance)
+        if errors is not None:
+            cross = product(covariance, product(errors.slope.T, errors.rows))
+            P = P.at[:6, 12:].set(cross).at[12:, :6].set(cross.T)
+        return jnp.append(wxyz_xyz, jnp.zeros_like(variance[6:])), P

@@ -3,7 +3,6 @@
 from dataclasses import fields, replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jaxlie
 from jax.typing import DTypeLike
@@ -62,12 +61,11 @@ class BeliefReport(eqx.Module):
     def of(motion: Motion, belief: Belief) -> "BeliefReport":
         """The heaviest hypothesis; its covariance is the bank's second moment about its mean."""
         bank, best = belief.bank, heaviest(belief.bank)
-        Ts_world_vehicle = motion.poses(bank).T_world_vehicle
         covariance = motion.error_covariance(bank, best)
         return BeliefReport(
             **motion.planar(bank.mean[best], covariance)._asdict(),
-            covariance=covariance,
-            T_world_vehicle=jax.tree.map(lambda leaf: leaf[best], Ts_world_vehicle),
+            covariance=covariance[: motion.states, : motion.states],
+            T_world_vehicle=motion.T_world_vehicle(bank.mean[best]),
             located=bank.initialised[best],
             hypothesis=bank.number[best],
             flip_probability=belief.flip_probability,

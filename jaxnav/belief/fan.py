@@ -94,6 +94,7 @@ def fan(
         freedom=prior.freedom,
         nuisance=prior.nuisance,
         gate_nis=prior.gate_nis,
+        errors=None if prior.errors is None else prior.errors.fresh(),
     )
 
 

@@ -107,7 +107,13 @@ class MultiHypothesis(eqx.Module):
         does_as = jnp.where(bank.initialised, jnp.arange(count), heaviest)
         starts_at = _at(_poses(bank), does_as)
         fits = fit_poses(
-            starts_at.T_world_vehicle, starts_at.covariance, prior, snapshot, floor, self.max_steps
+            starts_at.T_world_vehicle,
+            starts_at.covariance,
+            jax.tree.map(lambda leaf: leaf[does_as], bank.errors),
+            prior,
+            snapshot,
+            floor,
+            self.max_steps,
         )
         alive = bank.initialised & fits.finite
         inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
@@ -250,14 +256,15 @@ def _started(
     """The prediction, or a new fan where no hypothesis is initialised; computed only there."""
 
     def changing(bank: PoseBelief) -> tuple[Any, ...]:
-        return bank.T_world_vehicle.wxyz_xyz, bank.covariance, bank.log_weight, bank.initialised
+        pose = bank.T_world_vehicle.wxyz_xyz, bank.covariance
+        return *pose, bank.log_weight, bank.initialised, bank.errors
 
     wxyz_xyz, *rest = jax.lax.cond(
         starts,
         lambda: changing(fan(prior, candidates, snapshot, prior.log_weight.shape[0])),
         lambda: changing(prior),
     )
-    return eqx.tree_at(changing, prior, (wxyz_xyz, *rest))
+    return eqx.tree_at(changing, prior, (wxyz_xyz, *rest), is_leaf=lambda leaf: leaf is None)
 
 
 def _nis(posteriors: PosePosterior) -> Float[Array, " K"]:

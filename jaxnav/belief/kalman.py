@@ -49,9 +49,16 @@ def update(
     HP = product(H, P)
     S = symmetrise(product(HP, H.T) + R)
     K = cho_solve(cholesky(S), HP).T
-    I_KH = jnp.eye(P.shape[0], dtype=P.dtype) - product(K, H)
-    posterior = symmetrise(sandwich(I_KH, P) + sandwich(K, R))
+    left = P - product(K, HP)  # (I - K H) P
+    posterior = symmetrise(left - product(product(left, H.T), K.T) + sandwich(K, R))
     return matvec(K, innovation), add_floor(posterior, P), S
+
+
+def replace_first(P: Float[Array, "n n"], H: Float[Array, "k n"]) -> Float[Array, "n n"]:
+    """The covariance of a state whose first k entries x are replaced by H x of the whole state."""
+    k = H.shape[0]
+    top = product(H, P)
+    return P.at[:k].set(top).at[:, :k].set(top.T).at[:k, :k].set(symmetrise(product(top, H.T)))
 
 
 def hide_rows(

@@ -21,6 +21,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief.ambiguity import PoseBelief, PosePosterior
+from jaxnav.belief.camera_errors import CameraErrors
+from jaxnav.belief.nuisances import ErrorsAtBest, Nuisances
 from jaxnav.models.geometry import cayley, cayley_jacobian, rotation_matrix
 from jaxnav.numerics.levenberg_marquardt import ImplicitGradient, NormalEquations, NormalEquationsLM
 from jaxnav.numerics.small_matrices import (
@@ -35,7 +37,6 @@ from jaxnav.numerics.small_matrices import (
     solve_upper,
 )
 from jaxnav.pose.linearised import answers, cross_product, reprojection_rows, turn_arms, wrench
-from jaxnav.pose.nuisance import Nuisance, camera_errors
 from jaxnav.pose.observation import Snapshot, log_sigmas
 
 
@@ -51,6 +52,7 @@ class PoseFit(eqx.Module):
 def fit_poses(
     T_world_prior: jaxlie.SE3,
     covariance: Float[Array, "K 6 6"],
+    errors: CameraErrors | None,
     prior: PoseBelief,
     snapshot: Snapshot,
     floor: Float[Array, " 6"],
@@ -63,6 +65,7 @@ def fit_poses(
     Args:
         T_world_prior: K poses at which the search starts, the predictions.
         covariance: (K, 6, 6) of the predictions.
+        errors: of the cameras, as predicted; None: those of each frame are new.
         prior: gives `freedom` (6, d) and `nuisance` (6, t).
         snapshot: what is seen.
         floor: (6,) standard deviations (m, rad) of the error that successive frames share, which
@@ -72,7 +75,7 @@ def fit_poses(
     Returns:
         K minima, along the leading axis of every leaf.
     """
-    freedom, nuisance = prior.freedom, prior.nuisance
+    freedom = prior.freedom
     d, dtype = freedom.shape[1], covariance.dtype
     eye = jnp.eye(d, dtype=dtype)
     P = jax.vmap(lambda P: sandwich(freedom.T, P))(covariance)
@@ -80,12 +83,12 @@ def fit_poses(
     usable = jnp.all(jnp.isfinite(P), axis=(1, 2)) & (jnp.min(variances, axis=1) > 0)
     root = jax.vmap(cholesky)(jnp.where(usable[:, None, None], P, eye[None]))
     spread = jax.vmap(lambda L: product(freedom, L))(root)
-    linearised, log_nuisance = _linearised(
-        T_world_prior, jnp.moveaxis(spread, 0, -1), nuisance, snapshot
-    )
+    corners = _corners(T_world_prior, snapshot)
+    beside = Nuisances.of(corners, root, errors, prior, snapshot)
+    linearised = _linearised(corners, jnp.moveaxis(spread, 0, -1), beside, snapshot)
 
     def with_prediction(u: Array, _: None) -> tuple[Any, NormalEquations]:
-        r, normal = linearised(u)
+        r, normal = linearised(u)[:2]
         return jnp.concatenate([r, u]), NormalEquations(
             normal.information + eye[:, :, None], normal.gradient + u
         )
@@ -100,9 +103,9 @@ def fit_poses(
         adjoint=ImplicitGradient(),
         throw=False,
     )
-    r, normal = linearised(solution.value)
+    r, normal, raw = linearised(solution.value)
     fused: PoseFit = jax.vmap(
-        partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 5)
+        partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 6, 0)
     )(
         T_world_prior,
         usable,
@@ -112,42 +115,41 @@ def fit_poses(
         jnp.sum(r**2, axis=0),
         normal.gradient,
         normal.information,
-        log_nuisance - log_sigmas(snapshot.seen),
+        beside.log_share,
+        -jnp.broadcast_to(log_sigmas(snapshot.seen), usable.shape),
+        beside.errors_at_best(solution.value, *raw),
     )
     return fused
 
 
-def _linearised(
-    T_world_prior: jaxlie.SE3,
-    spread: Float[Array, "6 d K"],
-    nuisance: Float[Array, "6 t"],
-    snapshot: Snapshot,
-) -> tuple[Callable[[Float[Array, "d K"]], tuple[Array, NormalEquations]], Float[Array, " K"]]:
-    """The whitened residuals as a function of u, with the nuisance eliminated.
-
-    Returns:
-        A function that maps u (d, K) to residuals (m, K), at the nuisance that minimises them, and
-        their normal equations; and -log |J_t J_t' + I| / 2 (K,), the share of the nuisance's prior
-        that the corners leave.
-    """
-    rows = reprojection_rows(snapshot.rig, snapshot.seen)
+def _corners(T_world_prior: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "3 P K"]:
+    """The corners in view in the frame of each prediction, m."""
     corners_world = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
     T_prior_world = T_world_prior.inverse()
     R = jnp.moveaxis(jax.vmap(rotation_matrix)(T_prior_world.rotation()), 0, -1)
     shift = T_prior_world.translation().T[:, None]
-    corners = jnp.sum(R[:, :, None] * corners_world.T[None, :, :, None], axis=1) + shift
-    # Nuisances are small: residuals are linear in them.
-    cameras = camera_errors(snapshot.rig, snapshot.markers, snapshot.seen)
-    errors = [] if cameras is None else [cameras]
-    if nuisance.shape[1]:
-        _, slope = rows(corners)
-        J_t = -jnp.sum(answers(slope, corners)[:, None] * nuisance[:, :, None, None], axis=0)
-        for other in errors:
-            J_t = other.eliminated(J_t)
-        errors.append(Nuisance.of(J_t[:, :, None]))
-    log_nuisance = sum((e.log_share for e in errors), jnp.zeros_like(corners[0, 0]))
+    return jnp.sum(R[:, :, None] * corners_world.T[None, :, :, None], axis=1) + shift
 
-    def linearised(u: Array) -> tuple[Array, NormalEquations]:
+
+def _linearised(
+    corners: Float[Array, "3 P K"],
+    spread: Float[Array, "6 d K"],
+    beside: Nuisances,
+    snapshot: Snapshot,
+) -> Callable[[Float[Array, "d K"]], tuple[Array, NormalEquations, tuple[Array, Array]]]:
+    """The whitened residuals as a function of u, with the nuisances eliminated.
+
+    Args:
+        corners: in the frame of each prediction.
+
+    Returns:
+        A function that maps u (d, K) to residuals (m, K), at the nuisances that minimise them, to
+        their normal equations, and to residuals and slopes (d, m, K) before the elimination.
+    """
+    rows = reprojection_rows(snapshot.rig, snapshot.seen)
+    errors = beside.with_pose()
+
+    def linearised(u: Array) -> tuple[Array, NormalEquations, tuple[Array, Array]]:
         xi = jnp.sum(spread * u[None], axis=1)
         half, shift = xi[3:] / 2, xi[:3]
         per_norm = 1 / (1 + jnp.sum(half**2, axis=0))
@@ -160,15 +162,22 @@ def _linearised(
         residual, slope = rows(moved)
         J = -jnp.sum(answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
         r = residual.reshape(J.shape[1:])
+        if errors is not None:
+            offset, with_pose = errors
+            J = J + with_pose
+            r = r + offset + jnp.sum(with_pose * u[:, None], axis=0)
+        raw = r, J
         # J and r each by itself: the gradient follows from r and the wrench alone, and so do its
         # derivatives.
-        for error in errors:
-            r, J = error.eliminated(r), error.eliminated(J)
-        left = r[: residual[..., 0].size].reshape(residual.shape)
-        w = jnp.concatenate(wrench((left, slope), moved))
-        return r, NormalEquations(gram(J), -jnp.sum(twist * w[:, None], axis=0))
+        r, J = beside.eliminated(r), beside.eliminated(J)
+        left = r[: residual[..., 0].size]
+        w = jnp.concatenate(wrench((left.reshape(residual.shape), slope), moved))
+        gradient = -jnp.sum(twist * w[:, None], axis=0)
+        if errors is not None:
+            gradient = gradient + jnp.sum(errors[1] * left[None], axis=1)
+        return r, NormalEquations(gram(J), gradient), raw
 
-    return linearised, log_nuisance
+    return linearised
 
 
 def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
@@ -186,7 +195,9 @@ def _fused(
     cost: Float[Array, ""],
     gradient: Float[Array, " d"],
     information: Float[Array, "d d"],
+    log_share: Float[Array, ""],
     log_scale: Float[Array, ""],
+    errors: ErrorsAtBest | None,
     *,
     freedom: Float[Array, "6 d"],
     floor: Float[Array, " 6"],
@@ -200,6 +211,7 @@ def _fused(
     dtype = u.dtype
     eye = jnp.eye(u.shape[0], dtype=dtype)
     log_evidence = -(cost + jnp.sum(u**2)) / 2 - log_det(cholesky(information + eye)) / 2
+    log_evidence = log_evidence + log_share
 
     # The minimum of the corners alone, u_alone with covariance R, is fused with the prediction.
     ridge = jnp.sqrt(jnp.finfo(dtype).eps)
@@ -215,8 +227,11 @@ def _fused(
     # log p(corners | prediction): the misfit at the best pose, and that pose's distance.
     misfit = cost - jnp.sum(gradient * (u - u_alone))
     log_likelihood = (
-        log_scale - (misfit + log_det(alone) + jnp.sum(contradiction**2) + log_det(sigma)) / 2
+        log_scale
+        + log_share
+        - (misfit + log_det(alone) + jnp.sum(contradiction**2) + log_det(sigma)) / 2
     )
+    errors_in_view = None if errors is None else errors.given_pose(u_fused - u, unspread)
     xi = matvec(spread, u_fused)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
@@ -231,6 +246,7 @@ def _fused(
             jnp.ones((), dtype),
             jnp.where(finite, log_likelihood, 0),
             finite,
+            jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0), errors_in_view),
         ),
         cost=jnp.where(finite, cost, jnp.inf),
         log_evidence=jnp.where(finite, log_evidence, -jnp.inf),

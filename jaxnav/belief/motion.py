@@ -15,7 +15,7 @@ A bank has K hypotheses along the leading axis of every leaf. `bicycle_kalman.py
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,7 +25,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
+from jaxnav.belief.camera_errors import EACH, ridge
 from jaxnav.models.geometry import inverse_cayley, inverse_cayley_jacobian
+from jaxnav.models.rig import CameraRig
 from jaxnav.numerics.small_matrices import (
     cho_solve,
     cholesky,
@@ -81,13 +83,16 @@ class Planar(NamedTuple):
     velocity_covariance: Float[Array, "3 3"]
 
 
+Moments = tuple[Float[Array, " n"], Float[Array, "d d"]]  # mean and covariance
+
+
 class Offer(NamedTuple):
     """One hypothesis as a measured pose would start or correct it; `apply_gate` chooses."""
 
     innovation: Float[Array, " m"]  # of the pose, whitened
     # Mean and covariance where the pose starts the hypothesis, and where the hypothesis takes it.
-    first: tuple[Float[Array, " n"], Float[Array, "d d"]]
-    posterior: tuple[Float[Array, " n"], Float[Array, "d d"]]
+    first: Moments
+    posterior: Moments
     gate_nis: Float[Array, ""] | float  # a larger NIS is a contradiction, and counted
     log_likelihood: Float[Array, ""]  # of what was measured given the prediction
     inflation: Float[Array, ""] | float = 1.0  # a NIS above inflation * gate_nis is not fused
@@ -95,6 +100,8 @@ class Offer(NamedTuple):
 
 class Motion(eqx.Module):
     """Base class of the motion models: the abstract methods differ, the others are shared."""
+
+    states: ClassVar[int]  # error states of pose and velocity; those of sensors come behind
 
     @abc.abstractmethod
     def init(self, hypotheses: int = 1) -> Bank:
@@ -129,8 +136,40 @@ class Motion(eqx.Module):
         """The mean to which an error state leads."""
 
     @abc.abstractmethod
+    def T_world_vehicle(self, mean: Float[Array, " n"]) -> jaxlie.SE3:
+        """The pose of a mean."""
+
+    @abc.abstractmethod
     def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
         """(x_m, y_m, psi_rad) of a mean in the world, and their derivatives."""
+
+    @abc.abstractmethod
+    def for_rig(self, rig: CameraRig, hypotheses: int) -> "Motion":
+        """The model with the errors of this rig's cameras among its states, and of the sensors.
+
+        A single hypothesis has neither: a rule that takes one pose doubts nothing.
+        """
+
+    @abc.abstractmethod
+    def learns(self, bank: Bank) -> Bool[Array, ""]:
+        """Whether the errors that are only considered at first are estimated by now."""
+
+    def considered(self, learns: Bool[Array, ""], before: Moments, after: Moments) -> Moments:
+        """The posterior whose errors keep their mean and covariance unless the model `learns`.
+
+        Pose and velocity are corrected by their own gain, and stay correlated with the errors.
+
+        Source: Schmidt (1966), "Application of state-space methods to navigation problems".
+        """
+        (x, P), (mean, covariance) = before, after
+        states = self.states
+        gap = x.shape[0] - P.shape[0]
+        errors = jnp.where(learns, mean[states + gap :], x[states + gap :])
+        block = jnp.where(learns, covariance[states:, states:], P[states:, states:])
+        return (
+            mean.at[states + gap :].set(errors),
+            covariance.at[states:, states:].set(block),
+        )
 
     def planar(self, mean: Float[Array, " n"], covariance: Float[Array, "d d"]) -> Planar:
         """Pose and velocity on the ground: J P J' with the Jacobians of `on_ground`.
@@ -161,8 +200,13 @@ class Motion(eqx.Module):
         measured = selection.measured
         offer = self.follow if isinstance(measured, PosePosterior) else self.measure
 
+        learns = self.learns(bank)
+
         def one(before: Bank, measured: Any) -> BankUpdate:
             offered = offer(before, measured, obs)
+            predicted = before.mean, before.covariance
+            posterior = self.considered(learns, predicted, offered.posterior)
+            offered = offered._replace(posterior=posterior)
             after, nis, accepted = apply_gate(before, offered, measured.valid)
             compared = measured.valid & before.initialised
             return BankUpdate(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
@@ -189,12 +233,12 @@ class Motion(eqx.Module):
 
 
 def empty_bank(
-    mean: Float[Array, " n"], error_states: int, pose_states: int, hypotheses: int
+    mean: Float[Array, " n"], covariance: Float[Array, "d d"], pose_states: int, hypotheses: int
 ) -> Bank:
     """K hypotheses that have seen nothing."""
     return Bank(
         mean=jnp.tile(mean, (hypotheses, 1)),
-        covariance=jnp.tile(jnp.eye(error_states, dtype=mean.dtype), (hypotheses, 1, 1)),
+        covariance=jnp.tile(covariance, (hypotheses, 1, 1)),
         log_weight=jnp.zeros(hypotheses, mean.dtype),
         initialised=jnp.zeros(hypotheses, bool),
         number=jnp.arange(hypotheses),
@@ -205,6 +249,26 @@ def empty_bank(
             jnp.zeros(hypotheses, mean.dtype),
         ),
     )
+
+
+def camera_states(rig: CameraRig, hypotheses: int) -> int:
+    """How many errors of a rig's cameras a bank keeps: none where the cameras are exact."""
+    return 0 if rig.extrinsics_sigma is None or hypotheses == 1 else EACH * len(rig)
+
+
+def known_to(
+    bank: Bank, apart_rad: Float[Array, " K"], variance: Float[Array, " K"]
+) -> Float[Array, ""]:
+    """Second moment of an angle over a bank, about the reported hypothesis, rad^2.
+
+    Args:
+        apart_rad: of each hypothesis from the reported one.
+        variance: of each hypothesis, rad^2.
+    """
+    mass = jnp.where(bank.initialised, jnp.exp(bank.log_weight), 0)
+    total = jnp.sum(mass)
+    share = mass / jnp.where(total > 0, total, 1)
+    return jnp.sum(share * (variance + apart_rad**2))
 
 
 def forget_lost(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Bank:
@@ -290,45 +354,60 @@ def _cleared(rejections: Rejections, over: Bool[Array, "*K"]) -> Rejections:
 def follow_pose(
     P: Float[Array, "n n"],
     T_world_prior: jaxlie.SE3,
-    T_world_vehicle: jaxlie.SE3,
-    covariance: Float[Array, "6 6"],
+    posterior: PosePosterior,
     freedom: Float[Array, "6 d"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The whole state after its pose was corrected: the rest follows by regression on the pose.
+    """The whole state after its pose was corrected: the rest follows by regression.
 
-    With the pose error xi (d entries), the rest v, and the gain G = P_vx P_xx^-1:
+    With y = (xi, q), the pose's error and the errors of the cameras in view, the rest v, and the
+    gain G = P_vy P_yy^-1:
 
-        v += G xi,    P_vx = G B C,    P_vv = P_vv - G P_xv + G B C B' G',
+        v += G y,    P_vx = G M C,    P_vv = P_vv - G P_yv + G C_y G',
 
-    where C is the covariance of the corrected pose, and B carries its error to the prediction.
+    where C is the covariance of the corrected pose, M carries its error to y, and
+    C_y = M C M' + the covariance of q given the pose.
 
     Args:
         P: (n, n) of the predicted state, whose first d entries are
-            xi = freedom' cay^-1(T_world_prior^-1 T_world_vehicle).
+            xi = freedom' cay^-1(T_world_prior^-1 T_world_vehicle), and whose last ones are the
+            cameras' errors.
         T_world_prior: the predicted pose.
-        T_world_vehicle: the corrected pose.
-        covariance: (6, 6) of the corrected pose, in its own axes.
+        posterior: the corrected pose, with a covariance in its own axes, and the errors in view.
         freedom: (6, d), the directions in which the vehicle can move.
 
     Returns:
         Correction (n,) of the state, the pose's d entries included, and the covariance after it.
     """
-    d = freedom.shape[1]
-    away = inverse_cayley(T_world_prior.inverse() @ T_world_vehicle)
+    d, n = freedom.shape[1], P.shape[0]
+    away = inverse_cayley(T_world_prior.inverse() @ posterior.T_world_vehicle)
     xi = matvec(freedom.T, away)
+    C = sandwich(freedom.T, posterior.covariance)
     # Error at the corrected pose -> at the prediction.
-    back = sandwich(freedom.T, inverse_cayley_jacobian(away))
-    posterior = sandwich(freedom.T, covariance)
-    factor = cholesky(P[:d, :d])
-    gain = cho_solve(factor, P[:d, d:]).T  # of the rest on the pose, (n - d, d)
+    M = sandwich(freedom.T, inverse_cayley_jacobian(away))
+    y, P_yy, P_y, given_pose = xi, P[:d, :d], P[:d], None
+    errors = posterior.errors
+    if errors is not None:
+        M = jnp.concatenate([M, product(errors.slope, M)])
+        y = jnp.append(xi, errors.change)
+        e = errors.rows.shape[1]
+        P_y = jnp.concatenate([P_y, product(errors.rows, P[n - e :])])
+        of_errors = product(P_y[:, n - e :], errors.rows.T)
+        P_yy = jnp.block([[P_yy, of_errors[:d]], [of_errors[:d].T, of_errors[d:]]])
+        hidden = 1 - jnp.sum(errors.rows, axis=1)
+        P_yy = P_yy + jnp.diag(jnp.append(jnp.zeros(d, P.dtype), hidden + ridge(P.dtype)))
+        given_pose = errors.covariance
+    factor = cholesky(P_yy)
+    gain = cho_solve(factor, P_y[:, d:]).T  # of the rest on y, (n - d, len(y))
     # Block by block: as P plus a correction the pose would keep the rounding of its prediction,
     # which may be thousands of times as wide.
-    explained = gram(solve_lower(factor, P[:d, d:]).T)
-    moves = product(gain, back)
-    cross = product(moves, posterior)
-    rest = P[d:, d:] - explained + sandwich(moves, posterior)
-    after = kalman.symmetrise(jnp.block([[posterior, cross.T], [cross, rest]]))
-    return jnp.append(xi, matvec(gain, xi)), kalman.add_floor(after, P)
+    explained = gram(solve_lower(factor, P_y[:, d:]).T)
+    moves = product(gain, M)
+    cross = product(moves, C)
+    rest = P[d:, d:] - explained + product(cross, moves.T)
+    if given_pose is not None:
+        rest = rest + sandwich(gain[:, d:], given_pose)
+    after = kalman.symmetrise(jnp.block([[C, cross.T], [cross, rest]]))
+    return jnp.append(xi, matvec(gain, y)), kalman.add_floor(after, P)
 
 
 def merge_heirs(

@@ -38,6 +38,7 @@ class ForeignEntry(BaseModel):
 # has the bounds of each quantity.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e9, le=1e9)]
 Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
 Size = Annotated[Positive, within("size_m")]
 Radius = Annotated[Positive, within("radius_m")]
 CornerSigma = Annotated[Positive, within("corner_sigma_px")]

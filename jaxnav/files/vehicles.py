@@ -10,6 +10,11 @@ speed_time_constant_s: 0.3
 A calibrated vehicle also has corrections of its sensors: true speed = `speed_scale` * the speed
 read, true steering = `steering_gain` * the angle read + `steering_offset_rad`, and a camera's stamp
 is `camera_delay_s` later than the odometer's of the same instant. Left out, they correct nothing.
+
+`sigma: {speed_scale: 0.01, camera_delay_s: 0.005}` says how well each is known; the estimator lets
+a sensor be off by that much, and learns by how much it is. Left out it is 3 % of the speed, 3 % of
+the steering angle, 0.5 degrees (0.0087 rad) of its offset and 20 ms. Four zeros make the sensors
+exact.
 """
 
 import math
@@ -18,7 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, field_validator
 
 from jaxnav.files.provenance import Calibrated
 from jaxnav.files.ranges import within
@@ -28,6 +34,7 @@ from jaxnav.files.validation import (
     AngleDeg,
     Entry,
     FloorPlace,
+    NonNegative,
     Number,
     Position,
     Positive,
@@ -35,8 +42,10 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import atomic_write, yaml_text
-from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.bicycle import SENSOR_ERRORS, SENSORS_AS_TOLD, Vehicle
 from jaxnav.models.origin import Origin, opposite, planar_in_world, points_in_world
+
+_MOST_SIGMA = (0.5, 0.5, 0.35, 0.5)  # of the SENSOR_ERRORS; beyond it nothing would be known
 
 
 class VehicleFile(Entry):
@@ -53,11 +62,23 @@ class VehicleFile(Entry):
     steering_offset_rad: Annotated[Number, within("offset_rad")] = 0.0
     camera_delay_s: Annotated[Number, within("delay_s")] = 0.0
     calibrated: Calibrated | None = None
-    sigma: dict[str, Positive] = Field(default_factory=dict)  # of the keys above, by their names
+    sigma: dict[str, NonNegative] = Field(default_factory=dict)  # of the keys above, by their names
+
+    @field_validator("sigma")
+    @classmethod
+    def _in_the_key_s_unit(cls, sigma: dict[str, float]) -> dict[str, float]:
+        for name, most in zip(SENSOR_ERRORS, _MOST_SIGMA, strict=True):
+            if sigma.get(name, 0.0) > most:
+                unit = {"rad": " rad", "s": " s"}.get(name.rsplit("_", 1)[-1], "")
+                raise ValueError(f"{name} must be at most {most:g}{unit}, got {sigma[name]:g}")
+        return sigma
 
     def vehicle(self) -> Vehicle:
         """The vehicle, in the process's precision."""
-        return Vehicle.create(**self.model_dump(exclude={"calibrated", "sigma"}, exclude_none=True))
+        figures = self.model_dump(exclude={"calibrated", "sigma"}, exclude_none=True)
+        told = zip(SENSOR_ERRORS, SENSORS_AS_TOLD, strict=True)
+        sigma = np.asarray([self.sigma.get(name, default) for name, default in told])
+        return Vehicle.create(**figures, sensor_sigma=sigma if np.any(sigma) else None)
 
 
 # Name -> its default; that of a correction corrects nothing.
@@ -114,11 +135,19 @@ def load_vehicle(path: str | Path) -> Vehicle:
     return validate(VehicleFile, read_mapping(path), path).vehicle()
 
 
-def vehicle_data(vehicle: Vehicle) -> dict[str, float]:
+def vehicle_data(vehicle: Vehicle) -> dict[str, Any]:
     """The content of a vehicle's file, all numbers bit for bit; see `VehicleFile`."""
     data = {name: float(getattr(vehicle, name)) for name in _FIGURES}
     # Without corrections that correct nothing, any version of the program reads the file.
-    return {name: value for name, value in data.items() if _FIGURES[name] != value}
+    written: dict[str, Any] = {n: value for n, value in data.items() if _FIGURES[n] != value}
+    sigma = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma, float)
+    if not np.array_equal(sigma, SENSORS_AS_TOLD.astype(_dtype(vehicle))):
+        written["sigma"] = dict(zip(SENSOR_ERRORS, sigma.tolist(), strict=True))
+    return written
+
+
+def _dtype(vehicle: Vehicle) -> np.dtype[Any]:
+    return np.asarray(vehicle.wheelbase_m).dtype
 
 
 def save_vehicle(
@@ -136,9 +165,10 @@ def save_vehicle(
     Raises:
         BadInput: the file can't be written.
     """
-    data: dict[str, Any] = dict(vehicle_data(vehicle))
+    data = vehicle_data(vehicle)
     if sigma:
-        data["sigma"] = {name: float(value) for name, value in sigma.items()}
+        found = {name: float(value) for name, value in sigma.items()}
+        data["sigma"] = data.get("sigma", {}) | found
     atomic_write(path, yaml_text(with_provenance(data, calibrated)))
 
 

@@ -106,7 +106,9 @@ class GuardProcess:
         if self.stays is not None:
             return None
         numbers = {
-            field.name: float(getattr(setup.vehicle, field.name)) for field in fields(setup.vehicle)
+            field.name: float(getattr(setup.vehicle, field.name))
+            for field in fields(setup.vehicle)
+            if field.name != "sensor_sigma"  # a driver has no use for it
         }
         changes = {
             "setup": {

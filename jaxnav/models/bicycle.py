@@ -6,9 +6,14 @@ of gravity. Source: Liu, Schofield, Shan (2023), Eqs. 4-7.
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnav.models.geometry import safe_sinc
+
+# Errors of the sensors that a filter keeps, and their standard deviations where nobody says.
+SENSOR_ERRORS = ("speed_scale", "steering_gain", "steering_offset_rad", "camera_delay_s")
+SENSORS_AS_TOLD = np.asarray([0.03, 0.03, np.deg2rad(0.5), 0.02])
 
 
 class Vehicle(eqx.Module):
@@ -20,6 +25,9 @@ class Vehicle(eqx.Module):
     throttle_limit: Float[Array, ""]  # in the driver's unit (QCar: PWM duty)
     speed_per_throttle_mps: Float[Array, ""]  # steady-state speed at throttle 1
     speed_time_constant_s: Float[Array, ""]  # first-order lag from throttle to speed
+    # Standard deviations of what is left of the errors below, as in `SENSORS_AS_TOLD`; None: the
+    # sensors are exact but for white noise.
+    sensor_sigma: Float[Array, " 4"] | None = None
     # Calibration of its sensors. `jaxnav.loop.corrections` applies it; the core reads corrected
     # values only.
     speed_scale: float = eqx.field(static=True, default=1.0)  # true speed per speed read
@@ -39,6 +47,7 @@ class Vehicle(eqx.Module):
         steering_gain: float = 1.0,
         steering_offset_rad: float = 0.0,
         camera_delay_s: float = 0.0,
+        sensor_sigma: Float[Array | np.ndarray, " 4"] | None = None,
     ) -> "Vehicle":
         """A vehicle from plain numbers."""
         return Vehicle(
@@ -48,6 +57,7 @@ class Vehicle(eqx.Module):
             jnp.asarray(throttle_limit, float),
             jnp.asarray(speed_per_throttle_mps, float),
             jnp.asarray(speed_time_constant_s, float),
+            None if sensor_sigma is None else jnp.asarray(sensor_sigma, float),
             speed_scale=float(speed_scale),
             steering_gain=float(steering_gain),
             steering_offset_rad=float(steering_offset_rad),

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import safe_norm, skew, transform_points
@@ -58,17 +58,39 @@ class Nuisance(eqx.Module):
         return jnp.concatenate([moved, best.reshape(-1, rows.shape[-1])])
 
 
+class CameraSlopes(eqx.Module):
+    """How the errors of the g cameras in view move the residuals of an observation."""
+
+    places: Float[Array, "3 m g"]  # by a shift, in units of the prior's sigma
+    turns: Float[Array, "3 m g"]  # by a turn, in units of the prior's sigma
+    camera: Int[Array, " g"]  # index of each group's camera
+    in_view: Bool[Array, " g"]  # False: the group is empty
+
+    def nuisance(self) -> Nuisance:
+        """Both, new in every frame, with a single lane for all poses."""
+        return Nuisance.of(jnp.concatenate([self.places, self.turns])[..., None])
+
+
 def camera_errors(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> Nuisance | None:
     """The cameras' errors in place and direction, with the prior of `rig.extrinsics_sigma`.
 
-    Each camera is a group, or each sighting where these are fewer. The residuals' derivatives are
-    those at the corners as seen, at a distance that their sides tell: so every pose of an
-    observation is compared with the same errors. None where the cameras are exact.
+    None where the cameras are exact. The nuisance has a single lane, for all poses.
+    """
+    moves = camera_slopes(rig, markers, seen)
+    return None if moves is None else moves.nuisance()
+
+
+def camera_slopes(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> CameraSlopes | None:
+    """The derivatives of the residuals by each camera's error; None where the cameras are exact.
+
+    Each camera is a group, or each sighting where these are fewer. The derivatives are those at the
+    corners as seen, at a distance that their sides tell: so every pose of an observation is
+    compared with the same errors.
 
     Args:
         rig: C cameras.
         markers: M markers.
-        seen: D sightings; the result has m = 8 D residuals and a single lane, for all poses.
+        seen: D sightings, of m = 8 D residuals.
     """
     if rig.extrinsics_sigma is None:
         return None
@@ -86,7 +108,8 @@ def camera_errors(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> Nuisan
     moves = answers(slope, points)[..., 0]  # (6, 2 P)
     in_sigmas = jnp.sum(moves[:, None, :, None] * spread.transpose(1, 2, 0)[:, :, None], axis=0)
     slopes = jnp.where(jnp.tile(member, (2, 1))[None], in_sigmas, 0)
-    return Nuisance.of(slopes[..., None])
+    in_view = jnp.any(member & jnp.repeat(seen.visible, 4)[:, None], axis=0)
+    return CameraSlopes(slopes[:3], slopes[3:], camera_of_group, in_view)
 
 
 def _points_as_seen(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> Float[Array, "3 P 1"]:

@@ -151,10 +151,12 @@ def _around(navigator: Navigator, T_world_vehicle: Float[Array, "B 7"]) -> Bank:
         if isinstance(motion, BicycleKalman):
             pose = planar_from_T_world_vehicle(jaxlie.SE3(T))
         mean = jnp.concatenate([pose, jnp.zeros_like(empty.mean[0, pose.shape[0] :])])
+        # Behind pose and velocity are the errors of the sensors, as likely as not.
+        covariance = empty.covariance[0].at[: len(sigma), : len(sigma)].set(jnp.diag(sigma**2))
         bank: Bank = eqx.tree_at(
             lambda b: (b.mean, b.covariance, b.initialised),
             empty,
-            (mean[None], jnp.diag(sigma**2)[None], jnp.ones(1, bool)),
+            (mean[None], covariance[None], jnp.ones(1, bool)),
         )
         return bank
 

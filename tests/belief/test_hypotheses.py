@@ -12,7 +12,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from jaxnav.belief.ambiguity import PoseBelief, Selection
+from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.fan import fan
@@ -174,7 +174,7 @@ def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(f
     floors = jnp.full(6, floor)
 
     def covariance(here, prior, snapshot, floors):
-        found = fit_poses(jaxlie.SE3(here), prior.covariance, prior, snapshot, floors, 20)
+        found = fit_poses(jaxlie.SE3(here), prior.covariance, None, prior, snapshot, floors, 20)
         return found.posterior.covariance
 
     exact = correlations(jit_to_run(covariance)(here, prior, snapshot, floors), freedom)
@@ -365,7 +365,7 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     heir = np.array([0, 0, 2, 0, 2, 2])
     belief = Bank(
         jnp.asarray(means), jnp.asarray(covariances), jnp.log(weights), jnp.asarray(alive),
-        empty_bank(jnp.zeros(n), n, 3, count).rejections, jnp.arange(count),
+        empty_bank(jnp.zeros(n), jnp.eye(n), 3, count).rejections, jnp.arange(count),
     )  # fmt: skip
 
     def difference(mean, base):
@@ -431,7 +431,7 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
 def test_nobody_merges_with_itself():
     motionless = Bank(
         jnp.ones((3, 2)), jnp.tile(jnp.eye(2), (3, 1, 1)), jnp.log(jnp.asarray([0.2, 0.3, 0.5])),
-        jnp.asarray([True, False, True]), empty_bank(jnp.zeros(2), 2, 1, 3).rejections,
+        jnp.asarray([True, False, True]), empty_bank(jnp.zeros(2), jnp.eye(2), 1, 3).rejections,
         jnp.arange(3),
     )  # fmt: skip
     after = merge_heirs(motionless, jnp.arange(3), lambda m, b: m - b, lambda m, e: m + e)
@@ -454,7 +454,9 @@ def test_the_rest_of_the_state_follows_as_a_gaussian_does(n, freedom):
     T_prior = worlds.planar(0.3, -0.2, 2.0)
     T = T_prior @ jaxlie.SE3.exp(jnp.asarray(freedom @ expected[:d]))
     covariance = jnp.asarray(freedom @ P_expected[:d, :d] @ freedom.T)
-    correction, after = follow_pose(jnp.asarray(P), T_prior, T, covariance, jnp.asarray(freedom))
+    nis = jnp.zeros(d)
+    corrected = PosePosterior(T, covariance, nis, jnp.ones(()), jnp.zeros(()), jnp.asarray(True))
+    correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, jnp.asarray(freedom))
     np.testing.assert_allclose(correction, expected, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(after, P_expected, atol=1e-6 * np.max(P_expected))
     assert np.all(np.linalg.eigvalsh(np.asarray(after)) > 0)

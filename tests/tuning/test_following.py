@@ -367,7 +367,7 @@ def test_the_implicit_gradient_is_that_of_all_steps():
         snapshot = Snapshot.create(RIG, MARKERS, now, sigma_px)
         prior = prior_of(logs)
         found = fit_poses(
-            prior.T_world_vehicle, prior.covariance, prior, snapshot, jnp.zeros(6), 20
+            prior.T_world_vehicle, prior.covariance, None, prior, snapshot, jnp.zeros(6), 20
         )
         return found.posterior.T_world_vehicle.wxyz_xyz[0]
 

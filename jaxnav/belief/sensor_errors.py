@@ -1,0 +1,92 @@
+"""Errors of a vehicle's sensors that repeat: four states behind the six of the filter.
+
+    p = (k, g, o, tau)
+
+The odometer's true speed is (1 + k) times the one that it reads, the true steering angle is
+(1 + g) read + o, rad, and corners show the vehicle where it was tau s before their stamp.
+
+While the branch is open the four are only considered (Schmidt): they widen the covariance of pose
+and velocity and stay correlated with them, but keep their own mean and covariance. A mirrored pose
+and a wheel that slips explain the same corners, and a hypothesis would learn the error that fits
+its own mistake. Once the heading is known they are estimated like every other state.
+
+Source: Schmidt (1966), "Application of state-space methods to navigation problems"; Bar-Shalom,
+Li, Kirubarajan (2001), section 10.2 (augmented states).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxnav.models import bicycle
+
+SIX = 6  # states before the errors: pose and velocity
+SENSORS_END = SIX + 4  # the errors of cameras come behind those of sensors
+_DELAY = 3  # index of tau among the errors
+
+
+class ReadVelocity(NamedTuple):
+    """A velocity that the odometry reads, in the world, and its derivatives."""
+
+    velocity: Float[Array, " 3"]
+    by_heading: Float[Array, " 3"]
+    by_errors: Float[Array, "3 p"]  # p = 0 or 4
+
+
+def read_velocity(
+    speed_mps: Float[Array, ""],
+    steering_rad: Float[Array, ""],
+    mean: Float[Array, " n"],
+    wheelbase_m: Float[Array, ""],
+) -> ReadVelocity:
+    """The velocity (Eqs. 6 and 7) that speed and steering mean to a state, in the world.
+
+    Args:
+        mean: (6,), or longer with the errors p behind.
+    """
+    psi_rad, errors = mean[2], mean[SIX : SIX + 4]
+    speed, steering = speed_mps, steering_rad
+    if errors.shape[0]:
+        k, g, o, _ = errors
+        speed, steering = (1 + k) * speed_mps, (1 + g) * steering_rad + o
+
+    def at(steering: Array) -> Array:
+        return bicycle.velocity_world(jnp.ones_like(speed), steering, psi_rad, wheelbase_m)
+
+    unit, by_steering = jax.jvp(at, (steering,), (jnp.ones_like(steering),))
+    velocity = speed * unit
+    by_heading = jnp.stack([-velocity[1], velocity[0], jnp.zeros_like(speed)])
+    if not errors.shape[0]:
+        return ReadVelocity(velocity, by_heading, jnp.zeros((3, 0), mean.dtype))
+    by_angle = speed * by_steering
+    columns = [speed_mps * unit, steering_rad * by_angle, by_angle, jnp.zeros_like(by_angle)]
+    return ReadVelocity(velocity, by_heading, jnp.stack(columns, axis=1))
+
+
+def seen_pose(mean: Float[Array, " n"]) -> Float[Array, " 3"]:
+    """Where the corners show the vehicle: pose - tau velocity."""
+    return mean[:3] if mean.shape[0] == SIX else mean[:3] - mean[SIX + _DELAY] * mean[3:SIX]
+
+
+def seen_slope(mean: Float[Array, " n"]) -> Float[Array, "3 n"]:
+    """Derivative of `seen_pose` by the state."""
+    return _sheared(mean, -1)
+
+
+def from_seen(mean: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, "3 n"]]:
+    """The state of one whose first three entries are the seen pose, and their derivative by it."""
+    if mean.shape[0] == SIX:
+        return mean, _sheared(mean, 1)
+    return mean.at[:3].add(mean[SIX + _DELAY] * mean[3:SIX]), _sheared(mean, 1)
+
+
+def _sheared(mean: Array, sign: int) -> Array:
+    """Derivative of x + sign tau v."""
+    slope = jnp.eye(3, mean.shape[0], dtype=mean.dtype)
+    if mean.shape[0] == SIX:
+        return slope
+    tau = mean[SIX + _DELAY]
+    slope = slope.at[:, 3:SIX].set(sign * tau * jnp.eye(3, dtype=mean.dtype))
+    return slope.at[:, SIX + _DELAY].set(sign * mean[3:SIX])

@@ -1,0 +1,226 @@
+"""Errors of sensors and cameras as states: against dense least squares and textbook filters."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from jaxnav.belief.ambiguity import PosePosterior
+from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.camera_errors import EACH, ErrorsPosterior
+from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.map_fit import fit_poses
+from jaxnav.belief.motion import follow_pose
+from jaxnav.belief.sensor_errors import SENSORS_END, SIX
+from jaxnav.models.geometry import ON_GROUND, cayley
+from jaxnav.models.rig import PLACED_BY_HAND
+from jaxnav.navigator import Navigator
+from jaxnav.pose.linearised import reprojection_rows
+from jaxnav.pose.nuisance import camera_slopes
+from jaxnav.pose.observation import Snapshot
+from tests import worlds
+
+SIGMA = np.array([0.03, 0.03, 0.01, 0.02])
+VIEW = worlds.OVERLAP_VIEW  # two cameras see the marker
+PLANAR = jnp.asarray(ON_GROUND, float)
+
+
+def off_rig():
+    rig = worlds.qcar_rig()
+    return dataclasses.replace(rig, extrinsics_sigma=jnp.tile(jnp.asarray(PLACED_BY_HAND), (4, 1)))
+
+
+def off_car():
+    return dataclasses.replace(worlds.qcar(), sensor_sigma=jnp.asarray(SIGMA))
+
+
+def spd(n: int, rng: np.random.Generator, scale: np.ndarray) -> np.ndarray:
+    A = rng.normal(size=(n, 2 * n)) / np.sqrt(2 * n)
+    return scale[:, None] * (A @ A.T) * scale[None]
+
+
+@pytest.fixture(scope="module")
+def navigator() -> Navigator:
+    return Navigator(off_rig(), worlds.paper_markers(), off_car(), selector=MultiHypothesis())
+
+
+def bank_at(navigator: Navigator, rng: np.random.Generator):
+    """A single hypothesis at VIEW, all of its states correlated."""
+    bank = navigator.motion.init(1)
+    n = bank.mean.shape[1]
+    scale = np.concatenate([[0.03, 0.03, 0.03], [0.1] * 3, SIGMA, np.ones(n - SENSORS_END)])
+    mean = np.zeros(n)
+    mean[:3] = VIEW + 0.01 * rng.normal(size=3)
+    mean[3:SIX] = 0.3, -0.1, 0.2
+    mean[SIX:] = 0.3 * scale[SIX:] * rng.normal(size=n - SIX)
+    return eqx.tree_at(
+        lambda b: (b.mean, b.covariance, b.initialised, b.log_weight),
+        bank,
+        (
+            jnp.asarray(mean[None]),
+            jnp.asarray(spd(n, rng, scale)[None]),
+            jnp.ones(1, bool),
+            jnp.zeros(1),
+        ),
+    )
+
+
+def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
+    """Pose, turns, places and the vehicle's tilt as the unknowns of one problem, by SciPy."""
+    rng = np.random.default_rng(5)
+    noise_px = rng.normal(size=(4, 1, 4, 2))
+    obs = worlds.observe(
+        off_rig(), worlds.paper_markers(), worlds.planar(*VIEW), jnp.asarray(noise_px)
+    )
+    snapshot = Snapshot.create(off_rig(), worlds.paper_markers(), obs, 1.0)
+    assert int(jnp.sum(snapshot.seen.visible)) == 2
+    bank = bank_at(navigator, rng)
+    prior = navigator.motion.poses(bank)
+    fit = jax.jit(fit_poses, static_argnums=6)(
+        prior.T_world_vehicle, prior.covariance, prior.errors, prior, snapshot, jnp.zeros(6), 60
+    )
+
+    moves = camera_slopes(snapshot.rig, snapshot.markers, snapshot.seen)
+    rows = reprojection_rows(snapshot.rig, snapshot.seen)
+    corners = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
+    T_prior = jaxlie.SE3(prior.T_world_vehicle.wxyz_xyz[0])
+    e = prior.errors.mean.shape[1]
+    H = np.zeros((3 + e, bank.mean.shape[1]))
+    H[3:, SENSORS_END:] = np.eye(e)
+    P = np.block(
+        [
+            [PLANAR.T @ prior.covariance[0] @ PLANAR, PLANAR.T @ prior.errors.cross[0]],
+            [(PLANAR.T @ prior.errors.cross[0]).T, prior.errors.covariance[0]],
+        ]
+    )
+    root = np.linalg.cholesky(P)
+    turns = np.zeros((e, moves.turns.shape[1]))
+    for group, camera in enumerate(np.asarray(moves.camera)):
+        turns[EACH * camera : EACH * (camera + 1)] += np.asarray(moves.turns[:, :, group])
+    places = np.asarray(moves.places).transpose(2, 0, 1).reshape(-1, turns.shape[1])
+    # The vehicle's nuisance, as the estimator linearises it: at the prediction.
+    tilt = jax.jacobian(
+        lambda t: rows(moved(T_prior @ cayley(prior.nuisance @ t), corners))[0].reshape(-1)
+    )(jnp.zeros(prior.nuisance.shape[1]))
+    base = jax.jit(lambda xi: rows(moved(T_prior @ cayley(PLANAR @ xi), corners))[0].reshape(-1))
+
+    def residuals(x):
+        y, b, t = np.split(x, [3 + e, 3 + e + len(places)])
+        xi, q = np.split(root @ y, [3])
+        q = q + np.asarray(prior.errors.mean[0])
+        r = np.asarray(base(jnp.asarray(xi))) + q @ turns + b @ places + np.asarray(tilt) @ t
+        return np.concatenate([r, x])
+
+    found = least_squares(residuals, np.zeros(3 + e + len(places) + 3), method="lm", xtol=1e-14)
+    y = root @ found.x[: 3 + e]
+    C = root @ np.linalg.inv(found.jac.T @ found.jac)[: 3 + e, : 3 + e] @ root.T
+    T_expected = T_prior @ cayley(PLANAR @ jnp.asarray(y[:3]))
+    T = jaxlie.SE3(fit.posterior.T_world_vehicle.wxyz_xyz[0])
+    np.testing.assert_allclose((T.inverse() @ T_expected).log(), 0, atol=2e-6)
+    seen = np.asarray(fit.posterior.errors.rows[0]).sum(0) > 0
+    assert seen.sum() == 2 * EACH
+    q = np.asarray(fit.posterior.errors.rows[0]).T @ np.asarray(fit.posterior.errors.change[0])
+    np.testing.assert_allclose(q[seen], y[3:][seen], atol=1e-4)
+
+    # The rest of the state, by the joint Gaussian of all of it.
+    posterior = jax.tree.map(lambda leaf: leaf[0], fit.posterior)
+    offer = navigator.motion.follow(jax.tree.map(lambda leaf: leaf[0], bank), posterior, obs)
+    mean, covariance = map(np.asarray, offer.posterior)
+    np.testing.assert_allclose(mean[SENSORS_END:] - bank.mean[0, SENSORS_END:], y[3:], atol=1e-4)
+    np.testing.assert_allclose(covariance[SENSORS_END:, SENSORS_END:], C[3:, 3:], atol=2e-3)
+    assert np.all(np.linalg.eigvalsh(covariance) > 0)
+
+
+def moved(T_world_vehicle: jaxlie.SE3, corners):
+    return jax.vmap(T_world_vehicle.inverse().apply)(corners).T[..., None]
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_the_rest_follows_pose_and_errors_as_a_gaussian_does(hidden):
+    """The textbook's joint update by a measurement of pose and errors, of which some are unseen."""
+    rng = np.random.default_rng(7)
+    n, d, e = 12, 3, 4
+    P = spd(n, rng, np.full(n, 0.01))
+    rows = np.eye(e)[:2]
+    if hidden:
+        rows = np.vstack([rows, np.zeros((1, e))])
+    H = np.zeros((d + 2, n))
+    H[:d, :d] = np.eye(d)
+    H[d:, n - e :] = np.eye(e)[:2]
+    R = spd(d + 2, rng, np.full(d + 2, 0.01))
+    z = 0.003 * rng.normal(size=d + 2)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    expected, P_expected = K @ z, P - K @ H @ P
+    y, C = H @ expected, H @ P_expected @ H.T
+    slope = C[d:, :d] @ np.linalg.inv(C[:d, :d])
+    given = C[d:, d:] - slope @ C[:d, d:]
+    if hidden:
+        y, slope = np.append(y, 0), np.vstack([slope, np.zeros((1, d))])
+        given = np.block([[given, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+    T_prior = worlds.planar(0.3, -0.2, 0.7)
+    xi = PLANAR @ jnp.asarray(y[:d])
+    corrected = PosePosterior(
+        T_prior @ cayley(xi),
+        PLANAR @ jnp.asarray(C[:d, :d]) @ PLANAR.T,
+        jnp.zeros(d),
+        jnp.ones(()),
+        jnp.zeros(()),
+        jnp.asarray(True),
+        ErrorsPosterior(*map(jnp.asarray, (y[d:], slope, given, rows))),
+    )
+    correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, PLANAR)
+    np.testing.assert_allclose(correction[:d], y[:d], atol=1e-8)
+    np.testing.assert_allclose(correction, expected, atol=2e-5)
+    np.testing.assert_allclose(after, P_expected, atol=3e-6)
+
+
+def test_what_is_considered_keeps_mean_and_covariance(navigator):
+    """Schmidt's filter: pose and velocity and their correlations as in the optimal one."""
+    motion, rng = navigator.motion, np.random.default_rng(2)
+    before = bank_at(navigator, rng)
+    x, P = before.mean[0], before.covariance[0]
+    after = x + 0.1, P / 2
+    mean, covariance = motion.considered(jnp.asarray(False), (x, P), after)
+    np.testing.assert_array_equal(mean[SIX:], x[SIX:])
+    np.testing.assert_array_equal(covariance[SIX:, SIX:], P[SIX:, SIX:])
+    np.testing.assert_array_equal(mean[:SIX], after[0][:SIX])
+    np.testing.assert_array_equal(covariance[:SIX], after[1][:SIX])
+    learnt = motion.considered(jnp.asarray(True), (x, P), after)
+    for one, other in zip(learnt, after, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_nothing_is_learnt_while_the_heading_is_open_or_from_odometry(navigator):
+    motion = navigator.motion
+    bank = motion.init(2)
+    P = bank.covariance.at[:, 2, 2].set(0.01**2)
+    bank = eqx.tree_at(
+        lambda b: (b.covariance, b.initialised, b.log_weight),
+        bank,
+        (P, jnp.ones(2, bool), jnp.log(jnp.asarray([0.9, 0.1]))),
+    )
+    assert bool(motion.learns(bank))
+    mirrored = eqx.tree_at(lambda b: b.mean, bank, bank.mean.at[1, 2].set(1.0))
+    assert not bool(motion.learns(mirrored))
+    obs = worlds.observe(off_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
+    obs = dataclasses.replace(
+        obs, speed_mps=jnp.asarray(0.5), steering_rad=jnp.asarray(0.3), dt_s=jnp.asarray(0.1)
+    )
+    later = motion.predict(motion.predict(bank, obs), obs)
+    np.testing.assert_array_equal(later.mean[:, SIX:], 0)
+    np.testing.assert_array_equal(later.covariance[:, SIX:, SIX:], bank.covariance[:, SIX:, SIX:])
+
+
+def test_a_rule_has_the_paper_s_six_states():
+    from jaxnav.belief.ambiguity import PaperCost
+
+    rule = Navigator(off_rig(), worlds.paper_markers(), off_car(), selector=PaperCost())
+    assert rule.init().belief.bank.mean.shape == (1, 6)
+    exact = Navigator(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar())
+    assert exact.init().belief.bank.mean.shape == (24, 6)
+    assert isinstance(exact.motion, BicycleKalman)
