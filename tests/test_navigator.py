@@ -1,5 +1,6 @@
 """Algorithm 1 as one pure step: the same alone, scanned and vmapped; its gradient; bad input."""
 
+import dataclasses
 import functools
 from typing import ClassVar
 
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from jaxnav.belief.ambiguity import PaperCost, PoseBelief, PoseMeasurement, Selection
 from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.models.geometry import planar_from_T_world_vehicle
 from jaxnav.models.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator, Output, State
@@ -424,15 +426,39 @@ class EachItsOwn(eqx.Module):
         )
 
 
-def test_step_by_regime_is_step():
+by_regime = jax.jit(lambda nav, state, obs: jax.lax.scan(step_by_regime(nav), state, obs))
+
+
+def spanning(bank):
+    """The bank with one hypothesis, at the mirrored pose, too wide to know."""
+    out = step(navigator(), navigator().init(), at(drive(), 0))[1]
+    Ts_world_vehicle = jax.vmap(lambda T: T.inverse())(out.candidates.T_vehicle_world)
+    poses = np.asarray(planar_from_T_world_vehicle(Ts_world_vehicle))
+    gaps = np.linalg.norm(poses[:2] - true_poses()[0], axis=1)
+    wrong, apart = poses[np.argmax(gaps)], poses[0] - poses[1]
+    return dataclasses.replace(
+        bank,
+        mean=bank.mean.at[0, :3].set(wrong),
+        covariance=bank.covariance.at[0, :3, :3].set(jnp.diag(apart**2 + 0.5**2)),
+        initialised=bank.initialised.at[0].set(True),
+    )
+
+
+@pytest.mark.parametrize("start", ["empty", "one that spans both poses"])
+def test_step_by_regime_is_step(start):
     """A start with the whole bank, a few hypotheses, one; one sighting, two and none."""
     nav = navigator(selector=MultiHypothesis(hypotheses=12), max_sightings=2)
     obs = drive(sigma_px=1.0, blind=(STEPS - 2,))
-    state, out = scan(nav, nav.init(), obs)
-    by_regime = jax.jit(lambda nav, state, obs: jax.lax.scan(step_by_regime(nav), state, obs))
-    _, same = by_regime(nav, nav.init(), obs)
-    alive = int(np.sum(state.belief.bank.initialised))
-    assert alive < 8
+    begin = nav.init()
+    if start != "empty":
+        begin = eqx.tree_at(lambda s: s.belief.bank, begin, spanning(begin.belief.bank))
+    state, out = scan(nav, begin, obs)
+    _, same = by_regime(nav, begin, obs)
+    bank = state.belief.bank
+    assert int(np.sum(bank.initialised)) < 8
+    if start != "empty":
+        assert int(out.hypothesis[0]) == 0  # the mirrored one
+        assert int(out.hypothesis[-1]) > 0
     for name in ("selected", "hypothesis", "decided", "located", "done"):
         np.testing.assert_array_equal(getattr(same, name), getattr(out, name))
     for name in ("pose", "covariance", "flip_probability", "nis", "command"):

@@ -87,6 +87,8 @@ class Selection(eqx.Module):
     selected: Int[Array, ""]  # candidate of the reported hypothesis, -1: none
     flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
     decided: Bool[Array, ""]  # whether the reported pose may be acted upon
+    # The predicted hypothesis that each one continues; None: every one itself.
+    parent: Int[Array, " K"] | None = None
 
 
 @runtime_checkable

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
+from jaxnav.belief.branches import SecondPoses, give_slots, second_poses
 from jaxnav.belief.fan import CANDIDATES, fan, normalise
 from jaxnav.belief.map_fit import PoseFit, fit_poses
 from jaxnav.models.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
@@ -32,6 +33,9 @@ from jaxnav.numerics.small_matrices import cholesky, matvec, product, ranks, san
 from jaxnav.numerics.trees import where
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Snapshot
+
+# Corners off by more than so many of their sigmas, however the vehicle stands, start no branch.
+_TELLS_BRANCHES = 2.0
 
 
 class MultiHypothesis(eqx.Module):
@@ -46,9 +50,12 @@ class MultiHypothesis(eqx.Module):
 
     `flip_probability` is the mass farther than `far_rad` from the reported pose, or nearer to
     another candidate than to the selected one, with the tails of every hypothesis. The bank is
-    `decided` when hypotheses farther off than `far_rad` weigh less than `decided_mass` and the
-    orientation is known to `decided_sigma_rad`; until then the car explores (see
+    `decided` when hypotheses farther off than `far_rad` weigh less than `decided_mass` and all of
+    them together know the orientation to `decided_sigma_rad`; until then the car explores (see
     `control.Exploration` and docs/design.md, Ambiguity).
+
+    Where the prediction of a settled bank spans a second candidate as well, an empty slot takes
+    that posterior (see `branches.py`).
 
     The bank can't decide while the vehicle stands and both poses fit the image equally well. It
     takes the corner errors of different frames for independent: the corners' sigma has to include
@@ -104,35 +111,49 @@ class MultiHypothesis(eqx.Module):
         floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
         # All slots take as many steps as the slowest, so an empty slot repeats the heaviest one.
         heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
-        does_as = jnp.where(bank.initialised, jnp.arange(count), heaviest)
-        starts_at = _at(_poses(bank), does_as)
+        own = jnp.arange(count)
+        does_as = jnp.where(bank.initialised, own, heaviest)
+        predicted = _at(_poses(bank), does_as)
+        second = self.second_poses(bank, heaviest, candidates, snapshot)
+        tried = give_slots(second, ~bank.initialised & ~starts)
         fits = fit_poses(
-            starts_at.T_world_vehicle,
-            starts_at.covariance,
+            predicted.T_world_vehicle,
+            predicted.covariance,
             jax.tree.map(lambda leaf: leaf[does_as], bank.errors),
             prior,
             snapshot,
             floor,
             self.max_steps,
+            tried,
         )
         alive = bank.initialised & fits.finite
         inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
         free_cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
         posteriors = _contradicted(_inflated(fits.posterior, inflation), fits.cost - free_cost)
         fits_one = starts | (jnp.min(jnp.where(alive, fits.cost, jnp.inf)) - free_cost < self.gate)
-        evidence = self._evidence(fits, inflation, alive, fits_one)
-        log_weight = normalise(jnp.where(alive, bank.log_weight + evidence, -jnp.inf))
-        alive = alive & (log_weight > self.forget_log_weight)
+        passes = starts | (_nis(posteriors) <= prior.gate_nis * inflation)
+        log_evidence = _log_evidence(fits, inflation)
+        evidence = self._bounded(log_evidence, alive & fits_one)
+        log_weight = jnp.where(alive, bank.log_weight + evidence, -jnp.inf)
+
+        # A second posterior shares its parent's prediction, and is no surer of it than the parent.
+        branches = tried.taken & fits.finite & passes & fits_one & alive[does_as]
+        T_fitted = fits.posterior.T_world_vehicle
+        branches = branches & (_turns_rad(T_fitted, _rows(T_fitted, does_as)) > self.linear_rad)
+        lighter = jnp.minimum(log_evidence - log_evidence[does_as], 0)
+        log_weight = jnp.where(branches, log_weight[does_as] + lighter, log_weight)
+        log_weight = normalise(log_weight)
+        alive = (alive | branches) & (log_weight > self.forget_log_weight)
 
         # A hypothesis whose pose the gate rejects stays where it was predicted.
-        passes = starts | (_nis(posteriors) <= prior.gate_nis * inflation)
-        after = where(passes, _poses(posteriors), _poses(bank))
+        after = where(passes, _poses(posteriors), predicted)
         best = jnp.argmax(log_weight)
         T_best = _at(after, best).T_world_vehicle
         apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(after.T_world_vehicle)
         sigmas_rad = safe_sqrt(jnp.trace(after.covariance[:, 3:, 3:], axis1=1, axis2=2))
         mass = jnp.where(alive, jnp.exp(log_weight), 0)
         far = jnp.sum(jnp.where(apart_rad > self.far_rad, mass, 0))
+        known_rad = safe_sqrt(jnp.sum(mass * (sigmas_rad**2 + apart_rad**2)))
         to_best_rad = jax.vmap(lambda T: rotation_error_rad(T.inverse(), T_best))(
             candidates.T_vehicle_world
         )
@@ -144,7 +165,7 @@ class MultiHypothesis(eqx.Module):
         )
         flip_probability = jnp.sum(mass * wrong)
         located = jnp.any(alive)
-        own = heir = jnp.arange(count)
+        heir = own
         if count > 1:
             heir = jax.lax.cond(
                 jnp.sum(alive) > 1,
@@ -159,10 +180,25 @@ class MultiHypothesis(eqx.Module):
             costs=costs,
             selected=jnp.where(jnp.any(candidates.valid) & located, jnp.argmin(costs), -1),
             flip_probability=jnp.where(located, flip_probability, 0),
-            decided=located
-            & (far < self.decided_mass)
-            & (sigmas_rad[best] < self.decided_sigma_rad),
+            decided=located & (far < self.decided_mass) & (known_rad < self.decided_sigma_rad),
+            parent=jnp.where(branches & alive, does_as, own),
         )
+
+    def second_poses(
+        self,
+        bank: PoseBelief,
+        heaviest: Int[Array, ""] | int,
+        candidates: Candidates,
+        snapshot: Snapshot,
+    ) -> SecondPoses:
+        """The candidates for which a bank takes empty slots.
+
+        None while the bank is open, when others stand for them, and none where all misfit.
+        """
+        second = second_poses(bank, heaviest, candidates, self.forget_log_weight)
+        settled = bank.log_weight[heaviest] > np.log(0.5)
+        fits = _misfit(candidates, snapshot) < _TELLS_BRANCHES**2
+        return second._replace(wanted=second.wanted & settled & fits)
 
     def _trusted(self, snapshot: Snapshot, candidates: Candidates) -> Snapshot:
         """The snapshot with the corners' sigma raised where no pose explains the corners.
@@ -170,12 +206,9 @@ class MultiHypothesis(eqx.Module):
         Where the cost of the best candidate exceeds its chi-square by three sigmas, the sigma is
         multiplied so that it does not: the marker is blurred, bent or half hidden.
         """
-        seen = snapshot.seen
-        misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
-        freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
-        scale = jnp.sqrt(_excess(jnp.where(jnp.isfinite(misfit), misfit, 0), freedom))
-        scale = jnp.minimum(scale, self.max_misfit)
-        return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, seen.sigma_px * scale)
+        scale = jnp.minimum(jnp.sqrt(_misfit(candidates, snapshot)), self.max_misfit)
+        sigma_px = snapshot.seen.sigma_px * scale
+        return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, sigma_px)
 
     def _inflation(
         self, fits: PoseFit, alive: Bool[Array, " K"], starts: Array, freedom: int
@@ -191,19 +224,13 @@ class MultiHypothesis(eqx.Module):
         excess = _excess(jnp.where(known, least, 0), jnp.asarray(freedom, least.dtype))
         return jnp.minimum(excess, self.max_inflation).astype(least.dtype)
 
-    def _evidence(
-        self,
-        fits: PoseFit,
-        inflation: Float[Array, ""],
-        alive: Bool[Array, " K"],
-        fits_one: Bool[Array, ""],
+    def _bounded(
+        self, log_evidence: Float[Array, " K"], compared: Bool[Array, " K"]
     ) -> Float[Array, " K"]:
-        """Bounded change of each log-weight by this frame; zeros where it fits no hypothesis."""
-        forgiven = jnp.where(alive, _nis(fits.posterior), 0) * (1 - 1 / inflation) / 2
-        log_evidence = fits.log_evidence + forgiven
-        best = jnp.max(jnp.where(alive, log_evidence, -jnp.inf))
+        """Bounded change of each log-weight by this frame; 0 for those that are not compared."""
+        best = jnp.max(jnp.where(compared, log_evidence, -jnp.inf))
         bounded = jnp.maximum(log_evidence - best, self.outlier_log_evidence)
-        return jnp.where(alive & fits_one, bounded, 0)
+        return jnp.where(compared, bounded, 0)
 
     def _heirs(
         self,
@@ -267,6 +294,12 @@ def _started(
     return eqx.tree_at(changing, prior, (wxyz_xyz, *rest), is_leaf=lambda leaf: leaf is None)
 
 
+def _log_evidence(fits: PoseFit, inflation: Float[Array, ""]) -> Float[Array, " K"]:
+    """Laplace's evidence, with the NIS by covariances as inflated."""
+    forgiven = jnp.where(fits.finite, _nis(fits.posterior), 0) * (1 - 1 / inflation) / 2
+    return fits.log_evidence + forgiven
+
+
 def _nis(posteriors: PosePosterior) -> Float[Array, " K"]:
     return jnp.sum(posteriors.innovation**2, axis=1)
 
@@ -291,6 +324,13 @@ def _contradicted(posteriors: PosePosterior, excess: Float[Array, " K"]) -> Pose
     return eqx.tree_at(lambda p: p.innovation, posteriors, posteriors.innovation * growth[:, None])
 
 
+def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
+    """The `_excess` of the best candidate's cost; 1 without a candidate."""
+    cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+    freedom = jnp.maximum(8 * jnp.sum(snapshot.seen.visible) - 6, 2).astype(cost.dtype)
+    return _excess(jnp.where(jnp.isfinite(cost), cost, 0), freedom)
+
+
 def _excess(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:
     """Ratio of a sum of squares to its chi-square's mean plus three sigmas; 1 below it.
 
@@ -306,6 +346,14 @@ class _Poses(eqx.Module):
 
 def _poses(of: PoseBelief | PosePosterior) -> _Poses:
     return _Poses(of.T_world_vehicle, of.covariance)
+
+
+def _turns_rad(T: jaxlie.SE3, other: jaxlie.SE3) -> Float[Array, " K"]:
+    return jax.vmap(rotation_error_rad)(T, other)
+
+
+def _rows(T: jaxlie.SE3, index: Int[Array, "*rows"]) -> jaxlie.SE3:
+    return jaxlie.SE3(T.wxyz_xyz[index])
 
 
 def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:

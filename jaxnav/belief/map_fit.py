@@ -57,13 +57,14 @@ def fit_poses(
     snapshot: Snapshot,
     floor: Float[Array, " 6"],
     max_steps: int,
+    elsewhere: tuple[Bool[Array, " K"], Float[Array, "K d"]] | None = None,
 ) -> PoseFit:
     """Minimise e over u, in units of the prediction's own sigma: xi = freedom L u, P = L L'.
 
         e(u) = |r(T_prior cay(freedom L u))|^2 / sigma^2 + |u|^2
 
     Args:
-        T_world_prior: K poses at which the search starts, the predictions.
+        T_world_prior: K predictions, batch axis (K,).
         covariance: (K, 6, 6) of the predictions.
         errors: of the cameras, as predicted; None: those of each frame are new.
         prior: gives `freedom` (6, d) and `nuisance` (6, t).
@@ -71,6 +72,8 @@ def fit_poses(
         floor: (6,) standard deviations (m, rad) of the error that successive frames share, which
             no number of frames averages out.
         max_steps: bound on the LM steps.
+        elsewhere: hypotheses that are not searched for but take the corners as linear about
+            another pose, and that pose: xi along `freedom`, (K, d).
 
     Returns:
         K minima, along the leading axis of every leaf.
@@ -103,21 +106,26 @@ def fit_poses(
         adjoint=ImplicitGradient(),
         throw=False,
     )
-    r, normal, raw = linearised(solution.value)
+    u, linear = solution.value, jnp.zeros_like(usable)
+    if elsewhere is not None:
+        linear, xi = elsewhere
+        u = jnp.where(linear, jax.vmap(solve_lower, out_axes=-1)(root, xi), u)
+    r, normal, raw = linearised(u)
     fused: PoseFit = jax.vmap(
-        partial(_fused, freedom=freedom, floor=floor), in_axes=(0, 0, 0, 0, *(-1,) * 6, 0)
+        partial(_fused, freedom=freedom, floor=floor), in_axes=(*(0,) * 5, *(-1,) * 6, 0)
     )(
         T_world_prior,
         usable,
+        linear,
         root,
         spread,
-        solution.value,
+        u,
         jnp.sum(r**2, axis=0),
         normal.gradient,
         normal.information,
         beside.log_share,
         -jnp.broadcast_to(log_sigmas(snapshot.seen), usable.shape),
-        beside.errors_at_best(solution.value, *raw),
+        beside.errors_at_best(u, *raw),
     )
     return fused
 
@@ -189,6 +197,7 @@ def _swung(half: Float[Array, "3 ..."], shift: Float[Array, "3 ..."]) -> Array:
 def _fused(
     T_world_prior: jaxlie.SE3,
     usable: Bool[Array, ""],
+    linear: Bool[Array, ""],
     root: Float[Array, "d d"],
     spread: Float[Array, "6 d"],
     u: Float[Array, " d"],
@@ -202,7 +211,7 @@ def _fused(
     freedom: Float[Array, "6 d"],
     floor: Float[Array, " 6"],
 ) -> PoseFit:
-    """Posterior and evidence of one hypothesis at its minimum u.
+    """Posterior and evidence of one hypothesis at its minimum u, or, `linear`, about another u.
 
     With A = J'J of the corners in units of the prediction's sigma, N the floor in the same units,
     and R = A^-1 + N, the posterior covariance is R (I + R)^-1, the evidence
@@ -210,9 +219,6 @@ def _fused(
     """
     dtype = u.dtype
     eye = jnp.eye(u.shape[0], dtype=dtype)
-    log_evidence = -(cost + jnp.sum(u**2)) / 2 - log_det(cholesky(information + eye)) / 2
-    log_evidence = log_evidence + log_share
-
     # The minimum of the corners alone, u_alone with covariance R, is fused with the prediction.
     ridge = jnp.sqrt(jnp.finfo(dtype).eps)
     alone = cholesky(information + ridge * eye)
@@ -226,6 +232,8 @@ def _fused(
     C = _between(information + ridge * eye, N)
     # log p(corners | prediction): the misfit at the best pose, and that pose's distance.
     misfit = cost - jnp.sum(gradient * (u - u_alone))
+    least = jnp.where(linear, misfit + jnp.sum(contradiction**2), cost + jnp.sum(u**2))
+    log_evidence = log_share - (least + log_det(cholesky(information + eye))) / 2
     log_likelihood = (
         log_scale
         + log_share
@@ -248,7 +256,7 @@ def _fused(
             finite,
             jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0), errors_in_view),
         ),
-        cost=jnp.where(finite, cost, jnp.inf),
+        cost=jnp.where(finite, jnp.where(linear, misfit, cost), jnp.inf),
         log_evidence=jnp.where(finite, log_evidence, -jnp.inf),
         finite=finite,
     )

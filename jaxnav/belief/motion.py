@@ -194,12 +194,13 @@ class Motion(eqx.Module):
             selection: what each hypothesis takes as measured, its weight and its heir.
             obs: the observation; its odometry gives a hypothesis that starts its velocity.
         """
+        if selection.parent is not None:
+            bank = branched(bank, selection.parent)
         bank = eqx.tree_at(
             lambda b: (b.log_weight, b.initialised), bank, (selection.log_weight, selection.kept)
         )
         measured = selection.measured
         offer = self.follow if isinstance(measured, PosePosterior) else self.measure
-
         learns = self.learns(bank)
 
         def one(before: Bank, measured: Any) -> BankUpdate:
@@ -453,6 +454,15 @@ def merge_heirs(
         log_weight=jnp.where(stays, jnp.log(jnp.where(total > 0, total, 1)), bank.log_weight),
         initialised=stays,
     )
+
+
+def branched(bank: Bank, parent: Int[Array, " K"]) -> Bank:
+    """The bank whose slots continue their parents; a copy of another slot gets a new number."""
+    copied = parent != jnp.arange(parent.shape[0])
+    anew = jnp.max(jnp.where(bank.initialised, bank.number, -1)) + jnp.cumsum(copied)
+    number = jnp.where(copied, anew, bank.number)
+    copies: Bank = jax.tree.map(lambda leaf: leaf[parent], bank)
+    return dataclasses.replace(copies, number=number)
 
 
 def heaviest(bank: Bank) -> Int[Array, ""]:

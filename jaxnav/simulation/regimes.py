@@ -9,10 +9,11 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
 
 from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.motion import fill_slots, first_hypotheses, survivors_first
+from jaxnav.belief.motion import Bank, fill_slots, first_hypotheses, survivors_first
 from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.consistency import ConsistentSnapshot, Inliers, find_inliers
 from jaxnav.pose.observation import Observation
@@ -66,12 +67,25 @@ class _ByRegime(Navigator):
 
             return fuse
 
-        starts = any_seen & ~jnp.any(bank.initialised & ~self.motion.lost(bank))
+        lives = bank.initialised & ~self.motion.lost(bank)
+        starts = any_seen & ~jnp.any(lives)
         sizes = [size for size in _BANKS if size < count] + [count]
         needed = jnp.max(jnp.where(bank.initialised, jnp.arange(count) + 1, 0))
+        needed = needed + jnp.where(any_seen, self._branches(bank, lives, seen), 0)
         needed = jnp.where(starts, count, needed)
         index = jnp.sum(needed > jnp.asarray(sizes[:-1])) + jnp.where(any_seen, len(sizes), 0)
         fused: tuple[Belief, Estimate] = jax.lax.switch(
             index, [within(size, sees) for sees in (False, True) for size in sizes], belief
         )
         return fused
+
+    def _branches(
+        self, bank: Bank, lives: Bool[Array, " K"], seen: ConsistentSnapshot
+    ) -> Int[Array, ""]:
+        """How many empty slots the selector is going to take for second poses."""
+        assert isinstance(self.selector, MultiHypothesis)
+        best = jnp.argmax(jnp.where(lives, bank.log_weight, -jnp.inf))
+        alone = jax.tree.map(lambda leaf: leaf[best][None], bank)
+        prior = self.motion.poses(self.motion.predict(alone, seen.snapshot.obs))
+        second = self.selector.second_poses(prior, 0, seen.candidates, seen.snapshot)
+        return jnp.sum(second.wanted)
