@@ -104,6 +104,11 @@ COMMANDS = {
         "calibrate.odometry",
         in_folder=("vehicle.yaml", *_REPORT),
     ),
+    "calibrate adopt": Registered(
+        "calibrate.arguments:CalibrateAdopt",
+        "calibrate.adopt",
+        in_folder=("rig.yaml", "vehicle.yaml", *_REPORT),
+    ),
     "calibrate convert": Registered("calibrate.arguments:CalibrateConvert", "calibrate.convert"),
 }
 GROUPS = {

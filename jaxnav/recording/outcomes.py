@@ -21,6 +21,7 @@ from jaxnav.files.validation import Count, Entry
 from jaxnav.loop.flags import Health, Reject
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.origin import inverses_in_world, planar_in_world
+from jaxnav.recording.learnt import errors_of
 from jaxnav.recording.message_fields import (
     Array,
     Faults,
@@ -126,6 +127,11 @@ def _ragged(row: tuple[int, ...], of: _Of) -> Column:
     return _reported(kind, of, None, missing=np.zeros((0, *row)))
 
 
+def _of_sensors(of: _Of) -> Column:
+    kind = Annotated[np.ndarray, Array("number")]
+    return _field(kind, of, float, shape=(0,), default=None, missing=np.nan)
+
+
 _initialised, _valid = _at("belief.bank.initialised"), _at("output.candidates.valid")
 _candidates, _slot = _at("output.candidates.T_vehicle_world.wxyz_xyz"), _at("output.selected")
 _covariance, _log_weight = _at("output.covariance"), _at("belief.bank.log_weight")
@@ -171,6 +177,8 @@ class Outcomes:
         hypotheses, log_weight: N arrays, (K, 3) and (K,), of the hypotheses alive.
         Ts_vehicle_world, costs: N arrays, (M, 7) wxyz_xyz and (M,), of the valid candidates.
         selected: (N,) int, index of the selected candidate.
+        errors, errors_sigma: (N, e), of sensors and cameras, see `jaxnav.recording.learnt`; older
+            drives have none.
         outvoted: N lists, ids of markers that were left out; older drives have none.
     """
 
@@ -212,6 +220,12 @@ class Outcomes:
         _ragged((), lambda one: Rows(_costs(one), _valid(one))),
     ]
     selected: Annotated[Int[np.ndarray, " N"], _index(_selected)]
+    errors: Annotated[
+        Float[np.ndarray, "N e"], _of_sensors(lambda one: Rows(errors_of(_bank(one))[0]))
+    ]
+    errors_sigma: Annotated[
+        Float[np.ndarray, "N e"], _of_sensors(lambda one: Rows(errors_of(_bank(one))[1]))
+    ]
     outvoted: Annotated[
         tuple[list[int], ...],
         _field(list[Count], lambda one: list(one.outvoted) or None, None, default=[], missing=[]),

@@ -2,7 +2,7 @@
 
     world                     markers, waypoints, track, ellipse, hypotheses, candidates
     world/vehicle             moves; below it its cameras with their images and detections
-    plots/...                 numbers over time
+    plots/...                 numbers over time; the cameras' errors in units of their prior's sigma
     health                    a line where health, faults or rejects change
 
 Rerun stores positions in float32, so they count from the origin of the map; `health` tells the
@@ -20,6 +20,7 @@ from jaxtyping import Float, UInt8
 
 from jaxnav.files import poses
 from jaxnav.loop.flags import Fault, Health, Reject, names
+from jaxnav.models.bicycle import SENSOR_ERRORS
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import ZERO, inverses_in_world, opposite, planar_in_world
 from jaxnav.models.rig import CameraRig
@@ -54,8 +55,11 @@ class RerunScene:
         self._shown_flags = ""
         self._last_m: np.ndarray | None = None
         self._still("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._still("plots/sensor_errors", rerun.SeriesLines(names=list(SENSOR_ERRORS)))
         if rig is not None:
             self._lay_out_cameras(rig)
+            turns = [f"{name} about {axis}" for name in rig.names for axis in "xyz"]
+            self._still("plots/camera_errors", rerun.SeriesLines(names=turns))
         if markers is not None:
             corners_m = np.asarray(markers.corners_world_m, float)
             strips = [np.vstack([corners, corners[:1]]) for corners in corners_m]
@@ -206,6 +210,13 @@ class RerunScene:
         ):
             if math.isfinite(value):
                 self._say(f"plots/{entity}", self._rerun.Scalars(float(value)))
+        errors = outcomes.errors[index]
+        for entity, values in (
+            ("sensor_errors", errors[: len(SENSOR_ERRORS)]),
+            ("camera_errors", errors[len(SENSOR_ERRORS) :]),
+        ):
+            if values.size and np.isfinite(values).all():
+                self._say(f"plots/{entity}", self._rerun.Scalars(values))
 
     def _blueprint(self) -> Any:
         blueprint = self._rerun.blueprint
@@ -219,6 +230,9 @@ class RerunScene:
                 origin=f"plots/{name}", name=name, plot_legend=blueprint.PlotLegend(visible=False)
             )
             for name in ("flip_probability", "hypotheses", "nis", "position_sigma_m")
+        ] + [
+            blueprint.TimeSeriesView(origin=f"plots/{name}", name=name)
+            for name in ("sensor_errors", "camera_errors")
         ]
         commands = ["plots/throttle", "plots/steering_rad"]
         cameras = [

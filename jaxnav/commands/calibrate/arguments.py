@@ -180,6 +180,27 @@ class CalibrateIntrinsics(Headless):
 
 
 @dataclass(frozen=True)
+class CalibrateAdopt(Headless):
+    """Write what a drive has learnt of its cameras and sensors into a new rig and a new vehicle.
+
+    While it drives, the estimator learns by how much each camera is turned, and how far the
+    odometer, the steering and the cameras' stamps are off, as far as the drive tells; it never
+    changes a file. What the drive did not tell stays as it was, with its sigma.
+
+    Written to --out: rig.yaml and vehicle.yaml, which demo, run and replay take; report.png, each
+    error over the drive; report.json.
+    """
+
+    recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
+    """A drive recorded by `jaxnav run --record` (.mcap)."""
+    rig: _RecordedFile = None
+    """The rig that it was driven with, for figures that a recording does not hold."""
+    vehicle: _RecordedFile = None
+    """The vehicle that it was driven with."""
+    out: ResultsFolder = Path("adopted")
+
+
+@dataclass(frozen=True)
 class CalibrateConvert(Checked):
     """Convert cameras and marker maps between jaxnav's files and those of other tools.
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
+from jaxnav.commands.drive.learnt_watch import LearntWatch
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
@@ -71,6 +72,7 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
         waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
         add(LiveView(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
     add(DelayWatch(setup, warns=not args.headless))
+    add(LearntWatch(setup, tells=not args.headless))
     if not args.headless:
         add(StatusLine())
     return onlookers

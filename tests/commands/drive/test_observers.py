@@ -10,6 +10,7 @@ import pytest
 from jaxnav import cli
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
+from jaxnav.commands.drive.learnt_watch import LearntWatch
 from jaxnav.commands.drive.observers import (
     WIDTH,
     DriveRecorder,
@@ -92,7 +93,8 @@ def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monk
     path = tmp_path / "drive.mcap"
     with ExitStack() as closing:
         found = open_onlookers(Run(record=path, view=True), setup, closing)
-        assert [type(one) for one in found] == [DriveRecorder, LiveView, DelayWatch, StatusLine]
+        kinds = [DriveRecorder, LiveView, DelayWatch, LearntWatch, StatusLine]
+        assert [type(one) for one in found] == kinds
         fake = found[1]._view
         rig, markers, waypoints_m = fake.where
         assert (rig, markers, fake.how) == (setup.rig, setup.markers, {"live": True, "save": None})
@@ -103,7 +105,7 @@ def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monk
     assert not read_drive(path).truncated
     with ExitStack() as closing:
         alone = open_onlookers(Run(headless=True), setup, closing)
-        assert [type(one) for one in alone] == [DelayWatch]
+        assert [type(one) for one in alone] == [DelayWatch, LearntWatch]
 
 
 def test_a_drive_that_is_called_off_leaves_what_was_recorded_before(setup, tmp_path):

@@ -1,0 +1,61 @@
+"""Tell what a drive learns of its sensors and cameras, while it is driven and in the end."""
+
+import sys
+
+from jaxnav.errors import visible
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import FrameDetections
+from jaxnav.loop.interfaces import Frame
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.learnt import Learnt, errors_of
+
+_PERIOD_NS = 2_000_000_000
+_WIDTH = 100  # characters, over what the status line leaves
+_ADOPT = "`jaxnav calibrate adopt` writes what a recorded drive has learnt into new files"
+
+
+class LearntWatch:
+    """Tells once of each error that the drive has learnt; see `Onlooker`."""
+
+    faults = Fault(0)
+
+    def __init__(self, setup: DriveSetup, tells: bool):
+        """Args:
+        tells: on the terminal, as soon as it is learnt; in any case in the end.
+        """
+        self._rig, self._vehicle, self._tells = setup.rig, setup.vehicle, tells
+        self._last_ns = 0
+        self._told: set[tuple[str, ...]] = set()
+        self._sentences: list[str] = []
+
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
+        """See `Observer`."""
+        if given.now_ns - self._last_ns < _PERIOD_NS or not outcome.output.decided:
+            return
+        self._last_ns = given.now_ns
+        learnt = Learnt.of(*errors_of(outcome.belief.bank), self._rig, self._vehicle)
+        self._sentences = [] if learnt is None else list(learnt.sentences())
+        for sentence in self._sentences:
+            subject = tuple(word for word in sentence.split() if not _has_digit(word))
+            if subject not in self._told:
+                self._told.add(subject)
+                if self._tells:
+                    sys.stderr.write(f"\r{f'learnt: {visible(sentence)}':<{_WIDTH}}\n")
+
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
+        """See `Observer`."""
+
+    def close(self) -> None:
+        """See `Onlooker`."""
+
+    @property
+    def closing_note(self) -> str | None:
+        """See `Onlooker`."""
+        if not self._sentences:
+            return None
+        return "\n".join([*(f"learnt: {visible(line)}" for line in self._sentences), _ADOPT])
+
+
+def _has_digit(word: str) -> bool:
+    return any(letter.isdigit() for letter in word)

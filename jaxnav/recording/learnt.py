@@ -1,0 +1,107 @@
+"""The errors of a car's sensors and cameras that its bank has learnt, in units that a file has."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxnav.belief.camera_errors import EACH
+from jaxnav.belief.motion import Bank
+from jaxnav.belief.sensor_errors import SENSORS_END, SIX
+from jaxnav.files import poses
+from jaxnav.models.bicycle import SENSOR_ERRORS, Vehicle
+from jaxnav.models.rig import CameraRig
+
+_SURE = 3.0  # an error of less than so many of its sigmas is not worth a word
+_LEARNT = 0.7  # share of its prior's sigma below which an error's sigma tells of a drive
+# About a camera's own axes, x right, y down, z forward: a positive turn and a negative one.
+_WORDS = (
+    ("looks {} too high", "looks {} too low"),
+    ("looks {} too far right", "looks {} too far left"),
+    ("is rolled by {} clockwise", "is rolled by {} anticlockwise"),
+)
+
+
+def errors_of(
+    bank: Bank,
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+    """The errors that the heaviest hypothesis of a car keeps, and their sigmas.
+
+    (k, g, o, tau) of `sensor_errors`, then three turns a camera in units of their prior's sigma.
+    Empty where the bank keeps none.
+
+    Args:
+        bank: of NumPy, with its leading axis (K,).
+    """
+    best = int(np.argmax(np.where(bank.initialised, bank.log_weight, -np.inf)))
+    variance = np.diagonal(np.asarray(bank.covariance[best], float))[SIX:]
+    mean = np.asarray(bank.mean[best], float)
+    return mean[len(mean) - len(variance) :], np.sqrt(np.maximum(variance, 0))
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What a drive has taught of the errors that repeat, beside what the files had said.
+
+    Attributes:
+        sensors: (4,) by which the `SENSOR_ERRORS` of the vehicle's file are to be corrected.
+        turns_rad: (C, 3) by which each camera is turned, against the rig's file, about the
+            vehicle's axes x, y, z.
+        sensors_sigma, turns_sigma_rad: standard deviations now.
+        sensors_prior, turns_prior_rad: those of the files.
+        rig: whose cameras they are.
+    """
+
+    sensors: Float[np.ndarray, " 4"]
+    sensors_sigma: Float[np.ndarray, " 4"]
+    sensors_prior: Float[np.ndarray, " 4"]
+    turns_rad: Float[np.ndarray, "C 3"]
+    turns_sigma_rad: Float[np.ndarray, "C 3"]
+    turns_prior_rad: Float[np.ndarray, "C 3"]
+    rig: CameraRig
+
+    @staticmethod
+    def of(
+        errors: Float[np.ndarray, " e"],
+        sigma: Float[np.ndarray, " e"],
+        rig: CameraRig,
+        vehicle: Vehicle,
+    ) -> "Learnt | None":
+        """What `errors_of` a bank says for this rig and vehicle; None if the bank keeps none."""
+        if not errors.size:
+            return None
+        of_sensors, cameras = SENSORS_END - SIX, len(rig)
+        exact = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma)
+        prior = np.zeros((cameras, 3))
+        turns, turns_sigma = np.zeros((2, cameras, 3))
+        if rig.extrinsics_sigma is not None:
+            prior = np.asarray(rig.extrinsics_sigma, float)[:, 3:]
+            # The filter keeps the turn that takes a camera back to where its file has it.
+            turns = -errors[of_sensors:].reshape(cameras, EACH) * prior
+            turns_sigma = sigma[of_sensors:].reshape(cameras, EACH) * prior
+        sensors = errors[:of_sensors], sigma[:of_sensors], exact.astype(float)
+        return Learnt(*sensors, turns, turns_sigma, prior, rig)
+
+    def sentences(self) -> Iterator[str]:
+        """An error a line, of those that the drive has told apart from none."""
+        for camera, T in enumerate(np.asarray(self.rig.Ts_camera_vehicle.wxyz_xyz, float)):
+            R = poses.matrix(T)[:3, :3]
+            turns = R @ self.turns_rad[camera]
+            sigmas, priors = (
+                np.sqrt(R**2 @ of[camera] ** 2)
+                for of in (self.turns_sigma_rad, self.turns_prior_rad)
+            )
+            for axis, words in enumerate(_WORDS):
+                if _is_learnt(turns[axis], sigmas[axis], priors[axis]):
+                    turn_deg, sigma_deg = np.rad2deg([abs(turns[axis]), sigmas[axis]])
+                    does = words[int(turns[axis] < 0)].format(f"{turn_deg:.2f} deg")
+                    yield f"camera {self.rig.names[camera]} {does} (sigma {sigma_deg:.2f})"
+        told = zip(SENSOR_ERRORS, self.sensors, self.sensors_sigma, self.sensors_prior, strict=True)
+        for name, value, sigma, prior in told:
+            if _is_learnt(value, sigma, prior):
+                yield f"{name} is off by {value:+.4f} (sigma {sigma:.4f})"
+
+
+def _is_learnt(value: float, sigma: float, prior: float) -> bool:
+    return bool(prior > 0 and sigma < _LEARNT * prior and abs(value) > _SURE * sigma)

@@ -1,0 +1,41 @@
+"""What `jaxnav run` says of the errors that a drive learns."""
+
+import dataclasses
+
+from jaxnav.commands.drive.learnt_watch import LearntWatch
+from tests.commands.calibrate.test_adopt import learnt_outcome, setup_of
+from tests.helpers.drives import make_input
+
+
+def at(seconds: float):
+    return dataclasses.replace(make_input(2), now_ns=int((100 + seconds) * 1e9))
+
+
+def test_it_tells_of_each_error_once_and_of_all_in_the_end(capsys):
+    watch = LearntWatch(setup_of(), tells=True)
+    for index, seconds in ((0, 0.0), (5, 1.0), (8, 3.0), (9, 6.0)):
+        watch.on_outcome(at(seconds), learnt_outcome(index))
+    told = capsys.readouterr().err
+    # At 1 s it does not look; at 3 s it sees eight ninths of each error, later no other ones.
+    assert told.count("speed_scale") == 1
+    assert "looks 1.07 deg too far left" in told
+    note = watch.closing_note
+    assert note is not None
+    assert "looks 1.20 deg too far left" in note
+    assert note.endswith("into new files")
+
+
+def test_it_says_nothing_before_the_pose_is_known_or_where_nothing_is_wrong(capsys):
+    watch = LearntWatch(setup_of(), tells=True)
+    watch.on_outcome(at(0.0), learnt_outcome(9, decided=False))
+    watch.on_outcome(at(3.0), learnt_outcome(0))
+    watch.on_outcome(at(6.0), learnt_outcome(9, learnt=False))
+    assert watch.closing_note is None
+    assert capsys.readouterr().err == ""
+
+
+def test_without_a_terminal_only_the_end_tells(capsys):
+    watch = LearntWatch(setup_of(), tells=False)
+    watch.on_outcome(at(0.0), learnt_outcome(9))
+    assert capsys.readouterr().err == ""
+    assert "speed_scale" in str(watch.closing_note)
