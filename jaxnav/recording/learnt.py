@@ -14,6 +14,7 @@ from jaxnav.models.bicycle import SENSOR_ERRORS, Vehicle
 from jaxnav.models.rig import CameraRig
 
 _SURE = 3.0  # an error of less than so many of its sigmas is not worth a word
+_CONTRADICTS = 3.0  # an error of more sigmas of its file is more than that allows for
 _LEARNT = 0.7  # share of its prior's sigma below which an error's sigma tells of a drive
 # About a camera's own axes, x right, y down, z forward: a positive turn and a negative one.
 _WORDS = (
@@ -96,12 +97,20 @@ class Learnt:
                 if _is_learnt(turns[axis], sigmas[axis], priors[axis]):
                     turn_deg, sigma_deg = np.rad2deg([abs(turns[axis]), sigmas[axis]])
                     does = words[int(turns[axis] < 0)].format(f"{turn_deg:.2f} deg")
-                    yield f"camera {self.rig.names[camera]} {does} (sigma {sigma_deg:.2f})"
-        told = zip(SENSOR_ERRORS, self.sensors, self.sensors_sigma, self.sensors_prior, strict=True)
-        for name, value, sigma, prior in told:
+                    told = f"camera {self.rig.names[camera]} {does} (sigma {sigma_deg:.2f})"
+                    yield told + _contradiction(turns[axis], priors[axis])
+        rows = zip(SENSOR_ERRORS, self.sensors, self.sensors_sigma, self.sensors_prior, strict=True)
+        for name, value, sigma, prior in rows:
             if _is_learnt(value, sigma, prior):
-                yield f"{name} is off by {value:+.4f} (sigma {sigma:.4f})"
+                told = f"{name} is off by {value:+.4f} (sigma {sigma:.4f})"
+                yield told + _contradiction(value, prior)
 
 
 def _is_learnt(value: float, sigma: float, prior: float) -> bool:
     return bool(prior > 0 and sigma < _LEARNT * prior and abs(value) > _SURE * sigma)
+
+
+def _contradiction(value: float, prior: float) -> str:
+    """What to add where an error is larger than its file allows for."""
+    ratio = abs(value) / prior
+    return f", {ratio:.1f} times the sigma of its file" if ratio > _CONTRADICTS else ""

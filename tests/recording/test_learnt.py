@@ -121,3 +121,12 @@ def test_the_words_are_those_of_one_who_stands_behind_the_camera(camera, axis, p
 
 def test_a_rule_that_doubts_nothing_has_learnt_nothing():
     assert Learnt.of(np.zeros(0), np.zeros(0), told_rig(), sensors_as_told()) is None
+
+
+def test_an_error_beyond_what_its_file_allows_for_is_named_so():
+    e = np.zeros(4 + 3 * 4)
+    e[0], e[4 + 2] = 0.2, 3.5  # of 3 % and of a sigma
+    told = Learnt.of(e, np.full(len(e), 1e-3), told_rig(), sensors_as_told()).sentences()
+    camera, wheels = told
+    assert camera.endswith("3.5 times the sigma of its file")
+    assert wheels.endswith("6.7 times the sigma of its file")
