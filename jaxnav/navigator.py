@@ -15,11 +15,12 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief.ambiguity import Selector, Ungated
+from jaxnav.belief.bank import Bank, renumber_if_empty, restart_broken
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief, Estimate, Evidence
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.motion import Bank, Motion, renumber_if_empty, restart_broken
+from jaxnav.belief.motion import Motion
 from jaxnav.belief.repeats import RepeatedErrors, Repeats
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.models.bicycle import Vehicle

@@ -61,7 +61,7 @@ class PoseMeasurement(eqx.Module):
 class PosePosterior(eqx.Module):
     """The corrected pose of each hypothesis: prediction and corners fused by the selector.
 
-    The filter adopts it and corrects the rest of its state by regression (`motion.follow_pose`).
+    The filter adopts it and corrects the rest of its state by regression (`follow_pose`).
     Lanes where `valid` is False hold finite numbers.
     """
 

@@ -12,21 +12,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
+from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heaviest, known_to
 from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
-from jaxnav.belief.motion import (
-    Bank,
-    Moments,
-    Motion,
-    Offer,
-    Planar,
-    camera_states,
-    contradicted,
-    empty_bank,
-    follow_pose,
-    forget_lost,
-    heaviest,
-    known_to,
-)
+from jaxnav.belief.follow_pose import follow_pose
+from jaxnav.belief.gate import Moments, Offer
+from jaxnav.belief.motion import Motion, Planar, camera_states
 from jaxnav.belief.sensor_errors import (
     SENSORS_END,
     SIX,

@@ -11,20 +11,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
+from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heaviest, known_to
 from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
-from jaxnav.belief.motion import (
-    Bank,
-    Moments,
-    Motion,
-    Offer,
-    camera_states,
-    contradicted,
-    empty_bank,
-    follow_pose,
-    forget_lost,
-    heaviest,
-    known_to,
-)
+from jaxnav.belief.follow_pose import follow_pose
+from jaxnav.belief.gate import Moments, Offer
+from jaxnav.belief.motion import Motion, camera_states
 from jaxnav.models.geometry import (
     cayley,
     inverse_cayley,

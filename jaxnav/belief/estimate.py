@@ -9,7 +9,8 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.belief.ambiguity import Selection
-from jaxnav.belief.motion import Bank, BankUpdate, Motion, heaviest, mixture_log_mean
+from jaxnav.belief.bank import Bank, heaviest, mixture_log_mean
+from jaxnav.belief.motion import BankUpdate, Motion
 from jaxnav.belief.repeats import Repeats
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.consistency import ConsistentSnapshot

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from jaxnav.belief.bank import Bank
 from jaxnav.belief.camera_errors import EACH
-from jaxnav.belief.motion import Bank
 from jaxnav.belief.sensor_errors import SENSORS_END, SIX
 from jaxnav.files import poses
 from jaxnav.models.bicycle import SENSOR_ERRORS, Vehicle

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from jaxnav.belief.bank import Bank, fill_slots, first_hypotheses, survivors_first
 from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.motion import Bank, fill_slots, first_hypotheses, survivors_first
 from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.consistency import ConsistentSnapshot, Inliers, find_inliers
 from jaxnav.pose.observation import Observation

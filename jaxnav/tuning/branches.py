@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from jaxnav.belief.bank import Bank, heaviest
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.kalman import nis
-from jaxnav.belief.motion import Bank, Motion, heaviest
+from jaxnav.belief.motion import Motion
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import (
     T_world_vehicle_from_planar,

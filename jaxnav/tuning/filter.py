@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnav.belief.motion import Bank
+from jaxnav.belief.bank import Bank
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import with_parameters
 from jaxnav.simulation.batch_jit import batch_jit

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from jaxnav.belief.bank import Bank
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.kalman import log_likelihood
-from jaxnav.belief.motion import Bank
 from jaxnav.navigator import Navigator
 from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND
 from jaxnav.pose.candidates import Candidates

@@ -13,9 +13,9 @@ from scipy.optimize import least_squares
 from jaxnav.belief.ambiguity import PosePosterior
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.camera_errors import EACH, ErrorsPosterior
+from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.map_fit import fit_poses
-from jaxnav.belief.motion import follow_pose
 from jaxnav.belief.sensor_errors import SENSORS_END, SIX
 from jaxnav.models.geometry import ON_GROUND, cayley
 from jaxnav.models.rig import PLACED_BY_HAND

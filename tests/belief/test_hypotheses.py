@@ -13,12 +13,14 @@ import scipy.optimize
 import scipy.stats
 
 from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
+from jaxnav.belief.bank import Bank, empty_bank
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.fan import fan
+from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.map_fit import fit_poses
-from jaxnav.belief.motion import Bank, empty_bank, follow_pose, merge_heirs
+from jaxnav.belief.merging import merge_heirs
 from jaxnav.models.geometry import on_ground
 from jaxnav.navigator import Navigator
 from jaxnav.pose.candidates import Candidates, find_candidates

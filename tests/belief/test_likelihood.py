@@ -13,11 +13,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from jaxnav.belief.ambiguity import LowestReprojection
+from jaxnav.belief.bank import Bank
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.kalman import white_acceleration
 from jaxnav.belief.map_fit import fit_poses
-from jaxnav.belief.motion import Bank
 from jaxnav.models.geometry import OFF_GROUND, T_world_vehicle_from_planar
 from jaxnav.navigator import Navigator
 from jaxnav.pose.observation import Observation, Snapshot, log_sigmas

@@ -11,9 +11,11 @@ import pytest
 from scipy import stats
 
 from jaxnav.belief.ambiguity import PoseMeasurement, Selection
+from jaxnav.belief.bank import Bank, restart_broken
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
-from jaxnav.belief.motion import Bank, Motion, Offer, apply_gate, restart_broken
+from jaxnav.belief.gate import Offer, apply_gate
+from jaxnav.belief.motion import Motion
 from jaxnav.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import in_float32

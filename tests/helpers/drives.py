@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
+from jaxnav.belief.bank import Bank, Rejections
 from jaxnav.belief.estimate import Belief
-from jaxnav.belief.motion import Bank, Rejections
 from jaxnav.belief.repeats import Repeats
 from jaxnav.control import Command
 from jaxnav.detection.types import Detections
