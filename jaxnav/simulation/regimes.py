@@ -9,9 +9,15 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
-from jaxnav.belief.bank import Bank, fill_slots, first_hypotheses, survivors_first
+from jaxnav.belief.bank import (
+    Bank,
+    fill_slots,
+    first_hypotheses,
+    heaviest,
+    survivors_first,
+)
 from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator, Step
@@ -55,37 +61,52 @@ class _ByRegime(Navigator):
         if count == 1 or not isinstance(self.selector, MultiHypothesis):
             return super().fuse(belief, seen)
         empty, any_seen = self.motion.init(count), jnp.any(seen.snapshot.seen.visible)
+        sizes = [size for size in _BANKS if size < count] + [count]
 
-        def within(size: int, sees: bool) -> Callable[[Belief], tuple[Belief, Estimate]]:
-            def fuse(belief: Belief) -> tuple[Belief, Estimate]:
+        def regime(needed: Int[Array, ""]) -> Int[Array, ""]:
+            return jnp.sum(needed > jnp.asarray(sizes[:-1]))
+
+        def predicting(size: int) -> Callable[[Belief], Belief]:
+            def predict(belief: Belief) -> Belief:
                 few = dataclasses.replace(belief, bank=first_hypotheses(belief.bank, size))
                 predicted = self.predict(few, seen.snapshot.obs)
-                after, evidence = self.correct(predicted, seen) if sees else self.coast(predicted)
+                return dataclasses.replace(predicted, bank=fill_slots(predicted.bank, empty))
+
+            return predict
+
+        def correcting(size: int, sees: bool) -> Callable[[Belief], tuple[Belief, Estimate]]:
+            def correct(predicted: Belief) -> tuple[Belief, Estimate]:
+                few = dataclasses.replace(predicted, bank=first_hypotheses(predicted.bank, size))
+                after, evidence = self.correct(few, seen) if sees else self.coast(few)
                 estimate = Estimate.of(self.motion, after, evidence)
                 whole = fill_slots(survivors_first(after.bank), empty)
                 return dataclasses.replace(after, bank=whole), estimate
 
-            return fuse
+            return correct
 
-        lives = bank.initialised & ~self.motion.lost(bank)
-        starts = any_seen & ~jnp.any(lives)
-        sizes = [size for size in _BANKS if size < count] + [count]
-        needed = jnp.max(jnp.where(bank.initialised, jnp.arange(count) + 1, 0))
-        needed = needed + jnp.where(any_seen, self._branches(bank, lives, seen), 0)
+        predicted: Belief = jax.lax.switch(
+            regime(_slots_taken(bank)), [predicting(size) for size in sizes], belief
+        )
+        bank = predicted.bank
+        needed = _slots_taken(bank) + jnp.where(any_seen, self._branches(bank, seen), 0)
+        starts = any_seen & ~jnp.any(bank.initialised)
         needed = jnp.where(starts, count, needed)
-        index = jnp.sum(needed > jnp.asarray(sizes[:-1])) + jnp.where(any_seen, len(sizes), 0)
         fused: tuple[Belief, Estimate] = jax.lax.switch(
-            index, [within(size, sees) for sees in (False, True) for size in sizes], belief
+            regime(needed) + jnp.where(any_seen, len(sizes), 0),
+            [correcting(size, sees) for sees in (False, True) for size in sizes],
+            predicted,
         )
         return fused
 
-    def _branches(
-        self, bank: Bank, lives: Bool[Array, " K"], seen: ConsistentSnapshot
-    ) -> Int[Array, ""]:
+    def _branches(self, predicted: Bank, seen: ConsistentSnapshot) -> Int[Array, ""]:
         """How many empty slots the selector is going to take for second poses."""
         assert isinstance(self.selector, MultiHypothesis)
-        best = jnp.argmax(jnp.where(lives, bank.log_weight, -jnp.inf))
-        alone = jax.tree.map(lambda leaf: leaf[best][None], bank)
-        prior = self.motion.poses(self.motion.predict(alone, seen.snapshot.obs))
+        best = heaviest(predicted)
+        prior = self.motion.poses(jax.tree.map(lambda leaf: leaf[best][None], predicted))
         second = self.selector.second_poses(prior, 0, seen.candidates, seen.snapshot)
         return jnp.sum(second.wanted)
+
+
+def _slots_taken(bank: Bank) -> Int[Array, ""]:
+    """The number of first slots of a bank outside of which no hypothesis lives."""
+    return jnp.max(jnp.where(bank.initialised, jnp.arange(bank.initialised.shape[0]) + 1, 0))
