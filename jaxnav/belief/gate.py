@@ -37,8 +37,6 @@ def apply_gate(
     NIS = |innovation|^2 <= gate_nis * inflation, and stays as predicted otherwise. The NIS is 0
     where there was nothing to compare.
 
-    See docs/design.md, Gate.
-
     Args:
         bank: a bank without its leading axis.
         offer: what the pose makes of it.

@@ -138,8 +138,9 @@ class MultiHypothesis(eqx.Module):
 
         # A second posterior shares its parent's prediction, and is no surer of it than the parent.
         branches = tried.taken & fits.finite & passes & fits_one & alive[does_as]
-        T_fitted = fits.posterior.T_world_vehicle
-        branches = branches & (_turns_rad(T_fitted, _rows(T_fitted, does_as)) > self.linear_rad)
+        fitted = _poses(fits.posterior).T_world_vehicle
+        of_parent = _at(_poses(fits.posterior), does_as).T_world_vehicle
+        branches = branches & (jax.vmap(rotation_error_rad)(fitted, of_parent) > self.linear_rad)
         lighter = jnp.minimum(log_evidence - log_evidence[does_as], 0)
         log_weight = jnp.where(branches, log_weight[does_as] + lighter, log_weight)
         log_weight = normalise(log_weight)
@@ -346,14 +347,6 @@ class _Poses(eqx.Module):
 
 def _poses(of: PoseBelief | PosePosterior) -> _Poses:
     return _Poses(of.T_world_vehicle, of.covariance)
-
-
-def _turns_rad(T: jaxlie.SE3, other: jaxlie.SE3) -> Float[Array, " K"]:
-    return jax.vmap(rotation_error_rad)(T, other)
-
-
-def _rows(T: jaxlie.SE3, index: Int[Array, "*rows"]) -> jaxlie.SE3:
-    return jaxlie.SE3(T.wxyz_xyz[index])
 
 
 def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:

@@ -1,6 +1,5 @@
 """The errors of a car's sensors and cameras that its bank has learnt, in units that a file has."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,10 +34,31 @@ def errors_of(
     Args:
         bank: of NumPy, with its leading axis (K,).
     """
+    at = errors_at(bank)
+    return np.asarray(bank.mean[at], float), error_sigmas(np.asarray(bank.covariance[at[0]]))
+
+
+def errors_at(bank: Bank) -> tuple[int, slice]:
+    """Where in `bank.mean` they stand: slot of the heaviest hypothesis, and its last entries."""
     best = int(np.argmax(np.where(bank.initialised, bank.log_weight, -np.inf)))
-    variance = np.diagonal(np.asarray(bank.covariance[best], float))[SIX:]
-    mean = np.asarray(bank.mean[best], float)
-    return mean[len(mean) - len(variance) :], np.sqrt(np.maximum(variance, 0))
+    count, states = bank.mean.shape[1], bank.covariance.shape[1]
+    return best, slice(count - states + SIX, count)
+
+
+def error_sigmas(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, " e"]:
+    """The sigmas of the errors in the covariance (d, d) of a hypothesis."""
+    return np.sqrt(np.maximum(np.diagonal(covariance)[SIX:], 0)).astype(float)
+
+
+def as_filed(
+    errors: Float[np.ndarray, " e"],
+) -> tuple[Float[np.ndarray, " sensors"], Float[np.ndarray, " turns"]]:
+    """The errors against the files: those of the sensors, and three turns a camera.
+
+    The filter keeps the turn that takes a camera back to where its file has it.
+    """
+    of_sensors = SENSORS_END - SIX
+    return errors[:of_sensors], -errors[of_sensors:]
 
 
 @dataclass(frozen=True)
@@ -72,20 +92,26 @@ class Learnt:
         """What `errors_of` a bank says for this rig and vehicle; None if the bank keeps none."""
         if not errors.size:
             return None
-        of_sensors, cameras = SENSORS_END - SIX, len(rig)
+        cameras = len(rig)
+        sensors, turned = as_filed(errors)
+        sensors_sigma, turned_sigma = sigma[: len(sensors)], sigma[len(sensors) :]
         exact = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma)
         prior = np.zeros((cameras, 3))
         turns, turns_sigma = np.zeros((2, cameras, 3))
         if rig.extrinsics_sigma is not None:
             prior = np.asarray(rig.extrinsics_sigma, float)[:, 3:]
-            # The filter keeps the turn that takes a camera back to where its file has it.
-            turns = -errors[of_sensors:].reshape(cameras, EACH) * prior
-            turns_sigma = sigma[of_sensors:].reshape(cameras, EACH) * prior
-        sensors = errors[:of_sensors], sigma[:of_sensors], exact.astype(float)
-        return Learnt(*sensors, turns, turns_sigma, prior, rig)
+            turns = turned.reshape(cameras, EACH) * prior
+            turns_sigma = turned_sigma.reshape(cameras, EACH) * prior
+        of_sensors = sensors, sensors_sigma, exact.astype(float)
+        return Learnt(*of_sensors, turns, turns_sigma, prior, rig)
 
-    def sentences(self) -> Iterator[str]:
+    def sentences(self) -> list[str]:
         """An error a line, of those that the drive has told apart from none."""
+        return list(self.found().values())
+
+    def found(self) -> dict[tuple[str, str], str]:
+        """The sentence of each error, by the camera or `sensors`, and what is wrong with it."""
+        sentences = {}
         for camera, T in enumerate(np.asarray(self.rig.Ts_camera_vehicle.wxyz_xyz, float)):
             R = poses.matrix(T)[:3, :3]
             turns = R @ self.turns_rad[camera]
@@ -96,14 +122,16 @@ class Learnt:
             for axis, words in enumerate(_WORDS):
                 if _is_learnt(turns[axis], sigmas[axis], priors[axis]):
                     turn_deg, sigma_deg = np.rad2deg([abs(turns[axis]), sigmas[axis]])
-                    does = words[int(turns[axis] < 0)].format(f"{turn_deg:.2f} deg")
-                    told = f"camera {self.rig.names[camera]} {does} (sigma {sigma_deg:.2f})"
-                    yield told + _contradiction(turns[axis], priors[axis])
+                    name, does = self.rig.names[camera], words[int(turns[axis] < 0)]
+                    told = does.format(f"{turn_deg:.2f} deg")
+                    told = f"camera {name} {told} (sigma {sigma_deg:.2f})"
+                    sentences[name, does] = told + _contradiction(turns[axis], priors[axis])
         rows = zip(SENSOR_ERRORS, self.sensors, self.sensors_sigma, self.sensors_prior, strict=True)
         for name, value, sigma, prior in rows:
             if _is_learnt(value, sigma, prior):
                 told = f"{name} is off by {value:+.4f} (sigma {sigma:.4f})"
-                yield told + _contradiction(value, prior)
+                sentences["sensors", name] = told + _contradiction(value, prior)
+        return sentences
 
 
 def _is_learnt(value: float, sigma: float, prior: float) -> bool:

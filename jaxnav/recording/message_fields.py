@@ -67,13 +67,13 @@ class Rows:
 
     array: Any
     which: Any = ...
-    in_world: Callable[[Any], Any] | None = None  # to the world's coordinates
+    made: Callable[[Any], Any] | None = None  # of the rows, as to the world's coordinates
 
     @property
     def values(self) -> Shaped[np.ndarray, "..."]:
         """The rows as an array."""
         rows = self.array[self.which]
-        return np.asarray(rows if self.in_world is None else self.in_world(rows))
+        return np.asarray(rows if self.made is None else self.made(rows))
 
     def tolist(self) -> list[Any]:
         """The rows as one list, as `encode` writes them."""

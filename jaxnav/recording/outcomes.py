@@ -21,7 +21,7 @@ from jaxnav.files.validation import Count, Entry
 from jaxnav.loop.flags import Health, Reject
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.origin import inverses_in_world, planar_in_world
-from jaxnav.recording.learnt import errors_of
+from jaxnav.recording.learnt import error_sigmas, errors_at
 from jaxnav.recording.message_fields import (
     Array,
     Faults,
@@ -139,7 +139,16 @@ _costs, _bank, _pose = _at("output.costs"), _at("belief.bank"), _at("output.pose
 
 
 def _world_pose(one: Outcome) -> Rows:
-    return Rows(_pose(one), in_world=partial(planar_in_world, origin_m=one.origin_m))
+    return Rows(_pose(one), made=partial(planar_in_world, origin_m=one.origin_m))
+
+
+def _errors(one: Outcome) -> Rows:
+    return Rows(_bank(one).mean, errors_at(_bank(one)))
+
+
+def _errors_sigma(one: Outcome) -> Rows:
+    slot, _ = errors_at(_bank(one))
+    return Rows(_bank(one).covariance, slot, error_sigmas)
 
 
 def _hypotheses(one: Outcome) -> Rows:
@@ -220,12 +229,8 @@ class Outcomes:
         _ragged((), lambda one: Rows(_costs(one), _valid(one))),
     ]
     selected: Annotated[Int[np.ndarray, " N"], _index(_selected)]
-    errors: Annotated[
-        Float[np.ndarray, "N e"], _of_sensors(lambda one: Rows(errors_of(_bank(one))[0]))
-    ]
-    errors_sigma: Annotated[
-        Float[np.ndarray, "N e"], _of_sensors(lambda one: Rows(errors_of(_bank(one))[1]))
-    ]
+    errors: Annotated[Float[np.ndarray, "N e"], _of_sensors(_errors)]
+    errors_sigma: Annotated[Float[np.ndarray, "N e"], _of_sensors(_errors_sigma)]
     outvoted: Annotated[
         tuple[list[int], ...],
         _field(list[Count], lambda one: list(one.outvoted) or None, None, default=[], missing=[]),

@@ -25,6 +25,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import ZERO, inverses_in_world, opposite, planar_in_world
 from jaxnav.models.rig import CameraRig
 from jaxnav.plots.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.recording.learnt import as_filed
 from jaxnav.recording.outcomes import Outcomes
 
 TIMELINE = "drive"  # seconds since the first event
@@ -210,11 +211,8 @@ class RerunScene:
         ):
             if math.isfinite(value):
                 self._say(f"plots/{entity}", self._rerun.Scalars(float(value)))
-        errors = outcomes.errors[index]
-        for entity, values in (
-            ("sensor_errors", errors[: len(SENSOR_ERRORS)]),
-            ("camera_errors", errors[len(SENSOR_ERRORS) :]),
-        ):
+        errors = as_filed(outcomes.errors[index])
+        for entity, values in zip(("sensor_errors", "camera_errors"), errors, strict=True):
             if values.size and np.isfinite(values).all():
                 self._say(f"plots/{entity}", self._rerun.Scalars(values))
 

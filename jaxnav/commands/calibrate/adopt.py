@@ -2,7 +2,6 @@
 
 import dataclasses
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -40,10 +39,13 @@ def run(args: CalibrateAdopt) -> int:
     assert learnt is not None  # _last_sure
     calibrated = calibrated_now(f"jaxnav {version('jaxnav')} calibrate adopt", [log.path])
     out = output_folder(args.out)
+    written = []
     if setup.rig.extrinsics_sigma is not None:
+        written.append("rig.yaml")
         save_rig(out / "rig.yaml", adopted_rig(rig, learnt), calibrated)
     if setup.vehicle.sensor_sigma is not None:
         told = dict(zip(SENSOR_ERRORS, learnt.sensors_sigma.tolist(), strict=True))
+        written.append("vehicle.yaml")
         save_vehicle(out / "vehicle.yaml", adopted_vehicle(vehicle, learnt), calibrated, told)
     report = {
         "recording": str(log.path),
@@ -55,10 +57,9 @@ def run(args: CalibrateAdopt) -> int:
     }
     write_json(out / "report.json", calibrated.model_dump() | report)
     save_figure(learnt_over_time(log.outcomes, setup.rig, setup.vehicle), out / "report.png")
-    sentences = list(learnt.sentences())
-    for sentence in sentences or ["nothing that differs from the files by more than its sigma"]:
+    for sentence in learnt.sentences() or ["nothing is off by three of its sigmas"]:
         print(visible(sentence))
-    print(f"{', '.join(_written(out))} in {visible(out)}")
+    print(f"{', '.join([*written, 'report.json', 'report.png'])} in {visible(out)}")
     return 0
 
 
@@ -69,10 +70,12 @@ def adopted_rig(rig: CameraRig, learnt: Learnt) -> CameraRig:
         sigma = np.asarray(rig.extrinsics_sigma, float)
     wxyz_xyz = np.asarray(rig.Ts_camera_vehicle.wxyz_xyz, float).copy()
     for camera, turn_rad in enumerate(learnt.turns_rad):
-        T_vehicle_camera = poses.matrix(poses.inverse(wxyz_xyz[camera]))
-        turn = poses.matrix(poses.pose_from_rotation_vector(turn_rad.tolist(), [0.0] * 3))
-        T_vehicle_camera[:3, :3] = turn[:3, :3] @ T_vehicle_camera[:3, :3]
-        wxyz_xyz[camera] = poses.inverse(poses.pose_from_matrix(T_vehicle_camera))
+        turn = poses.pose_from_rotation_vector(turn_rad.tolist(), [0.0] * 3)
+        T_vehicle_camera = poses.inverse(wxyz_xyz[camera])
+        T_vehicle_camera[:4] = poses.quaternion_product(
+            turn[:4].tolist(), T_vehicle_camera[:4].tolist()
+        )
+        wxyz_xyz[camera] = poses.inverse(T_vehicle_camera)
     return dataclasses.replace(
         rig,
         Ts_camera_vehicle=jaxlie.SE3(jnp.asarray(wxyz_xyz)),
@@ -134,8 +137,3 @@ def _last_sure(log: DriveLog) -> int:
 def _columns(names: Any, values: np.ndarray, sigmas: np.ndarray) -> dict[str, Any]:
     rows = zip(names, values.tolist(), sigmas.tolist(), strict=True)
     return {name: {"value": value, "sigma": sigma} for name, value, sigma in rows}
-
-
-def _written(out: Path) -> list[str]:
-    names = ("rig.yaml", "vehicle.yaml", "report.json", "report.png")
-    return [name for name in names if (out / name).exists()]

@@ -2,6 +2,8 @@
 
 import sys
 
+import jax
+
 from jaxnav.errors import visible
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -24,10 +26,11 @@ class LearntWatch:
         """Args:
         tells: on the terminal, as soon as it is learnt; in any case in the end.
         """
-        self._rig, self._vehicle, self._tells = setup.rig, setup.vehicle, tells
-        self._last_ns = 0
-        self._told: set[tuple[str, ...]] = set()
-        self._sentences: list[str] = []
+        # Of NumPy: the driving thread asks no device.
+        self._rig, self._vehicle = jax.device_get((setup.rig, setup.vehicle))
+        self._tells, self._last_ns = tells, 0
+        self._told: set[tuple[str, str]] = set()
+        self._found: dict[tuple[str, str], str] = {}
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
@@ -35,9 +38,8 @@ class LearntWatch:
             return
         self._last_ns = given.now_ns
         learnt = Learnt.of(*errors_of(outcome.belief.bank), self._rig, self._vehicle)
-        self._sentences = [] if learnt is None else list(learnt.sentences())
-        for sentence in self._sentences:
-            subject = tuple(word for word in sentence.split() if not _has_digit(word))
+        self._found = {} if learnt is None else learnt.found()
+        for subject, sentence in self._found.items():
             if subject not in self._told:
                 self._told.add(subject)
                 if self._tells:
@@ -52,10 +54,6 @@ class LearntWatch:
     @property
     def closing_note(self) -> str | None:
         """See `Onlooker`."""
-        if not self._sentences:
+        if not self._found:
             return None
-        return "\n".join([*(f"learnt: {visible(line)}" for line in self._sentences), _ADOPT])
-
-
-def _has_digit(word: str) -> bool:
-    return any(letter.isdigit() for letter in word)
+        return "\n".join([*(f"learnt: {visible(line)}" for line in self._found.values()), _ADOPT])

@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import equinox as eqx
+
 from jaxnav.commands.drive.learnt_watch import LearntWatch
 from tests.commands.calibrate.test_adopt import learnt_outcome, setup_of
 from tests.helpers.drives import make_input
@@ -39,3 +41,18 @@ def test_without_a_terminal_only_the_end_tells(capsys):
     watch.on_outcome(at(0.0), learnt_outcome(9))
     assert capsys.readouterr().err == ""
     assert "speed_scale" in str(watch.closing_note)
+
+
+def test_cameras_whose_names_differ_in_a_digit_are_told_apart(capsys):
+    setup = setup_of()
+    rig = dataclasses.replace(setup.rig, names=tuple(f"cam{index}" for index in range(4)))
+    watch = LearntWatch(dataclasses.replace(setup, rig=rig), tells=True)
+    outcome = learnt_outcome(9)
+    watch.on_outcome(at(0.0), outcome)
+    mean = outcome.belief.bank.mean.copy()
+    mean[1, 16:19] = mean[1, 13:16]
+    belief = eqx.tree_at(lambda b: b.bank.mean, outcome.belief, mean)
+    watch.on_outcome(at(3.0), dataclasses.replace(outcome, belief=belief))
+    told = capsys.readouterr().err
+    assert told.count("camera cam1 looks 1.20 deg too far left") == 1
+    assert "camera cam2 looks" in told
