@@ -17,6 +17,8 @@ from jaxnav.loop.interfaces import Ending, HasOwnFiles, Odometry, Vehicle
 from jaxnav.loop.pilot import Input
 from jaxnav.models.rig import PLACED_BY_HAND
 from jaxnav.recording.drive_log import read_drive
+from jaxnav.recording.drive_replay import first_difference, replay_drive
+from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.recording.messages import input_message
 from jaxnav.recording.outcomes import Outcomes
 from jaxnav.recording.recorder import Recorder
@@ -323,13 +325,23 @@ def at_readings(log) -> dict[int, int]:
     return {stamp_ns - read[0][0]: k for stamp_ns, k in read}
 
 
+def told(log) -> tuple[dict, dict]:
+    """Readings by stamp, corners by camera and stamp; stamps since that of the first reading."""
+    odometry = [i.odometry for i in log.inputs if i.odometry]
+    begin_ns = odometry[0].stamp_ns
+    readings = {o.stamp_ns - begin_ns: (o.speed_mps, o.steering_rad) for o in odometry}
+    frames = [frame for i in log.inputs for frame in i.frames]
+    corners = {(f.camera, f.stamp_ns - begin_ns): f.detections.corners_px.tobytes() for f in frames}
+    return readings, corners
+
+
 def test_the_real_loop_comes_to_what_was_recorded(tmp_path, capsys):
     """The first second and a half of a drive.
 
-    The same readings and corners are fused, at their own stamps, whatever the threads make of their
-    order: at a reading the two differ at most by a set of frames that is a tick late in one of
-    them. So no decided pose may be farther off than the sigma that the recording claims for it,
-    three times, and half of them only by a small part of it.
+    The loop gets the recorded readings and corners, at their own stamps, whatever a busy machine
+    makes of their order, and makes of them what a replay of its own recording makes. How many of
+    them it has had at a reading is the machine's affair: no decided pose may be farther from the
+    recorded one than three of the sigmas that were claimed for it.
     """
     whole = read_drive(PLAIN)
     inputs = [i for i in whole.inputs if i.now_ns - whole.inputs[0].now_ns < 1_500 * MS]
@@ -339,14 +351,20 @@ def test_the_real_loop_comes_to_what_was_recorded(tmp_path, capsys):
     assert capsys.readouterr().out.startswith("ended: the recording is over\n")
     log = read_drive(again)
     before, now = at_readings(whole), at_readings(log)
-    assert len(now) > 0.7 * len(at_readings(read_drive(short)))  # on a machine that is busy
     common = [(before[stamp], now[stamp]) for stamp in before.keys() & now.keys()]
     assert len(common) == len(now)
     off_m, sigma_m = off(whole.outcomes, log.outcomes, np.array(common).T)
     assert len(off_m) > 0.5 * len(common)
     assert np.all(off_m < 3 * sigma_m)
-    assert np.median(off_m / sigma_m) < 0.3
-    assert log.outcomes.health[-1] == Health.OK
+    readings, corners = told(log)
+    recorded_readings, recorded_corners = told(whole)
+    assert len(readings) > 10  # of 38 and 92: a machine at load 10 skips two readings of three
+    assert len(corners) > 40
+    assert readings.items() <= recorded_readings.items()
+    assert corners.items() <= recorded_corners.items()
+    again_alone = replay_drive(log.inputs, DriveSetup.of_header(log.header, again), None)
+    assert first_difference(log, again_alone) is None
+    assert Health.OK in log.outcomes.health
     cameras = log.header["rig"]["cameras"]
     sigmas = [camera.pop("sigma") for camera in cameras]  # the recording is older than these
     for sigma in sigmas:
