@@ -5,9 +5,11 @@
 
 A name is the path of the attribute. Drives and recordings can teach all but the guards. Everything
 else about a navigator is known otherwise: cameras and wheelbase are measured, limits are the
-vehicle's.
+vehicle's. Of cameras and sensors only how far off they may be is a parameter; by how much they are
+is a state of the filter.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import reduce
@@ -32,6 +34,8 @@ class Tunable:
         matrix: None for numbers that are positive each by itself. Else the number may be a matrix,
             symmetric and positive definite, instead of the vector whose entries are, "sigma", the
             square roots of its diagonal or, "variance", that diagonal itself.
+        rows: whether it is a table, a row for each camera.
+        most: the largest that its entries, or those of a row, may be; beyond it nothing is known.
         guard: whether it only bounds what is believed. No gradient teaches such a number, and a
             file may hold an infinite one, which bounds nothing.
     """
@@ -40,6 +44,8 @@ class Tunable:
     unit: str
     typical: float
     matrix: str | None = None
+    rows: bool = False
+    most: tuple[float, ...] = ()
     guard: bool = False
 
 
@@ -67,6 +73,19 @@ TUNABLES: dict[str, Tunable] = {
     ),
     "motion.tilt_sigma_rad": Tunable("roll and pitch of the cameras", "rad", 0.005),
     "motion.height_sigma_m": Tunable("height of the cameras", "m", 0.002),
+    "motion.vehicle.sensor_sigma": Tunable(
+        "P0: scale of the odometer, gain and offset of the steering, delay of the cameras",
+        "1, 1, rad, s",
+        0.02,
+        most=(0.5, 0.5, 0.35, 0.5),
+    ),
+    "rig.extrinsics_sigma": Tunable(
+        "P0: place and direction of each camera, in the vehicle's axes",
+        "m, rad",
+        0.01,
+        rows=True,
+        most=(0.5, 0.5, 0.5, *3 * (math.radians(15.0),)),
+    ),
     "motion.gate_nis": Tunable(
         "largest NIS of a pose that is fused; .inf: no gate, and no restart", "1", 20.0, guard=True
     ),

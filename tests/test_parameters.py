@@ -15,7 +15,7 @@ from jaxnav.navigator import Navigator
 from jaxnav.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 from tests import worlds
 
-RIG, MARKERS, CAR = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()
+RIG, MARKERS, CAR = worlds.qcar_rig_by_hand(), worlds.paper_markers(), worlds.qcar_by_hand()
 DRIVER = Navigator(RIG, MARKERS, CAR, worlds.WAYPOINTS_M)
 HANDHELD = Navigator(RIG, MARKERS, selector=LowestReprojection())
 MATRICES = [name for name, tunable in TUNABLES.items() if tunable.matrix is not None]

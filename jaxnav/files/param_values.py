@@ -1,4 +1,4 @@
-"""Validation of a tuned parameter's value: a number, a list of them, or a matrix as its rows.
+"""Validation of a tuned parameter's value: a number, a list of them, or a table or matrix as rows.
 
 Every number must be positive, and a matrix a covariance: symmetric and positive definite. One that
 only bounds what is believed may be infinite. The navigator decides how many entries there must be.
@@ -43,7 +43,9 @@ def param_array(value: Any, where: str, tunable: Tunable) -> Float[np.ndarray, "
         bound = f"1 to {_MOST_ENTRIES}"
         raise BadInput(where, f"must have {bound} entries, got {len(value)}")
     if not any(isinstance(entry, list) for entry in value):
-        return np.array([_positive(entry, f"{where}[{i}]") for i, entry in enumerate(value)])
+        return np.array(_entries(value, where, tunable))
+    if tunable.rows:
+        return np.array([_row(row, f"{where}[{i}]", tunable) for i, row in enumerate(value)])
     if tunable.matrix is None:
         raise BadInput(where, "can't be a matrix: it is a number, or a list of them")
     for i, row in enumerate(value):
@@ -57,6 +59,23 @@ def param_array(value: Any, where: str, tunable: Tunable) -> Float[np.ndarray, "
         for i, row in enumerate(value)
     ]
     return _covariance(np.array(entries), where)
+
+
+def _row(value: Any, where: str, tunable: Tunable) -> list[float]:
+    """A row of a table."""
+    count = len(tunable.most)
+    if not isinstance(value, list) or len(value) != count:
+        got = f"{len(value)}" if isinstance(value, list) else show_value(value)
+        raise BadInput(where, f"must have {count} numbers, got {got}")
+    return _entries(value, where, tunable)
+
+
+def _entries(value: list[Any], where: str, tunable: Tunable) -> list[float]:
+    numbers = [_positive(entry, f"{where}[{i}]") for i, entry in enumerate(value)]
+    for i, (number, most) in enumerate(zip(numbers, tunable.most, strict=False)):
+        if number > most:
+            raise BadInput(f"{where}[{i}]", f"must be at most {most:g}, got {number:g}")
+    return numbers
 
 
 def _plain(value: Any) -> Any:

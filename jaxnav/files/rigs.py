@@ -17,6 +17,7 @@ not say, 5 mm and 0.5 degrees, and for a camchain, which was calibrated, 2 mm an
 file may have a provenance (`calibrated`, see `jaxnav.files.provenance`).
 """
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -57,9 +58,11 @@ from jaxnav.files.validation import (
 from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.camera import LENS_COEFFICIENTS
 from jaxnav.models.rig import CameraRig
+from jaxnav.parameters import TUNABLES
 
 # One that is larger says that nobody knows where the camera is, or was written in another unit.
-_MOST_SIGMA_M, _MOST_SIGMA_DEG = 0.5, 15.0
+_MOST_SIGMA_M, *_, _MOST_SIGMA_RAD = TUNABLES["rig.extrinsics_sigma"].most
+_MOST_SIGMA_DEG = round(math.degrees(_MOST_SIGMA_RAD), 9)
 SigmaM = Annotated[Number, Field(ge=0, le=_MOST_SIGMA_M)]
 SigmaDeg = Annotated[Number, Field(ge=0, le=_MOST_SIGMA_DEG)]
 _Three = Field(min_length=3, max_length=3)

@@ -44,8 +44,9 @@ from jaxnav.files.validation import (
 from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.bicycle import SENSOR_ERRORS, SENSORS_AS_TOLD, Vehicle
 from jaxnav.models.origin import Origin, opposite, planar_in_world, points_in_world
+from jaxnav.parameters import TUNABLES
 
-_MOST_SIGMA = (0.5, 0.5, 0.35, 0.5)  # of the SENSOR_ERRORS; beyond it nothing would be known
+_MOST_SIGMA = TUNABLES["motion.vehicle.sensor_sigma"].most
 
 
 class VehicleFile(Entry):

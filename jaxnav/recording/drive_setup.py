@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
+import jax.numpy as jnp
 from pydantic import Field, create_model, field_validator
 
 from jaxnav.belief.selectors import SELECTORS, make_selector
@@ -142,11 +143,18 @@ class DriveSetup:
     def with_params(self, params: Params) -> "DriveSetup":
         """The setup with these parameters in place of all that it had.
 
+        What they say of cameras and sensors it says itself: errors that are learnt of a camera
+        count in these sigmas.
+
         Raises:
             BadInput: a parameter does not fit the navigator; names file and key.
         """
-        apply_params(replace(self, parameters={}).navigator(), params)
-        return replace(self, parameters=params.plain())
+        navigator = apply_params(replace(self, parameters={}).navigator(), params)
+        rig = replace(self.rig, extrinsics_sigma=navigator.rig.extrinsics_sigma)
+        vehicle, sigma = self.vehicle, params.values.get("motion.vehicle.sensor_sigma")
+        if sigma is not None and vehicle.sensor_sigma is not None:
+            vehicle = replace(vehicle, sensor_sigma=jnp.asarray(sigma, float))
+        return replace(self, rig=rig, vehicle=vehicle, parameters=params.plain())
 
     @property
     def route_on_map(self) -> Route:

@@ -18,6 +18,7 @@ from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.kalman import log_likelihood
+from jaxnav.belief.motion import Motion
 from jaxnav.navigator import Navigator
 from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND
 from jaxnav.pose.candidates import Candidates
@@ -57,6 +58,7 @@ def trust_corners(navigator: Navigator) -> Navigator:
 def follow(navigator: Navigator, start: Bank, recorded: FrameSequences) -> FilterScores:
     """Run the filter frame by frame along one sequence (no batch axis)."""
     local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
+    start = _with_priors(local.motion, start)
 
     @functools.partial(jax.checkpoint, policy=KEEP_FOUND)
     def frame(
@@ -83,6 +85,14 @@ def follow(navigator: Navigator, start: Bank, recorded: FrameSequences) -> Filte
 
     frames = (recorded.obs, recorded.used, recorded.T_world_vehicle_true, recorded.judged)
     return jax.lax.scan(frame, local.believe(start), frames)[1]
+
+
+def _with_priors(motion: Motion, start: Bank) -> Bank:
+    """The start, whose errors of the sensors are as likely as the model says, for its gradient."""
+    errors = slice(motion.states, None)
+    priors = motion.init(1).covariance[:, errors, errors]
+    covariance = start.covariance.at[:, errors, errors].set(priors)
+    return eqx.tree_at(lambda b: b.covariance, start, covariance)
 
 
 class _Trusts(Navigator):

@@ -79,10 +79,10 @@ class Space(eqx.Module):
 
 
 def _free(tunable: Tunable, value: Array, full: bool) -> Array:
-    if value.ndim == 2 and not full:
+    if value.ndim == 2 and not (full or tunable.rows):
         value = jnp.diagonal(value)
         value = jnp.sqrt(value) if tunable.matrix == "sigma" else value
-    if value.ndim < 2:
+    if value.ndim < 2 or tunable.rows:
         known = jnp.isfinite(value) & (value > 0)
         ratio = jnp.where(known, value / tunable.typical, 1)
         if tunable.matrix is None:
@@ -99,7 +99,8 @@ def _free(tunable: Tunable, value: Array, full: bool) -> Array:
 
 def _bound(tunable: Tunable, free: Array, full: bool) -> Array:
     if tunable.matrix is None:
-        return tunable.typical * jax.nn.softplus(jnp.clip(free, -_FARTHEST, _MOST)) / np.log(2)
+        value = tunable.typical * jax.nn.softplus(jnp.clip(free, -_FARTHEST, _MOST)) / np.log(2)
+        return jnp.minimum(value, np.broadcast_to(tunable.most or np.inf, value.shape))
     if not full:
         return tunable.typical * _exp(free)
     diagonal = _exp(jnp.diagonal(free))

@@ -18,7 +18,7 @@ from jaxnav.navigator import Navigator
 from jaxnav.parameters import TUNABLES, parameters_of
 from tests import worlds
 
-RIG, MARKERS, QCAR = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()
+RIG, MARKERS, QCAR = worlds.qcar_rig_by_hand(), worlds.paper_markers(), worlds.qcar_by_hand()
 CAR = Navigator(RIG, MARKERS, QCAR, worlds.WAYPOINTS_M)
 PARKED = Navigator(RIG, MARKERS, QCAR)  # a car that goes nowhere has no controller
 FREE = Navigator(RIG, MARKERS)
@@ -67,9 +67,10 @@ def tuned(navigator: Navigator) -> st.SearchStrategy[dict]:
     known = {}
     for name, value in parameters_of(navigator).items():
         count = value.size
-        known[name] = st.lists(positive, min_size=count, max_size=count).map(
-            lambda entries, shape=value.shape: np.reshape(entries, shape)
-        )
+        most = TUNABLES[name].most
+        known[name] = st.lists(
+            st.floats(1e-18, min(most)) if most else positive, min_size=count, max_size=count
+        ).map(lambda entries, shape=value.shape: np.reshape(entries, shape))
         if TUNABLES[name].matrix is not None:
             known[name] |= covariances(value.shape[0])
         if TUNABLES[name].guard:
@@ -98,7 +99,8 @@ def test_numbers_come_back_bit_for_bit_and_reach_the_navigator(kind, tmp_path):
 
 
 def test_a_navigator_keeps_its_precision(precision, tmp_path):
-    navigator = Navigator(worlds.qcar_rig(), MARKERS, worlds.qcar(), worlds.WAYPOINTS_M)
+    rig, car = worlds.qcar_rig_by_hand(), worlds.qcar_by_hand()
+    navigator = Navigator(rig, MARKERS, car, worlds.WAYPOINTS_M)
     known = parameters_of(navigator)
     finite = {name: value for name, value in known.items() if np.all(np.isfinite(value))}
     assert len(finite) == len(known) - 2  # lookahead_m and slows_at_rad are infinite
@@ -260,6 +262,26 @@ GATE = "parameters.motion.gate_nis"
             "{motion.initial_velocity_sigma: [[1, 0], [0, 1]]}",
             "parameters.motion.initial_velocity_sigma: can't be a matrix: it is a number, or a",
         ),
+        (
+            "{rig.extrinsics_sigma: [[0.01, 0.01, 0.01, 0.02, 0.02]]}",
+            "parameters.rig.extrinsics_sigma[0]: must have 6 numbers, got 5",
+        ),
+        (
+            "{rig.extrinsics_sigma: [[0.1, 0.1, 0.1, 0.1, 0.1, 0.1], 0.02]}",
+            "parameters.rig.extrinsics_sigma[1]: must have 6 numbers, got 0.02",
+        ),
+        (
+            "{rig.extrinsics_sigma: [[0.1, 0.1, 0.1, 0.1, 0.1, -1]]}",
+            "parameters.rig.extrinsics_sigma[0][5]: must be > 0, got -1",
+        ),
+        (
+            "{rig.extrinsics_sigma: [[0.1, 0.1, 0.1, 0.1, 0.1, 5]]}",
+            "parameters.rig.extrinsics_sigma[0][5]: must be at most 0.261799, got 5",
+        ),
+        (
+            "{motion.vehicle.sensor_sigma: [0.03, 0.03, 0.5, 0.02]}",
+            "parameters.motion.vehicle.sensor_sigma[2]: must be at most 0.35, got 0.5",
+        ),
     ],
 )
 def test_a_bad_parameter_is_named_with_its_key(parameters, line, tmp_path):
@@ -314,6 +336,11 @@ def test_one_file_serves_every_selector_and_what_is_not_driven():
     values = {"controller.lookahead_m": 2.0, "selector.floor_m": 1e-3, "model_sigma_px": 0.2}
     params = Params.of(values, WHERE)
     paper = Navigator(RIG, MARKERS, QCAR, worlds.WAYPOINTS_M, selector=PaperCost())
+    exact = Navigator(worlds.qcar_rig(), MARKERS, worlds.qcar())
+    priors = {"motion.vehicle.sensor_sigma": [0.1] * 4, "rig.extrinsics_sigma": [[0.1] * 6] * 4}
+    assert parameters_of(apply_params(exact, Params.of(priors, WHERE))).keys() == (
+        parameters_of(exact).keys()
+    )
     for navigator, taken in [
         (CAR, set(values)),
         (PARKED, {"selector.floor_m", "model_sigma_px"}),
@@ -354,6 +381,16 @@ def test_one_file_serves_every_selector_and_what_is_not_driven():
             "car",
             {"motion.vision_floor": 1},
             "motion.vision_floor: must have 3 entries or 3 rows of 3, got a number",
+        ),
+        (
+            "car",
+            {"rig.extrinsics_sigma": [[0.01] * 6] * 3},
+            "rig.extrinsics_sigma: must have 4 rows of 6, got 3 rows of 6",
+        ),
+        (
+            "free",
+            {"motion.vehicle.sensor_sigma": [0.01] * 4},
+            "motion.vehicle.sensor_sigma: this navigator has no such number",
         ),
         ("car", {"corner_sigma_px": [1]}, "corner_sigma_px: must be a number, got 1 entry"),
     ],

@@ -177,6 +177,23 @@ def test_parameters_reach_the_navigator_and_come_with_the_header():
         setup.with_params(Params.of({"motion.vision_floor": [1] * 6}, WHERE))
 
 
+def test_what_parameters_say_of_cameras_and_sensors_the_setup_says_itself():
+    """Also where it is read back; a rule that takes one pose has no use for the sensors'."""
+    sigma, turned = [0.05, 0.04, 0.03, 0.02], [[0.01] * 3 + [0.02] * 3] * 4
+    values = {"motion.vehicle.sensor_sigma": sigma, "rig.extrinsics_sigma": turned}
+    tuned = dataclasses.replace(
+        qcar_setup(), rig=worlds.qcar_rig_by_hand(), vehicle=worlds.qcar_by_hand()
+    ).with_params(Params.of(values, WHERE))
+    rule = dataclasses.replace(tuned, selector="paper-cost")
+    for one in (tuned, rule):
+        for setup in (one, DriveSetup.of_header(decode(encode(one.header())), WHERE)):
+            np.testing.assert_allclose(setup.vehicle.sensor_sigma, sigma, rtol=1e-12)
+            np.testing.assert_allclose(setup.rig.extrinsics_sigma, turned, rtol=1e-12)
+            known = parameters_of(setup.navigator())
+            np.testing.assert_allclose(known["rig.extrinsics_sigma"], turned, rtol=1e-12)
+            assert ("motion.vehicle.sensor_sigma" in known) == (one is tuned)
+
+
 def test_a_rule_without_a_gate_drives_without_one():
     """Also where its header has the gate that other rules were given."""
     tuned = qcar_setup().with_params(Params.of({"motion.gate_nis": 30}, WHERE))

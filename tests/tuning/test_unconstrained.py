@@ -18,8 +18,8 @@ from jaxnav.tuning.unconstrained import Space
 from tests import worlds
 from tests.derivatives import check_derivatives
 
-RIG, MARKERS = worlds.qcar_rig(), worlds.paper_markers()
-CAR = Navigator(RIG, MARKERS, worlds.qcar(), worlds.WAYPOINTS_M)
+RIG, MARKERS = worlds.qcar_rig_by_hand(), worlds.paper_markers()
+CAR = Navigator(RIG, MARKERS, worlds.qcar_by_hand(), worlds.WAYPOINTS_M)
 HANDHELD = Navigator(RIG, MARKERS, selector=LowestReprojection())
 NAVIGATORS = pytest.mark.parametrize("navigator", [CAR, HANDHELD], ids=["car", "hand-held"])
 MATRICES = frozenset(name for name, tunable in TUNABLES.items() if tunable.matrix is not None)
@@ -63,8 +63,9 @@ def test_there_and_back(navigator, seed, decades):
     """Seven powers of ten to either side of what is typical."""
     rng = np.random.default_rng(seed)
     values = {
-        name: jnp.asarray(
-            TUNABLES[name].typical * 10 ** rng.uniform(-decades, decades, np.shape(value))
+        name: jnp.minimum(
+            TUNABLES[name].typical * 10 ** rng.uniform(-decades, decades, np.shape(value)),
+            np.broadcast_to(TUNABLES[name].most or np.inf, np.shape(value)),
         )
         for name, value in parameters_of(navigator).items()
     }
