@@ -9,6 +9,7 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -17,6 +18,9 @@ from jaxtyping import install_import_hook
 
 import tests.helpers.shapes
 
+# No test is judged by the clock: machines are shared.
+hypothesis.settings.register_profile("shared", deadline=None)
+hypothesis.settings.load_profile("shared")
 # As a terminal has it: a suite under `nohup` would have tests whose programs ignore it too.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # Most of a run is compilation. LLVM's costly passes and wide registers win nothing on inputs as

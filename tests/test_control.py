@@ -372,7 +372,7 @@ ANYTHING = st.floats(allow_nan=True, allow_infinity=True)
 WHATEVER = controller()
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(*[ANYTHING] * 6)
 @example(np.nan, 0.0, 0.0, 0.0, 0.1, 0.0)
 @example(0.0, 0.0, np.inf, 0.0, 0.1, 0.0)

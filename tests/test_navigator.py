@@ -266,7 +266,7 @@ def located():
 ANYTHING = st.floats(allow_nan=True, allow_infinity=True)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @example((9.35e155, 1.0, 0.0), [None] * 7 + [1.3407807929942597e154])
 @example((0.0, 0.0, 0.0), [None, 1498.0, None, 232430.0, None, 232616.0, None, 1603.0])
 @given(

@@ -69,7 +69,6 @@ def shifted_setup(by_m, float64: bool) -> DriveSetup:
     return DriveSetup(worlds.qcar_rig(), markers, worlds.qcar(), route, float64=float64)
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(far, far, far), min_size=1, max_size=5))
 def test_an_origin_is_round_and_near_or_zero(places_m):
     middle_m, origin_m = np.mean(places_m, axis=0), origin_near(np.array(places_m))
@@ -96,7 +95,7 @@ def test_near_zero_not_a_bit_changes(dtype):
     assert paper.without_origin() is paper
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.tuples(far, far, far), st.integers(0, 2**32 - 1))
 def test_an_inverse_leads_where_its_pose_is(origin_m, seed):
     """Quaternions of float32 are not of length 1 by 1e-7, which is a metre at 10 000 km."""

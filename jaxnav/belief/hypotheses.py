@@ -26,10 +26,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
 from jaxnav.belief.branches import SecondPoses, give_slots, second_poses
 from jaxnav.belief.fan import CANDIDATES, fan, normalise
+from jaxnav.belief.flips import beyond, nearer_to_another
 from jaxnav.belief.map_fit import PoseFit, fit_poses
-from jaxnav.models.geometry import rotation_error_rad, rotation_matrix, safe_norm, safe_sqrt
+from jaxnav.belief.merging import find_heirs
+from jaxnav.models.geometry import rotation_error_rad, safe_norm, safe_sqrt
 from jaxnav.numerics.levenberg_marquardt import mark_found
-from jaxnav.numerics.small_matrices import cholesky, matvec, product, ranks, sandwich, solve_lower
 from jaxnav.numerics.trees import where
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Snapshot
@@ -160,9 +161,15 @@ class MultiHypothesis(eqx.Module):
         )
         costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
         wrong = jnp.maximum(
-            _beyond(self.far_rad, apart_rad, sigmas_rad),
+            beyond(self.far_rad, apart_rad, sigmas_rad),
             # Candidates of a spoilt frame are of no branch.
-            jnp.where(fits_one, _nearer_to_another(after, candidates, jnp.argmin(costs)), 0),
+            jnp.where(
+                fits_one,
+                nearer_to_another(
+                    after.T_world_vehicle, after.covariance, candidates, jnp.argmin(costs)
+                ),
+                0,
+            ),
         )
         flip_probability = jnp.sum(mass * wrong)
         located = jnp.any(alive)
@@ -170,7 +177,14 @@ class MultiHypothesis(eqx.Module):
         if count > 1:
             heir = jax.lax.cond(
                 jnp.sum(alive) > 1,
-                lambda: self._heirs(after, log_weight, alive, prior.freedom, snapshot),
+                lambda: find_heirs(
+                    after.T_world_vehicle,
+                    after.covariance,
+                    jnp.where(alive, log_weight, -jnp.inf),
+                    self._linear(after.T_world_vehicle, snapshot),
+                    prior.freedom,
+                    self.merge_distance,
+                ),
                 lambda: own,
             )
         return Selection(
@@ -233,49 +247,15 @@ class MultiHypothesis(eqx.Module):
         bounded = jnp.maximum(log_evidence - best, self.outlier_log_evidence)
         return jnp.where(compared, bounded, 0)
 
-    def _heirs(
-        self,
-        poses: "_Poses",
-        log_weight: Array,
-        alive: Array,
-        freedom: Array,
-        snapshot: Snapshot,
-    ) -> Int[Array, " K"]:
-        """Index of the hypothesis into which each one is merged; its own index where it stays.
+    def _linear(self, T: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "K 6"]:
+        """Shifts and turns so small that the corners are linear in them, of poses (K,), m and rad.
 
-        A hypothesis merges into the heaviest of those that are close: within `merge_distance`
-        sigmas of the receiver, where the sigma includes `linear_rad`, an angle so small that the
-        corners are linear in it.
+        A shift looks the larger the nearer the marker is.
         """
-        count = log_weight.shape[0]
-        T = poses.T_world_vehicle
-        apart = jax.vmap(jax.vmap(_apart, (None, 0)), (0, None))(T.wxyz_xyz, T.wxyz_xyz)
-        apart = jax.vmap(lambda rows: product(rows, freedom))(apart)
-        nearest_m = jnp.min(
-            safe_norm(
-                T.translation()[:, None] - snapshot.markers.Ts_world_marker.translation()[None]
-            ),
-            axis=1,
-        )
-        linear = jnp.concatenate(
-            [
-                self.linear_rad * jnp.tile(nearest_m[:, None], 3),
-                jnp.full((count, 3), self.linear_rad),
-            ],
-            1,
-        )
-        P = poses.covariance + jax.vmap(jnp.diag)(linear**2)
-        factor = jax.vmap(lambda P: cholesky(sandwich(freedom.T, P)))(P)
-        whitened = jax.vmap(lambda L, a: solve_lower(L, a.T))(factor, apart)
-        close = jnp.sum(whitened**2, axis=1) < self.merge_distance**2  # [receiver, other]
-        close = close & alive[:, None] & alive[None]
-        rank = ranks(jnp.where(alive, log_weight, -jnp.inf))
-        heavier = rank[:, None] < rank[None]
-        # A hypothesis that receives others is not merged itself.
-        takes = close & heavier
-        takes = takes & ~jnp.any(takes, axis=0)[:, None]
-        best_rank = jnp.where(takes, rank[:, None], count)
-        return jnp.where(jnp.any(takes, axis=0), jnp.argmin(best_rank, axis=0), jnp.arange(count))
+        to_markers = snapshot.markers.Ts_world_marker.translation()[None]
+        nearest_m = jnp.min(safe_norm(T.translation()[:, None] - to_markers), axis=1)
+        turns = jnp.full((nearest_m.shape[0], 3), self.linear_rad)
+        return jnp.concatenate([self.linear_rad * jnp.tile(nearest_m[:, None], 3), turns], 1)
 
 
 def _started(
@@ -352,50 +332,3 @@ def _poses(of: PoseBelief | PosePosterior) -> _Poses:
 def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:
     chosen: _Poses = jax.tree.map(lambda leaf: leaf[index], poses)
     return chosen
-
-
-def _apart(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, " 6"]:
-    """(shift in the axes of `base`, m; turn, rad to second order) from `base` to `other`.
-
-    Args:
-        base, other: poses (wxyz, xyz).
-    """
-    (w, v), (w_other, v_other) = (base[0], base[1:4]), (other[0], other[1:4])
-    cosine = w * w_other + jnp.sum(v * v_other)
-    sine = w * v_other - w_other * v - jnp.cross(v, v_other)
-    shift = matvec(rotation_matrix(jaxlie.SO3(base[:4])).T, other[4:] - base[4:])
-    return jnp.append(shift, 2 * jnp.where(cosine < 0, -1, 1) * sine)
-
-
-def _nearer_to_another(
-    poses: _Poses, candidates: Candidates, selected: Int[Array, ""]
-) -> Float[Array, " K"]:
-    """Probability that a candidate is nearer in angle than the selected one, for each hypothesis.
-
-    Between two candidates lies a bisector: a pose is nearer to the other one beyond it.
-    """
-    base = poses.T_world_vehicle.wxyz_xyz
-    other = jax.vmap(lambda T: T.inverse().wxyz_xyz)(candidates.T_vehicle_world)
-    turns = jax.vmap(jax.vmap(_apart, (None, 0)), (0, None))(base, other)[..., 3:]  # (K, N, 3)
-    own = turns[:, selected]
-    across = turns - own[:, None]
-    length = safe_norm(across)
-    direction = across / jnp.where(length > 0, length, 1)[..., None]
-    gap = jnp.sum(turns**2, axis=2) - jnp.sum(own**2, axis=1)[:, None]
-    gap_rad = gap / jnp.where(length > 0, 2 * length, 1)
-    P = poses.covariance[:, None, 3:, 3:]
-    variance = jnp.sum(direction[..., None] * P * direction[..., None, :], axis=(2, 3))
-    sigma_rad = jnp.maximum(safe_sqrt(jnp.maximum(variance, 0)), 1e-6)
-    nearer = jax.scipy.special.erfc(gap_rad / (np.sqrt(2) * sigma_rad)) / 2
-    return jnp.max(jnp.where(candidates.valid[None] & (length > 0), nearer, 0), axis=1)
-
-
-def _beyond(
-    limit_rad: Float[Array, ""] | float,
-    apart_rad: Float[Array, " K"],
-    sigma_rad: Float[Array, " K"],
-) -> Float[Array, " K"]:
-    """Probability that |N(apart_rad, sigma_rad^2)| exceeds a limit, for each hypothesis."""
-    scale = np.sqrt(2) * jnp.maximum(sigma_rad, 1e-6)
-    below, above = (limit_rad - apart_rad) / scale, (limit_rad + apart_rad) / scale
-    return (jax.scipy.special.erfc(below) + jax.scipy.special.erfc(above)) / 2

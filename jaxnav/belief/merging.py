@@ -5,10 +5,12 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 from jaxtyping import Array, Float, Int
 
 from jaxnav.belief.bank import Bank
-from jaxnav.numerics.small_matrices import product
+from jaxnav.models.geometry import shift_and_turn
+from jaxnav.numerics.small_matrices import cholesky, product, ranks, sandwich, solve_lower
 
 
 def merge_heirs(
@@ -54,3 +56,40 @@ def merge_heirs(
         log_weight=jnp.where(stays, jnp.log(jnp.where(total > 0, total, 1)), bank.log_weight),
         initialised=stays,
     )
+
+
+def find_heirs(
+    T_world_vehicle: jaxlie.SE3,
+    covariance: Float[Array, "K 6 6"],
+    log_weight: Float[Array, " K"],
+    linear: Float[Array, "K 6"],
+    freedom: Float[Array, "6 d"],
+    distance: Float[Array, ""] | float,
+) -> Int[Array, " K"]:
+    """Index of the hypothesis into which each one is merged; its own index where it stays.
+
+    A hypothesis merges into the heaviest of those that are close: within `distance` sigmas of the
+    receiver, where the sigma includes the shifts and turns in which it is linear.
+
+    Args:
+        T_world_vehicle: poses (K,).
+        log_weight: -inf of those that are not alive.
+        linear: m and rad, of each.
+        freedom: directions in which the vehicle can move.
+    """
+    count, alive = log_weight.shape[0], log_weight > -jnp.inf
+    wxyz_xyz = T_world_vehicle.wxyz_xyz
+    apart = jax.vmap(jax.vmap(shift_and_turn, (None, 0)), (0, None))(wxyz_xyz, wxyz_xyz)
+    apart = jax.vmap(lambda rows: product(rows, freedom))(apart)
+    P = covariance + jax.vmap(jnp.diag)(linear**2)
+    factor = jax.vmap(lambda P: cholesky(sandwich(freedom.T, P)))(P)
+    whitened = jax.vmap(lambda L, a: solve_lower(L, a.T))(factor, apart)
+    close = jnp.sum(whitened**2, axis=1) < distance**2  # [receiver, other]
+    close = close & alive[:, None] & alive[None]
+    rank = ranks(log_weight)
+    heavier = rank[:, None] < rank[None]
+    # A hypothesis that receives others is not merged itself.
+    takes = close & heavier
+    takes = takes & ~jnp.any(takes, axis=0)[:, None]
+    best_rank = jnp.where(takes, rank[:, None], count)
+    return jnp.where(jnp.any(takes, axis=0), jnp.argmin(best_rank, axis=0), jnp.arange(count))

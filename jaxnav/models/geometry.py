@@ -235,3 +235,16 @@ def on_last_axis(
 ) -> Shaped[Array, "... n"]:
     """A vector with leading axes of length 1, which broadcasts along the last axis of `like`."""
     return vector.reshape((1,) * (like.ndim - 1) + vector.shape)
+
+
+def shift_and_turn(base: Float[Array, " 7"], other: Float[Array, " 7"]) -> Float[Array, " 6"]:
+    """(shift in the axes of `base`, m; turn, rad to second order) from `base` to `other`.
+
+    Args:
+        base, other: poses (wxyz, xyz).
+    """
+    (w, v), (w_other, v_other) = (base[0], base[1:4]), (other[0], other[1:4])
+    cosine = w * w_other + jnp.sum(v * v_other)
+    sine = w * v_other - w_other * v - jnp.cross(v, v_other)
+    shift = matvec(rotation_matrix(jaxlie.SO3(base[:4])).T, other[4:] - base[4:])
+    return jnp.append(shift, 2 * jnp.where(cosine < 0, -1, 1) * sine)

@@ -275,7 +275,7 @@ def driven(selector):
 
 
 @pytest.mark.parametrize("selector", [BANK, LowestReprojection()], ids=["bank", "choosing"])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(angle_rad=st.floats(-7, 7))
 @example(angle_rad=np.pi / 2)
 def test_a_turned_world_is_followed_as_it_was(selector, angle_rad):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import assume, settings
+from hypothesis import assume
 from hypothesis import given as drawn
 from hypothesis import strategies as st
 
@@ -28,7 +28,6 @@ def _velocity_world(*of: jax.Array) -> jax.Array:
     return bicycle.velocity_world(*(jnp.asarray(value, float) for value in of))
 
 
-@settings(deadline=None)
 @drawn(
     speed_mps=st.one_of(st.floats(0.1, 30.0), st.floats(-30.0, -0.1)),
     steering_rad=st.floats(-1.5, 1.5),
@@ -43,7 +42,6 @@ def test_a_twist_tells_what_the_bicycle_did(speed_mps, steering_rad, psi_rad, wh
     assert found == pytest.approx((speed_mps, steering_rad), rel=1e-9, abs=1e-9)
 
 
-@settings(deadline=None)
 @drawn(st.lists(st.tuples(st.floats(), st.floats())))
 def test_whatever_a_twist_says_the_steering_stays_inside_its_limit(twists):
     reader = TwistReader(0.256, 0.5)

@@ -48,7 +48,6 @@ LONGEST = 1200  # characters of a line for a person
 
 fuzzed = settings(
     max_examples=EXAMPLES,
-    deadline=None,
     derandomize=True,
     database=None,
     phases=[Phase.generate, Phase.shrink],

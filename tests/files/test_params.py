@@ -83,7 +83,7 @@ def test_numbers_come_back_bit_for_bit_and_reach_the_navigator(kind, tmp_path):
     navigator, path = NAVIGATORS[kind], tmp_path / "p.yaml"
     before = bits(parameters_of(navigator))
 
-    @settings(max_examples=40, deadline=None, derandomize=True)
+    @settings(max_examples=40, derandomize=True)
     @given(tuned(navigator))
     def check(values: dict) -> None:
         write_params(path, values)
@@ -182,7 +182,7 @@ def test_the_shipped_gains_are_for_the_shipped_car():
 def test_provenance_is_kept_and_shown(tmp_path):
     path, values = tmp_path / "p.yaml", {"corner_sigma_px": 0.3}
 
-    @settings(max_examples=150, deadline=None, derandomize=True)
+    @settings(max_examples=150, derandomize=True)
     @given(st.dictionaries(st.text(max_size=5), plain, max_size=4))
     def check(provenance: dict) -> None:
         write_params(path, values, provenance)

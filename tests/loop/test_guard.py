@@ -230,7 +230,7 @@ def test_a_write_that_fails_now_is_none_and_the_next_may_succeed(car, guard):
     assert car.told[-1][2] == 0.1
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.lists(st.tuples(st.floats(), st.floats()), max_size=20))
 def test_what_reaches_the_vehicle_is_inside_the_limits(commands):
     car, now_ns = Car(), [0]

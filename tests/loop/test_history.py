@@ -1,7 +1,7 @@
 """Events in the order of their stamps, in whatever order they arrive, against a sorted list."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.loop.history import KEPT, THIN_NS, EventData, History
@@ -109,7 +109,6 @@ def test_what_is_older_than_all_that_is_kept_is_refused():
     np.testing.assert_array_equal(moment, [*range(200), 777])
 
 
-@settings(deadline=None)
 @given(st.sampled_from([50, 100, 200, 500, 1000, 5000]), st.integers(0, 790), st.integers(1, 4))
 def test_all_that_stamps_let_in_has_its_place_whatever_the_rates(rate_hz, late_ms, cameras):
     """Cameras at 30 Hz whose frames are late by so much, among odometry at some rate."""

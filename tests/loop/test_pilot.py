@@ -359,7 +359,7 @@ def fuzzed(draw) -> Input:
     return Input(now_ns, frames=(FrameDetections(camera, now_ns + draw(stamps), found),))
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30, derandomize=True)
 @drawn(st.lists(fuzzed(), max_size=10))
 def test_whatever_comes_in_what_comes_out_is_finite(setup, inputs, told):
     pilot, _ = handled(setup, inputs[:20])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.loop.standstill import Standstill, Way, between
@@ -75,7 +75,6 @@ def test_what_stays_where_nothing_is_due_is_not_frozen():
     assert not any(Drive().go(4.0, told_mps=0.4, noise_px=0.01, of=ahead)[0])
 
 
-@settings(deadline=None)  # a machine may do something else
 @given(st.floats(0.03, 1.0), st.floats(0.7, 1.4), st.integers(0, 2**31), st.booleans())
 def test_a_camera_that_sees_is_not_frozen(speed_mps, scale, seed, stops):
     """Wheels that slip, corners with noise, and starts and stops."""
@@ -136,7 +135,6 @@ def test_who_moves_or_does_not_pull_or_is_not_told_is_not_held():
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(

@@ -17,7 +17,7 @@ from tests.worlds import planar
 ANGLES = st.floats(-1e4, 1e4)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(ANGLES)
 def test_wrapping_keeps_the_direction(angle_rad):
     wrapped = float(geometry.wrap_angle(jnp.asarray(angle_rad)))

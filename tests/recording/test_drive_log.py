@@ -214,7 +214,7 @@ EDITS = st.lists(
 )
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150, derandomize=True)
 @given(EDITS)
 def test_whatever_a_file_holds_it_is_a_drive_or_bad_input(in_chunks, tmp_path_factory, edits):
     raw = bytearray(in_chunks)
@@ -255,7 +255,7 @@ def _file(tmp_path: Path, *messages, header: dict | None = None, **options) -> P
 TICK = {"now_ns": 1, "faults": []}
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200, derandomize=True)
 @given(st.integers(0, 10**6), st.binary(max_size=4), st.integers(0, 6), st.integers(0, 3))
 def test_messages_that_are_damaged_under_sound_checksums(tmp_path_factory, where, new, out, which):
     """As another program could write them: the checks of the messages alone are left."""

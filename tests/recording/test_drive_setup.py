@@ -92,7 +92,7 @@ def wxyz_xyz(pose: tuple[list[float], list[float]]) -> np.ndarray:
 
 @pytest.mark.parametrize("double", [False, True])
 def test_a_setup_comes_back_bit_for_bit(double):
-    @settings(max_examples=25, deadline=None, derandomize=True)
+    @settings(max_examples=25, derandomize=True)
     @given(
         st.lists(st.tuples(cameras, poses, sizes_px), min_size=1, max_size=3),
         st.lists(placed_markers, min_size=1, max_size=3, unique_by=lambda marker: marker[2:]),
@@ -260,7 +260,7 @@ values = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150, derandomize=True)
 @given(st.lists(st.integers(0, 11), min_size=1, max_size=6), values, st.booleans())
 def test_any_change_of_a_value_gives_a_setup_or_bad_input(path, value, removes):
     header = json.loads(TEXT)
@@ -284,7 +284,7 @@ def test_any_change_of_a_value_gives_a_setup_or_bad_input(path, value, removes):
         assert str(error).startswith("drive.mcap: header.")  # noqa: PT017
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150, derandomize=True)
 @given(st.integers(0, len(TEXT) - 1), st.binary(max_size=3), st.integers(0, 4))
 def test_any_change_of_a_byte_gives_a_setup_or_bad_input(where, new, out):
     raw = bytearray(TEXT)

@@ -47,7 +47,7 @@ def _same(one, other) -> bool:
     return (type(one), repr(one)) == (type(other), repr(other))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.dictionaries(st.text(max_size=5).filter(lambda key: key != "not_finite"), VALUES))
 def test_what_is_encoded_comes_back(message):
     raw = encode(message)
@@ -55,7 +55,7 @@ def test_what_is_encoded_comes_back(message):
     json.loads(raw, parse_constant=pytest.fail)  # NaN is no JSON
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     hnp.arrays(st.sampled_from([np.float32, np.float64]), hnp.array_shapes(max_dims=2, max_side=3))
 )
@@ -132,7 +132,7 @@ INPUTS = st.builds(Input, NOW_NS, st.none() | READINGS, st.just(()), FAULTS) | s
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(INPUTS)
 def test_inputs_come_back_bit_for_bit(given):
     topic, _, message = input_message(given)

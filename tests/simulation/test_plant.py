@@ -47,7 +47,7 @@ def test_a_steady_turn_is_a_circle():
     np.testing.assert_allclose(spread, 2 * radius_m, rtol=1e-4)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(-2.0, 2.0), st.floats(-0.5, 0.5))
 def test_no_command_takes_the_car_beyond_its_limits(steering, throttle, speed, angle):
     state = CarState(jnp.zeros(3), jnp.asarray(speed), jnp.asarray(angle))

@@ -295,7 +295,7 @@ def test_a_summary_does_not_depend_on_the_boxes(
     xr.testing.assert_allclose(cut, summary, rtol=1e-12)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     st.lists(
         st.one_of(

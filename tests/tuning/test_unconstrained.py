@@ -57,7 +57,7 @@ def random_covariance(rng: np.random.Generator, d: int, scale: float) -> np.ndar
 
 
 @NAVIGATORS
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), decades=st.floats(0, 7))
 def test_there_and_back(navigator, seed, decades):
     """Seven powers of ten to either side of what is typical."""
@@ -130,7 +130,7 @@ def test_what_is_not_known_starts_at_what_is_typical(nothing, full):
 
 
 @NAVIGATORS
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 10**6), scale=st.sampled_from([1.0, 30.0, 1e3, 1e30]))
 def test_no_x_leads_out_of_what_is_allowed(navigator, seed, scale):
     full = MATRICES & set(parameters_of(navigator))

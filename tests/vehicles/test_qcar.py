@@ -99,7 +99,7 @@ def test_a_servo_turns_at_its_rate():
     assert servo.angle_at(9_000_000_000) == -0.5
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.floats(), st.floats(), st.floats(), st.floats())
 def test_no_command_is_beyond_the_limits(first_rad, steering_rad, throttle, limit):
     hardware = Hardware()

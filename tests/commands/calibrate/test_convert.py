@@ -37,9 +37,7 @@ from tests.helpers.conversions import (
 from tests.helpers.mutations import Changed, restructured
 from tests.helpers.yaml_numbers import dumped
 
-drawn = settings(
-    deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
-)
+drawn = settings(derandomize=True, database=None, suppress_health_check=list(HealthCheck))
 
 
 def assert_same_place(a: CameraFigures, b: CameraFigures) -> None:
