@@ -170,6 +170,7 @@ class BicycleKalman(Motion):
             T_world_vehicle_from_planar(seen),
             measured,
             freedom,
+            self.states,
         )
         P = kalman.replace_first(
             P, jnp.eye(3, P.shape[0], dtype=P.dtype).at[:, :3].set(_turn(pose[2]))

@@ -134,6 +134,7 @@ class ConstantVelocity(Motion):
             jaxlie.SE3(bank.mean[:7]),
             measured,
             jnp.eye(6, dtype=bank.mean.dtype),
+            self.states,
         )
         return Offer(
             measured.innovation,

@@ -24,6 +24,7 @@ def follow_pose(
     T_world_prior: jaxlie.SE3,
     posterior: PosePosterior,
     freedom: Float[Array, "6 d"],
+    states: int,
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The whole state after its pose was corrected: the rest follows by regression.
 
@@ -35,6 +36,9 @@ def follow_pose(
     where C is the covariance of the corrected pose, M carries its error to y, and
     C_y = M C M' + the covariance of q given the pose.
 
+    What C is inflated by widens pose and velocity alone. Errors that are only considered keep their
+    covariance, and would be correlated with a wider pose by more than they vary.
+
     Args:
         P: (n, n) of the predicted state, whose first d entries are
             xi = freedom' cay^-1(T_world_prior^-1 T_world_vehicle), and whose last ones are the
@@ -42,6 +46,7 @@ def follow_pose(
         T_world_prior: the predicted pose.
         posterior: the corrected pose, with a covariance in its own axes, and the errors in view.
         freedom: (6, d), the directions in which the vehicle can move.
+        states: of pose and velocity, before the errors.
 
     Returns:
         Correction (n,) of the state, the pose's d entries included, and the covariance after it.
@@ -49,7 +54,7 @@ def follow_pose(
     d, n = freedom.shape[1], P.shape[0]
     away = inverse_cayley(T_world_prior.inverse() @ posterior.T_world_vehicle)
     xi = matvec(freedom.T, away)
-    C = sandwich(freedom.T, posterior.covariance)
+    C = sandwich(freedom.T, posterior.covariance) / posterior.inflation
     # Error at the corrected pose -> at the prediction.
     M = sandwich(freedom.T, inverse_cayley_jacobian(away))
     y, P_yy, P_y, given_pose = xi, P[:d, :d], P[:d], None
@@ -75,4 +80,6 @@ def follow_pose(
     if given_pose is not None:
         rest = rest + sandwich(gain[:, d:], given_pose)
     after = kalman.symmetrise(jnp.block([[C, cross.T], [cross, rest]]))
+    wider = jnp.concatenate([jnp.eye(d, dtype=C.dtype), moves[: states - d]])
+    after = after.at[:states, :states].add((posterior.inflation - 1) * sandwich(wider, C))
     return jnp.append(xi, matvec(gain, y)), kalman.add_floor(after, P)

@@ -173,7 +173,7 @@ def test_the_rest_follows_pose_and_errors_as_a_gaussian_does(hidden):
         jnp.asarray(True),
         ErrorsPosterior(*map(jnp.asarray, (y[d:], slope, given, rows))),
     )
-    correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, PLANAR)
+    correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, PLANAR, n - e)
     np.testing.assert_allclose(correction[:d], y[:d], atol=1e-8)
     np.testing.assert_allclose(correction, expected, atol=2e-5)
     np.testing.assert_allclose(after, P_expected, atol=3e-6)
@@ -193,6 +193,37 @@ def test_what_is_considered_keeps_mean_and_covariance(navigator):
     learnt = motion.considered(jnp.asarray(True), (x, P), after)
     for one, other in zip(learnt, after, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("inflation", [1.0, 3.0, 10.0])
+def test_a_pose_that_is_inflated_keeps_errors_that_are_considered_in_proportion(
+    navigator, inflation
+):
+    """Whatever the prior: with its errors at their prior again the covariance is still one."""
+    motion, rng = navigator.motion, np.random.default_rng(5)
+    bank = bank_at(navigator, rng)
+    x, n, states, d = bank.mean[0], bank.covariance.shape[1], motion.states, 3
+    # As correlated as they are after a while: pose, velocity and errors vary as one, nearly.
+    alike = rng.normal(size=(n, d))
+    P = 0.01**2 * (alike @ alike.T + 0.05 * np.eye(n))
+    freedom, C = PLANAR, P[:d, :d] / 2
+    corrected = PosePosterior(
+        worlds.planar(0.3, -0.2, 0.7),
+        freedom @ jnp.asarray(inflation * C) @ freedom.T,
+        jnp.zeros(d),
+        jnp.asarray(inflation),
+        jnp.zeros(()),
+        jnp.asarray(True),
+    )
+    _, after = follow_pose(
+        jnp.asarray(P), worlds.planar(0.3, -0.2, 0.7), corrected, freedom, states
+    )
+    np.testing.assert_allclose(after[:d, :d], inflation * C, rtol=1e-7, atol=1e-12)
+    posterior = jnp.zeros_like(x), after
+    _, considered = motion.considered(jnp.asarray(False), (x, jnp.asarray(P)), posterior)
+    sigma = np.sqrt(np.diagonal(considered))
+    assert np.linalg.eigvalsh(considered / np.outer(sigma, sigma)).min() > -1e-9
+    np.testing.assert_array_equal(considered[states:, states:], P[states:, states:])
 
 
 def test_nothing_is_learnt_while_the_heading_is_open_or_from_odometry(navigator):

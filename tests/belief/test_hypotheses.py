@@ -458,7 +458,7 @@ def test_the_rest_of_the_state_follows_as_a_gaussian_does(n, freedom):
     covariance = jnp.asarray(freedom @ P_expected[:d, :d] @ freedom.T)
     nis = jnp.zeros(d)
     corrected = PosePosterior(T, covariance, nis, jnp.ones(()), jnp.zeros(()), jnp.asarray(True))
-    correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, jnp.asarray(freedom))
+    correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, jnp.asarray(freedom), n)
     np.testing.assert_allclose(correction, expected, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(after, P_expected, atol=1e-6 * np.max(P_expected))
     assert np.all(np.linalg.eigvalsh(np.asarray(after)) > 0)
