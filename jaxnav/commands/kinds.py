@@ -38,6 +38,7 @@ Scenario = Literal[
     "each-camera-off",
     "uneven-wheels",
     "everything",
+    "as-told",
 ]
 StudyKind = Literal["ambiguity", "drive"]
 CornerBackend = Literal["aruco", "apriltag"]

@@ -162,7 +162,8 @@ class Rollout(eqx.Module):
         zero = jnp.zeros_like(start[0])
         corners = (len(self.navigator.rig), len(self.markers.ids), 4, 2)
         drift = jax.random.normal(jax.random.fold_in(rig_key, 1), corners, start.dtype)
-        truth = nominal(self.vehicle, scenario, start.dtype)
+        told_key = jax.random.fold_in(rig_key, 3)
+        truth = nominal(self.vehicle, scenario, told_key, start.dtype)
         if self.spread is not None:
             truth_key = jax.random.fold_in(rig_key, 2)
             truth = self.spread.draw(truth_key, truth, scenario.frame_period_s)
@@ -198,7 +199,10 @@ class Rollout(eqx.Module):
         key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, world.frame))
 
         # Late corners lie where they were a part of a frame period earlier.
-        part = scenario.corner_lag_s / scenario.frame_period_s
+        sensed, lag_s = car, jnp.asarray(scenario.corner_lag_s, dtype)
+        if scenario.as_told:
+            sensed, lag_s = world.truth.sensed(car), world.truth.sensor_errors[-1]
+        part = lag_s / scenario.frame_period_s
         earlier = scenario.displaced(world.car, stamp_s, period_s)
         seen_from = car.pose + part * (earlier.pose - car.pose)
         corners_px, visible = see(world.rig, self.markers, T_world_vehicle_from_planar(seen_from))
@@ -211,7 +215,7 @@ class Rollout(eqx.Module):
         visible = visible & ~scenario.hidden(stamp_s)
         corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
         speed_mps, steering_rad = read_odometry(
-            car, scenario.odometry, key_odometry, world.truth.odometer_scale, stamp_s
+            sensed, scenario.odometry, key_odometry, world.truth.odometer_scale, stamp_s
         )
         truth = T_world_vehicle_from_planar(car.pose)
         obs = Observation(

@@ -42,6 +42,7 @@ class Scenario:
     kidnapped_s: float = np.inf  # when the car is displaced
     kidnapped_by: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad, in the world
     extrinsics_off: tuple[float, float] = (0.0, 0.0)  # rad, m; each camera in its own direction
+    as_told: bool = False  # cameras and sensors are off by what their files tell, anew each drive
     told_tilt_sigma_rad: float = 0.0
     told_height_sigma_m: float = 0.0
     corner_lag_s: float = 0.0  # corners lie where they were this long before the stamp
@@ -79,6 +80,8 @@ class Scenario:
 
     def true_rig(self, rig: CameraRig, key: Key[Array, ""]) -> CameraRig:
         """The true rig, if the navigator believes `rig`."""
+        if self.as_told:
+            return _off_as_told(rig, key)
         turn_rad, shift_m = self.extrinsics_off
         if turn_rad == 0 and shift_m == 0:
             return rig
@@ -100,6 +103,23 @@ class Scenario:
             "heading_sigma_rad": HEADING_SIGMA_RAD,
             "T_world_vehicle_true": T_world_vehicle,
         }
+
+
+def _off_as_told(rig: CameraRig, key: Key[Array, ""]) -> CameraRig:
+    """The rig, its cameras shifted along and turned about the vehicle's axes as it allows for."""
+    if rig.extrinsics_sigma is None:
+        return rig
+    dtype = rig.cameras.focal_px.dtype
+    off = rig.extrinsics_sigma * jax.random.normal(key, (len(rig), 6), dtype)
+
+    def one(T_camera_vehicle: jaxlie.SE3, off: Array) -> Array:
+        T = T_camera_vehicle.inverse()
+        turned = jaxlie.SO3.exp(off[3:]) @ T.rotation()
+        moved = jaxlie.SE3.from_rotation_and_translation(turned, T.translation() + off[:3])
+        return moved.inverse().wxyz_xyz
+
+    wxyz_xyz = jax.vmap(one)(rig.Ts_camera_vehicle, off)
+    return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, jaxlie.SE3(wxyz_xyz))
 
 
 def _paper() -> Scenario:
@@ -187,4 +207,5 @@ def scenarios() -> dict[str, Scenario]:
         "each-camera-off": on_laps(vary(paper, extrinsics_off=off), laps=4),
         "uneven-wheels": vary(paper, odometry=uneven),
         "everything": _everything(),
+        "as-told": vary(paper, as_told=True),
     }

@@ -1,5 +1,6 @@
 """Hold the state of one drive of a rollout, and the true car that its seed drew."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -21,6 +22,16 @@ class Truth(eqx.Module):
     vehicle: Vehicle
     odometer_scale: Float[Array, ""]  # reported speed over true speed
     latency_s: Float[Array, ""]  # from the stamp of a frame until its command acts
+    sensor_errors: Float[Array, " 4"]  # see `SENSOR_ERRORS`; of scenarios that are `as_told`
+
+    def sensed(self, car: CarState) -> CarState:
+        """The car as its sensors would show it without noise."""
+        scale, gain, offset_rad, _ = self.sensor_errors
+        return dataclasses.replace(
+            car,
+            speed_mps=car.speed_mps / (1 + scale),
+            steering_rad=(car.steering_rad - offset_rad) / (1 + gain),
+        )
 
 
 @dataclass(frozen=True)
@@ -60,7 +71,12 @@ class Spread:
             ),
         )
         latency_s = jnp.clip(truth.latency_s + later_s, 0, longest_s)
-        return Truth(vehicle, truth.odometer_scale * scale, latency_s)
+        return dataclasses.replace(
+            truth,
+            vehicle=vehicle,
+            odometer_scale=truth.odometer_scale * scale,
+            latency_s=latency_s,
+        )
 
 
 class DriveState(eqx.Module):
@@ -81,10 +97,14 @@ class DriveState(eqx.Module):
     on_floor: Bool[Array, ""]
 
 
-def nominal(vehicle: Vehicle, scenario: Scenario, dtype: jnp.dtype) -> Truth:
+def nominal(vehicle: Vehicle, scenario: Scenario, key: Key[Array, ""], dtype: jnp.dtype) -> Truth:
     """The scenario's car, without any spread."""
+    errors = jnp.zeros(4, dtype)
+    if scenario.as_told and vehicle.sensor_sigma is not None:
+        errors = vehicle.sensor_sigma.astype(dtype) * jax.random.normal(key, (4,), dtype)
     return Truth(
         jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle),
         jnp.asarray(scenario.odometry.speed_scale, dtype),
         jnp.asarray(scenario.latency_s, dtype),
+        errors,
     )

@@ -5,10 +5,13 @@ import itertools
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 
+from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.navigator import Navigator
 from jaxnav.simulation.corners import see
 from jaxnav.simulation.plant import OdometryNoise
 from jaxnav.simulation.rollout import Rollout
@@ -146,6 +149,59 @@ def test_the_car_that_run_drives_in_simulation_has_the_same_odometer():
         assert speed_mps == pytest.approx(scale * world.state(at_ns)[3])
         assert steering_rad == pytest.approx(0.12)
         assert world.state(at_ns)[3] > 0.3
+
+
+class ByHand(Spy):
+    """A rig whose cameras are somewhere near where it says."""
+
+    rig = worlds.qcar_rig_by_hand()
+
+
+def test_cameras_and_sensors_are_off_as_their_files_tell():
+    """Shifted along and turned about the vehicle's axes; the true car is (1 + k) times the read."""
+    car, rig = worlds.qcar_by_hand(), ByHand.rig
+    rollout = Rollout(ByHand(), car, MARKERS, scenarios()["as-told"], 0.0)
+    drawn = rollout.start(keys(jnp.arange(400)))
+    errors = np.asarray(drawn.truth.sensor_errors / car.sensor_sigma)
+
+    def off(wxyz_xyz):
+        (T, T_told) = (jaxlie.SE3(x).inverse() for x in (wxyz_xyz, rig.Ts_camera_vehicle.wxyz_xyz))
+        turn = jax.vmap(lambda R, told: (R @ told.inverse()).log())(T.rotation(), T_told.rotation())
+        return jnp.concatenate([T.translation() - T_told.translation(), turn], axis=1)
+
+    turned = (
+        jax.jit(jax.vmap(off))(drawn.rig.Ts_camera_vehicle.wxyz_xyz) / rig.extrinsics_sigma[None]
+    )
+    for drawn_sigmas in (errors, np.asarray(turned).reshape(400, -1)):
+        np.testing.assert_allclose(np.std(drawn_sigmas, axis=0), 1, atol=0.15)
+        np.testing.assert_allclose(np.mean(drawn_sigmas, axis=0), 0, atol=0.2)
+        count = drawn_sigmas.shape[1]
+        assert np.abs(np.corrcoef(drawn_sigmas.T) - np.eye(count)).max() < 0.25
+    one = jax.tree.map(lambda leaf: leaf[7], drawn)
+    moving = dataclasses.replace(one.car, speed_mps=jnp.asarray(0.4), steering_rad=jnp.asarray(0.2))
+    scale, gain, offset_rad, _ = one.truth.sensor_errors
+    read = one.truth.sensed(moving)
+    assert float((1 + scale) * read.speed_mps) == pytest.approx(0.4)
+    assert float((1 + gain) * read.steering_rad + offset_rad) == pytest.approx(0.2)
+    exact = Rollout(Spy(), CAR, MARKERS, scenarios()["as-told"], 0.0).start(keys(jnp.arange(2)))
+    np.testing.assert_array_equal(exact.truth.sensor_errors, 0)
+    for wxyz_xyz in exact.rig.Ts_camera_vehicle.wxyz_xyz:
+        np.testing.assert_array_equal(wxyz_xyz, RIG.Ts_camera_vehicle.wxyz_xyz)
+
+
+def test_what_the_default_claims_is_true_where_errors_are_as_told():
+    """Its covariance is that of its errors, within a third; half or twice of it would show."""
+    scenario = dataclasses.replace(scenarios()["as-told"], duration_s=2.0)
+    car = worlds.qcar_by_hand()
+    motion = BicycleKalman(car, tilt_sigma_rad=0.0, height_sigma_m=0.0)
+    navigator = Navigator(ByHand.rig, MARKERS, car, scenario.waypoints_m, motion=motion)
+    trace = Rollout(navigator, car, MARKERS, scenario, 1.0).run(keys(jnp.arange(32)))
+    counted = np.asarray(trace.active & trace.decided)
+    nees = np.where(counted, trace.nees, 0).sum(axis=1) / counted.sum(axis=1)
+    assert np.all(np.isfinite(nees))
+    assert 2.0 < np.mean(nees) < 4.6
+    off_rad = np.abs(np.asarray(trace.pose - trace.true_pose)[..., 2])
+    assert np.all(np.minimum(off_rad, 2 * np.pi - off_rad)[counted] < np.deg2rad(20))
 
 
 def test_everything_is_half_of_each():

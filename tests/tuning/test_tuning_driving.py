@@ -242,7 +242,7 @@ def frame_costs(
     route = scenario(waypoints_m=((2.0, 0.0), (2.0, 2.0)))
     zero = jnp.zeros(())
     common = {
-        "truth": nominal(CAR, route, jnp.zeros(()).dtype),
+        "truth": nominal(CAR, route, jax.random.key(0), jnp.zeros(()).dtype),
         "start_pose": jnp.zeros(3),
         "passed": 2,
         "on_floor": jnp.asarray(True),
