@@ -22,9 +22,8 @@ def nearer_to_another(
     """
     base = T_world_vehicle.wxyz_xyz
     other = jax.vmap(lambda T: T.inverse().wxyz_xyz)(candidates.T_vehicle_world)
-    turns = jax.vmap(jax.vmap(shift_and_turn, (None, 0)), (0, None))(base, other)[
-        ..., 3:
-    ]  # (K, N, 3)
+    between = jax.vmap(jax.vmap(shift_and_turn, (None, 0)), (0, None))(base, other)
+    turns = between[..., 3:]  # (K, N, 3)
     own = turns[:, selected]
     across = turns - own[:, None]
     length = safe_norm(across)
