@@ -162,17 +162,16 @@ def test_cameras_and_sensors_are_off_as_their_files_tell():
     car, rig = worlds.qcar_by_hand(), ByHand.rig
     rollout = Rollout(ByHand(), car, MARKERS, scenarios()["as-told"], 0.0)
     drawn = rollout.start(keys(jnp.arange(400)))
-    errors = np.asarray(drawn.truth.sensor_errors / car.sensor_sigma)
+    errors = np.asarray(drawn.truth.sensor_errors) / np.asarray(car.sensor_sigma)
 
     def off(wxyz_xyz):
         (T, T_told) = (jaxlie.SE3(x).inverse() for x in (wxyz_xyz, rig.Ts_camera_vehicle.wxyz_xyz))
         turn = jax.vmap(lambda R, told: (R @ told.inverse()).log())(T.rotation(), T_told.rotation())
         return jnp.concatenate([T.translation() - T_told.translation(), turn], axis=1)
 
-    turned = (
-        jax.jit(jax.vmap(off))(drawn.rig.Ts_camera_vehicle.wxyz_xyz) / rig.extrinsics_sigma[None]
-    )
-    for drawn_sigmas in (errors, np.asarray(turned).reshape(400, -1)):
+    turned = np.asarray(jax.jit(jax.vmap(off))(drawn.rig.Ts_camera_vehicle.wxyz_xyz))
+    turned = turned / np.asarray(rig.extrinsics_sigma)
+    for drawn_sigmas in (errors, turned.reshape(400, -1)):
         np.testing.assert_allclose(np.std(drawn_sigmas, axis=0), 1, atol=0.15)
         np.testing.assert_allclose(np.mean(drawn_sigmas, axis=0), 0, atol=0.2)
         count = drawn_sigmas.shape[1]
