@@ -199,10 +199,7 @@ class Rollout(eqx.Module):
         key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, world.frame))
 
         # Late corners lie where they were a part of a frame period earlier.
-        sensed, lag_s = car, jnp.asarray(scenario.corner_lag_s, dtype)
-        if scenario.as_told:
-            sensed, lag_s = world.truth.sensed(car), world.truth.sensor_errors[-1]
-        part = lag_s / scenario.frame_period_s
+        part = world.truth.sensor_errors[-1] / scenario.frame_period_s
         earlier = scenario.displaced(world.car, stamp_s, period_s)
         seen_from = car.pose + part * (earlier.pose - car.pose)
         corners_px, visible = see(world.rig, self.markers, T_world_vehicle_from_planar(seen_from))
@@ -215,7 +212,11 @@ class Rollout(eqx.Module):
         visible = visible & ~scenario.hidden(stamp_s)
         corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
         speed_mps, steering_rad = read_odometry(
-            sensed, scenario.odometry, key_odometry, world.truth.odometer_scale, stamp_s
+            world.truth.sensed(car),
+            scenario.odometry,
+            key_odometry,
+            world.truth.odometer_scale,
+            stamp_s,
         )
         truth = T_world_vehicle_from_planar(car.pose)
         obs = Observation(

@@ -22,7 +22,7 @@ class Truth(eqx.Module):
     vehicle: Vehicle
     odometer_scale: Float[Array, ""]  # reported speed over true speed
     latency_s: Float[Array, ""]  # from the stamp of a frame until its command acts
-    sensor_errors: Float[Array, " 4"]  # see `SENSOR_ERRORS`; of scenarios that are `as_told`
+    sensor_errors: Float[Array, " 4"]  # see `SENSOR_ERRORS`
 
     def sensed(self, car: CarState) -> CarState:
         """The car as its sensors would show it without noise."""
@@ -99,9 +99,9 @@ class DriveState(eqx.Module):
 
 def nominal(vehicle: Vehicle, scenario: Scenario, key: Key[Array, ""], dtype: jnp.dtype) -> Truth:
     """The scenario's car, without any spread."""
-    errors = jnp.zeros(4, dtype)
+    errors = jnp.zeros(4, dtype).at[-1].set(scenario.corner_lag_s)
     if scenario.as_told and vehicle.sensor_sigma is not None:
-        errors = vehicle.sensor_sigma.astype(dtype) * jax.random.normal(key, (4,), dtype)
+        errors = errors + vehicle.sensor_sigma.astype(dtype) * jax.random.normal(key, (4,), dtype)
     return Truth(
         jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle),
         jnp.asarray(scenario.odometry.speed_scale, dtype),
