@@ -15,13 +15,13 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief.ambiguity import Selector, Ungated
-from jaxnav.belief.bank import Bank, renumber_if_empty, restart_broken
+from jaxnav.belief.bank import Bank, heaviest, renumber_if_empty, restart_broken
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief, Estimate, Evidence
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.motion import Motion
-from jaxnav.belief.repeats import RepeatedErrors, Repeats
+from jaxnav.belief.repeats import RepeatedErrors
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
@@ -65,7 +65,7 @@ class Navigator(eqx.Module):
     controller: Controller | None
     corner_sigma_px: Float[Array, ""]
     model_sigma_px: Float[Array, ""]
-    repeated_errors: RepeatedErrors | None
+    repeated_errors: RepeatedErrors | None  # None with a single hypothesis, which doubts nothing
     max_sightings: int | None = eqx.field(static=True)
     max_candidates: int = eqx.field(static=True)
     max_lm_steps: int = eqx.field(static=True)
@@ -114,6 +114,8 @@ class Navigator(eqx.Module):
         self.corner_sigma_px = jnp.asarray(corner_sigma_px, float)
         self.model_sigma_px = jnp.asarray(model_sigma_px, float)
         self.repeated_errors = repeated_errors
+        if repeated_errors is None and self.selector.hypotheses > 1:
+            self.repeated_errors = RepeatedErrors()
         self.max_sightings = max_sightings
         self.max_candidates = max_candidates
         self.max_lm_steps = max_lm_steps
@@ -134,7 +136,8 @@ class Navigator(eqx.Module):
 
     def believe(self, bank: Bank) -> Belief:
         """The belief in these hypotheses before the first observation."""
-        repeats = None if self.repeated_errors is None else Repeats.none(self.rig, self.markers)
+        repeated = self.repeated_errors
+        repeats = None if repeated is None else repeated.begin(self.rig, self.markers)
         return Belief.begin(bank, repeats)
 
     def step(self, state: State, obs: Observation) -> tuple[State, Output]:
@@ -172,17 +175,21 @@ class Navigator(eqx.Module):
 
     def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
-        motion, snapshot, repeats = self.motion, seen.snapshot, belief.repeats
-        if self.repeated_errors is not None and repeats is not None:
-            snapshot, repeats = self.repeated_errors.weighed(repeats, snapshot)
+        motion, snapshot = self.motion, seen.snapshot
+        repeated, repeats = self.repeated_errors, belief.repeats
+        if repeated is not None and repeats is not None:
+            snapshot = repeated.weighed(repeats, snapshot)
         prior = renumber_if_empty(belief.bank)
         predicted = motion.poses(prior)
         selection = self.selector(predicted, seen.candidates, snapshot)
         updated = motion.update(prior, selection, snapshot.obs)
         updated = updated._replace(bank=self._sound(updated.bank))
         belief = belief.after(updated.bank, selection.decided, selection.flip_probability)
-        evidence = Evidence.of(seen, prior, selection, updated, predicted.gate_nis)
-        return replace(belief, repeats=repeats), evidence
+        if repeated is not None and repeats is not None:
+            best = motion.T_world_vehicle(belief.bank.mean[heaviest(belief.bank)])
+            repeats = repeated.after(repeats, seen.snapshot, best, belief.decided)
+            belief = replace(belief, repeats=repeats)
+        return belief, Evidence.of(seen, prior, selection, updated, predicted.gate_nis)
 
     def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
         """The predicted belief as the next one, where no marker is in view."""

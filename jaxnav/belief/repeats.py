@@ -1,4 +1,4 @@
-"""Corner errors that repeat from frame to frame, and how little a repeated sighting tells.
+"""Corner errors that repeat from frame to frame: how many do, and how little a repeat tells.
 
 A lens residual, a marker that is not flat and blur are the same in the next frame, as long as the
 marker's image has hardly moved. Of the variance sigma^2 of a corner a share s repeats. After n
@@ -13,6 +13,10 @@ instead of sigma^2 / (n + 1), so the next sighting counts as one of the variance
 
 The first counts in full, and many of a vehicle that stands add up to 1 / (s sigma^2) at most.
 
+The share is learnt. Two of a sighting's eight numbers fit no pose of its marker, wherever camera
+and marker are: of white noise their product with the sum S of those of n sightings before has the
+mean 0 and the variance 2 n, and where a share repeats the mean 2 s n.
+
 Source: Bayley, Hammersley (1946), "The 'effective' number of independent observations in an
 autocorrelated time series".
 """
@@ -21,56 +25,137 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import jaxlie
+from jaxtyping import Array, Bool, Float
 
+from jaxnav.models.geometry import safe_norm, safe_sqrt, transform_points
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
-from jaxnav.pose.observation import Observation, Snapshot
+from jaxnav.pose.linearised import answers, reprojection_rows
+from jaxnav.pose.observation import Sightings, Snapshot
+
+_UNEXPLAINED = 2  # of a sighting's eight numbers: a pose has six
+_CERTAIN_SIGMAS = 2.0  # a share is believed as far as it exceeds so many sigmas of white noise
+_MEMORY_FRAMES = 1000.0  # after so many, 1 / e of what was learnt of the share is left
+_MOST_SIGMAS = 6.0  # that one product counts for: a spoilt frame is no proof
 
 
 class Repeats(eqx.Module):
-    """The last sighting of each marker by each camera, and how many before it had its errors."""
+    """The last sighting of each marker by each camera, and what of its errors was seen before."""
 
     corners_px: Float[Array, "C M 4 2"]
-    count: Float[Array, "C M"]
-
-    @staticmethod
-    def none(rig: CameraRig, markers: MarkerMap) -> "Repeats":
-        """Nothing was seen yet."""
-        lanes, dtype = (len(rig), len(markers.ids)), rig.cameras.focal_px.dtype
-        return Repeats(jnp.zeros((*lanes, 4, 2), dtype), jnp.zeros(lanes, dtype))
+    count: Float[Array, "C M"]  # sightings that had the errors of the last one, itself among them
+    residuals: Float[Array, "C M 4 2"]  # S: sum of those that fit no pose, in sigmas
+    squares: Float[Array, "C M"]  # sum of squared weights in S
+    alike: Float[Array, ""]  # sum of the products
+    white: Float[Array, ""]  # variance of that sum, were all errors white
+    share: Float[Array, ""]  # of a corner's variance that repeats
 
 
 class RepeatedErrors(eqx.Module):
-    """The share of a corner's variance that repeats, and how far an image moves until it is new.
+    """How much of a corner's variance may repeat, and how far an image moves until it is new.
 
-    A navigator has none by default: with a share of 0.1 recordings are judged more honestly, but a
-    picture that freezes leads a car farther astray before it is noticed.
+    The share starts at `least_share` and grows with what residuals show, up to `most_share`. Both
+    alike fix it.
     """
 
-    share: float = 0.1
-    renewal_px: float = 40.0  # by which corners have moved when 1 / e of their errors is the same
+    least_share: Float[Array, ""] | float = 0.0
+    most_share: Float[Array, ""] | float = 0.1
+    # By which corners have moved when 1 / e of their errors is the same.
+    renewal_px: Float[Array, ""] | float = 40.0
 
-    def weighed(self, repeats: Repeats, snapshot: Snapshot) -> tuple[Snapshot, Repeats]:
-        """The snapshot with the sigma of repeated sightings raised, and the sightings after it."""
-        obs, seen = snapshot.obs, snapshot.seen
-        still = self._still(repeats, obs)
-        lane = seen.camera_index, seen.marker_index
-        visible = jnp.zeros_like(obs.visible).at[lane].max(seen.visible)
-        corners_px = jnp.asarray(obs.corners_px, still.dtype)
-        after = Repeats(
-            jnp.where(visible[..., None, None], corners_px, repeats.corners_px),
-            jnp.where(visible, still + 1, repeats.count),
-        )
-        n, s = still[lane][:, None], self.share
+    def begin(self, rig: CameraRig, markers: MarkerMap) -> Repeats:
+        """Nothing was seen yet."""
+        lanes, dtype = (len(rig), len(markers.ids)), rig.cameras.focal_px.dtype
+        corners, count, zero = (jnp.zeros(n, dtype) for n in ((*lanes, 4, 2), lanes, ()))
+        return Repeats(corners, count, corners, count, zero, zero, zero + self.least_share)
+
+    def weighed(self, repeats: Repeats, snapshot: Snapshot) -> Snapshot:
+        """The snapshot with the sigma of repeated sightings raised."""
+        seen, s = snapshot.seen, repeats.share
+        n = (self._same(repeats, seen) * repeats.count[_lanes(seen)])[:, None]
         scale = jnp.sqrt((1 - s + (n + 1) * s) * (1 - s + n * s) / (1 - s))
-        seen = dataclasses.replace(seen, sigma_px=seen.sigma_px * scale)
-        return dataclasses.replace(snapshot, seen=seen), after
+        sigma_px = seen.sigma_px * scale.astype(seen.sigma_px.dtype)
+        return dataclasses.replace(snapshot, seen=dataclasses.replace(seen, sigma_px=sigma_px))
 
-    def _still(self, repeats: Repeats, obs: Observation) -> Float[Array, "C M"]:
-        """How many sightings had the errors of this one."""
-        moved_px2 = jnp.sum((obs.corners_px - repeats.corners_px) ** 2, axis=(2, 3)) / 4
-        moved_px2 = jnp.where(obs.visible, moved_px2, 0)
-        far = moved_px2 > 0
-        moved_px = jnp.where(far, jnp.sqrt(jnp.where(far, moved_px2, 1)), 0)
-        return (repeats.count * jnp.exp(-moved_px / self.renewal_px)).astype(repeats.count.dtype)
+    def after(
+        self,
+        repeats: Repeats,
+        snapshot: Snapshot,
+        T_world_vehicle: jaxlie.SE3,
+        decided: Bool[Array, ""],
+    ) -> Repeats:
+        """What is known after a snapshot.
+
+        Args:
+            T_world_vehicle: the estimate. Not the best pose of the snapshot alone: near the frontal
+                view that bends towards the errors, in every frame alike.
+            decided: whether it is of the right branch; else the share learns nothing.
+        """
+        seen, dtype = snapshot.seen, repeats.count.dtype
+        at = _lanes(seen)
+        judged = (seen.visible & decided)[:, None, None]
+        r = jnp.where(judged, unexplained(T_world_vehicle.inverse(), snapshot), 0).astype(dtype)
+
+        same = self._same(repeats, seen)
+        S = same[:, None, None] * repeats.residuals[at]
+        squares = same**2 * repeats.squares[at]
+        variance = jnp.where(judged[:, 0, 0], _UNEXPLAINED * squares, 0)
+        most = _MOST_SIGMAS * safe_sqrt(variance)
+        alike = jnp.sum(jnp.clip(jnp.sum(r * S, axis=(1, 2)), -most, most))
+        kept = 1 - jnp.any(variance > 0) / _MEMORY_FRAMES
+        alike = kept * repeats.alike + alike
+        white = kept * repeats.white + jnp.sum(variance)
+        surely = alike - _CERTAIN_SIGMAS * safe_sqrt(white)
+        share = jnp.where(white > 0, surely, 0) / jnp.where(white > 0, white, 1)
+
+        def renewed(before: Array, now: Array) -> Array:
+            """Hidden sightings keep what was."""
+            shown = seen.visible.reshape(-1, *(1,) * (now.ndim - 1))
+            return before.at[at].set(jnp.where(shown, now, before[at]).astype(dtype))
+
+        return Repeats(
+            renewed(repeats.corners_px, seen.corners_px),
+            renewed(repeats.count, same * repeats.count[at] + 1),
+            renewed(repeats.residuals, S + r),
+            renewed(repeats.squares, squares + judged[:, 0, 0]),
+            alike.astype(dtype),
+            white.astype(dtype),
+            jnp.clip(share, self.least_share, self.most_share).astype(dtype),
+        )
+
+    def _same(self, repeats: Repeats, seen: Sightings) -> Float[Array, " D"]:
+        """The part of the last repeated errors that these sightings have."""
+        moved = (seen.corners_px - repeats.corners_px[_lanes(seen)]).reshape(-1, 8) / 2
+        return jnp.exp(-safe_norm(moved) / self.renewal_px).astype(repeats.count.dtype)
+
+
+def unexplained(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "D 4 2"]:
+    """Residuals in sigmas that no pose of the marker before its camera explains, to first order.
+
+    Those at the given pose, without their part along the six derivatives by the marker's pose
+    (Gram-Schmidt; about its centre, where the derivatives are most different).
+    """
+    seen, count = snapshot.seen, snapshot.seen.visible.shape[0]
+    corners = transform_points(T_vehicle_world, snapshot.markers.corners_world_m[seen.marker_index])
+    arms = corners - jnp.mean(corners, axis=1, keepdims=True)
+    points, about = (x.reshape(-1, 3).T[..., None] for x in (corners, arms))
+    residual, slope = reprojection_rows(snapshot.rig, seen)(points)
+
+    def by_sighting(rows: Array) -> Float[Array, "n D 8"]:
+        return rows.reshape(-1, 2, count, 4).transpose(0, 2, 3, 1).reshape(-1, count, 8)
+
+    rest, columns = by_sighting(residual)[0], list(by_sighting(answers(slope, about)))
+    while columns:
+        length = safe_norm(columns[0])[:, None]
+        unit = columns[0] / jnp.where(length > 0, length, 1)
+
+        def across(vector: Array, unit: Array = unit) -> Array:
+            return vector - unit * jnp.sum(unit * vector, axis=1, keepdims=True)
+
+        rest, columns = across(rest), [across(column) for column in columns[1:]]
+    return rest.reshape(count, 4, 2)
+
+
+def _lanes(seen: Sightings) -> tuple[Array, Array]:
+    return seen.camera_index, seen.marker_index
