@@ -14,6 +14,7 @@ from jaxnav.recording.learnt import Learnt, errors_of
 
 _PERIOD_NS = 2_000_000_000
 _WIDTH = 100  # characters, over what the status line leaves
+_TELLS_SHARE = 0.05  # of the corners' variance
 _ADOPT = "`jaxnav calibrate adopt` writes what a recorded drive has learnt into new files"
 
 
@@ -31,6 +32,7 @@ class LearntWatch:
         self._tells, self._last_ns = tells, 0
         self._told: set[tuple[str, str]] = set()
         self._found: dict[tuple[str, str], str] = {}
+        self._of_files = False  # whether any of them is written in files
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
@@ -39,6 +41,12 @@ class LearntWatch:
         self._last_ns = given.now_ns
         learnt = Learnt.of(*errors_of(outcome.belief.bank), self._rig, self._vehicle)
         self._found = {} if learnt is None else learnt.found()
+        self._of_files, repeats = bool(self._found), outcome.belief.repeats
+        if repeats is not None and repeats.share >= _TELLS_SHARE:
+            self._found["corners", "repeat"] = (
+                f"{repeats.share:.0%} of the corners' variance is the same from frame to frame: "
+                "the lens model, or a marker that is not flat"
+            )
         for subject, sentence in self._found.items():
             if subject not in self._told:
                 self._told.add(subject)
@@ -56,4 +64,5 @@ class LearntWatch:
         """See `Onlooker`."""
         if not self._found:
             return None
-        return "\n".join([*(f"learnt: {visible(line)}" for line in self._found.values()), _ADOPT])
+        lines = [f"learnt: {visible(line)}" for line in self._found.values()]
+        return "\n".join([*lines, _ADOPT] if self._of_files else lines)

@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import numpy as np
 
 from jaxnav.commands.drive.learnt_watch import LearntWatch
 from tests.commands.calibrate.test_adopt import learnt_outcome, setup_of
@@ -34,6 +35,21 @@ def test_it_says_nothing_before_the_pose_is_known_or_where_nothing_is_wrong(caps
     watch.on_outcome(at(6.0), learnt_outcome(9, learnt=False))
     assert watch.closing_note is None
     assert capsys.readouterr().err == ""
+
+
+def test_it_tells_of_corner_errors_that_repeat(capsys):
+    """Which no file holds, so that there is nothing to adopt."""
+    watch = LearntWatch(setup_of(), tells=True)
+    for seconds, share in ((0.0, 0.04), (3.0, 0.1), (6.0, 0.08)):
+        outcome = learnt_outcome(0)
+        belief = eqx.tree_at(lambda b: b.repeats.share, outcome.belief, np.float32(share))
+        watch.on_outcome(at(seconds), dataclasses.replace(outcome, belief=belief))
+    told = capsys.readouterr().err
+    assert told.count("variance is the same") == 1
+    assert "10% of the corners' variance is the same from frame to frame" in told
+    note = str(watch.closing_note)
+    assert "8% of the corners' variance" in note
+    assert "adopt" not in note
 
 
 def test_without_a_terminal_only_the_end_tells(capsys):
