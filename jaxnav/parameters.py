@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Whole = TypeVar("Whole", bound=eqx.Module)  # a `Navigator`
@@ -47,6 +48,11 @@ class Tunable:
     rows: bool = False
     most: tuple[float, ...] = ()
     guard: bool = False
+
+    def largest(self, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+        """The largest that the entries of a number of this shape may be; inf without a bound."""
+        most = np.reshape(self.most, shape[-1:]) if self.most else np.inf
+        return np.broadcast_to(most, shape)
 
 
 TUNABLES: dict[str, Tunable] = {
@@ -93,6 +99,12 @@ TUNABLES: dict[str, Tunable] = {
     "selector.floor_rad": Tunable("R: what successive frames get wrong alike", "rad", 1e-3),
     "corner_sigma_px": Tunable("R: corners that come without a sigma of their own", "px", 1.0),
     "model_sigma_px": Tunable("R: added to the sigma that corners come with", "px", 0.15),
+    "repeated_errors.least_share": Tunable(
+        "R: share of the corners' variance that repeats, before any corner has told",
+        "1",
+        0.05,
+        most=(0.9,),
+    ),
     "controller.proportional_per_m": Tunable("p1: throttle per distance", "1/m", 0.03),
     "controller.integral_per_ms": Tunable("p2: throttle per distance and time", "1/(m s)", 0.005),
     "controller.integral_limit_ms": Tunable("bound of the integral", "m s", 5.0),

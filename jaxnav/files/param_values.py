@@ -38,7 +38,7 @@ def param_array(value: Any, where: str, tunable: Tunable) -> Float[np.ndarray, "
             raise BadInput(where, f"must be > 0 and finite, or .inf for none, got {value}")
         return np.array(value)
     if not isinstance(value, list):
-        return np.array(_positive(value, where))
+        return np.array(_at_most(_positive(value, where), where, *tunable.most[:1]))
     if not 1 <= len(value) <= _MOST_ENTRIES:
         bound = f"1 to {_MOST_ENTRIES}"
         raise BadInput(where, f"must have {bound} entries, got {len(value)}")
@@ -73,9 +73,14 @@ def _row(value: Any, where: str, tunable: Tunable) -> list[float]:
 def _entries(value: list[Any], where: str, tunable: Tunable) -> list[float]:
     numbers = [_positive(entry, f"{where}[{i}]") for i, entry in enumerate(value)]
     for i, (number, most) in enumerate(zip(numbers, tunable.most, strict=False)):
-        if number > most:
-            raise BadInput(f"{where}[{i}]", f"must be at most {most:g}, got {number:g}")
+        _at_most(number, f"{where}[{i}]", most)
     return numbers
+
+
+def _at_most(number: float, where: str, most: float = math.inf) -> float:
+    if number > most:
+        raise BadInput(where, f"must be at most {most:g}, got {number:g}")
+    return number
 
 
 def _plain(value: Any) -> Any:

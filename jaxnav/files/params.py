@@ -154,8 +154,9 @@ def apply_params(navigator: Navigator, params: Params) -> Navigator:
     """The navigator with these parameters; all others stay as they are.
 
     One file serves the car, a simulation of it and every selector, so these are passed over:
-    `controller.*` where nothing is driven, `selector.*` that this selector does not have, the gate
-    where the navigator has none, and how far off cameras and sensors may be where they are exact.
+    `controller.*` where nothing is driven, `selector.*` and `repeated_errors.*` that this selector
+    does not have, the gate where the navigator has none, and how far off cameras and sensors may be
+    where they are exact.
     Another `motion.*` that the motion model does not have is of another body, and an error.
 
     Raises:
@@ -187,7 +188,7 @@ def _is_passed_over(name: str, navigator: Navigator) -> bool:
     if part == "controller":
         return navigator.controller is None
     is_prior = part == "rig" or (part == "motion" and hasattr(navigator.motion, "vehicle"))
-    return part == "selector" or (is_prior and bool(TUNABLES[name].most))
+    return part in ("selector", "repeated_errors") or (is_prior and bool(TUNABLES[name].most))
 
 
 def _counted(shape: tuple[int, ...]) -> str:

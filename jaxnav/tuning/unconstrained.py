@@ -100,7 +100,7 @@ def _free(tunable: Tunable, value: Array, full: bool) -> Array:
 def _bound(tunable: Tunable, free: Array, full: bool) -> Array:
     if tunable.matrix is None:
         value = tunable.typical * jax.nn.softplus(jnp.clip(free, -_FARTHEST, _MOST)) / np.log(2)
-        return jnp.minimum(value, np.broadcast_to(tunable.most or np.inf, value.shape))
+        return jnp.minimum(value, tunable.largest(value.shape))
     if not full:
         return tunable.typical * _exp(free)
     diagonal = _exp(jnp.diagonal(free))

@@ -102,9 +102,12 @@ def test_a_navigator_keeps_its_precision(precision, tmp_path):
     rig, car = worlds.qcar_rig_by_hand(), worlds.qcar_by_hand()
     navigator = Navigator(rig, MARKERS, car, worlds.WAYPOINTS_M)
     known = parameters_of(navigator)
-    finite = {name: value for name, value in known.items() if np.all(np.isfinite(value))}
-    assert len(finite) == len(known) - 2  # lookahead_m and slows_at_rad are infinite
-    write_params(tmp_path / "p.yaml", finite)
+    bounded = {
+        name: value for name, value in known.items() if np.all(np.isfinite(value) & (value > 0))
+    }
+    # lookahead_m and slows_at_rad are infinite, repeated_errors.least_share is 0
+    assert len(bounded) == len(known) - 3
+    write_params(tmp_path / "p.yaml", bounded)
     changed = parameters_of(apply_params(navigator, load_params(tmp_path / "p.yaml")))
     assert bits(changed) == bits(known)
     assert {value.dtype for value in changed.values()} == {precision}
@@ -281,6 +284,10 @@ GATE = "parameters.motion.gate_nis"
         (
             "{motion.vehicle.sensor_sigma: [0.03, 0.03, 0.5, 0.02]}",
             "parameters.motion.vehicle.sensor_sigma[2]: must be at most 0.35, got 0.5",
+        ),
+        (
+            "{repeated_errors.least_share: 1}",
+            "parameters.repeated_errors.least_share: must be at most 0.9, got 1",
         ),
     ],
 )

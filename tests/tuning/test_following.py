@@ -47,6 +47,7 @@ SPACE = Space.of(
             "motion.acceleration_density", "motion.odometry_sigma", "motion.tilt_sigma_rad",
             "motion.height_sigma_m", "motion.vehicle.sensor_sigma", "rig.extrinsics_sigma",
             "selector.floor_m", "selector.floor_rad", "corner_sigma_px",
+            "repeated_errors.least_share",
         ],
         True,
     ),

