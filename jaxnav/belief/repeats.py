@@ -26,6 +26,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.models.geometry import safe_norm, safe_sqrt, transform_points
@@ -43,20 +44,19 @@ _MOST_SIGMAS = 6.0  # that one product counts for: a spoilt frame is no proof
 class Repeats(eqx.Module):
     """The last sighting of each marker by each camera, and what of its errors was seen before."""
 
-    corners_px: Float[Array, "C M 4 2"]
+    diagonal_px: Float[Array, "C M 2 2"]  # two opposite corners, which say how all have moved
     count: Float[Array, "C M"]  # sightings that had the errors of the last one, itself among them
-    residuals: Float[Array, "C M 4 2"]  # S: sum of those that fit no pose, in sigmas
+    unexplained: Float[Array, "C M 2"]  # S: sum of what fits no pose, in sigmas
     squares: Float[Array, "C M"]  # sum of squared weights in S
-    alike: Float[Array, ""]  # sum of the products
-    white: Float[Array, ""]  # variance of that sum, were all errors white
-    share: Float[Array, ""]  # of a corner's variance that repeats
+    share: Float[Array, ""]  # of a corner's variance that surely repeats; none: 0 or less
+    white: Float[Array, ""]  # variance of the sum of all products, were all errors white
 
 
 class RepeatedErrors(eqx.Module):
     """How much of a corner's variance may repeat, and how far an image moves until it is new.
 
-    The share starts at `least_share` and grows with what residuals show, up to `most_share`. Both
-    alike fix it.
+    The share is `least_share` at first, and grows with what residuals show to `most_share`. As
+    large a least one fixes it.
     """
 
     least_share: Float[Array, ""] | float = 0.0
@@ -67,12 +67,13 @@ class RepeatedErrors(eqx.Module):
     def begin(self, rig: CameraRig, markers: MarkerMap) -> Repeats:
         """Nothing was seen yet."""
         lanes, dtype = (len(rig), len(markers.ids)), rig.cameras.focal_px.dtype
-        corners, count, zero = (jnp.zeros(n, dtype) for n in ((*lanes, 4, 2), lanes, ()))
-        return Repeats(corners, count, corners, count, zero, zero, zero + self.least_share)
+        shapes = ((*lanes, 2, 2), lanes, (*lanes, 2), lanes, (), ())
+        return Repeats(*(jnp.zeros(shape, dtype) for shape in shapes))
 
     def weighed(self, repeats: Repeats, snapshot: Snapshot) -> Snapshot:
         """The snapshot with the sigma of repeated sightings raised."""
-        seen, s = snapshot.seen, repeats.share
+        seen = snapshot.seen
+        s = jnp.maximum(jnp.minimum(repeats.share, self.most_share), self.least_share)
         n = (self._same(repeats, seen) * repeats.count[_lanes(seen)])[:, None]
         scale = jnp.sqrt((1 - s + (n + 1) * s) * (1 - s + n * s) / (1 - s))
         sigma_px = seen.sigma_px * scale.astype(seen.sigma_px.dtype)
@@ -94,19 +95,20 @@ class RepeatedErrors(eqx.Module):
         """
         seen, dtype = snapshot.seen, repeats.count.dtype
         at = _lanes(seen)
-        judged = (seen.visible & decided)[:, None, None]
-        r = jnp.where(judged, unexplained(T_world_vehicle.inverse(), snapshot), 0).astype(dtype)
+        judged = seen.visible & decided
+        r = unexplained(T_world_vehicle.inverse(), snapshot).astype(dtype)
+        r = jnp.where(judged[:, None], r, 0)
 
         same = self._same(repeats, seen)
-        S = same[:, None, None] * repeats.residuals[at]
+        S = same[:, None] * repeats.unexplained[at]
         squares = same**2 * repeats.squares[at]
-        variance = jnp.where(judged[:, 0, 0], _UNEXPLAINED * squares, 0)
+        variance = jnp.where(judged, _UNEXPLAINED * squares, 0)
         most = _MOST_SIGMAS * safe_sqrt(variance)
-        alike = jnp.sum(jnp.clip(jnp.sum(r * S, axis=(1, 2)), -most, most))
+        alike = jnp.sum(jnp.clip(jnp.sum(r * S, axis=1), -most, most))
+        before = repeats.share * repeats.white + _CERTAIN_SIGMAS * safe_sqrt(repeats.white)
         kept = 1 - jnp.any(variance > 0) / _MEMORY_FRAMES
-        alike = kept * repeats.alike + alike
         white = kept * repeats.white + jnp.sum(variance)
-        surely = alike - _CERTAIN_SIGMAS * safe_sqrt(white)
+        surely = kept * before + alike - _CERTAIN_SIGMAS * safe_sqrt(white)
         share = jnp.where(white > 0, surely, 0) / jnp.where(white > 0, white, 1)
 
         def renewed(before: Array, now: Array) -> Array:
@@ -115,29 +117,31 @@ class RepeatedErrors(eqx.Module):
             return before.at[at].set(jnp.where(shown, now, before[at]).astype(dtype))
 
         return Repeats(
-            renewed(repeats.corners_px, seen.corners_px),
+            renewed(repeats.diagonal_px, seen.corners_px[:, ::2]),
             renewed(repeats.count, same * repeats.count[at] + 1),
-            renewed(repeats.residuals, S + r),
-            renewed(repeats.squares, squares + judged[:, 0, 0]),
-            alike.astype(dtype),
+            renewed(repeats.unexplained, S + r),
+            renewed(repeats.squares, squares + judged),
+            share.astype(dtype),
             white.astype(dtype),
-            jnp.clip(share, self.least_share, self.most_share).astype(dtype),
         )
 
     def _same(self, repeats: Repeats, seen: Sightings) -> Float[Array, " D"]:
         """The part of the last repeated errors that these sightings have."""
-        moved = (seen.corners_px - repeats.corners_px[_lanes(seen)]).reshape(-1, 8) / 2
-        return jnp.exp(-safe_norm(moved) / self.renewal_px).astype(repeats.count.dtype)
+        moved = seen.corners_px[:, ::2] - repeats.diagonal_px[_lanes(seen)]
+        moved_px = safe_norm(moved.reshape(-1, 4) / np.sqrt(2))
+        return jnp.exp(-moved_px / self.renewal_px).astype(repeats.count.dtype)
 
 
-def unexplained(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "D 4 2"]:
-    """Residuals in sigmas that no pose of the marker before its camera explains, to first order.
+def unexplained(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "D 2"]:
+    """What of residuals, in sigmas, no pose of the marker before its camera explains.
 
-    Those at the given pose, without their part along the six derivatives by the marker's pose
-    (Gram-Schmidt; about its centre, where the derivatives are most different).
+    To first order about the given pose: the residuals along two unit vectors that are orthogonal
+    to the six derivatives by the marker's pose (Gram, Schmidt), those nearest to its diagonals
+    stretched against each other.
     """
     seen, count = snapshot.seen, snapshot.seen.visible.shape[0]
     corners = transform_points(T_vehicle_world, snapshot.markers.corners_world_m[seen.marker_index])
+    # About the marker's centre, where the derivatives are most different.
     arms = corners - jnp.mean(corners, axis=1, keepdims=True)
     points, about = (x.reshape(-1, 3).T[..., None] for x in (corners, arms))
     residual, slope = reprojection_rows(snapshot.rig, seen)(points)
@@ -145,16 +149,14 @@ def unexplained(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Array,
     def by_sighting(rows: Array) -> Float[Array, "n D 8"]:
         return rows.reshape(-1, 2, count, 4).transpose(0, 2, 3, 1).reshape(-1, count, 8)
 
-    rest, columns = by_sighting(residual)[0], list(by_sighting(answers(slope, about)))
-    while columns:
-        length = safe_norm(columns[0])[:, None]
-        unit = columns[0] / jnp.where(length > 0, length, 1)
-
-        def across(vector: Array, unit: Array = unit) -> Array:
-            return vector - unit * jnp.sum(unit * vector, axis=1, keepdims=True)
-
-        rest, columns = across(rest), [across(column) for column in columns[1:]]
-    return rest.reshape(count, 4, 2)
+    stretched = jnp.asarray(np.kron([[1, -1, 1, -1]], np.eye(2)), slope.dtype)[:, None]
+    units: list[Array] = []
+    for vector in [*by_sighting(answers(slope, about)), *jnp.tile(stretched, (count, 1))]:
+        for unit in units:
+            vector = vector - unit * jnp.sum(unit * vector, axis=1, keepdims=True)
+        length = safe_norm(vector)[:, None]
+        units.append(vector / jnp.where(length > 0, length, 1))
+    return jnp.sum(jnp.stack(units[-_UNEXPLAINED:], 1) * by_sighting(residual)[0][:, None], axis=2)
 
 
 def _lanes(seen: Sightings) -> tuple[Array, Array]:

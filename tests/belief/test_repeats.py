@@ -130,8 +130,8 @@ def test_the_share_is_learnt_and_white_noise_teaches_none():
 
 
 def test_what_no_pose_explains_is_what_least_squares_leave():
-    """Against the residual of NumPy's least squares by numeric derivatives of the marker's pose
-    before its camera."""
+    """As much as NumPy's least squares leave, by numeric derivatives of the marker's pose before
+    its camera; and the same axes in the next frame, since its numbers are compared."""
     shot = snapshot()
     rng = np.random.default_rng(3)
     seen = shot.seen
@@ -152,7 +152,9 @@ def test_what_no_pose_explains_is_what_least_squares_leave():
         r = np.asarray(residual(jnp.zeros(6)))
         J = np.asarray(jax.jacfwd(residual)(jnp.zeros(6)))
         left = r - J @ np.linalg.lstsq(J, r, rcond=None)[0]
-        np.testing.assert_allclose(got[i].reshape(-1), left, atol=1e-8)
+        np.testing.assert_allclose(np.sum(got[i] ** 2), np.sum(left**2), rtol=1e-9)
+    near = np.asarray(unexplained(T @ jaxlie.SE3.exp(jnp.full(6, 0.01)), shot))
+    np.testing.assert_allclose(near, got, atol=0.1 * np.abs(got).max())
     hidden = ~np.asarray(seen.visible)
     assert hidden.any()
     assert (got[hidden] == 0).all()
@@ -167,7 +169,7 @@ def test_a_spoilt_frame_teaches_nothing():
         bent = shot.seen.corners_px.at[:, 0].add(wrong_px)
         shot = dataclasses.replace(shot, seen=dataclasses.replace(shot.seen, corners_px=bent))
         repeats = judged(repeats, shot)
-    assert float(repeats.share) == 0
+    assert float(repeats.share) <= 0
 
 
 @jax.jit

@@ -115,8 +115,8 @@ def make_belief(rng: np.random.Generator, dtype: type = float) -> Belief:
         number=jnp.arange(4),
     )
     decided, restarts = jnp.asarray(True), jnp.asarray(1, jnp.int32)
-    corners, count = random(2, 3, 4, 2), random(2, 3)
-    repeats = Repeats(corners, count, corners, count, random(), random(), random())
+    count = random(2, 3)
+    repeats = Repeats(random(2, 3, 2, 2), count, random(2, 3, 2), count, random(), random())
     return _as_numpy(Belief(bank, decided, random(), restarts, repeats))
 
 
