@@ -38,7 +38,7 @@ from jaxnav.pose.observation import Sightings, Snapshot
 _UNEXPLAINED = 2  # of a sighting's eight numbers: a pose has six
 _CERTAIN_SIGMAS = 2.0  # a share is believed as far as it exceeds so many sigmas of white noise
 _MEMORY_FRAMES = 1000.0  # after so many, 1 / e of what was learnt of the share is left
-_MOST_SIGMAS = 6.0  # that one product counts for: a spoilt frame is no proof
+_MOST_SIGMAS = 6.0  # that a number, or a product, counts for: a spoilt frame is no proof
 
 
 class Repeats(eqx.Module):
@@ -97,7 +97,7 @@ class RepeatedErrors(eqx.Module):
         at = _lanes(seen)
         judged = seen.visible & decided
         r = unexplained(T_world_vehicle.inverse(), snapshot).astype(dtype)
-        r = jnp.where(judged[:, None], r, 0)
+        r = jnp.clip(jnp.where(judged[:, None], r, 0), -_MOST_SIGMAS, _MOST_SIGMAS)
 
         same = self._same(repeats, seen)
         S = same[:, None] * repeats.unexplained[at]

@@ -173,8 +173,22 @@ def test_a_spoilt_frame_teaches_nothing():
 
 
 @jax.jit
-def judged(repeats, shot):
-    return LEARNS.after(repeats, shot, pose(), YES)
+def judged(repeats, shot, T_world_vehicle=None):
+    return LEARNS.after(repeats, shot, T_world_vehicle or pose(), YES)
+
+
+def test_a_pose_that_looks_away_leaves_nothing_behind():
+    """A vehicle that was turned round stays decided for some frames: the marker seems behind it.
+    White noise after them still teaches nothing."""
+    away = pose() @ jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(np.pi))
+    repeats, rng = nothing(), np.random.default_rng(1)
+    for n in range(200):
+        shot = snapshot()
+        noisy = shot.seen.corners_px + SIGMA_PX * rng.normal(size=shot.seen.corners_px.shape)
+        shot = dataclasses.replace(shot, seen=dataclasses.replace(shot.seen, corners_px=noisy))
+        repeats = judged(repeats, shot, away if 20 <= n < 30 else pose())
+    assert float(repeats.share) < 0.02
+    assert np.abs(repeats.unexplained).max() < 30
 
 
 def test_derivatives_are_finite_where_nothing_moves():
