@@ -44,8 +44,8 @@ class LearntWatch:
         self._of_files, repeats = bool(self._found), outcome.belief.repeats
         if repeats is not None and repeats.share >= _TELLS_SHARE:
             self._found["corners", "repeat"] = (
-                f"{repeats.share:.0%} of the corners' variance is the same from frame to frame: "
-                "the lens model, or a marker that is not flat"
+                f"{min(repeats.share, 1):.0%} of the corners' variance is the same from frame to "
+                "frame: the lens model, or a marker that is not flat"
             )
         for subject, sentence in self._found.items():
             if subject not in self._told:
