@@ -11,7 +11,7 @@ import pytest
 
 from jaxnav.belief.repeats import RepeatedErrors, Repeats, unexplained
 from jaxnav.pose.observation import Snapshot
-from jaxnav.simulation.corners import see
+from jaxnav.simulation.corners import drifted, see
 from tests import worlds
 from tests.derivatives import in_float32
 
@@ -80,6 +80,14 @@ def test_a_pause_changes_nothing():
         np.testing.assert_array_equal(now, before)
 
 
+def test_white_errors_are_told_by_a_share_of_nothing():
+    repeats, white = nothing(), RepeatedErrors(0.0, 0.0)
+    for _ in range(5):
+        seen = white.weighed(repeats, snapshot()).seen
+        repeats = white.after(repeats, snapshot(), pose(), YES)
+        np.testing.assert_allclose(seen.sigma_px, snapshot().seen.sigma_px, rtol=1e-12)
+
+
 @jax.jit
 @functools.partial(jax.vmap, in_axes=(0, 0, 0, None, None))
 def learnt(key, repeats_share, turn_rad, exact, start):
@@ -100,8 +108,7 @@ def learnt(key, repeats_share, turn_rad, exact, start):
         T = worlds.planar(0.006 * index - 0.9, -0.4, 1.5)
         corners_px = off_rig.project(T.inverse(), exact.markers.corners_world_m)
         white = jax.random.normal(key, lasting.shape)
-        fresh = jax.random.normal(jax.random.fold_in(key, 1), lasting.shape)
-        lasting = CORRELATION * lasting + np.sqrt(1 - CORRELATION**2) * fresh
+        lasting = drifted(lasting, CORRELATION, jax.random.fold_in(key, 1))
         error = jnp.sqrt(1 - repeats_share) * white + jnp.sqrt(repeats_share) * lasting
         corners_px = corners_px + SIGMA_PX * error
         visible = see(rig, exact.markers, T)[1]

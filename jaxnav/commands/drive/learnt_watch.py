@@ -14,6 +14,7 @@ from jaxnav.recording.learnt import Learnt, errors_of
 
 _PERIOD_NS = 2_000_000_000
 _WIDTH = 100  # characters, over what the status line leaves
+_CORNERS = "corners", "repeat"  # what is found of them is written in no file
 _TELLS_SHARE = 0.05  # of the corners' variance
 _ADOPT = "`jaxnav calibrate adopt` writes what a recorded drive has learnt into new files"
 
@@ -32,7 +33,6 @@ class LearntWatch:
         self._tells, self._last_ns = tells, 0
         self._told: set[tuple[str, str]] = set()
         self._found: dict[tuple[str, str], str] = {}
-        self._of_files = False  # whether any of them is written in files
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
@@ -41,9 +41,9 @@ class LearntWatch:
         self._last_ns = given.now_ns
         learnt = Learnt.of(*errors_of(outcome.belief.bank), self._rig, self._vehicle)
         self._found = {} if learnt is None else learnt.found()
-        self._of_files, repeats = bool(self._found), outcome.belief.repeats
+        repeats = outcome.belief.repeats
         if repeats is not None and repeats.share >= _TELLS_SHARE:
-            self._found["corners", "repeat"] = (
+            self._found[_CORNERS] = (
                 f"{min(repeats.share, 1):.0%} of the corners' variance is the same from frame to "
                 "frame: the lens model, or a marker that is not flat"
             )
@@ -65,4 +65,4 @@ class LearntWatch:
         if not self._found:
             return None
         lines = [f"learnt: {visible(line)}" for line in self._found.values()]
-        return "\n".join([*lines, _ADOPT] if self._of_files else lines)
+        return "\n".join([*lines, _ADOPT] if self._found.keys() - {_CORNERS} else lines)
