@@ -185,11 +185,13 @@ class Navigator(eqx.Module):
         updated = motion.update(prior, selection, snapshot.obs)
         updated = updated._replace(bank=self._sound(updated.bank))
         belief = belief.after(updated.bank, selection.decided, selection.flip_probability)
+        evidence = Evidence.of(seen, prior, selection, updated, predicted.gate_nis)
         if repeated is not None and repeats is not None:
             best = motion.T_world_vehicle(belief.bank.mean[heaviest(belief.bank)])
-            repeats = repeated.after(repeats, seen.snapshot, best, belief.decided)
+            known = belief.decided & evidence.agrees
+            repeats = repeated.after(repeats, seen.snapshot, best, known)
             belief = replace(belief, repeats=repeats)
-        return belief, Evidence.of(seen, prior, selection, updated, predicted.gate_nis)
+        return belief, evidence
 
     def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
         """The predicted belief as the next one, where no marker is in view."""

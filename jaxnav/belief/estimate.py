@@ -87,6 +87,11 @@ class Evidence(eqx.Module):
     # log p(corners | prediction of the whole bank), up to a constant; 0 at a start.
     log_likelihood: Float[Array, ""]
 
+    @property
+    def agrees(self) -> Bool[Array, ""]:
+        """Whether the pose taken was expected, without any covariance being inflated for it."""
+        return self.accepted & (self.nis <= self.gate_nis)
+
     @staticmethod
     def of(
         seen: ConsistentSnapshot,

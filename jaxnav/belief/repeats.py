@@ -84,18 +84,19 @@ class RepeatedErrors(eqx.Module):
         repeats: Repeats,
         snapshot: Snapshot,
         T_world_vehicle: jaxlie.SE3,
-        decided: Bool[Array, ""],
+        known: Bool[Array, ""],
     ) -> Repeats:
         """What is known after a snapshot.
 
         Args:
             T_world_vehicle: the estimate. Not the best pose of the snapshot alone: near the frontal
                 view that bends towards the errors, in every frame alike.
-            decided: whether it is of the right branch; else the share learns nothing.
+            known: whether it is of the right branch and the snapshot was expected; else the share
+                learns nothing.
         """
         seen, dtype = snapshot.seen, repeats.count.dtype
         at = _lanes(seen)
-        judged = seen.visible & decided
+        judged = seen.visible & known
         r = unexplained(T_world_vehicle.inverse(), snapshot).astype(dtype)
         r = jnp.clip(jnp.where(judged[:, None], r, 0), -_MOST_SIGMAS, _MOST_SIGMAS)
 

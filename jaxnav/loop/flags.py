@@ -36,6 +36,7 @@ class Fault(enum.IntFlag):
     ODOMETRY_DOUBTFUL = enum.auto()  # no marker, and the odometer contradicts the throttle
     MARKER_OUTVOTED = enum.auto()  # its corners contradict what the others agree on
     CAMERA_LATE = enum.auto()  # images are older or newer than their stamps; health stays as it is
+    CAMERA_OUTVOTED = enum.auto()  # it does not see markers where another does
 
 
 class Reject(enum.IntFlag):

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.belief.estimate import Belief
+from jaxnav.loop.camera_votes import CameraVotes
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.estimator import Estimator, Program
 from jaxnav.loop.flags import Fault, Health, Reject
@@ -74,6 +75,7 @@ class Outcome:
     restarts: int  # so far, and the reason of the last one
     restart_reason: str
     outvoted: tuple[int, ...] = ()  # ids of markers left out because others contradict them
+    outvoted_cameras: tuple[str, ...] = ()  # names of those that are left out
     origin_m: Origin = ZERO  # see `MarkerMap`
 
     @property
@@ -176,6 +178,8 @@ class Pilot:
         self._support = Support(navigator.controller.vehicle, relocate)
         self._outvoted = MarkerVotes(navigator.markers.ids)
         self._hidden: tuple[int, ...] = ()  # marker ids left out of the last frames
+        self._camera_votes = CameraVotes(navigator)
+        self._sure = False  # whether the estimate may judge cameras
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
         self._distance_m = 0.0
@@ -200,6 +204,9 @@ class Pilot:
         frames = [self._corrections.correct_frame(frame) for frame in given.frames]
         data, stamp_ns, seen_faults = self._frames.check(frames, now_ns, self._frozen)
         faults |= seen_faults
+        if data is not None:
+            self._judge_cameras(data, stamp_ns)
+            data = self._camera_votes.remove_outvoted(data)
         if data is not None:
             data, self._hidden = self._outvoted.remove_outvoted(data)
             if self._hidden:
@@ -281,7 +288,11 @@ class Pilot:
             if outvoted:
                 faults |= Fault.MARKER_OUTVOTED
             rejects |= self._judge(known, fused.belief, stamp_ns, now_ns)
-        faults |= self._support.faults
+        doubts, cameras = self._support.faults, self._camera_votes.outvoted
+        faults |= doubts
+        if cameras:
+            faults |= Fault.CAMERA_OUTVOTED
+        self._sure = known.decided and self._support.confirmed and not doubts
         output, known = self._honest(fused.output, known)
         if self._left is not None and output.decided:
             self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
@@ -305,12 +316,15 @@ class Pilot:
             self._restarts,
             self._restart_reason,
             outvoted or (self._hidden if Fault.MARKER_OUTVOTED in faults else ()),
+            cameras,
             self._origin_m,
         )
 
     def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
         """Use the corners to confirm or doubt the estimate; return their `Reject` flags."""
         agrees = known.accepted and known.nis <= known.gate_nis
+        if not agrees:
+            self._camera_votes.note_contradiction(stamp_ns)
         self._monitor.corners(agrees)
         fix = _fix(known.pose, known.pose_covariance) if known.decided else None
         bank = belief.bank
@@ -332,6 +346,14 @@ class Pilot:
         if not known.accepted:
             return Reject.INNOVATION
         return Reject.INNOVATION_LARGE if known.nis > known.gate_nis / 2 else _NO_REJECT
+
+    def _judge_cameras(self, data: EventData, stamp_ns: int) -> None:
+        """Let a sure estimate vote on the cameras in view; see `CameraVotes`."""
+        if not (self._sure and self._camera_votes.open(stamp_ns)):
+            return
+        due = self._due_px((0.0, 0.0, 0.0))
+        if due is not None:
+            self._camera_votes.count(data, due[1], stamp_ns)
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""

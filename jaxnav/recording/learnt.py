@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from jaxnav.belief.bank import Bank
 from jaxnav.belief.camera_errors import EACH
+from jaxnav.belief.estimate import Belief
 from jaxnav.belief.sensor_errors import SENSORS_END, SIX
 from jaxnav.files import poses
 from jaxnav.models.bicycle import SENSOR_ERRORS, Vehicle
@@ -142,3 +143,9 @@ def _contradiction(value: float, prior: float) -> str:
     """What to add where an error is larger than its file allows for."""
     ratio = abs(value) / prior
     return f", {ratio:.1f} times the sigma of its file" if ratio > _CONTRADICTS else ""
+
+
+def repeated_share(belief: Belief) -> float | None:
+    """The part of the corners' variance that repeats, 0 to 1; None where none is taken to."""
+    repeats = belief.repeats
+    return None if repeats is None else min(max(float(repeats.share), 0.0), 1.0)

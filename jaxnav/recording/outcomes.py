@@ -21,7 +21,7 @@ from jaxnav.files.validation import Count, Entry
 from jaxnav.loop.flags import Health, Reject
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.origin import inverses_in_world, planar_in_world
-from jaxnav.recording.learnt import error_sigmas, errors_at
+from jaxnav.recording.learnt import error_sigmas, errors_at, repeated_share
 from jaxnav.recording.message_fields import (
     Array,
     Faults,
@@ -189,6 +189,8 @@ class Outcomes:
         errors, errors_sigma: (N, e), of sensors and cameras, see `jaxnav.recording.learnt`; older
             drives have none.
         outvoted: N lists, ids of markers that were left out; older drives have none.
+        outvoted_cameras: N lists, names of cameras that were; older drives have none.
+        repeated_share: (N,), of the corners' variance that repeats; NaN in older drives.
     """
 
     now_ns: Annotated[Int[np.ndarray, " N"], _field(Now, "now_ns", np.int64)]
@@ -234,6 +236,16 @@ class Outcomes:
     outvoted: Annotated[
         tuple[list[int], ...],
         _field(list[Count], lambda one: list(one.outvoted) or None, None, default=[], missing=[]),
+    ]
+    outvoted_cameras: Annotated[
+        tuple[list[str], ...],
+        _field(
+            list[Word], lambda one: list(one.outvoted_cameras) or None, None, default=[], missing=[]
+        ),
+    ]
+    repeated_share: Annotated[
+        Float[np.ndarray, " N"],
+        _field(Real, lambda one: repeated_share(one.belief), float, default=None, missing=np.nan),
     ]
 
     @cached_property

@@ -208,6 +208,7 @@ class RerunScene:
             ("throttle", outcomes.throttle[index]),
             ("steering_rad", outcomes.steering_rad[index]),
             ("position_sigma_m", sigma_m if outcomes.located[index] else math.nan),
+            ("repeated_share", outcomes.repeated_share[index]),
         ):
             if math.isfinite(value):
                 self._say(f"plots/{entity}", self._rerun.Scalars(float(value)))
@@ -227,7 +228,13 @@ class RerunScene:
             blueprint.TimeSeriesView(
                 origin=f"plots/{name}", name=name, plot_legend=blueprint.PlotLegend(visible=False)
             )
-            for name in ("flip_probability", "hypotheses", "nis", "position_sigma_m")
+            for name in (
+                "flip_probability",
+                "hypotheses",
+                "nis",
+                "position_sigma_m",
+                "repeated_share",
+            )
         ] + [
             blueprint.TimeSeriesView(origin=f"plots/{name}", name=name)
             for name in ("sensor_errors", "camera_errors")

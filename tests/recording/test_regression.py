@@ -14,6 +14,7 @@ from jaxnav.loop.flags import Fault, Health, Reject, names
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_replay import first_difference, replay_drive
 from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.learnt import repeated_share
 from jaxnav.recording.outcomes import Outcomes
 from jaxnav.testing import injections as inject
 from jaxnav.testing.lockstep import BEGIN_NS, Rates
@@ -102,3 +103,12 @@ def test_the_recorded_drives_are_what_they_are_called():
     jump_m = np.hypot(*np.diff(kidnapped.pose[:, :2], axis=0).T).max()
     assert jump_m > 0.5
     assert max(np.hypot(*np.diff(tunnel.pose[30:, :2], axis=0).T)) < 0.1
+
+
+def test_a_car_that_is_carried_off_teaches_no_share_of_errors_that_repeat():
+    """The frames that contradict a pose until the filter gives it up repeat one error."""
+    path = FOLDER / "kidnapped.mcap"
+    log = read_drive(path)
+    outcomes = list(replay_drive(log.inputs, DriveSetup.of_header(log.header, path), None))
+    assert sum(outcome.rejects != 0 for outcome in outcomes) >= 10
+    assert max(repeated_share(outcome.belief) for outcome in outcomes) == 0

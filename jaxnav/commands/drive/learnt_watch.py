@@ -10,7 +10,7 @@ from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.learnt import Learnt, errors_of
+from jaxnav.recording.learnt import Learnt, errors_of, repeated_share
 
 _PERIOD_NS = 2_000_000_000
 _WIDTH = 100  # characters, over what the status line leaves
@@ -41,10 +41,10 @@ class LearntWatch:
         self._last_ns = given.now_ns
         learnt = Learnt.of(*errors_of(outcome.belief.bank), self._rig, self._vehicle)
         self._found = {} if learnt is None else learnt.found()
-        repeats = outcome.belief.repeats
-        if repeats is not None and repeats.share >= _TELLS_SHARE:
+        share = repeated_share(outcome.belief)
+        if share is not None and share >= _TELLS_SHARE:
             self._found[_CORNERS] = (
-                f"{min(repeats.share, 1):.0%} of the corners' variance is the same from frame to "
+                f"{share:.0%} of the corners' variance is the same from frame to "
                 "frame: the lens model, or a marker that is not flat"
             )
         for subject, sentence in self._found.items():
