@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import jaxlie
@@ -232,18 +233,32 @@ def _calibration_and_world() -> list[FaultRow]:
             ends_s=BEGIN_S + stall_s,
         )
 
+    def knocked(by_deg: float, **more: Any) -> FaultRow:
+        turn_rad = (0.0, float(np.deg2rad(by_deg)), 0.0)
+        return _may_slow(
+            f"camera 1 knocked by {by_deg:g} deg",
+            happens=_once(lambda world: world.knock_camera(1, turn_rad)),
+            error_m=0.05,
+            ends_s=_LATEST,
+            drive_s=14.0,  # through the view of the three next cameras
+            **more,
+        )
+
     return [
         wrong("cameras off by 1 deg, 1 cm", telling="extrinsics"),
         wrong("focal length off by 2 %", telling="focal"),
         _may_stop(
             "cameras swapped",
             telling="swapped",
-            rejects=Reject.INNOVATION,
+            # One that shares its view with another is outvoted; one that is alone looks right.
+            faults=Fault.CAMERA_OUTVOTED | Fault.RESTARTED,
             error_m=np.inf,
             begins_s=2.0,
             ends_s=_LATEST,
             drive_s=12.0,  # to a side camera's view
         ),
+        knocked(8.0),
+        knocked(30.0, faults=Fault.CAMERA_OUTVOTED),
         _may_slow(
             "marker moved by 5 cm",
             happens=_once(lambda world: world.move_markers((0.05, 0.0, 0.0))),

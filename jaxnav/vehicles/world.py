@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Float
 
@@ -102,6 +103,14 @@ class SimWorld:
             size_m = self.markers.size_m.at[which].multiply(scale)
             self.markers = eqx.tree_at(lambda m: m.size_m, self.markers, size_m)
             self.markers = eqx.tree_at(lambda m: m.Ts_world_marker.wxyz_xyz, self.markers, moved)
+
+    def knock_camera(self, camera: int, turn_rad: tuple[float, float, float]) -> None:
+        """Somebody turns a camera about its own axes, by a rotation vector."""
+        with self._lock:
+            Ts = self.rig.Ts_camera_vehicle.wxyz_xyz
+            turn = jaxlie.SE3.from_rotation(jaxlie.SO3.exp(jnp.asarray(turn_rad, Ts.dtype)))
+            turned = Ts.at[camera].set((turn @ jaxlie.SE3(Ts[camera])).wxyz_xyz)
+            self.rig = eqx.tree_at(lambda r: r.Ts_camera_vehicle.wxyz_xyz, self.rig, turned)
 
     def state(self, at_ns: int) -> Float[np.ndarray, " 5"]:
         """(x_m, y_m, psi_rad, speed_mps, steering_rad) at an instant of the last two seconds."""

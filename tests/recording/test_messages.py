@@ -142,7 +142,9 @@ def test_inputs_come_back_bit_for_bit(given):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_an_outcome_is_recorded_whole(dtype):
-    outcome = make_outcome(3, seed=1, dtype=dtype)
+    outcome = dataclasses.replace(
+        make_outcome(3, seed=1, dtype=dtype), outvoted=(7,), outvoted_cameras=("rear",)
+    )
     got = validate(MESSAGES["/outcome"][1], decode(encode(outcome_message(outcome, "d"))), PATH)
     assert (got.now_ns, got.stamp_ns) == (outcome.now_ns, outcome.stamp_ns)
     assert (got.health, got.faults, got.rejects) == (
@@ -163,6 +165,8 @@ def test_an_outcome_is_recorded_whole(dtype):
     assert got.selected == 1  # the third candidate is the second of those that are valid
     assert (got.nis, got.flip_probability) == (output.nis, output.flip_probability)
     assert (got.located, got.decided, got.done, got.hypothesis) == (True, True, False, 7)
+    assert (got.outvoted, got.outvoted_cameras) == ([7], ["rear"])
+    assert got.repeated_share == np.clip(outcome.belief.repeats.share, 0, 1)
 
 
 NOT_REPORTED = {*REPORTED, "located", "decided", "done"}

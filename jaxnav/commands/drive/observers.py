@@ -263,4 +263,7 @@ def notice(outcome: Outcome, before: Fault) -> str | None:
     if Fault.MARKER_OUTVOTED in new and outcome.outvoted:
         ids = ", ".join(map(str, outcome.outvoted))
         reasons.append(f"marker {ids} is not where the others say: left out")
+    if Fault.CAMERA_OUTVOTED in new and outcome.outvoted_cameras:
+        cameras = ", ".join(outcome.outvoted_cameras)
+        reasons.append(f"the camera {cameras} does not see markers where another does: left out")
     return "; ".join(reasons) or None

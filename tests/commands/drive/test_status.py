@@ -76,6 +76,10 @@ def test_what_begins_is_told_once():
     assert "marker 3, 7" in told
     assert notice(outcome, outcome.faults) is None
     assert "marker" not in notice(outcome, Fault.MARKER_OUTVOTED)
+    outvoted = dataclasses.replace(
+        outcome, faults=Fault.CAMERA_OUTVOTED, outvoted_cameras=("right",)
+    )
+    assert "the camera right does not see markers" in notice(outvoted, Fault(0))
     for fault in (Fault.WAYS_DISPUTED, Fault.ODOMETRY_DOUBTFUL):
         assert notice(dataclasses.replace(outcome, faults=fault), Fault(0))
     assert notice(dataclasses.replace(outcome, faults=Fault.CAMERA_STALE), Fault(0)) is None
