@@ -32,6 +32,7 @@ from jaxnav.models.geometry import (
     T_world_vehicle_from_planar,
     planar_covariance,
     planar_from_T_world_vehicle,
+    safe_norm,
     wrap_angle,
 )
 from jaxnav.models.rig import CameraRig
@@ -55,7 +56,7 @@ class BicycleKalman(Motion):
       themselves: numbers learned on one course are valid on another.
     * Errors that repeat are states behind the six: four of the sensors (`sensor_errors.py`) and
       three of each camera (`camera_errors.py`), where vehicle and rig say that there are any. The
-      corners show the pose x - tau v.
+      corners show the pose x - tau v. The odometer's scale wanders, since wheels slip.
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
       floor, since errors of successive frames are correlated.
 
@@ -73,6 +74,7 @@ class BicycleKalman(Motion):
     odometry_sigma: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.01, 0.01, 0.01])
     )  # along, across, turning: standard deviations, m/s m/s rad/s; or their covariance
+    slip_density: float = 0.05**2  # variance that the odometer's scale gains on a metre, 1/m
     initial_velocity_sigma: Float[Array, " 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0, 1.0, 2.0])
     )  # before the first odometry, m/s m/s rad/s
@@ -256,6 +258,8 @@ class BicycleKalman(Motion):
         density = sandwich(_turn(mean[2]), kalman.as_matrix(self.acceleration_density))
         Q = kalman.white_acceleration(density, dt_s).astype(dtype)
         P = kalman.replace_first(P, A).at[:SIX, :SIX].add(Q)
+        if P.shape[0] > SIX:
+            P = P.at[SIX, SIX].add(self.slip_density * safe_norm(mean[3:5]) * dt_s)
         pose = mean[:3] + dt_s * mean[3:SIX]
         return mean.at[:3].set(pose.at[2].set(wrap_angle(pose[2]))), P
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from jaxnav.belief.ambiguity import PosePosterior
+from jaxnav.belief.ambiguity import PoseMeasurement, PosePosterior
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.camera_errors import EACH, ErrorsPosterior
 from jaxnav.belief.follow_pose import follow_pose
@@ -242,9 +242,51 @@ def test_nothing_is_learnt_while_the_heading_is_open_or_from_odometry(navigator)
     obs = dataclasses.replace(
         obs, speed_mps=jnp.asarray(0.5), steering_rad=jnp.asarray(0.3), dt_s=jnp.asarray(0.1)
     )
-    later = motion.predict(motion.predict(bank, obs), obs)
+    once = motion.predict(bank, obs)
+    later = motion.predict(once, obs)
     np.testing.assert_array_equal(later.mean[:, SIX:], 0)
-    np.testing.assert_array_equal(later.covariance[:, SIX:, SIX:], bank.covariance[:, SIX:, SIX:])
+    errors = np.array(bank.covariance[:, SIX:, SIX:])
+    np.testing.assert_array_equal(once.covariance[:, SIX:, SIX:], errors)  # it stood
+    way_m = 0.1 * np.linalg.norm(once.mean[:, 3:5], axis=1)
+    assert way_m.min() > 0.04
+    errors[:, 0, 0] += motion.slip_density * way_m
+    np.testing.assert_allclose(later.covariance[:, SIX:, SIX:], errors, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("slip_density", "least", "most"), [(0.05**2, 0.17, 0.23), (0.0, 0.0, 0.1)])
+def test_the_odometer_s_scale_follows_wheels_that_spin(slip_density, least, most):
+    """Straight on at 0.3 m/s; after four seconds the odometer reads a quarter more. Two seconds on
+    its scale, 1 / 1.25, is known, and the pose has followed; a constant scale is a mean of both."""
+    car = dataclasses.replace(off_car(), sensor_sigma=jnp.asarray([0.03, 0.0, 0.0, 0.0]))
+    motion = BicycleKalman(car, slip_density=slip_density)
+    bank = eqx.tree_at(lambda b: b.initialised, motion.init(1), jnp.ones(1, bool))
+    P = bank.covariance.at[:, :SIX, :SIX].multiply(0.01**2)
+    bank = eqx.tree_at(lambda b: b.covariance, bank, P)
+    obs = worlds.observe(worlds.qcar_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
+    sigma_m = 0.01
+    R = PLANAR @ (sigma_m**2 * jnp.eye(3)) @ PLANAR.T
+
+    def frame(bank, time_s):
+        read = 0.3 * jnp.where(time_s < 4, 1, 1.25)
+        told = dataclasses.replace(
+            obs, speed_mps=read, steering_rad=jnp.zeros(()), dt_s=jnp.asarray(1 / 15)
+        )
+        bank = motion.predict(bank, told)
+        there = PoseMeasurement(
+            worlds.planar(0.3 * time_s, 0.0, 0.0), R, jnp.zeros(()), jnp.asarray(True)
+        )
+        offer = motion.measure(jax.tree.map(lambda leaf: leaf[0], bank), there, told)
+        bank = eqx.tree_at(
+            lambda b: (b.mean, b.covariance), bank, tuple(leaf[None] for leaf in offer.posterior)
+        )
+        return bank, bank.mean[0]
+
+    times_s = jnp.arange(1, 91) / 15
+    mean = np.asarray(jax.jit(lambda: jax.lax.scan(frame, bank, times_s)[1])())
+    assert least <= -mean[-1, SIX] <= most
+    assert abs(mean[times_s < 4, SIX]).max() < 0.01
+    behind_m = abs(mean[-1, 0] - 0.3 * times_s[-1])
+    assert behind_m < 0.005 if slip_density else behind_m > 0.01
 
 
 def test_a_rule_has_the_paper_s_six_states():
