@@ -74,9 +74,6 @@ TUNABLES: dict[str, Tunable] = {
         0.01,
         "sigma",
     ),
-    "motion.slip_density": Tunable(
-        "Q: variance that the odometer's scale gains on a metre, where it is a state", "1/m", 0.003
-    ),
     "motion.initial_velocity_sigma": Tunable(
         "P0: the velocity before anything tells it", "m/s, rad/s", 1.0
     ),

@@ -56,7 +56,8 @@ class BicycleKalman(Motion):
       themselves: numbers learned on one course are valid on another.
     * Errors that repeat are states behind the six: four of the sensors (`sensor_errors.py`) and
       three of each camera (`camera_errors.py`), where vehicle and rig say that there are any. The
-      corners show the pose x - tau v. The odometer's scale wanders, since wheels slip.
+      corners show the pose x - tau v. The odometer's scale wanders where wheels are told to slip
+      (`slip_density`).
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
       floor, since errors of successive frames are correlated.
 
@@ -74,7 +75,7 @@ class BicycleKalman(Motion):
     odometry_sigma: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.01, 0.01, 0.01])
     )  # along, across, turning: standard deviations, m/s m/s rad/s; or their covariance
-    slip_density: float = 0.05**2  # variance that the odometer's scale gains on a metre, 1/m
+    slip_density: float = 0.0  # variance that the odometer's scale gains on a metre, 1/m
     initial_velocity_sigma: Float[Array, " 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0, 1.0, 2.0])
     )  # before the first odometry, m/s m/s rad/s

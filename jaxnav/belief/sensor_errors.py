@@ -3,8 +3,8 @@
     p = (k, g, o, tau)
 
 The odometer's true speed is (1 + k) times the one that it reads, the true steering angle is
-(1 + g) read + o, rad, and corners show the vehicle where it was tau s before their stamp. Wheels
-slip now and then: k wanders with the way, the others stay.
+(1 + g) read + o, rad, and corners show the vehicle where it was tau s before their stamp. Where
+wheels slip now and then k may wander with the way (`BicycleKalman.slip_density`); the others stay.
 
 While the branch is open the four are only considered (Schmidt): they widen the covariance of pose
 and velocity and stay correlated with them, but keep their own mean and covariance. A mirrored pose
