@@ -11,7 +11,6 @@ one. A vehicle that was carried off is where no camera expects it. So an accusat
 another camera has seen markers where they should be, since.
 """
 
-import dataclasses
 import math
 
 import numpy as np
@@ -80,8 +79,7 @@ class CameraVotes:
         hidden = self._outvoted & data.visible.any(axis=1)
         if not hidden.any():
             return data
-        visible = data.visible & ~hidden[:, None]
-        return dataclasses.replace(data, visible=visible) if visible.any() else None
+        return data.hiding(np.broadcast_to(hidden[:, None], data.visible.shape))
 
     @property
     def _outvoted(self) -> Bool[np.ndarray, " C"]:

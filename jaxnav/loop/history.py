@@ -6,7 +6,7 @@ kept for `OLD_NS`. Readings of an odometer that come faster than `THIN_NS` are f
 but only a part of them is kept to be fused again.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,6 +29,12 @@ class EventData:
     corners_px: Float[np.ndarray, "C M 4 2"] | None = None  # finite
     visible: Bool[np.ndarray, "C M"] | None = None
     sigma_px: Float[np.ndarray, "C M 4"] | None = None  # positive
+
+    def hiding(self, hidden: Bool[np.ndarray, "C M"]) -> "EventData | None":
+        """The data without these views of markers; None where that leaves no marker."""
+        assert self.visible is not None
+        visible = self.visible & ~hidden
+        return replace(self, visible=visible) if visible.any() else None
 
 
 @dataclass

@@ -1,7 +1,5 @@
 """Remember markers that the others have outvoted, and hide them when too few are in view."""
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import Bool
 
@@ -44,8 +42,7 @@ class MarkerVotes:
         hidden = in_view & (self._times >= _OFTEN)
         if in_view.sum() >= LEAST_MARKERS or not hidden.any():
             return data, ()
-        visible = data.visible & ~hidden[None]
-        left = dataclasses.replace(data, visible=visible) if visible.any() else None
+        left = data.hiding(np.broadcast_to(hidden, data.visible.shape))
         return left, self._named(hidden)
 
     def _named(self, which: np.ndarray) -> tuple[int, ...]:

@@ -32,7 +32,7 @@ from jaxnav.loop.limits import Limits
 from jaxnav.loop.odometer import Odometer
 from jaxnav.loop.outvoted import MarkerVotes
 from jaxnav.loop.stamps import Stamps
-from jaxnav.loop.standstill import Place, Standstill, Way, due_px
+from jaxnav.loop.standstill import Place, Standstill, Way, due_px, quads_px
 from jaxnav.loop.support import Support
 from jaxnav.loop.ways import Fix
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
@@ -349,11 +349,11 @@ class Pilot:
 
     def _judge_cameras(self, data: EventData, stamp_ns: int) -> None:
         """Let a sure estimate vote on the cameras in view; see `CameraVotes`."""
-        if not (self._sure and self._camera_votes.open(stamp_ns)):
-            return
-        due = self._due_px((0.0, 0.0, 0.0))
-        if due is not None:
-            self._camera_votes.count(data, due[1], stamp_ns)
+        known = self._known
+        if self._sure and known is not None and self._camera_votes.open(stamp_ns):
+            x_m, y_m, psi_rad = known.pose.tolist()
+            due_px = quads_px(self.navigator, (x_m, y_m, psi_rad))
+            self._camera_votes.count(data, due_px, stamp_ns)
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""

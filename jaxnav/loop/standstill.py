@@ -291,11 +291,11 @@ def due_px(
         y_m - s * motion[0] - c * motion[1],
         before_rad,
     )
-    return _quads_px(navigator, before), _quads_px(navigator, (x_m, y_m, psi_rad))
+    return quads_px(navigator, before), quads_px(navigator, (x_m, y_m, psi_rad))
 
 
-def _quads_px(navigator: Navigator, place: Place) -> np.ndarray:
-    """Corners as seen from a place, (C, M, 4, 2), by the program that predicts search regions."""
+def quads_px(navigator: Navigator, place: Place) -> Float[np.ndarray, "C M 4 2"]:
+    """Corners as seen from a place, px, by the program that predicts search regions."""
     (x_m, y_m, psi_rad), dtype = place, np.asarray(navigator.corner_sigma_px).dtype
     wxyz_xyz = np.array([math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0], dtype)
     corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))
