@@ -74,6 +74,13 @@ TUNABLES: dict[str, Tunable] = {
         0.01,
         "sigma",
     ),
+    "motion.slip_sigma": Tunable(
+        "Q: slip of the wheels, a share of their speed; not looked at where their scale is exact",
+        "1",
+        0.05,
+        most=(0.5,),
+    ),
+    "motion.slip_length_m": Tunable("Q: way after which a slip has faded to 1/e", "m", 0.2),
     "motion.initial_velocity_sigma": Tunable(
         "P0: the velocity before anything tells it", "m/s, rad/s", 1.0
     ),

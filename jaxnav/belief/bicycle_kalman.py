@@ -24,6 +24,7 @@ from jaxnav.belief.sensor_errors import (
     read_velocity,
     seen_pose,
     seen_slope,
+    slipped,
 )
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import (
@@ -54,10 +55,10 @@ class BicycleKalman(Motion):
       the heading turns the velocity along and the drift of the position corrects the heading.
     * Q and the odometry's noise are given in the vehicle's axes, since wheels slip along and across
       themselves: numbers learned on one course are valid on another.
-    * Errors that repeat are states behind the six: four of the sensors (`sensor_errors.py`) and
+    * Errors that repeat are states behind the six: five of the sensors (`sensor_errors.py`) and
       three of each camera (`camera_errors.py`), where vehicle and rig say that there are any. The
-      corners show the pose x - tau v. The odometer's scale wanders where wheels are told to slip
-      (`slip_density`).
+      corners show the pose x - tau v; the odometer's scale has a part that stays and one that comes
+      and goes, the slip of the wheels.
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
       floor, since errors of successive frames are correlated.
 
@@ -75,7 +76,8 @@ class BicycleKalman(Motion):
     odometry_sigma: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.01, 0.01, 0.01])
     )  # along, across, turning: standard deviations, m/s m/s rad/s; or their covariance
-    slip_density: float = 0.0  # variance that the odometer's scale gains on a metre, 1/m
+    slip_sigma: float = 0.05  # of the wheels, a share of their speed; none where they are exact
+    slip_length_m: float = 0.2  # way after which the correlation of a slip has fallen to 1/e
     initial_velocity_sigma: Float[Array, " 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0, 1.0, 2.0])
     )  # before the first odometry, m/s m/s rad/s
@@ -250,7 +252,13 @@ class BicycleKalman(Motion):
         if sigma is None and not self.camera_states:
             return jnp.zeros(0, dtype)
         of_sensors = jnp.zeros(4, dtype) if sigma is None else jnp.asarray(sigma, dtype) ** 2
-        return jnp.append(of_sensors, jnp.ones(self.camera_states, dtype))
+        slip = self._slip_sigma()[None] ** 2
+        return jnp.concatenate([slip, of_sensors, jnp.ones(self.camera_states, dtype)])
+
+    def _slip_sigma(self) -> Array:
+        """Standard deviation of the slip; 0 where the sensors are exact."""
+        dtype = self.vehicle.wheelbase_m.dtype
+        return jnp.asarray(0.0 if self.vehicle.sensor_sigma is None else self.slip_sigma, dtype)
 
     def _later(self, mean: Array, P: Array, obs: Observation) -> Moments:
         """The state `dt_s` later (Eq. 9)."""
@@ -259,10 +267,10 @@ class BicycleKalman(Motion):
         density = sandwich(_turn(mean[2]), kalman.as_matrix(self.acceleration_density))
         Q = kalman.white_acceleration(density, dt_s).astype(dtype)
         P = kalman.replace_first(P, A).at[:SIX, :SIX].add(Q)
-        if P.shape[0] > SIX:
-            P = P.at[SIX, SIX].add(self.slip_density * safe_norm(mean[3:5]) * dt_s)
         pose = mean[:3] + dt_s * mean[3:SIX]
-        return mean.at[:3].set(pose.at[2].set(wrap_angle(pose[2]))), P
+        later = mean.at[:3].set(pose.at[2].set(wrap_angle(pose[2])))
+        way_m = safe_norm(mean[3:5]) * dt_s
+        return slipped(later, P, way_m, self._slip_sigma(), jnp.asarray(self.slip_length_m, dtype))
 
     def _with_odometry(
         self, mean: Array, P: Array, obs: Observation, since_s: Array | float = 0.0

@@ -1,18 +1,19 @@
-"""Errors of a vehicle's sensors that repeat: four states behind the six of the filter.
+"""Errors of a vehicle's sensors that repeat: five states behind the six of the filter.
 
-    p = (k, g, o, tau)
+    p = (s, k, g, o, tau)
 
-The odometer's true speed is (1 + k) times the one that it reads, the true steering angle is
-(1 + g) read + o, rad, and corners show the vehicle where it was tau s before their stamp. Where
-wheels slip now and then k may wander with the way (`BicycleKalman.slip_density`); the others stay.
+The odometer's true speed is (1 + s + k) times the one that it reads, the true steering angle is
+(1 + g) read + o, rad, and corners show the vehicle where it was tau s before their stamp. The slip
+s comes and goes with the way: a first-order Gauss-Markov process. The other four are constant.
 
-While the branch is open the four are only considered (Schmidt): they widen the covariance of pose
+While the branch is open the five are only considered (Schmidt): they widen the covariance of pose
 and velocity and stay correlated with them, but keep their own mean and covariance. A mirrored pose
 and a wheel that slips explain the same corners, and a hypothesis would learn the error that fits
 its own mistake. Once the heading is known they are estimated like every other state.
 
 Source: Schmidt (1966), "Application of state-space methods to navigation problems"; Bar-Shalom,
-Li, Kirubarajan (2001), section 10.2 (augmented states).
+Li, Kirubarajan (2001), section 10.2 (augmented states); Gelb (1974), "Applied Optimal Estimation"
+(first-order Gauss-Markov process).
 """
 
 from typing import NamedTuple
@@ -24,8 +25,10 @@ from jaxtyping import Array, Float
 from jaxnav.models import bicycle
 
 SIX = 6  # states before the errors: pose and velocity
-SENSORS_END = SIX + 4  # the errors of cameras come behind those of sensors
-_DELAY = 3  # index of tau among the errors
+SLIP = SIX
+LEARNT = SLIP + 1  # the errors from here on are constant
+SENSORS_END = LEARNT + 4  # the errors of cameras come behind those of sensors
+_DELAY = SENSORS_END - 1
 
 
 class ReadVelocity(NamedTuple):
@@ -33,7 +36,7 @@ class ReadVelocity(NamedTuple):
 
     velocity: Float[Array, " 3"]
     by_heading: Float[Array, " 3"]
-    by_errors: Float[Array, "3 p"]  # p = 0 or 4
+    by_errors: Float[Array, "3 p"]  # p = 0 or 5
 
 
 def read_velocity(
@@ -47,11 +50,11 @@ def read_velocity(
     Args:
         mean: (6,), or longer with the errors p behind.
     """
-    psi_rad, errors = mean[2], mean[SIX : SIX + 4]
+    psi_rad, errors = mean[2], mean[SIX:SENSORS_END]
     speed, steering = speed_mps, steering_rad
     if errors.shape[0]:
-        k, g, o, _ = errors
-        speed, steering = (1 + k) * speed_mps, (1 + g) * steering_rad + o
+        slip, k, g, o, _ = errors
+        speed, steering = (1 + slip + k) * speed_mps, (1 + g) * steering_rad + o
 
     def at(steering: Array) -> Array:
         return bicycle.velocity_world(jnp.ones_like(speed), steering, psi_rad, wheelbase_m)
@@ -62,13 +65,36 @@ def read_velocity(
     if not errors.shape[0]:
         return ReadVelocity(velocity, by_heading, jnp.zeros((3, 0), mean.dtype))
     by_angle = speed * by_steering
-    columns = [speed_mps * unit, steering_rad * by_angle, by_angle, jnp.zeros_like(by_angle)]
+    by_scale = speed_mps * unit
+    columns = [by_scale, by_scale, steering_rad * by_angle, by_angle, jnp.zeros_like(by_angle)]
     return ReadVelocity(velocity, by_heading, jnp.stack(columns, axis=1))
+
+
+def slipped(
+    mean: Float[Array, " n"],
+    P: Float[Array, "n n"],
+    way_m: Float[Array, ""],
+    sigma: Float[Array, ""],
+    length_m: Float[Array, ""],
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """The state after a way, in which a part of the slip was forgotten for another.
+
+        s' = f s + w,    f = exp(-way / length),    var w = (1 - f^2) sigma^2
+
+    Args:
+        sigma: standard deviation of the slip.
+        length_m: way after which its correlation has fallen to 1/e.
+    """
+    if mean.shape[0] == SIX:
+        return mean, P
+    kept = jnp.exp(-way_m / length_m)
+    P = P.at[SLIP].multiply(kept).at[:, SLIP].multiply(kept)
+    return mean.at[SLIP].multiply(kept), P.at[SLIP, SLIP].add((1 - kept**2) * sigma**2)
 
 
 def seen_pose(mean: Float[Array, " n"]) -> Float[Array, " 3"]:
     """Where the corners show the vehicle: pose - tau velocity."""
-    return mean[:3] if mean.shape[0] == SIX else mean[:3] - mean[SIX + _DELAY] * mean[3:SIX]
+    return mean[:3] if mean.shape[0] == SIX else mean[:3] - mean[_DELAY] * mean[3:SIX]
 
 
 def seen_slope(mean: Float[Array, " n"]) -> Float[Array, "3 n"]:
@@ -80,7 +106,7 @@ def from_seen(mean: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array
     """The state of one whose first three entries are the seen pose, and their derivative by it."""
     if mean.shape[0] == SIX:
         return mean, _sheared(mean, 1)
-    return mean.at[:3].add(mean[SIX + _DELAY] * mean[3:SIX]), _sheared(mean, 1)
+    return mean.at[:3].add(mean[_DELAY] * mean[3:SIX]), _sheared(mean, 1)
 
 
 def _sheared(mean: Array, sign: int) -> Array:
@@ -88,6 +114,6 @@ def _sheared(mean: Array, sign: int) -> Array:
     slope = jnp.eye(3, mean.shape[0], dtype=mean.dtype)
     if mean.shape[0] == SIX:
         return slope
-    tau = mean[SIX + _DELAY]
+    tau = mean[_DELAY]
     slope = slope.at[:, 3:SIX].set(sign * tau * jnp.eye(3, dtype=mean.dtype))
-    return slope.at[:, SIX + _DELAY].set(sign * mean[3:SIX])
+    return slope.at[:, _DELAY].set(sign * mean[3:SIX])

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jaxnav.belief.bank import Bank
 from jaxnav.belief.camera_errors import EACH
 from jaxnav.belief.estimate import Belief
-from jaxnav.belief.sensor_errors import SENSORS_END, SIX
+from jaxnav.belief.sensor_errors import LEARNT, SENSORS_END
 from jaxnav.files import poses
 from jaxnav.models.bicycle import SENSOR_ERRORS, Vehicle
 from jaxnav.models.rig import CameraRig
@@ -43,12 +43,12 @@ def errors_at(bank: Bank) -> tuple[int, slice]:
     """Where in `bank.mean` they stand: slot of the heaviest hypothesis, and its last entries."""
     best = int(np.argmax(np.where(bank.initialised, bank.log_weight, -np.inf)))
     count, states = bank.mean.shape[1], bank.covariance.shape[1]
-    return best, slice(count - states + SIX, count)
+    return best, slice(count - states + LEARNT, count)
 
 
 def error_sigmas(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, " e"]:
     """The sigmas of the errors in the covariance (d, d) of a hypothesis."""
-    return np.sqrt(np.maximum(np.diagonal(covariance)[SIX:], 0)).astype(float)
+    return np.sqrt(np.maximum(np.diagonal(covariance)[LEARNT:], 0)).astype(float)
 
 
 def as_filed(
@@ -58,7 +58,7 @@ def as_filed(
 
     The filter keeps the turn that takes a camera back to where its file has it.
     """
-    of_sensors = SENSORS_END - SIX
+    of_sensors = SENSORS_END - LEARNT
     return errors[:of_sensors], -errors[of_sensors:]
 
 

@@ -16,7 +16,7 @@ from jaxnav.belief.camera_errors import EACH, ErrorsPosterior
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.map_fit import fit_poses
-from jaxnav.belief.sensor_errors import SENSORS_END, SIX
+from jaxnav.belief.sensor_errors import SENSORS_END, SIX, SLIP
 from jaxnav.models.geometry import ON_GROUND, cayley
 from jaxnav.models.rig import PLACED_BY_HAND
 from jaxnav.navigator import Navigator
@@ -26,6 +26,7 @@ from jaxnav.pose.observation import Snapshot
 from tests import worlds
 
 SIGMA = np.array([0.03, 0.03, 0.01, 0.02])
+SLIP_SIGMA = 0.05
 VIEW = worlds.OVERLAP_VIEW  # two cameras see the marker
 PLANAR = jnp.asarray(ON_GROUND, float)
 
@@ -53,7 +54,9 @@ def bank_at(navigator: Navigator, rng: np.random.Generator):
     """A single hypothesis at VIEW, all of its states correlated."""
     bank = navigator.motion.init(1)
     n = bank.mean.shape[1]
-    scale = np.concatenate([[0.03, 0.03, 0.03], [0.1] * 3, SIGMA, np.ones(n - SENSORS_END)])
+    scale = np.concatenate(
+        [[0.03, 0.03, 0.03], [0.1] * 3, [SLIP_SIGMA], SIGMA, np.ones(n - SENSORS_END)]
+    )
     mean = np.zeros(n)
     mean[:3] = VIEW + 0.01 * rng.normal(size=3)
     mean[3:SIX] = 0.3, -0.1, 0.2
@@ -227,7 +230,7 @@ def test_a_pose_that_is_inflated_keeps_errors_that_are_considered_in_proportion(
 
 
 def test_nothing_is_learnt_while_the_heading_is_open_or_from_odometry(navigator):
-    motion = dataclasses.replace(navigator.motion, slip_density=0.05**2)
+    motion = navigator.motion
     bank = motion.init(2)
     P = bank.covariance.at[:, 2, 2].set(0.01**2)
     bank = eqx.tree_at(
@@ -245,22 +248,41 @@ def test_nothing_is_learnt_while_the_heading_is_open_or_from_odometry(navigator)
     once = motion.predict(bank, obs)
     later = motion.predict(once, obs)
     np.testing.assert_array_equal(later.mean[:, SIX:], 0)
-    errors = np.array(bank.covariance[:, SIX:, SIX:])
-    np.testing.assert_array_equal(once.covariance[:, SIX:, SIX:], errors)  # it stood
-    way_m = 0.1 * np.linalg.norm(once.mean[:, 3:5], axis=1)
-    assert way_m.min() > 0.04
-    errors[:, 0, 0] += motion.slip_density * way_m
+    errors = bank.covariance[:, SIX:, SIX:]
     np.testing.assert_allclose(later.covariance[:, SIX:, SIX:], errors, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("slip_density", "least", "most"), [(0.05**2, 0.17, 0.23), (0.0, 0.0, 0.1)]
-)
-def test_the_odometer_s_scale_follows_wheels_that_spin(slip_density, least, most):
+def test_a_slip_fades_with_the_way_and_another_comes(navigator):
+    """A Gauss-Markov process: the covariance of two slips falls with the way between them."""
+    motion, rng = navigator.motion, np.random.default_rng(3)
+    bank = bank_at(navigator, rng)
+    obs = worlds.observe(off_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
+    obs = dataclasses.replace(
+        obs, dt_s=jnp.asarray(0.1), has_odometry=jnp.asarray(False), speed_mps=jnp.zeros(())
+    )
+    way_m = 0.1 * float(jnp.linalg.norm(bank.mean[0, 3:5]))
+    f = np.exp(-way_m / motion.slip_length_m)
+    later = motion.predict(bank, obs)
+    n = bank.mean.shape[1]
+    F = np.eye(n)
+    F[SLIP, SLIP] = f
+    expected = F @ np.asarray(bank.covariance[0]) @ F.T
+    expected[SLIP, SLIP] += (1 - f**2) * SLIP_SIGMA**2
+    np.testing.assert_allclose(later.covariance[0, SIX:, SIX:], expected[SIX:, SIX:], rtol=1e-10)
+    assert 0.5 < f < 0.95
+    assert float(later.mean[0, SLIP]) == pytest.approx(f * float(bank.mean[0, SLIP]))
+    still = motion.init(1)  # at its prior it stays there, whatever the way
+    moving = eqx.tree_at(lambda b: b.mean, still, still.mean.at[:, 3].set(0.5))
+    variance = motion.predict(moving, obs).covariance[0, SLIP, SLIP]
+    assert float(variance) == pytest.approx(SLIP_SIGMA**2)
+
+
+@pytest.mark.parametrize("slip_sigma", [SLIP_SIGMA, 0.0])
+def test_the_pose_follows_where_wheels_spin(slip_sigma):
     """Straight on at 0.3 m/s; after four seconds the odometer reads a quarter more. Two seconds on
-    its scale, 1 / 1.25, is known, and the pose has followed; a constant scale is a mean of both."""
+    the slip is known and the pose has followed; without one the constant scale takes it along."""
     car = dataclasses.replace(off_car(), sensor_sigma=jnp.asarray([0.03, 0.0, 0.0, 0.0]))
-    motion = BicycleKalman(car, slip_density=slip_density)
+    motion = BicycleKalman(car, slip_sigma=slip_sigma)
     bank = eqx.tree_at(lambda b: b.initialised, motion.init(1), jnp.ones(1, bool))
     P = bank.covariance.at[:, :SIX, :SIX].multiply(0.01**2)
     bank = eqx.tree_at(lambda b: b.covariance, bank, P)
@@ -285,10 +307,14 @@ def test_the_odometer_s_scale_follows_wheels_that_spin(slip_density, least, most
 
     times_s = jnp.arange(1, 91) / 15
     mean = np.asarray(jax.jit(lambda: jax.lax.scan(frame, bank, times_s)[1])())
-    assert least <= -mean[-1, SIX] <= most
-    assert abs(mean[times_s < 4, SIX]).max() < 0.01
+    slip, scale = mean[:, SLIP], mean[:, SLIP + 1]
     behind_m = abs(mean[-1, 0] - 0.3 * times_s[-1])
-    assert behind_m < 0.005 if slip_density else behind_m > 0.01
+    assert max(abs(slip[times_s < 4]).max(), abs(scale[times_s < 4]).max()) < 0.015
+    if slip_sigma:
+        assert slip[-1] < -1.5 * SLIP_SIGMA
+        assert behind_m < 0.01
+    else:
+        assert behind_m > 0.03
 
 
 def test_a_rule_has_the_paper_s_six_states():

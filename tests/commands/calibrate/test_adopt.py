@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.belief.sensor_errors import LEARNT, SENSORS_END, SIX, SLIP
 from jaxnav.cli import main
 from jaxnav.files import load_rig, load_vehicle, save_rig, save_vehicle
 from jaxnav.models.bicycle import SENSORS_AS_TOLD
@@ -37,15 +38,17 @@ def setup_of(**changes):
 
 
 def learnt_outcome(index: int, learnt: bool = True, decided: bool = True):
-    """One hypothesis of ten sensor and camera errors; the heaviest of two."""
+    """A hypothesis that slips and has learnt errors of sensors and cameras; the heaviest of two."""
     outcome = make_outcome(index)
-    count = 10 + 3 * 4
+    count = SENSORS_END + 3 * 4
+    sensors, turn = slice(LEARNT, SENSORS_END), slice(SENSORS_END + 3, SENSORS_END + 6)
     mean, variance = np.zeros((4, count)), np.ones(count)
-    mean[1, 6:10], variance[6:10] = SENSORS * index / 9, SENSORS_SIGMA**2
-    mean[1, 13:16] = -TURN_RAD / SIGMA[3:] * index / 9
-    variance[10:] = 0.1**2
+    mean[1, SLIP], variance[SLIP] = 0.2, 0.05**2
+    mean[1, sensors], variance[sensors] = SENSORS * index / 9, SENSORS_SIGMA**2
+    mean[1, turn] = -TURN_RAD / SIGMA[3:] * index / 9
+    variance[SENSORS_END:] = 0.1**2
     if not learnt:
-        mean, variance = mean[:, :6], variance[:6]
+        mean, variance = mean[:, :SIX], variance[:SIX]
     told = mean, np.tile(np.diag(variance), (4, 1, 1)), np.array([0.0, -0.1, -2.0, 0.0])
     belief, output = eqx.tree_at(
         lambda both: (

@@ -5,6 +5,7 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 
+from jaxnav.belief.sensor_errors import SENSORS_END
 from jaxnav.commands.drive.learnt_watch import LearntWatch
 from tests.commands.calibrate.test_adopt import learnt_outcome, setup_of
 from tests.helpers.drives import make_input
@@ -67,7 +68,8 @@ def test_cameras_whose_names_differ_in_a_digit_are_told_apart(capsys):
     outcome = learnt_outcome(9)
     watch.on_outcome(at(0.0), outcome)
     mean = outcome.belief.bank.mean.copy()
-    mean[1, 16:19] = mean[1, 13:16]
+    first = SENSORS_END + 3  # of camera 1
+    mean[1, first + 3 : first + 6] = mean[1, first : first + 3]
     belief = eqx.tree_at(lambda b: b.bank.mean, outcome.belief, mean)
     watch.on_outcome(at(3.0), dataclasses.replace(outcome, belief=belief))
     told = capsys.readouterr().err
