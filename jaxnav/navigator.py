@@ -21,7 +21,7 @@ from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief, Estimate, Evidence
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.motion import Motion
-from jaxnav.belief.repeats import RepeatedErrors
+from jaxnav.belief.repeats import RepeatedErrors, surprise_of
 from jaxnav.control import Command, Controller, ControlLog, ControlState
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
@@ -176,11 +176,12 @@ class Navigator(eqx.Module):
     def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
         motion, snapshot = self.motion, seen.snapshot
-        repeated, repeats = self.repeated_errors, belief.repeats
-        if repeated is not None and repeats is not None:
-            snapshot = repeated.weighed(repeats, snapshot)
         prior = renumber_if_empty(belief.bank)
         predicted = motion.poses(prior)
+        repeated, repeats = self.repeated_errors, belief.repeats
+        if repeated is not None and repeats is not None:
+            surprise = surprise_of(predicted, heaviest(prior), seen.candidates, snapshot)
+            snapshot = repeated.weighed(repeats, snapshot, surprise)
         selection = self.selector(predicted, seen.candidates, snapshot)
         updated = motion.update(prior, selection, snapshot.obs)
         updated = updated._replace(bank=self._sound(updated.bank))

@@ -75,3 +75,11 @@ def _and_another(
         rejections.duration_s + jnp.where(rejected, rejections.waited_s, 0),
         jnp.where(rejected, 0, rejections.waited_s),
     )
+
+
+def excess_of(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:
+    """Ratio of a sum of squares to its chi-square's mean plus three sigmas; 1 below it.
+
+    Source: Birge (1932), "The calculation of errors by the method of least squares".
+    """
+    return jnp.maximum(chi2 / (freedom + 3 * jnp.sqrt(2 * freedom)), 1)

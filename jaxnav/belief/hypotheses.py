@@ -27,6 +27,7 @@ from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
 from jaxnav.belief.branches import SecondPoses, give_slots, second_poses
 from jaxnav.belief.fan import CANDIDATES, fan, normalise
 from jaxnav.belief.flips import beyond, nearer_to_another
+from jaxnav.belief.gate import excess_of
 from jaxnav.belief.map_fit import PoseFit, fit_poses
 from jaxnav.belief.merging import find_heirs
 from jaxnav.models.geometry import rotation_error_rad, safe_norm, safe_sqrt
@@ -236,7 +237,7 @@ class MultiHypothesis(eqx.Module):
         """
         least = jnp.min(jnp.where(alive, _nis(fits.posterior), jnp.inf))
         known = jnp.isfinite(least) & ~starts
-        excess = _excess(jnp.where(known, least, 0), jnp.asarray(freedom, least.dtype))
+        excess = excess_of(jnp.where(known, least, 0), jnp.asarray(freedom, least.dtype))
         return jnp.minimum(excess, self.max_inflation).astype(least.dtype)
 
     def _bounded(
@@ -306,18 +307,10 @@ def _contradicted(posteriors: PosePosterior, excess: Float[Array, " K"]) -> Pose
 
 
 def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
-    """The `_excess` of the best candidate's cost; 1 without a candidate."""
+    """The `excess_of` of the best candidate's cost; 1 without a candidate."""
     cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
     freedom = jnp.maximum(8 * jnp.sum(snapshot.seen.visible) - 6, 2).astype(cost.dtype)
-    return _excess(jnp.where(jnp.isfinite(cost), cost, 0), freedom)
-
-
-def _excess(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array, ""]:
-    """Ratio of a sum of squares to its chi-square's mean plus three sigmas; 1 below it.
-
-    Source: Birge (1932), "The calculation of errors by the method of least squares".
-    """
-    return jnp.maximum(chi2 / (freedom + 3 * jnp.sqrt(2 * freedom)), 1)
+    return excess_of(jnp.where(jnp.isfinite(cost), cost, 0), freedom)
 
 
 class _Poses(eqx.Module):

@@ -13,6 +13,10 @@ instead of sigma^2 / (n + 1), so the next sighting counts as one of the variance
 
 The first counts in full, and many of a vehicle that stands add up to 1 / (s sigma^2) at most.
 
+Repeated errors stay as they are, so corners that contradict the prediction beyond white noise show
+something else: the marker is another, or the odometer stands still. These sightings are new, by
+n / surprise^2.
+
 The share is learnt. Two of a sighting's eight numbers fit no pose of its marker, wherever camera
 and marker are: of white noise their product with the sum S of those of n sightings before has the
 mean 0 and the variance 2 n, and where a share repeats the mean 2 s n.
@@ -27,11 +31,22 @@ import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxnav.belief.ambiguity import PoseBelief
+from jaxnav.belief.gate import excess_of
 from jaxnav.models.geometry import safe_norm, safe_sqrt, transform_points
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.small_matrices import (
+    cholesky,
+    gram,
+    matvec,
+    product,
+    sandwich,
+    solve_lower,
+)
+from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.linearised import answers, reprojection_rows
 from jaxnav.pose.observation import Sightings, Snapshot
 
@@ -70,11 +85,13 @@ class RepeatedErrors(eqx.Module):
         shapes = ((*lanes, 2, 2), lanes, (*lanes, 2), lanes, (), ())
         return Repeats(*(jnp.zeros(shape, dtype) for shape in shapes))
 
-    def weighed(self, repeats: Repeats, snapshot: Snapshot) -> Snapshot:
-        """The snapshot with the sigma of repeated sightings raised."""
+    def weighed(
+        self, repeats: Repeats, snapshot: Snapshot, surprise: Float[Array, ""] | float = 1.0
+    ) -> Snapshot:
+        """The snapshot with the sigma of repeated sightings raised, see `surprise_of`."""
         seen = snapshot.seen
         s = jnp.maximum(jnp.minimum(repeats.share, self.most_share), self.least_share)
-        n = (self._same(repeats, seen) * repeats.count[_lanes(seen)])[:, None]
+        n = (self._same(repeats, seen) * repeats.count[_lanes(seen)])[:, None] / surprise**2
         scale = jnp.sqrt((1 - s + (n + 1) * s) * (1 - s + n * s) / (1 - s))
         sigma_px = seen.sigma_px * scale.astype(seen.sigma_px.dtype)
         return dataclasses.replace(snapshot, seen=dataclasses.replace(seen, sigma_px=sigma_px))
@@ -131,6 +148,32 @@ class RepeatedErrors(eqx.Module):
         moved = seen.corners_px[:, ::2] - repeats.diagonal_px[_lanes(seen)]
         moved_px = safe_norm(moved.reshape(-1, 4) / np.sqrt(2))
         return jnp.exp(-moved_px / self.renewal_px).astype(repeats.count.dtype)
+
+
+def surprise_of(
+    predicted: PoseBelief, index: Int[Array, ""], candidates: Candidates, snapshot: Snapshot
+) -> Float[Array, ""]:
+    """How far the corners contradict a hypothesis: 1 where they don't by more than white noise.
+
+    By its NIS, which is what the corners cost at the best pose between prediction and corners, to
+    first order, more than at the best candidate.
+    """
+    T = jaxlie.SE3(predicted.T_world_vehicle.wxyz_xyz[index])
+    alive = predicted.initialised[index]
+    P = sandwich(predicted.freedom.T, predicted.covariance[index])
+    eye = jnp.eye(P.shape[0], dtype=P.dtype)
+    spread = product(predicted.freedom, cholesky(jnp.where(alive, P, eye)))
+    spread = jnp.concatenate([spread, predicted.nuisance], axis=1)
+    corners = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
+    points = transform_points(T.inverse(), corners).T[..., None]
+    residual, slope = reprojection_rows(snapshot.rig, snapshot.seen)(points)
+    r, J = residual.reshape(-1), product(spread.T, answers(slope, points)[..., 0])
+    information = gram(J) + jnp.eye(J.shape[0], dtype=J.dtype)
+    explained = jnp.sum(solve_lower(cholesky(information), matvec(J, r)) ** 2)
+    free = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+    nis = jnp.sum(r**2) - explained - free
+    nis = jnp.where(alive & jnp.isfinite(nis), nis, 0)
+    return excess_of(nis, jnp.asarray(J.shape[0], nis.dtype))
 
 
 def unexplained(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "D 2"]:

@@ -44,7 +44,8 @@ _REST_NS = 5_000_000_000
 
 _RESTS_MPS = 0.02  # the odometer of a standing car reads less: twice the same sigma
 _SLOW_NS = 100_000_000  # after the car has stopped: frames may be late, whatever their stamps say
-_MOVES, _MOVES_NS = 3, 300_000_000  # this often and long: no single push, no marker that is moved
+# This often and long: no single push, no marker that is moved. Fewer do where the throttle pulls.
+_MOVES, _PULLED_MOVES, _MOVES_NS = 3, 2, 300_000_000
 _PAUSE_NS = 1_000_000_000  # longest time between two moves of one motion
 
 # Without a marker and without odometry the vehicle stops after 1 s (see `health`): nothing tells
@@ -252,7 +253,11 @@ class Standstill:
         now.moving_ns = before.moving_ns if goes_on else before.stamp_ns
         if self._quiet_ns is not None and now.stamp_ns < self._told_ns + _SLOW_NS:
             since_ns = max(now.moving_ns, self._quiet_ns + _SLOW_NS)
-            if now.moves >= _MOVES and now.stamp_ns - since_ns >= _MOVES_NS:
+            pulled = abs(self._pulled_mps) >= _GOES_MPS
+            if (
+                now.moves >= (_PULLED_MOVES if pulled else _MOVES)
+                and now.stamp_ns - since_ns >= _MOVES_NS
+            ):
                 self._contradicted_ns = now.stamp_ns
         return now
 

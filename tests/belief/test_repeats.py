@@ -9,7 +9,10 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.belief.repeats import RepeatedErrors, Repeats, unexplained
+from jaxnav.belief.ambiguity import PoseBelief
+from jaxnav.belief.repeats import RepeatedErrors, Repeats, surprise_of, unexplained
+from jaxnav.models.geometry import OFF_GROUND, ON_GROUND, cayley
+from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Snapshot
 from jaxnav.simulation.corners import drifted, see
 from tests import worlds
@@ -70,6 +73,73 @@ def test_what_has_moved_counts_anew():
     n = np.exp(-4.0 / 40.0)
     growth = (1 - SHARE + (n + 1) * SHARE) * (1 - SHARE + n * SHARE) / (1 - SHARE)
     assert near == pytest.approx(SIGMA_PX * np.sqrt(growth))
+
+
+def test_what_surprises_counts_anew():
+    """By n / surprise^2: at four times the bound a repeated sighting is new but for a sixteenth."""
+    _, repeats = weigh(nothing(), snapshot())
+    one, four = (
+        MODEL.weighed(repeats, snapshot(), surprise).seen.sigma_px[0, 0] for surprise in (1.0, 4.0)
+    )
+    n = 1 / 16
+    growth = (1 - SHARE + (n + 1) * SHARE) * (1 - SHARE + n * SHARE) / (1 - SHARE)
+    assert float(four) == pytest.approx(SIGMA_PX * np.sqrt(growth))
+    assert float(one) > 1.2 * float(four)
+
+
+def predicted(off, sigma, alive=True) -> PoseBelief:
+    """Two hypotheses, the second one off by (m, m, rad) with sigmas of its own."""
+    freedom = jnp.asarray(ON_GROUND, float)
+    covariance = freedom @ jnp.diag(jnp.asarray(sigma) ** 2) @ freedom.T
+    there = pose() @ cayley(freedom @ jnp.asarray(off, float))
+    return PoseBelief(
+        jaxlie.SE3(jnp.stack([worlds.planar(*worlds.NO_VIEW).wxyz_xyz, there.wxyz_xyz])),
+        jnp.stack([jnp.eye(6), covariance]),
+        jnp.log(jnp.asarray([0.1, 0.9])),
+        jnp.asarray([True, alive]),
+        freedom,
+        jnp.asarray(OFF_GROUND * np.array([0.002, 0.005, 0.005])),
+        21.1,
+    )
+
+
+def surprise(belief, free_cost=0.0, valid=True):
+    candidates = Candidates.none(2, jnp.zeros(()).dtype)
+    candidates = dataclasses.replace(
+        candidates, cost=jnp.asarray([free_cost, 0.0]), valid=jnp.asarray([valid, False])
+    )
+    return float(surprise_of(belief, jnp.asarray(1), candidates, snapshot()))
+
+
+def test_the_surprise_is_the_nis_of_the_prediction_over_its_bound():
+    """Against r' (I + J P J')^-1 r with numeric derivatives by the vehicle's pose."""
+    off, sigma = np.array([0.2, -0.1, 0.1]), np.array([0.01, 0.02, 0.005])
+    belief, shot = predicted(off, sigma), snapshot()
+    T = jaxlie.SE3(belief.T_world_vehicle.wxyz_xyz[1])
+    shown = np.asarray(shot.seen.visible)
+
+    def residual(xi):
+        corners_px = shot.rig.project((T @ cayley(xi)).inverse(), shot.markers.corners_world_m)
+        at = corners_px[shot.seen.camera_index, shot.seen.marker_index]
+        r = (at - shot.seen.corners_px) / shot.seen.sigma_px[..., None]
+        return r[shown].reshape(-1)
+
+    r = np.asarray(residual(jnp.zeros(6)))
+    J = np.asarray(jax.jacfwd(residual)(jnp.zeros(6)))
+    spread = np.hstack([np.asarray(ON_GROUND) * sigma, np.asarray(belief.nuisance)])
+    S = np.eye(r.size) + J @ spread @ spread.T @ J.T
+    nis, bound = r @ np.linalg.solve(S, r), 6 + 3 * np.sqrt(12)
+    assert nis > 2 * bound
+    assert surprise(belief) == pytest.approx(nis / bound, rel=1e-6)
+    assert surprise(belief, free_cost=10.0) == pytest.approx((nis - 10) / bound, rel=1e-6)
+
+
+def test_nothing_surprises_who_expects_it_or_knows_nothing():
+    off, sure, unsure = [0.2, -0.1, 0.1], [0.01, 0.02, 0.005], [0.3, 0.3, 0.3]
+    assert surprise(predicted([0.0] * 3, sure)) == 1
+    assert surprise(predicted(off, unsure)) == 1
+    assert surprise(predicted(off, sure, alive=False)) == 1
+    assert surprise(predicted(off, sure), valid=False) == 1
 
 
 def test_a_pause_changes_nothing():
@@ -210,6 +280,16 @@ def test_derivatives_are_finite_where_nothing_moves():
         slopes = jax.grad(sigma, argnums=(0, 1))(*map(jnp.asarray, at))
         assert np.all(np.isfinite(slopes))
     assert float(slopes[1]) > 0
+
+    def of_surprise(off):
+        belief, none = predicted(off * jnp.ones(3), [0.01] * 3), Candidates.none(2, off.dtype)
+        found = dataclasses.replace(none, valid=none.valid.at[0].set(True))
+        return surprise_of(belief, jnp.asarray(1), found, shot)
+
+    still, moved = (jax.grad(of_surprise)(jnp.asarray(off)) for off in (0.0, 0.05))
+    assert float(still) == 0
+    assert np.isfinite(moved)
+    assert float(moved) > 0
 
 
 @in_float32

@@ -132,6 +132,17 @@ def test_who_moves_or_does_not_pull_or_is_not_told_is_not_held():
     assert not drive.standstill.nothing_moves
 
 
+@pytest.mark.parametrize(
+    ("throttle", "earliest_s", "latest_s"), [(0.0, 0.9, 1.3), (0.03, 0.5, 0.8)]
+)
+def test_corners_contradict_sooner_where_the_throttle_pulls(throttle, earliest_s, latest_s):
+    """Corners go at 6 px/s, a move of 1.8 px each 0.32 s: two moves are enough, else three."""
+    drive = Drive()
+    drive.go(0.2)
+    _, contradicted = drive.go(2.0, true_mps=0.06, throttle=throttle)
+    assert earliest_s < 0.02 * np.argmax(contradicted) < latest_s
+
+
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 
 
