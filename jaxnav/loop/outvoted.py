@@ -19,31 +19,31 @@ class MarkerVotes:
         self._ids = ids
         self._times = np.zeros(len(ids), int)
 
-    def count(self, data: EventData, outvoted: Bool[np.ndarray, " M"]) -> tuple[int, ...]:
-        """Count the votes of a frame; return the ids of the markers outvoted in it.
+    def count(self, data: EventData, outvoted: Bool[np.ndarray, " M"]) -> None:
+        """Count the votes of a frame.
 
         Args:
             outvoted: (M,), which markers the filter found to be outvoted.
         """
-        if len(self._ids) < LEAST_MARKERS or data.visible is None:
-            return ()
+        assert data.visible is not None
         in_view = data.visible.any(axis=0)
-        if in_view.sum() < LEAST_MARKERS:
-            return ()
-        times = self._times + np.where(outvoted, 1, -1) * in_view
-        self._times = np.clip(times, 0, 2 * _OFTEN)
-        return self._named(outvoted)
+        if in_view.sum() >= LEAST_MARKERS:
+            times = self._times + np.where(outvoted, 1, -1) * in_view
+            self._times = np.clip(times, 0, 2 * _OFTEN)
 
-    def remove_outvoted(self, data: EventData) -> tuple[EventData | None, tuple[int, ...]]:
-        """The data without markers that were often outvoted, if too few can vote, and their ids."""
-        if len(self._ids) < LEAST_MARKERS or data.visible is None:
-            return data, ()
+    @property
+    def outvoted(self) -> tuple[int, ...]:
+        """The ids of the markers that have more votes against them than for them."""
+        return tuple(self._ids[index] for index in np.flatnonzero(self._times))
+
+    def remove_outvoted(self, data: EventData) -> EventData | None:
+        """The data without markers that were often outvoted, if too few are in view to vote.
+
+        None where that leaves nothing.
+        """
+        assert data.visible is not None
         in_view = data.visible.any(axis=0)
         hidden = in_view & (self._times >= _OFTEN)
         if in_view.sum() >= LEAST_MARKERS or not hidden.any():
-            return data, ()
-        left = data.hiding(np.broadcast_to(hidden, data.visible.shape))
-        return left, self._named(hidden)
-
-    def _named(self, which: np.ndarray) -> tuple[int, ...]:
-        return tuple(self._ids[index] for index in np.flatnonzero(which))
+            return data
+        return data.hiding(np.broadcast_to(hidden, data.visible.shape))

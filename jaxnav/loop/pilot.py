@@ -176,8 +176,7 @@ class Pilot:
         )
         self._frozen = partial(self._standstill.is_frozen, due=self._due_px)
         self._support = Support(navigator.controller.vehicle, relocate)
-        self._outvoted = MarkerVotes(navigator.markers.ids)
-        self._hidden: tuple[int, ...] = ()  # marker ids left out of the last frames
+        self._marker_votes = MarkerVotes(navigator.markers.ids)
         self._camera_votes = CameraVotes(navigator)
         self._sure = False  # whether the estimate may judge cameras
         self._odometer_ns: int | None = None
@@ -208,9 +207,7 @@ class Pilot:
             self._judge_cameras(data, stamp_ns)
             data = self._camera_votes.remove_outvoted(data)
         if data is not None:
-            data, self._hidden = self._outvoted.remove_outvoted(data)
-            if self._hidden:
-                faults |= Fault.MARKER_OUTVOTED
+            data = self._marker_votes.remove_outvoted(data)
         if data is not None:
             outcome = self._fuse(data, stamp_ns, now_ns, faults, _NO_REJECT)
         if given.odometry is not None:
@@ -282,16 +279,14 @@ class Pilot:
             self._left = self._known
             self._restarts_ns.append(now_ns)
             self._support.note_restart()
-        outvoted: tuple[int, ...] = ()
         if data is not None and data.corners_px is not None and not fused.refused:
-            outvoted = self._outvoted.count(data, np.asarray(fused.output.outvoted))
-            if outvoted:
-                faults |= Fault.MARKER_OUTVOTED
+            self._marker_votes.count(data, np.asarray(fused.output.outvoted))
             rejects |= self._judge(known, fused.belief, stamp_ns, now_ns)
-        doubts, cameras = self._support.faults, self._camera_votes.outvoted
+        doubts = self._support.faults
         faults |= doubts
-        if cameras:
-            faults |= Fault.CAMERA_OUTVOTED
+        markers, cameras = self._marker_votes.outvoted, self._camera_votes.outvoted
+        faults |= Fault.MARKER_OUTVOTED if markers else Fault(0)
+        faults |= Fault.CAMERA_OUTVOTED if cameras else Fault(0)
         self._sure = known.decided and self._support.confirmed and not doubts
         output, known = self._honest(fused.output, known)
         if self._left is not None and output.decided:
@@ -315,7 +310,7 @@ class Pilot:
             stamp_ns,
             self._restarts,
             self._restart_reason,
-            outvoted or (self._hidden if Fault.MARKER_OUTVOTED in faults else ()),
+            markers,
             cameras,
             self._origin_m,
         )

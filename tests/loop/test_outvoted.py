@@ -9,11 +9,11 @@ from jaxnav.loop.outvoted import MarkerVotes
 IDS = (7, 3, 12)
 
 
-def told(*in_view: int) -> EventData:
-    visible = np.zeros((2, 3), bool)
+def told(*in_view: int, count: int = len(IDS)) -> EventData:
+    visible = np.zeros((2, count), bool)
     visible[0, list(in_view)] = True
     return EventData(
-        corners_px=np.zeros((2, 3, 4, 2)), visible=visible, sigma_px=np.ones((2, 3, 4))
+        corners_px=np.zeros((2, count, 4, 2)), visible=visible, sigma_px=np.ones((2, count, 4))
     )
 
 
@@ -22,39 +22,52 @@ def voted(*which: int) -> np.ndarray:
 
 
 def test_one_that_was_outvoted_often_is_hidden_where_too_few_are_in_view_to_vote():
-    outvoted = MarkerVotes(IDS)
+    votes, alone = MarkerVotes(IDS), told(2)
+    assert votes.outvoted == ()
     for _ in range(10):
-        assert outvoted.remove_outvoted(told(2))[1] == ()
-        assert outvoted.count(told(0, 1, 2), voted(2)) == (12,)
-    assert outvoted.remove_outvoted(told(2)) == (None, (12,))
-    left, named = outvoted.remove_outvoted(told(0, 2))
-    assert named == (12,)
+        assert votes.remove_outvoted(alone) is alone
+        votes.count(told(0, 1, 2), voted(2))
+        assert votes.outvoted == (12,)
+    assert votes.remove_outvoted(alone) is None
+    left = votes.remove_outvoted(told(0, 2))
     np.testing.assert_array_equal(left.visible.any(axis=0), [True, False, False])
     everything = told(0, 1, 2)
-    assert outvoted.remove_outvoted(everything) == (everything, ())
+    assert votes.remove_outvoted(everything) is everything
+
+
+def test_it_stays_named_while_others_are_in_view_or_none():
+    votes = MarkerVotes(IDS)
+    votes.count(told(0, 1, 2), voted(2))
+    for seen in (told(0, 1), told(2), told()):
+        votes.count(seen, voted())
+        assert votes.outvoted == (12,)
+    votes.count(told(0, 1, 2), voted())
+    assert votes.outvoted == ()
 
 
 def test_one_that_agrees_again_is_believed_again():
-    outvoted = MarkerVotes(IDS)
+    votes, alone = MarkerVotes(IDS), told(0)
     for _ in range(100):
-        outvoted.count(told(0, 1, 2), voted(0))
+        votes.count(told(0, 1, 2), voted(0))
     for _ in range(11):
-        assert outvoted.remove_outvoted(told(0))[1] == (7,)
-        outvoted.count(told(0, 1, 2), voted())
-    assert outvoted.remove_outvoted(told(0))[1] == ()
+        assert votes.remove_outvoted(alone) is None
+        votes.count(told(0, 1, 2), voted())
+    assert votes.remove_outvoted(alone) is alone
 
 
 @pytest.mark.parametrize("ids", [(0,), (0, 1)])
 def test_maps_too_small_to_vote_hide_nothing(ids):
-    outvoted = MarkerVotes(ids)
-    seen = told(*range(len(ids)))
+    votes = MarkerVotes(ids)
+    seen = told(*range(len(ids)), count=len(ids))
     for _ in range(50):
-        assert outvoted.count(seen, np.ones(len(ids), bool)) == ()
-    assert outvoted.remove_outvoted(seen) == (seen, ())
+        votes.count(seen, np.ones(len(ids), bool))
+    assert votes.outvoted == ()
+    assert votes.remove_outvoted(seen) is seen
 
 
 def test_frames_that_show_too_few_do_not_count():
-    outvoted = MarkerVotes(IDS)
+    votes, alone = MarkerVotes(IDS), told(0)
     for _ in range(50):
-        assert outvoted.count(told(0, 1), voted(0)) == ()
-    assert outvoted.remove_outvoted(told(0))[1] == ()
+        votes.count(told(0, 1), voted(0))
+    assert votes.outvoted == ()
+    assert votes.remove_outvoted(alone) is alone
