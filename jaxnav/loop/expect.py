@@ -2,14 +2,17 @@
 
     quads_px, visible, radius_px = expected(rig, markers, T_world_vehicle, covariance)
 
-A corner is searched in the circle of that radius around its place in `quads_px`.
+A corner is searched in the circle of that radius around its place in `quads_px`. The same program
+tells the corners at any place, and before and after a motion.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.compiling.executables import kept
@@ -22,7 +25,9 @@ from jaxnav.models.geometry import (
 )
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.navigator import Navigator
 
+Place = tuple[float, float, float]  # x_m, y_m, psi_rad
 SIGMAS = 3.0
 # The corner's own noise, and its motion during the exposure.
 MARGIN_PX = 4.0
@@ -84,6 +89,37 @@ def expect_corners(
     visible = _inside(rig, quads_px, radius_px) & _towards(rig, markers, mean)
     finite = jnp.isfinite(radius_px) & jnp.all(jnp.isfinite(covariance))
     return Expected(quads_px, visible & finite, radius_px)
+
+
+def quads_px(navigator: Navigator, place: Place) -> Float[np.ndarray, "C M 4 2"]:
+    """Corners as seen from a place, px, by the program that predicts search regions."""
+    (x_m, y_m, psi_rad), dtype = place, np.asarray(navigator.corner_sigma_px).dtype
+    wxyz_xyz = np.array([math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0], dtype)
+    corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))
+    return np.asarray(corners.quads_px)
+
+
+def due_px(
+    navigator: Navigator, pose: Float[np.ndarray, " 3"] | None, motion: Place
+) -> tuple[Float[np.ndarray, "C M 4 2"], Float[np.ndarray, "C M 4 2"]] | None:
+    """Corners before and after a motion, (C, M, 4, 2) each; None where the pose is not known.
+
+    Args:
+        pose: estimated (x_m, y_m, psi_rad) after the motion. Its error matters little: the relative
+            error of a shift is that of the distance to the marker.
+        motion: (x_m, y_m, psi_rad) in the vehicle's axes before the motion.
+    """
+    if pose is None:
+        return None
+    x_m, y_m, psi_rad = map(float, pose)
+    before_rad = psi_rad - motion[2]
+    c, s = math.cos(before_rad), math.sin(before_rad)
+    before = (
+        x_m - c * motion[0] + s * motion[1],
+        y_m - s * motion[0] - c * motion[1],
+        before_rad,
+    )
+    return quads_px(navigator, before), quads_px(navigator, (x_m, y_m, psi_rad))
 
 
 def _axes(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

@@ -23,6 +23,7 @@ from jaxnav.belief.estimate import Belief
 from jaxnav.loop.camera_votes import CameraVotes
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.estimator import Estimator, Program
+from jaxnav.loop.expect import Place, due_px, quads_px
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.frames import FrameDetections, FrameIntake
 from jaxnav.loop.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
@@ -32,7 +33,7 @@ from jaxnav.loop.limits import Limits
 from jaxnav.loop.odometer import Odometer
 from jaxnav.loop.outvoted import MarkerVotes
 from jaxnav.loop.stamps import Stamps
-from jaxnav.loop.standstill import Place, Standstill, Way, due_px, quads_px
+from jaxnav.loop.standstill import Standstill, Way
 from jaxnav.loop.support import Support
 from jaxnav.loop.ways import Fix
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world

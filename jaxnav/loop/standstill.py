@@ -24,10 +24,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxnav.loop.expect import expect_corners
-from jaxnav.navigator import Navigator
+from jaxnav.loop.expect import Place
 
-Place = tuple[float, float, float]  # x_m, y_m, psi_rad
 # The corners before and after a motion (x_m, y_m, psi_rad, in the vehicle's earlier axes);
 # None: the pose of the vehicle is not known.
 Due = Callable[[Place], tuple[Float[np.ndarray, "C M 4 2"], Float[np.ndarray, "C M 4 2"]] | None]
@@ -274,34 +272,3 @@ def _withheld(due_px: np.ndarray, seen_px: np.ndarray, sigma_px: float) -> bool:
         return False
     share = along_px2 / squared_px2
     return share + _SHARE_SIGMAS * math.sqrt(2 / squared_px2) * sigma_px < _SHARE
-
-
-def due_px(
-    navigator: Navigator, pose: Float[np.ndarray, " 3"] | None, motion: Place
-) -> tuple[Float[np.ndarray, "C M 4 2"], Float[np.ndarray, "C M 4 2"]] | None:
-    """Corners before and after a motion, (C, M, 4, 2) each; None where the pose is not known.
-
-    Args:
-        pose: estimated (x_m, y_m, psi_rad) after the motion. Its error matters little: the relative
-            error of a shift is that of the distance to the marker.
-        motion: (x_m, y_m, psi_rad) in the vehicle's axes before the motion.
-    """
-    if pose is None:
-        return None
-    x_m, y_m, psi_rad = map(float, pose)
-    before_rad = psi_rad - motion[2]
-    c, s = math.cos(before_rad), math.sin(before_rad)
-    before = (
-        x_m - c * motion[0] + s * motion[1],
-        y_m - s * motion[0] - c * motion[1],
-        before_rad,
-    )
-    return quads_px(navigator, before), quads_px(navigator, (x_m, y_m, psi_rad))
-
-
-def quads_px(navigator: Navigator, place: Place) -> Float[np.ndarray, "C M 4 2"]:
-    """Corners as seen from a place, px, by the program that predicts search regions."""
-    (x_m, y_m, psi_rad), dtype = place, np.asarray(navigator.corner_sigma_px).dtype
-    wxyz_xyz = np.array([math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0], dtype)
-    corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))
-    return np.asarray(corners.quads_px)
