@@ -20,6 +20,7 @@ def found(outliers: int) -> OdometryCalibration:
         fixed={"wheelbase_m": "as told"},
         correlation=np.eye(1),
         chi2_per_dof=1.0,
+        inflation=1.0,
         rms_px=0.3,
         outliers=np.arange(200) < outliers,
         views_px=rng.normal(0, 0.3, (200, 4, 2)),

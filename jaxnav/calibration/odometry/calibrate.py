@@ -32,6 +32,7 @@ from jaxnav.calibration.odometry.fit import OdometryFit, Prior, fit
 from jaxnav.calibration.odometry.model import FULL_WEIGHT, NAMES, Model
 from jaxnav.calibration.odometry.motion import STEERED_LITTLE, cannot_tell, driven_m
 from jaxnav.calibration.odometry.start import LOOSE, TIGHT, start
+from jaxnav.calibration.parts import variance_inflation
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -49,6 +50,7 @@ _RELATIVE = ("speed_scale", "steering_gain", "wheelbase_m")
 _KEPT_FIRST = ("wheelbase_m", "camera_delay_s", "steering_gain", "steering_offset_rad")
 _GAIN_SIGMA = 0.1  # of a gain that was kept, for its effect on the offset's sigma
 _LEAST_WAY_M = 1.0
+_NOTICED = 1.5  # a smaller inflation counts as none: 20 parts tell no better
 _REFUSED_CHI2, _AGAIN_CHI2 = 4.0, 1.2  # per degree of freedom
 _MOST_OUTLIERS, _AGAIN_OUTLIERS = 0.3, 0.05
 _OTHER = (0.1, TIGHT, TIGHT)  # errors of the odometry, for further starts
@@ -73,8 +75,9 @@ class OdometryCalibration:
         sigma: name -> standard deviation, of the parameters found.
         fixed: name -> why it was not fitted.
         correlation: between the parameters found, in the order of `sigma`.
-        chi2_per_dof: 1 if the sigmas of readings and corners are right. If it is above 1, all
-            sigmas of the parameters are larger by its root.
+        chi2_per_dof: 1 if the sigmas of readings and corners are right.
+        inflation: of the variances, where parts of the drives disagree; else 1. The sigmas have
+            grown by the root of the larger one of the two.
         rms_px: RMS residual of corners along one axis, without outliers.
         outliers: (V,) bool, true for views that count less because they are far off.
         views_px: (V, 4, 2), residuals.
@@ -93,6 +96,7 @@ class OdometryCalibration:
     fixed: dict[str, str]
     correlation: Float[np.ndarray, "p p"]
     chi2_per_dof: float
+    inflation: float
     rms_px: float
     outliers: Bool[np.ndarray, " V"]
     views_px: Float[np.ndarray, "V 4 2"]
@@ -165,7 +169,9 @@ def calibrate_odometry(
             outliers = solution.blocks.view_chi2 > FULL_WEIGHT
         _refuse_contradiction(where, solution, chi2, outliers)
         free = [name for name in NAMES if name not in why]
-        covariance = np.linalg.inv(solution.information) * max(chi2, 1.0)
+        covariance = np.linalg.inv(solution.information)
+        inflation = variance_inflation(solution.scores, covariance, len(free), _NOTICED)
+        covariance = covariance * max(chi2, inflation, 1.0)
         if why.get("steering_gain") == STEERED_LITTLE and "steering_offset_rad" in free:
             row = free.index("steering_offset_rad")
             covariance[row, row] += (_GAIN_SIGMA * steering_rad) ** 2
@@ -177,6 +183,7 @@ def calibrate_odometry(
         fixed=why,
         correlation=covariance / np.outer(deviation, deviation),
         chi2_per_dof=chi2,
+        inflation=inflation,
         rms_px=float(np.sqrt(np.mean(solution.blocks.views_px[~outliers] ** 2))),
         outliers=outliers,
         views_px=solution.blocks.views_px,
@@ -187,7 +194,7 @@ def calibrate_odometry(
         reading_sigma=sigma,
         way_m=way_m,
         duration_s=course.duration_s,
-        advice=_advice(why, chi2, outliers, wheelbase_sigma_m),
+        advice=_advice(why, chi2, inflation, outliers, wheelbase_sigma_m),
     )
 
 
@@ -298,6 +305,7 @@ def _refuse_contradiction(
 def _advice(
     fixed: Mapping[str, str],
     chi2: float,
+    inflation: float,
     outliers: np.ndarray,
     wheelbase_sigma_m: float | None,
 ) -> tuple[str, ...]:
@@ -307,7 +315,13 @@ def _advice(
             "The steering gain is as sure as the wheelbase that was taken as exact: an error of "
             "1 % there is one of 1 % here."
         )
-    if chi2 > 1.5:
+    if inflation > max(chi2, 1.0):
+        lines.append(
+            f"Parts of the drives disagree {np.sqrt(inflation):.1f} times as far as their noise "
+            "explains; all sigma are larger by that. Wheels that slip, or cameras that are off, "
+            "are the likely cause: drive more slowly, and calibrate the cameras and the rig first."
+        )
+    elif chi2 > 1.5:
         lines.append(
             f"Residuals are {np.sqrt(chi2):.1f} times as large as readings and corners say of "
             "themselves; all sigma are larger by that. Calibrate the cameras and the rig first, "

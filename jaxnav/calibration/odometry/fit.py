@@ -19,6 +19,7 @@ from jaxnav.numerics.levenberg_marquardt import adapted
 _BELOW = NODE + NEXT - 1  # diagonals below the main one
 _RTOL = 1e-9
 _MOST_STEPS = 100
+_PARTS = 20  # of a course, compared with each other
 _HOLDS = 1e-9  # of a pose that nothing tells of, as the last of a stretch before its first view
 
 
@@ -44,6 +45,8 @@ class OdometryFit:
         theta: (5,), see `model.NAMES`.
         information: (p, p), of the free parameters, with all nodes eliminated.
         blocks: the normal equations at this point.
+        scores: (B, p), gradient of half the cost of each part of the course by the free parameters,
+            with all nodes eliminated; they sum to zero.
         converged: true if no step lowers the cost any more.
     """
 
@@ -51,6 +54,7 @@ class OdometryFit:
     theta: Float[np.ndarray, " 5"]
     information: Float[np.ndarray, "p p"]
     blocks: Blocks
+    scores: Float[np.ndarray, "B p"]
     converged: bool
 
 
@@ -100,12 +104,9 @@ def fit(
             nodes, theta, blocks, cost = new_nodes, new_theta, new_blocks, new_cost
         if converged:
             break
+    system = _System.of(blocks, theta, free, prior)
     return OdometryFit(
-        nodes,
-        theta,
-        _System.of(blocks, theta, free, prior).reduced(),
-        blocks,
-        converged,
+        nodes, theta, system.reduced(), blocks, system.scores(blocks, free), converged
     )
 
 
@@ -154,6 +155,16 @@ class _System:
     def reduced(self) -> np.ndarray:
         """(p, p): the parameters' information with the nodes eliminated; raises as `solved`."""
         return self._eliminated(0.0)[0]
+
+    def scores(self, blocks: Blocks, free: np.ndarray) -> np.ndarray:
+        """(B, p): the parameters' gradient by each part of the course, the nodes eliminated."""
+        inner = self._eliminated(0.0)[1][:, :-1].reshape(-1, NODE, self.border.shape[1])
+        g = blocks.gradient
+        by_nodes = np.einsum("ni,nip->np", g[:, :NODE], inner[:-1])
+        by_nodes += np.einsum("ni,nip->np", g[:, NODE : NODE + NEXT], inner[1:, :NEXT])
+        scores = g[:, NODE + NEXT :][:, free] - by_nodes
+        edges = np.linspace(0, len(scores), min(_PARTS, len(scores)), endpoint=False).astype(int)
+        return np.add.reduceat(scores, edges, axis=0)
 
     def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
         """The damped step of the nodes and of the parameters, and the decrease of the cost that the

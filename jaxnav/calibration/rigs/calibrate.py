@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxnav.calibration.parts import variance_inflation
 from jaxnav.calibration.rigs import bundle
 from jaxnav.calibration.rigs.branches import other_branches
 from jaxnav.calibration.rigs.linking import Linker, Links
@@ -238,7 +239,8 @@ def _calibration(
     # The fitted unknowns have taken up their part of the noise.
     left = max(residuals.size - unknowns, 1) / residuals.size
     sigma_px = bundle.sigma_px_of(residuals) / np.sqrt(left)
-    inflation = _inflation(np.asarray(adjusted.scores), inverse, int(flat.sum()))
+    scores = np.asarray(adjusted.scores)
+    inflation = variance_inflation(scores, inverse, int(flat.sum()), _NOTICED)
     lenses = adjusted.poses.lenses
     return RigCalibration(
         views=views,
@@ -255,7 +257,7 @@ def _calibration(
         sigma_px=sigma_px,
         residuals_px=residuals,
         weight=np.asarray(adjusted.weight),
-        covariance=inverse * (sigma_px / used_px) ** 2 * max(1.0, inflation),
+        covariance=inverse * (sigma_px / used_px) ** 2 * inflation,
         frames_follow=np.asarray(_follows(adjusted.reduced)),
         inflation=inflation,
         turned=turned,
@@ -265,18 +267,3 @@ def _calibration(
 @jax.jit
 def _follows(reduced: ReducedSystem) -> Array:
     return -jax.vmap(solve_upper)(reduced.factor, reduced.carried)
-
-
-def _inflation(scores: np.ndarray, inverse: np.ndarray, unknowns: int) -> float:
-    """The factor of the variances over those from noise independent between frames.
-
-    A lens that is a little off, or a marker that is not flat, errs alike for seconds. Parts of the
-    recording then disagree by more than their residuals explain. The factor is 1 if they don't.
-
-    Source: Liang, Zeger (1986), "Longitudinal data analysis using generalized linear models": the
-    robust variance, of which this is the mean over all unknowns.
-    """
-    parts = len(scores)
-    spread = np.einsum("bi,ij,bj->", scores, inverse, scores) * parts / max(parts - 1, 1)
-    ratio = spread / max(unknowns, 1)
-    return float(ratio) if ratio > _NOTICED else 1.0

@@ -79,6 +79,7 @@ def report(
         "recordings": list(args.recordings),
         "reprojection_rms_px": calibration.rms_px,
         "chi2_per_dof": calibration.chi2_per_dof,
+        "variance_inflation": calibration.inflation,
         "parameters": {
             name: {
                 "value": calibration.value[name],

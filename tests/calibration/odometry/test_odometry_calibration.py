@@ -68,6 +68,7 @@ def test_a_minute_of_eights_tells_every_figure(recipe):
     assert np.all(np.abs(errors(recipe)) < 4 * sigma)
     assert np.all(sigma < allowed() / 2)
     assert recipe.chi2_per_dof == pytest.approx(1.0, abs=0.05)
+    assert recipe.inflation == 1
     assert recipe.rms_px == pytest.approx(0.3, rel=0.1)
     assert not recipe.outliers.sum() > 5
 
@@ -85,6 +86,20 @@ def test_wrong_detections_count_little():
     found = calibrate(driven(RECIPE, 60.0, seed=1, sensors=Sensors(wrong_share=0.02)))
     assert np.all(np.abs(errors(found)) < allowed())
     assert 10 < found.outliers.sum() < 60
+
+
+def test_parts_that_disagree_make_the_sigmas_larger(minute, recipe):
+    """Wheels that spin by a tenth for 2 s of 6: residuals are 1.5 times as large, the scale's error
+    about its mean ten times. The mean itself is found."""
+    spins = (minute.reading_stamps_ns - minute.reading_stamps_ns[0]) % 6_000_000_000 < 2_000_000_000
+    found = calibrate(
+        dataclasses.replace(minute, speed_mps=minute.speed_mps * np.where(spins, 1.1, 1.0))
+    )
+    assert found.inflation > 10 * found.chi2_per_dof > 10
+    assert found.sigma["speed_scale"] > 5 * recipe.sigma["speed_scale"]
+    mean = recipe.value["speed_scale"] / (1 + 0.1 / 3)
+    assert abs(found.value["speed_scale"] - mean) < 3 * found.sigma["speed_scale"]
+    assert any(sentence.startswith("Parts of the drives disagree") for sentence in found.advice)
 
 
 def test_recordings_add_up(recipe):
@@ -231,6 +246,10 @@ def test_the_band_solves_what_a_dense_matrix_does(short):
     step_nodes, step_theta, _ = system.solved(0.01)
     np.testing.assert_allclose(step_theta, expected[-4:], rtol=1e-6)
     np.testing.assert_allclose(step_nodes.ravel(), expected[:-4], rtol=1e-5, atol=1e-9)
+    scores, border = system.scores(blocks, free), dense[:-4, -4:]
+    reduced = gradient[-4:] - border.T @ np.linalg.solve(dense[:-4, :-4], gradient[:-4])
+    assert scores.shape == (20, 4)
+    np.testing.assert_allclose(scores.sum(axis=0), reduced, rtol=1e-5)
     covariance = np.linalg.inv(dense)[-4:, -4:]
     np.testing.assert_allclose(np.linalg.inv(system.reduced()), covariance, rtol=1e-4)
 
