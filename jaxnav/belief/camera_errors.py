@@ -49,7 +49,7 @@ class CameraErrors(eqx.Module):
 class ErrorsPosterior(eqx.Module):
     """The errors of the cameras in view, given the corrected pose: N(mean + slope xi, covariance).
 
-    xi is the pose's error in the axes of the prediction, along its freedom.
+    xi is the pose's error in the corrected pose's own axes, along its freedom.
     """
 
     change: Float[Array, "*K t"]  # of the mean, at the corrected pose

@@ -60,7 +60,7 @@ def follow_pose(
     y, P_yy, P_y, given_pose = xi, P[:d, :d], P[:d], None
     errors = posterior.errors
     if errors is not None:
-        M = jnp.concatenate([M, product(errors.slope, M)])
+        M = jnp.concatenate([M, errors.slope])
         y = jnp.append(xi, errors.change)
         e = errors.rows.shape[1]
         P_y = jnp.concatenate([P_y, product(errors.rows, P[n - e :])])

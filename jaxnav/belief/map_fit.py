@@ -23,7 +23,12 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.belief.ambiguity import PoseBelief, PosePosterior
 from jaxnav.belief.camera_errors import CameraErrors
 from jaxnav.belief.nuisances import ErrorsAtBest, Nuisances
-from jaxnav.models.geometry import cayley, cayley_jacobian, rotation_matrix
+from jaxnav.models.geometry import (
+    cayley,
+    cayley_jacobian,
+    inverse_cayley_jacobian,
+    rotation_matrix,
+)
 from jaxnav.numerics.levenberg_marquardt import ImplicitGradient, NormalEquations, NormalEquationsLM
 from jaxnav.numerics.small_matrices import (
     cho_solve,
@@ -239,8 +244,12 @@ def _fused(
         + log_share
         - (misfit + log_det(alone) + jnp.sum(contradiction**2) + log_det(sigma)) / 2
     )
-    errors_in_view = None if errors is None else errors.given_pose(u_fused - u, unspread)
     xi = matvec(spread, u_fused)
+    errors_in_view = None
+    if errors is not None:
+        # Error at the corrected pose -> at the prediction -> in units of its sigma.
+        back = product(unspread, sandwich(freedom.T, inverse_cayley_jacobian(xi)))
+        errors_in_view = errors.given_pose(u_fused - u, back)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, C)

@@ -28,11 +28,11 @@ class ErrorsAtBest(eqx.Module):
     covariance: Float[Array, "*K t t"]
     rows: Float[Array, "*K t e"]
 
-    def given_pose(self, du: Float[Array, " d"], unspread: Float[Array, "d d"]) -> ErrorsPosterior:
-        """The errors of one hypothesis at u + du, by the pose's error xi = unspread^-1 u."""
+    def given_pose(self, du: Float[Array, " d"], by_xi: Float[Array, "d d"]) -> ErrorsPosterior:
+        """The errors of one hypothesis at u + du, by the pose's error there: by_xi is du / dxi."""
         return ErrorsPosterior(
             self.change + matvec(self.slope, du),
-            product(self.slope, unspread),
+            product(self.slope, by_xi),
             self.covariance,
             self.rows,
         )

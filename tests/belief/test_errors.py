@@ -139,6 +139,29 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
     assert np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
+@pytest.mark.parametrize("body", ["car", "free"])
+def test_a_start_far_from_its_guess_keeps_a_covariance(navigator, body):
+    """Hypotheses of the fan turn by degrees onto the corners, and 3 m away a degree is 5 cm: the
+    turns of the cameras go with the corrected pose, not with the guess."""
+    if body == "free":
+        navigator = Navigator(off_rig(), worlds.paper_markers(), selector=MultiHypothesis())
+    rng = np.random.default_rng(0)
+    noise_px = rng.normal(size=(4, 1, 4, 2))
+    obs = worlds.observe(
+        off_rig(), worlds.paper_markers(), worlds.planar(0.0, -1.7, 1.7), jnp.asarray(noise_px)
+    )
+    bank = jax.jit(navigator.sense)(navigator.believe(navigator.motion.init(24)), obs)[0].bank
+    alive = np.asarray(bank.initialised)
+    assert alive.sum() > 5
+    P = np.asarray(bank.covariance)[alive]
+    states = navigator.motion.states
+    known = np.r_[0 : states // 2, P.shape[1] - 4 * EACH : P.shape[1]]
+    P = P[:, known][:, :, known]
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    least = np.linalg.eigvalsh(P / sigma[:, :, None] / sigma[:, None])[:, 0]
+    assert np.all(least > 0)
+
+
 def moved(T_world_vehicle: jaxlie.SE3, corners):
     return jax.vmap(T_world_vehicle.inverse().apply)(corners).T[..., None]
 
