@@ -130,7 +130,7 @@ class MultiHypothesis(eqx.Module):
         )
         alive = bank.initialised & fits.finite
         inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
-        free_cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+        free_cost = candidates.least_cost
         posteriors = _contradicted(_inflated(fits.posterior, inflation), fits.cost - free_cost)
         fits_one = starts | (jnp.min(jnp.where(alive, fits.cost, jnp.inf)) - free_cost < self.gate)
         passes = starts | (_nis(posteriors) <= prior.gate_nis * inflation)
@@ -308,7 +308,7 @@ def _contradicted(posteriors: PosePosterior, excess: Float[Array, " K"]) -> Pose
 
 def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
     """The `excess_of` of the best candidate's cost; 1 without a candidate."""
-    cost = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+    cost = candidates.least_cost
     freedom = jnp.maximum(8 * jnp.sum(snapshot.seen.visible) - 6, 2).astype(cost.dtype)
     return excess_of(jnp.where(jnp.isfinite(cost), cost, 0), freedom)
 

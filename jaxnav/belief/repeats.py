@@ -170,8 +170,7 @@ def surprise_of(
     r, J = residual.reshape(-1), product(spread.T, answers(slope, points)[..., 0])
     information = gram(J) + jnp.eye(J.shape[0], dtype=J.dtype)
     explained = jnp.sum(solve_lower(cholesky(information), matvec(J, r)) ** 2)
-    free = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
-    nis = jnp.sum(r**2) - explained - free
+    nis = jnp.sum(r**2) - explained - candidates.least_cost
     nis = jnp.where(alive & jnp.isfinite(nis), nis, 0)
     return excess_of(nis, jnp.asarray(J.shape[0], nis.dtype))
 

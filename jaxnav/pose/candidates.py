@@ -59,6 +59,11 @@ class Candidates(eqx.Module):
             steps=jnp.zeros(count, int),
         )
 
+    @property
+    def least_cost(self) -> Float[Array, ""]:
+        """The cost of the best candidate; inf without one."""
+        return jnp.min(jnp.where(self.valid, self.cost, jnp.inf))
+
     def padded(self, count: int) -> "Candidates":
         """The candidates with lanes appended up to `count`, which are not valid."""
         kept = self.valid.shape[0]

@@ -137,6 +137,6 @@ def _in_view(seen: Sightings, markers: int) -> Bool[Array, " M"]:
 
 def _excess(candidates: Candidates, seen: Sightings) -> Float[Array, ""]:
     """Cost of the best candidate over the mean plus three sigmas of its chi-square."""
-    misfit = jnp.min(jnp.where(candidates.valid, candidates.cost, jnp.inf))
+    misfit = candidates.least_cost
     freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
     return misfit / (freedom + 3 * jnp.sqrt(2 * freedom))

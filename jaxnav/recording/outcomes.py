@@ -188,8 +188,8 @@ class Outcomes:
         selected: (N,) int, index of the selected candidate.
         errors, errors_sigma: (N, e), of sensors and cameras, see `jaxnav.recording.learnt`; older
             drives have none.
-        outvoted: N lists, ids of markers that were left out; older drives have none.
-        outvoted_cameras: N lists, names of cameras that were; older drives have none.
+        outvoted: N lists, ids of markers that others have voted against; older drives have none.
+        outvoted_cameras: N lists, names of cameras that were left out; older drives have none.
         repeated_share: (N,), of the corners' variance that repeats; NaN in older drives.
     """
 
