@@ -111,7 +111,7 @@ def grey_image(kind: str, message: Any) -> UInt8[np.ndarray, "rows columns"] | N
     """
     data = np.asarray(message.data, np.uint8)
     if kind == COMPRESSED:
-        return decode_image(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        return decode_image(data, cv2.IMREAD_GRAYSCALE)
     if message.encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
         raise ValueError(f"the encoding {message.encoding!r} is none of {known}")

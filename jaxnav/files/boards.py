@@ -8,8 +8,9 @@
     family: 4x4_50
     first_id: 0
 
-An aprilgrid has also `spacing`, in sides of a tag, and `border_cells`, the width of the tags'
-black frame in cells: 2 as Kalibr prints them.
+`legacy: true` says that a charuco board of an even number of rows is white at its top left, as
+calib.io and OpenCV before 4.6 print it. An aprilgrid has also `spacing`, in sides of a tag, and
+`border_cells`, the width of the tags' black frame in cells: 2 as Kalibr prints them.
 """
 
 from collections.abc import Mapping
@@ -49,6 +50,7 @@ class Charuco(_Own):
     marker_m: Size
     family: Text
     first_id: Count = 0
+    legacy: Annotated[bool, Field(strict=True, serialization_alias="white_top_left")] = False
 
 
 class Aprilgrid(_Own):

@@ -1,18 +1,32 @@
-"""Decoding of compressed images of any bytes: BMP, JPEG, PNG, PNM, TIFF and WebP.
+"""Decoding of compressed images of any bytes: BMP, JPEG, PNG, PNM, TIFF, WebP; HEIC by pillow-heif.
 
 OpenCV takes memory for the size that a header declares, whatever follows. So the header is read
 first, and an image that is too large or of another format is not decoded.
+
+Pixels come as the camera stored them. A calibration belongs to the sensor, so a picture is not
+turned as its EXIF orientation asks viewers to: a phone held upright has the same lens as one held
+across. Only what the orientation calls mirrored is mirrored back, for no lens draws such a picture.
 """
 
+import importlib.util
+import io
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image, UnidentifiedImageError
 
 from jaxnav.errors import BadInput, libraries_silenced
 from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
+
+_ORIENTATION = 0x0112
+_MIRRORED = (2, 4, 5, 7)
+_TURNS_BACK = {3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}  # quarters, anticlockwise, after viewers' turn
+_EXIF_WITHIN = 2**20  # bytes from the start of a file
+_BROKEN = (OSError, ValueError, SyntaxError, KeyError, TypeError, EOFError, RuntimeError)
+_HEIC = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif")
 
 
 def decode_image(
@@ -22,16 +36,57 @@ def decode_image(
 
     Args:
         raw: the file's bytes, as `bytes` or (N,) uint8.
-        flags: of `cv2.imdecode`.
+        flags: `cv2.IMREAD_COLOR` or `cv2.IMREAD_GRAYSCALE`, (H, W).
     """
-    data = np.frombuffer(raw, np.uint8) if isinstance(raw, bytes) else raw
     if image_problem(raw) is not None:
         return None
+    stored = raw if isinstance(raw, bytes) else raw.tobytes()
+    if is_heic(stored):
+        return _decode_heic(stored, flags)
     try:
-        image = cv2.imdecode(data, flags)
+        image = cv2.imdecode(np.frombuffer(stored, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:  # for no bytes at all, or a size beyond the memory
         return None
-    return None if image is None else np.asarray(image)
+    if image is None:
+        return None
+    mirrored = exif_orientation(stored) in _MIRRORED
+    return np.ascontiguousarray(image[:, ::-1]) if mirrored else np.asarray(image)
+
+
+def exif_orientation(raw: bytes) -> int:
+    """How viewers are asked to turn an image, 1 to 8 as EXIF counts; 1 is not at all."""
+    if not any(mark in raw[:_EXIF_WITHIN] for mark in (b"Exif", b"eXIf", b"II*\0", b"MM\0*")):
+        return 1
+    try:
+        with Image.open(io.BytesIO(raw)) as image:
+            orientation = image.getexif().get(_ORIENTATION, 1)
+    except (UnidentifiedImageError, Image.DecompressionBombError, *_BROKEN):
+        return 1
+    return orientation if orientation in range(1, 9) else 1
+
+
+def is_heic(raw: bytes) -> bool:
+    """True for a picture as phones store it, which OpenCV does not read."""
+    return raw[4:8] == b"ftyp" and raw[8:12] in _HEIC
+
+
+def _decode_heic(raw: bytes, flags: int) -> np.ndarray | None:
+    try:
+        import pillow_heif
+    except ImportError:
+        return None
+    try:
+        file = pillow_heif.open_heif(raw)
+        if file.size[0] * file.size[1] > limits.IMAGE_PIXELS:
+            return None
+        # It turns the pixels as viewers do, and keeps by how much.
+        orientation = int(file.info.get("original_orientation") or 1)
+        rgb = np.asarray(file.to_pillow().convert("RGB"))
+    except (UnidentifiedImageError, *_BROKEN):
+        return None
+    stored = np.ascontiguousarray(np.rot90(rgb, _TURNS_BACK.get(orientation, 0)))
+    grey = flags == cv2.IMREAD_GRAYSCALE
+    return np.asarray(cv2.cvtColor(stored, cv2.COLOR_RGB2GRAY if grey else cv2.COLOR_RGB2BGR))
 
 
 def read_image(
@@ -58,7 +113,12 @@ def image_problem(raw: bytes | UInt8[np.ndarray, " N"]) -> str | None:
     """The reason why an image is not to be decoded; None where decoding can be tried."""
     if len(raw) > limits.IMAGE_BYTES:
         return f"is larger than {limits.IMAGE_BYTES // limits.MIB} MiB"
-    size_px = image_size_px(raw if isinstance(raw, bytes) else raw.tobytes())
+    stored = raw if isinstance(raw, bytes) else raw.tobytes()
+    if is_heic(stored):
+        if importlib.util.find_spec("pillow_heif") is not None:
+            return None
+        return "is a HEIC picture: pip install 'jaxnav[heic]' reads it, or save it as JPEG"
+    size_px = image_size_px(stored)
     if size_px is None:
         return "is not an image that OpenCV can read"
     width, height = size_px

@@ -3,11 +3,13 @@
 A board lies in the plane z = 0 of its own frame: x right, y up, z towards its reader, the origin
 in the centre of its ink. There are four kinds:
 
-    charuco     a chessboard with a marker in every white square (OpenCV's layout since 4.6); its
-                points are the corners between the squares
+    charuco     a chessboard with a marker in every white square, black at its top left; of an even
+                number of rows it may be white there (calib.io's, and OpenCV's before 4.6: the
+                legacy pattern); its points are the corners between the squares
     aprilgrid   tags in a grid with black squares between their corners (Kalibr's layout); its
                 points are the corners of the tags
-    chessboard  squares alone; its points are the corners between them
+    chessboard  squares alone, in either colour; its points are the corners between them. One that
+                looks the same when it is turned tells a lens as well as any other
     marker      one navigation marker; its points are its four corners
 """
 
@@ -60,6 +62,7 @@ class Board:
         family: family of the markers, one of `jaxnav.models.markers.FAMILY_SIZES`.
         first_id: id of the first marker; the others follow in order.
         border_cells: width in cells of the black frame of an aprilgrid's tags; Kalibr prints 2.
+        white_top_left: true if the top left square of a charuco board or a chessboard is white.
 
     Raises:
         ValueError: the board is impossible; the message says why in one line.
@@ -74,6 +77,7 @@ class Board:
     family: str = ""
     first_id: int = 0
     border_cells: int = 1
+    white_top_left: bool = False
 
     def __post_init__(self) -> None:
         if not 1e-4 <= self.size_m <= 100:
@@ -84,10 +88,9 @@ class Board:
                 f"a {self.kind} has {fewest} to 100 columns and rows, "
                 f"got {self.columns} x {self.rows}"
             )
-        if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
+        if self.kind == "charuco" and self.white_top_left and self.rows % 2:
             raise ValueError(
-                f"a chessboard of {self.columns} x {self.rows} squares looks the same upside down: "
-                f"take an odd and an even number, as {self.columns} x {self.rows - 1}"
+                f"the legacy pattern differs on an even number of rows only, got {self.rows}"
             )
         if self.kind == "charuco" and not 0 < self.marker_m < self.size_m:
             raise ValueError(
@@ -187,7 +190,7 @@ class Board:
                 (column, self.rows - 1 - row)
                 for row in range(self.rows)
                 for column in range(self.columns)
-                if (row + column) % 2
+                if (row + column) % 2 != self.white_top_left
             ]
         else:
             places = [(column, row) for row in range(self.rows) for column in range(self.columns)]
@@ -211,7 +214,7 @@ class Board:
     def dark_top_left(self) -> Bool[np.ndarray, " P"]:
         """(P,) bool, true where a saddle is black at its top left and bottom right."""
         if self.kind in ("charuco", "chessboard"):
-            return np.asarray(self.grid.sum(axis=1) % 2 == 0)
+            return np.asarray(self.grid.sum(axis=1) % 2 == self.white_top_left)
         # The corner squares touch a tag's TL and BR from outside, its TR and BL from beside.
         return np.tile([True, False, True, False], self.tag_count)
 
@@ -240,7 +243,8 @@ class Board:
         if self.kind == "chessboard":
             return f"{grid}, squares {size}"
         if self.kind == "charuco":
-            return f"{grid}, squares {size}, markers {1e3 * self.marker_m:g} mm, {ids}"
+            legacy = ", legacy pattern" if self.white_top_left else ""
+            return f"{grid}, squares {size}, markers {1e3 * self.marker_m:g} mm, {ids}{legacy}"
         return f"{grid}, tags {size}, gap {1e3 * self.spacing * self.size_m:g} mm, {ids}"
 
 

@@ -1,12 +1,13 @@
 """Detection of a board in an image: its points to some hundredths of a pixel.
 
 On a charuco board or an aprilgrid, tags are read and each point is predicted from the tags around
-it; on a chessboard, OpenCV finds all points at once. From there all three kinds are treated alike:
-`fit_saddles` fits each point, first with straight edges, then with edges that bend as the
-neighbours in their rows and columns show. Points that don't fit their neighbours are dropped.
+it; on a chessboard, one of OpenCV's finders finds all points at once. From there all three kinds
+are treated alike: `fit_saddles` fits each point, first with straight edges, then with edges that
+bend as the neighbours in their rows and columns show. Points that don't fit their neighbours are
+dropped.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from jaxnav.calibration.boards.places import (
     straight_places,
 )
 from jaxnav.calibration.boards.saddles import EDGE_WIDTH_SIGMAS, Places, Saddles, fit_saddles
-from jaxnav.calibration.boards.tags import read_tags
+from jaxnav.calibration.boards.tags import as_printed, read_tags
 from jaxnav.calibration.lenses.views import BoardView
 from jaxnav.detection import make_detector
 from jaxnav.detection.edges import PIXEL_VARIANCE_PX2
@@ -35,6 +36,7 @@ _RADIUS = 0.45  # of a square: radius of the patch around a saddle
 _MIN_RADIUS_PX, _MAX_RADIUS_PX = 3.0, 9.0
 _FIRST_MOVE, _SECOND_MOVE_PX = 0.25, 1.5  # part of a square, px
 _NEIGHBOURS = 12
+_SMALLER_PX = (800, 400)  # longer sides of the pictures in which a chessboard is looked for again
 # A point is wrong when its distance from where its neighbours predict it exceeds this many times
 # that of the median point, and this many pixels.
 _MAX_STRAY, _MIN_STRAY_PX = 6.0, 0.7
@@ -48,11 +50,13 @@ class BoardLook:
         view: the points found; None if there are too few.
         foreign_ids: ids seen of the board's family that are not on the board.
         own_ids: ids seen that are on the board.
+        board: the board as it is printed: a chessboard may be inverse, a charuco board legacy.
     """
 
     view: BoardView | None
     foreign_ids: tuple[int, ...] = ()
     own_ids: tuple[int, ...] = ()
+    board: Board | None = None
 
 
 def find_board(
@@ -89,16 +93,17 @@ def look_at(
     foreign: tuple[int, ...] = ()
     own: tuple[int, ...] = ()
     if board.kind == "chessboard":
-        ids, places = _chessboard_places(board, levels)
+        board, ids, places = _chessboard_places(board, levels)
     else:
         tags, corners_px, foreign = read_tags(board, levels)
         own = tuple(board.tags[place].id for place in tags)
+        board = as_printed(board, tags, corners_px)
         corners_m = [board.tags[place].corners_board_m for place in tags]
         known_m, known_px = np.reshape(corners_m, (-1, 2)), corners_px.reshape(-1, 2)
         ids, places = predicted_places(
             board, np.arange(len(board.points_board_m)), known_m, known_px
         )
-    return BoardLook(_view(board, levels, name, ids, places), foreign, own)
+    return BoardLook(_view(board, levels, name, ids, places), foreign, own, board)
 
 
 def _view(
@@ -168,14 +173,16 @@ def _look_for_marker(
     )
 
 
-def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[np.ndarray, Places]:
-    """The chessboard's inner corners as OpenCV finds them; empty if it doesn't find all."""
-    pattern = (board.pattern_columns, board.pattern_rows)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-    success, corners = cv2.findChessboardCornersSB(levels, pattern, flags=flags)
-    if not success:
-        return no_places(board)
-    grid = np.asarray(corners, float).reshape(board.pattern_rows, board.pattern_columns, 2)
+def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[Board, np.ndarray, Places]:
+    """The chessboard as it is printed, with its inner corners; none if not all are found.
+
+    Its colours say which way round it is. Where they don't, since it looks the same when it is
+    turned, any way round will do.
+    """
+    corners_px = _opencv_chessboard(levels, (board.pattern_columns, board.pattern_rows))
+    if corners_px is None:
+        return board, *no_places(board)
+    grid = corners_px.reshape(board.pattern_rows, board.pattern_columns, 2)
     right, down = np.mean(grid[:, -1] - grid[:, 0], axis=0), np.mean(grid[-1] - grid[0], axis=0)
     if right[0] * down[1] - right[1] * down[0] < 0:
         grid = grid[:, ::-1]
@@ -183,8 +190,33 @@ def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[np.ndarray, Pl
     places = straight_places(board, ids, grid.reshape(-1, 2))
     first = fit_saddles(levels, places, _MAX_RADIUS_PX, _MAX_RADIUS_PX)
     if np.sum(np.sign(first.amplitude) * np.where(board.dark_top_left, 1, -1)) < 0:
-        places = straight_places(board, ids, grid.reshape(-1, 2)[::-1])
-    return ids, places
+        if (board.columns + board.rows) % 2:
+            places = straight_places(board, ids, grid.reshape(-1, 2)[::-1])
+        else:  # turned by half, it has the same colours
+            board = replace(board, white_top_left=not board.white_top_left)
+    return board, ids, places
+
+
+def _opencv_chessboard(levels: np.ndarray, pattern: tuple[int, int]) -> np.ndarray | None:
+    """Inner corners (P, 2), px, row by row, by the first of OpenCV's finders that finds them.
+
+    The newer finder loses boards in large pictures that it finds in smaller ones, and the older
+    one finds some that it never does. Their corners are a start only.
+    """
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    for width_px in (max(levels.shape), *_SMALLER_PX):
+        scale = width_px / max(levels.shape)
+        if scale > 1:
+            continue
+        small = levels
+        if scale < 1:
+            small = cv2.resize(levels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        found, corners = cv2.findChessboardCornersSB(small, pattern, flags=flags)
+        if found:
+            return (np.asarray(corners, float).reshape(-1, 2) + 0.5) / scale - 0.5
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCorners(levels, pattern, flags=flags)
+    return np.asarray(corners, float).reshape(-1, 2) if found else None
 
 
 def _kept(

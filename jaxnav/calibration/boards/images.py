@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,8 @@ from jaxnav.files import limits
 from jaxnav.files.images import read_image
 from jaxnav.models.camera import Camera
 
-IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm",
+          ".heic", ".heif")  # fmt: skip
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
 
 _MOST_FRAMES = 600  # of one video that are searched
@@ -37,15 +39,19 @@ class CollectedViews:
         views: the input of the calibration.
         files: all files read, in order, for the hash of the data.
         duplicates: (name, name of the image that it repeats).
+        unreadable: (name, why it can't be read).
         without_board: names of images in which the board is not seen.
-        foreign_ids: ids seen of the board's family that are not on the board.
+        foreign_ids: ids seen often of the board's family that are not on the board.
+        other_pattern: true if a charuco board is seen in the pattern that its file does not say.
     """
 
     views: BoardViews
     files: tuple[Path, ...]
     duplicates: tuple[tuple[str, str], ...]
+    unreadable: tuple[tuple[str, str], ...]
     without_board: tuple[str, ...]
     foreign_ids: tuple[int, ...]
+    other_pattern: bool
 
 
 def collect_views(
@@ -67,8 +73,8 @@ def collect_views(
         headless: show no progress bar.
 
     Raises:
-        BadInput: a file can't be read, images differ in size, or the board is not seen; the
-            message then says what is seen instead.
+        BadInput: none of the images can be read, a video can't be, images differ in size, or the
+            board is not seen; the message then says what is seen instead.
     """
     files = source_files(sources)
     collector = _Collector(board, camera)
@@ -90,6 +96,8 @@ def source_files(sources: Sequence[Path]) -> tuple[Path, ...]:
     """
     files: list[Path] = []
     for source in sources:
+        if not source.exists():
+            raise BadInput(source, "can't be read: no such file or folder")
         if not source.is_dir():
             if source.suffix.lower() not in IMAGES + VIDEOS:
                 known = ", ".join(IMAGES + VIDEOS)
@@ -140,13 +148,16 @@ class _Collector:
         self._views: list[BoardView] = []
         self._looks: list[BoardLook] = []
         self._duplicates: list[tuple[str, str]] = []
+        self._unreadable: list[tuple[str, BadInput]] = []
         self._without: list[str] = []
         self._examples: list[np.ndarray] = []
 
     def add_image(self, file: Path, name: str) -> None:
-        # As the sensor gave it: an image turned upright belongs to another camera model.
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        image = read_image(file, flags)
+        try:
+            image = read_image(file, cv2.IMREAD_GRAYSCALE)
+        except BadInput as error:
+            self._unreadable.append((name, error))
+            return
         self._same_size(str(file), image)
         if not self._is_repeated(name, image):
             look = self._look(name, image)
@@ -169,23 +180,35 @@ class _Collector:
             last_view, last_thumbnail = view, thumbnail
 
     def collected(self, files: tuple[Path, ...]) -> CollectedViews:
-        foreign = sorted({i for look in self._looks for i in look.foreign_ids})
-        strange = sum(bool(look.foreign_ids) for look in self._looks)
-        # One foreign marker may hang in the room; a wrong board brings several into most images.
-        wrong = len(foreign) > 1 and strange > len(self._looks) / 2
-        if wrong or not self._views:
+        if self._unreadable and not self._looks:
+            raise self._unreadable[0][1]
+        often = Counter(i for look in self._looks for i in look.foreign_ids)
+        # A marker may hang in the room, and texture be read as one; a wrong board brings the same
+        # several into most images.
+        looks = len(self._looks)
+        rare = min(max(1, looks / 4), looks - 1)
+        foreign = sorted(i for i, count in often.items() if count > rare)
+        strange = sum(len(set(foreign) & set(look.foreign_ids)) > 1 for look in self._looks)
+        if strange > looks / 2 or not self._views:
             raise BadInput(
                 files[0] if len(files) == 1 else files[0].parent,
-                what_is_seen(self._board, self._looks, self._examples),
+                what_is_seen(self._board, self._looks, self._examples, foreign),
             )
         assert self._size_px is not None
         return CollectedViews(
             BoardViews(self._board.points_board_m, self._size_px, tuple(self._views)),
             files,
             tuple(self._duplicates),
+            tuple((name, str(error).partition(": ")[2]) for name, error in self._unreadable),
             tuple(self._without),
             tuple(foreign),
+            self._has_other_pattern(),
         )
+
+    def _has_other_pattern(self) -> bool:
+        seen = [look.board for look in self._looks if look.board is not None and look.view]
+        other = sum(board.white_top_left != self._board.white_top_left for board in seen)
+        return self._board.kind == "charuco" and other > len(seen) / 2
 
     def _look(self, name: str, image: np.ndarray) -> BoardLook:
         look = look_at(self._board, image, name, self._camera)

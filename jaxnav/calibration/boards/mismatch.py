@@ -19,7 +19,10 @@ _MANY = 4  # markers in an image; fewer may be chance
 
 
 def what_is_seen(
-    board: Board, looks: Sequence[BoardLook], examples: Sequence[UInt8[np.ndarray, "rows columns"]]
+    board: Board,
+    looks: Sequence[BoardLook],
+    examples: Sequence[UInt8[np.ndarray, "rows columns"]],
+    foreign: Sequence[int],
 ) -> str:
     """Explain to a person in one line why the board is not found, and what to do.
 
@@ -27,8 +30,8 @@ def what_is_seen(
         board: the board that was looked for.
         looks: the result for every image.
         examples: some of the images without the board, (H, W) grey.
+        foreign: ids that are often seen and not on the board.
     """
-    foreign = sorted({marker_id for look in looks for marker_id in look.foreign_ids})
     own = sorted({marker_id for look in looks for marker_id in look.own_ids})
     images = f"{len(looks)} image{'s' * (len(looks) != 1)}"
     if foreign:

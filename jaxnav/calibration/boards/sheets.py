@@ -101,7 +101,8 @@ def _canvas(width: int, height: int, quiet: int) -> np.ndarray:
 
 
 def _chequer(ink: np.ndarray, board: Board, square: int, quiet: int) -> None:
-    dark = np.add.outer(np.arange(board.rows), np.arange(board.columns)) % 2 == 0
+    dark = np.add.outer(np.arange(board.rows), np.arange(board.columns)) % 2
+    dark = dark == board.white_top_left
     inner = np.kron(dark, np.ones((square, square), bool))
     ink[quiet : quiet + inner.shape[0], quiet : quiet + inner.shape[1]] = inner
 

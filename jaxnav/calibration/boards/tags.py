@@ -1,15 +1,21 @@
 """Detection of a board's tags in an image: their ids, and their corners to a pixel."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.places import mapped
 from jaxnav.detection.families import dictionary
 
 # Where fewer than this part of the tags are read, the image is read again at twice its size.
 _FEW = 0.5
 _MAX_CORRECTION = 0.4  # part of the bits that a family can correct
+_TAGS_AROUND = 4  # a tag is predicted from so many others
+_MOST_STRAY = 2.0  # that one tag, misread perhaps, counts for
+_OTHER = 0.5  # of a board's strays: a layout with less is the one that is printed
 
 
 def read_tags(
@@ -46,6 +52,46 @@ def read_tags(
         np.array(corners, float).reshape(-1, 4, 2),
         tuple(sorted(marker_id for marker_id in seen if marker_id not in place_of)),
     )
+
+
+def as_printed(
+    board: Board, places: Int[np.ndarray, " N"], corners_px: Float[np.ndarray, "N 4 2"]
+) -> Board:
+    """The board, or its legacy twin, whichever has its tags where they are seen.
+
+    Args:
+        places: of N tags the indices into `Board.tags`, which both have alike.
+        corners_px: of these tags.
+    """
+    if board.kind != "charuco" or board.rows % 2:
+        return board
+    twin = replace(board, white_top_left=not board.white_top_left)
+    strays = [_stray(one, places, corners_px) for one in (board, twin)]
+    return twin if strays[1] < _OTHER * strays[0] else board
+
+
+def _stray(board: Board, places: np.ndarray, corners_px: np.ndarray) -> float:
+    """Mean distance of a tag from where its nearest tags predict it, in sides of a tag.
+
+    On an odd number of columns the twin has all tags a column further, but for those that begin
+    another row: it is they who tell.
+    """
+    corners_m = np.reshape([board.tags[place].corners_board_m for place in places], (-1, 4, 2))
+    centres_m = corners_m.mean(axis=1)
+    strays: list[float] = []
+    for index, centre_m in enumerate(centres_m):
+        apart_m = np.linalg.norm(centres_m - centre_m, axis=1)
+        near = np.argsort(apart_m, kind="stable")[1 : _TAGS_AROUND + 1]
+        if len(near) == _TAGS_AROUND:
+            known_m, known_px = (
+                corners[near].reshape(-1, 2) for corners in (corners_m, corners_px)
+            )
+            at = mapped(known_m / board.size_m, known_px, corners_m[index] / board.size_m)
+            if at is not None:
+                off_px = np.linalg.norm(at - corners_px[index], axis=1).mean()
+                side_px = np.linalg.norm(np.diff(corners_px[index], axis=0), axis=1).mean()
+                strays.append(min(off_px / side_px, _MOST_STRAY))
+    return float(np.mean(strays)) if strays else np.inf
 
 
 def _decoded(

@@ -171,17 +171,22 @@ def lens_information(blocks: Blocks, free: Bool[Array, " 9"]) -> Float[Array, "9
 @partial(jax.jit, static_argnames="lens")
 def view_information(
     lens: str, y: LensUnknowns, seen: BoardCorners, weights: Float[Array, "V P"]
-) -> Float[Array, "V 9 9"]:
-    """Information of the nine from each view alone, its pose eliminated, for 1 px of noise."""
-    _, of_lens, of_pose = linearised(lens, y, seen)
+) -> tuple[Float[Array, "V 9 9"], Float[Array, "V 9"]]:
+    """Information of the nine from each view alone, its pose eliminated, for 1 px of noise.
+
+    Also the gradient of half the cost of each view by the nine.
+    """
+    residual_px, of_lens, of_pose = linearised(lens, y, seen)
     root = jnp.sqrt(jnp.where(seen.present, weights, 0))[..., None, None]
     A, B = (
         (root * J).reshape(J.shape[0], -1, J.shape[-1]) for J in (of_lens, of_pose)
     )  # (V, 2P, 9), (V, 2P, 6)
+    r = (root[..., 0] * residual_px).reshape(A.shape[0], -1, 1)
     length = jnp.sqrt(jnp.sum(B**2, axis=1, keepdims=True))
     Q, _ = jnp.linalg.qr(B / jnp.where(length > 0, length, 1))
     rest = A - Q @ (jnp.swapaxes(Q, 1, 2) @ A)
-    return jnp.swapaxes(rest, 1, 2) @ rest
+    transposed = jnp.swapaxes(rest, 1, 2)
+    return transposed @ rest, (transposed @ r)[..., 0]
 
 
 @partial(jax.jit, static_argnames="lens")

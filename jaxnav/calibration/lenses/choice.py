@@ -34,11 +34,12 @@ def informative(
     squared = np.sum(np.asarray(held.residual_px) ** 2, axis=(1, 2))[: len(poses)]
     rms_px = np.sqrt(squared / np.maximum([len(view.ids) for view in views.views], 1))
     sound = posed & (rms_px < _WRONG * np.median(rms_px[posed]))
-    information = np.asarray(
-        lens_bundle.view_information(lens, held.unknowns, seen, jnp.asarray(seen.present, float))
-    )[: len(poses)]
+    each, _ = lens_bundle.view_information(
+        lens, held.unknowns, seen, jnp.asarray(seen.present, float)
+    )
     free = lens_bundle.free_mask(lens)
-    return _greedy(information[:, free][:, :, free], sound, most)
+    information = np.asarray(each)[: len(poses)][:, free][:, :, free]
+    return _greedy(information, sound, most)
 
 
 def _greedy(information: np.ndarray, sound: np.ndarray, most: int) -> tuple[int, ...]:

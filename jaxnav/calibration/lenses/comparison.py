@@ -6,7 +6,7 @@ the poses are then free; four times, so that each view is left out once.
 Source: Stone (1974), "Cross-validatory choice and assessment of statistical predictions".
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +18,8 @@ from jaxnav.calibration.lenses.fit import LensFit
 
 _FOLDS = 4
 FEWEST_VIEWS = 8
-_WORSE = 1.02  # times the least error: a lens of fewer coefficients may be this much worse
+_WORSE = 1.02  # times radtan's error: no coefficients at all may be this much worse
 _CLEARLY = 1.05, 3.0  # times the error, and standard errors of the difference
-SIMPLEST_FIRST = ("none", "equidistant", "radtan")
 
 
 @dataclass(frozen=True)
@@ -61,14 +60,17 @@ def held_out(fit: LensFit, weights: Float[np.ndarray, "V P"]) -> HeldOut:
     return HeldOut(view_px, float(np.sqrt(np.nanmean(view_px**2))))
 
 
-def best_lens(compared: Mapping[str, HeldOut]) -> str:
-    """The lens with the lowest error, or one with fewer coefficients that is hardly worse."""
-    least = min(one.rms_px for one in compared.values())
-    return next(
-        lens
-        for lens in SIMPLEST_FIRST
-        if lens in compared and compared[lens].rms_px <= _WORSE * least
-    )
+def best_lens(compared: Mapping[str, HeldOut], drawn: Collection[str]) -> str:
+    """The lens that most programs read, radtan, unless another is clearly better.
+
+    Args:
+        drawn: the lenses that draw the whole image as fitted; radtan folds where it is wide.
+    """
+    usual = "radtan" if "radtan" in drawn or not drawn else next(iter(drawn))
+    if compared["none"].rms_px <= _WORSE * compared[usual].rms_px:
+        usual = "none"
+    best = min(drawn or compared, key=lambda lens: compared[lens].rms_px)
+    return best if clearly_better(compared[best], compared[usual]) else usual
 
 
 def clearly_better(one: HeldOut, other: HeldOut) -> bool:

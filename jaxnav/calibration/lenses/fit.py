@@ -26,6 +26,7 @@ from jaxnav.calibration.lenses.bundle import (
 )
 from jaxnav.calibration.lenses.start import board_poses, lens_start
 from jaxnav.calibration.lenses.views import BoardViews
+from jaxnav.calibration.parts import leveraged_inflation
 from jaxnav.models.camera import Camera
 
 _CUT = 2.0  # in sigmas, of Cauchy's cost
@@ -33,6 +34,7 @@ _FAR = 5.0  # in sigmas: Gaussian noise takes one corner in 270 000 there
 _WEAK, _WRONG = 1.5, 4.0  # a view whose corners are this many times as far off counts less, or not
 _CHANCE = 1e-6  # probability that a good view is taken for a worse one
 _ROBUST_ROUNDS, _ROUNDS = 3, 10
+_NOTICED_SIGMAS = 3.0  # views that disagree by less may do so by chance
 _LEAST_SIGMA_PX = 1e-6
 
 
@@ -43,6 +45,7 @@ class LensFit:
     Attributes:
         parameters: (9,) fx fy cx cy and the coefficients in the camera's order.
         covariance: (9, 9) of the parameters; zero for fixed ones.
+        inflation: the factor in it by which views disagree beyond the noise of their corners.
         fixed: names of the parameters held at zero.
         Ts_camera_board: (V, 7) wxyz_xyz.
         residual_px: (V, P, 2) predicted - seen; 0 for points not seen.
@@ -57,6 +60,7 @@ class LensFit:
     views: BoardViews
     parameters: Float[np.ndarray, " 9"]
     covariance: Float[np.ndarray, "9 9"]
+    inflation: float
     fixed: tuple[str, ...]
     Ts_camera_board: Float[np.ndarray, "V 7"]
     residual_px: Float[np.ndarray, "V P 2"]
@@ -131,11 +135,13 @@ def fit_lens(
         if np.array_equal(used, before[0]) and np.allclose(view_weights, before[1], rtol=0.05):
             break
     used, view_weights = before  # those of the last fit
+    inflation = problem.inflation(bundle.unknowns, weights, sigma_px)
     return LensFit(
         lens=lens,
         views=views,
         parameters=np.asarray(bundle.unknowns.lens),
-        covariance=problem.covariance(bundle, sigma_px),
+        covariance=inflation * problem.covariance(bundle, sigma_px),
+        inflation=inflation,
         fixed=fixed,
         Ts_camera_board=np.asarray(bundle.unknowns.Ts_camera_board)[:count],
         residual_px=residual_px[:count],
@@ -201,6 +207,21 @@ class _Problem:
         # Fewer than four corners don't determine a pose.
         few = used.sum(axis=1) < 4
         return used & ~few[:, None], np.where(few, 0.0, weights)
+
+    def inflation(self, y: LensUnknowns, weights: np.ndarray, sigma_px: float) -> float:
+        """The factor of the variances by which the views disagree; 1 where there are too few."""
+        information, gradient = lens_bundle.view_information(
+            self.lens, y, self.seen, jnp.asarray(weights)
+        )
+        shown = np.any(weights > 0, axis=1)
+        each = np.asarray(information)[shown][:, self.free][:, :, self.free]
+        scores = np.asarray(gradient)[shown][:, self.free] / sigma_px
+        scale = 1 / np.sqrt(np.maximum(np.einsum("bii->i", each), 1e-300))
+        each, scores = each * np.outer(scale, scale), scores * scale
+        try:
+            return leveraged_inflation(each, scores, _NOTICED_SIGMAS)
+        except np.linalg.LinAlgError:  # the views don't tell all of them
+            return 1.0
 
     def covariance(self, bundle: Bundle, sigma_px: float) -> np.ndarray:
         """(9, 9) covariance; zero for fixed parameters, infinite if the views tell nothing."""

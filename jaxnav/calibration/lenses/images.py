@@ -52,6 +52,7 @@ def calibrate_images(
         camera = _camera_of_marker(board, sources, lens, tell, headless)
     collected = collect_views(board, sources, camera, headless=headless)
     gone = {name: f"the same picture as {twin}" for name, twin in collected.duplicates}
+    gone |= dict(collected.unreadable)
     gone |= dict.fromkeys(collected.without_board, "the board is not seen")
     return collected, calibrate_lens(collected.views, lens, max_views, where, tell, gone)
 

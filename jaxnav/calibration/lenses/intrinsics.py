@@ -24,8 +24,10 @@ from jaxnav.models.camera import Camera
 FEWEST_VIEWS = 5
 _LEAST_SPREAD_DEG = 5.0  # between the normals of two views
 _NO_FOCAL = 0.1  # relative sigma of a focal length beyond which holding others at zero can't help
-_WORST_FOCAL = 0.01  # relative sigma of a focal length
-_WORST_CENTER = 0.02  # sigma of the centre over the image's width
+_WORST_FOCAL = 0.03  # relative sigma of a focal length; less is said, not refused
+# The same from the corners' noise alone, where another lens explains them clearly better.
+_WRONG_LENS_FOCAL = 0.01
+_WORST_CENTER = 0.05  # sigma of the centre over the image's width
 _LOOSE_CENTER = 0.003  # the same, beyond which the tangential coefficients are held at zero
 _WORST_RIM_PX = 1.0  # one sigma of the radial function at the image's border
 _RIM_SIGMAS = 5.0  # the same in sigmas of the corners' noise, if that is more
@@ -36,6 +38,8 @@ _WHICH_BOARD = (
     "is it the board of the file, with as many squares in its rows and columns, and is the lens of "
     "this kind?"
 )
+_SIGNIFICANT = 4.0  # sigmas: a coefficient as large is known
+_GROWN = 1.01  # times the error of unseen views: it was needed
 _LAST_FIRST = {
     "none": (),
     "radtan": ("k3", "k2", "k1"),
@@ -119,7 +123,8 @@ def calibrate_lens(
     compared = _compared(fits)
     best = lens
     if lens == "auto" and compared:
-        best = lens_comparison.best_lens(compared)
+        drawn = [one for one in compared if np.isfinite(rim_sigma_px(fits[one]))]
+        best = lens_comparison.best_lens(compared, drawn)
     elif lens == "auto":
         best = min(fits, key=lambda one: fits[one].sigma_px)
     tell("check")
@@ -175,19 +180,39 @@ def _compared(fits: dict[str, LensFit]) -> dict[str, lens_comparison.HeldOut]:
 
 
 def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
-    """Refit the lens with coefficients that the corners don't determine held at zero."""
-    width = fit.views.image_size_px[0]
+    """Refit the lens with coefficients at zero that the corners don't tell from it.
+
+    Such a coefficient is not significant, unseen views do without it, and the image's border is
+    not known with it. The sigmas are those of the lens with all of them: none is known better for
+    another being held.
+    """
+    width, told = fit.views.image_size_px[0], fit
     for name in _LAST_FIRST[fit.lens]:
         rim_px = rim_sigma_px(fit)
         folds = np.isinf(rim_px) and reach(fit) > _FAR_ENOUGH  # corners aren't lacking
         if folds or rim_px < max(_WORST_RIM_PX, _RIM_SIGMAS * fit.sigma_px):
             break
-        tell(f"hold {name}")
-        fit = fit_lens(fit.views, fit.lens, (*fit.fixed, name), fit.parameters)
+        without = _without(fit, told, (name,), tell)
+        if without is None:
+            break
+        fit = without
     if fit.lens == "radtan" and np.max(fit.sigma[2:4]) > _LOOSE_CENTER * width:
-        tell("hold p1 p2")
-        fit = fit_lens(fit.views, fit.lens, (*fit.fixed, "p1", "p2"), fit.parameters)
-    return fit
+        fit = _without(fit, told, ("p1", "p2"), tell) or fit
+    return replace(fit, covariance=told.covariance)
+
+
+def _without(
+    fit: LensFit, told: LensFit, names: tuple[str, ...], tell: Callable[[str], None]
+) -> LensFit | None:
+    """The fit with coefficients held at zero; None where they are significant or needed."""
+    at = [told.names.index(name) for name in names]
+    if np.any(np.abs(told.parameters[at]) > _SIGNIFICANT * told.sigma[at]):
+        return None
+    tell(f"hold {' '.join(names)}")
+    held = fit_lens(fit.views, fit.lens, (*fit.fixed, *names), fit.parameters)
+    weights = fit.weights * held.weights
+    before, after = (lens_comparison.held_out(one, weights).rms_px for one in (fit, held))
+    return held if after < _GROWN * before else None
 
 
 def _require_sound(fit: LensFit, where: str) -> None:
@@ -222,7 +247,7 @@ def _relative_focal(fit: LensFit) -> float:
 def _require_observed(fit: LensFit, better: str, where: str) -> None:
     width = fit.views.image_size_px[0]
     relative = _relative_focal(fit)
-    if not relative < _WORST_FOCAL and better != fit.lens:
+    if not relative < _WRONG_LENS_FOCAL * np.sqrt(fit.inflation) and better != fit.lens:
         raise BadInput(
             where,
             f"lens {fit.lens} misses the corners by {fit.sigma_px:.2g} px, lens {better} explains "

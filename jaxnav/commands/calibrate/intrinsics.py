@@ -157,6 +157,7 @@ def _camera_report(calibration: LensCalibration, collected: CollectedViews) -> d
             "left_out": calibration.left_out,
             "downweighted": calibration.downweighted,
             "duplicates": dict(collected.duplicates),
+            "unreadable": dict(collected.unreadable),
             "without_board": collected.without_board,
         },
         "coverage": {
@@ -166,15 +167,26 @@ def _camera_report(calibration: LensCalibration, collected: CollectedViews) -> d
             "largest_angle_between_views_deg": spread_deg,
         },
         "systematic_residual_px": seen.systematic_px,
-        "findings": calibration.findings,
+        "findings": _notes(calibration, collected),
         "advice": calibration.advice,
     }
+
+
+def _notes(calibration: LensCalibration, collected: CollectedViews) -> tuple[str, ...]:
+    """What is to be known of the board and of the lens."""
+    if not collected.other_pattern:
+        return calibration.findings
+    other = (
+        "the board is printed in the pattern that its file does not say, `legacy: true` or "
+        "`legacy: false`: its points are the same"
+    )
+    return (other, *calibration.findings)
 
 
 def _text(name: str, calibration: LensCalibration, collected: CollectedViews) -> str:
     fit = calibration.fit
     used = int(np.sum(fit.view_weights > 0))
-    given = calibration.given + len(collected.without_board)
+    given = calibration.given + len(collected.without_board) + len(collected.unreadable)
     lines = [
         f"{name}: {fit.lens}, {used} of {given} views, {int(fit.used.sum())} corners, "
         f"RMS {fit.rms_px:.3f} px, corner noise {fit.sigma_px:.3f} px"
@@ -184,8 +196,9 @@ def _text(name: str, calibration: LensCalibration, collected: CollectedViews) ->
         sure = "held at zero" if parameter in fit.fixed else f"+- {sigma:.2g}"
         lines.append(f"  {parameter:>2} {value:12.6g} {sure}")
     lines += [f"  left out: {view}: {why}" for view, why in calibration.left_out.items()]
+    lines += [f"  left out: {view}: {why}" for view, why in collected.unreadable]
     lines += [f"  left out: {view}: repeats {twin}" for view, twin in collected.duplicates]
     lines += [f"  counts {weight:.2g}: {view}" for view, weight in calibration.downweighted.items()]
-    lines += [f"  note: {sentence}" for sentence in calibration.findings]
+    lines += [f"  note: {sentence}" for sentence in _notes(calibration, collected)]
     lines += [f"  next: {sentence}" for sentence in calibration.advice]
     return "\n".join(lines)

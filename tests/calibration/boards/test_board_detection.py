@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from jaxnav.calibration.boards.board import Board
-from jaxnav.calibration.boards.detection import find_board
+from jaxnav.calibration.boards.detection import find_board, look_at
 from jaxnav.calibration.boards.images import collect_views, source_files
 from jaxnav.calibration.boards.saddles import Places, fit_saddles
 from jaxnav.calibration.boards.sheets import sheet_of
+from jaxnav.detection.families import dictionary
 from jaxnav.errors import BadInput
 from jaxnav.simulation.boards import BoardRenderer, facing_pose
 from jaxnav.simulation.sensor import Sensor, Shutter
@@ -67,6 +68,88 @@ def test_points_are_found_to_hundredths_of_a_pixel(kind: str, pose: int) -> None
     assert np.abs(error_px.mean(axis=0)).max() < 0.004
     # 10 % to 90 % of an edge: a Gaussian on top of a square pixel.
     assert view.edge_width_px == pytest.approx(2.563 * np.sqrt(0.7**2 + 1 / 12), rel=0.12)
+
+
+@pytest.mark.parametrize("pose", range(len(POSES)))
+@pytest.mark.parametrize("size", [(8, 8), (9, 7), (7, 7)])
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_chessboard_that_looks_the_same_when_turned_is_found(
+    size: tuple[int, int], inverted: bool, pose: int
+) -> None:
+    board = Board("chessboard", *size, 0.02)
+    sheet = sheet_of(replace(board, white_top_left=inverted))
+    sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0)
+    image = BoardRenderer(CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor).render(
+        POSES[pose], np.random.default_rng(pose)
+    )
+    view = find_board(board, image, "here")
+    assert view is not None
+    assert len(view.ids) >= 0.95 * len(board.points_board_m)
+    expected_px = truth_px(board, POSES[pose])
+    half = expected_px[::-1]  # the points of the board turned by half a turn
+    turned = [expected_px, half]
+    if size[0] == size[1]:
+        grid = np.arange(len(expected_px)).reshape(size[1] - 1, size[0] - 1)
+        turned += [expected_px[np.rot90(grid, k).ravel()] for k in (1, 3)]
+    errors_px = [np.abs(view.corners_px - points[view.ids]).max() for points in turned]
+    assert min(errors_px) < 0.1
+
+
+def test_a_chessboard_that_one_finder_loses_is_found_by_another(monkeypatch) -> None:
+    board, image = BOARDS["chessboard"], picture("chessboard", 0)
+    expected, newer = find_board(board, image, "here"), cv2.findChessboardCornersSB
+    assert expected is not None
+    widths: list[int] = []
+    found_at = 800
+
+    def at_one_size_only(levels: np.ndarray, pattern: tuple[int, int], flags: int) -> tuple:
+        widths.append(levels.shape[1])
+        return newer(levels, pattern, flags=flags) if widths[-1] == found_at else (False, None)
+
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", at_one_size_only)
+    for found_at, last in ((800, 800), (0, 400)):  # noqa: B007
+        view = find_board(board, image, "here")
+        assert view is not None
+        assert widths[-1] == last
+        np.testing.assert_allclose(view.corners_px, expected.corners_px, atol=2e-3)
+
+
+@pytest.mark.parametrize("columns", [8, 9])
+@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize("printed", [False, True])
+def test_the_pattern_of_a_charuco_board_is_found_out(
+    printed: bool, told: bool, columns: int, tmp_path: Path
+) -> None:
+    board = replace(BOARDS["charuco"], columns=columns, white_top_left=told)
+    sheet = sheet_of(replace(board, white_top_left=printed))
+    sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0)
+    image = BoardRenderer(CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor).render(
+        POSES[0], np.random.default_rng(0)
+    )
+    look = look_at(board, image, "here")
+    assert look.view is not None
+    assert look.board is not None
+    assert look.board.white_top_left == printed
+    assert len(look.view.ids) > 0.9 * len(board.points_board_m)
+    error_px = look.view.corners_px - truth_px(board, POSES[0])[look.view.ids]
+    assert np.sqrt(np.mean(error_px**2)) < 0.015
+    cv2.imwrite(str(tmp_path / "0.png"), image)
+    assert collect_views(board, [tmp_path]).other_pattern == (printed != told)
+
+
+def test_a_spurious_id_does_not_refuse_a_set(tmp_path: Path) -> None:
+    """Each picture shows another marker that is not on the board, and one is always there."""
+    board = BOARDS["charuco"]
+    for number in range(3):
+        image = picture("charuco", 1).copy()
+        for place, marker in enumerate((40 + number, 49)):
+            tag = cv2.aruco.generateImageMarker(dictionary(board.family), marker, 24)
+            tag = cv2.copyMakeBorder(tag, 8, 8, 8, 8, cv2.BORDER_CONSTANT, value=255)
+            image[number : 40 + number, 40 * place : 40 * (place + 1)] = tag
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
+    collected = collect_views(board, [tmp_path])
+    assert len(collected.views.views) == 3
+    assert 49 in collected.foreign_ids
 
 
 def test_a_marker_s_corners_are_found_through_its_lens() -> None:
@@ -238,6 +321,10 @@ def test_what_is_no_image_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"a")
     with pytest.raises(BadInput, match=r"a\.png: is not an image"):
         collect_views(BOARDS["charuco"], [tmp_path / "a.png"])
+    cv2.imwrite(str(tmp_path / "d.png"), picture("charuco", 0))
+    collected = collect_views(BOARDS["charuco"], [tmp_path])
+    assert len(collected.views.views) == 1
+    assert collected.unreadable == (("a.png", "is not an image that OpenCV can read"),)
     with pytest.raises(BadInput, match=r"b\.png: can't be read"):
         collect_views(BOARDS["charuco"], [tmp_path / "b.png"])
     with pytest.raises(BadInput, match=r"b\.mp4: can't be read"):

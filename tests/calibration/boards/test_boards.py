@@ -22,15 +22,20 @@ CHARUCO = Board("charuco", 5, 4, 0.04, marker_m=0.03, family="4x4_50")
 APRILGRID = Board("aprilgrid", 3, 2, 0.08, spacing=0.3, family="tag36h11", border_cells=2)
 CHESSBOARD = Board("chessboard", 7, 4, 0.03)
 MARKER = Board("marker", 1, 1, 0.15, family="tag36h11", first_id=4)
-BOARDS = [CHARUCO, APRILGRID, CHESSBOARD, MARKER]
+LEGACY = Board("charuco", 5, 4, 0.04, marker_m=0.03, family="4x4_50", white_top_left=True)
+SQUARE = Board("chessboard", 6, 6, 0.03)
+BOARDS = [CHARUCO, APRILGRID, CHESSBOARD, MARKER, LEGACY, SQUARE]
 # The first codes of 36h11 as the authors of AprilTag print them, 1 white, from the top left.
 CODES_36H11 = (0xD5D628584, 0xD97F18B49)
 
 
+@pytest.mark.parametrize("legacy", [False, True])
 @pytest.mark.parametrize("grid", [(5, 4), (6, 5), (7, 3), (4, 4)])
-def test_a_charuco_board_is_opencvs(grid: tuple[int, int]) -> None:
-    board = replace(CHARUCO, columns=grid[0], rows=grid[1])
+def test_a_charuco_board_is_opencvs(grid: tuple[int, int], legacy: bool) -> None:
+    white = legacy and grid[1] % 2 == 0  # of an odd number of rows both patterns are the same
+    board = replace(CHARUCO, columns=grid[0], rows=grid[1], white_top_left=white)
     opencv = cv2.aruco.CharucoBoard(grid, board.size_m, board.marker_m, dictionary(board.family))
+    opencv.setLegacyPattern(legacy)
     picture = opencv.generateImage((8 * grid[0], 8 * grid[1]), marginSize=0)
     np.testing.assert_array_equal(sheet_of(board).ink[1:-1, 1:-1], picture < 128)
     # OpenCV counts from the top left corner, y down.
@@ -92,7 +97,7 @@ def test_rectangles_cover_the_ink_once(board: Board) -> None:
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"kind": "chessboard", "columns": 6}, "looks the same upside down"),
+        ({"rows": 5, "white_top_left": True}, "differs on an even number of rows only, got 5"),
         ({"marker_m": 0.05}, "must be smaller than the squares"),
         ({"family": "tag35"}, "unknown family 'tag35'"),
         ({"columns": 20, "rows": 20}, "needs the ids 0 to 199, but 4x4_50 has 0 to 49"),
@@ -133,7 +138,11 @@ def test_kalibrs_targets_are_read(tmp_path: Path) -> None:
         ("board: circles", "board: must be one of charuco, aprilgrid, chessboard, marker"),
         ("target_type: circlegrid", "target_type: must be aprilgrid or checkerboard"),
         ("{board: chessboard, columns: 7, rows: 4}", "square_m"),
-        ("{board: chessboard, columns: 7, rows: 5, square_m: 0.1}", "upside down"),
+        (
+            "{board: charuco, columns: 5, rows: 4, square_m: 0.1, marker_m: 0.07, family: 4x4_50, "
+            "legacy: 1}",
+            "legacy",
+        ),
         ("{board: chessboard, columns: 7, rows: 4, square_m: 0.1, size: 2}", "size: unknown key"),
         (
             "{target_type: checkerboard, targetCols: 6, targetRows: 3, rowSpacingMeters: 0.03, "

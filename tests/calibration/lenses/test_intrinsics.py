@@ -137,6 +137,67 @@ def test_what_corners_do_not_reach_is_held_and_named() -> None:
     assert np.all(np.abs(error) < 4 * found.fit.sigma[:2])
 
 
+def test_a_held_coefficient_makes_no_other_better_known() -> None:
+    views, _ = views_of("radtan", seed=6, reach=0.5, distances_m=(0.6, 1.2))
+    free, found = fit_lens(views, "radtan"), calibrate_lens(views, "radtan")
+    assert "k3" in found.fit.fixed
+    np.testing.assert_allclose(found.fit.sigma, free.sigma, rtol=1e-6)
+    error = found.fit.parameters[:4] - TRUTHS["radtan"][:4]
+    assert np.all(np.abs(error) < 4 * found.fit.sigma[:4])
+
+
+def test_a_coefficient_that_is_known_is_not_held() -> None:
+    """A webcam's lens, whose border no view shows: its k3 is 9 sigmas, its border 2 px unsure."""
+    truth = (680.0, 680.0, 312.0, 222.0, 0.15, -1.19, 0.0, 0.0, 2.2)
+    camera = Camera.create(truth[:2], truth[2:4], "radtan", truth[4:])
+    rng = np.random.default_rng(3)
+    views, _ = simulated_views(
+        camera, (640, 480), POINTS_M, 17, rng, SIGMA_PX, distances_m=(0.35, 0.6), reach=0.75
+    )
+    found = calibrate_lens(views)
+    assert found.fit.lens == "radtan"
+    assert not {"k1", "k2", "k3"} & set(found.fit.fixed)
+    assert np.all(np.abs(found.fit.parameters[:2] - 680) < 4 * found.fit.sigma[:2])
+
+
+def test_a_lens_that_most_programs_read_is_taken_where_it_does() -> None:
+    truth = (900.0, 900.0, 411.0, 212.0, 0.01, -5e-3, 2e-3, -4e-4)
+    camera = Camera.create(truth[:2], truth[2:4], "equidistant", truth[4:])
+    rng = np.random.default_rng(5)
+    views, _ = simulated_views(camera, SIZE_PX, POINTS_M, 16, rng, SIGMA_PX, distances_m=(0.4, 1.2))
+    assert calibrate_lens(views).fit.lens == "radtan"
+
+
+def bent(views, rng, scale_px=0.3):
+    """The views of a board that bends anew in each: corners shift by a smooth field."""
+
+    def one(view):
+        at = POINTS_M[view.ids, :2] / np.ptp(POINTS_M[:, :2], axis=0).max() * 2
+        field = np.column_stack([at**2, at[:, :1] * at[:, 1:], at**3]) @ rng.normal(size=(5, 2))
+        return replace(view, corners_px=view.corners_px + scale_px * field)
+
+    return replace(views, views=tuple(map(one, views.views)))
+
+
+def test_views_that_disagree_grow_the_sigmas() -> None:
+    rough = np.array([330.0, 330.0, 409.5, 204.5, *[0.0] * 5])
+    apart, white = [], []
+    for seed in range(8):
+        views = views_of("equidistant", seed, count=32)[0]
+        white.append(fit_lens(views, "equidistant", start=rough).inflation)
+        views = bent(views, np.random.default_rng(seed))
+        halves = [
+            fit_lens(replace(views, views=views.views[part]), "equidistant", start=rough)
+            for part in (slice(0, None, 2), slice(1, None, 2))
+        ]
+        assert min(half.inflation for half in halves) > 2
+        difference = halves[0].parameters[:8] - halves[1].parameters[:8]
+        apart.append(difference / np.hypot(halves[0].sigma[:8], halves[1].sigma[:8]))
+    assert np.sum(np.array(white) == 1) >= 7
+    assert np.mean(np.abs(apart) < 3) > 0.98
+    assert 0.7 < np.sqrt(np.mean(np.square(apart))) < 1.5
+
+
 def parallel():
     return views_of("none", seed=1, most_tilt_deg=0)[0]
 

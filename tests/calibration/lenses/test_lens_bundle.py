@@ -84,11 +84,14 @@ def test_minimum_and_information_are_those_of_scipy(lens) -> None:
     assert np.all(np.abs(found - expected.x[:count]) < 1e-3 * sigma)
     ratio = np.linalg.inv(information) / np.outer(sigma, sigma)
     np.testing.assert_allclose(ratio, of_all / np.outer(sigma, sigma), atol=2e-4)
-    each = lens_bundle.view_information(
+    each, gradient = lens_bundle.view_information(
         lens, bundle.unknowns, seen, jnp.asarray(seen.present, float)
     )
     summed = np.sum(np.asarray(each), axis=0)[:count, :count]
     np.testing.assert_allclose(summed, information, rtol=1e-6, atol=1e-6 * information.max())
+    # At the minimum the views' gradients balance, in sigmas.
+    balance = np.sum(np.asarray(gradient), axis=0)[:count] * sigma
+    assert np.max(np.abs(balance)) < 1e-2 < np.max(np.abs(np.asarray(gradient)[:, :count] * sigma))
 
 
 def test_what_is_held_stays_at_zero_and_what_has_no_weight_is_not_heard() -> None:
