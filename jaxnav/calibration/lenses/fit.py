@@ -34,7 +34,7 @@ _FAR = 5.0  # in sigmas: Gaussian noise takes one corner in 270 000 there
 _WEAK, _WRONG = 1.5, 4.0  # a view whose corners are this many times as far off counts less, or not
 _CHANCE = 1e-6  # probability that a good view is taken for a worse one
 _ROBUST_ROUNDS, _ROUNDS = 3, 10
-_NOTICED_SIGMAS = 3.0  # views that disagree by less may do so by chance
+_NOTICED_SIGMAS = 2.0  # views that disagree by less may do so by chance
 _LEAST_SIGMA_PX = 1e-6
 
 
@@ -131,7 +131,8 @@ def fit_lens(
         residual_px = np.asarray(bundle.residual_px)
         sigma_px = problem.sigma_px(residual_px, weights)
         before = used, view_weights
-        used, view_weights = problem.judged(residual_px, sigma_px)
+        # By the median view: a few bad ones would raise the sigma until they pass for good.
+        used, view_weights = problem.judged(residual_px, problem.typical_px(residual_px))
         if np.array_equal(used, before[0]) and np.allclose(view_weights, before[1], rtol=0.05):
             break
     used, view_weights = before  # those of the last fit

@@ -28,7 +28,6 @@ _WORST_FOCAL = 0.03  # relative sigma of a focal length; less is said, not refus
 # The same from the corners' noise alone, where another lens explains them clearly better.
 _WRONG_LENS_FOCAL = 0.01
 _WORST_CENTER = 0.05  # sigma of the centre over the image's width
-_LOOSE_CENTER = 0.003  # the same, beyond which the tangential coefficients are held at zero
 _WORST_RIM_PX = 1.0  # one sigma of the radial function at the image's border
 _RIM_SIGMAS = 5.0  # the same in sigmas of the corners' noise, if that is more
 _FAR_ENOUGH = 0.85  # of the way to the image's corner
@@ -38,8 +37,9 @@ _WHICH_BOARD = (
     "is it the board of the file, with as many squares in its rows and columns, and is the lens of "
     "this kind?"
 )
-_SIGNIFICANT = 4.0  # sigmas: a coefficient as large is known
-_GROWN = 1.01  # times the error of unseen views: it was needed
+_SIGNIFICANT = 3.0  # sigmas of the corners' noise: a coefficient as large is known
+_FEW_WORSE = 1.5  # times another lens's residuals: of few views radtan is not taken
+_GROWN = 1.01  # times the error of unseen views: more says that it was needed
 _LAST_FIRST = {
     "none": (),
     "radtan": ("k3", "k2", "k1"),
@@ -125,8 +125,11 @@ def calibrate_lens(
     if lens == "auto" and compared:
         drawn = [one for one in compared if np.isfinite(rim_sigma_px(fits[one]))]
         best = lens_comparison.best_lens(compared, drawn)
-    elif lens == "auto":
-        best = min(fits, key=lambda one: fits[one].sigma_px)
+    elif lens == "auto":  # nothing was left out to compare them by
+        drawn = [one for one in fits if np.isfinite(rim_sigma_px(fits[one]))]
+        least_px = min(fits[one].sigma_px for one in drawn or fits)
+        usual = "radtan" in drawn and fits["radtan"].sigma_px < _FEW_WORSE * least_px
+        best = "radtan" if usual else min(drawn or fits, key=lambda one: fits[one].sigma_px)
     tell("check")
     _require_sound(fits[best], where)
     better = min(compared, key=lambda one: compared[one].rms_px, default=best)
@@ -186,30 +189,29 @@ def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
     not known with it. The sigmas are those of the lens with all of them: none is known better for
     another being held.
     """
-    width, told = fit.views.image_size_px[0], fit
+    told = fit
     for name in _LAST_FIRST[fit.lens]:
         rim_px = rim_sigma_px(fit)
         folds = np.isinf(rim_px) and reach(fit) > _FAR_ENOUGH  # corners aren't lacking
         if folds or rim_px < max(_WORST_RIM_PX, _RIM_SIGMAS * fit.sigma_px):
             break
-        without = _without(fit, told, (name,), tell)
+        without = _without(fit, told, name, tell)
         if without is None:
             break
         fit = without
-    if fit.lens == "radtan" and np.max(fit.sigma[2:4]) > _LOOSE_CENTER * width:
-        fit = _without(fit, told, ("p1", "p2"), tell) or fit
     return replace(fit, covariance=told.covariance)
 
 
 def _without(
-    fit: LensFit, told: LensFit, names: tuple[str, ...], tell: Callable[[str], None]
+    fit: LensFit, told: LensFit, name: str, tell: Callable[[str], None]
 ) -> LensFit | None:
-    """The fit with coefficients held at zero; None where they are significant or needed."""
-    at = [told.names.index(name) for name in names]
-    if np.any(np.abs(told.parameters[at]) > _SIGNIFICANT * told.sigma[at]):
+    """The fit with a coefficient held at zero; None where it is significant or needed."""
+    at = told.names.index(name)
+    noise = told.sigma[at] / np.sqrt(told.inflation)  # what views disagree in, they need
+    if abs(told.parameters[at]) > _SIGNIFICANT * noise:
         return None
-    tell(f"hold {' '.join(names)}")
-    held = fit_lens(fit.views, fit.lens, (*fit.fixed, *names), fit.parameters)
+    tell(f"hold {name}")
+    held = fit_lens(fit.views, fit.lens, (*fit.fixed, name), fit.parameters)
     weights = fit.weights * held.weights
     before, after = (lens_comparison.held_out(one, weights).rms_px for one in (fit, held))
     return held if after < _GROWN * before else None
