@@ -10,6 +10,7 @@ across. Only what the orientation calls mirrored is mirrored back, for no lens d
 
 import importlib.util
 import io
+import warnings
 from pathlib import Path
 
 import cv2
@@ -23,7 +24,8 @@ from jaxnav.files.image_headers import image_size_px
 
 _ORIENTATION = 0x0112
 _MIRRORED = (2, 4, 5, 7)
-_TURNS_BACK = {3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}  # quarters, anticlockwise, after viewers' turn
+_TIFF = (b"II*\0", b"MM\0*")  # which OpenCV turns as viewers do, whatever flag it is given
+_TURNS_BACK = {3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}  # by so many quarters, anticlockwise
 _EXIF_WITHIN = 2**20  # bytes from the start of a file
 _BROKEN = (OSError, ValueError, SyntaxError, KeyError, TypeError, EOFError, RuntimeError)
 _HEIC = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif")
@@ -49,16 +51,20 @@ def decode_image(
         return None
     if image is None:
         return None
-    mirrored = exif_orientation(stored) in _MIRRORED
-    return np.ascontiguousarray(image[:, ::-1]) if mirrored else np.asarray(image)
+    orientation = exif_orientation(stored)
+    if stored.startswith(_TIFF):
+        image = np.rot90(image, _TURNS_BACK.get(orientation, 0))
+    elif orientation in _MIRRORED:
+        image = image[:, ::-1]
+    return np.ascontiguousarray(image)
 
 
 def exif_orientation(raw: bytes) -> int:
     """How viewers are asked to turn an image, 1 to 8 as EXIF counts; 1 is not at all."""
-    if not any(mark in raw[:_EXIF_WITHIN] for mark in (b"Exif", b"eXIf", b"II*\0", b"MM\0*")):
+    if not any(mark in raw[:_EXIF_WITHIN] for mark in (b"Exif", b"eXIf", *_TIFF)):
         return 1
     try:
-        with Image.open(io.BytesIO(raw)) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(raw)) as image:
             orientation = image.getexif().get(_ORIENTATION, 1)
     except (UnidentifiedImageError, Image.DecompressionBombError, *_BROKEN):
         return 1
@@ -79,12 +85,12 @@ def _decode_heic(raw: bytes, flags: int) -> np.ndarray | None:
         file = pillow_heif.open_heif(raw)
         if file.size[0] * file.size[1] > limits.IMAGE_PIXELS:
             return None
-        # It turns the pixels as viewers do, and keeps by how much.
-        orientation = int(file.info.get("original_orientation") or 1)
         rgb = np.asarray(file.to_pillow().convert("RGB"))
-    except (UnidentifiedImageError, *_BROKEN):
+        # The pixels were turned as the file asks viewers to; a mirror image stays mirrored back.
+        turns = [kind[1] for kind in file[0]._c_image.transformations if kind[0] == "irot"]
+    except (UnidentifiedImageError, AttributeError, *_BROKEN):
         return None
-    stored = np.ascontiguousarray(np.rot90(rgb, _TURNS_BACK.get(orientation, 0)))
+    stored = np.ascontiguousarray(np.rot90(rgb, -(sum(turns) // 90)))
     grey = flags == cv2.IMREAD_GRAYSCALE
     return np.asarray(cv2.cvtColor(stored, cv2.COLOR_RGB2GRAY if grey else cv2.COLOR_RGB2BGR))
 

@@ -202,9 +202,7 @@ def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
     return replace(fit, covariance=told.covariance)
 
 
-def _without(
-    fit: LensFit, told: LensFit, name: str, tell: Callable[[str], None]
-) -> LensFit | None:
+def _without(fit: LensFit, told: LensFit, name: str, tell: Callable[[str], None]) -> LensFit | None:
     """The fit with a coefficient held at zero; None where it is significant or needed."""
     at = told.names.index(name)
     noise = told.sigma[at] / np.sqrt(told.inflation)  # what views disagree in, they need

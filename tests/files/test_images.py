@@ -1,0 +1,116 @@
+"""One reader of images: the pixels as the camera stored them, whatever EXIF asks viewers for."""
+
+import builtins
+import importlib.util
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxnav.errors import BadInput
+from jaxnav.files.images import decode_image, exif_orientation, read_image
+
+SENSOR = cv2.GaussianBlur(
+    np.random.default_rng(0).integers(0, 255, (48, 80, 3), np.uint8), (0, 0), 3
+)  # (H, W, 3) BGR
+FORMATS = {
+    "JPEG": {"quality": 100, "subsampling": 0},
+    "PNG": {},
+    "TIFF": {},
+    "WEBP": {"lossless": True},
+}
+# What turns the stored pixels upright for viewers, by EXIF's number.
+SHOWN = {
+    1: lambda x: x, 2: np.fliplr, 3: lambda x: np.rot90(x, 2), 4: np.flipud,
+    5: lambda x: x.swapaxes(0, 1), 6: lambda x: np.rot90(x, -1),
+    7: lambda x: np.rot90(x, 2).swapaxes(0, 1), 8: lambda x: np.rot90(x, 1),
+}  # fmt: skip
+
+
+def file_of(pixels: np.ndarray, orientation: int, kind: str) -> bytes:
+    image, file = Image.fromarray(np.ascontiguousarray(pixels[:, :, ::-1])), io.BytesIO()
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    image.save(file, kind, exif=exif, **FORMATS.get(kind, {}))
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("orientation", SHOWN)
+@pytest.mark.parametrize("kind", FORMATS)
+def test_pixels_come_as_the_sensor_stored_them(kind: str, orientation: int) -> None:
+    raw = file_of(SENSOR, orientation, kind)
+    expected = SENSOR[:, ::-1] if orientation in (2, 4, 5, 7) else SENSOR
+    image = decode_image(raw)
+    assert image is not None
+    assert exif_orientation(raw) == orientation
+    assert np.abs(image.astype(int) - expected).mean() < 2
+    grey = decode_image(raw, cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    assert np.abs(grey.astype(int) - cv2.cvtColor(expected, cv2.COLOR_BGR2GRAY)).mean() < 2
+
+
+@pytest.mark.parametrize("orientation", SHOWN)
+def test_no_picture_comes_mirrored(orientation: int) -> None:
+    """Whatever program stored an upright picture in another orientation, it can be turned back."""
+    stored = next(
+        pixels
+        for turns in range(4)
+        for pixels in (np.rot90(SENSOR, turns), np.fliplr(np.rot90(SENSOR, turns)))
+        if np.array_equal(SHOWN[orientation](pixels), SENSOR)
+    )
+    image = decode_image(file_of(stored, orientation, "PNG"))
+    assert image is not None
+    assert any(np.array_equal(np.rot90(image, turns), SENSOR) for turns in range(4))
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_a_heic_picture_comes_as_the_sensor_stored_it(quarters: int) -> None:
+    """As phones do, the file asks viewers for a turn by a property of its own, `irot`."""
+    heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed")
+    picture, exif = Image.fromarray(np.ascontiguousarray(SENSOR[:, :, ::-1])), Image.Exif()
+    exif[0x0112] = 3
+    picture.info["exif"], file = exif.tobytes(), io.BytesIO()
+    heif.from_pillow(picture).save(file, quality=95)
+    raw = bytearray(file.getvalue())
+    assert raw.count(b"irot") == 1
+    raw[raw.index(b"irot") + 4] = quarters
+    image = decode_image(bytes(raw))
+    assert image is not None
+    assert image.shape == SENSOR.shape
+    # This writer turned the pixels itself, so that half a turn shows what it was given.
+    assert np.abs(np.rot90(image, 2).astype(int) - SENSOR).mean() < 2
+    grey = decode_image(bytes(raw), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    assert grey.shape == SENSOR.shape[:2]
+
+
+def test_without_its_reader_a_heic_picture_gets_a_hint(tmp_path: Path, monkeypatch) -> None:
+    file, given = tmp_path / "IMG_1.HEIC", importlib.util.find_spec
+    file.write_bytes(b"\0\0\0\x18ftypheic" + bytes(64))
+
+    def without(name: str, *rest: object, given=builtins.__import__) -> object:
+        if name == "pillow_heif":
+            raise ImportError(name)
+        return given(name, *rest)
+
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *_: None if name == "pillow_heif" else given(name)
+    )
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(BadInput, match=r"HEIC picture: pip install 'jaxnav\[heic\]' reads it"):
+        read_image(file)
+
+
+def test_what_is_no_picture_is_said_to_be_none(tmp_path: Path) -> None:
+    for name, raw in {
+        "a.heic": b"\0\0\0\x18ftypheic" + bytes(64),
+        "b.jpg": b"\xff\xd8\xff\xe1\0\x20Exif\0\0MM\0*" + b"\xff" * 40,
+        "c.png": b"",
+    }.items():
+        (tmp_path / name).write_bytes(raw)
+        with pytest.raises(BadInput, match=name):
+            read_image(tmp_path / name)
+        assert exif_orientation(raw) == 1
