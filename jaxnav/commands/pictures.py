@@ -24,15 +24,16 @@ PNG_DPI = 110
 _NORMAL_SIDES = 0.8  # length of a drawn normal, in sides of the marker
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, whole or not at all."""
+def save_figure(figure: Figure, path: Path, dpi: float = PNG_DPI) -> None:
+    """Write a figure, as JPEG where the file's name ends so, else as PNG; whole or not at all."""
     for text in _words(figure):
         # Names of files and markers are no formulas, and may hold any characters.
         text.set_parse_math(False)
         text.set_text("\n".join(visible(line) for line in text.get_text().split("\n")))
     with atomic_path(path) as beside, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from")  # a box stands for it
-        figure.savefig(beside, dpi=PNG_DPI, format="png")
+        form = "jpeg" if path.suffix.lower() in (".jpg", ".jpeg") else "png"
+        figure.savefig(beside, dpi=dpi, format=form)
 
 
 def _words(artist: Artist) -> Iterator[Text]:

@@ -104,6 +104,7 @@ class ArucoDetector:
             parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
             # With the default, the paper's outline swallows the marker: 3 of 10 frames are lost.
             parameters.minMarkerDistanceRate = 0.02
+            parameters.minDistanceToBorder = 1  # with the default of 3, whole markers are left out
             parameters.minMarkerPerimeterRate = max(perimeter_rate, _PERIMETER_RATE)
             self._decoders[perimeter_rate] = cv2.aruco.ArucoDetector(
                 dictionary(self.family), parameters

@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr
 from jaxnav.files.figures import CameraFigures
@@ -69,6 +72,24 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
         if name is not None and name != data.get("camera_name"):
             raise BadInput(path, f"holds one camera, and it is not named {name!r}")
     return camera.camera(), camera.image_size_px
+
+
+def load_lens_sigma(path: str | Path, name: str | None = None) -> Float[np.ndarray, " 4"] | None:
+    """One standard deviation of fx, fy, cx, cy of a camera, px; None where its file says none.
+
+    Args:
+        path: a calibration file that `load_camera` reads.
+        name: as there.
+    """
+    data = read_mapping(Path(path))
+    if "cameras" not in data:
+        return None
+    entries = validate(RigFile, data, Path(path)).cameras
+    entry = next((entry for entry in entries if name in (None, entry.name)), None)
+    sigma = None if entry is None else entry.sigma
+    if sigma is None or sigma.focal_px is None or sigma.center_px is None:
+        return None
+    return np.array([*sigma.focal_px, *sigma.center_px])
 
 
 def camera_file(path: Path, data: dict[str, Any], by_topic: bool = False) -> CameraFile:

@@ -27,6 +27,9 @@ METHOD_STYLES: tuple[dict[str, Any], ...] = (
     {"color": VERMILION, "ls": "--"},
 )
 SELECTED, OTHER = BLUE, ORANGE
+PHOTO_DPI = 100.0  # pixels of a photograph in an inch of its picture
+_USUAL_PX = 1200.0  # diagonal of a photograph whose words are as large as usual
+_LEAST_ARROW = 0.02  # length of an arrow, of the photograph's diagonal
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class AnnotatedFrame:
     detected_px: Float[np.ndarray, "K 4 2"]  # corners
     selected_px: Float[np.ndarray, "P 2 2"]  # marker normals of the candidate taken, foot and tip
     other_px: Float[np.ndarray, "Q 2 2"]  # of all other candidates
+    names: tuple[str, ...] = ()  # beside the markers, where given
 
 
 def drive_report(
@@ -176,12 +180,30 @@ def camera_mosaic(rows: Sequence[Sequence[AnnotatedFrame]], title: str = "") -> 
 
 
 def photo_with_poses(view: AnnotatedFrame) -> Figure:
-    """Draw a photograph with the detected markers and both poses of each."""
+    """Draw a photograph, pixel for pixel at `PHOTO_DPI`, with its markers and both poses of each.
+
+    The marker is green, the normal of the better pose blue and of the other one orange; the names
+    stand beside the markers.
+    """
     height, width = view.image.shape[:2]
-    figure = Figure(figsize=(10, 10 * height / width + 0.4), layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_title(view.title, fontsize=10)
-    _show(axes, view)
+    figure = Figure(figsize=(width / PHOTO_DPI, height / PHOTO_DPI))
+    axes = figure.add_axes((0, 0, 1, 1))
+    scale = max(1.0, np.hypot(width, height) / _USUAL_PX)  # words and arrows grow with the image
+    least_px = _LEAST_ARROW * np.hypot(width, height)
+    _show(axes, view, scale, least_px)
+    for corners, name in zip(view.detected_px, view.names, strict=False):
+        at = corners[np.argmax(corners[:, 1])]
+        label = axes.annotate(
+            name, at, xytext=(0, -3 * scale), textcoords="offset points", va="top", ha="center"
+        )
+        label.set(fontsize=8 * scale, color=GREEN, annotation_clip=False)
+        label.set_path_effects([withStroke(linewidth=2 * scale, foreground="white")])
+    key = (("better pose", SELECTED), ("other pose", OTHER))
+    for row, (words, color) in enumerate(key):
+        at = (0.01, 0.99 - 0.035 * row * max(1.0, width / height))
+        text = axes.text(*at, words, color=color, transform=axes.transAxes, va="top")
+        text.set(fontsize=9 * scale)
+        text.set_path_effects([withStroke(linewidth=2 * scale, foreground="white")])
     return figure
 
 
@@ -256,15 +278,25 @@ def draw_waypoints(axes: Axes, waypoints_m: Float[np.ndarray, "W 2"], radius_m: 
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
-def _show(axes: Axes, view: AnnotatedFrame) -> None:
+def _show(axes: Axes, view: AnnotatedFrame, scale: float = 1.0, least_px: float = 0.0) -> None:
+    """Draw a frame with its markers, and arrows at least as long as `least_px`."""
     axes.imshow(view.image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     for corners in view.detected_px:
         closed = np.vstack([corners, corners[:1]])
-        axes.plot(closed[:, 0], closed[:, 1], color=GREEN, lw=1.2)
-        axes.plot(*corners[0], "o", color=GREEN, ms=3)
+        axes.plot(closed[:, 0], closed[:, 1], color=GREEN, lw=1.2 * scale)
+        axes.plot(*corners[0], "o", color=GREEN, ms=3 * scale)
     for sticks, color in ((view.other_px, OTHER), (view.selected_px, SELECTED)):
+        arrow = {
+            "arrowstyle": "->",
+            "color": color,
+            "lw": 1.8 * scale,
+            "mutation_scale": 10 * scale,
+        }
         for foot, tip in sticks:
-            axes.annotate("", tip, foot, arrowprops={"arrowstyle": "->", "color": color, "lw": 1.8})
+            length_px = np.linalg.norm(tip - foot)
+            if 0 < length_px < least_px:
+                tip = foot + (tip - foot) * least_px / length_px
+            axes.annotate("", tip, foot, arrowprops=arrow)
     height, width = view.image.shape[:2]
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axes.set_axis_off()

@@ -184,11 +184,12 @@ class Locate(Checked):
     """Find markers in a photograph and print both poses of each.
 
     With each marker: reprojection errors, their ratio, the probability that the better pose is
-    the mirrored one, and sigma. No marker in view is a result and not an error.
+    the mirrored one, and sigma; notes on what does not add up. No marker in view is a result and
+    not an error.
     """
 
     image: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGE")]
-    """Photograph, in any format that OpenCV reads."""
+    """Photograph, in any format that OpenCV reads, or HEIC; not turned by its EXIF orientation."""
     camera: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Calibration: a rig file, a Kalibr camchain or a ROS camera_info YAML."""
     marker_size_m: Annotated[float, tyro.conf.arg(metavar="S"), within("size_m")]
@@ -200,5 +201,9 @@ class Locate(Checked):
     corner_backend: Detector = "aruco"
     json: Switch = False
     """Print JSON instead of a table."""
-    out: Annotated[Path | None, optional("PNG")] = None
-    """Draw the markers and both poses into this file."""
+    out: Annotated[Path | None, optional("FILE")] = None
+    """Draw the markers and both poses into this file, .png or .jpg, as large as the photograph."""
+
+    def _check(self) -> None:
+        known = self.out is None or self.out.suffix.lower() in (".png", ".jpg", ".jpeg")
+        require(known, "--out", f"must end in .png or .jpg, got {self.out}")

@@ -1,6 +1,7 @@
 """`jaxnav locate`: find the markers in a photograph, with both poses of each."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -11,18 +12,23 @@ import numpy as np
 from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.commands.drive.arguments import Locate
+from jaxnav.commands.drive.locate_notes import notes, without_doubles
 from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.detection import Detections, make_detector
 from jaxnav.errors import BadInput
 from jaxnav.files import load_camera
-from jaxnav.files.images import read_image
+from jaxnav.files.cameras import load_lens_sigma
+from jaxnav.files.images import exif_orientation, read_image
 from jaxnav.models.camera import Camera
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
-from jaxnav.plots.localisation import AnnotatedFrame, photo_with_poses
+from jaxnav.plots.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
 from jaxnav.pose.candidates import Candidates, find_candidates
 from jaxnav.pose.observation import Observation, Snapshot
+
+_FREEDOM = 2  # of a marker's eight numbers: a pose has six
+_EXCESS = 4.0  # mean square of residuals, in sigmas, beyond chance: one marker in 55 of white noise
 
 
 def run(args: Locate) -> int:
@@ -38,24 +44,47 @@ def run(args: Locate) -> int:
             f"is {width} x {height} pixels, but --camera {args.camera} was calibrated at "
             f"{image_size_px[0]} x {image_size_px[1]}",
         )
-    detections = detector.detect(image, camera)
-    rig = CameraRig.create([camera], [jaxlie.SE3.identity()], ["camera"], [image_size_px])
+    detections = without_doubles(detector.detect(image, camera))
+    lens_sigma_px = load_lens_sigma(args.camera, args.camera_name)
+    cameras = _cameras(camera, lens_sigma_px)
+    rigs = [
+        CameraRig.create([one], [jaxlie.SE3.identity()], ["camera"], [image_size_px])
+        for one in cameras
+    ]
     located = [
-        _locate(rig, args.marker_size_m, detections, index)
+        _locate(rigs, args.marker_size_m, detections, index)
         for index in np.argsort(detections.ids, kind="stable")
     ]
+    markers = [marker for marker, _ in located]
+    orientation = exif_orientation(args.image.read_bytes())
     report = {
         "image": str(args.image),
         "camera": str(args.camera),
         "family": args.family,
         "marker_size_m": args.marker_size_m,
-        "markers": [marker for marker, _ in located],
+        "markers": markers,
+        "notes": notes(args, markers, image, orientation, lens_sigma_px is not None),
     }
     if args.out is not None:
-        view = _view(args.image.name, image, camera, args.marker_size_m, detections, located)
-        save_figure(photo_with_poses(view), args.out)
+        view = _view(image, camera, args.marker_size_m, detections, located)
+        save_figure(photo_with_poses(view), args.out, PHOTO_DPI)
     print(json.dumps(report, indent=2) if args.json else table(report))
     return 0
+
+
+def _cameras(camera: Camera, lens_sigma_px: np.ndarray | None) -> list[Camera]:
+    """The camera, and three that are off by one sigma: in focal length, in x and y of the centre.
+
+    Both focal lengths are off together: what leaves one unsure does so to the other.
+    """
+    if lens_sigma_px is None:
+        return [camera]
+    focal, centre = jnp.asarray(lens_sigma_px[:2]), jnp.asarray(lens_sigma_px[2:])
+    return [
+        camera,
+        replace(camera, focal_px=camera.focal_px + focal),
+        *(replace(camera, center_px=camera.center_px + centre * axis) for axis in jnp.eye(2)),
+    ]
 
 
 @jax.jit
@@ -69,33 +98,64 @@ def _solve(rig: CameraRig, markers: MarkerMap, obs: Observation) -> tuple[Candid
 
 
 def _locate(
-    rig: CameraRig, size_m: float, detections: Detections, index: int
+    rigs: list[CameraRig], size_m: float, detections: Detections, index: int
 ) -> tuple[dict[str, Any], Candidates]:
     # The marker is the world and the camera the vehicle: T_vehicle_world is T_camera_marker.
     world = jaxlie.SE3(jaxlie.SE3.identity().wxyz_xyz[None])
     markers = MarkerMap(world, jnp.asarray([size_m]), (0,), (detections.families[index],))
-    obs = Observation(
-        corners_px=jnp.asarray(detections.corners_px[index])[None, None],
-        visible=jnp.ones((1, 1), bool),
-        corner_sigma_px=jnp.asarray(detections.sigma_px[index])[None, None],
-    )
-    candidates, flip_probability = jax.device_get(_solve(rig, markers, obs))
+
+    def solve(rig: CameraRig, factor: float = 1.0) -> tuple[Candidates, jax.Array]:
+        obs = Observation(
+            corners_px=jnp.asarray(detections.corners_px[index])[None, None],
+            visible=jnp.ones((1, 1), bool),
+            corner_sigma_px=jnp.asarray(factor * detections.sigma_px[index])[None, None],
+        )
+        solved: tuple[Candidates, jax.Array] = jax.device_get(_solve(rig, markers, obs))
+        return solved
+
+    candidates, flip_probability = solve(rigs[0])
+    # Corners that no pose explains are worse than their sigmas say, and the flip as unsure.
+    misfit = float(candidates.cost[0]) / _FREEDOM if candidates.valid[0] else 0.0
+    factor = np.sqrt(misfit / _EXCESS) if misfit > _EXCESS else 1.0
+    if factor > 1:
+        candidates, flip_probability = solve(rigs[0], factor)
     kept = np.flatnonzero(candidates.valid)
     errors_px = np.sqrt(candidates.e1_px2[kept] / 4)
+    others = [solve(rig, factor)[0] for rig in rigs[1:]]
     marker = {
         "id": int(detections.ids[index]),
         "corners_px": detections.corners_px[index].tolist(),
-        "corner_sigma_px": detections.sigma_px[index].tolist(),
+        "corner_sigma_px": (factor * detections.sigma_px[index]).tolist(),
+        "sigma_factor": float(factor),
+        "misfit_sigmas": float(np.sqrt(misfit)),
         "flip_probability": float(flip_probability),
         "error_ratio": float(errors_px[0] / errors_px[1]) if len(kept) > 1 else None,
         "poses": [
-            _pose(candidates, int(n), error) for n, error in zip(kept, errors_px, strict=True)
+            _pose(candidates, int(n), error, others)
+            for n, error in zip(kept, errors_px, strict=True)
         ],
     }
     return marker, candidates
 
 
-def _pose(candidates: Candidates, n: int, error_px: float) -> dict[str, Any]:
+def _lens_sigma_m(candidates: Candidates, n: int, others: list[Candidates]) -> np.ndarray:
+    """How far one sigma of the lens moves the position of a pose, (3,)."""
+    moved_m = []
+    for other in others:
+        # The pose that is nearest to it in angle: their order may have changed.
+        turns = np.abs(
+            other.T_vehicle_world.wxyz_xyz[:, :4] @ candidates.T_vehicle_world.wxyz_xyz[n, :4]
+        )
+        same = int(np.argmax(np.where(other.valid, turns, -1)))
+        moved_m.append(
+            (other.T_vehicle_world.wxyz_xyz[same] - candidates.T_vehicle_world.wxyz_xyz[n])[4:]
+        )
+    return np.linalg.norm(np.reshape(moved_m, (-1, 3)), axis=0)
+
+
+def _pose(
+    candidates: Candidates, n: int, error_px: float, others: list[Candidates]
+) -> dict[str, Any]:
     wxyz_xyz = candidates.T_vehicle_world.wxyz_xyz[n]
     T_camera_marker = jaxlie.SE3(jnp.asarray(wxyz_xyz))
     position_m = np.asarray(T_camera_marker.translation())
@@ -107,7 +167,8 @@ def _pose(candidates: Candidates, n: int, error_px: float) -> dict[str, Any]:
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     to_position = np.hstack([-np.eye(3), cross])
     covariance = np.asarray(candidates.covariance[n])
-    position_sigma_m = np.sqrt(np.diag(to_position @ covariance @ to_position.T))
+    corners_sigma_m = np.sqrt(np.diag(to_position @ covariance @ to_position.T))
+    lens_sigma_m = _lens_sigma_m(candidates, n, others)
     rotation_sigma_deg = np.rad2deg(np.sqrt(np.diag(covariance)[3:]))
     return {
         "T_camera_marker": np.asarray(T_camera_marker.as_matrix()).tolist(),
@@ -115,15 +176,18 @@ def _pose(candidates: Candidates, n: int, error_px: float) -> dict[str, Any]:
         "view_angle_deg": float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))),
         "reprojection_error_px": float(error_px),
         "converged": bool(candidates.converged[n]),
-        "position_sigma_m": position_sigma_m.tolist(),
+        "position_sigma_m": np.hypot(corners_sigma_m, lens_sigma_m).tolist(),
+        "lens_sigma_m": lens_sigma_m.tolist() if others else None,
         "rotation_sigma_deg": rotation_sigma_deg.tolist(),
     }
 
 
 def table(report: dict[str, Any]) -> str:
     """The report as text, a line for each pose."""
+    said = [f"note: {sentence}" for sentence in report["notes"]]
     if not report["markers"]:
-        return f"{report['image']}: no marker of {report['family']} in view"
+        none = f"{report['image']}: no marker of {report['family']} in view"
+        return "\n".join([none, *said])
     head = (
         f"{'id':>5} {'pose':>4} {'x (m)':>8} {'y (m)':>8} {'z (m)':>8} {'view (deg)':>10} "
         f"{'error (px)':>10} {'ratio':>6} {'P(flip)':>8} {'sigma (m)':>9} {'sigma (deg)':>11}"
@@ -145,11 +209,10 @@ def table(report: dict[str, Any]) -> str:
                 f"{np.linalg.norm(pose['position_sigma_m']):>9.4f} "
                 f"{np.linalg.norm(pose['rotation_sigma_deg']):>11.2f}"
             )
-    return "\n".join(lines)
+    return "\n".join([*lines, *said])
 
 
 def _view(
-    title: str,
     image: np.ndarray,
     camera: Camera,
     size_m: float,
@@ -162,10 +225,16 @@ def _view(
             wxyz_xyz = candidates.T_vehicle_world.wxyz_xyz[n]
             Ts_camera_marker = jaxlie.SE3(jnp.asarray(wxyz_xyz)[None])
             sticks[rank].append(normals_px(camera, Ts_camera_marker, np.array([size_m]))[0])
+    names = tuple(
+        f"{marker['id']}: {marker['poses'][0]['distance_m']:.2f} m" if marker["poses"] else ""
+        for marker, _ in located
+    )
+    order = np.argsort(detections.ids, kind="stable")
     return AnnotatedFrame(
-        title=f"{title}: detected marker green, normal of the better pose blue, other pose orange",
+        title="",
         image=image[:, :, ::-1],
-        detected_px=detections.corners_px,
+        detected_px=detections.corners_px[order],
         selected_px=np.asarray(sticks[0]).reshape(-1, 2, 2),
         other_px=np.asarray(sticks[1]).reshape(-1, 2, 2),
+        names=names,
     )

@@ -7,8 +7,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+import yaml
+from PIL import Image
 
 from jaxnav.cli import main
+from jaxnav.commands.drive.locate_notes import without_doubles
+from jaxnav.detection import Detections, marker_cells
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
@@ -69,6 +73,7 @@ def test_both_poses_of_a_rendered_marker(rendered, tmp_path, capsys):
 def test_the_table_has_a_line_for_each_pose(rendered, capsys):
     assert locate(rendered[0], *CAMERA) == 0
     lines = capsys.readouterr().out.strip().splitlines()
+    lines = [line for line in lines if not line.startswith("note: ")]
     assert len(lines) == 3
     assert all(
         word in lines[0]
@@ -127,3 +132,132 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, args, message):
     assert code == 2
     assert len(error.strip().splitlines()) == 1
     assert message in error
+
+
+def notes_of(capsys) -> str:
+    return "\n".join(json.loads(capsys.readouterr().out)["notes"])
+
+
+@pytest.mark.parametrize(
+    ("changed", "note"),
+    [
+        (("--marker-size-m", "86"), "86 is 86 m: 0.086 if 86 are mm, 0.86 if they are cm"),
+        (("--marker-size-m", "6.5"), "0.0065 if 6.5 are mm, 0.065 if they are cm"),
+        (("--family", "4x4_50"), "1 of tag36h11 in view (id 0): --family tag36h11"),
+        ((), "rig.yaml has no sigmas of its lens"),
+    ],
+)
+def test_what_does_not_add_up_is_noted(rendered, capsys, changed, note):
+    given = dict(zip(CAMERA[::2], CAMERA[1::2], strict=True))
+    given |= dict(zip(changed[::2], changed[1::2], strict=True))
+    assert locate(rendered[0], *(word for pair in given.items() for word in pair), "--json") == 0
+    assert note in notes_of(capsys)
+
+
+def with_lens(tmp_path, focal: float, **sigma) -> tuple:
+    """The front camera's file, with another focal length and with sigmas of its lens."""
+    rig = yaml.safe_load((QCAR / "rig.yaml").read_text())
+    rig["cameras"] = [entry for entry in rig["cameras"] if entry["name"] == "front"]
+    rig["cameras"][0]["focal_px"] = [focal] * 2
+    if sigma:
+        rig["cameras"][0]["sigma"] = sigma
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    return ("--camera", tmp_path / "rig.yaml", "--marker-size-m", "0.172", "--json")
+
+
+def test_an_unsure_lens_makes_the_position_unsure(rendered, tmp_path, capsys):
+    """A focal length that is 1 % off is 1 % of the distance."""
+    focal_px = float(load_rig(QCAR / "rig.yaml").cameras.focal_px[0, 0])
+    found = {}
+    for factor in (1.0, 1.01):
+        sigma = {"focal_px": [0.01 * focal_px] * 2, "center_px": [1.5, 0.5]}
+        assert locate(rendered[0], *with_lens(tmp_path, factor * focal_px, **sigma)) == 0
+        report = json.loads(capsys.readouterr().out)
+        found[factor] = report["markers"][0]["poses"][0]
+        assert not any("sigmas of its lens" in note for note in report["notes"])
+    pose = found[1.0]
+    at_m, moved_m = (np.array(one["T_camera_marker"])[:3, 3] for one in (pose, found[1.01]))
+    of_focal_m = np.abs(moved_m - at_m)
+    sigma_m = np.array(pose["lens_sigma_m"])
+    assert sigma_m[2] == pytest.approx(of_focal_m[2], rel=0.05)
+    across_m = np.array([1.5, 0.5]) * pose["distance_m"] / focal_px
+    np.testing.assert_allclose(sigma_m[:2], np.hypot(of_focal_m[:2], across_m), rtol=0.15)
+    assert np.all(np.array(pose["position_sigma_m"]) >= sigma_m)
+
+
+def test_corners_that_no_pose_explains_count_as_unsure(tmp_path, capsys):
+    """A marker foreshortened by 45 degrees without any perspective, as through a tele lens."""
+    cells = np.kron(np.pad(marker_cells("tag36h11", 0), 1, constant_values=1), np.ones((40, 40)))
+    paper = (255 * cells).astype(np.uint8)
+    camera = with_lens(tmp_path, 400.0)
+    found = []
+    for width in (100, 71):
+        image = np.full((410, 820), 255, np.uint8)
+        image[100:200, 300 : 300 + width] = cv2.resize(
+            paper, (width, 100), interpolation=cv2.INTER_AREA
+        )
+        cv2.imwrite(str(tmp_path / "tele.png"), cv2.GaussianBlur(image, (0, 0), 0.8))
+        assert locate(tmp_path / "tele.png", *camera) == 0
+        report = json.loads(capsys.readouterr().out)
+        (marker,) = report["markers"]
+        found.append(marker)
+        off = any("is --camera that of this photograph" in note for note in report["notes"])
+        assert off == (marker["misfit_sigmas"] > 5) == (width == 71)
+    face, tele = found
+    assert face["sigma_factor"] < 2 < 5 < tele["sigma_factor"]
+    assert np.min(tele["corner_sigma_px"]) > 2 * np.max(face["corner_sigma_px"])
+
+
+def test_one_sighting_is_not_two():
+    corners_px = np.array([[10.0, 10], [50, 10], [50, 50], [10, 50]])
+    seen = Detections(
+        ids=np.array([3, 3, 3, 5]),
+        corners_px=np.stack([corners_px, corners_px + 2, corners_px + 200, corners_px + 1]),
+        sigma_px=np.array([[0.2] * 4, [0.01] * 4, [0.3] * 4, [0.1] * 4]),
+        refined=np.array([True, True, True, False]),
+        families=("a", "b", "c", "d"),
+    )
+    kept = without_doubles(seen)
+    assert kept.ids.tolist() == [3, 3, 5]
+    assert kept.families == ("b", "c", "d")
+    assert len(without_doubles(Detections.concatenate([]))) == 0
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_picture_of_any_orientation_gives_the_pose_of_its_sensor(
+    rendered, tmp_path, capsys, orientation
+):
+    """EXIF asks viewers to turn it; the lens was calibrated as the sensor lies."""
+    path, T_camera_marker = rendered
+    image, exif = Image.open(path), Image.Exif()
+    if orientation in (2, 4, 5, 7):
+        image = image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)  # the only way to see it mirrored
+    exif[0x0112] = orientation
+    image.save(tmp_path / "phone.jpg", quality=98, exif=exif)
+    assert locate(tmp_path / "phone.jpg", *CAMERA, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    best = np.array(report["markers"][0]["poses"][0]["T_camera_marker"])
+    truth = np.asarray(T_camera_marker.as_matrix())
+    np.testing.assert_allclose(best[:3, 3], truth[:3, 3], atol=0.02)
+    assert any("(EXIF)" in note for note in report["notes"]) == (orientation != 1)
+
+
+def test_the_picture_is_as_large_as_the_photograph(rendered, tmp_path, capsys):
+    for name in ("drawn.png", "drawn.JPG"):
+        assert locate(rendered[0], *CAMERA, "--out", tmp_path / name) == 0
+        with Image.open(tmp_path / name) as drawn:
+            assert drawn.size == (820, 410)
+            assert drawn.format == ("PNG" if name.endswith("png") else "JPEG")
+    assert locate(rendered[0], *CAMERA, "--out", tmp_path / "drawn.pdf") == 2
+    assert "--out: must end in .png or .jpg" in capsys.readouterr().err
+    assert not (tmp_path / "drawn.pdf").exists()
+
+
+def test_a_marker_at_the_border_is_found(tmp_path, capsys):
+    cells = np.pad(marker_cells("tag36h11", 0), ((0, 1), (1, 1)), constant_values=1)
+    image = np.full((410, 820), 220, np.uint8)
+    marker = np.kron(30 + 190 * cells, np.ones((8, 8))).astype(np.uint8)
+    image[2 : 2 + len(marker), 200 : 200 + marker.shape[1]] = marker
+    cv2.imwrite(str(tmp_path / "border.png"), cv2.GaussianBlur(image, (0, 0), 0.7))
+    assert locate(tmp_path / "border.png", *CAMERA, "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)["markers"]) == 1

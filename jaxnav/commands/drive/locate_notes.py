@@ -1,0 +1,127 @@
+"""Notes of `jaxnav locate`: what a person should know of a photograph before trusting its poses."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxnav.commands.drive.arguments import Locate
+from jaxnav.detection import Detections, make_detector
+
+_LARGE_M, _SMALL_M = 1.5, 0.003  # sides that markers rarely have, and other units often make
+_MISFIT = 5.0  # sigmas by which corners are off their pose
+_FLIP = 0.3  # a larger probability says that both poses are possible
+# The largest of each kind of code, which hold the smaller ones.
+_FAMILIES = ("tag36h11", "tag25h9", "tag16h5", "4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000",
+             "aruco_original", "aruco_mip_36h12")  # fmt: skip
+_TURNED_DEG = {3: 180, 4: 180, 5: 90, 6: 90, 7: 270, 8: 270}  # clockwise, by EXIF's number
+_MIRRORED = (2, 4, 5, 7)
+
+
+def notes(
+    args: Locate,
+    markers: Sequence[dict[str, Any]],
+    image: UInt8[np.ndarray, "rows columns *channels"],
+    orientation: int,
+    knows_lens: bool,
+) -> list[str]:
+    """Sentences on a photograph and the markers found in it.
+
+    Args:
+        markers: as in the report.
+        orientation: of the photograph, 1 to 8, as EXIF counts.
+        knows_lens: whether the camera's file has sigmas of its lens.
+    """
+    said = _of_the_size(args.marker_size_m)
+    if orientation != 1:
+        turned = f"turned by {_TURNED_DEG[orientation]} deg" if orientation in _TURNED_DEG else ""
+        mirrored = "mirrored" if orientation in _MIRRORED else ""
+        shown = " and ".join(filter(None, (mirrored, turned)))
+        said.append(
+            f"viewers show this photograph {shown} (EXIF); x (right) and y (down) are those of the "
+            "pixels as the camera stored them"
+        )
+    if not markers:
+        said += _other_family(args, image)
+    for marker in markers:
+        name, best = f"marker {marker['id']}", marker["poses"][0] if marker["poses"] else None
+        if best is None:
+            said.append(f"{name}: no pose explains its corners")
+            continue
+        if marker["flip_probability"] > _FLIP:
+            said.append(
+                f"{name}: both poses are possible (P(flip) {marker['flip_probability']:.2f}): take "
+                "it from nearer, or more from the side"
+            )
+    said += _of_misfits(markers)
+    ids = [marker["id"] for marker in markers]
+    said += [
+        f"marker {i} is seen {ids.count(i)} times: at most one of them is the one that you mean"
+        for i in sorted({i for i in ids if ids.count(i) > 1})
+    ]
+    if markers and not knows_lens:
+        said.append(
+            f"--camera {args.camera.name} has no sigmas of its lens, so sigma (m) leaves out what "
+            "its focal length and centre are wrong: `jaxnav calibrate intrinsics` writes them"
+        )
+    return said
+
+
+def without_doubles(detections: Detections) -> Detections:
+    """The detections with the sharper one of two that show the same marker in the same place."""
+    order = np.argsort(detections.sigma_px.mean(axis=1), kind="stable")
+    centres_px = detections.corners_px.mean(axis=1)
+    sides_px = np.linalg.norm(np.diff(detections.corners_px, axis=1), axis=2).mean(axis=1)
+    kept: list[int] = []
+    for index in order:
+        apart_px = np.linalg.norm(centres_px[kept] - centres_px[index], axis=1)
+        same = (detections.ids[kept] == detections.ids[index]) & (apart_px < sides_px[index] / 2)
+        if not np.any(same):
+            kept.append(int(index))
+    rows = np.array(sorted(kept), int)
+    return Detections(
+        detections.ids[rows],
+        detections.corners_px[rows],
+        detections.sigma_px[rows],
+        detections.refined[rows],
+        tuple(detections.families[row] for row in rows),
+    )
+
+
+def _of_the_size(size_m: float) -> list[str]:
+    if _SMALL_M <= size_m <= _LARGE_M:
+        return []
+    if size_m > _LARGE_M:
+        other = f"{size_m / 1000:g} if {size_m:g} are mm, {size_m / 100:g} if they are cm"
+    else:
+        other = f"{1000 * size_m:g} if it was divided by 1000 twice"
+    return [f"--marker-size-m {size_m:g} is {size_m:g} m: {other}"]
+
+
+def _other_family(args: Locate, image: np.ndarray) -> list[str]:
+    """The family of which the photograph shows most markers instead."""
+    seen = {}
+    for family in _FAMILIES:
+        if family != args.family:
+            found = make_detector("aruco", family).detect(image)
+            seen[family] = found.ids[found.refined]
+    family = max(seen, key=lambda one: len(seen[one]))
+    if not len(seen[family]):
+        return []
+    ids = ", ".join(map(str, sorted(set(seen[family].tolist()))[:6]))
+    return [f"{len(seen[family])} of {family} in view (id {ids}): --family {family}"]
+
+
+def _of_misfits(markers: Sequence[dict[str, Any]]) -> list[str]:
+    off = [marker for marker in markers if marker["misfit_sigmas"] > _MISFIT]
+    if not off:
+        return []
+    worst = max(off, key=lambda marker: marker["misfit_sigmas"])
+    name = f"marker {worst['id']}" if len(off) == 1 else f"{len(off)} markers, worst {worst['id']}"
+    return [
+        f"{name}: corners are {worst['poses'][0]['reprojection_error_px']:.2g} px off the pose, "
+        f"{worst['misfit_sigmas']:.0f} of their sigmas, and count as "
+        f"{worst['sigma_factor']:.2g} times as unsure: is --camera that of this photograph, with "
+        "its zoom and focus, and is the marker flat?"
+    ]
