@@ -15,8 +15,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.models.geometry import on_last_axis, safe_norm
-from jaxnav.models.lenses import LENSES, MOST_COEFFICIENTS, bearing_of, image_of
+from jaxnav.models.geometry import on_last_axis
+from jaxnav.models.lenses import LENSES, MOST_COEFFICIENTS, bearing_of, can_be_seen, image_of
 
 LENS_COEFFICIENTS = {name: len(lens.coefficients) for name, lens in LENSES.items()}
 
@@ -123,9 +123,9 @@ class Camera(eqx.Module):
         return self._select([bearing_of(lens, normalised, self.distortion) for lens in self.lenses])
 
     def in_front(self, points_camera: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
-        """Whether a point lies in front of the lens, where it can be seen at all, (*batch) bool."""
-        depth_ratio = points_camera[..., 2] / jnp.maximum(safe_norm(points_camera), 1e-12)
-        return self._select([depth_ratio > LENSES[lens].least_depth_ratio for lens in self.lenses])
+        """Whether a point lies before the lens, and before the lens folds: it can be seen."""
+        points = jnp.moveaxis(points_camera, -1, 0)
+        return self._select([can_be_seen(lens, points, self.distortion) for lens in self.lenses])
 
     def _select(self, per_lens: list[Array]) -> Array:
         if len(per_lens) == 1:

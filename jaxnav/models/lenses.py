@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxnav.models.geometry import on_last_axis, safe_norm
 
@@ -21,6 +21,9 @@ MIN_DEPTH_RATIO = 1e-3
 # Size of the table from which an inverse lens starts: angles up to 89 or 180 degrees.
 _TABLE_SIZE = 96
 _NEWTON_STEPS = 4
+# On the way from the axis to a point, where a lens is asked whether its image moves outwards; the
+# first of a radtan lens, in radii of the point's pinhole image.
+_STOPS, _FIRST_STOP = 32, 0.01
 _LEAST_DENOMINATOR = 1e-3  # bound for a rational lens far outside of its fitted range
 
 Image = tuple[Float[Array, "2 ..."], Float[Array, "3 2 ..."]]
@@ -35,6 +38,8 @@ class LensModel(NamedTuple):
     # Unit vectors through images.
     bearing: Callable[[Float[Array, "*batch 2"], Float[Array, " k"]], Float[Array, "*batch 3"]]
     least_depth_ratio: float  # depth over distance of the last point that can be seen
+    # Whether the image moves outwards all the way from the axis to a point.
+    rises: Callable[[Float[Array, "3 ..."], Float[Array, "k ..."]], Bool[Array, "..."]]
 
 
 def _pinhole(points: Array, coefficients: Array) -> Image:
@@ -65,6 +70,22 @@ def _radtan(points: Array, coefficients: Array) -> Image:
         ],
         axis=1,
     )
+
+
+def _pinhole_rises(points: Array, coefficients: Array) -> Array:
+    return jnp.ones(points.shape[1:], bool)
+
+
+def _on_the_way(last: Array, parts: np.ndarray) -> Array:
+    """The parts of an array, along a new first axis."""
+    return last[None] * jnp.asarray(parts, last.dtype).reshape(-1, *(1,) * last.ndim)
+
+
+def _radtan_rises(points: Array, coefficients: Array) -> Array:
+    r2 = jnp.sum(_pinhole(points, coefficients)[0] ** 2, axis=0)
+    way = _on_the_way(r2, np.geomspace(_FIRST_STOP**2, 1, _STOPS))
+    radial, rise = _radial(way, coefficients)
+    return jnp.all(radial + 2 * way * rise > 0, axis=0)
 
 
 def _bent(x: Array, y: Array, coefficients: Array) -> tuple[Array, tuple[Array, Array, Array]]:
@@ -111,14 +132,13 @@ def _equidistant(points: Array, coefficients: Array) -> Image:
     Source: Kannala, Brandt (2006).
     """
     x, y, z = points
-    k1, k2, k3, k4 = coefficients
     r2, squared = x**2 + y**2, jnp.sum(points**2, axis=0)
     off_axis = r2 > 1e-14 * z**2
     per_radius = jax.lax.rsqrt(jnp.where(off_axis, r2, 1))
     theta = jnp.where(off_axis, jnp.arctan2(jnp.where(off_axis, r2 * per_radius, 1), z), 0)
     t2 = theta**2
     gain = _equidistant_gain(t2, coefficients)
-    rise = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))  # of theta * gain
+    rise = _equidistant_rise(t2, coefficients)
     # theta / radius, which tends to 1 / z on the axis
     on_axis = 1 / jnp.where(off_axis | (z <= 0), 1, z)
     ratio = jnp.where(off_axis, theta * per_radius, on_axis) * gain
@@ -129,6 +149,18 @@ def _equidistant(points: Array, coefficients: Array) -> Image:
     slope = jnp.where(is_depth, -rise[None], points * bend[None])[:, None] * points[None, :2]
     straight = _axes(jnp.eye(3, 2, dtype=points.dtype), points)
     return points[:2] * ratio[None], slope + straight * ratio[None, None]
+
+
+def _equidistant_rises(points: Array, coefficients: Array) -> Array:
+    theta = jnp.arctan2(safe_norm(jnp.moveaxis(points[:2], 0, -1)), points[2])
+    way = _on_the_way(theta**2, np.linspace(1 / _STOPS, 1, _STOPS) ** 2)
+    return jnp.all(_equidistant_rise(way, coefficients) > 0, axis=0)
+
+
+def _equidistant_rise(theta2: Array, coefficients: Array) -> Array:
+    """Derivative by theta of theta times the gain."""
+    k1, k2, k3, k4 = coefficients
+    return 1 + theta2 * (3 * k1 + theta2 * (5 * k2 + theta2 * (7 * k3 + theta2 * 9 * k4)))
 
 
 def _equidistant_gain(theta2: Array, coefficients: Array) -> Array:
@@ -218,10 +250,14 @@ def _invert(profile: Callable[[Array], Array], target: Array, table: np.ndarray)
 
 _BROWN = ("k1", "k2", "p1", "p2", "k3")
 LENSES = {
-    "none": LensModel((), _pinhole, _pinhole_bearing, MIN_DEPTH_RATIO),
-    "radtan": LensModel(_BROWN, _radtan, _radtan_bearing, MIN_DEPTH_RATIO),
-    "rational": LensModel((*_BROWN, "k4", "k5", "k6"), _radtan, _radtan_bearing, MIN_DEPTH_RATIO),
-    "equidistant": LensModel(("k1", "k2", "k3", "k4"), _equidistant, _equidistant_bearing, -0.99),
+    "none": LensModel((), _pinhole, _pinhole_bearing, MIN_DEPTH_RATIO, _pinhole_rises),
+    "radtan": LensModel(_BROWN, _radtan, _radtan_bearing, MIN_DEPTH_RATIO, _radtan_rises),
+    "rational": LensModel(
+        (*_BROWN, "k4", "k5", "k6"), _radtan, _radtan_bearing, MIN_DEPTH_RATIO, _radtan_rises
+    ),
+    "equidistant": LensModel(
+        ("k1", "k2", "k3", "k4"), _equidistant, _equidistant_bearing, -0.99, _equidistant_rises
+    ),
 }
 MOST_COEFFICIENTS = max(len(lens.coefficients) for lens in LENSES.values())
 
@@ -232,6 +268,20 @@ def image_of(
     """Images (2, ...) at focal length 1 of points (3, ...), and their slopes (3, 2, ...)."""
     kind = LENSES[lens]
     return kind.image(points, coefficients[: len(kind.coefficients)])
+
+
+def can_be_seen(
+    lens: str, points: Float[Array, "3 ..."], coefficients: Float[Array, "8 ..."]
+) -> Bool[Array, "..."]:
+    """Whether points (3, ...) lie before the lens, and where its image is still one-to-one.
+
+    A polynomial that was fitted up to some angle may fold beyond: it draws points from there into
+    the image that no camera sees there.
+    """
+    kind = LENSES[lens]
+    depth_ratio = points[2] / jnp.maximum(safe_norm(jnp.moveaxis(points, 0, -1)), 1e-12)
+    before = depth_ratio > kind.least_depth_ratio
+    return before & kind.rises(points, coefficients[: len(kind.coefficients)])
 
 
 def bearing_of(

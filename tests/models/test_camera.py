@@ -207,3 +207,36 @@ def test_too_many_coefficients_are_refused(lens):
 def test_an_unknown_lens_is_refused():
     with pytest.raises(ValueError, match="unknown lens 'fisheye'"):
         Camera.create((1.0, 1.0), (0.0, 0.0), "fisheye")
+
+
+FOLDS = {  # lens, coefficients, the angle up to which its image moves outwards, degrees
+    "radtan": ([-0.26, 0.09, 0.0, 0.0, -0.016], None),
+    "barrel": ([-0.4, 0.0, 0.0, 0.0, 0.0], np.rad2deg(np.arctan(np.sqrt(1 / 1.2)))),
+    "never": ([0.1, 0.05, 0.0, 0.0, 0.01], 89.0),
+    "equidistant": ([-0.2, 0.0, 0.0, 0.0], np.rad2deg(np.sqrt(1 / 0.6))),
+}
+
+
+@pytest.mark.parametrize("name", FOLDS)
+def test_a_point_beyond_the_fold_is_not_seen(name, precision):
+    """Of all points that are drawn at a pixel, only the one that its ray leads to is."""
+    coefficients, fold_deg = FOLDS[name]
+    lens = "equidistant" if name == "equidistant" else "radtan"
+    camera = Camera.create((400.0, 400.0), (320.0, 240.0), lens, coefficients)
+    angles_deg = np.linspace(0.5, 88.5, 177)
+    angles = np.deg2rad(angles_deg)
+    points = 2.0 * np.stack([0.8 * np.sin(angles), 0.6 * np.sin(angles), np.cos(angles)], axis=1)
+    seen = np.asarray(camera.in_front(jnp.asarray(points, precision)))
+    rays = np.asarray(camera.unproject(camera.project(jnp.asarray(points, precision))))
+    again = np.rad2deg(np.arccos(np.clip(rays[:, 2], -1, 1)))
+    assert seen.dtype == bool
+    last_deg = angles_deg[seen].max()
+    assert np.all(seen == (angles_deg <= last_deg))  # up to one angle
+    inner = angles_deg < last_deg - 1
+    np.testing.assert_allclose(again[inner], angles_deg[inner], atol=0.1)
+    if fold_deg is not None:
+        assert last_deg == pytest.approx(fold_deg, abs=0.6)
+    else:  # it folds where the review saw it drawing what it can't see
+        assert not np.any(seen[angles_deg > 62])
+        beyond = angles_deg > last_deg + 2
+        assert np.min(np.abs(again[beyond] - angles_deg[beyond])) > 1

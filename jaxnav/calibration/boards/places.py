@@ -15,7 +15,7 @@ from jaxnav.calibration.boards.saddles import Places
 _KNOWN_AROUND = 16  # most known points that predict one
 _NEAREST_KNOWN = 1.1  # most pitches from a point to the nearest known one
 _SPREAD = 2.0  # most pitches by which the other known points are further away
-_LONGEST_REACH = 2.6  # most pitches to a neighbour in a row or column
+_LONGEST_REACH = 3.6  # most pitches to a neighbour in a row or column
 
 
 def no_places(board: Board) -> tuple[Int[np.ndarray, " found"], Places]:
@@ -59,7 +59,7 @@ def straight_places(
 
 
 def bent_places(board: Board, ids: Int[np.ndarray, " N"], places: Places) -> Places:
-    """The places with edges along parabolas through their neighbours."""
+    """The places with edges along the curves through their neighbours."""
     steps, bends = _steps_and_bends(board, ids, places.points_px)
     known = np.isfinite(steps).all(axis=2)
     along_px = np.where(known[..., None], steps, places.along_px)
@@ -89,9 +89,11 @@ def mapped(
 def _steps_and_bends(
     board: Board, ids: np.ndarray, points_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (N, 2, 2) and bends (N, 2) as in `Places`, from three points in a row and in a column.
+    """Steps (N, 2, 2) and bends (N, 2) as in `Places`, from points in a row and in a column.
 
-    NaN where a point has no neighbour. With one neighbour there is a step, but no bend.
+    They are those of a parabola through the point and its two nearest neighbours; of a cubic, with
+    the third, where these are on one side, as at the board's border. NaN where a point has no
+    neighbour. With one neighbour there is a step, but no bend.
     """
     columns, rows = board.grid[ids].T
     table = np.full((2, board.pattern_rows, board.pattern_columns), np.nan)
@@ -107,16 +109,16 @@ def _steps_and_bends(
             own = column if axis == 0 else row
             seen = np.flatnonzero(np.isfinite(line[0]) & (np.arange(len(at)) != own))
             seen = seen[np.abs(at[seen] - at[own]) < _LONGEST_REACH]
-            seen = seen[np.argsort(np.abs(at[seen] - at[own]), kind="stable")[:2]]
+            seen = seen[np.argsort(np.abs(at[seen] - at[own]), kind="stable")[:3]]
+            t = at[seen] - at[own]
             if len(seen) == 0:
                 continue
-            t = (at[seen] - at[own])[:, None]
-            slope = (line[:, seen].T - line[:, own]) / t
-            if len(seen) == 1:
-                steps[index, axis] = slope[0]
-                continue
-            second = (slope[1] - slope[0]) / (t[1] - t[0])
-            steps[index, axis] = slope[0] - second * t[0]
-            u, v = steps[index, axis] / np.linalg.norm(steps[index, axis])
-            bends[index, axis] = second[1] * u - second[0] * v
+            if len(seen) == 3 and t[0] * t[1] < 0:
+                seen, t = seen[:2], t[:2]
+            powers = t[:, None] ** np.arange(1, len(t) + 1)
+            curve = np.linalg.solve(powers, (line[:, seen].T - line[:, own]))
+            steps[index, axis] = curve[0]
+            if len(seen) > 1:
+                u, v = curve[0] / np.linalg.norm(curve[0])
+                bends[index, axis] = curve[1, 1] * u - curve[1, 0] * v
     return steps, bends

@@ -1,5 +1,6 @@
 """Detection of boards in rendered images with known truth, and the messages if it fails."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.detection import find_board, look_at
 from jaxnav.calibration.boards.images import collect_views, source_files
+from jaxnav.calibration.boards.places import bent_places, straight_places
 from jaxnav.calibration.boards.saddles import Places, fit_saddles
 from jaxnav.calibration.boards.sheets import sheet_of
 from jaxnav.detection.families import dictionary
@@ -47,8 +49,12 @@ def picture(kind: str, pose: int, blur_px: float = 0.7) -> np.ndarray:
     return renderer(kind, blur_px).render(POSES[pose], np.random.default_rng(pose))
 
 
-def truth_px(board: Board, T_camera_board: np.ndarray) -> np.ndarray:
-    points_camera_m = board.points_board_m @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
+def truth_px(
+    board: Board, T_camera_board: np.ndarray, by_m: Sequence[float] | np.ndarray = (0, 0, 0)
+) -> np.ndarray:
+    """The board's points, all moved on the board by some metres."""
+    points_m = board.points_board_m + np.array(by_m)
+    points_camera_m = points_m @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
     return np.asarray(CAMERA.project(jnp.asarray(points_camera_m)))
 
 
@@ -332,3 +338,20 @@ def test_what_is_no_image_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "c.avi").write_bytes(b"a")
     with pytest.raises(BadInput, match=r"c\.avi: is not a video"):
         collect_views(BOARDS["charuco"], [tmp_path / "c.avi"])
+
+
+def test_edges_bend_at_the_border_of_a_board_as_inside() -> None:
+    """Steps and bends of the exact points against those of the lens itself, by differences."""
+    board = BOARDS["chessboard"]
+    ids, points_px = np.arange(len(board.points_board_m)), truth_px(board, POSES[1])
+    bent = bent_places(board, ids, straight_places(board, ids, points_px))
+    h = 1e-3  # of a square
+    worst_px = 0.0
+    for axis, step_m in enumerate(([board.size_m, 0, 0], [0, -board.size_m, 0])):
+        before, after = (truth_px(board, POSES[1], sign * h * np.array(step_m)) for sign in (-1, 1))
+        first, second = (after - before) / (2 * h), (after - 2 * points_px + before) / (2 * h**2)
+        u, v = (first / np.linalg.norm(first, axis=1, keepdims=True)).T
+        bend_px = second[:, 1] * u - second[:, 0] * v
+        worst_px = max(worst_px, float(np.max(np.abs(bent.bend_px[:, axis] - bend_px))))
+        np.testing.assert_allclose(bent.along_px[:, axis], first, rtol=0.02, atol=0.1)
+    assert worst_px < 0.06  # 0.26 px with parabolas alone
