@@ -88,6 +88,9 @@ COMMANDS = {
         "calibrate.intrinsics",
         in_folder=("camera.yaml", *_REPORT),
     ),
+    "calibrate compare": Registered(
+        "calibrate.arguments:CalibrateCompare", "calibrate.compare", in_folder=_REPORT
+    ),
     "calibrate rig": Registered(
         "calibrate.arguments:CalibrateRig",
         "calibrate.rig",

@@ -9,19 +9,21 @@ from matplotlib.figure import Figure, SubFigure
 from jaxnav.calibration.lenses.bundle import padded_corners
 from jaxnav.calibration.lenses.checks import Cells, cells
 from jaxnav.calibration.lenses.intrinsics import LensCalibration
+from jaxnav.calibration.lenses.maps import ImageMap, projection_sigma
 from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, SKY, VERMILION
 
 _ARROW = 0.5  # length of the longest arrow in cells
 _MOST_NAMES = 30  # the most view names that are readable below their bars
+_LONGEST = 18  # characters of a view's name, of which the end is shown
 
 
 def lens_report(calibrations: Mapping[str, LensCalibration]) -> Figure:
-    """Draw each camera's residual map, coverage, error of every view and table of parameters.
+    """Draw each camera's residuals, coverage and sigma over the image, its views and parameters.
 
     Args:
         calibrations: camera name -> calibration.
     """
-    figure = Figure(figsize=(12, 7.6 * len(calibrations)), layout="constrained")
+    figure = Figure(figsize=(12, 11.0 * len(calibrations)), layout="constrained")
     parts = figure.subfigures(len(calibrations), 1, squeeze=False)[:, 0]
     for part, (name, calibration) in zip(parts, calibrations.items(), strict=True):
         _draw(part, name, calibration)
@@ -34,12 +36,55 @@ def _draw(part: SubFigure, name: str, calibration: LensCalibration) -> None:
         f"{name}: {fit.lens}, {np.sum(fit.view_weights > 0)} of {calibration.given} views, "
         f"RMS {fit.rms_px:.3g} px, corner noise {fit.sigma_px:.3g} px"
     )
-    axes = part.subplots(2, 2, width_ratios=[3, 2])
+    grid = part.add_gridspec(3, 2, width_ratios=[3, 2])
     seen = cells(fit)
-    _draw_residuals(axes[0, 0], calibration, seen)
-    _draw_parameters(axes[0, 1], calibration)
-    _draw_coverage(axes[1, 0], calibration, seen)
-    _draw_views(axes[1, 1], calibration)
+    _draw_residuals(part.add_subplot(grid[0, 0]), calibration, seen)
+    _draw_coverage(part.add_subplot(grid[1, 0]), calibration, seen)
+    sigma = projection_sigma(fit)
+    draw_image_map(
+        part.add_subplot(grid[2, 0]), sigma, "how unsure the lens draws a ray, one sigma"
+    )
+    _draw_parameters(part.add_subplot(grid[0, 1]), calibration)
+    _draw_views(part.add_subplot(grid[1:, 1]), calibration)
+
+
+def comparison(maps: Mapping[str, ImageMap], title: str) -> Figure:
+    """Draw by how much the second of two files draws the rays of the first one elsewhere.
+
+    Args:
+        maps: camera name -> difference.
+        title: above everything.
+    """
+    figure = Figure(figsize=(8, 4.6 * len(maps) + 0.4), layout="constrained")
+    figure.suptitle(title)
+    for row, (name, one) in enumerate(maps.items(), 1):
+        axes = figure.add_subplot(len(maps), 1, row)
+        draw_image_map(axes, one, name)
+        at, shift_px = (x[1::2, 1::3].reshape(-1, 2) for x in (one.pixels, one.shift_px))
+        length_px = np.linalg.norm(shift_px, axis=1)
+        some = np.isfinite(length_px) & (length_px > 0)
+        usual_px = float(np.percentile(length_px[some], 75)) if some.any() else 1.0
+        shorter = np.minimum(1, usual_px / np.where(some, length_px, 1))  # those of the corners
+        axes.quiver(
+            *at[some].T, *(shift_px * shorter[:, None])[some].T, angles="xy", color="white",
+            width=0.003, scale=usual_px / (at[1, 0] - at[0, 0]) * 1.6, scale_units="xy",
+        )  # fmt: skip
+    return figure
+
+
+def draw_image_map(axes: Axes, one: ImageMap, title: str) -> None:
+    """Draw lengths over the image, px, on a scale from the least to the 98th percentile."""
+    (left, top), (right, bottom) = one.pixels[0, 0], one.pixels[-1, -1]
+    length_px = one.length_px
+    known = length_px[np.isfinite(length_px)]
+    most_px = float(np.percentile(known, 98)) if known.size else 1.0
+    picture = axes.imshow(
+        length_px, extent=(left, right, bottom, top), cmap="cividis", vmin=0,
+        vmax=max(most_px, 1e-9), interpolation="bilinear",
+    )  # fmt: skip
+    axes.figure.colorbar(picture, ax=axes, label="px; white: not drawn", shrink=0.8)
+    axes.set(xlabel="x (px)", ylabel="y (px)", aspect="equal")
+    axes.set_title(title, loc="left")
 
 
 def _draw_residuals(axes: Axes, calibration: LensCalibration, seen: Cells) -> None:
@@ -52,6 +97,7 @@ def _draw_residuals(axes: Axes, calibration: LensCalibration, seen: Cells) -> No
     width, height = fit.views.image_size_px
     cell_px = width / seen.corners.shape[1]
     magnified = _round_down(_ARROW * cell_px / max(length_px.max(initial=0), 1e-9))
+    axes.set_title(f"mean residual (predicted - seen), {magnified:g} times", loc="left")
     arrows = axes.quiver(
         *seen.middle_px[filled].T,
         *seen.mean_px[filled].T,
@@ -62,8 +108,7 @@ def _draw_residuals(axes: Axes, calibration: LensCalibration, seen: Cells) -> No
         width=0.004,
     )
     key_px = _round_down(_ARROW * cell_px / magnified)
-    axes.quiverkey(arrows, 0.88, 1.03, key_px, f"{key_px:g} px", labelpos="E")
-    axes.set_title(f"mean residual (predicted - seen), {magnified:g} times", loc="left")
+    axes.quiverkey(arrows, 0.9, -0.16, key_px, f"{key_px:g} px", labelpos="E")
     axes.set(
         xlabel="x (px)",
         ylabel="y (px)",
@@ -110,7 +155,8 @@ def _draw_views(axes: Axes, calibration: LensCalibration) -> None:
         ylim=(0, 1.05 * top_px),
     )
     if len(names) <= _MOST_NAMES:
-        axes.set_xticks(place, names, rotation=90, fontsize="x-small")
+        short = [name if len(name) <= _LONGEST else f"...{name[3 - _LONGEST :]}" for name in names]
+        axes.set_xticks(place, short, rotation=90, fontsize="x-small")
     else:
         axes.set_xlabel("view")
     axes.legend(fontsize="small")

@@ -333,6 +333,24 @@ class CalibrateCheck(_Seen):
 
 
 @dataclass(frozen=True)
+class CalibrateCompare:
+    """Draw where two calibrations of a camera differ, over its image.
+
+    A ray of the first file's camera is drawn by the second's, which is turned so that as little
+    as possible is left: the place of a camera makes up for such a turn. Cameras are compared by
+    name; of two files with one camera each, these.
+
+    Written to --out: report.png, a map for each camera; report.json.
+    """
+
+    one: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """Calibration: a rig file, a Kalibr camchain, or what convert reads."""
+    other: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """Another one."""
+    out: ResultsFolder = Path("compared")
+
+
+@dataclass(frozen=True)
 class CalibrateOdometry(Headless):
     """Find the scale of the speed, the steering's gain and offset, wheelbase and cameras' delay.
 
