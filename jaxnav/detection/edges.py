@@ -6,14 +6,16 @@ blurred pattern explains the pixels best. Fitting them to pixels rather than to 
 normals needs no resampling, keeps the noise of the samples independent, so that the covariance of
 the fit is honest, and tells an edge from the cells one or two pixels behind it.
 
-    I(u) = white - contrast * dark(u) + c1 x + c2 y + c3 far(u),    (x, y, 1) ~ M ray(u)
+    I(u) = white - contrast * dark + c1 x + c2 y + c3 far + c4 dark (1 - dark)
+    (x, y, 1) ~ M ray(u)
     dark = sum_kl K_kl Phi2((x - x_l) / s_x, (y - y_k) / s_y; rho)
 
 (x, y) are paper coordinates, K the corners of the cells at (x_l, y_k) (second differences of the
 pattern), Phi2 the integral of the blur on the paper. The blur's covariance is G (S + I/12) G' with
 G = d(x, y)/du, S that of lens and motion (px^2, fitted), 1/12 that of a square pixel, whose flat
-top is kept (see `_dark`). far is 1 beyond the white zone, one cell wide, around every marker. The
-light (white, contrast, c) enters linearly and is eliminated.
+top is kept (see `_dark`). far is 1 beyond the white zone, one cell wide, around every marker. With
+c4 the levels are no linear measure of the light, as in pictures for screens (sRGB): what is half
+dark is then too light. The light (white, contrast, c) enters linearly and is eliminated.
 
 Source: Golub and Pereyra (1973), variable projection; Kaufman (1975) for its Jacobian.
 """
@@ -38,8 +40,9 @@ _BLUR_LIMITS_PX2 = (0.0, 5.0**2)
 _HUBER = 2.5  # standard deviations
 _MEHLER_ORDERS = 3
 _MAX_RHO = 0.95
-# Prior of the far ground for views without it: within about a hundred grey levels of white.
-_FAR_PRIOR = 1e-3
+# Prior of the far ground for views without it, and of the curve of the levels: within about a
+# hundred grey levels.
+_PRIOR = 1e-3
 _CONVERGED = 1e-4  # of half the marker's side
 _PLATEAU = 1e-4  # of the loss
 _MAX_STEP = 0.1
@@ -160,17 +163,14 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     by_S = [jnp.sum(slope[2:] * blur_on_paper(xy_px, unit), axis=0) for unit in units]
     jacobian = jnp.concatenate([by_D, jnp.stack(by_S)])
 
-    light = jnp.stack([-dark, jnp.ones_like(dark), xy[0], xy[1], far])
+    light = jnp.stack([-dark, jnp.ones_like(dark), xy[0], xy[1], far, dark * (1 - dark)])
     weighted = light * weight[None]
-    prior = jnp.zeros((5, 5), dark.dtype).at[4, 4].set(_FAR_PRIOR)
-    gram = weighted @ light.T + prior
-    solved = eliminate(
-        gram,
-        jnp.concatenate([(weighted @ patch.levels)[:, None], weighted @ jacobian.T], axis=1),
-    )
-    coefficients, along_light = solved[:, 0], solved[:, 1:]
+    gram = weighted @ light.T + jnp.diag(jnp.asarray([0, 0, 0, 0, _PRIOR, _PRIOR], dark.dtype))
+    coefficients = eliminate(gram, (weighted @ patch.levels)[:, None])[:, 0]
     residual = patch.levels - coefficients @ light
-    J = -coefficients[0] * (jacobian - along_light.T @ light)
+    jacobian = (coefficients[5] * (1 - 2 * dark) - coefficients[0])[None] * jacobian
+    along_light = eliminate(gram, weighted @ jacobian.T)
+    J = jacobian - along_light.T @ light
     weighted = J * weight[None]
     return residual, weighted @ J.T, weighted @ residual, coefficients[0]
 

@@ -11,7 +11,8 @@ from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges, step_corners
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import SQUARE, generators, homography, on_paper, rays_of
 
-# Markers up to this side are fitted whole; of larger ones the outline suffices.
+# Markers up to this side are fitted whole; of larger ones the edges of all cells. The outline alone
+# is not enough: its corners and the curve of the levels move it alike.
 _WHOLE_UP_TO_PX = 30.0
 _NOWHERE_PX = 1e6  # as in `ranges`: no corner lies beyond
 _OUTLINE_PX = 3.0
@@ -65,7 +66,7 @@ def refine_corners(
         corners_px: (4, 2), TL TR BR BL, a pixel or half a cell off at most.
         cells: (n, n), 1 white, 0 black, with the black frame.
         lens: the lens that bends the marker's straight edges.
-        whole: fit the inside of a large marker too, not its outline alone.
+        whole: fit the inside of the cells of a large marker too, not their edges alone.
     """
     corners_px = np.asarray(corners_px, float)
     side_px = mean_side_px(corners_px)
@@ -103,7 +104,7 @@ def fit_marker(
     M = homography(lens.rays(corners_px)[0].T)
     side_px = mean_side_px(corners_px)
     whole = whole or side_px <= _WHOLE_UP_TO_PX
-    pixels = _pixels_around(image.shape, M, lens, side_px / len(cells), whole)
+    pixels = _pixels_around(image.shape, M, lens, side_px / len(cells), None if whole else cells)
     count = len(pixels)
     if count < _MIN_PIXELS:
         return None
@@ -127,10 +128,26 @@ def corners_of(M: Float[np.ndarray, "3 3"], lens: Lens) -> Float[np.ndarray, "4 
     return lens.pixels(rays_of(M, SQUARE))
 
 
+def _inner_edges(cells: np.ndarray) -> np.ndarray:
+    """Ends (E, 2, 2) on the paper of all edges between a black and a white cell."""
+    n = len(cells)
+    ends = []
+    for turned in (False, True):
+        table = cells.T if turned else cells
+        row, column = np.nonzero(np.diff(table, axis=1))
+        along = np.stack([row, row + 1], axis=1)
+        across = np.repeat(column[:, None] + 1, 2, axis=1)
+        at = np.stack([along, across] if turned else [across, along], axis=-1)
+        ends.append(at)
+    x, y = np.moveaxis(2 * np.concatenate(ends) / n - 1, -1, 0)
+    return np.stack([x, y], axis=-1)
+
+
 def _pixels_around(
-    shape: tuple[int, ...], M: np.ndarray, lens: Lens, cell_px: float, whole: bool
+    shape: tuple[int, ...], M: np.ndarray, lens: Lens, cell_px: float, cells: np.ndarray | None
 ) -> np.ndarray:
-    """The pixels (N, 2) to fit: along the outline, and inside it too if `whole`."""
+    """The pixels (N, 2) to fit: along the outline, and along the edges of the cells or, without
+    cells, all inside it."""
     t = np.linspace(0, 1, _POINTS_PER_EDGE, endpoint=False)[:, None]
     ends = zip(SQUARE, np.roll(SQUARE, -1, 0), strict=True)
     outline = np.concatenate([(1 - t) * a + t * b for a, b in ends])
@@ -146,8 +163,14 @@ def _pixels_around(
     mask = np.zeros((high - low)[::-1], np.uint8)
     polyline = np.round((outline_px - low) * 16).astype(np.int32)
     cv2.polylines(mask, [polyline], True, 1, 2 * reach, shift=4)
-    if whole:
+    if cells is None:
         cv2.fillPoly(mask, [polyline], 1, shift=4)
+    else:
+        ends_px = lens.pixels(rays_of(M, _inner_edges(cells).reshape(-1, 2))).reshape(-1, 2, 2)
+        if not (np.abs(ends_px) < _NOWHERE_PX).all():
+            return np.zeros((0, 2), int)
+        segments = np.round((ends_px - low) * 16).astype(np.int32)
+        cv2.polylines(mask, list(segments), False, 1, 2 * reach, shift=4)
     rows, columns = np.nonzero(mask)
     pixels = np.column_stack([columns, rows]) + low
     if len(pixels) > PIXELS:
