@@ -46,6 +46,7 @@ _PRIOR = 1e-3
 _CONVERGED = 1e-4  # of half the marker's side
 _PLATEAU = 1e-4  # of the loss
 _MAX_STEP = 0.1
+_NOTICED = 1.6  # a smaller factor may come from so many cells by chance
 
 
 class EdgeFit(NamedTuple):
@@ -58,6 +59,7 @@ class EdgeFit(NamedTuple):
     contrast: Float[Array, ""]  # white minus black, grey levels
     residual: Float[Array, " N"]  # grey levels
     converged: Bool[Array, ""]
+    step: Float[Array, ""]  # by which the last step moved a corner, or would have
 
 
 class _Patch(NamedTuple):
@@ -79,6 +81,7 @@ class _State(NamedTuple):
     damping: Array
     steps: Array
     converged: Array
+    step: Array
 
 
 def step_corners(cells: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n+1 n+1"]:
@@ -108,10 +111,11 @@ def fit_edges(
     blur = jnp.array([1.0, 0.0, 1.0], levels.dtype) * _START_BLUR_PX2
     ones = jnp.where(mask, one, 0)
     M = jnp.eye(3, dtype=levels.dtype)
-    residual, hessian, gradient, contrast = _linearise(M, blur, patch, ones)
+    residual, J, contrast = _linearise(M, blur, patch, ones)
+    hessian, gradient = _normal_equations(residual, J, ones)
     start = _State(
         M, blur, residual, hessian, gradient,
-        _rms(residual, ones), contrast, 1e-3 * one, jnp.array(0), jnp.array(False),
+        _rms(residual, ones), contrast, 1e-3 * one, jnp.array(0), jnp.array(False), one,
     )  # fmt: skip
 
     def attempt(s: _State) -> _State:
@@ -122,16 +126,17 @@ def fit_edges(
         step = step * jnp.minimum(1, _MAX_STEP / jnp.maximum(size, 1e-9))
         M, blur = _moved(s.M, s.blur, step)
         weight = jnp.where(mask, _huber_weight(s.residual / s.scale), 0)
-        residual, hessian, gradient, contrast = _linearise(M, blur, patch, weight)
+        residual, J, contrast = _linearise(M, blur, patch, weight)
+        hessian, gradient = _normal_equations(residual, J, weight)
         before, after = (_loss(jnp.where(mask, r, 0) / s.scale) for r in (s.residual, residual))
         better = after <= before
         scale = _rms(residual, weight)
         small = (size < _CONVERGED) | (jnp.abs(before - after) < _PLATEAU * before)
         moved = _State(
             M, blur, residual, hessian, gradient, scale, contrast,
-            jnp.maximum(s.damping * 0.1, 1e-6), s.steps + 1, small,
+            jnp.maximum(s.damping * 0.1, 1e-6), s.steps + 1, small, size,
         )  # fmt: skip
-        stayed = s._replace(damping=s.damping * 10, steps=s.steps + 1, converged=small)
+        stayed = s._replace(damping=s.damping * 10, steps=s.steps + 1, converged=small, step=size)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, stayed)
 
     s = jax.lax.while_loop(lambda s: (s.steps < _STEPS) & ~s.converged, attempt, start)
@@ -140,15 +145,16 @@ def fit_edges(
     noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
     ridge = jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(s.hessian), 1e-6 * jnp.max(s.hessian)))
     units = jnp.eye(s.hessian.shape[0], dtype=one.dtype)
-    covariance = eliminate(s.hessian + ridge, units)[:8, :8] * noise**2
-    return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, s.residual, s.converged)
+    factor = _disagreement(s, patch, weight, noise)
+    covariance = eliminate(s.hessian + ridge, units)[:8, :8] * noise**2 * factor
+    return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, s.residual, s.converged, s.step)
 
 
 _CORNER_MOTION = np.moveaxis(generators(SQUARE.T), -1, 0).reshape(8, 8).astype(np.float32)
 
 
-def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Array, ...]:
-    """Residual (N,), normal equations (11, 11), (11,) of D and S, light eliminated; contrast."""
+def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Array, Array, Array]:
+    """Residual (N,), slopes (11, N) of the model by D and S, light eliminated; contrast."""
     xy, xy_px = on_paper(M, patch.rays, patch.rays_px)
     pixel = PIXEL_VARIANCE_PX2 * jnp.array([1, 0, 1], blur.dtype)
     variance = blur_on_paper(xy_px, blur + pixel)
@@ -170,9 +176,34 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     residual = patch.levels - coefficients @ light
     jacobian = (coefficients[5] * (1 - 2 * dark) - coefficients[0])[None] * jacobian
     along_light = eliminate(gram, weighted @ jacobian.T)
-    J = jacobian - along_light.T @ light
+    return residual, jacobian - along_light.T @ light, coefficients[0]
+
+
+def _normal_equations(residual: Array, J: Array, weight: Array) -> tuple[Array, Array]:
     weighted = J * weight[None]
-    return residual, weighted @ J.T, weighted @ residual, coefficients[0]
+    return weighted @ J.T, weighted @ residual
+
+
+def _disagreement(s: _State, patch: _Patch, weight: Array, noise: Array) -> Array:
+    """The factor of the variances by which the cells disagree; 1 if it may be chance.
+
+    Where pixels, steps of a print or other ink are wrong alike for some pixels, as they are along
+    an edge of a picture that is sharper than its pixels, each cell of the pattern pulls its own
+    way. Of independent noise the factor is 1.
+
+    Source: Liang, Zeger (1986), as in `calibration/parts.py`.
+    """
+    residual, J, _ = _linearise(s.M, s.blur, patch, weight)
+    xy, _ = on_paper(s.M, patch.rays, patch.rays_px)
+    cells = patch.K.shape[0] - 1
+    column, row = jnp.clip(jnp.floor((xy + 1) * cells / 2) + 1, 0, cells + 1).astype(int)
+    scores = jax.ops.segment_sum(
+        (J * (weight * residual / noise)[None]).T, row * (cells + 2) + column, (cells + 2) ** 2
+    )
+    hessian, _ = _normal_equations(residual, J, weight)
+    ridge = jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(hessian), 1e-6 * jnp.max(hessian)))
+    ratio = jnp.sum(scores.T * eliminate(hessian + ridge, scores.T)) / hessian.shape[0]
+    return jnp.where(ratio > _NOTICED, ratio, 1)
 
 
 def _dark(xy: Array, variance: Array, split: Array, K: Array) -> tuple[Array, Array]:

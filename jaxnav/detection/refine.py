@@ -19,6 +19,7 @@ _OUTLINE_PX = 3.0
 _POINTS_PER_EDGE = 16
 _MIN_PIXELS = 60
 _MAX_NOISE = 0.25  # of the contrast
+_SETTLED_PX = 0.1  # a corner that moves by less in a step
 _MAX_MOVE = 0.2  # of the side
 # Errors that residuals don't show: pixels are square and not Gaussian, paper is not quite flat.
 _MODEL_SIGMA_PX = 0.006
@@ -41,7 +42,7 @@ class RefinedMarker:
         corners_px: (4, 2), TL TR BR BL; the given ones if the fit failed.
         sigma_px: (4,), standard deviation of each corner along an axis (RMS of the two).
         noise: standard deviation of the residual, over the contrast.
-        good: true if the fit converged, near its start, on something like the marker.
+        good: true if the fit settled, near its start, on something like the marker.
         fitted: the fit; None if it failed.
     """
 
@@ -78,8 +79,10 @@ def refine_corners(
     fit = fitted.edges
     fitted_px = corners_of(fitted.M, lens)
     moved_px = np.max(np.linalg.norm(fitted_px - corners_px, axis=1))
+    # Where the blur is at its limit, in pictures sharper than any lens draws, steps don't end.
+    settled = bool(fit.converged) or float(fit.step) * side_px / 2 < _SETTLED_PX
     good = (
-        bool(fit.converged)
+        settled
         and moved_px < max(2.0, _MAX_MOVE * side_px)
         and float(fit.noise) < _MAX_NOISE * float(fit.contrast)
     )

@@ -2,6 +2,7 @@
 
 import warnings
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -211,3 +212,45 @@ def test_no_warning_on_a_flat_image():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not refine_corners(np.full((80, 80), 90, np.uint8), square_px, cells, Lens()).good
+
+
+def textured(side_px: float, seed: int, oversampled: int) -> tuple[np.ndarray, ...]:
+    """A dim marker as a game engine draws it: a texture sampled at points, without a lens's blur.
+
+    Returns:
+        the picture, the corners (4, 2), and the pattern.
+    """
+    rng = np.random.default_rng(seed)
+    cells, cell_px = marker_cells(FAMILY, int(rng.integers(587))), 32
+    texture = np.kron(np.pad(cells, 2, constant_values=1), np.ones((cell_px, cell_px)))
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side_px / 2
+    turn = rng.uniform(0, 2 * np.pi)
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    corners_px = 100 + square * [1, rng.uniform(0.6, 1)] @ R.T + rng.uniform(-0.5, 0.5, 2)
+    corners_px += rng.uniform(-0.06, 0.06, (4, 2)) * side_px
+    inner = np.array([2, 2 + len(cells)]) * cell_px - 0.5
+    ink = np.array([[inner[i], inner[j]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    drawn_px = (corners_px + 0.5) * oversampled - 0.5
+    H = cv2.getPerspectiveTransform(ink.astype(np.float32), drawn_px.astype(np.float32))
+    size_px = (200 * oversampled, 200 * oversampled)
+    image = cv2.warpPerspective(texture, H, size_px, flags=cv2.INTER_NEAREST, borderValue=1)
+    image = cv2.resize(image, (200, 200), interpolation=cv2.INTER_AREA)
+    return np.round(15 + 50 * image).astype(np.uint8), corners_px, cells
+
+
+@pytest.mark.parametrize(("oversampled", "limit_px"), [(1, 0.2), (2, 0.06), (4, 0.03)])
+def test_pictures_sharper_than_any_lens_draws_give_corners_that_know_their_error(
+    oversampled, limit_px
+):
+    """Their errors are alike along an edge: sigmas of independent noise were 2 to 4 times less."""
+    rng, errors, sigmas, good = np.random.default_rng(0), [], [], 0
+    for seed in range(40):
+        image, truth_px, cells = textured(25 + seed, seed, oversampled)
+        refined = refine_corners(image, truth_px + rng.normal(0, 0.4, (4, 2)), cells, Lens())
+        good += refined.good
+        if refined.good:
+            errors.append(refined.corners_px - truth_px)
+            sigmas.append(refined.sigma_px)
+    assert good >= 38
+    assert np.sqrt(np.mean(np.square(errors))) < limit_px
+    assert 0.5 < np.sqrt(np.mean((np.array(errors) / np.array(sigmas)[..., None]) ** 2)) < 1.6
