@@ -25,6 +25,7 @@ help:
 
 demo: $(VENV)/.installed
 	$(BIN)/jaxnav demo --out demo
+	@echo "for all other commands: . $(VENV)/bin/activate, or $(VENV)/bin/jaxnav --help"
 
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile

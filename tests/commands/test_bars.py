@@ -4,7 +4,7 @@ import io
 
 from tqdm import tqdm
 
-from jaxnav.commands.bars import update_after_compiling
+from jaxnav.commands.bars import drawn_on, update_after_compiling
 
 
 def test_a_bar_says_compiling_until_something_moves():
@@ -16,3 +16,23 @@ def test_a_bar_says_compiling_until_something_moves():
         assert "compiling" not in shown.getvalue().split("\r")[-1]
         update(2)
         assert bar.n == 2
+
+
+def test_a_bar_in_a_file_is_a_line_each_second():
+    log = io.StringIO()
+    with tqdm(total=400, **drawn_on(log)) as bar:
+        for step in range(400):
+            bar.set_postfix_str(f"at {step} m", refresh=False)
+            bar.update()
+    lines = log.getvalue().splitlines()
+    assert 1 <= len(lines) <= 3
+    assert "400/400" in lines[-1]
+    assert "\r" not in log.getvalue()
+
+
+def test_a_bar_on_a_terminal_moves():
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    assert drawn_on(Terminal()) == {}

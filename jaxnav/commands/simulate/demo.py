@@ -3,6 +3,7 @@
 Source: Liu, Schofield, Shan (2023), section III.
 """
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from tqdm import tqdm
 
+from jaxnav.commands.bars import drawn_on
 from jaxnav.commands.pictures import corners_in_world, normals_px, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.simulate.arguments import Demo
@@ -108,16 +110,18 @@ def _drive(args: Demo, world: RenderedWorld, methods: Methods, seed: int) -> Rec
         desc=f"drive, seed {seed}",
         disable=args.headless,
         bar_format="{desc}: {n:.1f} of at most {total:.0f} s [{elapsed}]{postfix}",
+        **drawn_on(sys.stderr),
     ) as bar:
         bar.set_postfix_str("compiling")
         for frame in drive(methods, world.setup.vehicle, cameras.look, settings, seed):
             if len(frames) % KEEP_EVERY == 0:
                 kept[len(frames)] = cameras.images
             frames.append(frame)
-            bar.update(settings.frame_period_s)
             pose = planar_in_world(frame.outputs[OURS].pose, world.setup.markers.origin_m)
             x_m, y_m, psi_rad = pose
-            bar.set_postfix_str(f"at ({x_m:.2f}, {y_m:.2f}) m, {np.rad2deg(psi_rad):.0f} deg")
+            place = f"at ({x_m:.2f}, {y_m:.2f}) m, {np.rad2deg(psi_rad):.0f} deg"
+            bar.set_postfix_str(place, refresh=False)
+            bar.update(settings.frame_period_s)
     return Record(frames, kept)
 
 

@@ -1,6 +1,7 @@
 """`jaxnav study`: run a Monte-Carlo study, or go on with one."""
 
 import os
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import jax
 from tqdm import tqdm
 
+from jaxnav.commands.bars import drawn_on, update_after_compiling
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.study.arguments import RunStudy as Arguments
 from jaxnav.commands.study.studies import KINDS, load_study, shipped_configs
@@ -36,14 +38,18 @@ def run(args: Arguments) -> int:
         if 0 < done < total:
             print(f"{visible(path)} holds {done} of {total} trials: going on", flush=True)
         bar = stack.enter_context(
-            tqdm(total=total, initial=done, unit="trial", unit_scale=True, disable=args.headless)
-        )
+            tqdm(
+                total=total, initial=done, unit="trial", unit_scale=True, disable=args.headless,
+                **drawn_on(sys.stderr),
+            )
+        )  # fmt: skip
+        update = update_after_compiling(bar)
         try:
             if client is None:
-                run_here(store, bar.update)
+                run_here(store, update)
             else:
                 flag = "--workers" if args.scheduler is None else "--scheduler"
-                run_on_cluster(store, client, flag, bar.update)
+                run_on_cluster(store, client, flag, update)
         except KeyboardInterrupt:
             bar.close()
             print(
