@@ -1,6 +1,6 @@
 """Calibration boards: jaxnav's own YAML, in and out, and Kalibr's target YAML.
 
-    board: charuco         # or aprilgrid, chessboard, marker
+    board: charuco         # or aprilgrid, chessboard, marker, circles, asymmetric_circles
     columns: 9             # squares, or tags
     rows: 6
     square_m: 0.028        # of an aprilgrid tag_m, of a marker size_m
@@ -10,7 +10,8 @@
 
 `legacy: true` says that a charuco board of an even number of rows is white at its top left, as
 calib.io and OpenCV before 4.6 print it. An aprilgrid has also `spacing`, in sides of a tag, and
-`border_cells`, the width of the tags' black frame in cells: 2 as Kalibr prints them.
+`border_cells`, the width of the tags' black frame in cells: 2 as Kalibr prints them. Circles have
+`step_m`, from one row to the next, and `diameter_m`.
 """
 
 from collections.abc import Mapping
@@ -75,6 +76,16 @@ class Chessboard(_Own):
     square_m: _Side
 
 
+class Circles(_Own):
+    """A board file's grid of discs, symmetric or not, as OpenCV counts them."""
+
+    board: Annotated[Literal["circles", "asymmetric_circles"], _KIND]
+    columns: Squares
+    rows: Squares
+    step_m: _Side
+    diameter_m: Annotated[Size, Field(serialization_alias="marker_m")]
+
+
 class SingleMarker(_Own):
     """A board file's single navigation marker."""
 
@@ -105,12 +116,14 @@ class KalibrCheckerboard(ForeignEntry):
     colSpacingMeters: Size
 
 
-BoardFile = Charuco | Aprilgrid | Chessboard | SingleMarker
+BoardFile = Charuco | Aprilgrid | Chessboard | Circles | SingleMarker
 _OWN: dict[str, type[BoardFile]] = {
     "charuco": Charuco,
     "aprilgrid": Aprilgrid,
     "chessboard": Chessboard,
     "marker": SingleMarker,
+    "circles": Circles,
+    "asymmetric_circles": Circles,
 }
 
 

@@ -1,7 +1,7 @@
 """The layout of calibration boards: their points, their markers and their sizes.
 
 A board lies in the plane z = 0 of its own frame: x right, y up, z towards its reader, the origin
-in the centre of its ink. There are four kinds:
+in the centre of its ink. There are six kinds:
 
     charuco     a chessboard with a marker in every white square, black at its top left; of an even
                 number of rows it may be white there (calib.io's, and OpenCV's before 4.6: the
@@ -11,6 +11,8 @@ in the centre of its ink. There are four kinds:
     chessboard  squares alone, in either colour; its points are the corners between them. One that
                 looks the same when it is turned tells a lens as well as any other
     marker      one navigation marker; its points are its four corners
+    circles     discs in rows and columns; its points are their centres
+    asymmetric_circles   the same with every second row half a step further (OpenCV's layout)
 """
 
 from dataclasses import dataclass
@@ -23,9 +25,10 @@ from jaxtyping import Bool, Float, Int
 from jaxnav.detection import marker_cells
 from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES
 
-MIN_POINTS = 6  # of a board with saddles: among fewer, a wrong point can't be recognised
+MIN_POINTS = 6  # of a board but a marker: among fewer, a wrong point can't be recognised
+DISCS = ("circles", "asymmetric_circles")
 
-BoardKind = Literal["charuco", "aprilgrid", "chessboard", "marker"]
+BoardKind = Literal["charuco", "aprilgrid", "chessboard", "marker", "circles", "asymmetric_circles"]
 
 
 @dataclass(frozen=True)
@@ -47,17 +50,18 @@ class Tag:
 
 @dataclass(frozen=True)
 class Board:
-    """A board of one of the four kinds.
+    """A board of one of the six kinds.
 
     Points are numbered row by row from the top left. The points of an aprilgrid are numbered tag
     by tag, row by row from the bottom left, each tag TL TR BR BL; those of a marker TL TR BR BL.
 
     Attributes:
         kind: see the module.
-        columns: number of squares, or tags, side by side; 1 for a marker.
-        rows: number of squares, or tags, one above the other; 1 for a marker.
-        size_m: the side of a square, or of a tag's black outline.
-        marker_m: the side of a marker's black outline on a charuco board.
+        columns: number of squares, tags or discs side by side; 1 for a marker.
+        rows: number of squares, tags or discs one above the other; 1 for a marker.
+        size_m: the side of a square, or of a tag's black outline; from one row of discs to the
+            next, and of asymmetric ones half the distance of two in a row.
+        marker_m: the side of a marker's black outline on a charuco board; the diameter of a disc.
         spacing: the gap between the tags of an aprilgrid, in sides of a tag.
         family: family of the markers, one of `jaxnav.models.markers.FAMILY_SIZES`.
         first_id: id of the first marker; the others follow in order.
@@ -97,17 +101,22 @@ class Board:
                 f"the markers must be smaller than the squares ({self.size_m:g} m), "
                 f"got {self.marker_m:g} m"
             )
+        if self.has_discs and not 0 < self.marker_m < self.size_m * self._room:
+            raise ValueError(
+                f"the discs must be smaller than the room that they have "
+                f"({self.size_m * self._room:g} m), got {self.marker_m:g} m"
+            )
         if self.kind == "aprilgrid" and not 0.05 <= self.spacing <= 1:
             raise ValueError(
                 f"the spacing must be from 0.05 to 1 sides of a tag, got {self.spacing:g}"
             )
         points = self.pattern_columns * self.pattern_rows
-        if self.has_saddles and points < MIN_POINTS:
+        if self.kind != "marker" and points < MIN_POINTS:
             raise ValueError(
                 f"a {self.kind} of {self.columns} x {self.rows} has {points} points, "
                 f"at least {MIN_POINTS} are needed: take more columns or rows"
             )
-        if self.kind != "chessboard":
+        if self.kind not in ("chessboard", *DISCS):
             self._check_markers()
 
     def _check_markers(self) -> None:
@@ -128,7 +137,9 @@ class Board:
         """The number of markers on the board."""
         if self.kind == "charuco":
             return self.columns * self.rows // 2
-        return 0 if self.kind == "chessboard" else self.columns * self.rows
+        if self.kind in ("chessboard", *DISCS):
+            return 0
+        return self.columns * self.rows
 
     @property
     def pitch_m(self) -> float:
@@ -147,17 +158,31 @@ class Board:
 
     @property
     def has_saddles(self) -> bool:
-        """True if black squares touch at the points; at a marker's corners they don't."""
-        return self.kind != "marker"
+        """True if black squares touch at the points; not at a marker's corners, nor at discs."""
+        return self.kind != "marker" and not self.has_discs
+
+    @property
+    def has_discs(self) -> bool:
+        """True if the points are centres of discs."""
+        return self.kind in DISCS
+
+    @property
+    def _room(self) -> float:
+        """From a disc to the nearest other one, in sizes."""
+        return float(np.sqrt(2)) if self.kind == "asymmetric_circles" else 1.0
 
     @property
     def pattern_columns(self) -> int:
         """The number of points side by side."""
+        if self.has_discs:
+            return self.columns
         return self.columns - 1 if self.kind in ("charuco", "chessboard") else 2 * self.columns
 
     @property
     def pattern_rows(self) -> int:
         """The number of points one above the other."""
+        if self.has_discs:
+            return self.rows
         return self.rows - 1 if self.kind in ("charuco", "chessboard") else 2 * self.rows
 
     @cached_property
@@ -167,6 +192,12 @@ class Board:
             x = (np.arange(1, self.columns) - self.columns / 2) * self.size_m
             y = (self.rows / 2 - np.arange(1, self.rows)) * self.size_m
             xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        elif self.has_discs:
+            column, row = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+            if self.kind == "asymmetric_circles":
+                column = 2 * column + row % 2
+            xy = self.size_m * np.stack([column.ravel(), -row.ravel()], axis=-1)
+            xy = xy - (xy.min(axis=0) + xy.max(axis=0)) / 2
         else:
             xy = np.concatenate([tag.corners_board_m for tag in self.tags])
         return np.column_stack([xy, np.zeros(len(xy))])
@@ -183,7 +214,7 @@ class Board:
     @cached_property
     def tags(self) -> tuple[Tag, ...]:
         """The markers of the board, in order of their ids."""
-        if self.kind == "chessboard":
+        if self.tag_count == 0:
             return ()
         if self.kind == "charuco":
             places = [
@@ -233,6 +264,11 @@ class Board:
 
     def __str__(self) -> str:
         """Describe the board in words, with its sizes in mm."""
+        if self.has_discs:
+            return (
+                f"{self.kind.replace('_', ' ')} {self.columns} x {self.rows}, "
+                f"steps {1e3 * self.size_m:g} mm, discs {1e3 * self.marker_m:g} mm"
+            )
         ids = f"{self.family} {self.first_id}"
         if self.tag_count > 1:
             ids += f" to {self.first_id + self.tag_count - 1}"

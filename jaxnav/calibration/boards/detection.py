@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxnav.calibration.boards.board import MIN_POINTS, Board
+from jaxnav.calibration.boards.circles import find_discs
 from jaxnav.calibration.boards.places import (
     bent_places,
     mapped,
@@ -71,8 +72,9 @@ def find_board(
         board: the board to look for.
         image: (H, W) or (H, W, 3) in BGR order, uint8.
         name: name of the view.
-        camera: makes the edges of a marker straight in the world instead of in the image. The
-            edges around a saddle are as bent as its neighbours show, with a camera or without.
+        camera: makes the edges of a marker straight in the world instead of in the image, and
+            the centroid of a disc its centre. The edges around a saddle are as bent as its
+            neighbours show, with a camera or without.
 
     Raises:
         BadInput: the image has another shape or type.
@@ -90,6 +92,11 @@ def look_at(
     levels = grey(image)
     if board.kind == "marker":
         return _look_for_marker(board, levels, name, camera)
+    if board.has_discs:
+        centres_px = find_discs(board, levels, camera)
+        if centres_px is None:
+            return BoardLook(None)
+        return BoardLook(BoardView(name, np.arange(len(centres_px)), centres_px))
     foreign: tuple[int, ...] = ()
     own: tuple[int, ...] = ()
     if board.kind == "chessboard":

@@ -51,11 +51,13 @@ def what_is_seen(
                 f"shows a chessboard of {other[0]} x {other[1]} squares, not the {board}: count "
                 "the squares, not the corners between them"
             )
-    else:
+    elif not board.has_discs:
         other_code = _other_code(board, examples)
         if other_code is not None:
             return f"shows {other_code}, not the {board}: describe the board that is in the images"
-    whole = " All of a chessboard must be in the image." if board.kind == "chessboard" else ""
+    whole = ""
+    if board.kind == "chessboard" or board.has_discs:
+        whole = f" All of a {'chessboard' if not board.has_discs else 'grid'} must be in the image."
     return (
         f"no {board} is found in {images}: is it the right board, sharp, with white around it, and "
         f"at least some 20 px a square?{whole}"

@@ -3,7 +3,8 @@
 The bend of a board's edges at a saddle follows from its neighbours. The corners of a marker
 have none: a lens bends the marker's edges, and straight lines fitted to them meet beside the
 corner, by pixels if the lens is wide. Only the lens itself tells how they bend, so with a marker
-detection and fit are repeated, each with the last lens, until the lens stays the same.
+detection and fit are repeated, each with the last lens, until the lens stays the same. So are they
+with discs, whose centroids are not their centres.
 """
 
 from collections.abc import Callable, Sequence

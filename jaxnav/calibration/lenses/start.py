@@ -61,7 +61,7 @@ def board_poses(
     rays = np.asarray(_rays(lens, jnp.asarray(parameters), jnp.asarray(corners_px)))
     return np.array(
         [
-            _pose(views.points_board_m[view.ids], rays[row, view.ids])
+            pose_from_rays(views.points_board_m[view.ids], rays[row, view.ids])
             for row, view in enumerate(shown)
         ]
     ).reshape(-1, 7)
@@ -72,7 +72,10 @@ def _rays(lens: str, parameters: Array, corners_px: Array) -> Array:
     return lens_bundle.camera_of(lens, parameters).unproject(corners_px)
 
 
-def _pose(points_board_m: np.ndarray, rays_camera: np.ndarray) -> np.ndarray:
+def pose_from_rays(
+    points_board_m: Float[np.ndarray, "N 3"], rays_camera: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, " 7"]:
+    """T_camera_board (7,) of a view from its points and their rays; NaN where none is found."""
     nowhere = np.full(7, np.nan)
     middle = rays_camera.mean(axis=0)
     if len(points_board_m) < _FEWEST or np.linalg.norm(middle) < 1e-3:

@@ -25,6 +25,10 @@ MARKER = Board("marker", 1, 1, 0.15, family="tag36h11", first_id=4)
 LEGACY = Board("charuco", 5, 4, 0.04, marker_m=0.03, family="4x4_50", white_top_left=True)
 SQUARE = Board("chessboard", 6, 6, 0.03)
 BOARDS = [CHARUCO, APRILGRID, CHESSBOARD, MARKER, LEGACY, SQUARE]
+DISCS = [
+    Board("circles", 7, 5, 0.03, marker_m=0.018),
+    Board("asymmetric_circles", 4, 11, 0.02, marker_m=0.02),
+]
 # The first codes of 36h11 as the authors of AprilTag print them, 1 white, from the top left.
 CODES_36H11 = (0xD5D628584, 0xD97F18B49)
 
@@ -112,7 +116,19 @@ def test_what_can_t_be_is_refused(change: dict, problem: str) -> None:
         replace(CHARUCO, **change)
 
 
-@pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.kind)
+def test_discs_are_numbered_as_opencv_does() -> None:
+    symmetric, asymmetric = DISCS
+    np.testing.assert_allclose(
+        symmetric.points_board_m[[0, 6, 7]], [[-0.09, 0.06, 0], [0.09, 0.06, 0], [-0.09, 0.03, 0]]
+    )
+    # The tutorial's: ((2 * column + row % 2) * step, row * step), y down.
+    theirs = [[2 * c + r % 2, -r, 0] for r in range(11) for c in range(4)]
+    found = asymmetric.points_board_m / 0.02
+    np.testing.assert_allclose(found - found[0], np.array(theirs) - theirs[0], atol=1e-9)
+    assert len(np.unique(asymmetric.grid, axis=0)) == 44
+
+
+@pytest.mark.parametrize("board", BOARDS + DISCS, ids=lambda board: board.kind)
 def test_a_file_gives_the_board_back(board: Board, tmp_path: Path) -> None:
     write_board(tmp_path / "board.yaml", board)
     assert read_board(tmp_path / "board.yaml") == board
@@ -135,7 +151,9 @@ def test_kalibrs_targets_are_read(tmp_path: Path) -> None:
     ("text", "line"),
     [
         ("a: 1", "is neither a board"),
-        ("board: circles", "board: must be one of charuco, aprilgrid, chessboard, marker"),
+        ("board: dots", "board: must be one of charuco, aprilgrid, chessboard, marker, circles"),
+        ("{board: circles, columns: 7, rows: 5, step_m: 0.03}", "diameter_m"),
+        ("{board: circles, columns: 7, rows: 5, step_m: 0.03, diameter_m: 0.03}", "than the room"),
         ("target_type: circlegrid", "target_type: must be aprilgrid or checkerboard"),
         ("{board: chessboard, columns: 7, rows: 4}", "square_m"),
         (
