@@ -37,6 +37,17 @@ class Detections:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def only(self, rows: Bool[np.ndarray, " N"] | Int[np.ndarray, " n"]) -> "Detections":
+        """The detections in these rows, in their order."""
+        rows = np.arange(len(self))[rows]
+        return Detections(
+            self.ids[rows],
+            self.corners_px[rows],
+            self.sigma_px[rows],
+            self.refined[rows],
+            tuple(self.families[row] for row in rows),
+        )
+
     @staticmethod
     def concatenate(parts: Sequence["Detections"]) -> "Detections":
         """Concatenate one image's detections by several detectors, say of different families."""

@@ -1,5 +1,6 @@
 """`jaxnav locate`: find the markers in a photograph, with both poses of each."""
 
+import contextlib
 import json
 from dataclasses import replace
 from typing import Any
@@ -15,7 +16,7 @@ from jaxnav.commands.drive.arguments import Locate
 from jaxnav.commands.drive.locate_notes import notes, without_doubles
 from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.detection import Detections, make_detector
+from jaxnav.detection import ArucoDetector, Detections, Detector, make_detector
 from jaxnav.errors import BadInput
 from jaxnav.files import load_camera
 from jaxnav.files.cameras import load_lens_sigma
@@ -28,13 +29,14 @@ from jaxnav.pose.candidates import Candidates, find_candidates
 from jaxnav.pose.observation import Observation, Snapshot
 
 _FREEDOM = 2  # of a marker's eight numbers: a pose has six
+_CLOSER_LOOKS = 400
 _EXCESS = 4.0  # mean square of residuals, in sigmas, beyond chance: one marker in 55 of white noise
 
 
 def run(args: Locate) -> int:
     """Detect markers, solve for their poses, print them and, with --out, draw them."""
     configure_jax(float64=True)
-    detector = make_detector(args.corner_backend, args.family)
+    detectors = _detectors(args.corner_backend, args.family)
     camera, image_size_px = load_camera(args.camera, args.camera_name)
     image = read_image(args.image)
     height, width = image.shape[:2]
@@ -44,7 +46,10 @@ def run(args: Locate) -> int:
             f"is {width} x {height} pixels, but --camera {args.camera} was calibrated at "
             f"{image_size_px[0]} x {image_size_px[1]}",
         )
-    detections = without_doubles(detector.detect(image, camera))
+    first, *more = (detector.detect(image, camera) for detector in detectors)
+    # What the pattern does not fit is a ghost, or was found better by the first.
+    more = [found.only(found.refined) for found in more]
+    detections = without_doubles(Detections.concatenate([first, *more]))
     lens_sigma_px = load_lens_sigma(args.camera, args.camera_name)
     cameras = _cameras(camera, lens_sigma_px)
     rigs = [
@@ -70,6 +75,19 @@ def run(args: Locate) -> int:
         save_figure(photo_with_poses(view), args.out, PHOTO_DPI)
     print(json.dumps(report, indent=2) if args.json else table(report))
     return 0
+
+
+def _detectors(backend: str, family: str) -> list[Detector]:
+    """The detector that is asked for; AprilTag's beside OpenCV's where it is there.
+
+    A photograph has the time for a closer look at every quadrilateral.
+    """
+    if backend != "aruco":
+        return [make_detector(backend, family)]
+    detectors: list[Detector] = [ArucoDetector(family, closer_looks=_CLOSER_LOOKS)]
+    with contextlib.suppress(BadInput):
+        detectors.append(make_detector("apriltag", family))
+    return detectors
 
 
 def _cameras(camera: Camera, lens_sigma_px: np.ndarray | None) -> list[Camera]:

@@ -44,17 +44,12 @@ def notes(
         )
     if not markers:
         said += _other_family(args, image)
-    for marker in markers:
-        name, best = f"marker {marker['id']}", marker["poses"][0] if marker["poses"] else None
-        if best is None:
-            said.append(f"{name}: no pose explains its corners")
-            continue
-        if marker["flip_probability"] > _FLIP:
-            said.append(
-                f"{name}: both poses are possible (P(flip) {marker['flip_probability']:.2f}): take "
-                "it from nearer, or more from the side"
-            )
-    said += _of_misfits(markers)
+    said += [
+        f"marker {marker['id']}: no pose explains its corners"
+        for marker in markers
+        if not marker["poses"]
+    ]
+    said += _of_misfits(markers) + _of_flips(markers)
     ids = [marker["id"] for marker in markers]
     said += [
         f"marker {i} is seen {ids.count(i)} times: at most one of them is the one that you mean"
@@ -79,14 +74,7 @@ def without_doubles(detections: Detections) -> Detections:
         same = (detections.ids[kept] == detections.ids[index]) & (apart_px < sides_px[index] / 2)
         if not np.any(same):
             kept.append(int(index))
-    rows = np.array(sorted(kept), int)
-    return Detections(
-        detections.ids[rows],
-        detections.corners_px[rows],
-        detections.sigma_px[rows],
-        detections.refined[rows],
-        tuple(detections.families[row] for row in rows),
-    )
+    return detections.only(np.array(sorted(kept), int))
 
 
 def _of_the_size(size_m: float) -> list[str]:
@@ -118,10 +106,27 @@ def _of_misfits(markers: Sequence[dict[str, Any]]) -> list[str]:
     if not off:
         return []
     worst = max(off, key=lambda marker: marker["misfit_sigmas"])
-    name = f"marker {worst['id']}" if len(off) == 1 else f"{len(off)} markers, worst {worst['id']}"
     return [
-        f"{name}: corners are {worst['poses'][0]['reprojection_error_px']:.2g} px off the pose, "
+        f"{_named(off, worst)}: corners are "
+        f"{worst['poses'][0]['reprojection_error_px']:.2g} px off the pose, "
         f"{worst['misfit_sigmas']:.0f} of their sigmas, and count as "
         f"{worst['sigma_factor']:.2g} times as unsure: is --camera that of this photograph, with "
         "its zoom and focus, and is the marker flat?"
     ]
+
+
+def _of_flips(markers: Sequence[dict[str, Any]]) -> list[str]:
+    unsure = [marker for marker in markers if marker["flip_probability"] > _FLIP]
+    if not unsure:
+        return []
+    worst = max(unsure, key=lambda marker: marker["flip_probability"])
+    return [
+        f"{_named(unsure, worst)}: both poses are possible (P(flip) "
+        f"{worst['flip_probability']:.2f}): take it from nearer, or more from the side"
+    ]
+
+
+def _named(markers: Sequence[dict[str, Any]], worst: dict[str, Any]) -> str:
+    if len(markers) == 1:
+        return f"marker {worst['id']}"
+    return f"{len(markers)} markers, {worst['id']} most of all"

@@ -12,7 +12,7 @@ from PIL import Image
 
 from jaxnav.cli import main
 from jaxnav.commands.drive.locate_notes import without_doubles
-from jaxnav.detection import Detections, marker_cells
+from jaxnav.detection import Detections, make_detector, marker_cells
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
@@ -87,6 +87,27 @@ def test_no_marker_in_view_is_a_result(tmp_path, capsys):
     assert "no marker of tag36h11 in view" in capsys.readouterr().out
     assert locate(tmp_path / "grey.png", *CAMERA, "--json") == 0
     assert json.loads(capsys.readouterr().out)["markers"] == []
+
+
+def test_every_tag_that_either_detector_finds_is_found_once(data_dir, tmp_path, capsys):
+    photo = data_dir / "apriltag_photos" / "34085369442_304b6bafd9_c.jpg"
+    (tmp_path / "camera.yaml").write_text(
+        "cam0: {camera_model: pinhole, intrinsics: [700, 700, 399, 266], distortion_model: none,"
+        " distortion_coeffs: [], resolution: [799, 533]}\n"
+    )
+    assert locate(photo, "--camera", tmp_path / "camera.yaml", *CAMERA[4:], "--json") == 0
+    markers = json.loads(capsys.readouterr().out)["markers"]
+    found_px = np.array([np.mean(marker["corners_px"], axis=0) for marker in markers])
+    apart_px = np.linalg.norm(found_px[:, None] - found_px, axis=2) + 1e9 * np.eye(len(found_px))
+    assert apart_px.min() > 5
+    for backend in ("aruco", "apriltag"):
+        if backend == "apriltag":
+            pytest.importorskip("pyapriltags", reason="pyapriltags is not installed")
+        detections = make_detector(backend).detect(cv2.imread(str(photo)))
+        centres_px = detections.only(detections.refined).corners_px.mean(axis=1)
+        nearest_px = np.linalg.norm(centres_px[:, None] - found_px, axis=2).min(axis=1)
+        assert nearest_px.max() < 2
+    assert len(markers) > 35
 
 
 def test_a_real_photograph(data_dir, tmp_path, capsys):
