@@ -9,6 +9,12 @@ from jaxtyping import Float
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import FAMILY_SIZES, opencv_dictionary_name
 
+# Of each kind of code the family that holds the smaller ones.
+LARGEST_FAMILIES = (
+    "tag36h11", "tag25h9", "tag16h5", "4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000",
+    "aruco_original", "aruco_mip_36h12",
+)  # fmt: skip
+
 
 def dictionary(family: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary for a family.

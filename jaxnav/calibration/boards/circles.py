@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibration.boards.board import Board
+from jaxnav.calibration.boards.places import is_mirrored
 from jaxnav.calibration.lenses.start import pose_from_rays
 from jaxnav.models.camera import Camera
 
@@ -66,8 +67,7 @@ def _opencv_discs(board: Board, levels: np.ndarray) -> np.ndarray | None:
 
 def _as_seen(board: Board, grid: np.ndarray) -> np.ndarray:
     """The grid (rows, columns, 2) as a reader of the board counts it, not its mirror image."""
-    right, down = np.mean(grid[:, -1] - grid[:, 0], axis=0), np.mean(grid[-1] - grid[0], axis=0)
-    if right[0] * down[1] - right[1] * down[0] > 0:
+    if not is_mirrored(grid):
         return grid
     # Of asymmetric ones an odd number of rows is the same upside down.
     return grid[:, ::-1] if board.kind == "circles" else grid[::-1]

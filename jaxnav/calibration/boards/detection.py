@@ -17,6 +17,7 @@ from jaxnav.calibration.boards.board import MIN_POINTS, Board
 from jaxnav.calibration.boards.circles import find_discs
 from jaxnav.calibration.boards.places import (
     bent_places,
+    is_mirrored,
     mapped,
     no_places,
     predicted_places,
@@ -190,8 +191,7 @@ def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[Board, np.ndar
     if corners_px is None:
         return board, *no_places(board)
     grid = corners_px.reshape(board.pattern_rows, board.pattern_columns, 2)
-    right, down = np.mean(grid[:, -1] - grid[:, 0], axis=0), np.mean(grid[-1] - grid[0], axis=0)
-    if right[0] * down[1] - right[1] * down[0] < 0:
+    if is_mirrored(grid):
         grid = grid[:, ::-1]
     ids = np.arange(len(board.points_board_m))
     places = straight_places(board, ids, grid.reshape(-1, 2))

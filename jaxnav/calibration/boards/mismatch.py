@@ -8,13 +8,8 @@ from jaxtyping import UInt8
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.detection import BoardLook
-from jaxnav.detection.families import dictionary
+from jaxnav.detection.families import LARGEST_FAMILIES, dictionary
 
-# The largest of each kind of code, which hold the smaller ones.
-_FAMILIES = (
-    "tag36h11", "tag25h9", "tag16h5", "4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000",
-    "aruco_original", "aruco_mip_36h12",
-)  # fmt: skip
 _MANY = 4  # markers in an image; fewer may be chance
 
 
@@ -85,7 +80,7 @@ def _largest_chessboard(examples: Sequence[np.ndarray]) -> tuple[int, int] | Non
 def _other_code(board: Board, examples: Sequence[np.ndarray]) -> str | None:
     """Name in words the marker family that the images show instead."""
     most, named = _MANY - 1, None
-    for family in _FAMILIES:
+    for family in LARGEST_FAMILIES:
         for border in (1, 2):
             parameters = cv2.aruco.DetectorParameters()
             parameters.markerBorderBits = border

@@ -86,6 +86,13 @@ def mapped(
     return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
 
 
+def is_mirrored(grid_px: Float[np.ndarray, "rows columns 2"]) -> bool:
+    """True if points in rows and columns are counted as in a mirror."""
+    right = np.mean(grid_px[:, -1] - grid_px[:, 0], axis=0)
+    down = np.mean(grid_px[-1] - grid_px[0], axis=0)
+    return bool(right[0] * down[1] < right[1] * down[0])
+
+
 def _steps_and_bends(
     board: Board, ids: np.ndarray, points_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -8,13 +8,11 @@ from jaxtyping import UInt8
 
 from jaxnav.commands.drive.arguments import Locate
 from jaxnav.detection import Detections, make_detector
+from jaxnav.detection.families import LARGEST_FAMILIES
 
 _LARGE_M, _SMALL_M = 1.5, 0.003  # sides that markers rarely have, and other units often make
 _MISFIT = 5.0  # sigmas by which corners are off their pose
 _FLIP = 0.3  # a larger probability says that both poses are possible
-# The largest of each kind of code, which hold the smaller ones.
-_FAMILIES = ("tag36h11", "tag25h9", "tag16h5", "4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000",
-             "aruco_original", "aruco_mip_36h12")  # fmt: skip
 _TURNED_DEG = {3: 180, 4: 180, 5: 90, 6: 90, 7: 270, 8: 270}  # clockwise, by EXIF's number
 _MIRRORED = (2, 4, 5, 7)
 
@@ -90,7 +88,7 @@ def _of_the_size(size_m: float) -> list[str]:
 def _other_family(args: Locate, image: np.ndarray) -> list[str]:
     """The family of which the photograph shows most markers instead."""
     seen = {}
-    for family in _FAMILIES:
+    for family in LARGEST_FAMILIES:
         if family != args.family:
             found = make_detector("aruco", family).detect(image)
             seen[family] = found.ids[found.refined]
