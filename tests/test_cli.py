@@ -162,10 +162,14 @@ def test_a_defect_keeps_its_traceback(command) -> None:
         cli.main(["demo"])
 
 
-POSITIONALS = tuple("recording image store config kind recordings source sources target".split())
+POSITIONALS = tuple(
+    "recording image store config kind recordings source sources target one other".split()
+)
 POSITIONAL = {
     "recordings": "RECORDING",
     "sources": "SOURCE",
+    "one": "FILE",
+    "other": "FILE",
     "kind": r"\{ambiguity,drive\}",
     "target": r"\{charuco,aprilgrid,chessboard,marker\}",
 }
