@@ -203,7 +203,3 @@ class Locate(Checked):
     """Print JSON instead of a table."""
     out: Annotated[Path | None, optional("FILE")] = None
     """Draw the markers and both poses into this file, .png or .jpg, as large as the photograph."""
-
-    def _check(self) -> None:
-        known = self.out is None or self.out.suffix.lower() in (".png", ".jpg", ".jpeg")
-        require(known, "--out", f"must end in .png or .jpg, got {self.out}")

@@ -35,6 +35,8 @@ _EXCESS = 4.0  # mean square of residuals, in sigmas, beyond chance: one marker 
 
 def run(args: Locate) -> int:
     """Detect markers, solve for their poses, print them and, with --out, draw them."""
+    if args.out is not None and args.out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise BadInput("--out", f"must end in .png or .jpg, got {args.out}")
     configure_jax(float64=True)
     detectors = _detectors(args.corner_backend, args.family)
     camera, image_size_px = load_camera(args.camera, args.camera_name)
