@@ -21,6 +21,7 @@ Source: Golub and Pereyra (1973), variable projection; Kaufman (1975) for its Ja
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -43,6 +44,7 @@ _MAX_RHO = 0.95
 # Prior of the far ground for views without it, and of the curve of the levels: within about a
 # hundred grey levels.
 _PRIOR = 1e-3
+_MOST_CURVE = 1.0  # of the contrast; sRGB has up to 0.95
 _CONVERGED = 1e-4  # of half the marker's side
 _PLATEAU = 1e-4  # of the loss
 _MAX_STEP = 0.1
@@ -67,7 +69,8 @@ class _Patch(NamedTuple):
     rays_px: Float[Array, "2 3 N"]  # derivative by pixel
     levels: Float[Array, " N"]
     K: Float[Array, "k k"]  # row along y, column along x
-    mask: Bool[Array, " N"]
+    trust: Float[Array, " N"]
+    most_curve: Float[Array, ""]
 
 
 class _State(NamedTuple):
@@ -95,7 +98,8 @@ def fit_edges(
     rays_px: Float[Array, "2 3 N"],
     levels: Float[Array, " N"],
     K: Float[Array, "k k"],
-    mask: Bool[Array, " N"],
+    trust: Float[Array, " N"],
+    curved: Bool[Array, ""],
 ) -> EdgeFit:
     """Fit by Levenberg-Marquardt with Huber's loss, from M = I, in float32 in any process.
 
@@ -104,18 +108,18 @@ def fit_edges(
         rays_px: their derivatives by pixel.
         levels: grey levels of the pixels.
         K: `step_corners` of the marker.
-        mask: true for pixels that exist, false for padding.
+        trust: weights of the pixels, 1 or less; 0 for padding.
+        curved: whether levels may be coded; else c4 is 0.
     """
-    patch = _Patch(rays, rays_px, levels, K, mask)
+    patch = _Patch(rays, rays_px, levels, K, trust, jnp.where(curved, _MOST_CURVE, 0))
     one = jnp.ones((), levels.dtype)
     blur = jnp.array([1.0, 0.0, 1.0], levels.dtype) * _START_BLUR_PX2
-    ones = jnp.where(mask, one, 0)
     M = jnp.eye(3, dtype=levels.dtype)
-    residual, J, contrast = _linearise(M, blur, patch, ones)
-    hessian, gradient = _normal_equations(residual, J, ones)
+    residual, J, contrast = _linearise(M, blur, patch, trust)
+    hessian, gradient = _normal_equations(residual, J, trust)
     start = _State(
         M, blur, residual, hessian, gradient,
-        _rms(residual, ones), contrast, 1e-3 * one, jnp.array(0), jnp.array(False), one,
+        _rms(residual, trust), contrast, 1e-3 * one, jnp.array(0), jnp.array(False), one,
     )  # fmt: skip
 
     def attempt(s: _State) -> _State:
@@ -125,10 +129,10 @@ def fit_edges(
         size = jnp.max(jnp.abs(_CORNER_MOTION @ step[:8]))
         step = step * jnp.minimum(1, _MAX_STEP / jnp.maximum(size, 1e-9))
         M, blur = _moved(s.M, s.blur, step)
-        weight = jnp.where(mask, _huber_weight(s.residual / s.scale), 0)
+        weight = trust * _huber_weight(s.residual / s.scale)
         residual, J, contrast = _linearise(M, blur, patch, weight)
         hessian, gradient = _normal_equations(residual, J, weight)
-        before, after = (_loss(jnp.where(mask, r, 0) / s.scale) for r in (s.residual, residual))
+        before, after = (_loss(r / s.scale, trust) for r in (s.residual, residual))
         better = after <= before
         scale = _rms(residual, weight)
         small = (size < _CONVERGED) | (jnp.abs(before - after) < _PLATEAU * before)
@@ -140,7 +144,7 @@ def fit_edges(
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, stayed)
 
     s = jax.lax.while_loop(lambda s: (s.steps < _STEPS) & ~s.converged, attempt, start)
-    weight = jnp.where(mask, _huber_weight(s.residual / s.scale), 0)
+    weight = trust * _huber_weight(s.residual / s.scale)
     freedom = jnp.maximum(jnp.sum(weight) - 16, 1)
     noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
     ridge = jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(s.hessian), 1e-6 * jnp.max(s.hessian)))
@@ -169,14 +173,33 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     by_S = [jnp.sum(slope[2:] * blur_on_paper(xy_px, unit), axis=0) for unit in units]
     jacobian = jnp.concatenate([by_D, jnp.stack(by_S)])
 
-    light = jnp.stack([-dark, jnp.ones_like(dark), xy[0], xy[1], far, dark * (1 - dark)])
+    ones, bend = jnp.ones_like(dark), dark * (1 - dark)
+    light = jnp.stack([-dark, ones, xy[0], xy[1], far, bend])
+    coefficients, _ = _lit(light, weight, patch.levels[:, None])
+    # With a curve beyond its limits, edges of a sharp picture could lie anywhere in a pixel.
+    curve = coefficients[5, 0] / jnp.maximum(coefficients[0, 0], 1e-3)
+    limited = jnp.clip(curve, 0, patch.most_curve)
+    fixed = curve != limited
+    fixed_curve, free = jnp.where(fixed, limited, 0), jnp.where(fixed, 0, 1)
+    light = jnp.stack([fixed_curve * bend - dark, ones, xy[0], xy[1], far, free * bend])
+    coefficients, solve = _lit(light, weight, patch.levels[:, None])
+    contrast = coefficients[0, 0]
+    residual = patch.levels - coefficients[:, 0] @ light
+    curved = fixed_curve * contrast + free * coefficients[5, 0]
+    jacobian = (curved * (1 - 2 * dark) - contrast)[None] * jacobian
+    along_light = solve((light * weight[None]) @ jacobian.T)
+    return residual, jacobian - along_light.T @ light, contrast
+
+
+def _lit(light: Array, weight: Array, levels: Array) -> tuple[Array, Callable[[Array], Array]]:
+    """Coefficients (L, 1) of the light that fit levels (N, 1) best, and the solver for others."""
     weighted = light * weight[None]
-    gram = weighted @ light.T + jnp.diag(jnp.asarray([0, 0, 0, 0, _PRIOR, _PRIOR], dark.dtype))
-    coefficients = eliminate(gram, (weighted @ patch.levels)[:, None])[:, 0]
-    residual = patch.levels - coefficients @ light
-    jacobian = (coefficients[5] * (1 - 2 * dark) - coefficients[0])[None] * jacobian
-    along_light = eliminate(gram, weighted @ jacobian.T)
-    return residual, jacobian - along_light.T @ light, coefficients[0]
+    gram = weighted @ light.T + jnp.diag(jnp.asarray([0, 0, 0, 0, _PRIOR, _PRIOR], light.dtype))
+
+    def solve(right: Array) -> Array:
+        return eliminate(gram, right)
+
+    return solve(weighted @ levels), solve
 
 
 def _normal_equations(residual: Array, J: Array, weight: Array) -> tuple[Array, Array]:
@@ -296,6 +319,7 @@ def _huber_weight(r: Array) -> Array:
     return _HUBER / jnp.maximum(jnp.abs(r), _HUBER)
 
 
-def _loss(r: Array) -> Array:
+def _loss(r: Array, trust: Array) -> Array:
     size = jnp.abs(r)
-    return jnp.sum(jnp.where(size < _HUBER, 0.5 * r**2, _HUBER * (size - 0.5 * _HUBER)))
+    each = jnp.where(size < _HUBER, 0.5 * r**2, _HUBER * (size - 0.5 * _HUBER))
+    return jnp.sum(jnp.where(trust > 0, trust * each, 0))

@@ -12,13 +12,16 @@ from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import SQUARE, generators, homography, on_paper, rays_of
 
 # Markers up to this side are fitted whole; of larger ones the edges of all cells. The outline alone
-# is not enough: its corners and the curve of the levels move it alike.
+# is not enough where levels may be coded: a curve of theirs and its size look alike.
 _WHOLE_UP_TO_PX = 30.0
 _NOWHERE_PX = 1e6  # as in `ranges`: no corner lies beyond
 _OUTLINE_PX = 3.0
 _POINTS_PER_EDGE = 16
 _MIN_PIXELS = 60
 _MAX_NOISE = 0.25  # of the contrast
+_FEW_GREYS = 0.06  # of the pixels around the outline
+_NO_EDGES = np.zeros((0, 2, 2))
+_INSIDE = 0.1  # weight of the edges of cells beside those of a large marker's outline
 _SETTLED_PX = 0.1  # a corner that moves by less in a step
 _MAX_MOVE = 0.2  # of the side
 # Errors that residuals don't show: pixels are square and not Gaussian, paper is not quite flat.
@@ -107,7 +110,11 @@ def fit_marker(
     M = homography(lens.rays(corners_px)[0].T)
     side_px = mean_side_px(corners_px)
     whole = whole or side_px <= _WHOLE_UP_TO_PX
-    pixels = _pixels_around(image.shape, M, lens, side_px / len(cells), None if whole else cells)
+    around = image.shape, M, lens, side_px / len(cells)
+    pixels = _pixels_around(*around, None if whole else _NO_EDGES)
+    curved = bool(np.all((cells == 0) | (cells == 1))) and _has_greys(image, pixels)
+    if curved and not whole:
+        pixels = _pixels_around(*around, _inner_edges(cells))
     count = len(pixels)
     if count < _MIN_PIXELS:
         return None
@@ -116,7 +123,11 @@ def fit_marker(
     lanes = np.minimum(np.arange(PIXELS), count - 1)
     levels = image[pixels[:, 1], pixels[:, 0]]
     known = (M @ rays)[:, lanes], (M @ rays_px)[:, :, lanes], levels[lanes], step_corners(cells)
-    fit = fit_edges(*(np.asarray(a, np.float32) for a in known), np.arange(PIXELS) < count)
+    # Cells are printed less exactly than the outline, of few pixels say.
+    near = np.max(np.abs((M @ rays)[:2] / (M @ rays)[2:]), axis=0) > 1 - 0.5 * 2 / len(cells)
+    trust = np.where(whole | near, 1.0, _INSIDE)
+    trust = np.where(np.arange(PIXELS) < count, trust[lanes], 0)
+    fit = fit_edges(*(np.asarray(a, np.float32) for a in (*known, trust)), np.asarray(curved))
     fit = jax.device_get(fit)
     return MarkerFit(np.asarray(fit.M, float) @ M, pixels, fit)
 
@@ -129,6 +140,19 @@ def mean_side_px(corners_px: Float[np.ndarray, "4 2"]) -> float:
 def corners_of(M: Float[np.ndarray, "3 3"], lens: Lens) -> Float[np.ndarray, "4 2"]:
     """Pixels (4, 2) of the corners, TL TR BR BL, of the marker with homography M."""
     return lens.pixels(rays_of(M, SQUARE))
+
+
+def _has_greys(image: np.ndarray, pixels: np.ndarray) -> bool:
+    """True where levels lie between black and white, so that they can be coded one way or another.
+
+    In a picture sharper than any lens draws an edge shows none, and the outline alone is exact.
+    """
+    if len(pixels) < _MIN_PIXELS:
+        return False
+    levels = image[pixels[:, 1], pixels[:, 0]].astype(float)
+    dark, light = np.percentile(levels, [5, 95])
+    between = (levels > dark + 0.15 * (light - dark)) & (levels < light - 0.15 * (light - dark))
+    return bool(between.mean() > _FEW_GREYS)
 
 
 def _inner_edges(cells: np.ndarray) -> np.ndarray:
@@ -147,10 +171,10 @@ def _inner_edges(cells: np.ndarray) -> np.ndarray:
 
 
 def _pixels_around(
-    shape: tuple[int, ...], M: np.ndarray, lens: Lens, cell_px: float, cells: np.ndarray | None
+    shape: tuple[int, ...], M: np.ndarray, lens: Lens, cell_px: float, edges: np.ndarray | None
 ) -> np.ndarray:
-    """The pixels (N, 2) to fit: along the outline, and along the edges of the cells or, without
-    cells, all inside it."""
+    """The pixels (N, 2) to fit: along the outline and along edges (E, 2, 2) inside it; with None
+    all inside it."""
     t = np.linspace(0, 1, _POINTS_PER_EDGE, endpoint=False)[:, None]
     ends = zip(SQUARE, np.roll(SQUARE, -1, 0), strict=True)
     outline = np.concatenate([(1 - t) * a + t * b for a, b in ends])
@@ -166,10 +190,10 @@ def _pixels_around(
     mask = np.zeros((high - low)[::-1], np.uint8)
     polyline = np.round((outline_px - low) * 16).astype(np.int32)
     cv2.polylines(mask, [polyline], True, 1, 2 * reach, shift=4)
-    if cells is None:
+    if edges is None:
         cv2.fillPoly(mask, [polyline], 1, shift=4)
-    else:
-        ends_px = lens.pixels(rays_of(M, _inner_edges(cells).reshape(-1, 2))).reshape(-1, 2, 2)
+    elif len(edges):
+        ends_px = lens.pixels(rays_of(M, edges.reshape(-1, 2))).reshape(-1, 2, 2)
         if not (np.abs(ends_px) < _NOWHERE_PX).all():
             return np.zeros((0, 2), int)
         segments = np.round((ends_px - low) * 16).astype(np.int32)

@@ -201,7 +201,7 @@ def photo_with_poses(view: AnnotatedFrame) -> Figure:
     key = (("better pose", SELECTED), ("other pose", OTHER))
     for row, (words, color) in enumerate(key):
         at = (0.01, 0.99 - 0.035 * row * max(1.0, width / height))
-        text = axes.text(*at, words, color=color, transform=axes.transAxes, va="top")
+        text = figure.text(*at, words, color=color, va="top")
         text.set(fontsize=9 * scale)
         text.set_path_effects([withStroke(linewidth=2 * scale, foreground="white")])
     return figure

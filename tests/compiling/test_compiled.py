@@ -210,7 +210,7 @@ def test_nothing_that_a_file_holds_is_run_as_python(tmp_path):
 
 def test_a_tree_is_the_same_again():
     """Modules, named tuples, dicts, None; what has no fields to tell is refused."""
-    state, out = jax.eval_shape(navigator().init), {"a": (None, [EdgeFit(*range(7))])}
+    state, out = jax.eval_shape(navigator().init), {"a": (None, [EdgeFit(*range(8))])}
     for tree in (state, out, (), []):
         shape = jax.tree.map(lambda leaf: 0, tree)
         plain = json.loads(json.dumps(executable_bytes._plain(shape)))
