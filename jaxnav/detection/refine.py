@@ -20,8 +20,8 @@ _POINTS_PER_EDGE = 16
 _MIN_PIXELS = 60
 _MAX_NOISE = 0.25  # of the contrast
 _FEW_GREYS = 0.06  # of the pixels around the outline
+_CURVED_UP_TO_PX = 300.0  # of larger markers a third of a pixel is a thousandth
 _NO_EDGES = np.zeros((0, 2, 2))
-_INSIDE = 0.1  # weight of the edges of cells beside those of a large marker's outline
 _SETTLED_PX = 0.1  # a corner that moves by less in a step
 _MAX_MOVE = 0.2  # of the side
 # Errors that residuals don't show: pixels are square and not Gaussian, paper is not quite flat.
@@ -112,7 +112,8 @@ def fit_marker(
     whole = whole or side_px <= _WHOLE_UP_TO_PX
     around = image.shape, M, lens, side_px / len(cells)
     pixels = _pixels_around(*around, None if whole else _NO_EDGES)
-    curved = bool(np.all((cells == 0) | (cells == 1))) and _has_greys(image, pixels)
+    known = bool(np.all((cells == 0) | (cells == 1)))
+    curved = known and side_px <= _CURVED_UP_TO_PX and _has_greys(image, pixels)
     if curved and not whole:
         pixels = _pixels_around(*around, _inner_edges(cells))
     count = len(pixels)
@@ -122,12 +123,9 @@ def fit_marker(
     # In the basis of the first guess all numbers are of order one, which suits float32.
     lanes = np.minimum(np.arange(PIXELS), count - 1)
     levels = image[pixels[:, 1], pixels[:, 0]]
-    known = (M @ rays)[:, lanes], (M @ rays_px)[:, :, lanes], levels[lanes], step_corners(cells)
-    # Cells are printed less exactly than the outline, of few pixels say.
-    near = np.max(np.abs((M @ rays)[:2] / (M @ rays)[2:]), axis=0) > 1 - 0.5 * 2 / len(cells)
-    trust = np.where(whole | near, 1.0, _INSIDE)
-    trust = np.where(np.arange(PIXELS) < count, trust[lanes], 0)
-    fit = fit_edges(*(np.asarray(a, np.float32) for a in (*known, trust)), np.asarray(curved))
+    seen = (M @ rays)[:, lanes], (M @ rays_px)[:, :, lanes], levels[lanes], step_corners(cells)
+    trust = np.arange(PIXELS) < count
+    fit = fit_edges(*(np.asarray(a, np.float32) for a in (*seen, trust)), np.asarray(curved))
     fit = jax.device_get(fit)
     return MarkerFit(np.asarray(fit.M, float) @ M, pixels, fit)
 
