@@ -17,7 +17,6 @@ from jaxnav.configuration import configure
 
 configure(float64=True)  # before the first array, as the commands do
 
-import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 from jaxnav.calibration.boards.board import Board  # noqa: E402
@@ -119,5 +118,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    jnp.zeros(1)
     main()

@@ -147,10 +147,9 @@ def fit_edges(
     weight = trust * _huber_weight(s.residual / s.scale)
     freedom = jnp.maximum(jnp.sum(weight) - 16, 1)
     noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
-    ridge = jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(s.hessian), 1e-6 * jnp.max(s.hessian)))
     units = jnp.eye(s.hessian.shape[0], dtype=one.dtype)
     factor = _disagreement(s, patch, weight, noise)
-    covariance = eliminate(s.hessian + ridge, units)[:8, :8] * noise**2 * factor
+    covariance = eliminate(_ridged(s.hessian), units)[:8, :8] * noise**2 * factor
     return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, s.residual, s.converged, s.step)
 
 
@@ -224,9 +223,13 @@ def _disagreement(s: _State, patch: _Patch, weight: Array, noise: Array) -> Arra
         (J * (weight * residual / noise)[None]).T, row * (cells + 2) + column, (cells + 2) ** 2
     )
     hessian, _ = _normal_equations(residual, J, weight)
-    ridge = jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(hessian), 1e-6 * jnp.max(hessian)))
-    ratio = jnp.sum(scores.T * eliminate(hessian + ridge, scores.T)) / hessian.shape[0]
+    ratio = jnp.sum(scores.T * eliminate(_ridged(hessian), scores.T)) / hessian.shape[0]
     return jnp.where(ratio > _NOTICED, ratio, 1)
+
+
+def _ridged(hessian: Array) -> Array:
+    """The normal equations with a ridge, so that they have a solution whatever is seen."""
+    return hessian + jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(hessian), 1e-6 * jnp.max(hessian)))
 
 
 def _dark(xy: Array, variance: Array, split: Array, K: Array) -> tuple[Array, Array]:

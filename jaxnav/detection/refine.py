@@ -11,8 +11,8 @@ from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges, step_corners
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import SQUARE, generators, homography, on_paper, rays_of
 
-# Markers up to this side are fitted whole; of larger ones the edges of all cells. The outline alone
-# is not enough where levels may be coded: a curve of theirs and its size look alike.
+# Markers up to this side are fitted whole, of larger ones the outline. Where levels may be coded,
+# the edges of all cells go with it: a curve of the levels and an outline's size look alike.
 _WHOLE_UP_TO_PX = 30.0
 _NOWHERE_PX = 1e6  # as in `ranges`: no corner lies beyond
 _OUTLINE_PX = 3.0

@@ -23,7 +23,7 @@ from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
 
 _ORIENTATION = 0x0112
-_MIRRORED = (2, 4, 5, 7)
+MIRRORED = (2, 4, 5, 7)  # by EXIF's number
 _TIFF = (b"II*\0", b"MM\0*")  # which OpenCV turns as viewers do, whatever flag it is given
 _TURNS_BACK = {3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}  # by so many quarters, anticlockwise
 _EXIF_WITHIN = 2**20  # bytes from the start of a file
@@ -54,7 +54,7 @@ def decode_image(
     orientation = exif_orientation(stored)
     if stored.startswith(_TIFF):
         image = np.rot90(image, _TURNS_BACK.get(orientation, 0))
-    elif orientation in _MIRRORED:
+    elif orientation in MIRRORED:
         image = image[:, ::-1]
     return np.ascontiguousarray(image)
 

@@ -4,7 +4,7 @@ If the views don't determine focal length or centre, the calibration is refused 
 parameters that they don't determine are held at zero and named; none is returned as noise.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -122,14 +122,9 @@ def calibrate_lens(
     tell("compare")
     compared = _compared(fits)
     best = lens
-    if lens == "auto" and compared:
-        drawn = [one for one in compared if np.isfinite(rim_sigma_px(fits[one]))]
-        best = lens_comparison.best_lens(compared, drawn)
-    elif lens == "auto":  # nothing was left out to compare them by
+    if lens == "auto":
         drawn = [one for one in fits if np.isfinite(rim_sigma_px(fits[one]))]
-        least_px = min(fits[one].sigma_px for one in drawn or fits)
-        usual = "radtan" in drawn and fits["radtan"].sigma_px < _FEW_WORSE * least_px
-        best = "radtan" if usual else min(drawn or fits, key=lambda one: fits[one].sigma_px)
+        best = lens_comparison.best_lens(compared, drawn) if compared else _best_of_few(fits, drawn)
     tell("check")
     _require_sound(fits[best], where)
     better = min(compared, key=lambda one: compared[one].rms_px, default=best)
@@ -180,6 +175,13 @@ def _compared(fits: dict[str, LensFit]) -> dict[str, lens_comparison.HeldOut]:
     if np.sum(trusted.view_weights > 0) < lens_comparison.FEWEST_VIEWS:
         return {}
     return {one: lens_comparison.held_out(fit, trusted.weights) for one, fit in fits.items()}
+
+
+def _best_of_few(fits: Mapping[str, LensFit], drawn: Sequence[str]) -> str:
+    """The lens of so few views that none was left out to compare lenses by."""
+    least = min(drawn or fits, key=lambda one: fits[one].sigma_px)
+    usual = "radtan" in drawn and fits["radtan"].sigma_px < _FEW_WORSE * fits[least].sigma_px
+    return "radtan" if usual else least
 
 
 def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:

@@ -9,12 +9,12 @@ from jaxtyping import UInt8
 from jaxnav.commands.drive.arguments import Locate
 from jaxnav.detection import Detections, make_detector
 from jaxnav.detection.families import LARGEST_FAMILIES
+from jaxnav.files.images import MIRRORED
 
 _LARGE_M, _SMALL_M = 1.5, 0.003  # sides that markers rarely have, and other units often make
 _MISFIT = 5.0  # sigmas by which corners are off their pose
 _FLIP = 0.3  # a larger probability says that both poses are possible
 _TURNED_DEG = {3: 180, 4: 180, 5: 90, 6: 90, 7: 270, 8: 270}  # clockwise, by EXIF's number
-_MIRRORED = (2, 4, 5, 7)
 
 
 def notes(
@@ -34,7 +34,7 @@ def notes(
     said = _of_the_size(args.marker_size_m)
     if orientation != 1:
         turned = f"turned by {_TURNED_DEG[orientation]} deg" if orientation in _TURNED_DEG else ""
-        mirrored = "mirrored" if orientation in _MIRRORED else ""
+        mirrored = "mirrored" if orientation in MIRRORED else ""
         shown = " and ".join(filter(None, (mirrored, turned)))
         said.append(
             f"viewers show this photograph {shown} (EXIF); x (right) and y (down) are those of the "
@@ -100,13 +100,11 @@ def _other_family(args: Locate, image: np.ndarray) -> list[str]:
 
 
 def _of_misfits(markers: Sequence[dict[str, Any]]) -> list[str]:
-    off = [marker for marker in markers if marker["misfit_sigmas"] > _MISFIT]
-    if not off:
+    name, worst = _worst(markers, "misfit_sigmas", _MISFIT)
+    if worst is None:
         return []
-    worst = max(off, key=lambda marker: marker["misfit_sigmas"])
     return [
-        f"{_named(off, worst)}: corners are "
-        f"{worst['poses'][0]['reprojection_error_px']:.2g} px off the pose, "
+        f"{name}: corners are {worst['poses'][0]['reprojection_error_px']:.2g} px off the pose, "
         f"{worst['misfit_sigmas']:.0f} of their sigmas, and count as "
         f"{worst['sigma_factor']:.2g} times as unsure: is --camera that of this photograph, with "
         "its zoom and focus, and is the marker flat?"
@@ -114,17 +112,23 @@ def _of_misfits(markers: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _of_flips(markers: Sequence[dict[str, Any]]) -> list[str]:
-    unsure = [marker for marker in markers if marker["flip_probability"] > _FLIP]
-    if not unsure:
+    name, worst = _worst(markers, "flip_probability", _FLIP)
+    if worst is None:
         return []
-    worst = max(unsure, key=lambda marker: marker["flip_probability"])
     return [
-        f"{_named(unsure, worst)}: both poses are possible (P(flip) "
-        f"{worst['flip_probability']:.2f}): take it from nearer, or more from the side"
+        f"{name}: both poses are possible (P(flip) {worst['flip_probability']:.2f}): take it from "
+        "nearer, or more from the side"
     ]
 
 
-def _named(markers: Sequence[dict[str, Any]], worst: dict[str, Any]) -> str:
-    if len(markers) == 1:
-        return f"marker {worst['id']}"
-    return f"{len(markers)} markers, {worst['id']} most of all"
+def _worst(
+    markers: Sequence[dict[str, Any]], key: str, limit: float
+) -> tuple[str, dict[str, Any] | None]:
+    """What to call all markers beyond a limit, and the worst of them; None where there is none."""
+    beyond = [marker for marker in markers if marker[key] > limit]
+    if not beyond:
+        return "", None
+    worst = max(beyond, key=lambda marker: marker[key])
+    if len(beyond) == 1:
+        return f"marker {worst['id']}", worst
+    return f"{len(beyond)} markers, {worst['id']} most of all", worst
