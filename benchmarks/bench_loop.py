@@ -192,7 +192,7 @@ def started_s(folder: Path) -> tuple[float, float]:
     path = folder / "drive.mcap"
     begin_ns = time.monotonic_ns()
     subprocess.run(
-        [sys.executable, "-c", MAIN, "run", "--vehicle", "sim", "--headless", "--record", path,
+        [sys.executable, "-c", MAIN, "run", "--car", "sim", "--headless", "--record", path,
          "--duration-s", "3", "--timeout-s", "3"],
         env=os.environ | {"XDG_CACHE_HOME": str(folder)},
         capture_output=True,
@@ -223,7 +223,7 @@ def print_starts() -> None:
         rows["warm"] = [started_s(Path(name)) for _ in range(STARTS)]
     for kind, starts in rows.items():
         first_s, fine_s = np.median(starts, axis=0)
-        print(f"| `jaxnav run --vehicle sim`, {kind} | {first_s:.2f} | {fine_s:.2f} |")
+        print(f"| `jaxnav run --car sim`, {kind} | {first_s:.2f} | {fine_s:.2f} |")
     command = [sys.executable, "-c", MAIN, "--help"]
     taken_s = median_s(lambda: subprocess.run(command, capture_output=True, check=True), HELPS)
     print(f"\n`jaxnav --help`: {taken_s:.2f} s, median of {HELPS}")

@@ -3,7 +3,7 @@
     python benchmarks/bench_recordings.py [NAME ...] [--frames N]
 
 The recordings are the folders of `JAXNAV_DATA`/tagslam, or of ../shared/data/tagslam. A pose of a
-marker is judged as `jaxnav replay --markers one-at-a-time` does: wrong where another candidate is
+marker is judged as `jaxnav replay --one-at-a-time` does: wrong where another candidate is
 nearer to the reference in angle, an outlier where none is within 10 degrees.
 """
 

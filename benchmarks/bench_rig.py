@@ -301,15 +301,15 @@ def _localise(data: Path, Ts_vehicle_camera: np.ndarray, theirs: np.ndarray) -> 
         file = ROOT / "out" / f"rig-{name.split(chr(39))[0]}.yaml"
         file.parent.mkdir(exist_ok=True)
         save_rig(file, rig)
-        for markers in ("all", "one-at-a-time"):
+        for alone in ((), ("--one-at-a-time",)):
             out = subprocess.run(
                 [sys.executable, "-c", "from jaxnav.cli import main; main()", "replay",
                  str(data / "test_7"), "--rig", str(file),
-                 "--markers", markers, "--out", str(file.with_suffix("")), "--headless"],
+                 *alone, "--out", str(file.with_suffix("")), "--headless"],
                 capture_output=True, text=True, check=True,
                 env=os.environ | {"PYTHONPATH": str(ROOT)},
             )  # fmt: skip
-            print(f"test_7 with {name} extrinsics of test_5, {markers}:")
+            print(f"test_7 with {name} extrinsics of test_5, {' '.join(alone) or 'all'}:")
             print("  " + "\n  ".join(out.stdout.strip().splitlines()))
 
 

@@ -163,7 +163,7 @@ def _command(kind: str, log: Path, record: Path) -> list[str]:
         "a process": (plain_car.NAME, plain_cameras.NAME),
     }[kind]
     command = [sys.executable, "-c", MAIN, "run", "--headless", "--timeout-s", "2"]
-    told = {"--vehicle": vehicle, "--cameras": cameras, "--option": f"log={log}"}
+    told = {"--car": vehicle, "--cameras": cameras, "--option": f"log={log}"}
     return [*command, *itertools.chain(*told.items()), "--record", str(record)]
 
 
@@ -302,7 +302,7 @@ class _Drive:
 def _soaked(folder: Path, number: int) -> _Drive:
     """Each tenth drive is held for 1 s: it must be stopped."""
     record, held = folder / "drive.mcap", number % 10 == 0
-    command = [sys.executable, "-c", MAIN, "run", "--vehicle", "sim", "--headless", "--seed",
+    command = [sys.executable, "-c", MAIN, "run", "--car", "sim", "--headless", "--seed",
                str(number), "--record", str(record), "--duration-s", "40"]  # fmt: skip
     begin_s = time.monotonic()
     process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE,

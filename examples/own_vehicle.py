@@ -1,7 +1,7 @@
 """A vehicle of one's own, as a plug-in of the loop that drives: see `jaxnav.loop.interfaces`.
 
     python examples/own_vehicle.py                  # does it keep what a vehicle promises?
-    PYTHONPATH=examples jaxnav run --vehicle own_vehicle:MyCar --cameras sim
+    PYTHONPATH=examples jaxnav run --car own_vehicle:MyCar --cameras sim
 
 Here it talks to a simulated world, at which the cameras look too; a real one to its hardware.
 """
@@ -17,7 +17,7 @@ from jaxnav.vehicles.world import SimWorld
 
 
 class MyCar:
-    """Its constructor is what `--vehicle`, or an entry point of `jaxnav.vehicles`, names."""
+    """Its constructor is what `--car`, or an entry point of `jaxnav.vehicles`, names."""
 
     shares_process = True  # the cameras look at its world
     timeout_s = 0.2  # after so long without a `write` it stops by itself

@@ -164,7 +164,9 @@ def _parse(args: list[str]) -> Any:
     import tyro
 
     from jaxnav.commands import all_arguments
+    from jaxnav.commands.old_flags import with_new_names
 
+    args = with_new_names(args)
     messages = io.StringIO()
     wide = not {"-h", "--help"} & set(args)
     try:

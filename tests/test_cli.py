@@ -43,10 +43,8 @@ def test_arguments_reach_the_command(command) -> None:
         )
         == 0
     )
-    assert (
-        cli.main("replay --limit 5 --markers one-at-a-time --markers-file m.yaml bag".split()) == 0
-    )
-    assert cli.main("locate a.png --camera c.yaml --marker-size-m 0.1 --json".split()) == 0
+    assert cli.main("replay --limit 5 --one-at-a-time --markers m.yaml bag".split()) == 0
+    assert cli.main("locate a.png --camera c.yaml --marker-size-m 0.1 --as-json".split()) == 0
     assert received == [
         Demo(
             seed=3,
@@ -56,8 +54,8 @@ def test_arguments_reach_the_command(command) -> None:
             out=Path("x"),
             params=Path("p.yaml"),
         ),
-        ReplayRecording(Path("bag"), limit=5, markers="one-at-a-time", markers_file=Path("m.yaml")),
-        Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, json=True),
+        ReplayRecording(Path("bag"), limit=5, one_at_a_time=True, markers=Path("m.yaml")),
+        Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, as_json=True),
     ]
 
 

@@ -114,7 +114,7 @@ def test_every_command_can_be_typed(command: tuple[str, bool]) -> None:
 
 
 def test_commands_were_found() -> None:
-    assert ("jaxnav run --vehicle qcar --record drive.mcap", True) in COMMANDS
+    assert ("jaxnav run --car qcar --record drive.mcap", True) in COMMANDS
     assert ("jaxnav faults", False) in COMMANDS
     names = {line.split()[1] for line, _ in COMMANDS}
     assert {"demo", "replay", "locate", "simulate", "study", "tune", "calibrate"} <= names

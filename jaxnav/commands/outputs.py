@@ -20,7 +20,7 @@ def check_outputs(command: Any) -> None:
     one, flag, outputs = registered(command), "--out", list[Path]()
     if one.in_folder:
         names = one.in_folder
-        if one is COMMANDS["replay"] and command.record:
+        if one is COMMANDS["replay"] and command.record_anew:
             names += ("replay.mcap",)
         outputs = [path for name in names for path in command.out.glob(name)]
     elif name := one.file or one.made:

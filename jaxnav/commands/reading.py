@@ -14,18 +14,15 @@ from jaxnav.recording.drive_log import DriveLog, read_drive
 
 _PATIENCE_S = 2.0
 _LOADS = {
-    "rig": (load_rig, "rig"),
-    "markers": (load_markers, "markers_file"),
-    "vehicle": (load_vehicle, "vehicle"),
-    "route": (load_route, "route"),
-}
+    "rig": load_rig, "markers": load_markers, "vehicle": load_vehicle, "route": load_route,
+}  # fmt: skip
 
 
 def given_files(args: Any, names: Sequence[str], bag: Path | None = None) -> dict[str, Any]:
     """The content of the files that are given in place of a recording's own.
 
     Args:
-        args: with the fields rig, markers_file, vehicle and route, as far as they are asked for.
+        args: with the fields rig, markers, vehicle and route, as far as they are asked for.
         names: those asked for: rig, markers, vehicle, route.
         bag: a recording that holds none of them, so that all must be given.
 
@@ -34,12 +31,11 @@ def given_files(args: Any, names: Sequence[str], bag: Path | None = None) -> dic
     """
     content = {}
     for name in names:
-        load, field = _LOADS[name]
-        path = getattr(args, field)
+        path = getattr(args, name)
         if path is not None:
-            content[name] = load(path)
+            content[name] = _LOADS[name](path)
         elif bag is not None:
-            raise BadInput(flag_of(field), f"missing: a ROS bag ({bag}) does not hold it")
+            raise BadInput(flag_of(name), f"missing: a ROS bag ({bag}) does not hold it")
     return content
 
 

@@ -144,7 +144,7 @@ def assemble(
         BadInput: two families share an id in the map; the detections do not tell families.
     """
     if len(set(markers.ids)) < len(markers.ids):
-        raise BadInput("--markers-file", "ids must differ: the recording does not tell families")
+        raise BadInput("--markers", "ids must differ: the recording does not tell families")
     stamps = np.unique(rows.frame_stamps_ns)
     index_of_id = {marker_id: index for index, marker_id in enumerate(markers.ids)}
     index = np.array([index_of_id.get(int(marker_id), -1) for marker_id in rows.ids], int)

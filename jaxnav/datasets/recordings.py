@@ -68,7 +68,7 @@ def _read_single_bag(path: Path, rig: CameraRig | None) -> RecordingSource:
 
 
 def _no_markers(path: Path) -> NoReturn:
-    raise BadInput("--markers-file", f"missing: {path} does not say where its markers are")
+    raise BadInput("--markers", f"missing: {path} does not say where its markers are")
 
 
 def _topic_of(path: Path, bag: bags.Bag, camera: str) -> str:

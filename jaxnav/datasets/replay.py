@@ -100,7 +100,7 @@ def replay(
         problem = (
             f"{len(recording)} frames of {tracks} markers are more than {limits.TRACKED_POSES}"
         )
-        raise BadInput("--markers one-at-a-time", f"{problem} poses: take fewer frames (--limit)")
+        raise BadInput("--one-at-a-time", f"{problem} poses: take fewer frames (--limit)")
     alone = _with_markers(navigator, _single(navigator.markers, jnp.asarray(0)))
     state = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)),

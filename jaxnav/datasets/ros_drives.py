@@ -131,7 +131,7 @@ class _Reader:
         if ros_messages.TAGSLAM in [kinds[topic] for topic in chosen]:
             if len(set(self.markers.ids)) < len(self.markers.ids):
                 problem = "ids must differ: the recording does not tell families"
-                raise BadInput("--markers-file", problem)
+                raise BadInput("--markers", problem)
         return chosen
 
     def _find(

@@ -220,7 +220,7 @@ def _report(guard: Guard, link: Link) -> None:
 
 def _factory(name: str, path: list[str]) -> Any:
     sys.path[:] = path
-    factory = plugins.load_factory("--vehicle", plugins.VEHICLES, name)
+    factory = plugins.load_factory("--car", plugins.VEHICLES, name)
     if isinstance(factory, SharesProcess) and factory.shares_process:
         raise CanNotMoveError("it shares its process")
     if modules := [module for module in _HEAVY if module in sys.modules]:

@@ -163,7 +163,7 @@ class GuardProcess:
             answer = self.commands.mapping()
         except (EOFError, OSError):
             raise BadInput(
-                f"--vehicle {self.name}", f"the guard's process {ending(self.process)}"
+                f"--car {self.name}", f"the guard's process {ending(self.process)}"
             ) from None
         self.stays = answer.get("stays")
         return answer

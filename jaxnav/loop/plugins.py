@@ -38,12 +38,12 @@ def open_vehicle(name: str, setup: Setup) -> Vehicle:
         BadInput: there is none of that name, it can't be imported or opened, or it does not return
             a vehicle.
     """
-    return opened_vehicle(name, load_factory("--vehicle", VEHICLES, name), setup)
+    return opened_vehicle(name, load_factory("--car", VEHICLES, name), setup)
 
 
 def opened_vehicle(name: str, factory: Callable[..., Any], setup: Setup) -> Vehicle:
     """Like `open_vehicle`, with a factory that was found before."""
-    flag = "--vehicle"
+    flag = "--car"
     vehicle: Vehicle = _opened(flag, name, factory, setup)
     if lacking := missing_members(vehicle, Vehicle):
         _close([vehicle])

@@ -1,6 +1,6 @@
 """Replay a recorded drive as a vehicle in real time: nothing moves, all data come as they came.
 
-jaxnav run --vehicle replay --option drive=drive.mcap       # detections as recorded
+jaxnav run --car replay --option drive=drive.mcap       # detections as recorded
     --option images=true                                    # the recorded images
 
 The clock of the recording starts when it is first read; data arrive at their recorded times, with
@@ -199,7 +199,7 @@ def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
             decoded or have another size than the rig's.
     """
     if not isinstance(vehicle, ReplayVehicle):
-        raise BadInput("--cameras", "replay shows what --vehicle replay has recorded")
+        raise BadInput("--cameras", "replay shows what --car replay has recorded")
     log, rig = vehicle.recorded, setup.rig
     for name in rig.names:
         if name not in vehicle.camera_names:

@@ -1,7 +1,7 @@
 """Run the simulated car in real time: a vehicle and cameras like any other.
 
-jaxnav run --vehicle sim                           # cameras that detect markers themselves
-jaxnav run --vehicle sim --option images=true      # rendered images
+jaxnav run --car sim                           # cameras that detect markers themselves
+jaxnav run --car sim --option images=true      # rendered images
 """
 
 import threading

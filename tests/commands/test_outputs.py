@@ -24,9 +24,9 @@ from jaxnav.files.writing import atomic_write_all, refuse_overwriting, require_w
 ROOT = Path(__file__).parents[2]
 # What is typed, the file that would be destroyed, and the flag that is to be named.
 OVERWRITING = [
-    ("run --vehicle replay --option drive=a.mcap --record a.mcap", "a.mcap", "--record"),
+    ("run --car replay --option drive=a.mcap --record a.mcap", "a.mcap", "--record"),
     ("run --rig a.yaml --record a.yaml", "a.yaml", "--record"),
-    ("replay out/replay.mcap --out out --record", "out/replay.mcap", "--out"),
+    ("replay out/replay.mcap --out out --record-anew", "out/replay.mcap", "--out"),
     ("replay a.npz --rig out/summary.json --out out", "out/summary.json", "--out"),
     ("replay bag --out bag", "bag/trajectory.tum", "--out"),
     ("locate p.png --camera c.yaml --marker-size-m 0.1 --out p.png", "p.png", "--out"),
@@ -50,9 +50,9 @@ OVERWRITING = [
     ("calibrate intrinsics f=shots --board b.yaml --out shots", "shots/report.png", "--out"),
     ("calibrate intrinsics shots --board b.yaml --out shots", "shots/report.png", "--out"),
     ("calibrate rig a.mcap --rig out/rig.yaml --out out", "out/rig.yaml", "--out"),
-    ("calibrate markers a.mcap --markers-file out/markers.yaml --out out", "out/markers.yaml",
+    ("calibrate markers a.mcap --markers out/markers.yaml --out out", "out/markers.yaml",
      "--out"),
-    ("calibrate check a.mcap --markers-file out/markers.yaml --out out", "out/markers.yaml",
+    ("calibrate check a.mcap --markers out/markers.yaml --out out", "out/markers.yaml",
      "--out"),
     ("calibrate odometry a.mcap --vehicle out/vehicle.yaml --out out", "out/vehicle.yaml",
      "--out"),

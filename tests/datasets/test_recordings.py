@@ -244,7 +244,7 @@ def test_topics_are_matched_by_name_or_named(tmp_path, rig, markers):
 def test_a_bag_alone_names_the_missing_flag(tmp_path, rig):
     bag = write_bag(tmp_path / "a.bag", {"/front/tags": [(10, [])]})
     assert problem(bag).startswith("--rig: missing")
-    assert problem(bag, rig).startswith("--markers-file: missing")
+    assert problem(bag, rig).startswith("--markers: missing")
 
 
 CAMERAS, TAGSLAM, POSES = (
@@ -459,4 +459,4 @@ def test_ids_of_two_families_can_not_be_told_apart(tmp_path, rig):
     (tmp_path / "m.yaml").write_text(str({"markers": markers}))
     bag = write_bag(tmp_path / "a.bag", {topic: [(1, [])] for topic in QCAR_TOPICS})
     line = problem(bag, rig, files.load_markers(tmp_path / "m.yaml"))
-    assert line.startswith("--markers-file: ids must differ")
+    assert line.startswith("--markers: ids must differ")

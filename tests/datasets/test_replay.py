@@ -142,7 +142,7 @@ def test_a_recording_without_a_reference_gives_a_track_and_no_errors(
 
 def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
     folder = str(data_dir / "tagslam" / "test_7")
-    args = ["--markers", "one-at-a-time", "--selector", "lowest-reprojection", "--limit", "300"]
+    args = ["--one-at-a-time", "--selector", "lowest-reprojection", "--limit", "300"]
     assert main(["replay", folder, "--out", str(tmp_path), "--headless", *args]) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["frames"] == 300

@@ -51,7 +51,7 @@ def test_topics_that_do_not_fit_are_one_line(tmp_path):
     twice = MarkerMap(
         twice.Ts_world_marker, twice.size_m, (0, 0, 1, 2), ("tag36h11", *["tag25h9"] * 3)
     )
-    assert "--markers-file: ids must differ" in problem(path, topic_map(tmp_path, TOPICS), twice)
+    assert "--markers: ids must differ" in problem(path, topic_map(tmp_path, TOPICS), twice)
 
 
 def test_what_is_no_bag_is_one_line(tmp_path):

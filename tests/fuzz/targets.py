@@ -7,7 +7,7 @@ The first file named is the one that is damaged, unless another is marked by `{!
 import re
 from dataclasses import dataclass
 
-_RIGGED = "--rig {rig.yaml} --markers-file {markers.yaml}"
+_RIGGED = "--rig {rig.yaml} --markers {markers.yaml}"
 _ROS = f"--topics {{topics.yaml}} {_RIGGED} --vehicle {{vehicle.yaml}}"
 _FROM = {
     "rig.yaml": "kalibr",
@@ -24,14 +24,15 @@ _LINES: list[tuple[float, str]] = [
     (1, "view {drive.mcap} --out {out}/view.rrd --headless"),
     (3, "replay {drive.mcap} --out {out} --headless --limit 60"),
     (2, "replay {drive.mcap} --selector mahalanobis --out {out} --headless --limit 60"),
-    (1, "replay {drive.mcap} --corner-sigma-px 0.5 --record --out {out} --headless --limit 60"),
+    (1, "replay {drive.mcap} --corner-sigma-px 0.5 --record-anew --out {out} --headless"
+        " --limit 60"),
     (1, "replay {drive.mcap} --images --out {out} --headless"),
     (2, "replay {decoded.npz} --out {out} --headless"),
-    (1, "replay {decoded.npz} --markers one-at-a-time --out {out} --headless"),
+    (1, "replay {decoded.npz} --one-at-a-time --out {out} --headless"),
     (1, "replay {seen.bag} " + _RIGGED + " --out {out} --headless"),
     (1, "replay {tagslam/tagslam.yaml/..} --out {out} --headless"),
     (1, "replay {ros.bag} " + _ROS + " --route {route.yaml} --out {out} --headless"),
-    (1, "replay {ros.bag} --topics {!topics.yaml} --rig {rig.yaml} --markers-file {markers.yaml}"
+    (1, "replay {ros.bag} --topics {!topics.yaml} --rig {rig.yaml} --markers {markers.yaml}"
         " --vehicle {vehicle.yaml} --route {route.yaml} --out {out} --headless"),
     (3, "calibrate odometry {eights.mcap} --out {out} --headless"),
     (1, "calibrate odometry {eights.mcap} --rig {!rig.yaml} --out {out} --headless"),
@@ -51,8 +52,7 @@ _LINES: list[tuple[float, str]] = [
     (1, "tune filter {drive.mcap} --out {out} --headless"),
     (1, "tune filter {decoded.npz} --out {out} --headless"),
     (1, "reliability {decoded.npz} --out {out} --headless"),
-    *((0.4, f"doctor --{flag} {{{name}.yaml}}") for flag, name in
-      (("rig", "rig"), ("markers", "markers"), ("vehicle-file", "vehicle"), ("route", "route"))),
+    *((0.4, f"doctor --{name} {{{name}.yaml}}") for name in ("rig", "markers", "vehicle", "route")),
     (1, "doctor --frame front={photo.png}"),
     (1, "locate {photo.png} --camera {opencv.yml} --marker-size-m 0.2 --out {out}/found.png"),
     (1, "locate {photo.png} --camera {!opencv.yml} --marker-size-m 0.2"),
@@ -61,10 +61,9 @@ _LINES: list[tuple[float, str]] = [
       for name in ("rig", "markers", "vehicle", "params")),
     *((0.4, f"demo --out {{out}} --headless --{name} {{{name}.yaml}}")
       for name in ("rig", "markers", "vehicle", "route", "params")),
-    (0.4, "run --vehicle replay --option drive={drive.mcap} --duration-s 0.2 --headless"),
-    *((0.4, f"run --headless --duration-s 0.1 --{flag} {{{name}.yaml}}") for flag, name in
-      (("rig", "rig"), ("markers", "markers"), ("vehicle-file", "vehicle"), ("route", "route"),
-       ("params", "params"))),
+    (0.4, "run --car replay --option drive={drive.mcap} --duration-s 0.2 --headless"),
+    *((0.4, f"run --headless --duration-s 0.1 --{name} {{{name}.yaml}}")
+      for name in ("rig", "markers", "vehicle", "route", "params")),
     (0.5, "study ambiguity {ambiguity.yaml} --out {out}/s.zarr --headless"),
     (0.5, "study drive {drive.yaml} --out {out}/s.zarr --headless"),
     *((0.5, f"plot {{study/s.zarr/{part}/..}} --out {{out}} --headless")

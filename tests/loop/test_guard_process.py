@@ -196,7 +196,7 @@ def test_a_driver_that_hangs_there_is_stopped_around(tmp_path):
         ("jaxnav.vehicles.sim:open_vehicle", "it shares its process"),
         ("tests.helpers.plain_car:open_curious_vehicle", "it looks at setup.rig"),
         ("tests.worlds:qcar", "its module imports jax"),
-        ("tests.helpers.plain_car:nothing", "there --vehicle: tests.helpers.plain_car:nothing: "),
+        ("tests.helpers.plain_car:nothing", "there --car: tests.helpers.plain_car:nothing: "),
     ],
 )
 def test_a_vehicle_that_can_not_be_moved_says_why(tmp_path, name, why):

@@ -112,7 +112,7 @@ def test_a_module_that_fails_on_import_is_one_line(tmp_path, monkeypatch):
     (tmp_path / "halfcar.py").write_text("import\n")
     (tmp_path / "anglecar.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(BadInput, match="--vehicle: halfcar:x: importing halfcar failed: SyntaxErr"):
+    with pytest.raises(BadInput, match="--car: halfcar:x: importing halfcar failed: SyntaxErr"):
         open_vehicle("halfcar:x", SETUP)
     with pytest.raises(BadInput, match="importing anglecar failed: ZeroDivisionError: division"):
         open_vehicle("anglecar:x", SETUP)
@@ -191,7 +191,7 @@ def test_an_error_while_closing_does_not_hide_the_reason(module):
 
 def test_names_are_looked_up_where_packages_are_installed(monkeypatch):
     monkeypatch.setattr(plugins, "entry_points", importlib.metadata.entry_points)
-    with pytest.raises(BadInput, match="--vehicle: there is no 'submarine': expected "):
+    with pytest.raises(BadInput, match="--car: there is no 'submarine': expected "):
         open_vehicle("submarine", SETUP)
 
 
@@ -205,4 +205,4 @@ def declared():
 @pytest.mark.parametrize(("group", "target"), list(declared()))
 def test_what_jaxnav_declares_is_there(group, target):
     """Without the makers' software: it is imported when something is opened."""
-    assert load_factory("--vehicle", group, target).__name__ == target.partition(":")[2]
+    assert load_factory("--car", group, target).__name__ == target.partition(":")[2]

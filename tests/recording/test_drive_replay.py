@@ -249,7 +249,7 @@ def replayed(out: Path, *arguments: object) -> tuple[int, dict]:
 
 
 def test_a_drive_is_replayed_bit_for_bit_and_recorded_anew(drive, tmp_path, capsys):
-    code, summary = replayed(tmp_path, drive[0], "--record")
+    code, summary = replayed(tmp_path, drive[0], "--record-anew")
     count = len(drive[1])
     assert code == 0
     assert f"{count} states, bit for bit as recorded" in capsys.readouterr().out
@@ -343,7 +343,7 @@ def test_a_ros_bag_is_driven_too(drive, route, tmp_path):
     topics = tmp_path / "topics.yaml"
     topics.write_text("cameras: {front: /front}\nodometry: /drive\n")
     folder = bag.write(tmp_path)
-    files = {"--rig": "rig", "--markers-file": "markers", "--vehicle": "vehicle"}
+    files = {"--rig": "rig", "--markers": "markers", "--vehicle": "vehicle"}
     flags = [part for flag, name in files.items() for part in (flag, QCAR / f"{name}.yaml")]
     arguments = [folder, "--topics", topics, *flags, "--route", route]
     code, summary = replayed(tmp_path / "out", *arguments)
@@ -361,9 +361,9 @@ def test_flags_that_do_not_go_together_are_one_line(drive, tmp_path, capsys):
     topics = tmp_path / "topics.yaml"
     topics.write_text("cameras: {front: /front}\n")
     for arguments, line in [
-        ([drive[0], "--markers", "one-at-a-time"], "--markers: must be all for a drive, got one"),
+        ([drive[0], "--one-at-a-time"], "--one-at-a-time: goes with recordings of a rig"),
         ([foreign], f"--topics: missing: {foreign} is a ROS bag"),
-        ([tmp_path / "x.npz", "--record"], "--record: is for drives, and"),
+        ([tmp_path / "x.npz", "--record-anew"], "--record-anew: is for drives, and"),
         ([tmp_path / "x.mcap"], "there is no such file or folder"),
         ([foreign, "--topics", topics], "--rig: missing: a ROS bag"),
         ([drive[0], "--route", tmp_path / "none.yaml"], "none.yaml: can't be read"),

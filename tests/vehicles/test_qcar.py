@@ -221,7 +221,7 @@ def test_a_closed_car_says_so(hardware, car):
 def test_a_board_without_data_is_one_line(hardware, monkeypatch):
     monkeypatch.setattr("jaxnav.vehicles.qcar._FIRST_DATA_S", 0.1)
     hardware.fails = True
-    with pytest.raises(BadInput, match="--vehicle qcar: the board gives no data"):
+    with pytest.raises(BadInput, match="--car qcar: the board gives no data"):
         open_vehicle(SETUP)
     assert "terminate" in hardware.calls
 
@@ -309,7 +309,7 @@ def test_a_driver_that_repeats_its_picture_gives_no_frame(hardware, monkeypatch)
 def test_without_the_makers_software_a_person_hears_where_it_is_from(monkeypatch):
     monkeypatch.setitem(sys.modules, "pal", None)
     target = "jaxnav.vehicles.qcar:open_{}"
-    with pytest.raises(BadInput, match=r"--vehicle: .* needs the module pal.* Quanser's software"):
+    with pytest.raises(BadInput, match=r"--car: .* needs the module pal.* Quanser's software"):
         open_vehicle_by_name(target.format("vehicle"), SETUP)
     with pytest.raises(BadInput, match=r"--cameras: .* needs the module pal.* Quanser's software"):
         open_by_name(target.format("cameras"), SETUP, None)
@@ -327,5 +327,5 @@ def test_software_that_fails_on_import_is_one_line(hardware, monkeypatch):
     monkeypatch.delattr(sys.modules["pal.products"], "qcar")
     monkeypatch.setattr(sys.modules["pal.products"], "__path__", [], raising=False)
     monkeypatch.setattr(sys, "meta_path", [NoLogin(), *sys.meta_path])
-    with pytest.raises(BadInput, match=r"--vehicle qcar: pal.products.qcar: OSError: .*No such"):
+    with pytest.raises(BadInput, match=r"--car qcar: pal.products.qcar: OSError: .*No such"):
         open_vehicle(SETUP)

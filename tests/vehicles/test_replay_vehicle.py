@@ -34,7 +34,7 @@ FRONT, REAR = 0, 2
 MS = 1_000_000
 SLACK_NS = 150 * MS  # of a machine that does something else
 NAMES = (
-    "--vehicle",
+    "--car",
     f"{ReplayVehicle.__module__}:ReplayVehicle",
     "--cameras",
     f"{ReplayVehicle.__module__}:open_cameras",
@@ -262,7 +262,7 @@ def test_images_that_are_not_there_or_not_the_rigs_are_refused(tmp_path, images,
 
 def test_cameras_that_were_not_recorded_are_refused(drive):
     setup = setup_with(drive=str(drive))
-    with pytest.raises(BadInput, match="--cameras: replay shows what --vehicle replay has"):
+    with pytest.raises(BadInput, match="--cameras: replay shows what --car replay has"):
         open_cameras(setup, GoodVehicle(setup))
     other = dataclasses.replace(SETUP.rig.first(1), names=("top",))
     other_setup = dataclasses.replace(setup, rig=other)

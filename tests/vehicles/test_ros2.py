@@ -189,7 +189,7 @@ def test_an_unknown_type_of_message_is_named(bus):
 def test_without_ros_a_person_hears_what_is_missing(bus, monkeypatch, missing, hint):
     for name in [name for name in sys.modules if name.split(".")[0] == missing]:
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(BadInput, match=rf"--vehicle: .* needs the module {missing}.*{hint}"):
+    with pytest.raises(BadInput, match=rf"--car: .* needs the module {missing}.*{hint}"):
         open_by_name("jaxnav.vehicles.ros2:open_vehicle", SETUP)
 
 

@@ -71,7 +71,7 @@ def check_fit(board: Board, paper_mm: tuple[float, float]) -> None:
     raise ValueError(
         f"the {board} needs {needed[0]:g} x {needed[1]:g} mm with its white zone, but "
         f"{_paper(paper_mm)} has room for {room[0]:g} x {room[1]:g} mm: "
-        f"{1e3 * fitting.size_m:g} mm would fit{turned}"
+        f"{1e3 * fitting.size_m:g} mm would fit (--size-m {fitting.size_m:g}){turned}"
     )
 
 

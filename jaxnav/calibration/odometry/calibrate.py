@@ -206,7 +206,7 @@ def _computable(where: str) -> Iterator[None]:
     except np.linalg.LinAlgError:
         problem = (
             "odometry, cameras and map have no course of a car in common that can be computed: "
-            "check --markers-file, --rig and --vehicle"
+            "check --markers, --rig and --vehicle"
         )
         raise BadInput(where, problem) from None
 
@@ -284,7 +284,7 @@ def _refuse_contradiction(
     if outliers.mean() > _MOST_OUTLIERS:
         problem = (
             f"{outliers.mean():.0%} of the markers seen are not where the map says: check "
-            "--markers-file and --rig, with calibrate check"
+            "--markers and --rig, with calibrate check"
         )
         raise BadInput(where, problem)
     if not solution.converged:
@@ -296,7 +296,7 @@ def _refuse_contradiction(
     if chi2 > _REFUSED_CHI2:
         problem = (
             f"odometry and cameras contradict each other (chi-square per degree of freedom "
-            f"{chi2:.1f}): check --rig, --markers-file and --vehicle, drive slowly enough that no "
+            f"{chi2:.1f}): check --rig, --markers and --vehicle, drive slowly enough that no "
             "wheel slips, and keep a marker in view"
         )
         raise BadInput(where, problem)

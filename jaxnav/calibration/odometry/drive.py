@@ -131,7 +131,7 @@ def lay_out(drives: Sequence[Drive]) -> Course:
         count = sum(len(drive.view_stamps_ns) for drive in drives)
         problem = (
             f"markers of the map were seen {count} times beside readings of the odometer, at least "
-            f"{_LEAST_VIEWS} views are needed: drive where a camera sees a marker of --markers-file"
+            f"{_LEAST_VIEWS} views are needed: drive where a camera sees a marker of --markers"
         )
         raise BadInput(names, problem)
     begin_s, intervals, views = 0.0, [], []

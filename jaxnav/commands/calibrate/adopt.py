@@ -125,7 +125,7 @@ def _last_sure(log: DriveLog) -> int:
         problem = (
             "tells no errors of sensors and cameras: it was driven by a rule of one pose, with "
             "files that say they are exact, or recorded by an older jaxnav (`jaxnav replay "
-            "--record` records it anew)"
+            "--record-anew` makes another)"
         )
         raise BadInput(log.path, problem)
     sure = np.flatnonzero(kept & outcomes.located & outcomes.decided)

@@ -75,14 +75,14 @@ class CalibrateBoard(Checked):
     """Squares or tags side by side."""
     rows: _Count = None
     """Squares or tags one above the other."""
-    size_mm: Annotated[
+    size_m: Annotated[
         float | None, optional("FLOAT", "(default: the largest round size that fits)"), POSITIVE
     ] = None
-    """Side of a square, or of the black outline of a tag or marker."""
-    marker_mm: Annotated[
+    """Side of a square, or of the black outline of a tag or marker, m."""
+    marker_size_m: Annotated[
         float | None, optional("FLOAT", "(default: a cell of white around it)"), POSITIVE
     ] = None
-    """Of a charuco board, the side of its markers."""
+    """Of a charuco board, the side of its markers, m."""
     spacing: float = 0.3
     """Of an aprilgrid, the gap between tags in sides of a tag: Kalibr's tagSpacing."""
     family: Annotated[str | None, optional("NAME", "(default: 4x4 for charuco, else tag36h11)")] = (
@@ -106,12 +106,12 @@ class CalibrateBoard(Checked):
         if self.paper_size_mm is not None:
             fits = all(50 <= side <= 5000 for side in self.paper_size_mm)
             require(fits, "--paper", f"must be from 50 to 5000 mm a side, got {self.paper}")
-        charuco = self.target == "charuco" or self.marker_mm is None
-        require(charuco, "--marker-mm", f"goes with charuco, not with {self.target}")
+        charuco = self.target == "charuco" or self.marker_size_m is None
+        require(charuco, "--marker-size-m", f"goes with charuco, not with {self.target}")
         alone = self.target != "marker" or (self.columns is None and self.rows is None)
         require(alone, "--columns", "and --rows go with boards, not with a single marker")
-        pair = self.marker_mm is None or self.size_mm is not None
-        require(pair, "--marker-mm", "needs --size-mm")
+        pair = self.marker_size_m is None or self.size_m is not None
+        require(pair, "--marker-size-m", "needs --size-m")
         require(math.isfinite(self.spacing), "--spacing", f"must be finite, got {self.spacing}")
         require(50 <= self.dpi <= 2400, "--dpi", f"must be from 50 to 2400, got {self.dpi}")
 
@@ -275,7 +275,7 @@ class CalibrateRig(_Seen):
 
     rig: OptionalFile = None
     """Cameras: their lenses, and about where they are, in place of the recording's own."""
-    markers_file: OptionalFile = None
+    markers: OptionalFile = None
     """Markers whose places are known, one at least: they tie the world down. By default those that
     a drive brings along; without any the world is the frame of the marker seen most."""
     marker_size_m: MarkerSize = None
@@ -301,7 +301,7 @@ class CalibrateMarkers(_Seen):
 
     rig: OptionalFile = None
     """Cameras, in place of the recording's own."""
-    markers_file: OptionalFile = None
+    markers: OptionalFile = None
     """Markers whose places are known, one at least. By default those that a drive brings along;
     without any the world is the frame of the marker seen most."""
     marker_size_m: MarkerSize = None
@@ -322,7 +322,7 @@ class CalibrateCheck(_Seen):
 
     rig: OptionalFile = None
     """Cameras, in place of the recording's own."""
-    markers_file: OptionalFile = None
+    markers: OptionalFile = None
     """Map to be checked, in place of the one that a drive brings along."""
     family: Family = "tag36h11"
     tolerance_m: Positive = 0.02
@@ -367,7 +367,7 @@ class CalibrateOdometry(Headless):
     """Drives recorded by `jaxnav run --record` (.mcap), or ROS bags with --topics."""
     rig: _RecordedFile = None
     """Cameras: a rig file or a Kalibr camchain."""
-    markers_file: _RecordedFile = None
+    markers: _RecordedFile = None
     """Marker map."""
     vehicle: _RecordedFile = None
     """The vehicle as it stands: limits, wheelbase, and where the search starts."""

@@ -69,10 +69,10 @@ def _board(args: CalibrateBoard, paper_mm: tuple[float, float]) -> Board:
     columns, rows = args.columns or across, args.rows or down
     family = _family(args, columns * rows // 2)
     # Without a given size, squares of 1 m, which are scaled below.
-    size_m = 1.0 if args.size_mm is None else args.size_mm / 1e3
+    size_m = 1.0 if args.size_m is None else args.size_m
     marker_m = 0.0
-    if args.marker_mm is not None:
-        marker_m = args.marker_mm / 1e3
+    if args.marker_size_m is not None:
+        marker_m = args.marker_size_m
     elif args.target == "charuco":
         cells = len(marker_cells(family, 0))
         marker_m = size_m * cells / (cells + 2)
@@ -88,7 +88,7 @@ def _board(args: CalibrateBoard, paper_mm: tuple[float, float]) -> Board:
             first_id=0 if args.target == "chessboard" else args.first_id,
             border_cells=args.border_cells if args.target == "aprilgrid" else 1,
         )
-        if args.size_mm is None:
+        if args.size_m is None:
             board = largest(board, paper_mm)
         check_fit(board, paper_mm)
     except ValueError as error:

@@ -24,11 +24,11 @@ def run(args: Arguments) -> int:
     """Compare the map with the recordings, write a report, name wrong markers; 1 if there are."""
     configure_jax(float64=True)
     data = read_rig_data(
-        args.recordings, args.rig, args.markers_file, None, args.family, only_known=True
+        args.recordings, args.rig, args.markers, None, args.family, only_known=True
     )
     if len(data.known) < 2:
         raise BadInput(
-            args.markers_file or args.recordings[0],
+            args.markers or args.recordings[0],
             "one marker of the map was seen, two at least must be: nothing else can contradict it",
         )
     counts = np.bincount(data.views.marker, minlength=len(data.keys))

@@ -78,7 +78,7 @@ def read_rig_data(
         if markers is not None:
             ids = ", ".join(str(marker_id) for marker_id in markers.ids)
             problem = f"none of its markers ({ids}) was seen; seen were {_listed(keys)}"
-            raise BadInput(markers_file or "--markers-file", problem)
+            raise BadInput(markers_file or "--markers", problem)
         known = {index_of[seen.most_common(1)[0][0]]: np.eye(4)}
     marker = np.array([index_of.get(key, -1) for part in parts for key in _keys(part, family)], int)
     used = marker >= 0

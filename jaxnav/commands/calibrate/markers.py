@@ -11,9 +11,7 @@ from jaxnav.commands.process import configure_jax
 def run(args: Arguments) -> int:
     """Find the markers, write the files, and print a summary."""
     configure_jax(float64=True)
-    data = read_rig_data(
-        args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family
-    )
+    data = read_rig_data(args.recordings, args.rig, args.markers, args.marker_size_m, args.family)
     given = Ts_vehicle_camera(data.rig)
     calibration = calibrate_rig(data.views, data.rig, data.known, None)
     refuse_wrong_sizes(data, calibration)

@@ -48,13 +48,13 @@ def read_recordings(args: Arguments) -> RecordedDrives:
     Raises:
         BadInput: names the file or the flag.
     """
-    given = [path for path in (args.rig, args.markers_file, args.vehicle) if path is not None]
+    given = [path for path in (args.rig, args.markers, args.vehicle) if path is not None]
     files = (*(file for path in args.recordings for file in _files(path)), *given)
     return _ros(args, files) if args.topics is not None else _own(args, files)
 
 
 def _own(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
-    flags = dict(zip(_SHARED, (args.rig, args.markers_file, args.vehicle), strict=True))
+    flags = dict(zip(_SHARED, (args.rig, args.markers, args.vehicle), strict=True))
     logs = []
     for path in args.recordings:
         if path.is_dir() or path.suffix != ".mcap":
@@ -64,8 +64,7 @@ def _own(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
     for log in logs[1:]:
         for key in _SHARED:
             if flags[key] is None and log.header.get(key) != logs[0].header.get(key):
-                flag = "--markers-file" if key == "markers" else f"--{key}"
-                problem = f"was driven with another {key} than {logs[0].path}: say which by {flag}"
+                problem = f"was driven with another {key} than {logs[0].path}: say which by --{key}"
                 raise BadInput(log.path, problem)
     setup = DriveSetup.of_header(logs[0].header, logs[0].path)
     setup = replace(setup, **given_files(args, _SHARED))

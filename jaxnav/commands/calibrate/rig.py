@@ -33,9 +33,7 @@ _APART_M = 0.05  # a smaller given distance is not compared
 def run(args: Arguments) -> int:
     """Find cameras and markers, write the files, and print a summary."""
     configure_jax(float64=True)
-    data = read_rig_data(
-        args.recordings, args.rig, args.markers_file, args.marker_size_m, args.family
-    )
+    data = read_rig_data(args.recordings, args.rig, args.markers, args.marker_size_m, args.family)
     names = data.rig.names
     ties = ("places", "drive", *names)
     if args.vehicle_frame not in ties:

@@ -31,10 +31,10 @@ class Doctor(Checked):
 
     rig: QCarRig = None
     markers: QCarMarkers = None
-    vehicle_file: QCarVehicle = None
+    vehicle: QCarVehicle = None
     route: QCarFile = None
     """Start and waypoints."""
-    vehicle: OptionalName = None
+    car: OptionalName = None
     """Vehicle plug-in to open and read: an installed name or module:name."""
     cameras: OptionalName = None
     """Camera plug-in to open and read: an installed name or module:name."""

@@ -26,7 +26,7 @@ def run(args: Doctor) -> int:
     report.examine("compile cache", _cache, patient)
     if args.frame:
         report.examine("picture", _pictures, args, patient)
-    if args.vehicle is not None or args.cameras is not None:
+    if args.car is not None or args.cameras is not None:
         report.examine("plug-ins", _plug_ins, report, args, patient)
     if args.drive is not None:
         report.examine("stamps", _check, "stamps", "stamps", args.drive)
@@ -71,7 +71,7 @@ def _files(report: Report, args: Doctor) -> SimpleNamespace:
     paths = {
         "rig": args.rig or qcar / "rig.yaml",
         "markers": args.markers or qcar / "markers.yaml",
-        "vehicle": args.vehicle_file or qcar / "vehicle.yaml",
+        "vehicle": args.vehicle or qcar / "vehicle.yaml",
         "route": args.route or qcar / "route.yaml",
     }
     for name, path in paths.items():
@@ -163,5 +163,5 @@ def _plug_ins(report: Report, args: Doctor, patient: SimpleNamespace) -> Iterabl
     setup = Setup(
         patient.rig, patient.markers, patient.vehicle, patient.route.start_pose, options=options
     )
-    plug_ins(report, setup, args.vehicle, args.cameras)
+    plug_ins(report, setup, args.car, args.cameras)
     return ()

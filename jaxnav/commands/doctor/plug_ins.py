@@ -60,7 +60,7 @@ def plug_ins(
 
 
 def _open_vehicle(name: str, setup: Setup, opened: list[Vehicle]) -> Iterator[Finding]:
-    plugins.load_factory("--vehicle", plugins.VEHICLES, name)
+    plugins.load_factory("--car", plugins.VEHICLES, name)
     vehicle, problems = _open("opening it", plugins.open_vehicle, name, setup)
     yield from problems
     if problems:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -41,8 +41,8 @@ class Run(Checked):
     is zero throttle: at the last waypoint, on Ctrl-C, Ctrl-Z and any other signal, when data are
     missing for too long, and when anything hangs, fails or is killed. A vehicle that can be moved
     is opened in a small process of its own, which stops it whatever becomes of this one; others,
-    `sim` and `replay` among them, are watched by a thread. `--vehicle sim` is a simulated car in
-    real time; `--vehicle replay --option drive=FILE` is a recorded drive, with its own rig,
+    `sim` and `replay` among them, are watched by a thread. `--car sim` is a simulated car in
+    real time; `--car replay --option drive=FILE` is a recorded drive, with its own rig,
     markers, vehicle and route.
 
     Exit codes: 0 arrived, out of time or recording, 1 stopped by a guard, 2 bad input, 128 plus the
@@ -50,15 +50,15 @@ class Run(Checked):
     148 Ctrl-Z.
     """
 
-    vehicle: str = "sim"
+    car: str = "sim"
     """An installed vehicle (sim, qcar, ros2, replay and those of plug-ins), or MODULE:NAME."""
-    cameras: Annotated[str | None, optional("NAME", "(default: as --vehicle)", str)] = None
+    cameras: Annotated[str | None, optional("NAME", "(default: as --car)", str)] = None
     """Installed cameras (sim, qcar, opencv, replay and those of plug-ins), or MODULE:NAME."""
     option: KeyValues = ()
     """What the vehicle and the cameras are told, e.g. images=true for sim."""
     rig: QCarRig = None
     markers: QCarMarkers = None
-    vehicle_file: QCarVehicle = None
+    vehicle: QCarVehicle = None
     route: QCarFile = None
     """Waypoints, and where a simulated car starts."""
     params: OptionalFile = None
@@ -109,7 +109,7 @@ class Faults(Headless):
     """Faults whose names hold one of these."""
     rig: QCarRig = None
     markers: QCarMarkers = None
-    vehicle_file: QCarVehicle = None
+    vehicle: QCarVehicle = None
     json: OptionalFile = None
     """Write the table into this file too."""
     float64: Float64 = False
@@ -119,12 +119,12 @@ class Faults(Headless):
 class ReplayRecording(Headless):
     """Drive a recorded drive again, or localise a recorded camera rig in every frame.
 
-    A drive is a .mcap of `jaxnav`, or a ROS bag with --topics, --rig, --markers-file, --vehicle and
+    A drive is a .mcap of `jaxnav`, or a ROS bag with --topics, --rig, --markers, --vehicle and
     --route. A .mcap with nothing changed is held against what was recorded, and the exit code is 1
     where it differs.
 
     A rig is localised in 6 degrees of freedom from a folder with bags and their calibration as
-    TagSLAM writes it, a ROS 1 bag with --rig and --markers-file, or an .npz of detections. Where
+    TagSLAM writes it, a ROS 1 bag with --rig and --markers, or an .npz of detections. Where
     there is a reference trajectory the errors against it are measured.
 
     Written to --out: a TUM trajectory, summary.json, and a PNG where something is to be compared.
@@ -134,7 +134,7 @@ class ReplayRecording(Headless):
     """Drive (.mcap), ROS bag, folder of TagSLAM or .npz."""
     rig: OptionalFile = None
     """Cameras, a rig file or a Kalibr camchain, in place of the recording's own."""
-    markers_file: OptionalFile = None
+    markers: OptionalFile = None
     """Marker map in place of the recording's own."""
     vehicle: OptionalFile = None
     """Vehicle in place of the drive's own."""
@@ -148,10 +148,10 @@ class ReplayRecording(Headless):
     """Look for the markers once more in the drive's recorded images."""
     corner_backend: CornerBackend = "aruco"
     """Marker detector, for images. apriltag needs the extra of that name."""
-    record: Switch = False
+    record_anew: Switch = False
     """Record the drive anew, as replay.mcap."""
-    markers: Literal["all", "one-at-a-time"] = "all"
-    """One pose from all markers in view, or every marker alone as in the paper."""
+    one_at_a_time: Switch = False
+    """A pose from every marker alone, as in the paper, instead of one from all in view."""
     selector: Annotated[
         Selector | None,
         tyro.conf.arg(help_behavior_hint="(default: the drive's, or multi-hypothesis)"),
@@ -199,7 +199,7 @@ class Locate(Checked):
     family: str = "tag36h11"
     """Marker family."""
     corner_backend: Detector = "aruco"
-    json: Switch = False
+    as_json: Switch = False
     """Print JSON instead of a table."""
     out: Annotated[Path | None, optional("FILE")] = None
     """Draw the markers and both poses into this file, .png or .jpg, as large as the photograph."""

@@ -20,7 +20,7 @@ def run(args: Faults) -> int:
     trial = Trial(
         load_rig(args.rig or qcar / "rig.yaml"),
         load_markers(args.markers or qcar / "markers.yaml"),
-        load_vehicle(args.vehicle_file or qcar / "vehicle.yaml"),
+        load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
     )
     rows = [row for row in matrix() if not args.only or any(p in row.name for p in args.only)]
     if not rows:

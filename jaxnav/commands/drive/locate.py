@@ -75,7 +75,7 @@ def run(args: Locate) -> int:
     if args.out is not None:
         view = _view(image, camera, args.marker_size_m, detections, located)
         save_figure(photo_with_poses(view), args.out, PHOTO_DPI)
-    print(json.dumps(report, indent=2) if args.json else table(report))
+    print(json.dumps(report, indent=2) if args.as_json else table(report))
     return 0
 
 

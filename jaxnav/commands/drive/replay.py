@@ -42,7 +42,7 @@ def run(args: Arguments) -> int:
     recording = read_recording(
         args.recording,
         None if args.rig is None else load_rig(args.rig),
-        None if args.markers_file is None else load_markers(args.markers_file),
+        None if args.markers is None else load_markers(args.markers),
     )
     if args.limit is not None:
         recording = recording.first(args.limit)
@@ -63,7 +63,7 @@ def run(args: Arguments) -> int:
         result = replay(
             recording,
             make_selector(str(args.selector)),
-            one_at_a_time=args.markers == "one-at-a-time",
+            one_at_a_time=args.one_at_a_time,
             corner_sigma_px=args.corner_sigma_px,
             progress=advance,
             params=params,
@@ -81,7 +81,7 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
     """The content of summary.json: counts, speed and, with a reference, errors and branches."""
     summary: dict[str, Any] = {
         "recording": recording.name,
-        "markers": args.markers,
+        "markers": "one-at-a-time" if args.one_at_a_time else "all",
         "selector": args.selector,
         "params": args.params,
         "frames": len(recording),
@@ -126,7 +126,7 @@ def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None
     stamps_s = recording.stamps_ns / 1e9
     for track in range(result.seen.shape[1]):
         name = "trajectory"
-        if args.markers == "one-at-a-time":
+        if args.one_at_a_time:
             name = f"trajectory_marker_{recording.markers.ids[track]}"
         seen = result.seen[:, track]
         write_tum(args.out / f"{name}.tum", stamps_s[seen], result.T_world_vehicle[seen, track])

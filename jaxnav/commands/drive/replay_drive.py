@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
+from jaxnav.commands.kinds import flag_of
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
@@ -49,9 +50,9 @@ from jaxnav.recording.recorder import Recorder
 
 EXIT_DIFFERS = 1
 _FILES = ("rig", "markers", "vehicle", "route")
-_FOR_DRIVES = ("vehicle", "route", "images", "record")
+_FOR_DRIVES = ("vehicle", "route", "images", "record_anew")
 _OVERRIDES = (
-    *("rig", "markers_file", "vehicle", "route", "params"),
+    *("rig", "markers", "vehicle", "route", "params"),
     *("selector", "corner_sigma_px", "images"),
 )
 
@@ -143,8 +144,8 @@ def is_for(args: Arguments) -> bool:
     """
     path = args.recording
     if args.topics is not None or profile_of(path) == PROFILE:
-        if args.markers != "all":
-            raise BadInput("--markers", f"must be all for a drive, got {args.markers}")
+        if args.one_at_a_time:
+            raise BadInput("--one-at-a-time", "goes with recordings of a rig, not with a drive")
         return True
     if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file():
         if path.exists():
@@ -152,7 +153,7 @@ def is_for(args: Arguments) -> bool:
             raise BadInput("--topics", problem)
     for name in _FOR_DRIVES:
         if getattr(args, name):
-            raise BadInput(f"--{name}", f"is for drives, and {path} is none")
+            raise BadInput(flag_of(name), f"is for drives, and {path} is none")
     return False
 
 
@@ -242,7 +243,7 @@ def _replayed(
     outcomes = replay_drive(inputs, setup, step_folder())
     with ExitStack() as closing:
         recorder = None
-        if args.record:
+        if args.record_anew:
             path = args.out / "replay.mcap"
             beside = closing.enter_context(atomic_path(path))
             # No car waits for this replay, so that the queue may hold every message.
@@ -263,7 +264,7 @@ def _replayed(
         if recorder is not None:
             recorder.close(timeout_s=60.0)
             if recorder.failed is not None:
-                raise BadInput("--record", recorder.failed.replace(str(beside), str(path)))
+                raise BadInput("--record-anew", recorder.failed.replace(str(beside), str(path)))
     columns: list[Any] = list(zip(*rows, strict=True))
     now_ns, poses, Ts, located, decided, health, faults, rejects, restarts, reasons = columns
     return Track(

@@ -90,8 +90,8 @@ def run(args: Run, signals: Signals) -> int:
 def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     """Read all files and find all plug-ins before anything is compiled or moves, so that bad input
     is found first."""
-    factory = plugins.load_factory("--vehicle", plugins.VEHICLES, args.vehicle)
-    plugins.load_factory("--cameras", plugins.CAMERAS, args.cameras or args.vehicle)
+    factory = plugins.load_factory("--car", plugins.VEHICLES, args.car)
+    plugins.load_factory("--cameras", plugins.CAMERAS, args.cameras or args.car)
     own = factory.own_files(options) if isinstance(factory, HasOwnFiles) else None
     qcar = calib_dir() / "qcar"
 
@@ -103,7 +103,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     return DriveSetup(
         rig=chosen("rig", args.rig, load_rig),
         markers=chosen("markers", args.markers, load_markers),
-        vehicle=chosen("vehicle", args.vehicle_file, load_vehicle),
+        vehicle=chosen("vehicle", args.vehicle, load_vehicle),
         route=chosen("route", args.route, load_route),
         selector=args.selector,
         float64=args.float64,
@@ -113,14 +113,14 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
 
 def _guarding(args: Run) -> GuardProcess | None:
     """The process that will own the vehicle; None where its plug-in must stay in this one."""
-    factory = plugins.load_factory("--vehicle", plugins.VEHICLES, args.vehicle)
+    factory = plugins.load_factory("--car", plugins.VEHICLES, args.car)
     if isinstance(factory, SharesProcess) and factory.shares_process:
         return None
     try:
-        return GuardProcess(args.vehicle)
+        return GuardProcess(args.car)
     except OSError as error:
         problem = f"the guard's process can't be started: {error.strerror or error}"
-        raise BadInput(f"--vehicle {args.vehicle}", problem) from None
+        raise BadInput(f"--car {args.car}", problem) from None
 
 
 def _searches(args: Run, setup: DriveSetup) -> list[Search]:
@@ -176,7 +176,7 @@ class _Drive:
             closing.callback(self._close, vehicle, guard)
             signals.on_signal(guard.trip)
             signals.check()
-            cameras = plugins.open_cameras(args.cameras or args.vehicle, self._setup, vehicle)
+            cameras = plugins.open_cameras(args.cameras or args.car, self._setup, vehicle)
             self.eyes = Eyes(cameras, searches, guard, workers=max(1, os.cpu_count() or 1))
             closing.callback(self.eyes.close)
             # The guard trips before the eyes are closed, which their threads may delay.
@@ -197,9 +197,9 @@ class _Drive:
                 _say(args, f"guard: {self.kept_by}")
                 return moved, guard
             why = self._guarding.stays or why
-        self.kept_by = f"a thread, {args.vehicle} can't be moved to another process: {why}"
+        self.kept_by = f"a thread, {args.car} can't be moved to another process: {why}"
         _say(args, f"guard: {self.kept_by}")
-        vehicle = plugins.open_vehicle(args.vehicle, self._setup)
+        vehicle = plugins.open_vehicle(args.car, self._setup)
         corrections = Corrections.of(self._setup.vehicle)
         return vehicle, Guard(vehicle, limits, args.timeout_s, corrections=corrections)
 

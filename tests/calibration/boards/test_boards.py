@@ -192,7 +192,7 @@ def test_the_largest_fits_and_the_next_does_not(board: Board, paper_mm: tuple) -
 PRINTS = {
     "charuco": "charuco",
     "aprilgrid": "aprilgrid --landscape",
-    "chessboard": "chessboard --size-mm 21",
+    "chessboard": "chessboard --size-m 0.021",
     "marker": "marker --first-id 7",
 }
 
@@ -243,8 +243,8 @@ def test_the_rulers_are_true_to_scale(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ("charuco --size-mm 60", "28 mm would fit"),
-        ("chessboard --columns 10 --rows 7 --size-mm 22", "or the paper turned"),
+        ("charuco --size-m 0.06", "28 mm would fit"),
+        ("chessboard --columns 10 --rows 7 --size-m 0.022", "or the paper turned"),
         ("charuco --family 4x5", "--family: must be one of tag16h5"),
         ("marker --columns 3", "--columns: and --rows go with boards"),
         ("charuco --paper b5", "--paper: must be a4, a3, letter or WxH"),

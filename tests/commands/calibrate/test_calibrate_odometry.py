@@ -121,7 +121,7 @@ def test_a_marker_that_is_elsewhere_is_not_blamed_on_the_odometry(capsys, tmp_pa
     path = tmp_path / "markers.yaml"
     markers = worlds.paper_markers()
     save_markers(path, dataclasses.replace(markers, ids=(7,)))
-    line = told(capsys, str(recording), "--markers-file", str(path))
+    line = told(capsys, str(recording), "--markers", str(path))
     assert "eights.mcap" in line
     assert "seen 0 times" in line
 

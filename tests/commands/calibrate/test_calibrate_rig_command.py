@@ -157,7 +157,7 @@ def test_what_nobody_saw_stays_in_the_map_and_recordings_follow_each_other(
     far = np.concatenate([room[:2], room[:1]])
     markers = rig_rooms.as_map(far)
     save_markers(tmp_path / "map.yaml", dataclasses.replace(markers, ids=(0, 1, 99)))
-    words = ("--rig", drive / "true.yaml", "--markers-file", tmp_path / "map.yaml")
+    words = ("--rig", drive / "true.yaml", "--markers", tmp_path / "map.yaml")
     recording = drive / "drive.mcap"
     code, _, err = told(capsys, "markers", recording, recording, *words, "--out", tmp_path)
     assert (code, err) == (0, "")
@@ -174,7 +174,7 @@ def test_check_names_the_marker_that_was_entered_wrongly(drive, tmp_path, capsys
     moved = room.copy()
     moved[3, :3, 3] += [0.69, 0, 0]
     save_markers(tmp_path / "map.yaml", rig_rooms.as_map(moved))
-    words = ("--rig", drive / "true.yaml", "--markers-file", tmp_path / "map.yaml")
+    words = ("--rig", drive / "true.yaml", "--markers", tmp_path / "map.yaml")
     code, out, err = told(capsys, "check", drive / "drive.mcap", *words, "--out", tmp_path)
     assert (code, err) == (1, "")
     assert "7 of 8 markers agree" in out
@@ -185,7 +185,7 @@ def test_check_names_the_marker_that_was_entered_wrongly(drive, tmp_path, capsys
 
 
 def test_check_is_content_with_a_right_map(drive, tmp_path, capsys):
-    words = ("--rig", drive / "true.yaml", "--markers-file", drive / "all.yaml")
+    words = ("--rig", drive / "true.yaml", "--markers", drive / "all.yaml")
     code, out, err = told(capsys, "check", drive / "drive.mcap", *words, "--out", tmp_path)
     assert (code, err) == (0, "")
     assert "all markers that could be linked are where the map says" in out
@@ -204,7 +204,7 @@ def ten_times(folder: Path, room: np.ndarray, index: int | None) -> Path:
 
 def test_a_size_ten_times_too_large_is_refused(drive, tmp_path, capsys, room):
     one = ten_times(tmp_path, room, 5)
-    words = ("--markers-file", one, "--out", tmp_path / "out")
+    words = ("--markers", one, "--out", tmp_path / "out")
     code, _, err = told(
         capsys, "markers", drive / "drive.mcap", "--rig", drive / "true.yaml", *words
     )
@@ -218,7 +218,7 @@ def test_a_size_ten_times_too_large_is_refused(drive, tmp_path, capsys, room):
 def test_all_sizes_ten_times_too_large_are_refused(drive, tmp_path, capsys, room):
     one = tmp_path / "one.yaml"
     save_markers(one, rig_rooms.as_map(room[:1], size_m=1.72))
-    words = ("--markers-file", one, "--out", tmp_path / "out")
+    words = ("--markers", one, "--out", tmp_path / "out")
     code, _, err = told(capsys, "rig", drive / "drive.mcap", *words)
     assert code == 2
     assert "times as far apart as the rig says: is the size of the markers right" in err

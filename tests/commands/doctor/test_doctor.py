@@ -51,8 +51,8 @@ def test_the_qcars_own_files_are_in_order(capsys, tmp_path):
 def test_an_unreadable_file_is_exit_code_2_and_hides_nothing(capsys, tmp_path):
     (tmp_path / "rig.yaml").write_text("cameras: [")
     (tmp_path / "vehicle.yaml").write_text("wheelbase_m: 0\n")
-    bad = ["--rig", str(tmp_path / "rig.yaml"), "--vehicle-file", str(tmp_path / "vehicle.yaml")]
-    bad += ["--route", str(tmp_path / "gone.yaml"), "--frame", "front=x.png", "--vehicle", "sim"]
+    bad = ["--rig", str(tmp_path / "rig.yaml"), "--vehicle", str(tmp_path / "vehicle.yaml")]
+    bad += ["--route", str(tmp_path / "gone.yaml"), "--frame", "front=x.png", "--car", "sim"]
     assert cli.main(["doctor", *bad]) == cli.EXIT_BAD_INPUT
     out, err = capsys.readouterr()
     assert err == ""
@@ -129,7 +129,7 @@ def test_plug_ins_get_their_options(capsys, monkeypatch):
     monkeypatch.setattr(
         f"{CHECKS}.plug_ins.plug_ins", lambda report, setup, *names: told.append((setup, names))
     )
-    arguments = "--vehicle car:open --cameras eyes:open --option a=1 --option b=x=y"
+    arguments = "--car car:open --cameras eyes:open --option a=1 --option b=x=y"
     assert cli.main(["doctor", *arguments.split()]) == 0
     ((setup, names),) = told
     assert names == ("car:open", "eyes:open")

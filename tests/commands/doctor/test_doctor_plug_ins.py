@@ -122,7 +122,7 @@ def test_cameras_alone_get_a_vehicle_that_stands(module):
 def test_names_that_lead_nowhere_are_bad_usage(module, vehicle, cameras):
     report = examine(vehicle, cameras)
     assert report.exit_code == EXIT_UNREADABLE
-    assert report.findings[0].what.startswith("--vehicle" if vehicle else "--cameras")
+    assert report.findings[0].what.startswith("--car" if vehicle else "--cameras")
 
 
 @pytest.mark.parametrize(

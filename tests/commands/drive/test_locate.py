@@ -49,7 +49,7 @@ CAMERA = ("--camera", QCAR / "rig.yaml", "--camera-name", "front", "--marker-siz
 
 def test_both_poses_of_a_rendered_marker(rendered, tmp_path, capsys):
     path, T_camera_marker = rendered
-    assert locate(path, *CAMERA, "--json", "--out", tmp_path / "drawn.png") == 0
+    assert locate(path, *CAMERA, "--as-json", "--out", tmp_path / "drawn.png") == 0
     report = json.loads(capsys.readouterr().out)
     (marker,) = report["markers"]
     assert marker["id"] == 0
@@ -85,7 +85,7 @@ def test_no_marker_in_view_is_a_result(tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "grey.png"), np.full((410, 820), 120, np.uint8))
     assert locate(tmp_path / "grey.png", *CAMERA) == 0
     assert "no marker of tag36h11 in view" in capsys.readouterr().out
-    assert locate(tmp_path / "grey.png", *CAMERA, "--json") == 0
+    assert locate(tmp_path / "grey.png", *CAMERA, "--as-json") == 0
     assert json.loads(capsys.readouterr().out)["markers"] == []
 
 
@@ -95,7 +95,7 @@ def test_every_tag_that_either_detector_finds_is_found_once(data_dir, tmp_path, 
         "cam0: {camera_model: pinhole, intrinsics: [700, 700, 399, 266], distortion_model: none,"
         " distortion_coeffs: [], resolution: [799, 533]}\n"
     )
-    assert locate(photo, "--camera", tmp_path / "camera.yaml", *CAMERA[4:], "--json") == 0
+    assert locate(photo, "--camera", tmp_path / "camera.yaml", *CAMERA[4:], "--as-json") == 0
     markers = json.loads(capsys.readouterr().out)["markers"]
     found_px = np.array([np.mean(marker["corners_px"], axis=0) for marker in markers])
     apart_px = np.linalg.norm(found_px[:, None] - found_px, axis=2) + 1e9 * np.eye(len(found_px))
@@ -116,7 +116,7 @@ def test_a_real_photograph(data_dir, tmp_path, capsys):
         " distortion_coeffs: [], resolution: [799, 533]}\n"
     )
     photo = data_dir / "apriltag_photos" / "34139872896_defdb2f8d9_c.jpg"
-    args = ("--camera", tmp_path / "camera.yaml", "--marker-size-m", "0.2", "--json")
+    args = ("--camera", tmp_path / "camera.yaml", "--marker-size-m", "0.2", "--as-json")
     assert locate(photo, *args) == 0
     markers = json.loads(capsys.readouterr().out)["markers"]
     assert len(markers) >= 10
@@ -171,7 +171,7 @@ def notes_of(capsys) -> str:
 def test_what_does_not_add_up_is_noted(rendered, capsys, changed, note):
     given = dict(zip(CAMERA[::2], CAMERA[1::2], strict=True))
     given |= dict(zip(changed[::2], changed[1::2], strict=True))
-    assert locate(rendered[0], *(word for pair in given.items() for word in pair), "--json") == 0
+    assert locate(rendered[0], *(word for pair in given.items() for word in pair), "--as-json") == 0
     assert note in notes_of(capsys)
 
 
@@ -183,7 +183,7 @@ def with_lens(tmp_path, focal: float, **sigma) -> tuple:
     if sigma:
         rig["cameras"][0]["sigma"] = sigma
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
-    return ("--camera", tmp_path / "rig.yaml", "--marker-size-m", "0.172", "--json")
+    return ("--camera", tmp_path / "rig.yaml", "--marker-size-m", "0.172", "--as-json")
 
 
 def test_an_unsure_lens_makes_the_position_unsure(rendered, tmp_path, capsys):
@@ -255,7 +255,7 @@ def test_a_picture_of_any_orientation_gives_the_pose_of_its_sensor(
         image = image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)  # the only way to see it mirrored
     exif[0x0112] = orientation
     image.save(tmp_path / "phone.jpg", quality=98, exif=exif)
-    assert locate(tmp_path / "phone.jpg", *CAMERA, "--json") == 0
+    assert locate(tmp_path / "phone.jpg", *CAMERA, "--as-json") == 0
     report = json.loads(capsys.readouterr().out)
     best = np.array(report["markers"][0]["poses"][0]["T_camera_marker"])
     truth = np.asarray(T_camera_marker.as_matrix())
@@ -280,5 +280,5 @@ def test_a_marker_at_the_border_is_found(tmp_path, capsys):
     marker = np.kron(30 + 190 * cells, np.ones((8, 8))).astype(np.uint8)
     image[2 : 2 + len(marker), 200 : 200 + marker.shape[1]] = marker
     cv2.imwrite(str(tmp_path / "border.png"), cv2.GaussianBlur(image, (0, 0), 0.7))
-    assert locate(tmp_path / "border.png", *CAMERA, "--json") == 0
+    assert locate(tmp_path / "border.png", *CAMERA, "--as-json") == 0
     assert len(json.loads(capsys.readouterr().out)["markers"]) == 1

@@ -54,7 +54,7 @@ class Workplace:
     def driving(self, log: Path, record: Path) -> list[str]:
         """With a watchdog that is patient with a busy machine, and parameters of its own."""
         return self.command(
-            *("--vehicle", recorded_vehicle.NAME, "--cameras", "sim", "--option", f"log={log}"),
+            *("--car", recorded_vehicle.NAME, "--cameras", "sim", "--option", f"log={log}"),
             *("--route", self.folder / "route.yaml", "--record", record),
             *("--params", self.folder / "params.yaml"),
             *("--headless", "--timeout-s", 3),
@@ -63,7 +63,7 @@ class Workplace:
     def moved(self, log: Path, record: Path) -> list[str]:
         """The same, of a car in the guard's process."""
         return self.command(
-            *("--vehicle", plain_car.NAME, "--cameras", plain_cameras.NAME),
+            *("--car", plain_car.NAME, "--cameras", plain_cameras.NAME),
             *("--option", f"log={log}", "--route", self.folder / "route.yaml"),
             *("--record", record, "--timeout-s", 3),
         )
@@ -355,7 +355,7 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["--vehicle", "bicycle"], "--vehicle: there is no 'bicycle': expected qcar, "),
+        (["--car", "bicycle"], "--car: there is no 'bicycle': expected qcar, "),
         (["--option", "images"], "--option: expected KEY=VALUE, got 'images'"),
         (["--option", "a=1", "--option", "a=2"], "--option: a is given twice"),
         (["--record", "nowhere/drive.mcap"], "nowhere/drive.mcap: can't be written: no such file"),
@@ -370,7 +370,7 @@ def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     write_params("p.yaml", {"motion.vision_floor": [1.0] * 6})
     monkeypatch.setattr("jaxnav.commands.drive.run.configure_jax", lambda **_: None)
-    vehicle = [] if "--vehicle" in arguments else ["--vehicle", recorded_vehicle.NAME]
+    vehicle = [] if "--car" in arguments else ["--car", recorded_vehicle.NAME]
     log = tmp_path / "told"
     options = [*vehicle, "--cameras", "sim", "--option", f"log={log}", "--headless"]
     assert main(["run", *options, *arguments]) == EXIT_BAD_INPUT
