@@ -32,6 +32,8 @@ class Bank(eqx.Module):
     initialised: Bool[Array, "*K"]
     rejections: Rejections
     number: Int[Array, "*K"]  # identity of a hypothesis, kept when it changes its slot
+    # Velocity, in the vehicle's axes, less its mean over the last moments; zero without odometry.
+    velocity_lead: Float[Array, "*K m"]
 
 
 def empty_bank(
@@ -50,6 +52,7 @@ def empty_bank(
             jnp.zeros(hypotheses, mean.dtype),
             jnp.zeros(hypotheses, mean.dtype),
         ),
+        velocity_lead=jnp.zeros((hypotheses, pose_states), mean.dtype),
     )
 
 

@@ -21,6 +21,7 @@ from jaxnav.belief.sensor_errors import (
     SENSORS_END,
     SIX,
     from_seen,
+    lead_after,
     read_velocity,
     seen_pose,
     seen_slope,
@@ -33,11 +34,12 @@ from jaxnav.models.geometry import (
     T_world_vehicle_from_planar,
     planar_covariance,
     planar_from_T_world_vehicle,
+    planar_rotation,
     safe_norm,
     wrap_angle,
 )
 from jaxnav.models.rig import CameraRig
-from jaxnav.numerics.small_matrices import cholesky, log_det, product, sandwich
+from jaxnav.numerics.small_matrices import cholesky, log_det, matvec, product, sandwich
 from jaxnav.pose.observation import Observation
 
 
@@ -98,16 +100,29 @@ class BicycleKalman(Motion):
     def predict(self, bank: Bank, obs: Observation) -> Bank:
         """x = A x, P = A P A' + Q (Eq. 9), then the odometry (Eqs. 10 and 11).
 
-        Speed and steering change at an unknown instant inside the interval: with the difference d
-        (3,) between the velocity measured now and the one believed before, the pose gets the
-        noise D D', D = d dt / sqrt(12), the standard deviation of d t for a uniform t in (0, dt).
+        Speed and steering change at an unknown instant t inside the interval dt: with the
+        difference d (3,) between the velocity read now and the one believed before, velocity and
+        pose get the second moments of a step d and of d t for a uniform t,
+
+            [dt^2 / 3, dt / 2; dt / 2, 1] (x) d d'.
+
+        So a step is followed at once, however short the interval is, and leaves to the pose half of
+        d dt, and a standard deviation of d dt / sqrt(12).
 
         A hypothesis that the gate has contradicted too often or too long is forgotten.
         """
-        mean, covariance = jax.vmap(
-            lambda x, P: self._with_odometry(*self._later(x, P, obs), obs, obs.dt_s)
-        )(bank.mean, bank.covariance)
-        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, (mean, covariance))
+        dt_s = jnp.asarray(obs.dt_s, bank.mean.dtype)
+
+        def one(mean: Array, P: Array, lead: Array) -> tuple[Array, Array, Array]:
+            later, P = self._with_odometry(*self._later(mean, P, obs), obs, dt_s)
+            change = _in_body(later) - _in_body(mean)
+            return later, P, lead_after(lead, change, dt_s)
+
+        predicted = eqx.tree_at(
+            lambda b: (b.mean, b.covariance, b.velocity_lead),
+            bank,
+            jax.vmap(one)(bank.mean, bank.covariance, bank.velocity_lead),
+        )
         return forget_lost(predicted, self.lost(bank), obs.dt_s)
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
@@ -116,18 +131,18 @@ class BicycleKalman(Motion):
 
     def poses(self, bank: Bank) -> PoseBelief:
         """Poses level on the ground (Eq. 12); height, roll and pitch are nuisances with a sigma."""
-        seen = jax.vmap(seen_pose)(bank.mean)
+        seen = jax.vmap(seen_pose)(bank.mean, bank.velocity_lead)
         dtype = bank.mean.dtype
         freedom = jnp.asarray(ON_GROUND, dtype)
         tilt = [self.height_sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad]
         nuisance = jnp.asarray(OFF_GROUND, dtype) * jnp.asarray(tilt, dtype)[None]
 
-        def in_body(mean: Array, P: Array) -> tuple[Array, Array]:
-            H = product(freedom, product(_turn(-seen_pose(mean)[2]), seen_slope(mean)))
+        def in_body(mean: Array, P: Array, lead: Array, seen: Array) -> tuple[Array, Array]:
+            H = product(freedom, product(planar_rotation(-seen[2]), seen_slope(mean, lead)))
             of_pose = product(H, P)
             return kalman.symmetrise(product(of_pose, H.T)), of_pose[:, SENSORS_END:]
 
-        covariance, cross = jax.vmap(in_body)(bank.mean, bank.covariance)
+        covariance, cross = jax.vmap(in_body)(bank.mean, bank.covariance, bank.velocity_lead, seen)
         errors = None
         if self.camera_states:
             of_cameras = bank.covariance[:, SENSORS_END:, SENSORS_END:]
@@ -153,21 +168,22 @@ class BicycleKalman(Motion):
         fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
         log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
         R = R + kalman.as_covariance(self.vision_floor)
-        innovation = self.difference(pose, seen_pose(bank.mean))
-        correction, posterior, S = kalman.update(P, innovation, seen_slope(bank.mean), R)
+        innovation = self.difference(pose, seen_pose(bank.mean, bank.velocity_lead))
+        slope = seen_slope(bank.mean, bank.velocity_lead)
+        correction, posterior, S = kalman.update(P, innovation, slope, R)
         return Offer(
             kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
-            first=self._first(pose, R, obs, None),
+            first=self._first(pose, R, bank.velocity_lead, obs, None),
             posterior=(self.moved(bank.mean, correction), posterior),
         )
 
     def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has corrected its pose, in 3 dof."""
-        T = measured.T_world_vehicle
-        pose, seen = planar_from_T_world_vehicle(T), seen_pose(bank.mean)
-        in_body = product(_turn(-seen[2]), seen_slope(bank.mean))
+        T, lead = measured.T_world_vehicle, bank.velocity_lead
+        pose, seen = planar_from_T_world_vehicle(T), seen_pose(bank.mean, lead)
+        in_body = product(planar_rotation(-seen[2]), seen_slope(bank.mean, lead))
         predicted = kalman.replace_first(bank.covariance, in_body)
         freedom = jnp.asarray(ON_GROUND, pose.dtype)
         correction, P = follow_pose(
@@ -178,16 +194,16 @@ class BicycleKalman(Motion):
             self.states,
         )
         P = kalman.replace_first(
-            P, jnp.eye(3, P.shape[0], dtype=P.dtype).at[:, :3].set(_turn(pose[2]))
+            P, jnp.eye(3, P.shape[0], dtype=P.dtype).at[:, :3].set(planar_rotation(pose[2]))
         )
-        posterior = self._at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P)
+        posterior = _at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P, lead)
         started = planar_covariance(T, measured.covariance)
         return Offer(
             measured.innovation,
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
-            first=self._first(pose, started, obs, measured.errors),
+            first=self._first(pose, started, lead, obs, measured.errors),
             posterior=posterior,
         )
 
@@ -227,7 +243,12 @@ class BicycleKalman(Motion):
         return Planar(mean[:3], covariance[:3, :3], mean[3:SIX], covariance[3:SIX, 3:SIX])
 
     def _first(
-        self, pose: Array, covariance: Array, obs: Observation, errors: ErrorsPosterior | None
+        self,
+        pose: Array,
+        covariance: Array,
+        lead: Array,
+        obs: Observation,
+        errors: ErrorsPosterior | None,
     ) -> Moments:
         """A hypothesis that starts at a pose, moving as measured, with errors as likely as not."""
         velocity = jnp.asarray(self.initial_velocity_sigma, pose.dtype) ** 2
@@ -235,16 +256,11 @@ class BicycleKalman(Motion):
         P = jnp.diag(variance).at[:3, :3].set(covariance)
         if errors is not None:
             # d q / d (x, y, psi) in the world, of the errors in view
-            slope = product(errors.slope, _turn(-pose[2]))
+            slope = product(errors.slope, planar_rotation(-pose[2]))
             cross = product(covariance, product(slope.T, errors.rows))
             P = P.at[:3, SENSORS_END:].set(cross).at[SENSORS_END:, :3].set(cross.T)
         start = jnp.append(pose, jnp.zeros_like(variance[3:]))
-        return self._at_stamp(*self._with_odometry(start, P, obs))
-
-    def _at_stamp(self, seen: Array, P: Array) -> Moments:
-        """A state at its stamp, of one whose first three entries are the seen pose."""
-        mean, slope = from_seen(seen)
-        return mean.at[2].set(wrap_angle(mean[2])), kalman.replace_first(P, slope)
+        return _at_stamp(*self._with_odometry(start, P, obs), lead)
 
     def _error_variance(self) -> Array:
         """Variances (p,) of the errors that the state holds behind pose and velocity."""
@@ -264,7 +280,7 @@ class BicycleKalman(Motion):
         """The state `dt_s` later (Eq. 9)."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         A = jnp.eye(3, mean.shape[0], dtype=dtype).at[:, 3:SIX].set(dt_s * jnp.eye(3, dtype=dtype))
-        density = sandwich(_turn(mean[2]), kalman.as_matrix(self.acceleration_density))
+        density = sandwich(planar_rotation(mean[2]), kalman.as_matrix(self.acceleration_density))
         Q = kalman.white_acceleration(density, dt_s).astype(dtype)
         P = kalman.replace_first(P, A).at[:SIX, :SIX].add(Q)
         pose = mean[:3] + dt_s * mean[3:SIX]
@@ -294,11 +310,14 @@ class BicycleKalman(Motion):
             .at[:, SIX : SIX + read.by_errors.shape[1]]
             .set(-read.by_errors)
         )
-        R = sandwich(_turn(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(dtype)
+        R = sandwich(planar_rotation(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(
+            dtype
+        )
         present = jnp.asarray(obs.has_odometry, dtype)
         change = read.velocity - mean[3:SIX]
-        D = present * change * (jnp.asarray(since_s, dtype) / np.sqrt(12))
-        P = P.at[:3, :3].add(D[:, None] * D[None])
+        step, dt_s = present * change, jnp.asarray(since_s, dtype)
+        moments = jnp.stack([dt_s**2 / 3, dt_s / 2, dt_s / 2, dt_s * 0 + 1]).reshape(2, 2)
+        P = P.at[:SIX, :SIX].add(jnp.kron(moments, step[:, None] * step[None]))
         seen = kalman.hide_rows(change, H, R, jnp.full(3, present))
         correction, after, _ = kalman.update(P, *seen)
         return self.considered(jnp.asarray(False), (mean, P), (self.moved(mean, correction), after))
@@ -311,8 +330,12 @@ def planar_poses(
     return bank.mean[:, :3], bank.covariance[:, :3, :3]
 
 
-def _turn(angle_rad: Array) -> Array:
-    """Rotation (3, 3) of (x, y, psi) about z."""
-    c, s, zero, one = jnp.cos(angle_rad), jnp.sin(angle_rad), angle_rad * 0, angle_rad * 0 + 1
-    rows = ([c, -s, zero], [s, c, zero], [zero, zero, one])
-    return jnp.stack([jnp.stack(row) for row in rows])
+def _at_stamp(seen: Array, P: Array, lead: Array) -> Moments:
+    """A state at its stamp, of one whose first three entries are the seen pose."""
+    mean, slope = from_seen(seen, lead)
+    return mean.at[2].set(wrap_angle(mean[2])), kalman.replace_first(P, slope)
+
+
+def _in_body(mean: Array) -> Array:
+    """The velocity in the vehicle's own axes."""
+    return matvec(planar_rotation(-mean[2]), mean[3:SIX])

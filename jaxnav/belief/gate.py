@@ -56,6 +56,7 @@ def apply_gate(
             bank.initialised | valid,
             cleared(_and_another(bank.rejections, offered, offer.innovation), agrees | starts),
             bank.number,
+            bank.velocity_lead,
         ),
         jnp.where(offered, nis, 0),
         accepted | starts,

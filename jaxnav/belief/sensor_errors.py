@@ -3,7 +3,13 @@
     p = (s, k, g, o, tau)
 
 The odometer's true speed is (1 + s + k) times the one that it reads, the true steering angle is
-(1 + g) read + o, rad, and corners show the vehicle where it was tau s before their stamp. The slip
+(1 + g) read + o, rad, and corners show the vehicle where it was tau s before their stamp:
+
+    seen = pose - tau (v - c l),    c = clip(tau / 2 T, 0, 1)
+
+with the velocity v and its lead l over the mean of the last moments, which are T = 25 ms old on
+average. A step of the speed or the steering is not seen until tau later. Without l a filter that
+reads it at once would learn from each step that the corners are less late than they are. The slip
 s comes and goes with the way: a first-order Gauss-Markov process. The other four are constant.
 
 While the branch is open the five are only considered (Schmidt): they widen the covariance of pose
@@ -23,12 +29,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnav.models import bicycle
+from jaxnav.models.geometry import planar_rotation
+from jaxnav.numerics.small_matrices import matvec
 
 SIX = 6  # states before the errors: pose and velocity
 SLIP = SIX
 LEARNT = SLIP + 1  # the errors from here on are constant
 SENSORS_END = LEARNT + 4  # the errors of cameras come behind those of sensors
 _DELAY = SENSORS_END - 1
+MEMORY_S = 0.025  # T
 
 
 class ReadVelocity(NamedTuple):
@@ -92,28 +101,55 @@ def slipped(
     return mean.at[SLIP].multiply(kept), P.at[SLIP, SLIP].add((1 - kept**2) * sigma**2)
 
 
-def seen_pose(mean: Float[Array, " n"]) -> Float[Array, " 3"]:
-    """Where the corners show the vehicle: pose - tau velocity."""
-    return mean[:3] if mean.shape[0] == SIX else mean[:3] - mean[_DELAY] * mean[3:SIX]
+def lead_after(
+    lead: Float[Array, " 3"], change: Float[Array, " 3"], dt_s: Float[Array, ""]
+) -> Float[Array, " 3"]:
+    """The lead of a velocity over its exponential mean, after an interval of constant acceleration.
+
+        l' = f l + (1 - f) (T / dt) change,    f = exp(-dt / T)
+
+    Args:
+        change: of the velocity in the interval.
+    """
+    intervals = jnp.maximum(dt_s / MEMORY_S, jnp.finfo(lead.dtype).eps)
+    faded = -jnp.expm1(-intervals)
+    return (1 - faded) * lead + faded / intervals * change
 
 
-def seen_slope(mean: Float[Array, " n"]) -> Float[Array, "3 n"]:
-    """Derivative of `seen_pose` by the state."""
-    return _sheared(mean, -1)
+def seen_pose(mean: Float[Array, " n"], lead: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """Where the corners show the vehicle."""
+    return mean[:3] if mean.shape[0] == SIX else mean[:3] - _way_since(mean, lead)
 
 
-def from_seen(mean: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, "3 n"]]:
+def seen_slope(mean: Float[Array, " n"], lead: Float[Array, " 3"]) -> Float[Array, "3 n"]:
+    """Derivative of `seen_pose` by the state, but for the lead that turns with the heading."""
+    return _sheared(mean, lead, -1)
+
+
+def from_seen(
+    mean: Float[Array, " n"], lead: Float[Array, " 3"]
+) -> tuple[Float[Array, " n"], Float[Array, "3 n"]]:
     """The state of one whose first three entries are the seen pose, and their derivative by it."""
     if mean.shape[0] == SIX:
-        return mean, _sheared(mean, 1)
-    return mean.at[:3].add(mean[_DELAY] * mean[3:SIX]), _sheared(mean, 1)
+        return mean, _sheared(mean, lead, 1)
+    return mean.at[:3].add(_way_since(mean, lead)), _sheared(mean, lead, 1)
 
 
-def _sheared(mean: Array, sign: int) -> Array:
-    """Derivative of x + sign tau v."""
+def _way_since(mean: Array, lead: Array) -> Array:
+    """tau (v - c l), by which the vehicle has moved since it was seen."""
+    tau = mean[_DELAY]
+    part = jnp.clip(tau / (2 * MEMORY_S), 0, 1)
+    return tau * (mean[3:SIX] - part * matvec(planar_rotation(mean[2]), lead))
+
+
+def _sheared(mean: Array, lead: Array, sign: int) -> Array:
+    """Derivative of pose + sign tau (v - c l)."""
     slope = jnp.eye(3, mean.shape[0], dtype=mean.dtype)
     if mean.shape[0] == SIX:
         return slope
     tau = mean[_DELAY]
+    # d (tau c) / d tau
+    grown = jnp.where(tau < 2 * MEMORY_S, jnp.maximum(tau, 0) / MEMORY_S, 1)
+    by_delay = mean[3:SIX] - grown * matvec(planar_rotation(mean[2]), lead)
     slope = slope.at[:, 3:SIX].set(sign * tau * jnp.eye(3, dtype=mean.dtype))
-    return slope.at[:, _DELAY].set(sign * mean[3:SIX])
+    return slope.at[:, _DELAY].set(sign * by_delay)

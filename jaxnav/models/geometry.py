@@ -44,6 +44,13 @@ def T_world_vehicle_from_planar(pose: Float[Array, "*batch 3"]) -> jaxlie.SE3:
     )
 
 
+def planar_rotation(angle_rad: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rotation of (x, y, psi) about z."""
+    c, s, zero, one = jnp.cos(angle_rad), jnp.sin(angle_rad), angle_rad * 0, angle_rad * 0 + 1
+    rows = ([c, -s, zero], [s, c, zero], [zero, zero, one])
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
 def planar_from_T_world_vehicle(T_world_vehicle: jaxlie.SE3) -> Float[Array, "*batch 3"]:
     """The planar part (x_m, y_m, psi_rad) of a pose: position on the ground and heading.
 

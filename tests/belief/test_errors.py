@@ -340,6 +340,102 @@ def test_the_pose_follows_where_wheels_spin(slip_sigma):
         assert behind_m > 0.03
 
 
+def steered(rng: np.random.Generator, duration_s: float, by_frame: bool):
+    """Planar poses (N, 3) and steering (N,), rad, each ms at 0.35 m/s.
+
+    A servo of 5 rad/s follows targets that change at random times, or 25 ms after each frame.
+    """
+    times_s = np.arange(0, duration_s, 1e-3)
+    if by_frame:
+        walk = np.zeros(int(duration_s * 15) + 2)
+        for k in range(1, len(walk)):
+            walk[k] = np.clip(0.95 * walk[k - 1] + 0.1 * rng.normal(), -0.45, 0.45)
+        target = walk[np.clip((times_s - FIRST_S - 0.025) * 15, 0, None).astype(int)]
+    else:
+        steps = np.cumsum(rng.uniform(0.3, 1.2, int(duration_s / 0.3)))
+        target = rng.uniform(-0.4, 0.4, len(steps) + 1)[np.searchsorted(steps, times_s)]
+    steering = np.zeros_like(target)
+    for k in range(1, len(target)):
+        steering[k] = steering[k - 1] + np.clip(target[k] - steering[k - 1], -0.005, 0.005)
+    beta = np.arctan(np.tan(steering) / 2)
+    rate = 0.35 * np.cos(beta) * np.tan(steering) / float(worlds.qcar().wheelbase_m)
+    psi = np.cumsum(rate) * 1e-3
+    velocity = 0.35 * np.stack([np.cos(psi + beta), np.sin(psi + beta)], axis=1)
+    return np.column_stack([np.cumsum(velocity, axis=0) * 1e-3, psi]), steering
+
+
+FIRST_S = 0.25  # of the frames, where the poses are zero
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "odometry_hz", "by_frame", "most_z2", "most_off_s"),
+    [
+        (-0.02, 15, False, 2, 0.004),
+        (0.0, 150, False, 2, 0.002),
+        (0.05, 15, False, 2, 0.004),
+        (0.05, 150, False, 2, 0.002),
+        (0.05, 15, True, 2, 0.004),
+    ],
+)
+def test_the_delay_of_corners_is_learnt_as_well_as_it_claims(
+    delay_s, odometry_hz, by_frame, most_z2, most_off_s
+):
+    """Poses as they were `delay_s` earlier, from a car that steers between two frames.
+
+    An odometer that is read ten times a frame must not look like a delay of 4 ms, and steps that
+    are not seen yet not like cameras that are 5 ms less late.
+    """
+    cars, period, reads = 16, 1 / 15, odometry_hz // 15
+    motion = BicycleKalman(off_car())
+    obs = worlds.observe(worlds.qcar_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
+    sigma = np.array([0.004, 0.004, 0.004])
+    R = PLANAR @ jnp.diag(jnp.asarray(sigma**2)) @ PLANAR.T
+    start = motion.init(1)
+    P = start.covariance.at[:, :3, :3].multiply(0.03**2).at[:, 3:SIX, 3:SIX].multiply(0.01**2)
+    mean = start.mean.at[0, 3].set(0.35)
+    start = eqx.tree_at(
+        lambda b: (b.initialised, b.mean, b.covariance), start, (jnp.ones(1, bool), mean, P)
+    )
+    rng, frames = np.random.default_rng(8), 450
+    poses, readings = [], []
+    for _ in range(cars):
+        pose, steering = steered(rng, frames * period + 0.5, by_frame)
+        at_ms = 1e3 * FIRST_S + 1e3 * period * np.arange(frames)
+        seen = pose[np.round(at_ms - 1e3 * delay_s).astype(int)] - [*pose[250, :2], 0]
+        poses.append(seen + sigma * rng.normal(size=(frames, 3)))
+        ends = at_ms[:, None] - 1e3 * period * np.arange(reads)[::-1] / reads
+        readings.append(steering[np.round(ends).astype(int)])
+
+    def frame(bank, told):
+        pose, steering = told
+
+        def read(bank, angle):
+            event = dataclasses.replace(
+                obs,
+                speed_mps=jnp.asarray(0.35),
+                steering_rad=angle,
+                dt_s=jnp.asarray(period / reads),
+            )
+            return motion.predict(bank, event), None
+
+        bank, _ = jax.lax.scan(read, bank, steering)
+        there = PoseMeasurement(worlds.planar(*pose), R, jnp.zeros(()), jnp.asarray(True))
+        offer = motion.measure(jax.tree.map(lambda leaf: leaf[0], bank), there, obs)
+        bank = eqx.tree_at(
+            lambda b: (b.mean, b.covariance), bank, tuple(leaf[None] for leaf in offer.posterior)
+        )
+        return bank, None
+
+    drive = jax.jit(jax.vmap(lambda told: jax.lax.scan(frame, start, told)[0]))
+    bank = drive((jnp.asarray(np.array(poses)), jnp.asarray(np.array(readings))))
+    tau = np.asarray(bank.mean[:, 0, SENSORS_END - 1])
+    sigma_s = np.sqrt(np.asarray(bank.covariance[:, 0, SENSORS_END - 1, SENSORS_END - 1]))
+    assert np.all(sigma_s < 0.01)
+    z = (tau - delay_s) / sigma_s
+    assert np.mean(z**2) < most_z2, (tau, sigma_s)
+    assert abs(np.mean(tau) - delay_s) < most_off_s, (tau, sigma_s)
+
+
 def test_a_rule_has_the_paper_s_six_states():
     from jaxnav.belief.ambiguity import PaperCost
 

@@ -17,9 +17,9 @@ def wrap(angle_rad):
 def predict(x, P, dt_s, density, odometry=None):
     """Eq. 9 with the noise of a white acceleration.
 
-    `odometry` is (speed_mps, steering_rad, wheelbase_m): the velocity has become that at an unknown
-    instant of the interval, so a pose that counts on the old one is off by a share of the
-    difference, evenly distributed between 0 and dt_s.
+    `odometry` is (speed_mps, steering_rad, wheelbase_m): the velocity may have become that at any
+    instant of the interval, u before its end, and the pose has then moved by the difference times
+    u. The mean of the squares over u by Gauss's rule of two points.
     """
     A = np.eye(6)
     Q = np.zeros((6, 6))
@@ -34,7 +34,10 @@ def predict(x, P, dt_s, density, odometry=None):
     if odometry is not None:
         speed_mps, steering_rad, wheelbase_m = odometry
         change = velocity(speed_mps, steering_rad, x[2], wheelbase_m) - x[3:]
-        P[:3, :3] += np.outer(change, change) * dt_s**2 / 12
+        for point in (-1 / np.sqrt(3), 1 / np.sqrt(3)):
+            u_s = dt_s / 2 * (1 + point)
+            step = np.concatenate([change * u_s, change])
+            P = P + np.outer(step, step) / 2
     return x, P
 
 
@@ -65,4 +68,5 @@ def update(x, P, pose, R_pose, speed_mps, steering_rad, wheelbase_m, odometry_si
     nis = z_minus_h @ S_inverse @ z_minus_h - nis_odometry
     x = x + K @ np.array(z_minus_h)
     x[2] = wrap(x[2])
-    return x, (np.eye(6) - K @ H) @ P, nis
+    left = np.eye(6) - K @ H  # Joseph's form: as little rounding as possible
+    return x, left @ P @ left.T + K @ R @ K.T, nis
