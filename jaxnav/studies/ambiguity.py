@@ -33,7 +33,7 @@ from jaxnav.simulation.single_frames import (
 from jaxnav.studies.config import Config
 from jaxnav.studies.lanes import in_precision, run_lanes
 from jaxnav.studies.parameters import RANDOM, Parameter, cameras, positive, told_noise_px
-from jaxnav.studies.study import Cell, Rate, Schema, Study, Variable
+from jaxnav.studies.study import Cell, Progress, Rate, Schema, Study, Variable, nobody
 
 RIGHT, FLIPPED, DECLINED, OUTLIER, UNSEEN, INVALID = range(6)
 OUTCOMES = ("right", "flipped", "declined", "outlier", "unseen", "invalid")
@@ -132,7 +132,7 @@ class AmbiguityStudy(Study):
         self.rig = None if rig is None else in_precision(rig, config.precision)
 
     def run(
-        self, cells: Sequence[Cell], trials: range
+        self, cells: Sequence[Cell], trials: range, progress: Progress = nobody
     ) -> dict[str, Shaped[np.ndarray, "cells ... trials"]]:
         programs: dict[tuple[Any, ...], list[int]] = {}
         for index, cell in enumerate(cells):

@@ -26,7 +26,7 @@ from jaxnav.simulation.scores import Drives
 from jaxnav.studies.config import Config
 from jaxnav.studies.lanes import in_precision
 from jaxnav.studies.parameters import Parameter, cameras, positive, told_noise_px
-from jaxnav.studies.study import Cell, Rate, Schema, Study, Variable
+from jaxnav.studies.study import Cell, Ended, Progress, Rate, Schema, Study, Variable, nobody
 
 OUTCOMES = ("arrived", "failed", "left the floor", "invalid")
 ARRIVED, FAILED, LEFT_FLOOR, INVALID = range(4)
@@ -134,13 +134,13 @@ class DriveStudy(Study):
         return self.config.trials >= Rollout.many
 
     def run(
-        self, cells: Sequence[Cell], trials: range
+        self, cells: Sequence[Cell], trials: range, progress: Progress = nobody
     ) -> dict[str, Shaped[np.ndarray, "cells ... trials"]]:
         with jax.enable_x64(self.config.precision == "float64"):
-            scored = [self._cell(cell, trials) for cell in cells]
+            scored = [self._cell(cell, trials, progress) for cell in cells]
         return {name: np.stack([one[name] for one in scored]) for name in SCHEMA.variables}
 
-    def _cell(self, cell: Cell, trials: range) -> dict[str, np.ndarray]:
+    def _cell(self, cell: Cell, trials: range, progress: Progress) -> dict[str, np.ndarray]:
         """Run the drives of one cell: their scores (trials,) by name."""
         scenario = self.scenario(cell)
         rollout = self.rollout(cell, scenario)
@@ -149,7 +149,8 @@ class DriveStudy(Study):
         numbers = np.resize(np.asarray(trials), max(len(trials), lanes))
         key = jax.random.key(self.config.seed)
         keys = jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.asarray(numbers))
-        scores = _scores(rollout.run(keys), scenario)
+        # What fills the lanes beyond the trials is no trial.
+        scores = _scores(rollout.run(keys, Ended(progress, len(trials))), scenario)
         return {name: values[: len(trials)] for name, values in scores.items()}
 
     @staticmethod

@@ -14,42 +14,42 @@ from jaxtyping import Shaped
 
 from jaxnav.errors import BadInput
 from jaxnav.studies.store import Box, StudyStore, versions
-from jaxnav.studies.study import Cell, Study
+from jaxnav.studies.study import Cell, Ended, Progress, Study, nobody
 
 if TYPE_CHECKING:
     from distributed import Client
 
 _IN_FLIGHT = 2  # boxes for each worker, so that no worker waits for its next one
 _PATIENCE_S = 30.0  # for a cluster without workers
-Progress = Callable[[int], object]
 
 
-def run_here(store: StudyStore, progress: Progress = lambda done: None) -> None:
+def run_here(store: StudyStore, progress: Progress = nobody) -> None:
     """Run the missing boxes in this process, on all its devices; write each while the next runs.
 
     Raises:
         BadInput: the store can't be written to.
     """
 
-    def keep(box: Box, results: Mapping[str, np.ndarray]) -> None:
+    def keep(box: Box, results: Mapping[str, np.ndarray], ended: Ended) -> None:
         store.write(box, results)
-        progress(store.layout.size(box))
+        ended(ended.left)
 
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         try:
             for box in store.missing():
-                results = run_box(store.study, *_task(store, box))
+                ended = Ended(progress, store.layout.size(box))
+                results = store.study.run(*_task(store, box), ended)
                 if writing is not None:
                     writing.result()
-                writing = writer.submit(keep, box, results)
+                writing = writer.submit(keep, box, results, ended)
         finally:
             if writing is not None:
                 writing.result()
 
 
 def run_on_cluster(
-    store: StudyStore, client: "Client", where: str, progress: Progress = lambda done: None
+    store: StudyStore, client: "Client", where: str, progress: Progress = nobody
 ) -> None:
     """Run the missing boxes on a cluster's workers.
 

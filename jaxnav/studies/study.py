@@ -1,7 +1,7 @@
 """Define the interface of all kinds of study: cells times trials in, named variables out."""
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,6 +12,25 @@ from jaxnav.studies.config import Config
 from jaxnav.studies.parameters import Parameter, Value
 
 Cell = Mapping[str, Value]  # parameter name -> value, for every parameter
+Progress = Callable[[int], object]  # number of trials that have ended since the last call
+
+
+def nobody(ended: int) -> None:
+    """Tell nobody of progress."""
+
+
+class Ended:
+    """Counts the trials that have ended, tells of them, and of no more than there are."""
+
+    def __init__(self, progress: Progress, trials: int):
+        self.left = trials
+        self._progress = progress
+
+    def __call__(self, ended: int) -> None:
+        """Count some more."""
+        ended = min(ended, self.left)
+        self.left -= ended
+        self._progress(ended)
 
 
 @dataclass(frozen=True)
@@ -93,8 +112,12 @@ class Study(abc.ABC):
 
     @abc.abstractmethod
     def run(
-        self, cells: Sequence[Cell], trials: range
+        self, cells: Sequence[Cell], trials: range, progress: Progress = nobody
     ) -> dict[str, Shaped[np.ndarray, "cells ... trials"]]:
         """Run trials of cells: variables (cells, trials) or (cells, selectors, trials). A trial's
         bits depend on its cell and its number alone.
+
+        Args:
+            progress: called with the number of trials that have ended since the last call, if they
+                end one after the other.
         """

@@ -26,7 +26,7 @@ from jaxnav.studies.layout import BoxLayout
 from jaxnav.studies.parameters import Parameter
 from jaxnav.studies.running import local_cluster, remote_cluster, run_here, run_on_cluster
 from jaxnav.studies.store import count_done, open_store, read_dataset, read_layout
-from jaxnav.studies.study import Cell, Grid, Rate, Schema, Study, Variable
+from jaxnav.studies.study import Cell, Grid, Progress, Rate, Schema, Study, Variable, nobody
 from jaxnav.studies.summary import order_statistic, summarise
 
 PARAMETERS = {
@@ -60,7 +60,9 @@ class Fake(Study):
     slow_s = 0.0
     deadly = False
 
-    def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
+    def run(
+        self, cells: Sequence[Cell], trials: range, progress: Progress = nobody
+    ) -> dict[str, np.ndarray]:
         if self.deadly:
             os._exit(1)
         time.sleep(self.slow_s)
@@ -456,7 +458,9 @@ def test_memory_does_not_grow_with_the_study(tmp_path: Path) -> None:
     class Many(Fake):
         """As many trials as one likes, at once."""
 
-        def run(self, cells: Sequence[Cell], trials: range) -> dict[str, np.ndarray]:
+        def run(
+            self, cells: Sequence[Cell], trials: range, progress: Progress = nobody
+        ) -> dict[str, np.ndarray]:
             found = {}
             for name, variable in SCHEMA.variables.items():
                 shape = (len(cells), 2, len(trials)) if variable.of_selector else None

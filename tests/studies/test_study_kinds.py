@@ -173,7 +173,13 @@ def test_drives_are_those_of_simulate(tmp_path: Path) -> None:
     assert isinstance(study, DriveStudy)
     cells = [study.grid.cell((0,)), study.grid.cell((1,))]
     found = study.run(cells, range(6))
-    part = study.run(cells[1:], range(2, 5))
+    told: list[int] = []
+    part = study.run(cells[1:], range(2, 5), told.append)
+    assert sum(told) == 3  # and not the six lanes
+    told.clear()
+    run_here(open_store(tmp_path / "s.zarr", study), told.append)  # both cells in one box
+    assert sum(told) == 12
+    assert max(told) <= 6
     for name, values in found.items():
         assert values.shape == (2, 6)
         np.testing.assert_array_equal(part[name][0], values[1, 2:5], err_msg=name)
