@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from jaxnav.errors import BadInput
+from jaxnav.files.images import open_video
 from jaxnav.loop.interfaces import Camera, Frame, Setup, Vehicle
 from jaxnav.vehicles.grabber import Grabber
 from jaxnav.vehicles.options import latency_ns
@@ -126,11 +127,12 @@ class _Capture:
     def _open(self) -> None:
         self.release()
         source, backend = self._opened_with
-        capture = cv2.VideoCapture(source, backend)
+        file = self._is_file
+        capture = open_video(str(source)) if file else cv2.VideoCapture(source, backend)
         if not capture.isOpened():
             capture.release()
             raise OSError(f"{self._source} can't be opened")
-        if self._is_file:
+        if file:
             self._period_s = 1 / (capture.get(cv2.CAP_PROP_FPS) or _DEFAULT_RATE_HZ)
         elif backend == cv2.CAP_V4L2:
             width_px, height_px = self._size_px

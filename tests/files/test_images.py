@@ -3,6 +3,7 @@
 import builtins
 import importlib.util
 import io
+import struct
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 from PIL import Image
 
 from jaxnav.errors import BadInput
-from jaxnav.files.images import decode_image, exif_orientation, read_image
+from jaxnav.files.images import decode_image, exif_orientation, open_video, read_image
 
 SENSOR = cv2.GaussianBlur(
     np.random.default_rng(0).integers(0, 255, (48, 80, 3), np.uint8), (0, 0), 3
@@ -50,6 +51,33 @@ def test_pixels_come_as_the_sensor_stored_them(kind: str, orientation: int) -> N
     grey = decode_image(raw, cv2.IMREAD_GRAYSCALE)
     assert grey is not None
     assert np.abs(grey.astype(int) - cv2.cvtColor(expected, cv2.COLOR_BGR2GRAY)).mean() < 2
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_frames_of_a_video_come_as_the_sensor_stored_them(quarters: int, tmp_path: Path) -> None:
+    """A phone held upright writes frames that lie, and a matrix by which players turn them."""
+    file = tmp_path / "phone.mp4"
+    frame = cv2.resize(SENSOR, (160, 96))
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"mp4v"), 10, frame.shape[1::-1])
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no MP4")
+    for _ in range(3):
+        writer.write(frame)
+    writer.release()
+    raw = bytearray(file.read_bytes())
+    header = raw.index(b"tkhd")
+    assert raw[header + 4] == 0  # version
+    c, s = round(np.cos(quarters * np.pi / 2)), round(np.sin(quarters * np.pi / 2))
+    one = 1 << 16
+    matrix = struct.pack(">9i", c * one, s * one, 0, -s * one, c * one, 0, 0, 0, 1 << 30)
+    raw[header + 44 : header + 80] = matrix
+    file.write_bytes(raw)
+    turned = cv2.VideoCapture(str(file)).read()[1]
+    assert (turned.shape[0] > turned.shape[1]) == (quarters % 2 == 1)  # OpenCV's own way
+    got, image = open_video(str(file)).read()
+    assert got
+    assert image.shape == frame.shape
+    assert np.abs(image.astype(int) - frame).mean() < 8
 
 
 @pytest.mark.parametrize("orientation", SHOWN)

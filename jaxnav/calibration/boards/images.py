@@ -17,7 +17,7 @@ from jaxnav.calibration.boards.mismatch import what_is_seen
 from jaxnav.calibration.lenses.views import BoardView, BoardViews
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
-from jaxnav.files.images import read_image
+from jaxnav.files.images import open_video, read_image
 from jaxnav.models.camera import Camera
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm",
@@ -245,13 +245,12 @@ def _frames(file: Path) -> Iterator[tuple[int, np.ndarray]]:
     Raises:
         BadInput: OpenCV can't read the file as a video.
     """
-    capture = cv2.VideoCapture(str(file))
+    capture = open_video(str(file))
     try:
         if not file.is_file():
             raise BadInput(file, "can't be read: no such file")
         if not capture.isOpened():
             raise BadInput(file, "is not a video that OpenCV can read")
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as for images
         width, height = map(capture.get, (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if width * height > limits.IMAGE_PIXELS:
             raise BadInput(file, f"has frames of {width:.0f} x {height:.0f} pixels, too many")
