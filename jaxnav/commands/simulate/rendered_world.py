@@ -1,5 +1,6 @@
 """The world of a demo: objects built from its files, and cameras that render the scene."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxnav.commands.simulate.arguments import Demo
-from jaxnav.detection import Detections, Detector, make_detectors, observe
+from jaxnav.detection import Detections, Detector, observe
 from jaxnav.errors import BadInput
 from jaxnav.files import (
     Params,
@@ -19,6 +20,7 @@ from jaxnav.files import (
     load_route,
     load_vehicle,
 )
+from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -37,12 +39,12 @@ FLOOR_M = 5.0  # side of the floor around start, waypoints and markers, at least
 
 @dataclass(frozen=True)
 class RenderedWorld:
-    """The objects of a demo, built from its files, with a renderer and marker detectors."""
+    """The objects of a demo, built from its files, with a renderer."""
 
     setup: DriveSetup  # without the parameters
     params: Params | None
     renderer: Renderer
-    detectors: list[Detector]
+    cameras: list[Camera]  # those of the rig, one by one
 
     @staticmethod
     def load(args: Demo) -> "RenderedWorld":
@@ -62,12 +64,12 @@ class RenderedWorld:
                 f"({DriveSettings.latency_s * 1e3:.0f} ms after the stamp), got {args.exposure_ms}",
             )
         vehicle = load_vehicle(args.vehicle or qcar / "vehicle.yaml")
-        route = load_route(args.route or qcar / "route.yaml")
+        route = load_route(args.route or qcar / "demo_route.yaml")
         return RenderedWorld(
             DriveSetup(rig, markers, vehicle, route, float64=True),
             params=None if args.params is None else load_params(args.params),
             renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, SENSOR),
-            detectors=make_detectors(markers, args.corner_backend),
+            cameras=[rig.camera(c) for c in range(len(rig))],
         )
 
     def navigator(self, selector: str) -> Navigator:
@@ -95,6 +97,7 @@ class RenderedCameras:
     """Cameras whose rendered images are searched around the driver's belief and everywhere else."""
 
     world: RenderedWorld
+    detectors: Sequence[Detector]
     rng: np.random.Generator
     corner_noise_px: float = 0.0  # on top of the detection's errors
     # The latest, one a camera.
@@ -104,19 +107,24 @@ class RenderedCameras:
         self, T_world_vehicle_at: PoseAt, stamp_s: float, believed: Output | None
     ) -> tuple[Float[np.ndarray, "C M 4 2"], Bool[np.ndarray, "C M"], Float[np.ndarray, "C M 4"]]:
         """Corners (C, M, 4, 2), visibility (C, M) and sigmas (C, M, 4) at one instant."""
-        world, setup = self.world, self.world.setup
-        self.images = world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)
+        self.images = self.world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)
+        return self.search(self.images, believed)
+
+    def search(
+        self, images: Sequence[UInt8[np.ndarray, "rows columns"]], believed: Output | None
+    ) -> tuple[Float[np.ndarray, "C M 4 2"], Bool[np.ndarray, "C M"], Float[np.ndarray, "C M 4"]]:
+        """What `look` returns, from images (one a camera) that are there already."""
         predicted_px, expected = self._predicted(believed)
         detections = [
             Detections.concatenate(
                 [
-                    detector.detect(image, setup.rig.camera(c), predicted_px[c][expected[c]])
-                    for detector in world.detectors
+                    detector.detect(image, self.world.cameras[c], predicted_px[c][expected[c]])
+                    for detector in self.detectors
                 ]
             )
-            for c, image in enumerate(self.images)
+            for c, image in enumerate(images)
         ]
-        observed = observe(detections, setup.markers)
+        observed = observe(detections, self.world.setup.markers)
         noise_px = self.corner_noise_px * self.rng.standard_normal(observed.corners_px.shape)
         sigma_px = np.hypot(observed.sigma_px, self.corner_noise_px)
         return observed.corners_px + noise_px, observed.visible, sigma_px
@@ -126,11 +134,13 @@ class RenderedCameras:
         lanes = (len(rig), len(markers.ids))
         if believed is None or not believed.located:
             return np.zeros((*lanes, 4, 2)), np.zeros(lanes, bool)
-        return jax.device_get(_expect(rig, markers, believed.pose))
+        return jax.device_get(expected_corners(rig, markers, believed.pose))
 
 
 @jax.jit
-def _expect(rig: CameraRig, markers: MarkerMap, pose: jax.Array) -> tuple[jax.Array, jax.Array]:
+def expected_corners(
+    rig: CameraRig, markers: MarkerMap, pose: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Expected corners (C, M, 4, 2) from a pose, and whether each marker is in view, (C, M)."""
     T_vehicle_world = T_world_vehicle_from_planar(jnp.asarray(pose)).inverse()
     corners_world_m = markers.corners_world_m
