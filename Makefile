@@ -13,7 +13,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 .PHONY: help demo test test-fast lint format benchmark fuzz docs clean
 
 help:
-	@echo "make demo       the main job: a simulated drive, its report in demo/"
+	@echo "make demo       the main job: two simulated drives, their report in demo/"
 	@echo "make test       lint, types, tests"
 	@echo "make test-fast  the core and most commands, some minutes: tests/fast.txt"
 	@echo "make lint       ruff and mypy alone"

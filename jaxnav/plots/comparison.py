@@ -61,8 +61,8 @@ def comparison_report(
         wrong_heading_deg: drawn as a line: farther off, a pose is the wrong one.
         title: above everything.
     """
-    figure = Figure(figsize=(11, 6.5), layout="constrained")
-    figure.suptitle(title, fontsize=10)
+    figure = Figure(figsize=(9.5, 6), layout="constrained")
+    figure.suptitle(title, fontsize=9.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1))
     position, heading = (figure.add_subplot(grid[row, 0]) for row in range(2))
     for axes, error in ((position, "position_error_m"), (heading, "heading_error_deg")):
@@ -80,7 +80,7 @@ def comparison_report(
     position.set_ylabel("position error (m)")
     position.label_outer()
     heading.set(xlabel="time (s)", ylabel="heading error (deg)")
-    position.legend(loc="upper right", fontsize=8)
+    heading.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2, fontsize=8)
     _draw_ways(figure.add_subplot(grid[:, 1]), drives, waypoints_m, waypoint_radius_m, markers_m)
     return figure
 
@@ -106,4 +106,4 @@ def _draw_ways(
     axes.set(xlabel="x (m)", ylabel="y (m)")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
-    axes.legend(loc="best", fontsize=8)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2, fontsize=8)

@@ -27,7 +27,7 @@ def test_the_picture_has_both_ways_and_three_errors():
     assert (heading.get_ylabel(), heading.get_xlabel()) == ("heading error (deg)", "time (s)")
     assert (plane.get_xlabel(), plane.get_ylabel()) == ("x (m)", "y (m)")
     assert plane.get_aspect() == 1.0
-    names = [text.get_text() for text in position.get_legend().get_texts()]
+    names = [text.get_text() for text in heading.get_legend().get_texts()]
     assert names == ["ours", "other", "other, listening"]
     # An error of zero is drawn at the end of the logarithmic axis.
     np.testing.assert_allclose(position.lines[0].get_ydata(), 1e-3)

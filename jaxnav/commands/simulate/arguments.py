@@ -32,12 +32,12 @@ from jaxnav.commands.kinds import (
 
 @dataclass(frozen=True)
 class Demo(Headless):
-    """Drive the paper's experiment: a simulated car, four rendered cameras, one marker.
+    """Drive through the paper's waypoints: a simulated car, four rendered cameras, one marker.
 
-    The car is driven by the method of --selector alone. The paper's Method A (the pose of lowest
-    reprojection error, fused by a filter without gate and restart) runs alongside on the same
-    frames. Written to --out: report.png, a mosaic of camera frames, summary.json, and trajectories
-    in TUM format.
+    Each seed is driven twice from the same start: by our method, and by what people use otherwise
+    (OpenCV's corners and the first of the two IPPE poses, on the same filter), which also runs
+    alongside our drive, on its images. Written to --out: report.png, a mosaic of what our cameras
+    saw, summary.json, and trajectories in TUM format.
     """
 
     seed: Seed = 0
@@ -47,12 +47,12 @@ class Demo(Headless):
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("demo")
     """Folder for the report."""
     selector: Selector = "multi-hypothesis"
-    """Which of the two poses of a marker the driving method believes."""
+    """Which of the two poses of a marker our method believes."""
     rig: QCarRig = None
     markers: QCarMarkers = None
     vehicle: QCarVehicle = None
     route: QCarFile = None
-    """Start and waypoints."""
+    """Start and waypoints; by default demo_route.yaml. The paper's start is in route.yaml."""
     params: OptionalFile = None
     """Tuned parameters, for both methods: the noise of their filter is the same."""
     blur: bool = True
@@ -60,7 +60,7 @@ class Demo(Headless):
     exposure_ms: NotNegative = 10.0
     """Exposure time, ms."""
     corner_noise_px: NotNegative = 0.0
-    """Spoil the detected corners by this much (standard deviation, px)."""
+    """Spoil the corners of both methods by this much (standard deviation, px)."""
     rolling_shutter: bool = True
     """Expose the rows of an image one after the other."""
     corner_backend: Detector = "aruco"

@@ -12,6 +12,7 @@ from jaxnav.commands.simulate.rendered_world import RenderedWorld, expected_corn
 from jaxnav.simulation.drive import waypoints_passed
 
 WRONG_HEADING_DEG = 20.0  # farther off than this, a pose counts as the wrong one
+LOST_M = 1.0  # farther off than this, a car is lost: the paper's waypoints are 1.03 m apart
 
 
 def summary_of(args: Demo, world: RenderedWorld, drives: Drives, seed: int) -> dict[str, Any]:
@@ -64,7 +65,7 @@ def overall_lines(overall: dict[str, Any]) -> list[str]:
     return [
         f"{LABELS[name]}: reached all waypoints in {one['reached']} of {overall['runs']} drives; "
         f"median position RMSE {one['position_rmse_m']:.3f} m; "
-        f"heading once more than {WRONG_HEADING_DEG:.0f} deg off in {one['once_wrong']}"
+        f"once more than {LOST_M:.0f} m off in {one['once_lost']}"
         for name, one in overall["methods"].items()
     ]
 
@@ -119,7 +120,7 @@ def _together(drives: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "reached": sum(drive["reached"] for drive in drives),
         "success_rate": np.mean([drive["reached"] for drive in drives]),
-        "once_wrong": sum(drive["wrong_heading_fraction"] > 0 for drive in drives),
+        "once_lost": sum(drive["position_worst_m"] > LOST_M for drive in drives),
         **_medians(scores),
     }
 
@@ -132,5 +133,5 @@ def _errors(score: dict[str, float]) -> str:
     return (
         f"position RMSE {score['position_rmse_m']:.3f} m, "
         f"wrong branch {score['wrong_branch_fraction']:.1%}, "
-        f"heading {WRONG_HEADING_DEG:.0f} deg off {score['wrong_heading_fraction']:.1%}"
+        f"heading over {WRONG_HEADING_DEG:.0f} deg off in {score['wrong_heading_fraction']:.1%}"
     )

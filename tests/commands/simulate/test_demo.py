@@ -152,24 +152,24 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, flags, message)
 
 
 def test_counts_and_medians_of_several_seeds():
-    def drive(reached: bool, error_m: float, wrong: float) -> dict[str, Any]:
-        return {"reached": reached, "position_rmse_m": error_m, "wrong_heading_fraction": wrong}
+    def drive(reached: bool, error_m: float, worst_m: float) -> dict[str, Any]:
+        return {"reached": reached, "position_rmse_m": error_m, "position_worst_m": worst_m}
 
     def seed(ours: dict[str, Any], opencv: dict[str, Any]) -> dict[str, Any]:
         drives = {"our_method": ours, "opencv_first_pose": opencv}
         return {"drives": drives, "alongside": {"position_rmse_m": opencv["position_rmse_m"] * 2}}
 
-    fine = drive(True, 0.01, 0.0)
+    fine = drive(True, 0.01, 0.02)
     together = overall(
-        [seed(fine, drive(True, 0.1, 0.0)), seed(fine, drive(False, 0.9, 0.3)), seed(fine, fine)]
+        [seed(fine, drive(True, 0.1, 0.9)), seed(fine, drive(False, 0.9, 1.1)), seed(fine, fine)]
     )
     ours, opencv = together["methods"]["our_method"], together["methods"]["opencv_first_pose"]
-    assert (ours["reached"], ours["success_rate"], ours["once_wrong"]) == (3, 1.0, 0)
-    assert (opencv["reached"], opencv["once_wrong"]) == (2, 1)
+    assert (ours["reached"], ours["success_rate"], ours["once_lost"]) == (3, 1.0, 0)
+    assert (opencv["reached"], opencv["once_lost"]) == (2, 1)
     assert opencv["success_rate"] == pytest.approx(2 / 3)
     assert opencv["position_rmse_m"] == 0.1
     assert together["alongside"]["position_rmse_m"] == 0.2
     assert overall_lines(together)[1] == (
         "OpenCV, first pose: reached all waypoints in 2 of 3 drives; median position RMSE 0.100 m; "
-        "heading once more than 20 deg off in 1"
+        "once more than 1 m off in 1"
     )
