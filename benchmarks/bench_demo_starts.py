@@ -47,9 +47,7 @@ def main() -> None:
             if found > 0.5:
                 best = max(best, (rms_m, f"{distance_m} m, {aside_deg} degrees: {start.round(3)}"))
         print(f"| {aside_deg} | " + " | ".join(cells) + " |", flush=True)
-    print(
-        f"\nFarthest off where more than half of the pictures have a pose: {best[1]} (m, m, rad)."
-    )
+    print(f"\nFarthest off where more than half of the pictures show it: {best[1]} (m, m, rad).")
 
 
 def start_at(world: RenderedWorld, distance_m: float, aside_rad: float) -> np.ndarray:

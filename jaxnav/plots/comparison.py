@@ -62,7 +62,7 @@ def comparison_report(
         title: above everything.
     """
     figure = Figure(figsize=(9.5, 6), layout="constrained")
-    figure.suptitle(title, fontsize=9.5)
+    figure.suptitle(title, fontsize=8.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1))
     position, heading = (figure.add_subplot(grid[row, 0]) for row in range(2))
     for axes, error in ((position, "position_error_m"), (heading, "heading_error_deg")):

@@ -7,7 +7,13 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.demo_drives import drive_both, make_methods
 from jaxnav.commands.simulate.demo_report import write_report
-from jaxnav.commands.simulate.demo_scores import lines, overall, overall_lines, summary_of
+from jaxnav.commands.simulate.demo_scores import (
+    RATES,
+    lines,
+    overall,
+    overall_lines,
+    summary_of,
+)
 from jaxnav.commands.simulate.rendered_world import RenderedWorld
 from jaxnav.errors import visible
 from jaxnav.files import output_folder, write_json
@@ -33,5 +39,7 @@ def run(args: Demo) -> int:
         together = overall(summaries)
         write_json(out / "summary.json", together)
         print("\n".join(overall_lines(together)))
+    else:
+        print(RATES)
     print(f"report in {visible(out)}")
     return 0

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxnav.commands.pictures import corners_in_world, normals_px, save_figure
 from jaxnav.commands.simulate.demo_drives import LABELS, OURS, Drives, Record
-from jaxnav.commands.simulate.demo_scores import WRONG_HEADING_DEG, lines
+from jaxnav.commands.simulate.demo_scores import RATES, WRONG_HEADING_DEG, lines
 from jaxnav.files import write_json, write_tum
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.origin import Origin, planar_in_world, points_in_world, poses_in_world
@@ -42,7 +42,7 @@ def write_report(folder: Path, setup: DriveSetup, drives: Drives, summary: dict[
         setup.route.waypoint_radius_m,
         corners_in_world(setup.markers),
         WRONG_HEADING_DEG,
-        title="\n".join(lines(summary)),
+        title="\n".join([*lines(summary), RATES]),
     )
     save_figure(report, folder / "report.png")
     save_figure(_mosaic(setup, drives.ours), folder / "mosaic.png")

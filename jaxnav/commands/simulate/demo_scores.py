@@ -12,6 +12,7 @@ from jaxnav.commands.simulate.rendered_world import RenderedWorld, expected_corn
 from jaxnav.simulation.drive import waypoints_passed
 
 WRONG_HEADING_DEG = 20.0  # farther off than this, a pose counts as the wrong one
+RATES = "how often it goes which way, over 20 seeds: docs/guide/demo.md"
 LOST_M = 1.0  # farther off than this, a car is lost: the paper's waypoints are 1.03 m apart
 
 

@@ -74,13 +74,14 @@ def test_both_methods_drive_from_images_and_one_listens(tmp_path, capsys, monkey
     assert np.linalg.norm(truth[-1, 1:3] - [0.5, 0.65]) < 0.2
     for picture in ("report.png", "mosaic.png"):
         assert cv2.imread(str(tmp_path / picture)).shape[1] > 800
-    first, second, third, _ = capsys.readouterr().out.splitlines()
+    first, second, third, rates, _ = capsys.readouterr().out.splitlines()
     assert first.startswith("seed 0, our method: reached all waypoints in ")
     assert f"position RMSE {ours['position_rmse_m']:.3f} m" in first
     assert second.startswith("seed 0, OpenCV, first pose: ")
     assert f"position RMSE {opencv['position_rmse_m']:.3f} m" in second
     assert third.startswith("seed 0, OpenCV, first pose, on the images of our method: ")
     assert f"position RMSE {heard['position_rmse_m']:.3f} m" in third
+    assert rates.endswith("docs/guide/demo.md")
 
 
 def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):
