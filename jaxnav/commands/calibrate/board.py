@@ -54,6 +54,11 @@ def run(args: CalibrateBoard) -> int:
     print(f"{words}, on {paper_mm[0]:g} x {paper_mm[1]:g} mm")
     print(f"{folder / 'board.pdf'}, {folder / 'board.png'}, {folder / 'board.yaml'}")
     print("\n".join(_ADVICE))
+    if board.kind != "marker":
+        print(
+            "Photograph it 20 times, tilted, into the corners of the image: "
+            f"jaxnav calibrate intrinsics FOLDER --board {folder / 'board.yaml'}"
+        )
     return 0
 
 

@@ -65,13 +65,15 @@ def run(args: CalibrateIntrinsics) -> int:
     entries = {name: _entry(name, one, placed.get(name)) for name, one in calibrations.items()}
     rig = RigFile(cameras=list((placed | entries).values()))
     sigmas = [entry.sigma or CameraSigma() for entry in rig.cameras]
-    save_rig(folder / "camera.yaml", rig.rig(), calibrated, sigmas)
+    file = folder / "camera.yaml"
+    save_rig(file, rig.rig(), calibrated, sigmas)
     write_json(folder / "report.json", _report(str(board), calibrated, collected, calibrations))
     save_figure(lens_report(calibrations), folder / "report.png")
     for name, one in calibrations.items():
         print(_text(name, one, collected[name]))
     if not placed:
-        print("where the cameras are is not measured: write it into camera.yaml, or give --rig")
+        print(f"for a photo: jaxnav locate PHOTO --camera {file} --marker-size-m S")
+        print(f"for a car: write where its cameras are into {file}, or give --rig")
     print(", ".join(str(folder / name) for name in ("camera.yaml", "report.json", "report.png")))
     return 0
 
