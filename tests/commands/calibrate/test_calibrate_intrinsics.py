@@ -118,7 +118,9 @@ def test_videos_and_folders_of_several_cameras_go_together(shots, tmp_path, caps
     rear = report["cameras"]["rear"]["views"]
     assert list(rear["sigma_px"]) == [f"a.avi#{2 * n}" for n in range(VIEWS)]
     assert any(sentence.startswith("left: ") for sentence in report["advice"])
-    assert "write it into camera.yaml" in capsys.readouterr().out
+    told, file = capsys.readouterr().out, tmp_path / "out" / "camera.yaml"
+    assert f"jaxnav locate PHOTO --camera {file} --marker-size-m S" in told
+    assert f"write where its cameras are into {file}" in told
 
 
 def test_a_marker_is_looked_at_again_with_the_lens_it_told(tmp_path, monkeypatch) -> None:
