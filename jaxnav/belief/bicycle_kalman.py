@@ -24,7 +24,6 @@ from jaxnav.belief.sensor_errors import (
     lead_after,
     read_velocity,
     seen_pose,
-    seen_slope,
     slipped,
 )
 from jaxnav.models.bicycle import Vehicle
@@ -131,18 +130,18 @@ class BicycleKalman(Motion):
 
     def poses(self, bank: Bank) -> PoseBelief:
         """Poses level on the ground (Eq. 12); height, roll and pitch are nuisances with a sigma."""
-        seen = jax.vmap(seen_pose)(bank.mean, bank.velocity_lead)
+        seen, slopes = jax.vmap(seen_pose)(bank.mean, bank.velocity_lead)
         dtype = bank.mean.dtype
         freedom = jnp.asarray(ON_GROUND, dtype)
         tilt = [self.height_sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad]
         nuisance = jnp.asarray(OFF_GROUND, dtype) * jnp.asarray(tilt, dtype)[None]
 
-        def in_body(mean: Array, P: Array, lead: Array, seen: Array) -> tuple[Array, Array]:
-            H = product(freedom, product(planar_rotation(-seen[2]), seen_slope(mean, lead)))
+        def in_body(P: Array, seen: Array, slope: Array) -> tuple[Array, Array]:
+            H = product(freedom, product(planar_rotation(-seen[2]), slope))
             of_pose = product(H, P)
             return kalman.symmetrise(product(of_pose, H.T)), of_pose[:, SENSORS_END:]
 
-        covariance, cross = jax.vmap(in_body)(bank.mean, bank.covariance, bank.velocity_lead, seen)
+        covariance, cross = jax.vmap(in_body)(bank.covariance, seen, slopes)
         errors = None
         if self.camera_states:
             of_cameras = bank.covariance[:, SENSORS_END:, SENSORS_END:]
@@ -168,8 +167,8 @@ class BicycleKalman(Motion):
         fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
         log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
         R = R + kalman.as_covariance(self.vision_floor)
-        innovation = self.difference(pose, seen_pose(bank.mean, bank.velocity_lead))
-        slope = seen_slope(bank.mean, bank.velocity_lead)
+        seen, slope = seen_pose(bank.mean, bank.velocity_lead)
+        innovation = self.difference(pose, seen)
         correction, posterior, S = kalman.update(P, innovation, slope, R)
         return Offer(
             kalman.whiten(innovation, S),
@@ -182,8 +181,9 @@ class BicycleKalman(Motion):
     def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has corrected its pose, in 3 dof."""
         T, lead = measured.T_world_vehicle, bank.velocity_lead
-        pose, seen = planar_from_T_world_vehicle(T), seen_pose(bank.mean, lead)
-        in_body = product(planar_rotation(-seen[2]), seen_slope(bank.mean, lead))
+        pose = planar_from_T_world_vehicle(T)
+        seen, slope = seen_pose(bank.mean, lead)
+        in_body = product(planar_rotation(-seen[2]), slope)
         predicted = kalman.replace_first(bank.covariance, in_body)
         freedom = jnp.asarray(ON_GROUND, pose.dtype)
         correction, P = follow_pose(
@@ -316,7 +316,7 @@ class BicycleKalman(Motion):
         present = jnp.asarray(obs.has_odometry, dtype)
         change = read.velocity - mean[3:SIX]
         step, dt_s = present * change, jnp.asarray(since_s, dtype)
-        moments = jnp.stack([dt_s**2 / 3, dt_s / 2, dt_s / 2, dt_s * 0 + 1]).reshape(2, 2)
+        moments = jnp.stack([dt_s**2 / 3, dt_s / 2, dt_s / 2, jnp.ones_like(dt_s)]).reshape(2, 2)
         P = P.at[:SIX, :SIX].add(jnp.kron(moments, step[:, None] * step[None]))
         seen = kalman.hide_rows(change, H, R, jnp.full(3, present))
         correction, after, _ = kalman.update(P, *seen)

@@ -116,14 +116,15 @@ def lead_after(
     return (1 - faded) * lead + faded / intervals * change
 
 
-def seen_pose(mean: Float[Array, " n"], lead: Float[Array, " 3"]) -> Float[Array, " 3"]:
-    """Where the corners show the vehicle."""
-    return mean[:3] if mean.shape[0] == SIX else mean[:3] - _way_since(mean, lead)
+def seen_pose(
+    mean: Float[Array, " n"], lead: Float[Array, " 3"]
+) -> tuple[Float[Array, " 3"], Float[Array, "3 n"]]:
+    """Where the corners show the vehicle, and its derivative by the state.
 
-
-def seen_slope(mean: Float[Array, " n"], lead: Float[Array, " 3"]) -> Float[Array, "3 n"]:
-    """Derivative of `seen_pose` by the state, but for the lead that turns with the heading."""
-    return _sheared(mean, lead, -1)
+    The derivative leaves out that the lead turns with the heading.
+    """
+    slope = _sheared(mean, lead, -1)
+    return (mean[:3] if mean.shape[0] == SIX else mean[:3] - _way_since(mean, lead)), slope
 
 
 def from_seen(

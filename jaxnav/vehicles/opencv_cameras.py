@@ -127,12 +127,11 @@ class _Capture:
     def _open(self) -> None:
         self.release()
         source, backend = self._opened_with
-        file = self._is_file
-        capture = open_video(str(source)) if file else cv2.VideoCapture(source, backend)
+        capture = open_video(str(source)) if self._is_file else cv2.VideoCapture(source, backend)
         if not capture.isOpened():
             capture.release()
             raise OSError(f"{self._source} can't be opened")
-        if file:
+        if self._is_file:
             self._period_s = 1 / (capture.get(cv2.CAP_PROP_FPS) or _DEFAULT_RATE_HZ)
         elif backend == cv2.CAP_V4L2:
             width_px, height_px = self._size_px
