@@ -10,6 +10,7 @@ ended it.
 """
 
 import contextlib
+import dataclasses
 import importlib
 import io
 import os
@@ -50,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the arguments after the program's name, by default those of the process.
     """
     args = list(sys.argv[1:] if argv is None else argv)
-    if args[:1] != ["run"]:
+    if args[:1] not in (["run"], ["ros"]):
         return _main(args, _dispatch)
     # A car may move: from here on no signal is lost, and no terminal holds anything up.
     fill_descriptors()
@@ -166,7 +167,7 @@ def _parse(args: list[str]) -> Any:
     from jaxnav.commands import all_arguments
     from jaxnav.commands.old_flags import with_new_names
 
-    args = with_new_names(args)
+    args, words = _without_ros_args(with_new_names(args))
     messages = io.StringIO()
     wide = not {"-h", "--help"} & set(args)
     try:
@@ -180,11 +181,20 @@ def _parse(args: list[str]) -> Any:
                 description=DESCRIPTION,
                 args=args,
             )
-            return getattr(command, "what", command)  # of a group
+            command = getattr(command, "what", command)  # of a group
+            return dataclasses.replace(command, ros_args=words) if words else command
     except SystemExit as finished:
         if not finished.code:
             return None
     raise UsageError(_one_line(messages.getvalue()))
+
+
+def _without_ros_args(args: list[str]) -> tuple[list[str], tuple[str, ...]]:
+    """The arguments of `jaxnav ros`, and those from --ros-args on, which are ROS's own."""
+    if args[:1] != ["ros"] or "--ros-args" not in args:
+        return args, ()
+    at = args.index("--ros-args")
+    return args[:at], tuple(args[at:])
 
 
 @contextlib.contextmanager

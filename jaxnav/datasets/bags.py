@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.datasets import ros_messages
 from jaxnav.datasets.bag_readers import Ros1Reader, messages
 from jaxnav.datasets.recording import Rows
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
 from jaxnav.files.ranges import is_within
 from jaxnav.files.unpacking import Budget, copy_bz2
+from jaxnav.ros.camera_messages import TAGSLAM
+from jaxnav.ros.odometry_messages import stamp_ns as header_stamp_ns
 
 _TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
 
@@ -60,10 +61,10 @@ def read_bag(path: Path) -> Bag:
         try:
             with Ros1Reader(plain) as reader:
                 bag.topics = {c.topic: c.msgtype for c in reader.connections}
-                kinds = (ros_messages.TAGSLAM, *_TF_TYPES)
+                kinds = (TAGSLAM, *_TF_TYPES)
                 wanted = [c for c in reader.connections if c.msgtype in kinds]
                 for connection, _, message in messages(reader, wanted, {}):
-                    if connection.msgtype == ros_messages.TAGSLAM:
+                    if connection.msgtype == TAGSLAM:
                         detections = bag.detections.setdefault(connection.topic, TopicDetections())
                         _add_detections(detections, message)
                     else:
@@ -97,7 +98,7 @@ def decompress_bag(path: Path) -> Iterator[Path]:
 
 
 def _add_detections(detections: TopicDetections, message: Any) -> None:
-    stamp_ns = ros_messages.stamp_ns(message)
+    stamp_ns = header_stamp_ns(message)
     if len(message.apriltags) > limits.IN_VIEW:
         raise ValueError(f"a frame of more than {limits.IN_VIEW} detections")
     if len(detections.ids) > limits.DETECTIONS:
@@ -128,7 +129,7 @@ def _add_transforms(
             raise ValueError(f"the transform from {edge[1]} to {edge[0]} is not rigid")
         if not near[index]:
             raise ValueError(f"the transform from {edge[1]} to {edge[0]} leads out of the world")
-        transforms.setdefault(edge, {})[ros_messages.stamp_ns(stamped)] = rows[index]
+        transforms.setdefault(edge, {})[header_stamp_ns(stamped)] = rows[index]
 
 
 def list_topics(recorded: Sequence[Bag]) -> str:

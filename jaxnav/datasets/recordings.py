@@ -6,11 +6,11 @@ from typing import NoReturn
 from jaxnav.datasets import bags
 from jaxnav.datasets.decoded import read_decoded
 from jaxnav.datasets.recording import Recording, RecordingSource, Reference, assemble
-from jaxnav.datasets.ros_messages import TAGSLAM
 from jaxnav.datasets.tagslam import read_tagslam
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.ros.camera_messages import TAGSLAM
 
 __all__ = ["Recording", "Reference", "read_recording"]
 

@@ -12,7 +12,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxnav.datasets import ros_messages
 from jaxnav.datasets.ros_bags import ReceivedMessage, one_line, read_messages
 from jaxnav.detection import Detections
 from jaxnav.detection.image_search import ImageSearch, size_problem
@@ -26,6 +25,7 @@ from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.models.twists import TwistReader
+from jaxnav.ros import camera_messages, odometry_messages
 
 TOGETHER_NS = 100_000_000  # frames of one stamp that come later than this are not joined
 
@@ -64,7 +64,7 @@ def read_ros_drive(
         for received in messages:
             try:
                 if _same(received.topic, topics.odometry):
-                    reading = ros_messages.odometry(received.kind, received.message, twists)
+                    reading = odometry_messages.odometry(received.kind, received.message, twists)
                     inputs.append(Input(received.received_ns, reading))
                 else:
                     frames.append((received.received_ns, reader.sighted(received)))
@@ -122,13 +122,13 @@ class _Reader:
     def choose(self, kinds: Mapping[str, str]) -> list[str]:
         """The topics to read, each checked to be of a type that can be read."""
         wanted: dict[str, tuple[str, tuple[str, ...]]] = {
-            f"cameras.{name}": (topic, ros_messages.CAMERA_TYPES)
+            f"cameras.{name}": (topic, camera_messages.CAMERA_TYPES)
             for name, topic in self.topics.cameras.items()
         }
         if self.topics.odometry is not None:
-            wanted["odometry"] = (self.topics.odometry, ros_messages.ODOMETRY_TYPES)
+            wanted["odometry"] = (self.topics.odometry, odometry_messages.ODOMETRY_TYPES)
         chosen = [self._find(kinds, key, *entry) for key, entry in wanted.items()]
-        if ros_messages.TAGSLAM in [kinds[topic] for topic in chosen]:
+        if camera_messages.TAGSLAM in [kinds[topic] for topic in chosen]:
             if len(set(self.markers.ids)) < len(self.markers.ids):
                 problem = "ids must differ: the recording does not tell families"
                 raise BadInput("--markers", problem)
@@ -151,12 +151,12 @@ class _Reader:
     def sighted(self, received: ReceivedMessage) -> FrameDetections:
         """The sightings in a message of detections or of an image."""
         camera = self._camera_of[received.topic.strip("/")]
-        stamp_ns = ros_messages.stamp_ns(received.message)
-        if received.kind in (ros_messages.IMAGE, ros_messages.COMPRESSED):
+        stamp_ns = odometry_messages.stamp_ns(received.message)
+        if received.kind in (camera_messages.IMAGE, camera_messages.COMPRESSED):
             detections = self._search(camera, received)
             faults = Fault.FRAME_UNUSABLE if detections is None else Fault(0)
             return FrameDetections(camera, stamp_ns, detections, faults)
-        detections = ros_messages.detections(
+        detections = camera_messages.detections(
             received.kind,
             received.message,
             self.topics.first_corner,
@@ -166,7 +166,7 @@ class _Reader:
         return FrameDetections(camera, stamp_ns, detections)
 
     def _search(self, camera: int, received: ReceivedMessage) -> Detections | None:
-        image = ros_messages.grey_image(received.kind, received.message)
+        image = camera_messages.grey_image(received.kind, received.message)
         if image is None:
             return None
         self._images = self._images or ImageSearch(self.rig, self.markers, self.corner_backend)

@@ -15,7 +15,6 @@ from pydantic import Field
 
 from jaxnav.datasets import bags
 from jaxnav.datasets.recording import RecordingSource
-from jaxnav.datasets.ros_messages import TAGSLAM
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import rig_from_figures
@@ -24,6 +23,7 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import Count, ForeignEntry, Size, Vector, at, validate
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.ros.camera_messages import TAGSLAM
 
 _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 

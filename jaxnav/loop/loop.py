@@ -113,8 +113,11 @@ class Loop:
         # Compiled now: the threads that look for markers are watched.
         self._expected(np.array([1, 0, 0, 0, 0, 0, 0], dtype), self._min_covariance)
 
-    def run(self, duration_s: float = float("inf")) -> str:
+    def run(self, duration_s: float = float("inf"), until_arrival: bool = True) -> str:
         """Drive until the last waypoint, a trip of the guard, the time limit or the vehicle's end.
+
+        Args:
+            until_arrival: whether the last waypoint ends it.
 
         Returns:
             Why it ended: "arrived", "time is over", or the reason of an `Ending` vehicle or guard.
@@ -122,9 +125,9 @@ class Loop:
         self._eyes.expected = self._region
         self._eyes.start()
         with before_siblings():  # a late image costs one image, a late command ends the drive
-            return self._driven(duration_s)
+            return self._driven(duration_s, until_arrival)
 
-    def _driven(self, duration_s: float) -> str:
+    def _driven(self, duration_s: float, until_arrival: bool) -> str:
         ending = self._vehicle if isinstance(self._vehicle, Ending) else None
         begin_ns = self._now_ns()
         due_ns = begin_ns
@@ -145,7 +148,7 @@ class Loop:
                 return "time is over"
             if ending is not None and (why := ending.over) is not None:
                 return why
-            if self._outcome is not None and self._outcome.output.done:
+            if until_arrival and self._outcome is not None and self._outcome.output.done:
                 arrived_ns = arrived_ns or now_ns
                 if now_ns - arrived_ns > _STAYS_S * 1e9:
                     return "arrived"

@@ -151,6 +151,7 @@ class Pilot:
         program: Program | None = None,
         corner_sigma_px: float | None = None,
         relocate: bool = True,
+        drives: bool = True,
     ):
         """Args:
         navigator: with a vehicle and waypoints.
@@ -158,6 +159,8 @@ class Pilot:
         program: compiled `advance_packed` of the navigator; by default compiled by `jax.jit`.
         corner_sigma_px: of every corner along one axis; by default as each detection says.
         relocate: whether to drive on from a pose that no slip explains, slowly at first; else stop.
+        drives: whether the commands are the pilot's; else somebody else drives, they are zero, and
+            no throttle is known to hold the odometer against.
         """
         if navigator.controller is None:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
@@ -168,6 +171,7 @@ class Pilot:
         self._estimator = Estimator(navigator, program)
         self._frames = FrameIntake(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
+        self._drives = drives
         self._odometry_stamps = Stamps()
         self._odometer = Odometer.of(navigator.controller.vehicle)
         self._standstill = Standstill(
@@ -217,6 +221,7 @@ class Pilot:
 
     def _odometry(self, reading: Odometry, now_ns: int, faults: Fault) -> Outcome:
         known, jumps = self._known, self._odometry_stamps.jumps
+        throttle = self._pulling(reading.speed_mps)
         stamp_ns = self._odometry_stamps.take(reading.stamp_ns, now_ns)
         if not reading.valid or not (
             math.isfinite(reading.speed_mps) and math.isfinite(reading.steering_rad)
@@ -232,7 +237,7 @@ class Pilot:
             stamp_ns,
             known.speed_mps if known is not None and known.decided else None,
             self._seeing(now_ns),
-            self._command[1],
+            throttle,
             self._standstill.add_reading(stamp_ns, now_ns, reading.speed_mps),
         )
         faults |= faults_seen
@@ -248,7 +253,7 @@ class Pilot:
                 reading.steering_rad,
                 0.0 if known is None else float(known.pose[2]),
                 gap_s,
-                self._command[1],
+                throttle,
                 self._seeing(now_ns),
             )
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
@@ -369,15 +374,23 @@ class Pilot:
     def _limited(
         self, known: _Known, health: Health, now_ns: int, elapsed_ns: int
     ) -> tuple[float, float]:
-        self._command = self.limits.apply(
-            known.steering_rad,
-            known.throttle * SPEED_FACTOR[health],
-            self._command[0],
-            elapsed_ns / 1e9,
-        )
+        if self._drives:
+            self._command = self.limits.apply(
+                known.steering_rad,
+                known.throttle * SPEED_FACTOR[health],
+                self._command[0],
+                elapsed_ns / 1e9,
+            )
         self._commanded_ns = now_ns
         self._standstill.add_command(self._command[1], now_ns)
         return self._command
+
+    def _pulling(self, speed_mps: float) -> float:
+        """The throttle that moves the vehicle: the last one commanded, or, where somebody else
+        drives, the one that goes with the measured speed."""
+        if self._drives:
+            return self._command[1]
+        return speed_mps / self._odometer.speed_per_throttle_mps
 
     def _senses(self, known: _Known, now_ns: int, faults: Fault) -> Senses:
         began_ns = self._began_ns if self._began_ns is not None else now_ns

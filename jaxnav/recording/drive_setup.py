@@ -104,6 +104,7 @@ class SetupEntry(Entry):
     timeouts: TimeoutsEntry
     float64: Flag
     relocate: Flag = True  # older drives don't say
+    drives: Flag = True  # the same
     made_by: dict[str, str]
 
     @field_validator("selector")
@@ -127,6 +128,7 @@ class DriveSetup:
         parameters: name -> number or nested lists, in place of the navigator's own; see
             `with_params`.
         relocate: whether the car drives on from a pose that no slip explains; see `Pilot`.
+        drives: whether the commands are the pilot's, or somebody else drives; see `Pilot`.
     """
 
     rig: CameraRig
@@ -139,6 +141,7 @@ class DriveSetup:
     float64: bool = False
     parameters: dict[str, Any] = field(default_factory=dict)
     relocate: bool = True
+    drives: bool = True
 
     def with_params(self, params: Params) -> "DriveSetup":
         """The setup with these parameters in place of all that it had.
@@ -181,7 +184,9 @@ class DriveSetup:
         """
         navigator = self.navigator()
         program = compile_or_load(advance_packed, navigator, folder)
-        return Pilot(navigator, self.timeouts, program, self.corner_sigma_px, self.relocate)
+        return Pilot(
+            navigator, self.timeouts, program, self.corner_sigma_px, self.relocate, self.drives
+        )
 
     def header(self) -> dict[str, Any]:
         """The setup with every number bit for bit, and a description of this process."""
@@ -202,7 +207,9 @@ class DriveSetup:
             header["parameters"] = dict(self.parameters)
         if self.markers.origin_m != ZERO:
             header["origin_m"] = list(self.markers.origin_m)
-        return header if self.relocate else header | {"relocate": False}
+        # So can one in which these are as they always were.
+        others = {"relocate": self.relocate, "drives": self.drives}
+        return header | {name: False for name, value in others.items() if not value}
 
     @staticmethod
     def of_header(header: dict[str, Any], where: Path) -> "DriveSetup":
@@ -226,6 +233,7 @@ class DriveSetup:
             timeouts=Timeouts(**entry.timeouts.model_dump()),
             float64=entry.float64,
             relocate=entry.relocate,
+            drives=entry.drives,
         )
         if not entry.parameters:
             return setup

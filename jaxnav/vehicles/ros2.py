@@ -1,8 +1,14 @@
-"""Connect to ROS 2: a vehicle behind topics, and a publisher of the pilot's pose and command.
+"""Connect to a vehicle behind ROS 2 topics.
 
-Options of the vehicle: `odometry_topic` (/odom) and its `odometry_type` (odometry:
-nav_msgs/Odometry, or ackermann: ackermann_msgs/AckermannDriveStamped), `command_topic` (/drive,
-AckermannDriveStamped: the speed is throttle * speed_per_throttle_mps).
+Options, `--option KEY=VALUE`:
+
+    odometry_topic (/odom), odometry_type (nav_msgs/msg/Odometry, or another of
+        `jaxnav.ros.odometry_messages`; of a JointState also driven, steered: names of joints with
+        commas between them, and wheel_radius_m)
+    command_topic (/drive), command_type (ackermann: ackermann_msgs/AckermannDriveStamped whose
+        speed is throttle * speed_per_throttle_mps; twist: geometry_msgs/Twist; none: somebody else
+        drives)
+    sim_time (false): true takes the time of /clock
 
 ROS is not needed to install jaxnav; it is imported when something here is opened.
 """
@@ -14,20 +20,22 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from jaxnav.errors import BadInput
 from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
 from jaxnav.loop.limits import Limits
 from jaxnav.models.twists import TwistReader
-from jaxnav.vehicles.options import choice
-from jaxnav.vehicles.ros2_node import Node
+from jaxnav.ros.connection import Connection, message_type
+from jaxnav.ros.odometry_messages import ACKERMANN, JOINTS, ODOMETRY_TYPES, WheelJoints, odometry
+from jaxnav.vehicles.options import choice, number
 
 if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
-    from jaxnav.loop.pilot import Outcome
+    from collections.abc import Mapping
+
     from jaxnav.models.bicycle import Vehicle as VehicleModel
 
 _LOCK_PATIENCE_S = 0.03  # a `stop` waits this long for a message that another thread publishes
-_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y, rotation about z among the six of a ROS covariance
+_SHORT = {"odometry": ODOMETRY_TYPES[0], "ackermann": ACKERMANN}  # names of earlier releases
+_COMMANDS = {"ackermann": ACKERMANN, "twist": "geometry_msgs/msg/Twist"}
 
 
 def open_vehicle(setup: Setup) -> Vehicle:
@@ -37,14 +45,7 @@ def open_vehicle(setup: Setup) -> Vehicle:
         ImportError: ROS 2 or one of its message packages is not there.
         BadInput: an option is wrong.
     """
-    options = setup.options
-    kind = choice(options, "odometry_type", ("odometry", "ackermann"))
-    return RosVehicle(
-        setup.vehicle,
-        options.get("odometry_topic", "/odom"),
-        kind,
-        options.get("command_topic", "/drive"),
-    )
+    return RosVehicle(setup.vehicle, setup.options)
 
 
 class RosVehicle:
@@ -52,33 +53,37 @@ class RosVehicle:
 
     timeout_s = math.inf  # a subscriber may stop by itself, but does not say so
 
-    def __init__(
-        self, vehicle: VehicleModel, odometry_topic: str, odometry_type: str, command_topic: str
-    ):
+    def __init__(self, vehicle: VehicleModel, options: Mapping[str, str]):
         """Subscribe to the odometry.
 
         Args:
-            odometry_type: odometry or ackermann.
+            options: see the module.
         """
-        from ackermann_msgs.msg import AckermannDriveStamped
-        from nav_msgs.msg import Odometry as OdometryMessage
-
+        kind = choice(options, "odometry_type", (*ODOMETRY_TYPES, *_SHORT))
+        self._kind = _SHORT.get(kind, kind)
+        self._joints = _joints(options) if self._kind == JOINTS else None
+        command = choice(options, "command_type", (*_COMMANDS, "none"))
         self._limits = Limits.of(vehicle)
-        self._twists = TwistReader(float(vehicle.wheelbase_m), self._limits.steering_rad)
+        self._wheelbase_m = float(vehicle.wheelbase_m)
+        self._twists = TwistReader(self._wheelbase_m, self._limits.steering_rad)
         self._speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
-        self._topic = odometry_topic
+        self._topic = options.get("odometry_topic", "/odom")
         self._reading: Odometry | None = None
         self._steering_rad = 0.0
         self._written_ns: int | None = None
         self._closed = False
         self._writing = threading.Lock()  # so that no command follows the zero speed of a `stop`
         self._stops = 0
-        self._node = Node("jaxnav_vehicle")
-        self._publisher = self._node.publisher(AckermannDriveStamped, command_topic)
-        if odometry_type == "ackermann":
-            self._node.listen(AckermannDriveStamped, odometry_topic, self._take_ackermann)
-        else:
-            self._node.listen(OdometryMessage, odometry_topic, self._take_odometry)
+        sim_time = choice(options, "sim_time", ("false", "true")) == "true"
+        self._connection = Connection("jaxnav_vehicle", sim_time)
+        self._publisher, self._command_type = None, None
+        if command != "none":
+            topic, kind = options.get("command_topic", "/drive"), _COMMANDS[command]
+            self._publisher = self._connection.publisher(kind, topic)
+            self._command_type = message_type(kind)
+        self._stamped = command == "ackermann"
+        self._connection.listen(self._kind, self._topic, self._take)
+        self._connection.run()
 
     def read(self) -> Odometry:
         """The latest message, with its own stamp.
@@ -109,10 +114,10 @@ class RosVehicle:
             self._written_ns = now_ns
             stops = self._stops
             try:
-                self._command(throttle, now_ns)
+                self._command(throttle)
             finally:
                 if self._stops != stops:  # a stop did not wait for this command, which hung
-                    self._command(0.0, time.monotonic_ns())
+                    self._command(0.0)
 
     def stop(self) -> None:
         """Publish speed zero, also while ROS hangs with another message.
@@ -124,7 +129,7 @@ class RosVehicle:
         free = self._writing.acquire(timeout=_LOCK_PATIENCE_S)
         try:
             if not self._closed:
-                self._command(0.0, time.monotonic_ns())
+                self._command(0.0)
         finally:
             if free:
                 self._writing.release()
@@ -137,100 +142,38 @@ class RosVehicle:
             self.stop()
         finally:
             self._closed = True
-            self._node.close()
+            self._connection.close()
 
-    def _command(self, throttle: float, now_ns: int) -> None:
-        speed_mps = throttle * self._speed_per_throttle_mps
-        self._node.publish_drive(self._publisher, self._steering_rad, speed_mps, now_ns)
-
-    def _take_odometry(self, message: Any) -> None:
-        twist = message.twist.twist
-        self._take(message, *self._twists.read(float(twist.linear.x), float(twist.angular.z)))
-
-    def _take_ackermann(self, message: Any) -> None:
-        self._take(message, float(message.drive.speed), float(message.drive.steering_angle))
-
-    def _take(self, message: Any, speed_mps: float, steering_rad: float) -> None:
-        stamp_ns = self._node.monotonic_ns(message.header.stamp)
-        finite = math.isfinite(speed_mps) and math.isfinite(steering_rad)
-        self._reading = Odometry(stamp_ns, speed_mps, steering_rad, valid=finite)
-
-
-class RosPublisher:
-    """A publisher of every outcome of a pilot: the pose with its covariance, and the command."""
-
-    def __init__(
-        self,
-        vehicle: VehicleModel,
-        odometry_topic: str = "jaxnav/odometry",
-        command_topic: str = "jaxnav/command",
-        world_frame: str = "map",
-        vehicle_frame: str = "base_link",
-    ):
-        """Args:
-        world_frame: name of the poses' frame.
-        vehicle_frame: name of the frame midway between the axles, x forward.
-
-        Raises:
-            ImportError: ROS 2 or one of its message packages is not there.
-        """
-        from ackermann_msgs.msg import AckermannDriveStamped
-        from nav_msgs.msg import Odometry as OdometryMessage
-
-        self._speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
-        self._frames = world_frame, vehicle_frame
-        self._odometry_type = OdometryMessage
-        self._node = Node("jaxnav")
-        self._odometry = self._node.publisher(OdometryMessage, odometry_topic)
-        self._command = self._node.publisher(AckermannDriveStamped, command_topic)
-
-    def publish(self, outcome: Outcome) -> None:
-        """Publish the command, and the pose where it is known.
-
-        Raises:
-            OSError: it could not be published.
-        """
-        speed_mps = outcome.throttle * self._speed_per_throttle_mps
-        self._node.publish_drive(self._command, outcome.steering_rad, speed_mps, outcome.now_ns)
-        if not outcome.output.located:
+    def _command(self, throttle: float) -> None:
+        if self._command_type is None:
             return
-        pose = np.asarray(outcome.pose, float)
-        velocity = np.asarray(outcome.output.velocity, float)
-        covariance = np.asarray(outcome.output.covariance, float)
-        if all(np.isfinite(part).all() for part in (pose, velocity, covariance)):
-            self._publish_odometry(pose, velocity, covariance, outcome.now_ns)
+        speed_mps, message = throttle * self._speed_per_throttle_mps, self._command_type()
+        if self._stamped:
+            message.header.stamp = self._connection.stamp(self._connection.now_ns())
+            message.drive.steering_angle = float(self._steering_rad)
+            message.drive.speed = float(speed_mps)
+        else:  # the velocity along x is that of the rear axle; see `TwistReader`
+            slope = math.tan(self._steering_rad)
+            forward_mps = speed_mps / math.hypot(1.0, slope / 2)
+            message.linear.x = float(forward_mps)
+            message.angular.z = float(forward_mps * slope / self._wheelbase_m)
+        self._connection.publish(self._publisher, message)
 
-    def close(self) -> None:
-        """Leave ROS. May be called any number of times."""
-        self._node.close()
-
-    def _publish_odometry(
-        self, pose: np.ndarray, velocity: np.ndarray, covariance: np.ndarray, now_ns: int
-    ) -> None:
-        """Args:
-        pose: x_m, y_m, psi_rad in the world.
-        velocity: derivative of the pose.
-        covariance: (6, 6) of both.
-        """
-        message = self._odometry_type()
-        message.header.stamp = self._node.stamp(now_ns)
-        message.header.frame_id, message.child_frame_id = self._frames
-        x_m, y_m, psi_rad = map(float, pose)
-        message.pose.pose.position.x, message.pose.pose.position.y = x_m, y_m
-        message.pose.pose.orientation.z = math.sin(psi_rad / 2)
-        message.pose.pose.orientation.w = math.cos(psi_rad / 2)
-        message.pose.covariance = _among_six(covariance[:3, :3])
-        # A twist is in the axes of the vehicle, our velocity in those of the world.
-        c, s = math.cos(psi_rad), math.sin(psi_rad)
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        twist = message.twist.twist
-        twist.linear.x, twist.linear.y, twist.angular.z = map(float, turn @ velocity)
-        message.twist.covariance = _among_six(turn @ covariance[3:6, 3:6] @ turn.T)
-        self._node.publish(self._odometry, message)
+    def _take(self, message: Any) -> None:
+        reading = odometry(self._kind, message, self._twists, self._joints)
+        stamp_ns = self._connection.time_ns(message.header.stamp)
+        self._reading = Odometry(
+            stamp_ns, reading.speed_mps, reading.steering_rad, valid=reading.valid
+        )
 
 
-def _among_six(covariance: np.ndarray) -> list[float]:
-    """The 36 numbers of ROS (x, y, z and rotations about x, y, z) from a planar covariance."""
-    six = np.zeros((6, 6))
-    six[_PLANAR] = covariance
-    return [float(value) for value in six.ravel()]
+def _joints(options: Mapping[str, str]) -> WheelJoints:
+    names = {}
+    for key in ("driven", "steered"):
+        names[key] = tuple(name for name in options.get(key, "").split(",") if name)
+        if not names[key]:
+            raise BadInput(f"--option {key}", "missing: the names of a JointState's joints")
+    radius_m = number(options, "wheel_radius_m", math.nan, 0.001, 10.0)
+    if math.isnan(radius_m):
+        raise BadInput("--option wheel_radius_m", "missing: the radius of the driven wheels")
+    return WheelJoints(names["driven"], names["steered"], radius_m)

@@ -11,11 +11,11 @@ from hypothesis import assume
 from hypothesis import given as drawn
 from hypothesis import strategies as st
 
-from jaxnav.datasets.ros_messages import grey_image
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.loop.flags import Fault
 from jaxnav.models import bicycle
 from jaxnav.models.twists import STANDSTILL_MPS, TwistReader
+from jaxnav.ros.camera_messages import grey_image
 from tests.helpers.ros_bags import IMAGE, Bag
 from tests.helpers.ros_drives import BEGIN_NS, problem, read, topic_map
 from tests.worlds import paper_markers, qcar

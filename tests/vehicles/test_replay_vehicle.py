@@ -302,7 +302,7 @@ def test_bad_input_gets_one_line_before_anything_is_compiled(
     tmp_path, monkeypatch, capsys, options, line
 ):
     monkeypatch.setattr(
-        "jaxnav.commands.drive.run._compiled", lambda *told: pytest.fail("compiles")
+        "jaxnav.commands.drive.run.compiled_pilot", lambda *told: pytest.fail("compiles")
     )
     recorded(tmp_path / "good.mcap")
     (tmp_path / "text.mcap").write_text("a drive?\n" * 9)
@@ -390,7 +390,7 @@ def test_flags_go_before_the_recordings_own_files(tmp_path, drive, monkeypatch):
         given.append(setup)
         raise BadInput("--nothing", "is compiled here")
 
-    monkeypatch.setattr("jaxnav.commands.drive.run._compiled", compiled)
+    monkeypatch.setattr("jaxnav.commands.drive.run.compiled_pilot", compiled)
     save_rig(tmp_path / "rig.yaml", SETUP.rig.first(1))
     options = ("--option", f"drive={drive}", "--rig", str(tmp_path / "rig.yaml"))
     assert cli.main(["run", "--float64", "--headless", *NAMES, *options]) == 2

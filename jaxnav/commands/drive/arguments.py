@@ -33,6 +33,18 @@ from jaxnav.commands.kinds import (
 )
 
 
+def check_times(args: "Run | Ros") -> None:
+    """Refuse a period or a timeout that no loop can keep.
+
+    Raises:
+        BadInput: names the flag.
+    """
+    for name, least, most in (("period_s", 0.002, 0.1), ("timeout_s", 0.1, 10)):
+        value = getattr(args, name)
+        bounds = f"must be from {least} to {most}, got {value}"
+        require(least <= value <= most, flag_of(name), bounds)
+
+
 @dataclass(frozen=True)
 class Run(Checked):
     """Drive a vehicle through its route.
@@ -89,12 +101,39 @@ class Run(Checked):
     """No status line."""
 
     def _check(self) -> None:
-        for name, least, most in (("period_s", 0.002, 0.1), ("timeout_s", 0.1, 10)):
-            value = getattr(self, name)
-            bounds = f"must be from {least} to {most}, got {value}"
-            require(least <= value <= most, flag_of(name), bounds)
+        check_times(self)
         recorded = self.record is not None or not self.record_images
         require(recorded, "--record-images", "needs --record")
+
+
+@dataclass(frozen=True)
+class Ros(Checked):
+    """Localise and drive as a lifecycle node of ROS 2, named jaxnav.
+
+    FILE says which topic is what and names our files. With a route the node drives, through the
+    guard that `jaxnav run` has; without one it localises a car that somebody else drives; without
+    a vehicle, a rig that moves freely. It sends tf, pose with covariance, odometry, all
+    hypotheses, diagnostics. Words after --ros-args are ROS's own.
+
+    Exit codes: 1 the drive has ended, 2 bad input, 128 plus the number of the signal that ended it.
+    """
+
+    file: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="FILE")] = None
+    """The node's YAML; left out, the node's parameter `file` names it."""
+    managed: Switch = False
+    """Wait for the transitions configure and activate, instead of starting at once."""
+    record: Annotated[Path | None, optional("MCAP")] = None
+    """Record the drive into this file."""
+    corner_backend: Detector = "aruco"
+    period_s: float = 0.02
+    """Between two readings of the odometer, s."""
+    timeout_s: float = 0.2
+    """So long after the last sign of life of any thread the vehicle has been stopped, s."""
+    float64: Float64 = False
+    ros_args: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
+
+    def _check(self) -> None:
+        check_times(self)
 
 
 @dataclass(frozen=True)

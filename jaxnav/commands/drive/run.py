@@ -36,6 +36,8 @@ from jaxnav.loop.pilot import Pilot
 from jaxnav.loop.priority import before_others
 from jaxnav.loop.seeing import Eyes, Search
 from jaxnav.loop.signals import Signals
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import DriveSetup
 
 EXIT_STOPPED = 1  # by the watchdog, not by a person
@@ -64,18 +66,18 @@ def run(args: Run, signals: Signals) -> int:
         setup.rig, setup.markers, setup.vehicle, setup.route_on_map.start_pose, args.seed, options
     )
     with ExitStack() as closing:
-        guarding = _guarding(args)
+        guarding = guarding_process(args)
         if guarding is not None:
             closing.callback(guarding.end)
             guarding.prepare(signals.check)  # its errors are reported before anything is compiled
-        searches = _searches(args, setup)
+        searches = searches_for(args.corner_backend, setup.rig, setup.markers)
         onlookers = open_onlookers(args, setup, closing)
         for onlooker in onlookers:
             signals.before_leaving(onlooker.close)
         signals.check()
-        pilot = _compiled(args, setup, searches)
+        pilot = compiled_pilot(args, setup, searches)
         signals.check()
-        drive = _Drive(args, vehicle_setup, guarding, signals)
+        drive = Drive(args, vehicle_setup, guarding, signals)
         reason = drive.run(pilot, searches, onlookers)
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
@@ -111,7 +113,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     )
 
 
-def _guarding(args: Run) -> GuardProcess | None:
+def guarding_process(args: Run) -> GuardProcess | None:
     """The process that will own the vehicle; None where its plug-in must stay in this one."""
     factory = plugins.load_factory("--car", plugins.VEHICLES, args.car)
     if isinstance(factory, SharesProcess) and factory.shares_process:
@@ -123,14 +125,14 @@ def _guarding(args: Run) -> GuardProcess | None:
         raise BadInput(f"--car {args.car}", problem) from None
 
 
-def _searches(args: Run, setup: DriveSetup) -> list[Search]:
+def searches_for(corner_backend: str, rig: CameraRig, markers: MarkerMap) -> list[Search]:
     """A search for markers for each camera."""
-    detectors = make_detectors(setup.markers, args.corner_backend)
-    rig = jax.device_get(setup.rig)  # NumPy indexes its cameras without compiling anything
+    detectors = make_detectors(markers, corner_backend)
+    rig = jax.device_get(rig)  # NumPy indexes its cameras without compiling anything
     return [Search(c, rig.image_sizes_px[c], rig.camera(c), detectors) for c in range(len(rig))]
 
 
-def _compiled(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot:
+def compiled_pilot(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot:
     """A pilot and searches that are compiled and warmed up; returns the pilot."""
     _say(args, "compiling")
     began_s = time.monotonic()
@@ -143,26 +145,39 @@ def _compiled(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot
     return pilot
 
 
-class _Drive:
+class Drive:
     """One drive, from opening the vehicle and its cameras to closing them.
 
     Attributes:
+        guard: of this process, once the vehicle is open.
         kept_by: in words, the guard that stops the vehicle whatever happens here.
         unheard: why the vehicle may not have heard the last stop; None where it has.
     """
 
     loop: Loop
     eyes: Eyes
+    guard: Guard | None = None
     kept_by = ""
     unheard: str | None = None
 
-    def __init__(self, args: Run, setup: Setup, guarding: GuardProcess | None, signals: Signals):
+    def __init__(
+        self,
+        args: Run,
+        setup: Setup,
+        guarding: GuardProcess | None,
+        signals: Signals,
+        until_arrival: bool = True,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ):
         """Open nothing yet.
 
         Args:
             guarding: the process for the vehicle; None keeps it in this one.
+            until_arrival: whether the last waypoint ends the drive.
+            now_ns: the time of the vehicle's and the cameras' stamps.
         """
         self._args, self._setup, self._guarding, self._signals = args, setup, guarding, signals
+        self._until_arrival, self._now_ns = until_arrival, now_ns
 
     def run(self, pilot: Pilot, searches: list[Search], onlookers: Sequence[Observer]) -> str:
         """Open, drive, stop and close; return why the drive ended."""
@@ -173,6 +188,7 @@ class _Drive:
             closing.callback(gc.unfreeze)
             signals.hold()
             vehicle, guard = self._guarded(pilot.limits)
+            self.guard = guard
             closing.callback(self._close, vehicle, guard)
             signals.on_signal(guard.trip)
             signals.check()
@@ -181,9 +197,12 @@ class _Drive:
             closing.callback(self.eyes.close)
             # The guard trips before the eyes are closed, which their threads may delay.
             closing.callback(guard.trip, "the drive is over")
-            self.loop = Loop(pilot, guard, vehicle, self.eyes, onlookers, args.period_s)
+            self.loop = Loop(
+                pilot, guard, vehicle, self.eyes, onlookers, args.period_s, self._now_ns
+            )
             signals.check()
-            return self.loop.run(args.duration_s if args.duration_s is not None else float("inf"))
+            duration_s = args.duration_s if args.duration_s is not None else float("inf")
+            return self.loop.run(duration_s, self._until_arrival)
 
     def _guarded(self, limits: Limits) -> tuple[Vehicle, Guard]:
         """The vehicle, in a process of its own where possible, and the guard of this process."""

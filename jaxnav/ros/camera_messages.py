@@ -1,9 +1,7 @@
-"""Conversion of ROS messages into our types: corners, speed and steering, images.
+"""Conversion of ROS messages of cameras into corners and images.
 
     apriltag_msgs/AprilTagDetectionArray   apriltag_ros 2: pixels counted from the image's edge
     apriltag_msgs/ApriltagArrayStamped     TagSLAM: pixels as its calibration counts them
-    nav_msgs/Odometry                      speed and yaw rate
-    ackermann_msgs/AckermannDriveStamped   speed and steering angle
     sensor_msgs/Image, CompressedImage     8 bit, grey, colour or Bayer
 
 Corners are in the image that the detector was given. apriltag_ros takes a rectified image: its
@@ -19,18 +17,13 @@ from jaxtyping import UInt8
 
 from jaxnav.detection.types import Detections
 from jaxnav.files.images import decode_image
-from jaxnav.loop.interfaces import Odometry
 from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL, FirstCorner
-from jaxnav.models.twists import TwistReader
 
 APRILTAG_ROS = "apriltag_msgs/msg/AprilTagDetectionArray"
 TAGSLAM = "apriltag_msgs/msg/ApriltagArrayStamped"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
-NAV_ODOMETRY = "nav_msgs/msg/Odometry"
-ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 CAMERA_TYPES = (APRILTAG_ROS, TAGSLAM, IMAGE, COMPRESSED)
-ODOMETRY_TYPES = (NAV_ODOMETRY, ACKERMANN)
 
 # Name in ROS -> channels, and OpenCV's conversion to grey. OpenCV names a Bayer pattern after its
 # second row and column.
@@ -47,11 +40,6 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY),
     "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
 }
-
-
-def stamp_ns(message: Any) -> int:
-    """The stamp in a message's header, ns, on the clock of the computer that measured."""
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 def detections(
@@ -88,19 +76,6 @@ def detections(
             for tag, i in zip(tags, ids, strict=True)
         ),
     )
-
-
-def odometry(kind: str, message: Any, twists: TwistReader) -> Odometry:
-    """The odometry in a message of `NAV_ODOMETRY` or `ACKERMANN`.
-
-    Args:
-        twists: must read all messages of one topic, in their order.
-    """
-    if kind == ACKERMANN:
-        drive = message.drive
-        return Odometry(stamp_ns(message), float(drive.speed), float(drive.steering_angle))
-    twist = message.twist.twist
-    return Odometry(stamp_ns(message), *twists.read(float(twist.linear.x), float(twist.angular.z)))
 
 
 def grey_image(kind: str, message: Any) -> UInt8[np.ndarray, "rows columns"] | None:

@@ -1,0 +1,137 @@
+"""Reading of the file of a ROS node in YAML: our files, topics and frames.
+
+rig: rig.yaml                  # our files; their paths count from this file's folder
+markers: markers.yaml
+vehicle: vehicle.yaml          # left out: a rig that moves freely, without odometry
+route: route.yaml              # left out: somebody else drives, jaxnav only localises
+params: params.yaml            # tuned; may be left out, as all that follows
+selector: multi-hypothesis
+cameras: {front: /front/detections, left: /left/detections}     # as in topics.yaml
+camera_type: apriltag_msgs/msg/AprilTagDetectionArray   # or sensor_msgs/msg/Image
+corner_sigma_px: 0.3
+odometry: /odom
+odometry_type: nav_msgs/msg/Odometry
+joints: {driven: [rear_left, rear_right], steered: [front_left], wheel_radius_m: 0.033}
+command: /drive
+command_type: ackermann        # ackermann_msgs/AckermannDriveStamped; or twist
+frames: {map: map, odom: odom, base: base_link}
+base_x_m: -0.128               # of base_link, forward of the middle between the axles
+tf_tolerance_s: 0.0            # tf is stamped so far in the future
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from jaxnav.errors import BadInput
+from jaxnav.files.reading import read_mapping
+from jaxnav.files.topics import TopicMap
+from jaxnav.files.validation import Entry, Name, NonNegative, Number, Positive, Text, at, validate
+
+Frame = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z_][\w/.\-]{0,99}$")]
+
+
+class JointsEntry(Entry):
+    """The joints of a sensor_msgs/JointState that tell speed and steering."""
+
+    driven: Annotated[list[Name], Field(min_length=1, max_length=16)]
+    steered: Annotated[list[Name], Field(min_length=1, max_length=16)]
+    wheel_radius_m: Annotated[Positive, Field(le=10)]
+
+
+class FramesEntry(Entry):
+    """Names of frames, as REP-105 has them."""
+
+    map: Frame = "map"
+    odom: Frame = "odom"
+    base: Frame = "base_link"
+
+
+class RosFile(TopicMap):
+    """The file of a ROS node; see the module."""
+
+    rig: Text
+    markers: Text
+    vehicle: Text | None = None
+    route: Text | None = None
+    params: Text | None = None
+    selector: Text = "multi-hypothesis"
+    camera_type: Literal[
+        "apriltag_msgs/msg/AprilTagDetectionArray",
+        "sensor_msgs/msg/Image",
+        "sensor_msgs/msg/CompressedImage",
+    ] = "apriltag_msgs/msg/AprilTagDetectionArray"
+    odometry_type: Literal[
+        "nav_msgs/msg/Odometry",
+        "ackermann_msgs/msg/AckermannDriveStamped",
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        "geometry_msgs/msg/TwistStamped",
+        "sensor_msgs/msg/JointState",
+    ] = "nav_msgs/msg/Odometry"
+    joints: JointsEntry | None = None
+    command: Name = "/drive"
+    command_type: Literal["ackermann", "twist"] = "ackermann"
+    frames: FramesEntry = Field(default_factory=FramesEntry)
+    base_x_m: Annotated[Number, Field(ge=-100, le=100)] = 0.0
+    tf_tolerance_s: Annotated[NonNegative, Field(le=10)] = 0.0
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "RosFile":
+        if self.vehicle is None:
+            for key in ("route", "odometry", "joints"):
+                if getattr(self, key) is not None:
+                    raise ValueError(f"{key} needs a vehicle")
+        elif self.odometry is None:
+            raise ValueError("a vehicle needs odometry: its topic")
+        if (self.joints is not None) != (self.odometry_type == "sensor_msgs/msg/JointState"):
+            raise ValueError("joints go with the odometry_type sensor_msgs/msg/JointState")
+        return self
+
+    def file(self, key: str) -> Path | None:
+        """The path of one of our files; None where it is left out.
+
+        Raises:
+            BadInput: there is no such file.
+        """
+        text = getattr(self, key)
+        if text is None:
+            return None
+        path = self.path.parent / text
+        if not path.is_file():
+            raise BadInput(at(self.path, key), f"there is no file {path}")
+        return path
+
+    def options(self, drives: bool, sim_time: bool) -> dict[str, str]:
+        """The options of the plug-ins `ros2` of vehicle and cameras.
+
+        Args:
+            drives: whether commands are sent.
+        """
+        options = {f"camera.{name}": topic for name, topic in self.cameras.items()} | {
+            "camera_type": self.camera_type,
+            "corner_sigma_px": repr(self.corner_sigma_px),
+            "first_corner": self.first_corner,
+            "sim_time": "true" if sim_time else "false",
+        }
+        if self.odometry is not None:
+            options |= {"odometry_topic": self.odometry, "odometry_type": self.odometry_type}
+            options |= {"command_topic": self.command}
+            options |= {"command_type": self.command_type if drives else "none"}
+        if self.joints is not None:
+            options |= {"driven": ",".join(self.joints.driven)}
+            options |= {"steered": ",".join(self.joints.steered)}
+            options |= {"wheel_radius_m": repr(self.joints.wheel_radius_m)}
+        return options
+
+
+def load_ros(path: str | Path) -> RosFile:
+    """Read the file of a ROS node.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    path = Path(path)
+    node = validate(RosFile, read_mapping(path), path)
+    node._path = path
+    return node

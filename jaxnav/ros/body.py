@@ -1,0 +1,110 @@
+"""Localise a rig that moves freely, without odometry, from frames that arrive camera by camera.
+
+Frames of one stamp are one observation. Observations are taken in the order of their stamps, so
+that who comes first changes nothing: what `jaxnav replay` makes of the same frames is the same.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnav.detection.observe import observe
+from jaxnav.detection.types import Detections
+from jaxnav.navigator import Navigator, Step
+from jaxnav.pose.observation import Observation
+from jaxnav.ros.estimates import Report, report_of_body
+
+MAX_DT_S = 1.0  # over a longer pause the motion is predicted for one second
+_PATIENCE_S = 0.1  # an observation waits so long for the frames of its other cameras
+_NONE = Detections.concatenate([])
+
+
+class BodyTracker:
+    """The tracker of one rig, with a thread of its own.
+
+    Attributes:
+        late: frames older than the last observation, which are left out.
+    """
+
+    def __init__(
+        self, navigator: Navigator, step: Step, cameras: int, tell: Callable[[Report], None]
+    ):
+        """Args:
+        step: compiled `navigator.step`.
+        cameras: how many give frames.
+        tell: gets the report of each observation, in the tracker's thread.
+        """
+        self._navigator, self._step, self._tell = navigator, step, tell
+        self._cameras = cameras
+        self._state = navigator.init()
+        self._last_ns: int | None = None
+        self._sets: dict[int, tuple[float, dict[int, Detections]]] = {}  # by stamp
+        self._came = threading.Condition()
+        self._closed = False
+        self.late = 0
+        self._thread = threading.Thread(target=self._run, name="tracker", daemon=True)
+
+    def warm_up(self) -> None:
+        """Compile without changing the state."""
+        self._step(self._state, self._observation({}, 0.0))
+
+    def start(self) -> None:
+        """Begin to track."""
+        self._thread.start()
+
+    def add(self, camera: int, stamp_ns: int, detections: Detections) -> None:
+        """Take a camera's frame, by the camera's index in the rig."""
+        with self._came:
+            if self._last_ns is not None and stamp_ns <= self._last_ns:
+                self.late += 1
+                return
+            self._sets.setdefault(stamp_ns, (time.monotonic(), {}))[1][camera] = detections
+            self._came.notify()
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._came:
+            self._closed = True
+            self._came.notify()
+        if self._thread.ident is not None:
+            self._thread.join(1.0)
+
+    def _run(self) -> None:
+        while (taken := self._next()) is not None:
+            stamp_ns, frames = taken
+            before_ns = stamp_ns if self._last_ns is None else self._last_ns
+            self._last_ns = stamp_ns
+            dt_s = min(max((stamp_ns - before_ns) / 1e9, 0.0), MAX_DT_S)
+            self._state, output = self._step(self._state, self._observation(frames, dt_s))
+            belief = self._state.belief
+            restarts, origin_m = int(belief.restarts), self._navigator.markers.origin_m
+            self._tell(report_of_body(output, belief.bank, restarts, stamp_ns, origin_m))
+
+    def _next(self) -> tuple[int, dict[int, Detections]] | None:
+        """The next observation's stamp and frames; None: closed."""
+        with self._came:
+            while not self._closed:
+                if self._sets:
+                    stamp_ns = min(self._sets)
+                    came_s, frames = self._sets[stamp_ns]
+                    waits_s = came_s + _PATIENCE_S - time.monotonic()
+                    if len(frames) >= self._cameras or waits_s <= 0:
+                        del self._sets[stamp_ns]
+                        return stamp_ns, frames
+                    self._came.wait(waits_s)
+                else:
+                    self._came.wait()
+            return None
+
+    def _observation(self, frames: dict[int, Detections], dt_s: float) -> Observation:
+        count = len(self._navigator.rig)
+        lanes = observe([frames.get(c, _NONE) for c in range(count)], self._navigator.markers)
+        dtype = np.asarray(self._navigator.corner_sigma_px).dtype
+        return Observation(
+            jnp.asarray(lanes.corners_px, dtype),
+            jnp.asarray(lanes.visible),
+            dt_s=jnp.asarray(dt_s, dtype),
+        )

@@ -1,0 +1,166 @@
+"""Connect to ROS 2 with a node in a context of its own: the process's signals stay with the loop.
+
+    connection = Connection("jaxnav_cameras", sim_time=False)
+    connection.listen("sensor_msgs/msg/Image", "/front/image_raw", take)
+    connection.run()
+    ...
+    connection.close()
+
+Times in a program are those of `connection.now_ns`: the monotonic clock, or, with `ros_time`, that
+of ROS, which is /clock with `sim_time`.
+"""
+
+import importlib
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+_QUEUE = 10
+_WAIT_S = 0.05  # how long the thread sleeps where no message comes
+_OLDEST_NS = 1_000_000_000  # a message that claims to be older was stamped by another clock
+
+
+def message_type(kind: str) -> Any:
+    """The class of a message or service, by a name such as nav_msgs/msg/Odometry.
+
+    Raises:
+        ImportError: its package is not there.
+    """
+    package, group, name = kind.split("/")
+    return getattr(importlib.import_module(f"{package}.{group}"), name)
+
+
+class Connection:
+    """A node with topics and a thread that calls back. It must be closed.
+
+    Attributes:
+        node: rclpy's node.
+        sim_time: whether ROS takes the time of /clock.
+        ros_time: whether times are those of ROS, as they are stamped.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        sim_time: bool = False,
+        ros_time: bool = False,
+        make_node: Any = None,
+        args: Any = None,
+    ):
+        """Enter ROS.
+
+        Args:
+            sim_time: whether time is that of /clock; the words may say so too.
+            ros_time: whether times are those of ROS; with `sim_time` they always are.
+            make_node: called with name and context instead of `rclpy.create_node`.
+            args: words of the command line for ROS.
+
+        Raises:
+            ImportError: ROS 2 is not there.
+            OSError: ROS 2 can't start, or does not understand the words.
+        """
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.parameter import Parameter
+        from rclpy.signals import SignalHandlerOptions
+        from rclpy.time import Time
+
+        self._rclpy, self._Time = rclpy, Time
+        self._context = rclpy.Context()
+        try:
+            rclpy.init(
+                args=args, context=self._context, signal_handler_options=SignalHandlerOptions.NO
+            )
+            self.node: Any = (make_node or rclpy.create_node)(name, context=self._context)
+        except (
+            Exception
+        ) as error:  # rclpy's own, of which some are no `Exception` of Python's kinds
+            raise OSError(f"ROS: {type(error).__name__}: {error}") from error
+        if sim_time:
+            self.node.set_parameters([Parameter("use_sim_time", value=True)])
+        self.sim_time = bool(self.node.get_parameter("use_sim_time").value)
+        self.ros_time = ros_time or self.sim_time
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def publisher(self, kind: str, topic: str, latched: bool = False) -> Any:
+        """A publisher on a topic, for `publish`.
+
+        Args:
+            latched: who listens later hears the last message too.
+        """
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        quality = QoSProfile(depth=1 if latched else _QUEUE, durability=durability)
+        return self.node.create_publisher(message_type(kind), topic, quality)
+
+    def listen(self, kind: str, topic: str, take: Callable[[Any], None]) -> None:
+        """Pass every message of a topic to a function, in the thread of `run`."""
+        from rclpy.qos import qos_profile_sensor_data  # reliable publishers suit it too
+
+        self.node.create_subscription(message_type(kind), topic, take, qos_profile_sensor_data)
+
+    def run(self) -> None:
+        """Begin to call back, in a thread of its own."""
+        self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
+        self._thread.start()
+
+    def spin_some(self) -> None:
+        """Call back what has come, before `run`."""
+        self._executor.spin_once(timeout_sec=_WAIT_S)
+
+    def publish(self, publisher: Any, message: Any) -> None:
+        """Send a message.
+
+        Raises:
+            OSError: ROS refused it.
+        """
+        try:
+            publisher.publish(message)
+        except Exception as error:
+            # rclpy raises exceptions of its own for a context that is gone.
+            raise OSError(f"ROS: {type(error).__name__}: {error}") from error
+
+    def now_ns(self) -> int:
+        """The time, on the clock of the program."""
+        return self._ros_ns() if self.ros_time else time.monotonic_ns()
+
+    def stamp(self, now_ns: int) -> Any:
+        """Convert a time of the program to a ROS stamp."""
+        if self.ros_time:
+            return self._Time(nanoseconds=max(now_ns, 0)).to_msg()
+        age_ns = time.monotonic_ns() - now_ns
+        return self._Time(nanoseconds=max(self._ros_ns() - age_ns, 0)).to_msg()
+
+    def time_ns(self, stamp: Any) -> int:
+        """Convert a ROS stamp to the time of the program.
+
+        On the monotonic clock a missing stamp, or one of another computer's clock, is now.
+        """
+        stamped_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+        if self.ros_time:
+            return stamped_ns
+        age_ns = self._ros_ns() - stamped_ns
+        return time.monotonic_ns() - (age_ns if 0 <= age_ns <= _OLDEST_NS else 0)
+
+    def close(self) -> None:
+        """Leave ROS. May be called any number of times."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join(1.0)
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._rclpy.shutdown(context=self._context)
+
+    def _ros_ns(self) -> int:
+        return int(self.node.get_clock().now().nanoseconds)
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            self._executor.spin_once(timeout_sec=_WAIT_S)

@@ -1,0 +1,81 @@
+"""Conversion of ROS messages into speed and steering, without ROS, OpenCV or JAX.
+
+nav_msgs/Odometry                           speed and yaw rate
+geometry_msgs/TwistStamped, TwistWithCovarianceStamped      the same
+ackermann_msgs/AckermannDriveStamped        speed and steering angle
+sensor_msgs/JointState                      wheels and the joints that steer, by their names
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.models.twists import TwistReader
+
+NAV_ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST = "geometry_msgs/msg/TwistStamped"
+TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
+JOINTS = "sensor_msgs/msg/JointState"
+ODOMETRY_TYPES = (NAV_ODOMETRY, ACKERMANN, TWIST_WITH_COVARIANCE, TWIST, JOINTS)
+
+
+@dataclass(frozen=True)
+class WheelJoints:
+    """The joints of a car, by their names in a JointState.
+
+    Attributes:
+        driven: wheels without steering, whose mean rate in rad/s tells the speed.
+        steered: joints about the vertical axis; of several the mean angle is taken.
+        radius_m: of the driven wheels.
+    """
+
+    driven: tuple[str, ...]
+    steered: tuple[str, ...]
+    radius_m: float
+
+
+def stamp_ns(message: Any) -> int:
+    """The stamp in a message's header, ns, on the clock of the computer that measured."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def odometry(
+    kind: str, message: Any, twists: TwistReader, joints: WheelJoints | None = None
+) -> Odometry:
+    """The odometry in a message of one of `ODOMETRY_TYPES`; what is no number is not valid.
+
+    Args:
+        twists: must read all messages of one topic, in their order.
+        joints: of a JointState.
+    """
+    speed_mps, steering_rad = _speed_and_steering(kind, message, twists, joints)
+    finite = math.isfinite(speed_mps) and math.isfinite(steering_rad)
+    return Odometry(stamp_ns(message), speed_mps, steering_rad, valid=finite)
+
+
+def _speed_and_steering(
+    kind: str, message: Any, twists: TwistReader, joints: WheelJoints | None
+) -> tuple[float, float]:
+    if kind == ACKERMANN:
+        return float(message.drive.speed), float(message.drive.steering_angle)
+    if kind == JOINTS:
+        return (math.nan, math.nan) if joints is None else _of_joints(message, twists, joints)
+    twist = message.twist if kind == TWIST else message.twist.twist
+    return twists.read(float(twist.linear.x), float(twist.angular.z))
+
+
+def _of_joints(message: Any, twists: TwistReader, joints: WheelJoints) -> tuple[float, float]:
+    """Speed of the vehicle's middle, from the rear axle's, which the driven wheels tell."""
+    names = list(message.name)
+    try:
+        rates = [float(message.velocity[names.index(name)]) for name in joints.driven]
+        angles = [float(message.position[names.index(name)]) for name in joints.steered]
+    except (ValueError, IndexError):  # another robot's joints, or a message without rates
+        return math.nan, math.nan
+    steering_rad = sum(angles) / len(angles)
+    rear_mps = joints.radius_m * sum(rates) / len(rates)
+    yaw_rate_radps = rear_mps * math.tan(steering_rad) / twists.wheelbase_m
+    speed_mps, _ = twists.read(rear_mps, yaw_rate_radps)
+    return speed_mps, steering_rad

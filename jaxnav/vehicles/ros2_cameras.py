@@ -1,0 +1,108 @@
+"""Read cameras from ROS 2 topics: images, or the corners that another node has found.
+
+Options, `--option KEY=VALUE`:
+
+    camera.<name>     topic of each camera of the rig; one without a topic never has a frame
+    camera_type       apriltag_msgs/msg/AprilTagDetectionArray, or sensor_msgs/msg/Image or
+                      CompressedImage
+    corner_sigma_px   of detections (0.3)
+    first_corner      of detections, see `jaxnav.files.topics` (bottom_left)
+    sim_time          true takes the time of /clock (false)
+    stamps            monotonic, or ros: as they are in the messages
+"""
+
+import threading
+from collections import deque
+from functools import partial
+from typing import Any, get_args
+
+from jaxnav.detection.types import Detections
+from jaxnav.errors import BadInput
+from jaxnav.loop.interfaces import Camera, Frame, Setup, Vehicle
+from jaxnav.models.conventions import FirstCorner
+from jaxnav.ros.camera_messages import APRILTAG_ROS, COMPRESSED, IMAGE, detections, grey_image
+from jaxnav.ros.connection import Connection
+from jaxnav.vehicles.options import choice, number
+
+_PREFIX = "camera."
+_WAITING = 8  # frames that a camera keeps for its reader
+
+
+class RosCamera:
+    """A camera behind a topic. Implements `Camera`."""
+
+    def __init__(self, name: str, leave: Any):
+        """Args:
+        leave: called when it is closed.
+        """
+        self.name = name
+        self._leave = leave
+        self._frames: deque[Frame] = deque(maxlen=_WAITING)
+        self._came = threading.Condition()
+        self._closed = False
+
+    def add(self, frame: Frame) -> None:
+        """Take a frame from the topic."""
+        with self._came:
+            self._frames.append(frame)
+            self._came.notify()
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """See `Camera`."""
+        with self._came:
+            if not self._frames and not self._closed:
+                self._came.wait(timeout_s)
+            return self._frames.popleft() if self._frames else None
+
+    def close(self) -> None:
+        """See `Camera`."""
+        with self._came:
+            closed, self._closed = self._closed, True
+            self._came.notify_all()
+        if not closed:
+            self._leave()
+
+
+def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
+    """Listen to a topic for each camera of the rig.
+
+    Raises:
+        ImportError: ROS 2 or one of its message packages is not there.
+        BadInput: an option is wrong.
+    """
+    options, names = setup.options, setup.rig.names
+    kind = choice(options, "camera_type", (APRILTAG_ROS, IMAGE, COMPRESSED))
+    first_corner: Any = choice(options, "first_corner", get_args(FirstCorner))
+    sigma_px = number(options, "corner_sigma_px", 0.3, 1e-3, 100.0)
+    topics = {k.removeprefix(_PREFIX): v for k, v in options.items() if k.startswith(_PREFIX)}
+    for name in topics:
+        if name not in names:
+            problem = f"the rig has no such camera: expected {', '.join(names)}"
+            raise BadInput(f"--option {_PREFIX}{name}", problem)
+    if not topics:
+        raise BadInput(f"--option {_PREFIX}{names[0]}", "missing: a topic of at least one camera")
+    sim_time = choice(options, "sim_time", ("false", "true")) == "true"
+    families = dict(zip(setup.markers.ids, setup.markers.families, strict=True))
+    ros_time = choice(options, "stamps", ("monotonic", "ros")) == "ros"
+    connection = Connection("jaxnav_cameras", sim_time, ros_time)
+
+    def seen(message: Any) -> Detections:
+        return detections(kind, message, first_corner, sigma_px, families)
+
+    def take(camera: RosCamera, message: Any) -> None:
+        stamp_ns = connection.time_ns(message.header.stamp)
+        try:
+            if kind == APRILTAG_ROS:
+                frame = Frame(stamp_ns, detections=seen(message))
+            else:
+                frame = Frame(stamp_ns, grey_image(kind, message))
+        except ValueError:  # an encoding that nobody reads: reported as a frame without a picture
+            frame = Frame(stamp_ns)
+        camera.add(frame)
+
+    cameras = [RosCamera(name, connection.close) for name in names]
+    for camera in cameras:
+        if camera.name in topics:
+            connection.listen(kind, topics[camera.name], partial(take, camera))
+    connection.run()
+    return list(cameras)

@@ -1,0 +1,109 @@
+"""A simulated car behind ROS topics, as a process: python -m tests.ros.sim_car.
+
+It publishes /odom (with a pose that drifts), /NAME/detections of each camera of the QCar, and the
+true pose on /truth; it obeys /drive, and stops by itself 0.5 s after the last command.
+"""
+
+import math
+import signal
+import threading
+import time
+
+import numpy as np
+
+from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
+from jaxnav.loop.interfaces import Setup
+from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
+from jaxnav.ros.camera_messages import APRILTAG_ROS
+from jaxnav.ros.connection import Connection, message_type
+from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY
+from jaxnav.vehicles.sim import open_cameras, open_vehicle
+
+WHEELBASE_M = 0.256
+ODOMETRY_S = 0.02
+SILENT_S = 0.5
+
+
+def detections_message(found, stamp):
+    """An AprilTagDetectionArray of `Detections`."""
+    message = message_type(APRILTAG_ROS)()
+    message.header.stamp = stamp
+    kind, point = (message_type(f"apriltag_msgs/msg/{n}") for n in ("AprilTagDetection", "Point"))
+    order = np.argsort(TL_TR_BR_BL["bottom_left"])
+    for marker, family, corners_px in zip(found.ids, found.families, found.corners_px, strict=True):
+        one = kind(family=family, id=int(marker))
+        places = corners_px[order] + APRILTAG_PIXEL_EDGE_PX
+        one.corners = [point(x=float(x), y=float(y)) for x, y in places]
+        message.detections.append(one)
+    return message
+
+
+def main():
+    """Simulate until a signal comes."""
+    over = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: over.set())
+    qcar = calib_dir() / "qcar"
+    rig, route = load_rig(qcar / "rig.yaml"), load_route(qcar / "route.yaml")
+    vehicle_model = load_vehicle(qcar / "vehicle.yaml")
+    setup = Setup(rig, load_markers(qcar / "markers.yaml"), vehicle_model, route.start_pose)
+    vehicle = open_vehicle(setup)
+    cameras = open_cameras(setup, vehicle)
+    ros = Connection("sim_car")
+    per_throttle_mps = float(vehicle_model.speed_per_throttle_mps)
+    heard_s = [time.monotonic()]
+
+    def obey(message):
+        heard_s[0] = time.monotonic()
+        vehicle.write(message.drive.steering_angle, message.drive.speed / per_throttle_mps)
+
+    def look(camera, publisher):
+        while not over.is_set():
+            frame = camera.read(0.1)
+            if frame is not None:
+                stamp = ros.stamp(frame.stamp_ns)
+                ros.publish(publisher, detections_message(frame.detections, stamp))
+
+    ros.listen(ACKERMANN, "/drive", obey)
+    odom = ros.publisher(NAV_ODOMETRY, "/odom")
+    truth = ros.publisher("geometry_msgs/msg/PoseStamped", "/truth")
+    ros.run()
+    for camera in cameras:
+        publisher = ros.publisher(APRILTAG_ROS, f"/{camera.name}/detections")
+        threading.Thread(target=look, args=(camera, publisher), daemon=True).start()
+    x_m = y_m = psi_rad = 0.0
+    while not over.wait(ODOMETRY_S):
+        if time.monotonic() - heard_s[0] > SILENT_S:
+            vehicle.stop()
+        reading = vehicle.read()
+        slope = math.tan(reading.steering_rad)
+        forward_mps = reading.speed_mps / math.hypot(1.0, slope / 2)
+        rate_radps = forward_mps * slope / WHEELBASE_M
+        psi_rad += rate_radps * ODOMETRY_S
+        x_m += reading.speed_mps * math.cos(psi_rad + math.atan(slope / 2)) * ODOMETRY_S
+        y_m += reading.speed_mps * math.sin(psi_rad + math.atan(slope / 2)) * ODOMETRY_S
+        message = message_type(NAV_ODOMETRY)()
+        message.header.stamp = ros.stamp(reading.stamp_ns)
+        message.header.frame_id, message.child_frame_id = "odom", "base_link"
+        place(message.pose.pose, x_m, y_m, psi_rad)
+        message.twist.twist.linear.x, message.twist.twist.angular.z = forward_mps, rate_radps
+        ros.publish(odom, message)
+        true = message_type("geometry_msgs/msg/PoseStamped")()
+        now_ns = time.monotonic_ns()
+        true.header.stamp = ros.stamp(now_ns)
+        place(true.pose, *map(float, vehicle.world.state(now_ns)[:3]))
+        ros.publish(truth, true)
+    for camera in cameras:
+        camera.close()
+    vehicle.close()
+    ros.close()
+
+
+def place(pose, x_m, y_m, psi_rad):
+    """Write a planar pose into a message."""
+    pose.position.x, pose.position.y = x_m, y_m
+    pose.orientation.w, pose.orientation.z = math.cos(psi_rad / 2), math.sin(psi_rad / 2)
+
+
+if __name__ == "__main__":
+    main()
