@@ -1,8 +1,8 @@
 """Build the ROS 2 message packages that the Python package index lacks, and jaxnav's own.
 
-    python ros/environment/build.py [PREFIX]    build into the environment PREFIX, else this Python's
-    python ros/environment/build.py --check     can one be made here? a line says what is lacking
-    python ros/environment/build.py --wheels    are there wheels for this platform and Python?
+    python ros/environment/build.py [PREFIX]   build into the environment PREFIX, else this Python's
+    python ros/environment/build.py --check    can one be made here? a line says what is lacking
+    python ros/environment/build.py --wheels   are there wheels for this platform and Python?
 
 PREFIX has the wheels that requirements.txt beside this file names. Every package of messages/ and
 ../jaxnav_msgs is generated, compiled and installed there, what it depends on first: its Python
