@@ -8,9 +8,12 @@ SEED ?= $(shell date +%s)
 VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# ROS restarts every Python of its environment once, so it has one of its own.
+ROS := .venv-ros
+ROS_SOURCES := $(shell find ros/environment ros/jaxnav_msgs -type f)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast lint format benchmark fuzz docs clean
+.PHONY: help demo test test-fast lint format benchmark fuzz docs ros test-ros clean
 
 help:
 	@echo "make demo       the main job: two simulated drives, their report in demo/"
@@ -21,7 +24,9 @@ help:
 	@echo "make benchmark  timings against OpenCV and NumPy"
 	@echo "make fuzz       damaged files against every loader and command, an hour: MINUTES=5 SEED=1"
 	@echo "make docs       the site, in site/: guide, API, notebooks; a warning is an error"
-	@echo "make clean      remove .venv and everything that was generated"
+	@echo "make ros        ROS 2 with jaxnav and its messages, in .venv-ros, some minutes"
+	@echo "make test-ros   tests against that ROS 2"
+	@echo "make clean      remove both environments and everything that was generated"
 
 demo: $(VENV)/.installed
 	$(BIN)/jaxnav demo --out demo
@@ -52,8 +57,18 @@ fuzz: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
+ros: $(ROS)/.installed
+	@echo "to enter it: . $(ROS)/bin/activate"
+	@echo "ROS talks to the whole network unless told: export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST ROS_DOMAIN_ID=7"
+
+# Where there are no wheels, nothing is tested and nothing has failed.
+test-ros:
+	@if [ -e $(ROS)/.created ] || lacking=$$($(PYTHON) ros/environment/build.py --wheels 2>&1); then \
+	  $(MAKE) --no-print-directory $(ROS)/.installed && $(ROS)/bin/python -m pytest tests/ros; \
+	else echo "tests/ros are left out: $$lacking"; fi
+
 clean:
-	rm -rf $(VENV) build dist demo out site .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks
+	rm -rf $(VENV) $(ROS) build dist demo out site .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is written when its step has succeeded, so a failed installation is tried again.
@@ -79,3 +94,19 @@ $(VENV)/.installed-docs: pyproject.toml constraints.txt | $(VENV)/.created
 	@echo "installing jaxnav and what builds its site into $(VENV)"
 	@$(PIP_INSTALL) -e '.[docs]'
 	@touch $(VENV)/.installed $@
+
+$(ROS)/.created:
+	@$(PYTHON) ros/environment/build.py --check
+	@$(PYTHON) -m venv --clear $(ROS)
+	@touch $@
+
+$(ROS)/.wheels: ros/environment/requirements.txt ros/environment/constraints.txt pyproject.toml constraints.txt | $(ROS)/.created
+	@echo "installing ROS 2 and jaxnav into $(ROS)"
+	@$(ROS)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+	  -c ros/environment/constraints.txt -r ros/environment/requirements.txt -e '.[apriltag]'
+	@touch $@
+
+$(ROS)/.installed: $(ROS)/.wheels $(ROS_SOURCES)
+	@echo "building ROS messages into $(ROS)"
+	@$(ROS)/bin/python ros/environment/build.py
+	@touch $@

@@ -61,6 +61,10 @@ class Bag:
         """A message of `package/Type`."""
         return self._types.types[name.replace("/", "/msg/")](*values, **named)
 
+    def type_hash(self, name: str) -> str:
+        """What ROS 2 knows `package/msg/Type` by."""
+        return self._types.hash_rihs01(name)
+
     def header(self, stamp_ns: int) -> Any:
         """A header with a stamp."""
         time = self.make("builtin_interfaces/Time", stamp_ns // 10**9, stamp_ns % 10**9)
