@@ -16,6 +16,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from jaxnav.errors import libraries_silenced
+
 _QUEUE = 10
 _WAIT_S = 0.05  # how long the thread sleeps where no message comes
 _OLDEST_NS = 1_000_000_000  # a message that claims to be older was stamped by another clock
@@ -69,9 +71,10 @@ class Connection:
         self._rclpy, self._Time = rclpy, Time
         self._context = rclpy.Context()
         try:
-            rclpy.init(
-                args=args, context=self._context, signal_handler_options=SignalHandlerOptions.NO
-            )
+            with libraries_silenced():  # what is wrong with the words is in the exception too
+                rclpy.init(
+                    args=args, context=self._context, signal_handler_options=SignalHandlerOptions.NO
+                )
             self.node: Any = (make_node or rclpy.create_node)(name, context=self._context)
         except (
             Exception

@@ -1,0 +1,218 @@
+"""The node drives a simulated car, over real DDS: publisher, node, guard, subscriber."""
+
+import math
+import signal
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from jaxnav.files import calib_dir
+from jaxnav.files.poses import compose
+from jaxnav.ros.connection import Connection, message_type
+from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY
+from tests.ros.processes import node, sim_car, until
+
+CAMERAS = ("front", "right", "rear", "left")
+PATIENT = ("--timeout-s", "2")  # of the guard: other tests keep the machine busy
+GOAL = 0.50, 0.65
+
+
+class Listener:
+    """What others hear on the topics of the node and of the car."""
+
+    def __init__(self) -> None:
+        self.connection = Connection("listener")
+        self.heard: dict[str, list] = {}
+        for kind, topic in (
+            ("tf2_msgs/msg/TFMessage", "/tf"),
+            ("geometry_msgs/msg/PoseWithCovarianceStamped", "/jaxnav/pose"),
+            ("geometry_msgs/msg/PoseArray", "/jaxnav/hypotheses"),
+            ("visualization_msgs/msg/MarkerArray", "/jaxnav/ghosts"),
+            ("diagnostic_msgs/msg/DiagnosticArray", "/diagnostics"),
+            ("geometry_msgs/msg/PoseStamped", "/truth"),
+            ("jaxnav_msgs/msg/Bank", "/jaxnav/bank"),
+            (NAV_ODOMETRY, "/odom"),
+            (ACKERMANN, "/drive"),
+        ):
+            self.heard[topic] = []
+            self.connection.listen(kind, topic, self.heard[topic].append)
+        self.connection.run()
+
+    def last(self, topic: str):
+        """The last message; None without one."""
+        return self.heard[topic][-1] if self.heard[topic] else None
+
+    def forget(self) -> None:
+        """Begin to listen anew."""
+        for messages in self.heard.values():
+            messages.clear()
+
+    def decided(self) -> bool:
+        """Whether the node knows where the car is."""
+        return bool(self.last("/jaxnav/bank") and self.last("/jaxnav/bank").decided)
+
+    def drives(self) -> bool:
+        """Whether the last command is one to move."""
+        return self.last("/drive") is not None and self.last("/drive").drive.speed > 0.05
+
+
+@pytest.fixture
+def listener() -> Iterator[Listener]:
+    listener = Listener()
+    yield listener
+    listener.connection.close()
+
+
+@pytest.fixture
+def file(tmp_path):
+    return write_file(tmp_path)
+
+
+def write_file(folder, **changes):
+    """The node's file for the QCar."""
+    qcar = calib_dir() / "qcar"
+    entries = {name: str(qcar / f"{name}.yaml") for name in ("rig", "markers", "vehicle", "route")}
+    entries["cameras"] = "{" + ", ".join(f"{n}: /{n}/detections" for n in CAMERAS) + "}"
+    entries |= {"odometry": "/odom"} | changes
+    path = folder / "node.yaml"
+    lines = (f"{key}: {value}" for key, value in entries.items() if value is not None)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def pose_of(pose) -> np.ndarray:
+    """(7,) wxyz_xyz of a geometry_msgs/Pose."""
+    p, q = pose.position, pose.orientation
+    return np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
+
+
+def stamp_s(message) -> float:
+    return message.header.stamp.sec + message.header.stamp.nanosec / 1e9
+
+
+def nearest(messages, time_s):
+    return min(messages, key=lambda message: abs(stamp_s(message) - time_s))
+
+
+def test_it_drives_to_the_goal_and_tells_everybody_where_it_is(tmp_path, listener, file):
+    with sim_car(tmp_path), node(tmp_path, str(file), *PATIENT) as program:
+
+        def there() -> bool:
+            truth = listener.last("/truth")
+            return (
+                truth is not None
+                and math.dist((truth.pose.position.x, truth.pose.position.y), GOAL) < 0.2
+            )
+
+        until(there, 300.0, program)
+        check_poses(listener)
+        check_tf(listener)
+        check_bank(listener)
+        # It stays where it has arrived, and goes on to say where that is.
+        listener.forget()
+        until(lambda: len(listener.heard["/jaxnav/pose"]) > 20, 20.0, program)
+        check_reset(listener)
+        program.tell(signal.SIGTERM)
+        assert program.ends() == 128 + signal.SIGTERM, program.said
+    assert listener.last("/drive").drive.speed == 0
+
+
+def check_poses(listener: Listener) -> None:
+    """Poses are near the truth, and as near as they say."""
+    errors_m, nees = [], []
+    for message in listener.heard["/jaxnav/pose"]:
+        true = pose_of(nearest(listener.heard["/truth"], stamp_s(message)).pose)
+        error = pose_of(message.pose.pose)[4:6] - true[4:6]
+        covariance = np.reshape(message.pose.covariance, (6, 6))
+        assert np.all(np.linalg.eigvalsh(covariance) > 0)
+        errors_m.append(np.linalg.norm(error))
+        nees.append(error @ np.linalg.solve(covariance[:2, :2], error))
+    # The nearest truth is up to 10 ms away, in which the car drives 3 mm.
+    assert np.median(errors_m) < 0.02
+    assert np.max(errors_m) < 0.15
+    assert np.median(nees) < 5
+
+
+def check_tf(listener: Listener) -> None:
+    """map -> odom, with odom -> base_link of the odometer, gives the pose."""
+    frames = {
+        (one.header.frame_id, one.child_frame_id)
+        for message in listener.heard["/tf"]
+        for one in message.transforms
+    }
+    assert frames == {("map", "odom")}
+    apart_m = []
+    for message in listener.heard["/tf"][:: max(len(listener.heard["/tf"]) // 50, 1)]:
+        one = message.transforms[0]
+        t, q = one.transform.translation, one.transform.rotation
+        T_map_odom = np.array([q.w, q.x, q.y, q.z, t.x, t.y, t.z])
+        odometry = nearest(listener.heard["/odom"], stamp_s(one))
+        there = compose(T_map_odom, pose_of(odometry.pose.pose))
+        true = pose_of(nearest(listener.heard["/truth"], stamp_s(odometry)).pose)
+        apart_m.append(np.linalg.norm(there[4:6] - true[4:6]))
+    assert np.median(apart_m) < 0.03
+
+
+def check_bank(listener: Listener) -> None:
+    """All hypotheses come out, also as plain messages for who has not built ours."""
+    bank = listener.last("/jaxnav/bank")
+    assert bank.decided
+    assert bank.located
+    # A busy machine makes frames stale now and then.
+    assert "OK" in {one.health for one in listener.heard["/jaxnav/bank"]}
+    assert bank.child_frame_id == "base_link"
+    assert sum(one.weight for one in bank.hypotheses) == pytest.approx(1)
+    assert any(len(one.hypotheses) > 1 for one in listener.heard["/jaxnav/bank"])  # at the start
+    assert len(listener.last("/jaxnav/hypotheses").poses) == len(bank.hypotheses)
+    shown = [one for one in listener.last("/jaxnav/ghosts").markers if one.action == one.ADD]
+    assert len(shown) == len(bank.hypotheses)
+    status = listener.last("/diagnostics").status[0]
+    told = {pair.key: pair.value for pair in status.values}
+    assert told["decided"] == "True"
+    assert float(told["position_sigma_m"]) < 0.1
+
+
+def check_reset(listener: Listener) -> None:
+    """The service forgets the pose, and the node finds it again."""
+    connection = listener.connection
+    trigger = message_type("std_srvs/srv/Trigger")
+    client = connection.node.create_client(trigger, "/jaxnav/reset")
+    assert client.wait_for_service(10.0)
+    listener.forget()
+    answer = client.call_async(trigger.Request())
+    until(answer.done, 60.0)
+    assert answer.result().success, answer.result().message
+    until(listener.decided, 60.0)
+
+
+def test_a_paused_or_killed_node_leaves_the_car_standing(tmp_path, listener, file):
+    with sim_car(tmp_path):
+        for number in (signal.SIGSTOP, signal.SIGKILL):
+            with node(tmp_path, str(file), "--timeout-s", "1") as program:
+                listener.forget()
+                until(listener.drives, 300.0, program)
+                program.tell(number)
+                told_s = time.monotonic()
+                until(lambda: listener.last("/drive").drive.speed == 0, 10.0, program)
+                # The guard's process tells it, though the node can't: 1 s, and a busy machine.
+                assert time.monotonic() - told_s < 3.0
+                if number == signal.SIGSTOP:
+                    program.tell(signal.SIGCONT)
+                    program.until("ended: ")
+                    assert program.ends() == 1
+            listener.forget()
+            time.sleep(0.5)
+            assert all(one.drive.speed == 0 for one in listener.heard["/drive"])
+
+
+def test_a_silent_car_is_noticed_and_found_again(tmp_path, listener, file):
+    with sim_car(tmp_path) as car, node(tmp_path, str(file), *PATIENT) as program:
+        until(listener.drives, 300.0, program)
+        car.tell(signal.SIGSTOP)
+        stale = {"ODOMETRY_STALE", "CAMERAS_STALE"}
+        until(lambda: stale <= set(listener.last("/jaxnav/bank").faults), 20.0, program)
+        until(lambda: not listener.drives(), 20.0, program)
+        car.tell(signal.SIGCONT)
+        until(lambda: listener.last("/jaxnav/bank").health == "OK", 60.0, program)
