@@ -166,4 +166,9 @@ class Connection:
 
     def _run(self) -> None:
         while not self._closing.is_set():
-            self._executor.spin_once(timeout_sec=_WAIT_S)
+            try:
+                self.spin_some()
+            except Exception:
+                if self._context.ok():  # else ROS was shut down: publishing says so
+                    raise
+                return

@@ -59,9 +59,9 @@ def until(happens, timeout_s: float, program: Program | None = None) -> None:
         time.sleep(0.02)
 
 
-def sim_car(folder: Path) -> Program:
+def sim_car(folder: Path, *words: str) -> Program:
     """A simulated car behind topics."""
-    return Program(folder / "car.log", sys.executable, "-m", "tests.ros.sim_car")
+    return Program(folder / "car.log", sys.executable, "-m", "tests.ros.sim_car", *words)
 
 
 def node(folder: Path, *words: str) -> Program:

@@ -1,11 +1,14 @@
 """A simulated car behind ROS topics, as a process: python -m tests.ros.sim_car.
 
+With --clock it sends /clock, and its stamps are of that: seconds since it began, and 100.
+
 It publishes /odom (with a pose that drifts), /NAME/detections of each camera of the QCar, and the
 true pose on /truth; it obeys /drive, and stops by itself 0.5 s after the last command.
 """
 
 import math
 import signal
+import sys
 import threading
 import time
 
@@ -38,7 +41,7 @@ def detections_message(found, stamp):
     return message
 
 
-def main():
+def main(clocked):
     """Simulate until a signal comes."""
     over = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -52,6 +55,19 @@ def main():
     ros = Connection("sim_car")
     per_throttle_mps = float(vehicle_model.speed_per_throttle_mps)
     heard_s = [time.monotonic()]
+    began_ns, time_of = time.monotonic_ns(), message_type("builtin_interfaces/msg/Time")
+
+    def stamp_of(now_ns):
+        if not clocked:
+            return ros.stamp(now_ns)
+        since_ns = now_ns - began_ns + 100 * 10**9
+        return time_of(sec=since_ns // 10**9, nanosec=since_ns % 10**9)
+
+    def tick():
+        clock = message_type("rosgraph_msgs/msg/Clock")
+        publisher = ros.publisher("rosgraph_msgs/msg/Clock", "/clock")
+        while not over.wait(0.005):
+            ros.publish(publisher, clock(clock=stamp_of(time.monotonic_ns())))
 
     def obey(message):
         heard_s[0] = time.monotonic()
@@ -61,13 +77,15 @@ def main():
         while not over.is_set():
             frame = camera.read(0.1)
             if frame is not None:
-                stamp = ros.stamp(frame.stamp_ns)
+                stamp = stamp_of(frame.stamp_ns)
                 ros.publish(publisher, detections_message(frame.detections, stamp))
 
     ros.listen(ACKERMANN, "/drive", obey)
     odom = ros.publisher(NAV_ODOMETRY, "/odom")
     truth = ros.publisher("geometry_msgs/msg/PoseStamped", "/truth")
     ros.run()
+    if clocked:
+        threading.Thread(target=tick, daemon=True).start()
     for camera in cameras:
         publisher = ros.publisher(APRILTAG_ROS, f"/{camera.name}/detections")
         threading.Thread(target=look, args=(camera, publisher), daemon=True).start()
@@ -83,14 +101,14 @@ def main():
         x_m += reading.speed_mps * math.cos(psi_rad + math.atan(slope / 2)) * ODOMETRY_S
         y_m += reading.speed_mps * math.sin(psi_rad + math.atan(slope / 2)) * ODOMETRY_S
         message = message_type(NAV_ODOMETRY)()
-        message.header.stamp = ros.stamp(reading.stamp_ns)
+        message.header.stamp = stamp_of(reading.stamp_ns)
         message.header.frame_id, message.child_frame_id = "odom", "base_link"
         place(message.pose.pose, x_m, y_m, psi_rad)
         message.twist.twist.linear.x, message.twist.twist.angular.z = forward_mps, rate_radps
         ros.publish(odom, message)
         true = message_type("geometry_msgs/msg/PoseStamped")()
         now_ns = time.monotonic_ns()
-        true.header.stamp = ros.stamp(now_ns)
+        true.header.stamp = stamp_of(now_ns)
         place(true.pose, *map(float, vehicle.world.state(now_ns)[:3]))
         ros.publish(truth, true)
     for camera in cameras:
@@ -106,4 +124,4 @@ def place(pose, x_m, y_m, psi_rad):
 
 
 if __name__ == "__main__":
-    main()
+    main("--clock" in sys.argv)
