@@ -161,11 +161,12 @@ def test_a_defect_keeps_its_traceback(command) -> None:
 
 
 POSITIONALS = tuple(
-    "recording image store config kind recordings source sources target one other".split()
+    "recording image store config kind recordings source sources target one other file".split()
 )
 POSITIONAL = {
     "recordings": "RECORDING",
     "sources": "SOURCE",
+    "file": "FILE",
     "one": "FILE",
     "other": "FILE",
     "kind": r"\{ambiguity,drive\}",

@@ -113,7 +113,7 @@ class Ros(Checked):
     FILE says which topic is what and names our files. With a route the node drives, through the
     guard that `jaxnav run` has; without one it localises a car that somebody else drives; without
     a vehicle, a rig that moves freely. It sends tf, pose with covariance, odometry, all
-    hypotheses, diagnostics. Words after --ros-args are ROS's own.
+    hypotheses, diagnostics.
 
     Exit codes: 1 the drive has ended, 2 bad input, 128 plus the number of the signal that ended it.
     """
@@ -130,7 +130,8 @@ class Ros(Checked):
     timeout_s: float = 0.2
     """So long after the last sign of life of any thread the vehicle has been stopped, s."""
     float64: Float64 = False
-    ros_args: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
+    ros_args: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WORDS")] = ()
+    """Words for ROS itself, last on the line: --ros-args -p use_sim_time:=true."""
 
     def _check(self) -> None:
         check_times(self)
