@@ -102,8 +102,6 @@ class Environment:
     def install(self, package: Path) -> None:
         """Generate, compile and install one package."""
         name = package.name
-        for folder in (self.prefix / "share", self.prefix / "include", self.packages):
-            shutil.rmtree(folder / name, ignore_errors=True)
         with tempfile.TemporaryDirectory(prefix=f"{name}_") as build:
             configure = ["cmake", "-G", "Ninja", "-S", package, "-B", build]
             configure += [
@@ -117,6 +115,8 @@ class Environment:
             ]
             self.run(*configure)
             self.run("cmake", "--build", build)
+            for folder in (self.prefix / "share", self.prefix / "include", self.packages):
+                shutil.rmtree(folder / name, ignore_errors=True)
             self.run("cmake", "--install", build)
 
 
