@@ -64,8 +64,8 @@ ros: $(ROS)/.installed
 # Where there are no wheels, nothing is tested and nothing has failed.
 test-ros:
 	@if [ -e $(ROS)/.created ] || lacking=$$($(PYTHON) ros/environment/build.py --wheels 2>&1); then \
-	  $(MAKE) --no-print-directory $(ROS)/.installed && $(ROS)/bin/python -m pytest tests/ros; \
-	else echo "tests/ros are left out: $$lacking"; fi
+	  $(MAKE) --no-print-directory $(ROS)/.installed && $(ROS)/bin/python -m pytest tests/real_ros; \
+	else echo "tests/real_ros are left out: $$lacking"; fi
 
 clean:
 	rm -rf $(VENV) $(ROS) build dist demo out site .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks

@@ -263,6 +263,7 @@ STRUCTURED = {
     "route": Loader(_written("route.yaml", (QCAR / "route.yaml").read_bytes()), files.load_route),
     "params": Loader(_written("params.yaml", PARAMS), _applied),
     "topics": Loader(_written("topics.yaml", TOPICS), files.load_topics),
+    "ROS node": Loader(_written("node.yaml", ROS_NODE), load_ros),
     "Kalibr rig": Loader(_written("chain.yaml", KALIBR), files.load_rig),
     "Kalibr camera": Loader(
         _written("chain.yaml", KALIBR), lambda path: files.load_camera(path, "cam1")

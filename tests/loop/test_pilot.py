@@ -73,6 +73,15 @@ def test_the_same_inputs_give_the_same_bits(setup, steps, inputs):
     assert [digest(outcome) for outcome in again] == [digest(step.outcome) for step in steps]
 
 
+def test_where_somebody_else_drives_it_only_localises(setup, steps, inputs):
+    """Nor does it doubt an odometer that its own throttle, which is zero, can't explain."""
+    _, outcomes = handled(dataclasses.replace(setup, drives=False), inputs)
+    assert {(outcome.steering_rad, outcome.throttle) for outcome in outcomes} == {(0.0, 0.0)}
+    assert [outcome.rejects for outcome in outcomes] == [step.outcome.rejects for step in steps]
+    assert [outcome.faults for outcome in outcomes] == [step.outcome.faults for step in steps]
+    assert_same_belief(outcomes[-1], steps[-1].outcome, 0.0)
+
+
 def test_odometry_means_the_same_to_the_program_without_cameras(setup, steps, inputs, monkeypatch):
     """Nobody can tell which of the two was called."""
     seeing = Estimator._events

@@ -100,8 +100,9 @@ def test_a_setup_comes_back_bit_for_bit(double):
         st.tuples(routes, st.sampled_from(PILOT_SELECTORS), st.none() | positive, timeouts),
         parameters,
         st.booleans(),
+        st.booleans(),
     )
-    def check(rig, markers, vehicle, others, parameters, relocate) -> None:
+    def check(rig, markers, vehicle, others, parameters, relocate, drives) -> None:
         lenses, placed, images = zip(*rig, strict=True)
         setup = DriveSetup(
             CameraRig.create(
@@ -119,6 +120,7 @@ def test_a_setup_comes_back_bit_for_bit(double):
             double,
             parameters,
             relocate,
+            drives,
         )
         back = DriveSetup.of_header(decode(encode(setup.header())), WHERE)
         assert bits(back) == bits(setup)
@@ -299,11 +301,12 @@ def test_any_change_of_a_byte_gives_a_setup_or_bad_input(where, new, out):
         assert str(error).startswith("drive.mcap: header.")  # noqa: PT017
 
 
-def test_only_a_drive_that_must_not_relocate_says_so():
+@pytest.mark.parametrize("name", ["relocate", "drives"])
+def test_only_a_drive_that_must_not_says_so(name):
     """So that older programs read what they can replay, and older drives are read."""
-    assert "relocate" not in qcar_setup().header()
-    header = qcar_setup(relocate=False).header()
-    assert header["relocate"] is False
-    assert not DriveSetup.of_header(header, WHERE).relocate
-    with pytest.raises(BadInput, match=r"drive.mcap: header.relocate"):
-        DriveSetup.of_header(header | {"relocate": "no"}, WHERE)
+    assert name not in qcar_setup().header()
+    header = qcar_setup(**{name: False}).header()
+    assert header[name] is False
+    assert not getattr(DriveSetup.of_header(header, WHERE), name)
+    with pytest.raises(BadInput, match=rf"drive.mcap: header.{name}"):
+        DriveSetup.of_header(header | {name: "no"}, WHERE)

@@ -1,135 +1,163 @@
-"""The messages that were built from source travel between two processes, as types that other
-machines know."""
+"""The content of ROS messages: steering from a yaw rate, the order of corners, image pixels."""
 
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
+import math
 
+import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-import rclpy
-from ackermann_msgs.msg import AckermannDrive, AckermannDriveStamped
-from apriltag_msgs.msg import AprilTagDetection, AprilTagDetectionArray, Point
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovariance, Transform, TransformStamped, Vector3
-from jaxnav_msgs.msg import Bank, Hypothesis
-from jaxnav_msgs.srv import LoadMarkers
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from std_msgs.msg import Header
-from tf2_msgs.msg import TFMessage
+from hypothesis import assume
+from hypothesis import given as drawn
+from hypothesis import strategies as st
 
-from tests.helpers.ros_bags import ACKERMANN, APRILTAGS, Bag
-from tests.ros.mirror import KEPT, message_type
+from jaxnav.detection import make_detector, marker_cells
+from jaxnav.loop.flags import Fault
+from jaxnav.models import bicycle
+from jaxnav.models.twists import STANDSTILL_MPS, TwistReader
+from jaxnav.ros.camera_messages import grey_image
+from tests.helpers.ros_bags import IMAGE, Bag
+from tests.helpers.ros_drives import BEGIN_NS, problem, read, topic_map
+from tests.worlds import paper_markers, qcar
 
-PATIENCE_S = 30.0
-HEADER = Header(stamp=Time(sec=1_700_000_000, nanosec=5), frame_id="map")
-TF = "tf2_msgs/msg/TFMessage"
-SENT = {
-    TF: TFMessage(
-        transforms=[
-            TransformStamped(
-                header=HEADER,
-                child_frame_id="odom",
-                transform=Transform(translation=Vector3(x=1.0, y=-2.0, z=0.5)),
-            )
-        ]
-    ),
-    ACKERMANN: AckermannDriveStamped(
-        header=HEADER, drive=AckermannDrive(steering_angle=0.25, speed=-0.5)
-    ),
-    APRILTAGS: AprilTagDetectionArray(
-        header=HEADER,
-        detections=[
-            AprilTagDetection(
-                family="tag36h11",
-                id=3,
-                hamming=1,
-                decision_margin=50.0,
-                centre=Point(x=320.0, y=240.0),
-                corners=[Point(x=float(x), y=float(y)) for x, y in np.eye(4, 2)],
-                homography=np.arange(9.0),
-            )
-        ],
-    ),
-    "jaxnav_msgs/msg/Bank": Bank(
-        header=HEADER,
-        child_frame_id="base_link",
-        hypotheses=[
-            Hypothesis(pose=PoseWithCovariance(covariance=np.arange(36.0)), weight=weight)
-            for weight in (0.75, 0.25)
-        ],
-        located=True,
-        accepted=True,
-        flip_probability=0.01,
-        nis=7.5,
-        restarts=2,
-        health="OK",
-        faults=["CAMERA_SILENT"],
-        rejects=["TOO_OBLIQUE", "TOO_SMALL"],
-    ),
-}
-# What `ros2 topic info --verbose` says of upstream's packages on Jazzy and later.
-UPSTREAM = {
-    TF: "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
-    ACKERMANN: "RIHS01_48ca7612a08d3bb72744fd98b71b7cf2ea24c6ad50fa4e1aa0bbad963c90d8cf",
-}
+# --- steering -------------------------------------------------------------------------------------
+
+
+@jax.jit
+def _velocity_world(*of: jax.Array) -> jax.Array:
+    return bicycle.velocity_world(*(jnp.asarray(value, float) for value in of))
+
+
+@drawn(
+    speed_mps=st.one_of(st.floats(0.1, 30.0), st.floats(-30.0, -0.1)),
+    steering_rad=st.floats(-1.5, 1.5),
+    psi_rad=st.floats(-math.pi, math.pi),
+    wheelbase_m=st.floats(0.1, 5.0),
+)
+def test_a_twist_tells_what_the_bicycle_did(speed_mps, steering_rad, psi_rad, wheelbase_m):
+    velocity = np.asarray(_velocity_world(speed_mps, steering_rad, psi_rad, wheelbase_m))
+    forward_mps = math.cos(psi_rad) * velocity[0] + math.sin(psi_rad) * velocity[1]
+    assume(abs(forward_mps) >= STANDSTILL_MPS)
+    found = TwistReader(wheelbase_m, 1.55).read(float(forward_mps), float(velocity[2]))
+    assert found == pytest.approx((speed_mps, steering_rad), rel=1e-9, abs=1e-9)
+
+
+@drawn(st.lists(st.tuples(st.floats(), st.floats())))
+def test_whatever_a_twist_says_the_steering_stays_inside_its_limit(twists):
+    reader = TwistReader(0.256, 0.5)
+    for forward_mps, yaw_rate_radps in twists:
+        speed_mps, steering_rad = reader.read(forward_mps, yaw_rate_radps)
+        if math.isfinite(forward_mps) and math.isfinite(yaw_rate_radps):
+            assert abs(steering_rad) <= 0.5
+            assert abs(speed_mps) >= abs(forward_mps)
+        else:
+            assert math.isnan(speed_mps)
+            assert math.isnan(steering_rad)
+
+
+def test_odometry_at_its_limits(tmp_path):
+    bag = Bag("bag")
+    bag.apriltags("/front", BEGIN_NS, BEGIN_NS, [])
+    readings = [(0.0, 5.0), (-0.4, -0.2), (0.01, 3.0), (0.1, 9.0), (0.5, math.nan), (math.inf, 1.0)]
+    for k, (forward_mps, yaw_rate) in enumerate(readings, 1):
+        bag.odometry("/odom", BEGIN_NS + k, BEGIN_NS + k, forward_mps, yaw_rate)
+    topics = topic_map(tmp_path, "cameras: {front: /front}\nodometry: /odom\n")
+    read_back = [g.odometry for g in read(bag.write(tmp_path), topics)[1:]]
+    backwards = math.atan(0.2 * float(qcar().wheelbase_m) / 0.4)
+    limit = float(qcar().steering_limit_rad)
+    steering = [0.0, backwards, backwards, limit, math.nan, math.nan]
+    np.testing.assert_array_equal([reading.steering_rad for reading in read_back], steering)
+    forward = np.array([0.0, -0.4, 0.01, 0.1, math.nan, math.nan])
+    speeds = forward / np.cos(np.arctan(np.tan(steering) / 2))
+    np.testing.assert_allclose([reading.speed_mps for reading in read_back], speeds, atol=1e-15)
+
+
+# --- which corner comes first ---------------------------------------------------------------------
+
+
+def test_the_two_ways_to_hang_up_a_marker(tmp_path):
+    """AprilTag's own detector on OpenCV's picture, through a bag, agrees with jaxnav's."""
+    pyapriltags = pytest.importorskip("pyapriltags")
+    image = np.full((200, 300), 200, np.uint8)
+    image[40:120, 80:160] = 220 * np.kron(marker_cells("tag36h11", 2), np.ones((10, 10)))[:80, :80]
+    (tag,) = pyapriltags.Detector(families="tag36h11").detect(image)
+    bag = Bag("mcap")
+    bag.apriltags("/front", BEGIN_NS, BEGIN_NS, [("tag36h11", tag.tag_id, tag.corners)])
+    path = bag.write(tmp_path)
+    text = "cameras: {front: /front}\n"
+    ours = make_detector("aruco").detect(image).corners_px
+    np.testing.assert_allclose(ours[0, 0], [79.5, 39.5], atol=0.1)
+    (given,) = read(path, topic_map(tmp_path, text + "first_corner: top_right\n"))
+    np.testing.assert_allclose(given.frames[0].detections.corners_px, ours, atol=0.5)
+    (given,) = read(path, topic_map(tmp_path, text))
+    np.testing.assert_allclose(
+        given.frames[0].detections.corners_px, ours[:, [2, 3, 0, 1]], atol=0.5
+    )
+
+
+# --- images ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def node() -> Iterator[Node]:
-    """A node of this process, with a mirror in another one."""
-    script = Path(__file__).with_name("mirror.py")
-    command = [sys.executable, script, *SENT]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, **pipes) as mirror:
-        assert mirror.stdout.readline() == "ready\n"
-        context = rclpy.Context()
-        rclpy.init(context=context)
-        node = rclpy.create_node("messages", context=context)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        yield node
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.shutdown(context=context)
-        mirror.stdin.close()
-        assert mirror.wait(PATIENCE_S) == 0
+def picture() -> np.ndarray:
+    """Marker 0 in a frame of the front camera."""
+    image = np.full((410, 820), 200, np.uint8)
+    cells = np.kron(marker_cells("tag36h11", 0), np.ones((10, 10)))
+    image[200 : 200 + len(cells), 400 : 400 + len(cells)] = 20 + 180 * cells
+    return cv2.GaussianBlur(image, (0, 0), 0.6)
 
 
-def _spin_until(node: Node, is_done: Callable[[], Any]) -> None:
-    end_s = time.monotonic() + PATIENCE_S
-    while not is_done():
-        assert time.monotonic() < end_s, "nothing came"
-        node.executor.spin_once(timeout_sec=0.1)
+def test_images_are_searched(tmp_path, picture):
+    bag = Bag("mcap")
+    colours = np.repeat(picture[..., None], 3, axis=2)
+    _, jpeg = cv2.imencode(".jpg", picture)
+    t = BEGIN_NS
+    bag.image("/front", t, picture, "mono8")
+    bag.image("/left", t, colours, "rgb8", padding=12)
+    bag.compressed("/rear", t, jpeg.tobytes())
+    bag.image("/front", t + 1, picture, "mono8", height=409)
+    bag.compressed("/rear", t + 1, b"no picture")
+    bag.compressed("/rear", t + 2, b"")
+    path = bag.write(tmp_path)
+    topics = topic_map(tmp_path, "cameras: {front: /front, left: /left, rear: /rear}\n")
+    first, broken, empty = read(path, topics, paper_markers())
+    assert [f.detections.ids.tolist() for f in first.frames] == [[0], [0], [0]]
+    for seen in first.frames:
+        np.testing.assert_allclose(seen.detections.corners_px[0, 0], [399.5, 199.5], atol=0.2)
+    for seen in (*broken.frames, *empty.frames):
+        assert (seen.detections, seen.faults) == (None, Fault.FRAME_UNUSABLE)
+    smaller = Bag("bag")
+    smaller.image("/front", t, picture[:-10], "mono8")
+    topics = topic_map(tmp_path, "cameras: {front: /front}\n")
+    line = problem(smaller.write(tmp_path), topics)
+    assert "/front: the images are 820 x 400 px, but the rig's 'front' has 820 x 410 px" in line
+    sixteen = Bag("bag")
+    sixteen.image("/front", t, picture, "mono16")
+    (tmp_path / "drive.bag").unlink()
+    assert "the encoding 'mono16' is none of mono8" in problem(sixteen.write(tmp_path), topics)
 
 
-@pytest.mark.parametrize("name", SENT)
-def test_a_message_goes_to_another_process_and_back(node: Node, name: str) -> None:
-    kind, topic, came = message_type(name), name.split("/")[-1], []
-    node.create_subscription(kind, f"/back/{topic}", came.append, KEPT)
-    node.create_publisher(kind, f"/there/{topic}", KEPT).publish(SENT[name])
-    _spin_until(node, lambda: came)
-    assert came == [SENT[name]]
+@pytest.mark.parametrize(
+    ("encoding", "weights"),
+    [("rgb8", (0, 1, 2)), ("bgr8", (2, 1, 0)), ("rgba8", (0, 1, 2)), ("bgra8", (2, 1, 0))],
+)
+def test_colours_are_weighed_as_they_are_seen(encoding, weights):
+    channels = 4 if "a" in encoding else 3
+    pixels = np.zeros((2, 3, channels), np.uint8)
+    pixels[..., weights[0]] = 200  # red
+    message = Bag("mcap")
+    message.image("/a", 1, pixels, encoding)
+    image = grey_image(IMAGE, message.rows[0][3])
+    np.testing.assert_array_equal(image, np.full((2, 3), round(0.299 * 200)))
 
 
-def test_a_service_is_called_in_another_process(node: Node) -> None:
-    client = node.create_client(LoadMarkers, "/load_markers")
-    assert client.wait_for_service(PATIENCE_S)
-    answer = client.call_async(LoadMarkers.Request(path="markers.yaml"))
-    _spin_until(node, answer.done)
-    assert answer.result() == LoadMarkers.Response(success=True, message="markers.yaml")
-
-
-@pytest.mark.parametrize("name", [TF, ACKERMANN, APRILTAGS])
-def test_a_type_is_upstreams(node: Node, name: str) -> None:
-    """Its hash, which peers hold against their own, follows from the names, types and order of its
-    fields."""
-    topic = f"/back/{name.split('/')[-1]}"
-    _spin_until(node, lambda: node.get_publishers_info_by_topic(topic))
-    (mirror,) = node.get_publishers_info_by_topic(topic)
-    assert str(mirror.topic_type_hash) == Bag("mcap").type_hash(name)
-    assert str(mirror.topic_type_hash) == UPSTREAM.get(name, str(mirror.topic_type_hash))
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_begin_at_the_top_left(pattern):
+    red = np.zeros((8, 8), np.uint8)
+    for place, colour in enumerate(pattern):
+        if colour == "r":
+            red[place // 2 :: 2, place % 2 :: 2] = 200
+    bag = Bag("mcap")
+    bag.image("/a", 1, red, f"bayer_{pattern}8")
+    image = grey_image(IMAGE, bag.rows[0][3])
+    assert np.all(np.abs(image[2:-2, 2:-2].astype(int) - 60) <= 1)  # 0.299 of red everywhere

@@ -61,7 +61,7 @@ def until(happens, timeout_s: float, program: Program | None = None) -> None:
 
 def sim_car(folder: Path, *words: str) -> Program:
     """A simulated car behind topics."""
-    return Program(folder / "car.log", sys.executable, "-m", "tests.ros.sim_car", *words)
+    return Program(folder / "car.log", sys.executable, "-m", "tests.real_ros.sim_car", *words)
 
 
 def node(folder: Path, *words: str) -> Program:

@@ -12,7 +12,7 @@ from jaxnav.files import calib_dir
 from jaxnav.files.poses import compose
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY
-from tests.ros.processes import node, sim_car, until
+from tests.real_ros.processes import node, sim_car, until
 
 CAMERAS = ("front", "right", "rear", "left")
 PATIENT = ("--timeout-s", "2")  # of the guard: other tests keep the machine busy

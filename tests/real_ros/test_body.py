@@ -10,8 +10,8 @@ from jaxnav.detection.types import Detections
 from jaxnav.files import save_markers, save_rig
 from jaxnav.ros.camera_messages import APRILTAG_ROS
 from jaxnav.ros.connection import Connection
-from tests.ros.processes import JAXNAV, ROOT, node, until
-from tests.ros.sim_car import detections_message
+from tests.real_ros.processes import JAXNAV, ROOT, node, until
+from tests.real_ros.sim_car import detections_message
 
 FRAMES = 150
 SIGMA_PX = 0.5

@@ -1,4 +1,4 @@
-"""A simulated car behind ROS topics, as a process: python -m tests.ros.sim_car.
+"""A simulated car behind ROS topics, as a process: python -m tests.real_ros.sim_car.
 
 With --clock it sends /clock, and its stamps are of that: seconds since it began, and 100.
 

@@ -1,6 +1,6 @@
 """A process that sends back every message that it gets, until its input ends.
 
-    python tests/ros/mirror.py tf2_msgs/msg/TFMessage ...
+    python tests/real_ros/mirror.py tf2_msgs/msg/TFMessage ...
 
 What comes on /there/TFMessage goes to /back/TFMessage. /load_markers answers with its question.
 """

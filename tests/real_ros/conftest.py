@@ -49,4 +49,4 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_report_header() -> str | None:
-    return None if HAS_ROS else "tests/ros: no rclpy here; make test-ros has it"
+    return None if HAS_ROS else "tests/real_ros: no rclpy here; make test-ros has it"

@@ -19,7 +19,7 @@ from jaxnav.ros.odometry_messages import (
 from jaxnav.testing import check_vehicle
 from jaxnav.vehicles.ros2 import open_vehicle
 from tests.helpers.setups import setup_with
-from tests.ros.processes import until
+from tests.real_ros.processes import until
 
 WHEELBASE_M = 0.256
 SPEED_PER_THROTTLE_MPS = 10.0
