@@ -23,6 +23,7 @@ from jaxnav.files.images import read_image
 from jaxnav.files.markers import marker_map
 from jaxnav.files.poses import pose_as_read
 from jaxnav.files.reading import read_mapping
+from jaxnav.files.ros import load_ros
 from jaxnav.files.wpilib import layout_figures, layout_left_out
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
@@ -248,6 +249,18 @@ def _cameras(path: Path) -> Any:
     return [camera.camera() for camera in file.cameras]
 
 
+ROS_NODE = f"""
+rig: rig.yaml
+markers: markers.yaml
+vehicle: vehicle.yaml
+{TOPICS}
+odometry_type: sensor_msgs/msg/JointState
+joints: {{driven: [rear], steered: [front], wheel_radius_m: 0.03}}
+command_type: twist
+frames: {{map: world, base: car}}
+base_x_m: -0.128
+tf_tolerance_s: 0.1
+"""
 STRUCTURED = {
     "rig": Loader(_written("rig.yaml", (QCAR / "rig.yaml").read_bytes()), files.load_rig),
     "saved rig": Loader(_saved("rig.yaml", files.save_rig, qcar_rig), files.load_rig),

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -14,9 +15,9 @@ JAXNAV = (sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.ex
 class Program:
     """A process and what it has said. As a context it is killed in the end."""
 
-    def __init__(self, log: Path, *words: str):
+    def __init__(self, log: Path, *words: str, env: Mapping[str, str] | None = None):
         self.log = log
-        env = os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONPATH": str(ROOT)}
+        env = {"PYTHONPATH": str(ROOT)} | dict(env or os.environ) | {"PYTHONUNBUFFERED": "1"}
         with log.open("wb") as file:
             self.process = subprocess.Popen(
                 words, cwd=ROOT, env=env, stdout=file, stderr=file, start_new_session=True

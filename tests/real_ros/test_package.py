@@ -1,6 +1,8 @@
 """jaxnav_ros is a package that ROS 2 can install, and its files are what ROS 2 reads."""
 
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -9,6 +11,9 @@ from pathlib import Path
 import pytest
 import rclpy
 import yaml
+
+from tests.real_ros.processes import ROOT, Program
+from tests.real_ros.test_lifecycle import CONFIGURE, Manager
 
 SOURCE = Path(__file__).resolve().parents[2] / "ros" / "jaxnav_ros"
 PARAMETERS = SOURCE / "config" / "jaxnav.yaml"
@@ -45,14 +50,29 @@ def test_the_launch_file_compiles() -> None:
 
 def test_a_node_reads_the_parameters() -> None:
     written = yaml.safe_load(PARAMETERS.read_text())["/**"]["ros__parameters"]
-    cameras = written.pop("cameras")
-    flat = written | {f"cameras.{name}": topic for name, topic in cameras.items()}
     context = rclpy.Context()
     rclpy.init(args=["--ros-args", "--params-file", str(PARAMETERS)], context=context)
     node = rclpy.create_node(
         "jaxnav", context=context, automatically_declare_parameters_from_overrides=True
     )
-    read = {name: node.get_parameter(name).value for name in flat}
+    read = {name: node.get_parameter(name).value for name in written}
     node.destroy_node()
     rclpy.shutdown(context=context)
-    assert read == flat
+    assert read == written
+
+
+def test_its_executable_is_the_node(installed: Path, tmp_path: Path) -> None:
+    words = ("--ros-args", "--params-file", str(PARAMETERS))
+    run = "import sys; from jaxnav_ros.node import main; sys.exit(main())"
+    packages = next(installed.glob("lib/python*/site-packages"))
+    env = os.environ | {"PYTHONPATH": f"{packages}:{ROOT}"}
+    program = Program(tmp_path / "log", sys.executable, "-c", run, *words, env=env)
+    with program:
+        manager = Manager()
+        try:
+            assert not manager.go(CONFIGURE)
+        finally:
+            manager.connection.close()
+        program.until("node.yaml: ")
+        program.tell(signal.SIGINT)
+        assert program.ends() == 128 + signal.SIGINT

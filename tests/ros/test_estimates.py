@@ -122,7 +122,9 @@ class Message:
         w, x, y, z, *place = pose.tolist()
         orientation = SimpleNamespace(w=w, x=x, y=y, z=z)
         position = SimpleNamespace(**dict(zip("xyz", place, strict=True)))
-        self.pose = SimpleNamespace(pose=SimpleNamespace(position=position, orientation=orientation))
+        self.pose = SimpleNamespace(
+            pose=SimpleNamespace(position=position, orientation=orientation)
+        )
         linear, angular = (
             SimpleNamespace(**dict(zip("xyz", part.tolist(), strict=True)))
             for part in (twist[:3], twist[3:])

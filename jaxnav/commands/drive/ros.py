@@ -110,7 +110,8 @@ class _Node:
         except OSError as error:
             raise BadInput("--ros-args", str(error)) from None
         self._node: Any = self.connection.node
-        self._node.declare_parameter("file", str(args.file or ""))
+        given = self._node.declare_parameter("file", "").value
+        self._file = str(args.file or given)
         self._timer = self._node.create_timer(_LOOK_S, self._look)
         self._node.create_service(message_type("std_srvs/srv/Trigger"), "~/reset", self._reset)
 
@@ -147,10 +148,9 @@ class _Node:
         return True
 
     def _configure(self) -> None:
-        path = str(self._node.get_parameter("file").value)
-        if not path:
+        if not self._file:
             raise BadInput("file", "missing: the node's YAML file, as argument or as parameter")
-        file = load_ros(path)
+        file = load_ros(self._file)
         if file.selector not in PILOT_SELECTORS:
             expected = ", ".join(PILOT_SELECTORS)
             problem = f"unknown {file.selector!r}: expected one of {expected}"

@@ -1,8 +1,10 @@
-"""The executable of `ros2 run jaxnav_ros node`."""
+"""The executable of `ros2 run jaxnav_ros node`: `jaxnav ros --managed`, with ROS's own words."""
 
-import jaxnav.ros.node
+import sys
+
+from jaxnav.cli import main as jaxnav
 
 
-def main() -> None:
-    """Run the node until it is shut down."""
-    jaxnav.ros.node.main()
+def main() -> int:
+    """Run the node until a signal ends it; returns the exit code."""
+    return jaxnav(["ros", "--managed", *sys.argv[1:]])
