@@ -56,7 +56,7 @@ class Odometer:
         stamp_ns: int,
         believed: tuple[float, float] | None,
         seeing: bool,
-        throttle: float,
+        throttle: float | None,
         contradicted: bool = False,
     ) -> tuple[bool, Fault]:
         """Whether to fuse a reading, and the faults of the sensor.
@@ -64,7 +64,7 @@ class Odometer:
         Args:
             believed: the estimate's speed and its sigma, m/s; None: not known.
             seeing: cameras tell the speed too, so persistent impossible readings stay refused.
-            throttle: last commanded.
+            throttle: last commanded; None: by somebody else, who may pull as hard as it goes.
             contradicted: corners have moved for a while, but the reading says that the car stands.
         """
         if self._stuck(speed_mps, steering_rad, stamp_ns, throttle) or contradicted:
@@ -94,7 +94,7 @@ class Odometer:
         speed_mps: float,
         stamp_ns: int,
         believed: tuple[float, float] | None,
-        throttle: float,
+        throttle: float | None,
     ) -> bool:
         if abs(speed_mps) > 1.5 * self.max_mps + _MARGIN_MPS:
             return False
@@ -106,7 +106,8 @@ class Odometer:
         gap_s = min(max(stamp_ns - self._last_ns, 0), _MAX_GAP_NS) / 1e9
         # The throttle pulls towards a speed of its own, brakes and friction towards zero.
         done = 1 - math.exp(-gap_s / self.time_constant_s)
-        targets = (reference, throttle * self.speed_per_throttle_mps, 0.0)
+        pulled = self._towards(throttle, math.copysign(self.max_mps, speed_mps - reference))
+        targets = (reference, pulled, 0.0)
         reached = [reference + done * (target - reference) for target in targets]
         margin = _MARGIN_MPS + _SIGMAS * sigma
         return min(reached) - margin <= speed_mps <= max(reached) + margin
@@ -131,12 +132,18 @@ class Odometer:
         long_enough = stamp_ns - stamps[0] > _PATH_NS / 2
         return long_enough and abs(off_m) < _PATH_M + _PATH_SHARE * way_m
 
-    def _stuck(self, speed_mps: float, steering_rad: float, stamp_ns: int, throttle: float) -> bool:
+    def _towards(self, throttle: float | None, otherwise_mps: float) -> float:
+        """The speed towards which the throttle pulls, or another one where it is not known."""
+        return otherwise_mps if throttle is None else throttle * self.speed_per_throttle_mps
+
+    def _stuck(
+        self, speed_mps: float, steering_rad: float, stamp_ns: int, throttle: float | None
+    ) -> bool:
         """Whether readings repeat too often: all of it, or only the speed although the throttle has
         changed it meanwhile (a driver without a steering sensor reports the commanded angle)."""
         gap_s = min(max(stamp_ns - self._raw_ns, 0), _MAX_GAP_NS) / 1e9
         done = 1 - math.exp(-gap_s / self.time_constant_s)
-        self._pulled_mps += done * (throttle * self.speed_per_throttle_mps - self._pulled_mps)
+        self._pulled_mps += done * (self._towards(throttle, self._pulled_mps) - self._pulled_mps)
         same_speed = speed_mps != 0 and self._raw is not None and self._raw[0] == speed_mps
         same = same_speed and self._raw == (speed_mps, steering_rad)
         self._raw, self._raw_ns = (speed_mps, steering_rad), stamp_ns

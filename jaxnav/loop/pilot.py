@@ -221,7 +221,7 @@ class Pilot:
 
     def _odometry(self, reading: Odometry, now_ns: int, faults: Fault) -> Outcome:
         known, jumps = self._known, self._odometry_stamps.jumps
-        throttle = self._pulling(reading.speed_mps)
+        throttle = self._command[1] if self._drives else None
         stamp_ns = self._odometry_stamps.take(reading.stamp_ns, now_ns)
         if not reading.valid or not (
             math.isfinite(reading.speed_mps) and math.isfinite(reading.steering_rad)
@@ -384,13 +384,6 @@ class Pilot:
         self._commanded_ns = now_ns
         self._standstill.add_command(self._command[1], now_ns)
         return self._command
-
-    def _pulling(self, speed_mps: float) -> float:
-        """The throttle that moves the vehicle: the last one commanded, or, where somebody else
-        drives, the one that goes with the measured speed."""
-        if self._drives:
-            return self._command[1]
-        return speed_mps / self._odometer.speed_per_throttle_mps
 
     def _senses(self, known: _Known, now_ns: int, faults: Fault) -> Senses:
         began_ns = self._began_ns if self._began_ns is not None else now_ns

@@ -82,12 +82,17 @@ class Support:
         steering_rad: float,
         heading_rad: float,
         gap_s: float,
-        throttle: float,
+        throttle: float | None,
         seeing: bool,
     ) -> None:
-        """Take a reading of the odometer that was believed; see `Ways` and `Propulsion`."""
+        """Take a reading of the odometer that was believed; see `Ways` and `Propulsion`.
+
+        Args:
+            throttle: None where somebody else commands it: it contradicts nothing.
+        """
         self._ways.add_odometry(speed_mps, steering_rad, heading_rad, gap_s)
-        self._propulsion.add_reading(speed_mps, throttle, gap_s, seeing, self._ways.disputed)
+        if throttle is not None:
+            self._propulsion.add_reading(speed_mps, throttle, gap_s, seeing, self._ways.disputed)
 
     def note_restart(self) -> None:
         """The filter has restarted: confirm the pose anew, and check it against the last fix."""

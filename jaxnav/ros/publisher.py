@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.files.poses import compose, inverse
+from jaxnav.loop.loop import Statistics
 from jaxnav.models.markers import MarkerMap
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.estimates import Report
@@ -22,6 +23,7 @@ _GHOSTS = 24  # arrows of hypotheses at most
 _PERIOD_S = 0.1  # of the bank and of the pictures
 _DIAGNOSTICS_S = 1.0
 _STALE_NS = 200_000_000  # an older odometry is not carried on by its own twist
+_DELAY = "camera to tf"
 _WELL = ("", "OK", "DEAD_RECKONING")  # states of health that are no warning
 
 
@@ -91,15 +93,23 @@ class Publisher:
         self._latest: Report | None = None
         self._closing = threading.Event()
         self._told_s = 0.0
+        self._delays = Statistics()
         self.failed: str | None = None
         self._thread = threading.Thread(target=self._tell, name="ros publisher", daemon=True)
         self._thread.start()
 
-    def publish(self, report: Report) -> None:
-        """Send an estimate. Where no pose is decided, tf and pose stay silent."""
+    def publish(self, report: Report, seen_ns: int | None = None) -> None:
+        """Send an estimate. Where no pose is decided, tf and pose stay silent.
+
+        Args:
+            seen_ns: stamp of the corners that it is due to; None without any.
+        """
         try:
             if report.decided and report.is_finite:
                 self._publish_tf(report)
+                if seen_ns is not None:
+                    late_ms = (self._connection.now_ns() - seen_ns) / 1e6
+                    self._delays.add(_DELAY, max(late_ms, 0.0))
                 self._publish_pose(report)
         except OSError as error:
             self.failed = str(error)
@@ -231,6 +241,8 @@ class Publisher:
             "restarts": report.restarts,
             "faults": ", ".join(report.faults),
             "rejects": ", ".join(report.rejects),
+            "camera_to_tf_ms": f"{self._delays.quantile_ms(_DELAY, 0.5):.2f}",
+            "camera_to_tf_99_ms": f"{self._delays.quantile_ms(_DELAY, 0.99):.2f}",
         }
         status.values = [pair(key=key, value=str(value)) for key, value in told.items()]
         message.status = [status]

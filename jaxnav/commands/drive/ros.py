@@ -337,7 +337,7 @@ class _Reporter:
     faults = Fault(0)
     closing_note: str | None = None
 
-    def __init__(self, publish: Callable[[Report], None], base_x_m: float):
+    def __init__(self, publish: Callable[[Report, int | None], None], base_x_m: float):
         self._publish, self._base_x_m = publish, base_x_m
         self._last_ns = 0
 
@@ -346,7 +346,8 @@ class _Reporter:
         shows = outcome.data is not None and outcome.data.corners_px is not None
         if shows or abs(outcome.now_ns - self._last_ns) > _LEAST_NS:
             self._last_ns = outcome.now_ns
-            self._publish(report_of_drive(outcome, self._base_x_m))
+            seen_ns = outcome.stamp_ns if shows else None
+            self._publish(report_of_drive(outcome, self._base_x_m), seen_ns)
 
     def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
