@@ -190,7 +190,7 @@ def check_reset(listener: Listener) -> None:
 def test_it_drives_by_the_time_of_a_simulation(tmp_path, listener, file):
     words = (*PATIENT, "--ros-args", "-p", "use_sim_time:=true")
     with sim_car(tmp_path, "--clock"), node(tmp_path, str(file), *words) as program:
-        until(lambda: len(listener.heard["/jaxnav/pose"]) > 50, 300.0, program)
+        until(lambda: len(listener.heard["/jaxnav/pose"]) > 200, 300.0, program)
         assert 100 < stamp_s(listener.last("/jaxnav/pose")) < 1000  # the simulation's seconds
         until(listener.drives, 60.0, program)
         check_poses(listener)
