@@ -8,6 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxnav.models.geometry import wrap_angle_np
 from jaxnav.plots.localisation import (
     BLACK,
     BLUE,
@@ -37,8 +38,7 @@ class Driven:
     @property
     def heading_error_deg(self) -> Float[np.ndarray, " N"]:
         """Angle between the headings of pose and truth, 0 to 180."""
-        turn_rad = (self.poses - self.true_poses)[:, 2]
-        return np.rad2deg(np.abs((turn_rad + np.pi) % (2 * np.pi) - np.pi))
+        return np.rad2deg(np.abs(wrap_angle_np((self.poses - self.true_poses)[:, 2])))
 
 
 def comparison_report(

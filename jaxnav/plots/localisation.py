@@ -14,6 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from jaxnav.models.geometry import wrap_angle_np
+
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = (
     "#000000",
     "#E69F00",
@@ -249,7 +251,7 @@ def _styled(
 
 def _yaw_deg(psi_rad: np.ndarray) -> np.ndarray:
     """Degrees in [-180, 180), broken where they wrap so that no line crosses the plot."""
-    wrapped = np.rad2deg((psi_rad + np.pi) % (2 * np.pi) - np.pi)
+    wrapped = np.rad2deg(wrap_angle_np(psi_rad))
     jumps = np.abs(np.diff(wrapped, prepend=wrapped[:1])) > 180
     return np.where(jumps, np.nan, wrapped)
 

@@ -16,6 +16,7 @@ from jaxnav.commands.simulate.runner_up import SELECTOR, opencv_detectors
 from jaxnav.compiling.step import compiled_step
 from jaxnav.configuration import step_folder
 from jaxnav.detection import Detector, make_detectors
+from jaxnav.models.geometry import wrap_angle_np
 from jaxnav.models.origin import planar_in_world
 from jaxnav.simulation.drive import DriveFrame, DriveSettings, Methods, drive
 
@@ -62,7 +63,7 @@ class Record:
     def errors(self) -> Float[np.ndarray, "N 3"]:
         """Errors of `poses` (N, 3): m m rad, the heading's in [-pi, pi)."""
         errors = self.poses - self.true_poses
-        errors[:, 2] = (errors[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        errors[:, 2] = wrap_angle_np(errors[:, 2])
         return errors
 
 
