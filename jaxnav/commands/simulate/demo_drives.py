@@ -1,15 +1,13 @@
 """The drives of a demo: each method drives once, and the second also hears what the first sees."""
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
-from tqdm import tqdm
 
-from jaxnav.commands.bars import drawn_on
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
 from jaxnav.commands.simulate.runner_up import SELECTOR, opencv_detectors
@@ -140,13 +138,12 @@ def _drive(
     )
     cameras = RenderedCameras(world, method.detectors, rng, args.corner_noise_px)
     record = Record(method.name, [])
-    with tqdm(
+    with progress_bar(
         total=round(args.duration_s, 1),
         unit="s",
         desc=f"seed {seed}, {LABELS[method.name]}",
         disable=args.headless,
         bar_format="{desc}: {n:.1f} of at most {total:.0f} s [{elapsed}]{postfix}",
-        **drawn_on(sys.stderr),
     ) as bar:
         bar.set_postfix_str("compiling")
         for frame in drive(method.navigator, world.setup.vehicle, cameras.look, settings, seed):
