@@ -10,9 +10,10 @@ import numpy as np
 import jaxnav
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.demo_drives import OPENCV, START_SPREAD, Method, make_methods
-from jaxnav.commands.simulate.demo_scores import WRONG_HEADING_DEG
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
+from jaxnav.models.geometry import wrap_angle_np
 from jaxnav.pose.observation import Observation
+from jaxnav.simulation.scores import WRONG_DEG
 
 DISTANCES_M = (2.0, 2.5, 3.0, 3.5)  # from the marker
 ASIDE_DEG = (-30, -20, -10, 0, 10, 20, 30, 40)  # of its normal, positive where the waypoints are
@@ -25,7 +26,7 @@ IPPE poses give from one picture of a car at rest, its place and heading spread 
 them, {PICTURES} pictures a place. The car faces the first waypoint.
 
 RMS error of the position in m (part of the pictures in which the marker was found; part of those
-whose heading is more than {WRONG_HEADING_DEG:.0f} degrees off):
+whose heading is more than {WRONG_DEG:.0f} degrees off):
 """
 
 
@@ -86,11 +87,11 @@ def first_poses(
         outputs, _ = opencv.navigator.step(seen, jnp.asarray(pose))
         error = np.asarray(outputs[OPENCV].pose) - pose
         errors_m.append(np.hypot(error[0], error[1]))
-        turned.append(abs((error[2] + np.pi) % (2 * np.pi) - np.pi))
+        turned.append(error[2])
     if not errors_m:
         return float("nan"), 0.0, float("nan")
     rms_m = np.sqrt(np.mean(np.square(errors_m)))
-    wrong = np.mean(np.rad2deg(turned) > WRONG_HEADING_DEG)
+    wrong = np.mean(np.rad2deg(np.abs(wrap_angle_np(np.array(turned)))) > WRONG_DEG)
     return float(rms_m), len(errors_m) / PICTURES, float(wrong)
 
 

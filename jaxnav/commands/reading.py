@@ -5,8 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.kinds import flag_of
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig, load_route, load_vehicle
@@ -40,12 +39,12 @@ def given_files(args: Any, names: Sequence[str], bag: Path | None = None) -> dic
 
 
 def read_shown(path: Path, headless: bool = False) -> DriveLog:
-    """`read_drive`, with a bar on a terminal where it takes longer than `_PATIENCE_S`."""
+    """`read_drive`, with a bar where it takes longer than `_PATIENCE_S`."""
     size = None
     with suppress(OSError, ValueError):  # the reader says what is wrong
         size = path.stat().st_size
-    with tqdm(
+    with progress_bar(
         total=size, unit="B", unit_scale=True, desc="reading", leave=False, delay=_PATIENCE_S,
-        disable=headless or None,
+        disable=headless,
     ) as bar:  # fmt: skip
         return read_drive(path, bar.update)

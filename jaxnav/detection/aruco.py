@@ -9,7 +9,7 @@ from jaxnav.detection.families import dictionary
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.read import frames_first, read_marker
 from jaxnav.detection.refine import mean_side_px
-from jaxnav.detection.types import Detections, grey, refine_detections
+from jaxnav.detection.types import Detections, at_scale, grey, refine_detections
 from jaxnav.models.camera import Camera
 
 # Quadrilaterals with sides in this range get a closer look.
@@ -143,17 +143,15 @@ class ArucoDetector:
         high = np.minimum(np.ceil(quad.max(axis=0) + margin_px), image.shape[::-1]).astype(int)
         if np.any(high - low < 8):
             return [], []
-        region = image[low[1] : high[1], low[0] : high[0]]
         side_px = mean_side_px(quad)
         # The marker's cells are smaller than this; OpenCV would spend over 1 ms on each.
         perimeter_rate = _SMALLEST * 4 * side_px / max(high - low)
         scale = _ENLARGE if side_px <= _ENLARGE_UP_TO_PX else 1
-        if scale > 1:
-            region = cv2.resize(region, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        region, in_region = at_scale(image[low[1] : high[1], low[0] : high[0]], scale)
         markers, unread = self._decode(region, np.floor(10 * perimeter_rate) / 10)
 
         def back(corners: np.ndarray) -> np.ndarray:
-            return (corners + 0.5) / scale - 0.5 + low
+            return in_region(corners) + low
 
         return [(i, back(corners)) for i, corners in markers], [back(corners) for corners in unread]
 

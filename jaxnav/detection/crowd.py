@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 
 from jaxnav.detection.families import all_cells
 from jaxnav.detection.read import codes_of
+from jaxnav.detection.types import at_scale
 
 # A room with markers has a dozen quadrilaterals in 820 x 410 pixels, a robot field over a hundred.
 _CROWD = 300
@@ -60,7 +61,7 @@ def thin_crowd(
 def _has_outlines(image: np.ndarray, more_than: int) -> bool:
     """True if the image at half size has more outlines of dark and light spots than `more_than`. It
     takes 1/20 of the decoder's time; finding the quadrilaterals would take as long as decoding."""
-    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    small = at_scale(image, 0.5)[0]
     dark = cv2.morphologyEx(_dark(small, _HALF_WINDOW_PX), cv2.MORPH_OPEN, _SPECK)
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     return sum(len(outline) >= _OUTLINE_PX for outline in outlines) > more_than

@@ -69,7 +69,6 @@ class _Patch(NamedTuple):
     rays_px: Float[Array, "2 3 N"]  # derivative by pixel
     levels: Float[Array, " N"]
     K: Float[Array, "k k"]  # row along y, column along x
-    trust: Float[Array, " N"]
     most_curve: Float[Array, ""]
 
 
@@ -77,6 +76,7 @@ class _State(NamedTuple):
     M: Array
     blur: Array
     residual: Array
+    J: Array
     hessian: Array
     gradient: Array
     scale: Array
@@ -98,7 +98,7 @@ def fit_edges(
     rays_px: Float[Array, "2 3 N"],
     levels: Float[Array, " N"],
     K: Float[Array, "k k"],
-    trust: Float[Array, " N"],
+    used: Bool[Array, " N"],
     curved: Bool[Array, ""],
 ) -> EdgeFit:
     """Fit by Levenberg-Marquardt with Huber's loss, from M = I, in float32 in any process.
@@ -108,18 +108,19 @@ def fit_edges(
         rays_px: their derivatives by pixel.
         levels: grey levels of the pixels.
         K: `step_corners` of the marker.
-        trust: weights of the pixels, 1 or less; 0 for padding.
+        used: which pixels count; the others are padding.
         curved: whether levels may be coded; else c4 is 0.
     """
-    patch = _Patch(rays, rays_px, levels, K, trust, jnp.where(curved, _MOST_CURVE, 0))
+    patch = _Patch(rays, rays_px, levels, K, jnp.where(curved, _MOST_CURVE, 0))
     one = jnp.ones((), levels.dtype)
     blur = jnp.array([1.0, 0.0, 1.0], levels.dtype) * _START_BLUR_PX2
     M = jnp.eye(3, dtype=levels.dtype)
-    residual, J, contrast = _linearise(M, blur, patch, trust)
-    hessian, gradient = _normal_equations(residual, J, trust)
+    weight = used * one
+    residual, J, contrast = _linearise(M, blur, patch, weight)
+    hessian, gradient = _normal_equations(residual, J, weight)
     start = _State(
-        M, blur, residual, hessian, gradient,
-        _rms(residual, trust), contrast, 1e-3 * one, jnp.array(0), jnp.array(False), one,
+        M, blur, residual, J, hessian, gradient,
+        _rms(residual, weight), contrast, 1e-3 * one, jnp.array(0), jnp.array(False), one,
     )  # fmt: skip
 
     def attempt(s: _State) -> _State:
@@ -129,22 +130,22 @@ def fit_edges(
         size = jnp.max(jnp.abs(_CORNER_MOTION @ step[:8]))
         step = step * jnp.minimum(1, _MAX_STEP / jnp.maximum(size, 1e-9))
         M, blur = _moved(s.M, s.blur, step)
-        weight = trust * _huber_weight(s.residual / s.scale)
+        weight = used * _huber_weight(s.residual / s.scale)
         residual, J, contrast = _linearise(M, blur, patch, weight)
         hessian, gradient = _normal_equations(residual, J, weight)
-        before, after = (_loss(r / s.scale, trust) for r in (s.residual, residual))
+        before, after = (_loss(r / s.scale, used) for r in (s.residual, residual))
         better = after <= before
         scale = _rms(residual, weight)
         small = (size < _CONVERGED) | (jnp.abs(before - after) < _PLATEAU * before)
         moved = _State(
-            M, blur, residual, hessian, gradient, scale, contrast,
+            M, blur, residual, J, hessian, gradient, scale, contrast,
             jnp.maximum(s.damping * 0.1, 1e-6), s.steps + 1, small, size,
         )  # fmt: skip
         stayed = s._replace(damping=s.damping * 10, steps=s.steps + 1, converged=small, step=size)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, stayed)
 
     s = jax.lax.while_loop(lambda s: (s.steps < _STEPS) & ~s.converged, attempt, start)
-    weight = trust * _huber_weight(s.residual / s.scale)
+    weight = used * _huber_weight(s.residual / s.scale)
     freedom = jnp.maximum(jnp.sum(weight) - 16, 1)
     noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
     units = jnp.eye(s.hessian.shape[0], dtype=one.dtype)
@@ -215,15 +216,13 @@ def _disagreement(s: _State, patch: _Patch, weight: Array, noise: Array) -> Arra
 
     Source: Liang, Zeger (1986), as in `calibration/parts.py`.
     """
-    residual, J, _ = _linearise(s.M, s.blur, patch, weight)
     xy, _ = on_paper(s.M, patch.rays, patch.rays_px)
     cells = patch.K.shape[0] - 1
     column, row = jnp.clip(jnp.floor((xy + 1) * cells / 2) + 1, 0, cells + 1).astype(int)
     scores = jax.ops.segment_sum(
-        (J * (weight * residual / noise)[None]).T, row * (cells + 2) + column, (cells + 2) ** 2
+        (s.J * (weight * s.residual / noise)[None]).T, row * (cells + 2) + column, (cells + 2) ** 2
     )
-    hessian, _ = _normal_equations(residual, J, weight)
-    ratio = jnp.sum(scores.T * eliminate(_ridged(hessian), scores.T)) / hessian.shape[0]
+    ratio = jnp.sum(scores.T * eliminate(_ridged(s.hessian), scores.T)) / len(s.hessian)
     return jnp.where(ratio > _NOTICED, ratio, 1)
 
 
@@ -322,7 +321,7 @@ def _huber_weight(r: Array) -> Array:
     return _HUBER / jnp.maximum(jnp.abs(r), _HUBER)
 
 
-def _loss(r: Array, trust: Array) -> Array:
+def _loss(r: Array, used: Array) -> Array:
     size = jnp.abs(r)
     each = jnp.where(size < _HUBER, 0.5 * r**2, _HUBER * (size - 0.5 * _HUBER))
-    return jnp.sum(jnp.where(trust > 0, trust * each, 0))
+    return jnp.sum(jnp.where(used, each, 0))

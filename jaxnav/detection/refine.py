@@ -124,8 +124,8 @@ def fit_marker(
     lanes = np.minimum(np.arange(PIXELS), count - 1)
     levels = image[pixels[:, 1], pixels[:, 0]]
     seen = (M @ rays)[:, lanes], (M @ rays_px)[:, :, lanes], levels[lanes], step_corners(cells)
-    trust = np.arange(PIXELS) < count
-    fit = fit_edges(*(np.asarray(a, np.float32) for a in (*seen, trust)), np.asarray(curved))
+    used = np.arange(PIXELS) < count
+    fit = fit_edges(*(np.asarray(a, np.float32) for a in seen), used, np.asarray(curved))
     fit = jax.device_get(fit)
     return MarkerFit(np.asarray(fit.M, float) @ M, pixels, fit)
 

@@ -1,6 +1,6 @@
 """The protocols of detectors, and the detections that they return."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -120,6 +120,17 @@ def grey(image: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "rows columns"]:
     if image.ndim != 2:
         raise BadInput("image", f"expected shape (H, W) or (H, W, 3), got {image.shape}")
     return image
+
+
+def at_scale(
+    image: UInt8[np.ndarray, "rows columns"], scale: float
+) -> tuple[UInt8[np.ndarray, "scaled_rows scaled_columns"], Callable[[np.ndarray], np.ndarray]]:
+    """The image enlarged or reduced, and what takes pixels of it back to pixels of the first."""
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    scaled = image
+    if scale != 1:
+        scaled = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=how))
+    return scaled, lambda points_px: (points_px + 0.5) / scale - 0.5
 
 
 def refine_detections(

@@ -9,9 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from jaxtyping import Float
-
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr
 from jaxnav.files.figures import CameraFigures
@@ -36,7 +33,7 @@ class CameraFile:
 
     Attributes:
         cameras: under the names that the file gives them, at least one.
-        left_out: keys with values that a `CameraFigures` can't hold.
+        left_out: keys with values that no other file can be given.
     """
 
     format: CameraFormat
@@ -62,34 +59,19 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
         BadInput: one line naming file and key; with the names to choose from where there are
             several cameras.
     """
-    path = Path(path)
+    figures = load_figures(Path(path), name)
+    return figures.camera(), figures.image_size_px
+
+
+def load_figures(path: Path, name: str | None) -> CameraFigures:
+    """Read the figures of one camera; the arguments and errors are those of `load_camera`."""
     data = read_mapping(path)
     file = camera_file(path, data)
     if file.format in ("jaxnav", "kalibr"):
-        camera = choose_camera(path, file.cameras, name)
-    else:
-        (camera,) = file.cameras
-        if name is not None and name != data.get("camera_name"):
-            raise BadInput(path, f"holds one camera, and it is not named {name!r}")
-    return camera.camera(), camera.image_size_px
-
-
-def load_lens_sigma(path: str | Path, name: str | None = None) -> Float[np.ndarray, " 4"] | None:
-    """One standard deviation of fx, fy, cx, cy of a camera, px; None where its file says none.
-
-    Args:
-        path: a calibration file that `load_camera` reads.
-        name: as there.
-    """
-    data = read_mapping(Path(path))
-    if "cameras" not in data:
-        return None
-    entries = validate(RigFile, data, Path(path)).cameras
-    entry = next((entry for entry in entries if name in (None, entry.name)), None)
-    sigma = None if entry is None else entry.sigma
-    if sigma is None or sigma.focal_px is None or sigma.center_px is None:
-        return None
-    return np.array([*sigma.focal_px, *sigma.center_px])
+        return choose_camera(path, file.cameras, name)
+    if name is not None and name != data.get("camera_name"):
+        raise BadInput(path, f"holds one camera, and it is not named {name!r}")
+    return file.cameras[0]
 
 
 def camera_file(path: Path, data: dict[str, Any], by_topic: bool = False) -> CameraFile:

@@ -35,6 +35,8 @@ class CameraFigures:
             where the file does not place the camera.
         sigma: (6,) of its place along the vehicle's axes, m, and of its direction about them, rad;
             None where the file does not say.
+        lens_sigma_px: (4,) of fx, fy, cx, cy; None where the file does not say. Read only: no file
+            is given it.
     """
 
     name: str
@@ -45,6 +47,7 @@ class CameraFigures:
     image_size_px: tuple[int, int]
     T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None
     sigma: Float[np.ndarray, " 6"] | None = None
+    lens_sigma_px: Float[np.ndarray, " 4"] | None = None
 
     @staticmethod
     def create(
@@ -55,6 +58,7 @@ class CameraFigures:
         image_size_px: Sequence[int],
         T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None,
         sigma: Float[np.ndarray, " 6"] | None = None,
+        lens_sigma_px: Float[np.ndarray, " 4"] | None = None,
     ) -> "CameraFigures":
         """A camera from fx fy cx cy and coefficients; missing last coefficients are zero."""
         fx, fy, cx, cy = (float(value) for value in pinhole_px)
@@ -68,6 +72,7 @@ class CameraFigures:
             image_size_px=(int(image_size_px[0]), int(image_size_px[1])),
             T_camera_vehicle=T_camera_vehicle,
             sigma=sigma,
+            lens_sigma_px=lens_sigma_px,
         )
 
     def camera(self) -> Camera:

@@ -110,6 +110,13 @@ def read_image(
     Raises:
         BadInput: the file is missing, unreadable, too large, or not an image.
     """
+    return read_photograph(path, flags)[0]
+
+
+def read_photograph(
+    path: Path, flags: int = cv2.IMREAD_COLOR
+) -> tuple[UInt8[np.ndarray, "rows columns *channels"], int]:
+    """Read the image in a file as `read_image` does, and its `exif_orientation`."""
     try:
         with path.open("rb") as file:
             raw = file.read(limits.IMAGE_BYTES + 1)
@@ -119,7 +126,7 @@ def read_image(
         image = decode_image(raw, flags)
     if image is None:
         raise BadInput(path, image_problem(raw) or "is not an image that OpenCV can read")
-    return image
+    return image, exif_orientation(raw)
 
 
 def image_problem(raw: bytes | UInt8[np.ndarray, " N"]) -> str | None:

@@ -91,6 +91,12 @@ class CameraSigma(Entry):
             return None
         return np.concatenate([self.position_m, np.deg2rad(self.rotation_deg)])
 
+    def of_lens(self) -> Float[np.ndarray, " 4"] | None:
+        """Sigmas of fx, fy, cx, cy, px; None where they are not given."""
+        if self.focal_px is None or self.center_px is None:
+            return None
+        return np.array([*self.focal_px, *self.center_px])
+
 
 class CameraEntry(Entry):
     """One camera of a rig file."""
@@ -154,6 +160,7 @@ class CameraEntry(Entry):
             assert self.position_m is not None  # _placed_once
             angles_deg = (self.yaw_deg or 0.0, self.elevation_deg or 0.0, self.roll_deg or 0.0)
             T_camera_vehicle = place(self.position_m, angles_deg)
+        sigma = self.sigma or CameraSigma()
         return CameraFigures.create(
             self.name,
             self.lens,
@@ -161,7 +168,8 @@ class CameraEntry(Entry):
             self.distortion,
             self.image_size_px,
             T_camera_vehicle,
-            None if self.sigma is None else self.sigma.of_place(),
+            sigma.of_place(),
+            sigma.of_lens(),
         )
 
 

@@ -28,6 +28,11 @@ def wrap_angle(angle_rad: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return angle_rad - 2 * jnp.pi * jnp.floor((angle_rad + jnp.pi) / (2 * jnp.pi))
 
 
+def wrap_angle_np(angle_rad: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """`wrap_angle` of NumPy's arrays, of any precision: rad, wrapped to [-pi, pi)."""
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+
+
 def T_world_vehicle_from_planar(pose: Float[Array, "*batch 3"]) -> jaxlie.SE3:
     """Lift (x_m, y_m, psi_rad), the pose of the vehicle in the world, to SE(3).
 

@@ -1,4 +1,4 @@
-"""Draw drives, localised recordings and camera frames.
+"""Draw localised recordings and camera frames.
 
 One function returns one Figure; nothing is shown or saved here. Colours are Okabe and Ito's, which
 everybody can distinguish.
@@ -22,22 +22,10 @@ BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = (
     "#0072B2",
     "#D55E00",
 )
-METHOD_STYLES: tuple[dict[str, Any], ...] = (
-    {"color": BLUE, "ls": "-"},
-    {"color": VERMILION, "ls": "--"},
-)
 SELECTED, OTHER = BLUE, ORANGE
 PHOTO_DPI = 100.0  # pixels of a photograph in an inch of its picture
 _USUAL_PX = 1200.0  # diagonal of a photograph whose words are as large as usual
 _LEAST_ARROW = 0.02  # length of an arrow, of the photograph's diagonal
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """A trajectory to draw: poses (N, 3) of x_m, y_m, psi_rad; NaN where unknown."""
-
-    label: str
-    poses: Float[np.ndarray, "N 3"]
 
 
 @dataclass(frozen=True)
@@ -50,55 +38,6 @@ class AnnotatedFrame:
     selected_px: Float[np.ndarray, "P 2 2"]  # marker normals of the candidate taken, foot and tip
     other_px: Float[np.ndarray, "Q 2 2"]  # of all other candidates
     names: tuple[str, ...] = ()  # beside the markers, where given
-
-
-def drive_report(
-    times_s: Float[np.ndarray, " N"],
-    truth: Trajectory,
-    methods: Sequence[Trajectory],
-    waypoints_m: Float[np.ndarray, "W 2"],
-    waypoint_radius_m: float,
-    markers_m: Float[np.ndarray, "M 4 3"],
-    title: str = "",
-) -> Figure:
-    """Draw the paper's two figures of a drive: x, y, yaw against time, and the X-Y plane.
-
-    Args:
-        times_s: (N,).
-        truth: the true trajectory.
-        methods: at most two estimates, the driving one first.
-        waypoints_m: (W, 2).
-        waypoint_radius_m: drawn as circles.
-        markers_m: (M, 4, 3) corners in the world.
-        title: above everything.
-    """
-    figure = Figure(figsize=(11, 6.5), layout="constrained")
-    figure.suptitle(title)
-    grid = figure.add_gridspec(3, 2, width_ratios=(1, 1.15))
-    rows = [figure.add_subplot(grid[row, 0]) for row in range(3)]
-    for row, axes in enumerate(rows):
-        for track, style in _styled(truth, methods):
-            values = track.poses[:, row]
-            axes.plot(times_s, _yaw_deg(values) if row == 2 else values, label=track.label, **style)
-        axes.set_ylabel(("x (m)", "y (m)", "yaw (deg)")[row])
-        axes.grid(alpha=0.3)
-        axes.label_outer()
-    rows[0].legend(loc="best", fontsize=8)
-    rows[-1].set_xlabel("time (s)")
-
-    plane = figure.add_subplot(grid[:, 1])
-    for track, style in _styled(truth, methods):
-        plane.plot(track.poses[:, 0], track.poses[:, 1], label=track.label, **style)
-    known = np.isfinite(truth.poses[:, 0])
-    plane.plot(*truth.poses[known][0, :2], "o", color=BLACK, ms=6)
-    plane.annotate("start", truth.poses[known][0, :2], xytext=(6, -10), textcoords="offset points")
-    draw_waypoints(plane, waypoints_m, waypoint_radius_m)
-    draw_markers(plane, markers_m)
-    plane.set(xlabel="x (m)", ylabel="y (m)")
-    plane.set_aspect("equal", adjustable="datalim")
-    plane.grid(alpha=0.3)
-    plane.legend(loc="lower left", fontsize=8)
-    return figure
 
 
 def localisation_report(
@@ -236,22 +175,6 @@ def reliability_diagram(
     for axes in (upper, lower):
         axes.grid(alpha=0.3)
     return figure
-
-
-def _styled(
-    truth: Trajectory, methods: Sequence[Trajectory]
-) -> list[tuple[Trajectory, dict[str, Any]]]:
-    return [
-        (truth, {"color": BLACK, "lw": 2.2, "alpha": 0.75}),
-        *zip(methods, METHOD_STYLES, strict=False),
-    ]
-
-
-def _yaw_deg(psi_rad: np.ndarray) -> np.ndarray:
-    """Degrees in [-180, 180), broken where they wrap so that no line crosses the plot."""
-    wrapped = np.rad2deg((psi_rad + np.pi) % (2 * np.pi) - np.pi)
-    jumps = np.abs(np.diff(wrapped, prepend=wrapped[:1])) > 180
-    return np.where(jumps, np.nan, wrapped)
 
 
 def _fit_view(axes: Axes, points: np.ndarray) -> None:

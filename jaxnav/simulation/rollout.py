@@ -75,6 +75,7 @@ class Rollout(eqx.Module):
     start_pose: Float[Array, " 3"] | None = None  # None: the scenario's
     spread: Spread | None = eqx.field(static=True, default=None)  # None: all cars are nominal
     lanes: int = eqx.field(static=True, default=128)
+    all_lanes: bool = eqx.field(static=True, default=False)  # for fewer drives, too
     chunk_frames: int = eqx.field(static=True, default=15)
     many: int = eqx.field(static=True, default=2048)  # least number of drives for `over_lanes`
     many_lanes: int = eqx.field(static=True, default=1024)  # per thread
@@ -99,7 +100,8 @@ class Rollout(eqx.Module):
     ) -> tuple[Trace, PyTree]:
         """`run`, and `keep`'s record of every frame; after a drive's end its last is repeated."""
         if len(keys) < self.many:
-            lanes, threads, advance = min(self.lanes, len(keys)), 1, self._advance
+            lanes = self.lanes if self.all_lanes else min(self.lanes, len(keys))
+            threads, advance = 1, self._advance
         else:
             lanes, threads, advance = self.many_lanes, self.threads, self._advance_many
         kept = run_lanes(

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxnav.models.geometry import wrap_angle_np
 from jaxnav.simulation.rollout import Trace
 from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.statistics import wilson_interval
@@ -45,8 +46,7 @@ class Drives:
         counted = trace.active & trace.located
         decided = counted & trace.decided
         times_s = np.arange(trace.active.shape[1]) * scenario.frame_period_s
-        yaw_rad = (trace.pose[..., 2] - trace.true_pose[..., 2] + np.pi) % (2 * np.pi) - np.pi
-        yaw_error_rad = np.abs(yaw_rad)
+        yaw_error_rad = np.abs(wrap_angle_np(trace.pose[..., 2] - trace.true_pose[..., 2]))
         wrong = yaw_error_rad > np.deg2rad(WRONG_DEG)
         passed = trace.passed.max(axis=1) >= len(scenario.waypoints_m)
         last = trace.active.sum(axis=1) - 1

@@ -26,7 +26,7 @@ from jaxnav.simulation.scores import Drives
 from jaxnav.studies.config import Config
 from jaxnav.studies.lanes import in_precision
 from jaxnav.studies.parameters import Parameter, cameras, positive, told_noise_px
-from jaxnav.studies.study import Cell, Ended, Progress, Rate, Schema, Study, Variable, nobody
+from jaxnav.studies.study import Cell, Progress, Rate, Schema, Study, Variable, nobody
 
 OUTCOMES = ("arrived", "failed", "left the floor", "invalid")
 ARRIVED, FAILED, LEFT_FLOOR, INVALID = range(4)
@@ -144,14 +144,9 @@ class DriveStudy(Study):
         """Run the drives of one cell: their scores (trials,) by name."""
         scenario = self.scenario(cell)
         rollout = self.rollout(cell, scenario)
-        # The same shapes, and so the same bits, for any number of drives.
-        lanes = 0 if self._many else rollout.lanes
-        numbers = np.resize(np.asarray(trials), max(len(trials), lanes))
         key = jax.random.key(self.config.seed)
-        keys = jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.asarray(numbers))
-        # What fills the lanes beyond the trials is no trial.
-        scores = _scores(rollout.run(keys, Ended(progress, len(trials))), scenario)
-        return {name: values[: len(trials)] for name, values in scores.items()}
+        keys = jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.asarray(trials))
+        return _scores(rollout.run(keys, progress), scenario)
 
     @staticmethod
     def scenario(cell: Cell) -> Scenario:
@@ -220,7 +215,9 @@ class DriveStudy(Study):
             value["corner_noise_px"],
             jnp.asarray(_given(value["corner_drift_px"], scenario.corner_drift_px), float),
             jnp.asarray(start, float),
+            # The same shapes, and so the same bits, for any number of drives in a box.
             lanes=min(LANES, self.config.trials),
+            all_lanes=True,
             many=1 if self._many else sys.maxsize,
         )
 

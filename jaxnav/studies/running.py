@@ -14,7 +14,7 @@ from jaxtyping import Shaped
 
 from jaxnav.errors import BadInput
 from jaxnav.studies.store import Box, StudyStore, versions
-from jaxnav.studies.study import Cell, Ended, Progress, Study, nobody
+from jaxnav.studies.study import Cell, Progress, Study, nobody
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -30,19 +30,24 @@ def run_here(store: StudyStore, progress: Progress = nobody) -> None:
         BadInput: the store can't be written to.
     """
 
-    def keep(box: Box, results: Mapping[str, np.ndarray], ended: Ended) -> None:
+    def keep(box: Box, results: Mapping[str, np.ndarray], told: list[int]) -> None:
         store.write(box, results)
-        ended(ended.left)
+        progress(store.layout.size(box) - sum(told))
 
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         try:
             for box in store.missing():
-                ended = Ended(progress, store.layout.size(box))
-                results = store.study.run(*_task(store, box), ended)
+                told: list[int] = []  # how many trials of this box have ended
+
+                def tell(ended: int, told: list[int] = told) -> None:
+                    told.append(ended)
+                    progress(ended)
+
+                results = store.study.run(*_task(store, box), tell)
                 if writing is not None:
                     writing.result()
-                writing = writer.submit(keep, box, results, ended)
+                writing = writer.submit(keep, box, results, told)
         finally:
             if writing is not None:
                 writing.result()

@@ -19,20 +19,6 @@ def nobody(ended: int) -> None:
     """Tell nobody of progress."""
 
 
-class Ended:
-    """Counts the trials that have ended, tells of them, and of no more than there are."""
-
-    def __init__(self, progress: Progress, trials: int):
-        self.left = trials
-        self._progress = progress
-
-    def __call__(self, ended: int) -> None:
-        """Count some more."""
-        ended = min(ended, self.left)
-        self.left -= ended
-        self._progress(ended)
-
-
 @dataclass(frozen=True)
 class Variable:
     """A quantity that is measured in every trial."""

@@ -24,14 +24,14 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from jaxnav.errors import BadInput
 from jaxnav.loop.pilot import Outcome
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.recording.outcomes import Outcomes
-from jaxnav.viewer.scene import RerunScene
+from jaxnav.viewer.scene import Picture, RerunScene
 
 APPLICATION = "jaxnav"
 _IDLE_S = 0.02  # between looks at an empty queue
@@ -120,10 +120,7 @@ class RerunView:
         self,
         camera_name: str,
         stamp_ns: int,
-        image: bytes
-        | UInt8[np.ndarray, "rows columns"]
-        | UInt8[np.ndarray, "rows columns 3"]
-        | None,
+        image: Picture | None,
         corners_px: Float[np.ndarray, "N 4 2"] | None,
     ) -> None:
         """Show a frame of a camera. Never raises.

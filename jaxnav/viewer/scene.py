@@ -28,6 +28,9 @@ from jaxnav.plots.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION
 from jaxnav.recording.learnt import as_filed
 from jaxnav.recording.outcomes import Outcomes
 
+# A JPEG, or grey or BGR pixels.
+Picture = bytes | UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"]
+
 TIMELINE = "drive"  # seconds since the first event
 _CHI2_2DOF_95 = 5.991
 _ARROW_M = 0.15
@@ -103,10 +106,7 @@ class RerunScene:
         self,
         camera: str,
         stamp_ns: int,
-        image: bytes
-        | UInt8[np.ndarray, "rows columns"]
-        | UInt8[np.ndarray, "rows columns 3"]
-        | None,
+        image: Picture | None,
         corners_px: Float[np.ndarray, "N 4 2"] | None,
     ) -> None:
         """Log a camera's frame: JPEG or BGR or grey pixels, and detected corners (N, 4, 2). None

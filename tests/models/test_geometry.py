@@ -35,6 +35,15 @@ def test_wrapping_at_the_seam():
     np.testing.assert_array_equal(slopes, 1)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_wrapping_in_numpy_is_the_same(dtype):
+    angles = np.append(np.linspace(-20, 20, 101), [-np.pi, np.pi, np.nan]).astype(dtype)
+    wrapped = geometry.wrap_angle_np(angles)
+    assert wrapped.dtype == dtype
+    expected = geometry.wrap_angle(jnp.asarray(angles))
+    np.testing.assert_allclose(wrapped, expected, atol=20 * np.finfo(dtype).eps)
+
+
 def test_planar_pose_is_a_turn_about_z(precision):
     tolerance = 1e-6 if precision == np.float32 else 1e-14
     for pose in [(0.0, 0.0, 0.0), (1.0, -2.0, 3.1), (-4.0, 0.5, -3.1), (0.1, 0.2, np.pi / 2)]:

@@ -7,9 +7,7 @@ from matplotlib.figure import Figure
 
 from jaxnav.plots.localisation import (
     AnnotatedFrame,
-    Trajectory,
     camera_mosaic,
-    drive_report,
     localisation_report,
     photo_with_poses,
 )
@@ -31,35 +29,6 @@ def view(corners_px: np.ndarray) -> AnnotatedFrame:
 
 
 SQUARE_PX = np.array([[[40.0, 20.0], [50.0, 20.0], [50.0, 30.0], [40.0, 30.0]]])
-
-
-def test_a_drive_report_names_what_it_shows():
-    lost = POSES.copy()
-    lost[:7] = np.nan
-    figure = drive_report(
-        TIMES_S,
-        Trajectory("truth", POSES),
-        [Trajectory("our method", lost), Trajectory("Method A + KF", POSES + 0.1)],
-        np.array([[1.3, 0.0], [0.5, 0.65]]),
-        0.15,
-        MARKERS_M,
-        "title",
-    )
-    assert {axes.get_ylabel() for axes in figure.axes} == {"x (m)", "y (m)", "yaw (deg)"}
-    assert {axes.get_xlabel() for axes in figure.axes} == {"", "time (s)", "x (m)"}
-    plane = figure.axes[-1]
-    assert plane.get_aspect() == 1.0
-    assert [t.get_text() for t in plane.get_legend().get_texts()] == [
-        "truth",
-        "our method",
-        "Method A + KF",
-        "marker",
-    ]
-    # The yaw passes 180 degrees: the line is broken there and not drawn across the plot.
-    yaw = figure.axes[2].lines[0].get_ydata()
-    assert np.isnan(yaw).sum() == 1
-    assert np.nanmax(np.abs(np.diff(yaw))) < 5
-    assert rendered(figure)
 
 
 def test_a_localisation_report_draws_errors_only_where_known():

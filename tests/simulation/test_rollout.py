@@ -81,6 +81,17 @@ def test_a_seed_s_drive_does_not_depend_on_the_others(real):
     assert not np.allclose(first.pose[0] - first.true_pose[0], 0)
 
 
+def test_lanes_beyond_the_drives_count_for_nothing(real):
+    ended = []
+    alone = dataclasses.replace(real, all_lanes=True).run(keys(jnp.asarray([8])), ended.append)
+    assert sum(ended) == 1
+    both = real.run(keys(jnp.asarray([8, 3])))
+    own = alone.active[0]
+    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(both), strict=True):
+        assert len(a) == 1
+        np.testing.assert_array_equal(a[0][own], b[0][: len(own)][own])
+
+
 def test_a_seed_draws_what_it_always_drew():
     """Start, corner noise and odometer: figures are kept by seed."""
 

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.places import is_mirrored
 from jaxnav.calibration.lenses.start import pose_from_rays
+from jaxnav.detection.types import at_scale
 from jaxnav.models.camera import Camera
 
 _LARGEST_PX = 1600  # longer side of the picture in which discs are looked for
@@ -44,10 +45,7 @@ def find_discs(
 
 
 def _opencv_discs(board: Board, levels: np.ndarray) -> np.ndarray | None:
-    scale = min(1.0, _LARGEST_PX / max(levels.shape))
-    small = levels
-    if scale < 1:
-        small = cv2.resize(levels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small, back = at_scale(levels, min(1.0, _LARGEST_PX / max(levels.shape)))
     parameters = cv2.SimpleBlobDetector.Params()
     parameters.minArea = _LEAST_AREA_PX2
     parameters.maxArea = small.size / board.columns / board.rows
@@ -61,7 +59,7 @@ def _opencv_discs(board: Board, levels: np.ndarray) -> np.ndarray | None:
         found, centres = cv2.findCirclesGrid(small, size, flags=flags, blobDetector=detector)
         if found and centres is not None:
             grid = np.asarray(centres, float).reshape(board.rows, board.columns, 2)
-            return _as_seen(board, grid).reshape(-1, 2) / scale + (0.5 / scale - 0.5)
+            return back(_as_seen(board, grid).reshape(-1, 2))
     return None
 
 

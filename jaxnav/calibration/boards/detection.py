@@ -30,7 +30,7 @@ from jaxnav.detection import make_detector
 from jaxnav.detection.edges import PIXEL_VARIANCE_PX2
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.refine import refine_corners
-from jaxnav.detection.types import grey
+from jaxnav.detection.types import at_scale, grey
 from jaxnav.models.camera import Camera
 
 _GROWTHS = 4  # how often the set of found points is extended by one pitch
@@ -211,16 +211,12 @@ def _opencv_chessboard(levels: np.ndarray, pattern: tuple[int, int]) -> np.ndarr
     one finds some that it never does. Their corners are a start only.
     """
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-    for width_px in (max(levels.shape), *_SMALLER_PX):
-        scale = width_px / max(levels.shape)
-        if scale > 1:
-            continue
-        small = levels
-        if scale < 1:
-            small = cv2.resize(levels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    full_px = max(levels.shape)
+    for width_px in (full_px, *(width_px for width_px in _SMALLER_PX if width_px < full_px)):
+        small, back = at_scale(levels, width_px / full_px)
         found, corners = cv2.findChessboardCornersSB(small, pattern, flags=flags)
         if found:
-            return (np.asarray(corners, float).reshape(-1, 2) + 0.5) / scale - 0.5
+            return back(np.asarray(corners, float).reshape(-1, 2))
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(levels, pattern, flags=flags)
     return np.asarray(corners, float).reshape(-1, 2) if found else None

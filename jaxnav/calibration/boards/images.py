@@ -3,13 +3,13 @@
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.detection import BoardLook, look_at
@@ -29,6 +29,9 @@ _MOST_FRAMES = 600  # of one video that are searched
 _THUMBNAIL_PX, _MIN_CHANGE_GREY = (64, 48), 1.5
 _MIN_MOVE_PX = 10.0  # median distance of the board's points from where the last view has them
 _EXAMPLES = 5  # images kept to find out why no board is seen
+
+
+Bar = Callable[..., Iterable[Any]]  # the items that it is given
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ def collect_views(
     board: Board,
     sources: Sequence[Path],
     camera: Camera | None = None,
-    headless: bool = True,
+    bar: Bar = lambda items, **_: items,
 ) -> CollectedViews:
     """Find the board in images and videos of one camera.
 
@@ -70,7 +73,7 @@ def collect_views(
         sources: folders of images, images, videos. The images of a folder are read in the order
             of their names, with numbers compared by value.
         camera: see `find_board`.
-        headless: show no progress bar.
+        bar: shows progress, as `tqdm` does, which it takes the arguments of.
 
     Raises:
         BadInput: none of the images can be read, a video can't be, images differ in size, or the
@@ -79,10 +82,9 @@ def collect_views(
     files = source_files(sources)
     collector = _Collector(board, camera)
     names = _names(files)
-    for file, name in tqdm(zip(files, names, strict=True), total=len(files), disable=headless):
+    for file, name in bar(zip(files, names, strict=True), total=len(files)):
         if file.suffix.lower() in VIDEOS:
-            frames = tqdm(_frames(file), unit=" frame", leave=False, disable=headless)
-            collector.add_video(file, name, frames)
+            collector.add_video(file, name, bar(_frames(file), unit=" frame", leave=False))
         else:
             collector.add_image(file, name)
     return collector.collected(files)

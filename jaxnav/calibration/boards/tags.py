@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.places import mapped
 from jaxnav.detection.families import dictionary
+from jaxnav.detection.types import at_scale
 
 # Where fewer than this part of the tags are read, the image is read again at twice its size.
 _FEW = 0.5
@@ -36,8 +37,7 @@ def read_tags(
     decoder = cv2.aruco.ArucoDetector(dictionary(board.family), parameters)
     seen, twice = _decoded(decoder, image, 1)
     if len(seen) < _FEW * board.tag_count:
-        larger = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        seen_larger, twice_larger = _decoded(decoder, larger, 2)
+        seen_larger, twice_larger = _decoded(decoder, image, 2)
         seen, twice = seen_larger | seen, twice | twice_larger
     place_of = {tag.id: place for place, tag in enumerate(board.tags)}
     own = sorted(marker_id for marker_id in seen if marker_id in place_of)
@@ -97,8 +97,9 @@ def _stray(board: Board, places: np.ndarray, corners_px: np.ndarray) -> float:
 def _decoded(
     decoder: cv2.aruco.ArucoDetector, image: np.ndarray, scale: int
 ) -> tuple[dict[int, np.ndarray], set[int]]:
-    """Corners (4, 2) by id in pixels of the image before enlargement, and the ids seen twice."""
-    quads, ids, _ = decoder.detectMarkers(image)
+    """Corners (4, 2) by id, read in the image at another size, and the ids seen twice."""
+    scaled, back = at_scale(image, scale)
+    quads, ids, _ = decoder.detectMarkers(scaled)
     seen: dict[int, np.ndarray] = {}
     twice: set[int] = set()
     for marker_id, quad in zip(
@@ -106,5 +107,5 @@ def _decoded(
     ):
         if marker_id in seen:
             twice.add(marker_id)
-        seen[marker_id] = (quad.reshape(4, 2).astype(float) + 0.5) / scale - 0.5
+        seen[marker_id] = back(quad.reshape(4, 2).astype(float))
     return seen, twice

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxnav.calibration.boards.board import Board
-from jaxnav.calibration.boards.images import CollectedViews, collect_views
+from jaxnav.calibration.boards.images import Bar, CollectedViews, collect_views
 from jaxnav.calibration.lenses.bundle import FITTED
 from jaxnav.calibration.lenses.fit import LensFit, fit_lens
 from jaxnav.calibration.lenses.intrinsics import (
@@ -35,14 +35,14 @@ def calibrate_images(
     lens: str = "auto",
     max_views: int = 100,
     tell: Callable[[str], None] = lambda stage: None,
-    headless: bool = True,
+    bar: Bar = lambda items, **_: items,
 ) -> tuple[CollectedViews, LensCalibration]:
     """Collect the views of the board from images, and calibrate the lens from them.
 
     Args:
         sources: see `collect_views`.
         lens: see `calibrate_lens`, also for `max_views` and `tell`.
-        headless: show no progress bar.
+        bar: see `collect_views`.
 
     Raises:
         BadInput: as `collect_views` and `calibrate_lens` do.
@@ -50,8 +50,8 @@ def calibrate_images(
     where = str(sources[0]) + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
     camera = None
     if not board.has_saddles:
-        camera = _camera_of_marker(board, sources, lens, tell, headless)
-    collected = collect_views(board, sources, camera, headless=headless)
+        camera = _camera_of_marker(board, sources, lens, tell, bar)
+    collected = collect_views(board, sources, camera, bar=bar)
     gone = {name: f"the same picture as {twin}" for name, twin in collected.duplicates}
     gone |= dict(collected.unreadable)
     gone |= dict.fromkeys(collected.without_board, "the board is not seen")
@@ -63,14 +63,14 @@ def _camera_of_marker(
     sources: Sequence[Path],
     lens: str,
     tell: Callable[[str], None],
-    headless: bool,
+    bar: Bar,
 ) -> Camera | None:
     """Find the lens roughly, to bend the marker's edges by; None if there are too few views."""
     before: LensFit | None = None
     for look in range(_LOOKS):
         tell(f"look {look + 1}")
         seen_by = None if before is None else before.camera
-        views, _ = screened(collect_views(board, sources, seen_by, headless=headless).views)
+        views, _ = screened(collect_views(board, sources, seen_by, bar=bar).views)
         if len(views.views) < FEWEST_VIEWS:
             return seen_by
         fits = []

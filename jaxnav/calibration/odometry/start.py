@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxnav.calibration.odometry.drive import Course, Intervals, MarkerViews
 from jaxnav.calibration.odometry.model import NODE, corrected, padded
 from jaxnav.models.bicycle import advance
-from jaxnav.models.geometry import planar_from_T_world_vehicle
+from jaxnav.models.geometry import planar_from_T_world_vehicle, wrap_angle_np
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.ippe import ippe_from_rays
@@ -161,8 +161,7 @@ def _step_cost(
     led_m = _turned(b[:2] - a[:2], -a[2])
     seen_m = _turned(afters[None, :, :2] - befores[:, None, :2], -befores[:, None, 2])
     off_m = np.linalg.norm(seen_m - led_m, axis=-1)
-    off_rad = afters[None, :, 2] - befores[:, None, 2] - turn
-    off_rad = np.abs((off_rad + np.pi) % (2 * np.pi) - np.pi)
+    off_rad = np.abs(wrap_angle_np(afters[None, :, 2] - befores[:, None, 2] - turn))
     off_m = off_m / (_STEP_M + error * float(np.linalg.norm(led_m)))
     off_rad = off_rad / (_STEP_RAD + error * abs(turn))
     return np.asarray(np.minimum(off_m**2 + off_rad**2, _MOST))

@@ -1,17 +1,18 @@
 """`jaxnav calibrate intrinsics`: calibrate the lens of a camera, or of several."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from jaxnav import __version__
 from jaxnav.calibration.boards.images import CollectedViews
 from jaxnav.calibration.lenses.checks import cells, reach, rim_sigma_px, tilts_deg
 from jaxnav.calibration.lenses.images import calibrate_images
 from jaxnav.calibration.lenses.intrinsics import LensCalibration
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import read_board
 from jaxnav.commands.pictures import save_figure
@@ -49,15 +50,16 @@ def run(args: CalibrateIntrinsics) -> int:
     folder = output_folder(args.out)
     collected: dict[str, CollectedViews] = {}
     calibrations: dict[str, LensCalibration] = {}
+    bars = partial(progress_bar, disable=args.headless)
     for name, sources in args.by_camera.items():
-        with tqdm(unit=" step", desc=name, disable=args.headless) as bar:
+        with bars(unit=" step", desc=name) as bar:
 
-            def tell(stage: str, bar: tqdm = bar) -> None:
+            def tell(stage: str, bar: Any = bar) -> None:
                 bar.set_postfix_str(stage, refresh=False)
                 bar.update()
 
             collected[name], calibrations[name] = calibrate_images(
-                board, sources, args.lens, args.max_views, tell, args.headless
+                board, sources, args.lens, args.max_views, tell, bars
             )
 
     files = [args.board, *(file for one in collected.values() for file in one.files)]

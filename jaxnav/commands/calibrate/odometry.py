@@ -7,10 +7,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
 from jaxnav.calibration.odometry.model import NAMES
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.calibrate.odometry_recordings import RecordedDrives, read_recordings
 from jaxnav.commands.pictures import corners_in_world, save_figure
@@ -28,7 +28,7 @@ def run(args: Arguments) -> int:
     configure_jax(float64=True)
     recorded = read_recordings(args)
     before = {name: float(getattr(recorded.vehicle, name)) for name in NAMES}
-    with tqdm(unit="step", disable=args.headless, leave=False) as bar:
+    with progress_bar(unit="step", disable=args.headless, leave=False) as bar:
         calibration = calibrate_odometry(
             recorded.drives,
             recorded.rig,

@@ -1,7 +1,6 @@
 """`jaxnav faults`: drive with every fault of the matrix, and print a table."""
 
-from tqdm import tqdm
-
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.drive.arguments import Faults
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
@@ -28,11 +27,11 @@ def run(args: Faults) -> int:
         raise BadInput("--only", f"names no fault: there are {known}")
     results: list[Result] = []
     print(HEADER)
-    with tqdm(rows, unit="fault", disable=args.headless) as bar:
+    with progress_bar(rows, unit="fault", disable=args.headless) as bar:
         for row in bar:
             bar.set_postfix_str(row.name)
             results.append(run_trial(row, trial))
-            tqdm.write(line(results[-1]))
+            bar.write(line(results[-1]))
     if args.json is not None:
         write_json(args.json, {"faults": [_as_json(result) for result in results]})
     broken = sum(bool(result.broken) for result in results)

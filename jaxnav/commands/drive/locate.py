@@ -18,9 +18,8 @@ from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.detection import ArucoDetector, Detections, Detector, make_detector
 from jaxnav.errors import BadInput
-from jaxnav.files import load_camera
-from jaxnav.files.cameras import load_lens_sigma
-from jaxnav.files.images import exif_orientation, read_image
+from jaxnav.files.cameras import load_figures
+from jaxnav.files.images import read_photograph
 from jaxnav.models.camera import Camera
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -39,31 +38,29 @@ def run(args: Locate) -> int:
         raise BadInput("--out", f"must end in .png or .jpg, got {args.out}")
     configure_jax(float64=True)
     detectors = _detectors(args.corner_backend, args.family)
-    camera, image_size_px = load_camera(args.camera, args.camera_name)
-    image = read_image(args.image)
+    figures = load_figures(args.camera, args.camera_name)
+    camera, size_px, lens_sigma_px = figures.camera(), figures.image_size_px, figures.lens_sigma_px
+    image, orientation = read_photograph(args.image)
     height, width = image.shape[:2]
-    if (width, height) != tuple(image_size_px):
+    if (width, height) != size_px:
         raise BadInput(
             args.image,
             f"is {width} x {height} pixels, but --camera {args.camera} was calibrated at "
-            f"{image_size_px[0]} x {image_size_px[1]}",
+            f"{size_px[0]} x {size_px[1]}",
         )
     first, *more = (detector.detect(image, camera) for detector in detectors)
     # What the pattern does not fit is a ghost, or was found better by the first.
     more = [found.only(found.refined) for found in more]
     detections = without_doubles(Detections.concatenate([first, *more]))
-    lens_sigma_px = load_lens_sigma(args.camera, args.camera_name)
-    cameras = _cameras(camera, lens_sigma_px)
     rigs = [
-        CameraRig.create([one], [jaxlie.SE3.identity()], ["camera"], [image_size_px])
-        for one in cameras
+        CameraRig.create([one], [jaxlie.SE3.identity()], ["camera"], [size_px])
+        for one in _cameras(camera, lens_sigma_px)
     ]
     located = [
         _locate(rigs, args.marker_size_m, detections, index)
         for index in np.argsort(detections.ids, kind="stable")
     ]
     markers = [marker for marker, _ in located]
-    orientation = exif_orientation(args.image.read_bytes())
     report = {
         "image": str(args.image),
         "camera": str(args.camera),

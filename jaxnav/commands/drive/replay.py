@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive import replay_drive
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import Selector
@@ -53,19 +53,13 @@ def run(args: Arguments) -> int:
     out = output_folder(args.out)
     if params is not None:
         print(params.describe())
-    with tqdm(total=len(recording), unit="frame", disable=args.headless) as bar:
-        bar.set_postfix_str("compiling")
-
-        def advance(frames: int) -> None:
-            bar.set_postfix_str("", refresh=False)
-            bar.update(frames)
-
+    with progress_bar(total=len(recording), unit="frame", disable=args.headless) as bar:
         result = replay(
             recording,
             make_selector(str(args.selector)),
             one_at_a_time=args.one_at_a_time,
             corner_sigma_px=args.corner_sigma_px,
-            progress=advance,
+            progress=update_after_compiling(bar),
             params=params,
         )
     summary = summarise(args, recording, result)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
+from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import flag_of
 from jaxnav.commands.pictures import corners_in_world, save_figure
@@ -249,10 +249,11 @@ def _replayed(
             # No car waits for this replay, so that the queue may hold every message.
             recorder = Recorder(beside, setup.header(), queue_messages=2 * len(inputs) + 1)
             closing.callback(recorder.close, timeout_s=60.0)
-        bar = closing.enter_context(tqdm(total=len(inputs), unit="input", disable=args.headless))
-        bar.set_postfix_str("compiling")
+        bar = closing.enter_context(
+            progress_bar(total=len(inputs), unit="input", disable=args.headless)
+        )
+        update = update_after_compiling(bar)
         for given, outcome in zip(inputs, outcomes, strict=True):
-            bar.set_postfix_str("", refresh=False)
             rows.append(_row(outcome))
             if comparison is not None:
                 comparison.look(outcome)
@@ -260,7 +261,7 @@ def _replayed(
                 recorder.put(*input_message(given))
                 message = outcome_message(outcome, digest(outcome))
                 recorder.put(OUTCOME, given.now_ns, message)
-            bar.update()
+            update(1)
         if recorder is not None:
             recorder.close(timeout_s=60.0)
             if recorder.failed is not None:

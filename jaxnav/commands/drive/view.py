@@ -2,8 +2,7 @@
 
 from contextlib import ExitStack
 
-from tqdm import tqdm
-
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.drive.arguments import ViewDrive as Arguments
 from jaxnav.commands.drive.plot import read_outcomes
 from jaxnav.errors import visible
@@ -46,7 +45,9 @@ def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool)
     if odd:
         print(left_out_note(odd))
     names = () if scenery.rig is None else scenery.rig.names
-    for index in tqdm(range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False):
+    for index in progress_bar(
+        range(len(outcomes.now_ns)), unit="outcome", disable=headless, leave=False
+    ):
         view.show_recorded(outcomes, index)
     for frame in (frame for given in log.inputs for frame in given.frames):
         name = names[frame.camera] if frame.camera < len(names) else f"camera_{frame.camera}"

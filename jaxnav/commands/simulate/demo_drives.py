@@ -1,21 +1,20 @@
 """The drives of a demo: each method drives once, and the second also hears what the first sees."""
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
-from tqdm import tqdm
 
-from jaxnav.commands.bars import drawn_on
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
 from jaxnav.commands.simulate.runner_up import SELECTOR, opencv_detectors
 from jaxnav.compiling.step import compiled_step
 from jaxnav.configuration import step_folder
 from jaxnav.detection import Detector, make_detectors
+from jaxnav.models.geometry import wrap_angle_np
 from jaxnav.models.origin import planar_in_world
 from jaxnav.simulation.drive import DriveFrame, DriveSettings, Methods, drive
 
@@ -62,7 +61,7 @@ class Record:
     def errors(self) -> Float[np.ndarray, "N 3"]:
         """Errors of `poses` (N, 3): m m rad, the heading's in [-pi, pi)."""
         errors = self.poses - self.true_poses
-        errors[:, 2] = (errors[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        errors[:, 2] = wrap_angle_np(errors[:, 2])
         return errors
 
 
@@ -139,13 +138,12 @@ def _drive(
     )
     cameras = RenderedCameras(world, method.detectors, rng, args.corner_noise_px)
     record = Record(method.name, [])
-    with tqdm(
+    with progress_bar(
         total=round(args.duration_s, 1),
         unit="s",
         desc=f"seed {seed}, {LABELS[method.name]}",
         disable=args.headless,
         bar_format="{desc}: {n:.1f} of at most {total:.0f} s [{elapsed}]{postfix}",
-        **drawn_on(sys.stderr),
     ) as bar:
         bar.set_postfix_str("compiling")
         for frame in drive(method.navigator, world.setup.vehicle, cameras.look, settings, seed):

@@ -10,14 +10,15 @@ from matplotlib.figure import Figure
 
 from jaxnav.commands.pictures import corners_in_world, normals_px, save_figure
 from jaxnav.commands.simulate.demo_drives import LABELS, OURS, Drives, Record
-from jaxnav.commands.simulate.demo_scores import RATES, WRONG_HEADING_DEG, lines
+from jaxnav.commands.simulate.demo_scores import RATES, lines
 from jaxnav.files import write_json, write_tum
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.origin import Origin, planar_in_world, points_in_world, poses_in_world
-from jaxnav.plots.comparison import Driven, comparison_report
+from jaxnav.plots.against_truth import Driven, report_against_truth
 from jaxnav.plots.localisation import AnnotatedFrame, camera_mosaic
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.drive import DriveFrame
+from jaxnav.simulation.scores import WRONG_DEG
 
 MOSAIC_ROWS = 3
 
@@ -35,13 +36,13 @@ def write_report(folder: Path, setup: DriveSetup, drives: Drives, summary: dict[
         poses = (planar_in_world(rows, origin_m) for rows in (record.true_poses, record.poses))
         return Driven(label, record.times_s, *poses)
 
-    report = comparison_report(
+    report = report_against_truth(
         [driven(record, LABELS[name]) for name, record in drives.driven.items()],
-        driven(heard, f"{LABELS[heard.method]}, on the images of {LABELS[OURS]}"),
         np.asarray(points_in_world(setup.route_on_map.waypoints_m, origin_m)),
         setup.route.waypoint_radius_m,
         corners_in_world(setup.markers),
-        WRONG_HEADING_DEG,
+        WRONG_DEG,
+        listened=[driven(heard, f"{LABELS[heard.method]}, on the images of {LABELS[OURS]}")],
         title="\n".join([*lines(summary), RATES]),
     )
     save_figure(report, folder / "report.png")

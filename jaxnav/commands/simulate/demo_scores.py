@@ -10,8 +10,8 @@ from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.demo_drives import LABELS, OPENCV, OURS, Drives, Record
 from jaxnav.commands.simulate.rendered_world import RenderedWorld, expected_corners
 from jaxnav.simulation.drive import waypoints_passed
+from jaxnav.simulation.scores import WRONG_DEG
 
-WRONG_HEADING_DEG = 20.0  # farther off than this, a pose counts as the wrong one
 RATES = "how often it goes which way, over 20 seeds: docs/guide/demo.md"
 LOST_M = 1.0  # farther off than this, a car is lost: the paper's waypoints are 1.03 m apart
 
@@ -96,7 +96,7 @@ def _score(world: RenderedWorld, record: Record) -> dict[str, float]:
         "position_median_m": np.median(distance_m),
         "position_worst_m": np.max(distance_m),
         "yaw_rmse_deg": np.sqrt(np.mean(yaw_deg**2)),
-        "wrong_heading_fraction": np.mean(np.abs(yaw_deg) > WRONG_HEADING_DEG),
+        "wrong_heading_fraction": np.mean(np.abs(yaw_deg) > WRONG_DEG),
         "wrong_branch_fraction": sum(bool(b.wrong) for b in branches) / judged,
         "outlier_fraction": sum(bool(b.outlier) for b in branches) / judged,
         "marker_seen_fraction": np.mean([np.any(f.observation.visible) for f in record.frames]),
@@ -134,5 +134,5 @@ def _errors(score: dict[str, float]) -> str:
     return (
         f"position RMSE {score['position_rmse_m']:.3f} m, "
         f"wrong branch {score['wrong_branch_fraction']:.1%}, "
-        f"heading over {WRONG_HEADING_DEG:.0f} deg off in {score['wrong_heading_fraction']:.1%}"
+        f"heading over {WRONG_DEG:.0f} deg off in {score['wrong_heading_fraction']:.1%}"
     )

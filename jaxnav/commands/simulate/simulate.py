@@ -9,10 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from pydantic import Field
-from tqdm import tqdm
 
 from jaxnav.belief.selectors import SELECTORS, make_selector
-from jaxnav.commands.bars import update_after_compiling
+from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
@@ -91,7 +90,7 @@ def _drive(
     name, noise_px = key["selector"], key["corner_noise_px"]
     navigator = _navigator(car, scenario, name, key["told_noise_px"])
     rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px)
-    with tqdm(
+    with progress_bar(
         total=args.seeds,
         unit="drive",
         desc=f"{name}, {noise_px} px",

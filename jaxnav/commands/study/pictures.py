@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import xarray as xr
-from tqdm import tqdm
 
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.study.arguments import Plot as Arguments
 from jaxnav.commands.study.studies import summary_of
@@ -46,7 +46,7 @@ _MAX_PICTURES = 24  # of one sort
 
 def draw_study(args: Arguments) -> int:
     """Summarise the stored trials, draw them, and print how many are missing."""
-    with tqdm(unit="trial", unit_scale=True, disable=args.headless, leave=False) as bar:
+    with progress_bar(unit="trial", unit_scale=True, disable=args.headless, leave=False) as bar:
         kind, done, summary = summary_of(args.store, bar)
         total = int(bar.total or 0)
     if not done:

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.study.arguments import StudyReliability as Arguments
@@ -57,7 +57,7 @@ def run(args: Arguments) -> int:
 
 def _simulated(args: Arguments) -> tuple[str, np.ndarray, np.ndarray]:
     """Name, probabilities (N,) by the image alone and flips (N,) of pairs, on random views."""
-    with tqdm(total=args.frames, unit="frame", disable=args.headless) as bar:
+    with progress_bar(total=args.frames, unit="frame", disable=args.headless) as bar:
         frames = random_views(args.frames, args.seed, progress=bar.update)
     pair = np.asarray(frames.pair)
     return (
@@ -73,7 +73,7 @@ def _recorded(args: Arguments) -> tuple[str, np.ndarray, np.ndarray]:
     recording = read_recording(args.recording, None, None)
     if recording.reference is None:
         raise BadInput(args.recording, "has no reference trajectory to tell the true pose")
-    with tqdm(total=len(recording), unit="frame", disable=args.headless) as bar:
+    with progress_bar(total=len(recording), unit="frame", disable=args.headless) as bar:
         result = replay(
             recording, make_selector(args.selector), one_at_a_time=True, progress=bar.update
         )

@@ -1,15 +1,13 @@
 """`jaxnav study`: run a Monte-Carlo study, or go on with one."""
 
 import os
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import jax
-from tqdm import tqdm
 
-from jaxnav.commands.bars import drawn_on, update_after_compiling
+from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.study.arguments import RunStudy as Arguments
 from jaxnav.commands.study.studies import KINDS, load_study, shipped_configs
@@ -38,9 +36,8 @@ def run(args: Arguments) -> int:
         if 0 < done < total:
             print(f"{visible(path)} holds {done} of {total} trials: going on", flush=True)
         bar = stack.enter_context(
-            tqdm(
+            progress_bar(
                 total=total, initial=done, unit="trial", unit_scale=True, disable=args.headless,
-                **drawn_on(sys.stderr),
             )
         )  # fmt: skip
         update = update_after_compiling(bar)

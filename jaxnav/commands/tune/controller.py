@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
-from tqdm import tqdm
 
 from jaxnav.belief.selectors import make_selector
-from jaxnav.commands.bars import update_after_compiling
+from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneController as Arguments
@@ -136,7 +135,7 @@ class Gains:
         Both pass their gains as arrays, so that one program drives with either.
         """
         count = self._args.test_seeds
-        with tqdm(
+        with progress_bar(
             total=2 * count * len(self._tests),
             unit="drive",
             desc="test",

@@ -7,11 +7,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.selectors import make_selector
-from jaxnav.commands.bars import update_after_compiling
+from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.reading import read_shown
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
@@ -80,7 +79,9 @@ def _simulated(args: Arguments) -> TuningData:
         return simulate_sequences(rollout, keys, progress)
 
     count = args.seeds + args.held_out_seeds
-    with tqdm(total=count, unit="drive", desc="drive", disable=args.headless, leave=False) as bar:
+    with progress_bar(
+        total=count, unit="drive", desc="drive", disable=args.headless, leave=False
+    ) as bar:
         known = drive(args.seed, count, update_after_compiling(bar))
     own = car.navigator(scenario, make_selector(args.selector))
     return TuningData(

@@ -6,11 +6,10 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import Array
-from tqdm import tqdm
 
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.commands.bars import update_after_compiling
+from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
 from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
@@ -118,7 +117,7 @@ def _tested(
     """Results before and after the fit, by the name of the test."""
     results = {}
     for test in data.tests:
-        with tqdm(
+        with progress_bar(
             total=3 * test.size, unit="drive", desc="test", disable=args.headless, leave=False
         ) as bar:
             recorded = test.recorded(update_after_compiling(bar))

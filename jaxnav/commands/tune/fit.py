@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
+from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.pictures import save_figure
 from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
 from jaxnav.files import write_json, write_params
@@ -98,7 +98,7 @@ class Fitting:
             return self._run(headless)
 
     def _run(self, headless: bool) -> TuningFit:
-        with tqdm(total=self._problem.steps, unit="step", disable=headless) as bar:
+        with progress_bar(total=self._problem.steps, unit="step", disable=headless) as bar:
             bar.set_postfix_str("compiling")
             fit = TuningFit.begin(self.space.start, self._problem)
             kept = self._kept(fit)

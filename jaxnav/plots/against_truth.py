@@ -1,4 +1,4 @@
-"""Draw two cars that drove from the same start: where they went, and how far off they believed."""
+"""Draw cars that drove from the same start: where they went, and how far off they believed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,15 +8,11 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnav.plots.localisation import (
-    BLACK,
-    BLUE,
-    ORANGE,
-    draw_markers,
-    draw_waypoints,
-)
+from jaxnav.models.geometry import wrap_angle_np
+from jaxnav.plots.localisation import BLACK, BLUE, ORANGE, draw_markers, draw_waypoints
 
 COLORS = (BLUE, ORANGE)
+_STYLES = ({"color": BLUE}, {"color": ORANGE}, {"color": ORANGE, "ls": ":"})
 _LEAST_M, _LEAST_DEG = 1e-3, 0.01  # where the logarithmic axes end
 
 
@@ -37,43 +33,45 @@ class Driven:
     @property
     def heading_error_deg(self) -> Float[np.ndarray, " N"]:
         """Angle between the headings of pose and truth, 0 to 180."""
-        turn_rad = (self.poses - self.true_poses)[:, 2]
-        return np.rad2deg(np.abs((turn_rad + np.pi) % (2 * np.pi) - np.pi))
+        return np.rad2deg(np.abs(wrap_angle_np((self.poses - self.true_poses)[:, 2])))
 
 
-def comparison_report(
+def report_against_truth(
     drives: Sequence[Driven],
-    listened: Driven,
     waypoints_m: Float[np.ndarray, "W 2"],
     waypoint_radius_m: float,
     markers_m: Float[np.ndarray, "M 4 3"],
     wrong_heading_deg: float,
+    listened: Sequence[Driven] = (),
     title: str = "",
 ) -> Figure:
-    """Draw the ways of two cars, and the errors of what each of them believed, against time.
+    """Draw the ways of one or two cars, and the errors of what each believed, against time.
 
     Args:
-        drives: ours and the other's.
-        listened: what the other made of the images of our drive.
+        drives: ours and, where there is one, the other's.
         waypoints_m: (W, 2).
         waypoint_radius_m: drawn as circles.
         markers_m: (M, 4, 3) corners in the world.
         wrong_heading_deg: drawn as a line: farther off, a pose is the wrong one.
+        listened: what the other made of the images of our drive, where it listened.
         title: above everything.
     """
     figure = Figure(figsize=(9.5, 6), layout="constrained")
     figure.suptitle(title, fontsize=8.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1))
     position, heading = (figure.add_subplot(grid[row, 0]) for row in range(2))
-    for axes, error in ((position, "position_error_m"), (heading, "heading_error_deg")):
-        least = _LEAST_M if axes is position else _LEAST_DEG
-        styles = [(drive, {"color": color}) for drive, color in zip(drives, COLORS, strict=True)]
-        for drive, style in [*styles, (listened, {"color": COLORS[1], "ls": ":"})]:
+    panels = (
+        (position, "position_error_m", _LEAST_M),
+        (heading, "heading_error_deg", _LEAST_DEG),
+    )
+    for axes, error, least in panels:
+        for drive, style in zip([*drives, *listened], _STYLES, strict=False):
             values = np.maximum(getattr(drive, error), least)
             axes.semilogy(drive.times_s, values, label=drive.label, **style)
-        axes.set_ylim(bottom=least)
         axes.grid(alpha=0.3)
     heading.axhline(wrong_heading_deg, color=BLACK, lw=0.8, ls="--")
+    for axes, _, least in panels:
+        axes.set_ylim(bottom=least)
     end_s = max(drive.times_s[-1] for drive in drives)
     words = heading.annotate("above: the wrong pose", (end_s, wrong_heading_deg), fontsize=8)
     words.set(ha="right", va="bottom")
@@ -92,7 +90,7 @@ def _draw_ways(
     waypoint_radius_m: float,
     markers_m: np.ndarray,
 ) -> None:
-    for drive, color in zip(drives, COLORS, strict=True):
+    for drive, color in zip(drives, COLORS, strict=False):
         way, believed = drive.true_poses, drive.poses
         axes.plot(way[:, 0], way[:, 1], color=color, lw=2.2, label=f"{drive.label}: way driven")
         axes.plot(believed[:, 0], believed[:, 1], color=color, lw=0.9, ls="--")
