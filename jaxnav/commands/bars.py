@@ -16,6 +16,8 @@ def progress_bar(items: Iterable[Any] | None = None, **options: Any) -> "tqdm[An
     if not sys.stderr.isatty():
         # Below one another, bars would move the cursor.
         options |= {"file": _Lines(sys.stderr), "mininterval": 1.0, "position": 0}
+        if not options.get("leave", True):  # one that does not stay is told when it takes long
+            options.setdefault("delay", 1.0)
     return tqdm(items, **options)
 
 

@@ -61,6 +61,14 @@ def test_bars_inside_bars_are_lines_too(monkeypatch):
     assert "2/2" in lines[-1]
 
 
+def test_a_short_bar_that_does_not_stay_leaves_no_line(monkeypatch):
+    log = io.StringIO()
+    monkeypatch.setattr("sys.stderr", log)
+    with progress_bar(total=3, leave=False) as bar:
+        bar.update(3)
+    assert log.getvalue() == ""
+
+
 def test_a_bar_on_a_terminal_moves(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
