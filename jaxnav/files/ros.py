@@ -102,6 +102,12 @@ class RosFile(TopicMap):
             raise BadInput(at(self.path, key), f"there is no file {path}")
         return path
 
+    def with_markers(self, path: str) -> "RosFile":
+        """The same with another marker file, whose path counts from this file's folder."""
+        changed = self.model_copy(update={"markers": path})
+        changed._path = self._path
+        return changed
+
     def options(self, drives: bool, sim_time: bool) -> dict[str, str]:
         """The options of the plug-ins `ros2` of vehicle and cameras.
 

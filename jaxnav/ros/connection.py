@@ -112,11 +112,27 @@ class Connection:
         quality = QoSProfile(depth=1 if latched else _QUEUE, durability=durability)
         return self.node.create_publisher(message_type(kind), topic, quality)
 
-    def listen(self, kind: str, topic: str, take: Callable[[Any], None]) -> None:
-        """Pass every message of a topic to a function, in the thread of `run`."""
+    def listen(self, kind: str, topic: str, take: Callable[[Any], None]) -> Any:
+        """Pass every message of a topic to a function, in the thread of `run`.
+
+        Returns:
+            The subscription, for `forget`.
+        """
         from rclpy.qos import qos_profile_sensor_data  # reliable publishers suit it too
 
-        self.node.create_subscription(message_type(kind), topic, take, qos_profile_sensor_data)
+        quality = qos_profile_sensor_data
+        return self.node.create_subscription(message_type(kind), topic, take, quality)
+
+    def forget(self, *ends: Any) -> None:
+        """Leave the topics of publishers and subscriptions."""
+        for end in ends:
+            self.node.destroy_publisher(end)
+            self.node.destroy_subscription(end)
+
+    @property
+    def runs(self) -> bool:
+        """Whether `run` was called."""
+        return self._thread is not None
 
     def run(self) -> None:
         """Begin to call back, in a thread of its own."""

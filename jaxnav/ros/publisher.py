@@ -89,6 +89,11 @@ class Publisher:
         has_bank = importlib.util.find_spec("jaxnav_msgs") is not None
         self._bank = connection.publisher("jaxnav_msgs/msg/Bank", "~/bank") if has_bank else None
         self._map = connection.publisher("visualization_msgs/msg/MarkerArray", "~/map", True)
+        self._publishers = [
+            self._tf, self._pose, self._odometry, self._poses, self._ghosts, self._told, self._map,
+        ]  # fmt: skip
+        if self._bank is not None:
+            self._publishers.append(self._bank)
         self.show_map(markers)
         self._latest: Report | None = None
         self._closing = threading.Event()
@@ -130,9 +135,12 @@ class Publisher:
         self._connection.publish(self._map, message)
 
     def close(self) -> None:
-        """End the thread. May be called any number of times."""
+        """End the thread and leave the topics. May be called any number of times."""
+        if self._closing.is_set():
+            return
         self._closing.set()
         self._thread.join(1.0)
+        self._connection.forget(*self._publishers)
 
     def _publish_tf(self, report: Report) -> None:
         child, pose = self._frames.base, report.T_map_base

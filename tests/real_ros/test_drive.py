@@ -113,7 +113,13 @@ def test_it_drives_to_the_goal_and_tells_everybody_where_it_is(tmp_path, listene
         # It stays where it has arrived, and goes on to say where that is.
         listener.forget()
         until(lambda: len(listener.heard["/jaxnav/pose"]) > 20, 20.0, program)
-        check_reset(listener)
+        reset = "std_srvs/srv/Trigger", "/jaxnav/reset", {}
+        check_begun_anew(listener, *reset)
+        load = "jaxnav_msgs/srv/LoadMarkers", "/jaxnav/load_markers"
+        wrong = answer_of(listener, *load, {"path": "none.yaml"})
+        assert not wrong.success
+        assert "node.yaml: markers: there is no file" in wrong.message
+        check_begun_anew(listener, *load, {"path": str(calib_dir() / "qcar/markers.yaml")})
         program.tell(signal.SIGTERM)
         assert program.ends() == 128 + signal.SIGTERM, program.said
     assert listener.last("/drive").drive.speed == 0
@@ -174,16 +180,21 @@ def check_bank(listener: Listener) -> None:
     assert float(told["position_sigma_m"]) < 0.1
 
 
-def check_reset(listener: Listener) -> None:
-    """The service forgets the pose, and the node finds it again."""
-    connection = listener.connection
-    trigger = message_type("std_srvs/srv/Trigger")
-    client = connection.node.create_client(trigger, "/jaxnav/reset")
+def answer_of(listener: Listener, kind: str, name: str, values: dict):
+    """The answer of a service."""
+    service = message_type(kind)
+    client = listener.connection.node.create_client(service, name)
     assert client.wait_for_service(10.0)
+    answer = client.call_async(service.Request(**values))
+    until(answer.done, 120.0)
+    return answer.result()
+
+
+def check_begun_anew(listener: Listener, kind: str, name: str, values: dict) -> None:
+    """The service forgets the pose, and the node finds it again."""
+    answer = answer_of(listener, kind, name, values)
+    assert answer.success, answer.message
     listener.forget()
-    answer = client.call_async(trigger.Request())
-    until(answer.done, 60.0)
-    assert answer.result().success, answer.result().message
     until(listener.decided, 60.0)
 
 

@@ -123,7 +123,7 @@ class Ros(Checked):
     managed: Switch = False
     """Wait for the transitions configure and activate, instead of starting at once."""
     record: Annotated[Path | None, optional("MCAP")] = None
-    """Record the drive into this file."""
+    """Record the drive into this file; after a reset, the next one into FILE_2.mcap."""
     corner_backend: Detector = "aruco"
     period_s: float = 0.02
     """Between two readings of the odometer, s."""

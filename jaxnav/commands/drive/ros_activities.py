@@ -1,0 +1,347 @@
+"""What the node of ROS 2 does while it is active: drive a car, or track a rig that moves freely."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.drive.arguments import Ros, Run
+from jaxnav.commands.drive.observers import DriveRecorder
+from jaxnav.commands.drive.run import Drive, compiled_pilot, guarding_process, searches_for
+from jaxnav.compiling.step import compiled_step
+from jaxnav.configuration import step_folder
+from jaxnav.errors import BadInput
+from jaxnav.files import (
+    Params,
+    Route,
+    apply_params,
+    load_markers,
+    load_params,
+    load_rig,
+    load_route,
+    load_vehicle,
+)
+from jaxnav.files.ros import RosFile
+from jaxnav.files.validation import at
+from jaxnav.loop.flags import Fault
+from jaxnav.loop.frames import FrameDetections
+from jaxnav.loop.interfaces import Camera, Frame, Setup
+from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.loop.seeing import Search
+from jaxnav.loop.signals import Signals
+from jaxnav.models.markers import MarkerMap
+from jaxnav.navigator import Navigator
+from jaxnav.recording.drive_setup import PILOT_SELECTORS, DriveSetup
+from jaxnav.ros.body import BodyTracker
+from jaxnav.ros.connection import Connection
+from jaxnav.ros.estimates import Report, report_of_drive
+from jaxnav.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.ros.publisher import FrameNames, OdomPose, Publisher
+from jaxnav.vehicles.ros2_cameras import open_cameras
+
+_CAMERAS = "jaxnav.vehicles.ros2_cameras:open_cameras"
+_LOOK_S = 0.05
+_LEAST_NS = 18_000_000  # between two estimates of which the later has no new corners
+_NOWHERE = Route(((0.0, 0.0),), 0.15, (0.0, 0.0, 0.0))  # of who does not drive
+
+Say = Callable[[str], None]
+
+
+class Activity(Protocol):
+    """What the node does between `activate` and `deactivate`."""
+
+    ended: str | None
+    """Why it ended by itself; None while it goes on."""
+
+    def stop(self, reason: str) -> None:
+        """Stop it and wait until all is closed. May be called any number of times."""
+        ...
+
+
+class PreparedDrive:
+    """A car with its files read and its programs compiled.
+
+    Attributes:
+        file: the node's.
+    """
+
+    def __init__(
+        self, args: Ros, file: RosFile, connection: Connection, signals: Signals, say: Say
+    ):
+        """Read, compile, and begin to listen to the odometry's own pose.
+
+        Raises:
+            BadInput: a file is wrong; names file and key.
+        """
+        self.file, self._args, self._signals, self._say = file, args, signals, say
+        self._connection, self._drives = connection, file.route is not None
+        self._begun = 0
+        _check(file)
+        setup = DriveSetup(
+            rig=load_rig(_path(file, "rig")),
+            markers=load_markers(_path(file, "markers")),
+            vehicle=load_vehicle(_path(file, "vehicle")),
+            route=load_route(_path(file, "route")) if self._drives else _NOWHERE,
+            selector=file.selector,
+            float64=args.float64,
+            drives=self._drives,
+        )
+        _check_cameras(file, setup.rig.names)
+        if (params := file.file("params")) is not None:
+            setup = setup.with_params(load_params(params))
+        self._setup = setup
+        self._run = Run(
+            car="ros2",
+            cameras=_CAMERAS,
+            corner_backend=args.corner_backend,
+            period_s=args.period_s,
+            timeout_s=args.timeout_s,
+            float64=args.float64,
+            headless=True,
+        )
+        self._searches = searches_for(args.corner_backend, setup.rig, setup.markers)
+        _timed(say, lambda: compiled_pilot(self._run, setup, self._searches))
+        odom, self._listening = None, []
+        if file.odometry_type == NAV_ODOMETRY and file.odometry is not None:
+            odom = OdomPose()
+            take = partial(_add_odometry, odom, connection)
+            self._listening = [connection.listen(NAV_ODOMETRY, file.odometry, take)]
+        self._publisher = _publisher(file, connection, setup.markers, odom)
+
+    def begin(self) -> Activity:
+        """Begin a drive in which nothing is known."""
+        setup, signals = self._setup, self._signals
+        pilot = setup.pilot(step_folder())
+        pilot.warm_up()
+        reporter = _Reporter(self._publisher.publish, self.file.base_x_m)
+        observers: list[Any] = [reporter, *self._record()]
+        guarding = guarding_process(self._run)
+        if guarding is not None:
+            guarding.prepare(signals.check)
+        options = self.file.options(self._drives, self._connection.sim_time)
+        start = setup.route_on_map.start_pose
+        drive = Drive(
+            self._run,
+            Setup(setup.rig, setup.markers, setup.vehicle, start, 0, options),
+            guarding,
+            signals,
+            until_arrival=False,
+            now_ns=self._connection.now_ns,
+        )
+        run = partial(drive.run, pilot, self._searches, observers)
+        return _Driving(drive, run, observers, self._say)
+
+    def close(self) -> None:
+        """Leave the topics."""
+        self._publisher.close()
+        self._connection.forget(*self._listening)
+
+    def _record(self) -> list[DriveRecorder]:
+        """The recorder of one drive; of the second and later ones the file has a number."""
+        path = self._args.record
+        if path is None:
+            return []
+        self._begun += 1
+        if self._begun > 1:
+            path = path.with_stem(f"{path.stem}_{self._begun}")
+        return [DriveRecorder(path, self._setup, images=False)]
+
+
+class _Driving:
+    """A drive in a thread of its own. Implements `Activity`."""
+
+    def __init__(
+        self,
+        drive: Drive,
+        run: Callable[[], str],
+        observers: list[Any],
+        say: Say,
+    ):
+        self.ended: str | None = None
+        self._drive, self._run, self._observers, self._say = drive, run, observers, say
+        self._stopping: str | None = None
+        self._thread = threading.Thread(target=self._drives, name="the loop", daemon=True)
+        self._thread.start()
+
+    def stop(self, reason: str) -> None:
+        """See `Activity`."""
+        self._stopping = reason
+        while self._thread.is_alive():
+            if self._drive.guard is not None:
+                self._drive.guard.trip(reason)
+            self._thread.join(_LOOK_S)
+        for observer in self._observers:
+            observer.close()
+            if observer.closing_note is not None:
+                self._say(observer.closing_note)
+        self._observers = []
+        if self._drive.unheard is not None:
+            self._say(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {self._drive.unheard}")
+
+    def _drives(self) -> None:
+        try:
+            self.ended = self._run()
+        except (
+            BaseException
+        ) as error:  # of a plug-in, or a signal: the node says so and is inactive
+            self.ended = str(error) or type(error).__name__
+
+
+class _Reporter:
+    """An observer that publishes outcomes: each with corners, else every 20 ms."""
+
+    faults = Fault(0)
+    closing_note: str | None = None
+
+    def __init__(self, publish: Callable[[Report, int | None], None], base_x_m: float):
+        self._publish, self._base_x_m = publish, base_x_m
+        self._last_ns = 0
+
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
+        """See `Observer`."""
+        shows = outcome.data is not None and outcome.data.corners_px is not None
+        if shows or abs(outcome.now_ns - self._last_ns) > _LEAST_NS:
+            self._last_ns = outcome.now_ns
+            seen_ns = outcome.stamp_ns if shows else None
+            self._publish(report_of_drive(outcome, self._base_x_m), seen_ns)
+
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
+        """See `Observer`."""
+
+    def close(self) -> None:
+        """See `Onlooker`."""
+
+
+class PreparedBody:
+    """A rig that moves freely, with its files read and its step compiled.
+
+    Attributes:
+        file: the node's.
+    """
+
+    def __init__(
+        self, args: Ros, file: RosFile, connection: Connection, signals: Signals, say: Say
+    ):
+        """Read and compile.
+
+        Raises:
+            BadInput: a file is wrong; names file and key.
+        """
+        self.file = file
+        _check(file)
+        if args.record is not None:
+            raise BadInput("--record", "records drives: the file names no vehicle")
+        rig, markers = load_rig(_path(file, "rig")), load_markers(_path(file, "markers"))
+        _check_cameras(file, rig.names)
+        navigator = Navigator(
+            rig=rig,
+            markers=markers,
+            selector=make_selector(file.selector),
+            motion=ConstantVelocity(),
+            corner_sigma_px=file.corner_sigma_px,
+        )
+        params = file.file("params")
+        params_read = Params.of({}, "") if params is None else load_params(params)
+        self._navigator = apply_params(navigator, params_read)
+        self._searches = searches_for(args.corner_backend, rig, markers)
+        connection.ros_time = True  # the same stamps give the same poses, whenever they come
+        self._step = compiled_step(self._navigator, step_folder())
+        _timed(say, BodyTracker(self._navigator, self._step, 1, lambda report: None).warm_up)
+        self._publisher = _publisher(file, connection, markers, None)
+        nothing: Any = None
+        options = file.options(False, connection.sim_time) | {"stamps": "ros"}
+        self._setup = Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
+
+    def begin(self) -> Activity:
+        """Begin to track it, with nothing known."""
+        count = len(self.file.cameras)
+        tracker = BodyTracker(self._navigator, self._step, count, self._publisher.publish)
+        return _Tracking(tracker, open_cameras(self._setup, None), self._searches)
+
+    def close(self) -> None:
+        """Leave the topics."""
+        self._publisher.close()
+
+
+class _Tracking:
+    """The tracking of a rig, with a thread for each camera. Implements `Activity`."""
+
+    ended: str | None = None
+
+    def __init__(self, tracker: BodyTracker, cameras: Sequence[Camera], searches: Sequence[Search]):
+        self._tracker, self._cameras, self._searches = tracker, cameras, searches
+        self._over = threading.Event()
+        tracker.start()
+        self._threads = [
+            threading.Thread(target=self._look, args=(index,), daemon=True)
+            for index in range(len(cameras))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self, reason: str) -> None:
+        """See `Activity`."""
+        self._over.set()
+        for camera in self._cameras:
+            camera.close()
+        for thread in self._threads:
+            thread.join(1.0)
+        self._tracker.close()
+
+    def _look(self, index: int) -> None:
+        try:
+            while not self._over.is_set():
+                frame = self._cameras[index].read(_LOOK_S)
+                if frame is None:
+                    continue
+                sighted = self._searches[index].look(frame, None)
+                if sighted.detections is not None:
+                    self._tracker.add(index, sighted.stamp_ns, sighted.detections)
+        except Exception as error:  # whatever it is, a camera that is not read any more is said
+            self.ended = f"camera {self._cameras[index].name}: {type(error).__name__}: {error}"
+
+
+def _publisher(
+    file: RosFile, connection: Connection, markers: MarkerMap, odom: OdomPose | None
+) -> Publisher:
+    frames = FrameNames(file.frames.map, file.frames.odom, file.frames.base)
+    try:
+        return Publisher(connection, frames, markers, odom, file.tf_tolerance_s)
+    except ImportError as error:
+        problem = f"a message package of ROS 2 is missing ({error}): see docs/guide/ros.md"
+        raise BadInput("jaxnav ros", problem) from None
+
+
+def _path(file: RosFile, key: str) -> Path:
+    path = file.file(key)
+    assert path is not None  # the file has the key
+    return path
+
+
+def _check_cameras(file: RosFile, names: Sequence[str]) -> None:
+    for name in file.cameras:
+        if name not in names:
+            problem = f"the rig has no such camera: it has {', '.join(names)}"
+            raise BadInput(at(file.path, f"cameras.{name}"), problem)
+
+
+def _check(file: RosFile) -> None:
+    if file.selector not in PILOT_SELECTORS:
+        expected = ", ".join(PILOT_SELECTORS)
+        problem = f"unknown {file.selector!r}: expected one of {expected}"
+        raise BadInput(at(file.path, "selector"), problem)
+
+
+def _timed(say: Say, compile_all: Callable[[], object]) -> None:
+    say("compiling")
+    began_s = time.monotonic()
+    compile_all()
+    say(f"compiled in {time.monotonic() - began_s:.1f} s")
+
+
+def _add_odometry(odom: OdomPose, connection: Connection, message: Any) -> None:
+    odom.add(connection.time_ns(message.header.stamp), message)
