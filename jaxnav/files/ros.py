@@ -62,6 +62,8 @@ class RosFile(TopicMap):
         "sensor_msgs/msg/Image",
         "sensor_msgs/msg/CompressedImage",
     ] = "apriltag_msgs/msg/AprilTagDetectionArray"
+    camera_info: Annotated[dict[str, Name], Field(max_length=64)] = Field(default_factory=dict)
+    rectified: Annotated[bool, Field(strict=True)] | None = None  # None: detections are, images not
     odometry_type: Literal[
         "nav_msgs/msg/Odometry",
         "ackermann_msgs/msg/AckermannDriveStamped",
@@ -101,6 +103,12 @@ class RosFile(TopicMap):
         if not path.is_file():
             raise BadInput(at(self.path, key), f"there is no file {path}")
         return path
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether corners are pixels of a rectified image; apriltag_ros takes one."""
+        detects = self.camera_type == "apriltag_msgs/msg/AprilTagDetectionArray"
+        return detects if self.rectified is None else self.rectified
 
     def with_markers(self, path: str) -> "RosFile":
         """The same with another marker file, whose path counts from this file's folder."""

@@ -259,6 +259,8 @@ joints: {{driven: [rear], steered: [front], wheel_radius_m: 0.03}}
 command_type: twist
 frames: {{map: world, base: car}}
 base_x_m: -0.128
+camera_info: {{front: /front/camera_info}}
+rectified: false
 tf_tolerance_s: 0.1
 """
 STRUCTURED = {

@@ -19,6 +19,7 @@ from jaxnav.loop.interfaces import Setup
 from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
 from jaxnav.ros.camera_messages import APRILTAG_ROS
 from jaxnav.ros.connection import Connection, message_type
+from jaxnav.ros.lenses import CAMERA_INFO
 from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY
 from jaxnav.vehicles.sim import open_cameras, open_vehicle
 
@@ -39,6 +40,21 @@ def detections_message(found, stamp):
         one.corners = [point(x=float(x), y=float(y)) for x, y in places]
         message.detections.append(one)
     return message
+
+
+def tell_lenses(ros, rig, over):
+    """Publish the camera_info of each camera, five times a second."""
+    kind = message_type(CAMERA_INFO)
+    topics = [ros.publisher(CAMERA_INFO, f"/{name}/camera_info") for name in rig.names]
+    while not over.wait(0.2):
+        for c, topic in enumerate(topics):
+            camera = rig.camera(c)
+            (fx, fy), (cx, cy) = camera.focal_px.tolist(), camera.center_px.tolist()
+            width, height = rig.image_sizes_px[c]
+            info = kind(width=width, height=height, distortion_model="equidistant")
+            info.k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+            info.d = camera.distortion.tolist()[:4]
+            ros.publish(topic, info)
 
 
 def main(clocked):
@@ -86,6 +102,7 @@ def main(clocked):
     ros.run()
     if clocked:
         threading.Thread(target=tick, daemon=True).start()
+    threading.Thread(target=tell_lenses, args=(ros, rig, over), daemon=True).start()
     for camera in cameras:
         publisher = ros.publisher(APRILTAG_ROS, f"/{camera.name}/detections")
         threading.Thread(target=look, args=(camera, publisher), daemon=True).start()

@@ -198,7 +198,11 @@ def check_begun_anew(listener: Listener, kind: str, name: str, values: dict) -> 
     until(listener.decided, 60.0)
 
 
-def test_it_drives_by_the_time_of_a_simulation(tmp_path, listener, file):
+def test_it_drives_by_the_time_of_a_simulation_and_by_lenses_that_topics_tell(tmp_path, listener):
+    rig = (calib_dir() / "qcar/rig.yaml").read_text()
+    (tmp_path / "rig.yaml").write_text(rig.replace("[319.0, 319.0]", "[250.0, 250.0]"))
+    topics = "{" + ", ".join(f"{name}: /{name}/camera_info" for name in CAMERAS) + "}"
+    file = write_file(tmp_path, rig="rig.yaml", camera_info=topics, rectified="false")
     words = (*PATIENT, "--ros-args", "-p", "use_sim_time:=true")
     with sim_car(tmp_path, "--clock"), node(tmp_path, str(file), *words) as program:
         until(lambda: len(listener.heard["/jaxnav/pose"]) > 200, 300.0, program)

@@ -74,6 +74,10 @@ def test_a_managed_node_does_nothing_until_it_is_told(tmp_path):
         ({"rig": "none.yaml"}, "node.yaml: rig: there is no file"),
         ({"odometry": None}, "node.yaml: a vehicle needs odometry"),
         ({"cameras": "{frnt: /front/detections}"}, "node.yaml: cameras.frnt: the rig has no such"),
+        (
+            {"camera_info": "{front: /nobody}"},
+            "node.yaml: camera_info.front: no message on /nobody for 10 s",
+        ),
         ({"selector": "best"}, "node.yaml: selector: unknown 'best'"),
         ({"vehicle": None}, "node.yaml: route needs a vehicle"),
         ({"wheels": "4"}, "node.yaml: wheels: "),

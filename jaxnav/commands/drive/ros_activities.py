@@ -34,11 +34,13 @@ from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.loop.seeing import Search
 from jaxnav.loop.signals import Signals
 from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
 from jaxnav.recording.drive_setup import PILOT_SELECTORS, DriveSetup
 from jaxnav.ros.body import BodyTracker
 from jaxnav.ros.connection import Connection
 from jaxnav.ros.estimates import Report, report_of_drive
+from jaxnav.ros.lenses import await_lenses, with_lenses
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
 from jaxnav.ros.publisher import FrameNames, OdomPose, Publisher
 from jaxnav.vehicles.ros2_cameras import open_cameras
@@ -82,7 +84,7 @@ class PreparedDrive:
         self._begun = 0
         _check(file)
         setup = DriveSetup(
-            rig=load_rig(_path(file, "rig")),
+            rig=_rig(file, signals),
             markers=load_markers(_path(file, "markers")),
             vehicle=load_vehicle(_path(file, "vehicle")),
             route=load_route(_path(file, "route")) if self._drives else _NOWHERE,
@@ -90,7 +92,6 @@ class PreparedDrive:
             float64=args.float64,
             drives=self._drives,
         )
-        _check_cameras(file, setup.rig.names)
         if (params := file.file("params")) is not None:
             setup = setup.with_params(load_params(params))
         self._setup = setup
@@ -235,8 +236,7 @@ class PreparedBody:
         _check(file)
         if args.record is not None:
             raise BadInput("--record", "records drives: the file names no vehicle")
-        rig, markers = load_rig(_path(file, "rig")), load_markers(_path(file, "markers"))
-        _check_cameras(file, rig.names)
+        rig, markers = _rig(file, signals), load_markers(_path(file, "markers"))
         navigator = Navigator(
             rig=rig,
             markers=markers,
@@ -322,11 +322,16 @@ def _path(file: RosFile, key: str) -> Path:
     return path
 
 
-def _check_cameras(file: RosFile, names: Sequence[str]) -> None:
-    for name in file.cameras:
-        if name not in names:
-            problem = f"the rig has no such camera: it has {', '.join(names)}"
-            raise BadInput(at(file.path, f"cameras.{name}"), problem)
+def _rig(file: RosFile, signals: Signals) -> CameraRig:
+    """The rig of the file, with the lenses that topics tell."""
+    rig = load_rig(_path(file, "rig"))
+    for key in ("cameras", "camera_info"):
+        for name in getattr(file, key):
+            if name not in rig.names:
+                problem = f"the rig has no such camera: it has {', '.join(rig.names)}"
+                raise BadInput(at(file.path, f"{key}.{name}"), problem)
+    lenses = await_lenses(file.path, file.camera_info, file.is_rectified, signals.check)
+    return with_lenses(rig, lenses) if lenses else rig
 
 
 def _check(file: RosFile) -> None:
