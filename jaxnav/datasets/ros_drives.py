@@ -26,6 +26,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.models.twists import TwistReader
 from jaxnav.ros import camera_messages, odometry_messages
+from jaxnav.ros.odometry_messages import WheelJoints
 
 TOGETHER_NS = 100_000_000  # frames of one stamp that come later than this are not joined
 
@@ -57,6 +58,10 @@ def read_ros_drive(
             problem = f"the rig has no such camera: it has {', '.join(rig.names)}"
             raise BadInput(at(topics.path, f"cameras.{name}"), problem)
     reader = _Reader(path, topics, rig, markers, corner_backend)
+    joints = None
+    if topics.joints is not None:
+        told = topics.joints
+        joints = WheelJoints(tuple(told.driven), tuple(told.steered), told.wheel_radius_m)
     twists = TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
     inputs: list[Input] = []
     frames: list[tuple[int, FrameDetections]] = []
@@ -64,7 +69,9 @@ def read_ros_drive(
         for received in messages:
             try:
                 if _same(received.topic, topics.odometry):
-                    reading = odometry_messages.odometry(received.kind, received.message, twists)
+                    reading = odometry_messages.odometry(
+                        received.kind, received.message, twists, joints
+                    )
                     inputs.append(Input(received.received_ns, reading))
                 else:
                     frames.append((received.received_ns, reader.sighted(received)))
@@ -128,6 +135,10 @@ class _Reader:
         if self.topics.odometry is not None:
             wanted["odometry"] = (self.topics.odometry, odometry_messages.ODOMETRY_TYPES)
         chosen = [self._find(kinds, key, *entry) for key, entry in wanted.items()]
+        if odometry_messages.JOINTS in [kinds[topic] for topic in chosen]:
+            if self.topics.joints is None:
+                problem = f"missing: {self.topics.odometry} is of {odometry_messages.JOINTS}"
+                raise BadInput(at(self.topics.path, "joints"), problem)
         if camera_messages.TAGSLAM in [kinds[topic] for topic in chosen]:
             if len(set(self.markers.ids)) < len(self.markers.ids):
                 problem = "ids must differ: the recording does not tell families"

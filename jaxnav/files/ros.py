@@ -27,17 +27,9 @@ from pydantic import Field, model_validator
 from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.topics import TopicMap
-from jaxnav.files.validation import Entry, Name, NonNegative, Number, Positive, Text, at, validate
+from jaxnav.files.validation import Entry, Name, NonNegative, Number, Text, at, validate
 
 Frame = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z_][\w/.\-]{0,99}$")]
-
-
-class JointsEntry(Entry):
-    """The joints of a sensor_msgs/JointState that tell speed and steering."""
-
-    driven: Annotated[list[Name], Field(min_length=1, max_length=16)]
-    steered: Annotated[list[Name], Field(min_length=1, max_length=16)]
-    wheel_radius_m: Annotated[Positive, Field(le=10)]
 
 
 class FramesEntry(Entry):
@@ -71,7 +63,6 @@ class RosFile(TopicMap):
         "geometry_msgs/msg/TwistStamped",
         "sensor_msgs/msg/JointState",
     ] = "nav_msgs/msg/Odometry"
-    joints: JointsEntry | None = None
     command: Name = "/drive"
     command_type: Literal["ackermann", "twist"] = "ackermann"
     frames: FramesEntry = Field(default_factory=FramesEntry)

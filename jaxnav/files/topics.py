@@ -1,7 +1,8 @@
 """Reading of topic maps in YAML: the topics of a ROS bag with cameras and odometry.
 
     cameras: {front: /front/detections, left: /left/image_raw}   # names as in the rig
-    odometry: /odom                # nav_msgs/Odometry or ackermann_msgs/AckermannDriveStamped
+    odometry: /odom                # of a type in jaxnav/ros/odometry_messages.py
+    joints: {driven: [rear_left, rear_right], steered: [front], wheel_radius_m: 0.033}  # JointState
     corner_sigma_px: 0.3           # of detections in the bag; may be left out
     first_corner: bottom_left      # of detections in the bag; may be left out
 
@@ -16,8 +17,16 @@ from typing import Annotated, Any
 from pydantic import Field, PrivateAttr, field_validator
 
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import CornerSigma, Entry, Name, validate
+from jaxnav.files.validation import CornerSigma, Entry, Name, Positive, validate
 from jaxnav.models.conventions import FirstCorner
+
+
+class JointsEntry(Entry):
+    """The joints of a sensor_msgs/JointState that tell speed and steering."""
+
+    driven: Annotated[list[Name], Field(min_length=1, max_length=16)]
+    steered: Annotated[list[Name], Field(min_length=1, max_length=16)]
+    wheel_radius_m: Annotated[Positive, Field(le=10)]
 
 
 class TopicMap(Entry):
@@ -26,6 +35,7 @@ class TopicMap(Entry):
     Attributes:
         cameras: name in the rig -> topic of detections or of images.
         odometry: the topic; None where the bag has none.
+        joints: of a topic of JointState.
         corner_sigma_px: standard deviation of a detected corner along one axis.
         first_corner: the corner, as the marker map sees the marker, that a detection begins with;
             the others follow counter-clockwise.
@@ -34,6 +44,7 @@ class TopicMap(Entry):
     _path: Path = PrivateAttr(default=Path())
     cameras: Annotated[dict[str, Name], Field(min_length=1, max_length=64)]
     odometry: Name | None = None
+    joints: JointsEntry | None = None
     corner_sigma_px: CornerSigma = 0.3
     first_corner: FirstCorner = "bottom_left"
 

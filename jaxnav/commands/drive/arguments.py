@@ -124,6 +124,11 @@ class Ros(Checked):
     """Wait for the transitions configure and activate, instead of starting at once."""
     record: Annotated[Path | None, optional("MCAP")] = None
     """Record the drive into this file; after a reset, the next one into FILE_2.mcap."""
+    bag: OptionalFile = None
+    """Take the messages of this bag of ROS 1 or 2, as `jaxnav replay` does, and send what comes of
+    them and /clock; no vehicle hears a command."""
+    rate: Annotated[float, POSITIVE] = 1.0
+    """How fast the bag is played, times real time; inf is as fast as it goes."""
     corner_backend: Detector = "aruco"
     period_s: float = 0.02
     """Between two readings of the odometer, s."""

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from jaxnav.commands.drive.arguments import Ros
-from jaxnav.commands.drive.ros_activities import Activity, PreparedBody, PreparedDrive
+from jaxnav.commands.drive.ros_activities import OVER, Activity, PreparedBody, PreparedDrive
 from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder
@@ -43,7 +43,7 @@ def run(args: Ros, signals: Signals) -> int:
         while args.managed or node.ended is None:
             signals.check()
             time.sleep(_LOOK_S)
-        return EXIT_STOPPED
+        return 0 if node.ended == OVER else EXIT_STOPPED
     finally:
         node.close()
 

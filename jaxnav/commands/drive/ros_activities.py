@@ -14,6 +14,7 @@ from jaxnav.commands.drive.observers import DriveRecorder
 from jaxnav.commands.drive.run import Drive, compiled_pilot, guarding_process, searches_for
 from jaxnav.compiling.step import compiled_step
 from jaxnav.configuration import step_folder
+from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput
 from jaxnav.files import (
     Params,
@@ -30,21 +31,24 @@ from jaxnav.files.validation import at
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Camera, Frame, Setup
-from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.loop.seeing import Search
 from jaxnav.loop.signals import Signals
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
+from jaxnav.recording.drive_replay import check_inputs
 from jaxnav.recording.drive_setup import PILOT_SELECTORS, DriveSetup
 from jaxnav.ros.body import BodyTracker
-from jaxnav.ros.connection import Connection
+from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.estimates import Report, report_of_drive
 from jaxnav.ros.lenses import await_lenses, with_lenses
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
 from jaxnav.ros.publisher import FrameNames, OdomPose, Publisher
 from jaxnav.vehicles.ros2_cameras import open_cameras
 
+OVER = "the bag is over"
+_CLOCK = "rosgraph_msgs/msg/Clock"
 _CAMERAS = "jaxnav.vehicles.ros2_cameras:open_cameras"
 _LOOK_S = 0.05
 _LEAST_NS = 18_000_000  # between two estimates of which the later has no new corners
@@ -106,8 +110,11 @@ class PreparedDrive:
         )
         self._searches = searches_for(args.corner_backend, setup.rig, setup.markers)
         _timed(say, lambda: compiled_pilot(self._run, setup, self._searches))
-        odom, self._listening = None, []
-        if file.odometry_type == NAV_ODOMETRY and file.odometry is not None:
+        odom, self._listening, self._inputs = None, [], None
+        if args.bag is not None:
+            self._inputs = _inputs_of(args.bag, file, setup, args.corner_backend)
+            connection.ros_time = True  # the bag's
+        elif file.odometry_type == NAV_ODOMETRY and file.odometry is not None:
             odom = OdomPose()
             take = partial(_add_odometry, odom, connection)
             self._listening = [connection.listen(NAV_ODOMETRY, file.odometry, take)]
@@ -120,6 +127,10 @@ class PreparedDrive:
         pilot.warm_up()
         reporter = _Reporter(self._publisher.publish, self.file.base_x_m)
         observers: list[Any] = [reporter, *self._record()]
+        if self._inputs is not None:
+            return _Playing(
+                self._inputs, pilot, observers, self._connection, self._args.rate, self._say
+            )
         guarding = guarding_process(self._run)
         if guarding is not None:
             guarding.prepare(signals.check)
@@ -175,11 +186,7 @@ class _Driving:
             if self._drive.guard is not None:
                 self._drive.guard.trip(reason)
             self._thread.join(_LOOK_S)
-        for observer in self._observers:
-            observer.close()
-            if observer.closing_note is not None:
-                self._say(observer.closing_note)
-        self._observers = []
+        _close(self._observers, self._say)
         if self._drive.unheard is not None:
             self._say(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {self._drive.unheard}")
 
@@ -190,6 +197,50 @@ class _Driving:
             BaseException
         ) as error:  # of a plug-in, or a signal: the node says so and is inactive
             self.ended = str(error) or type(error).__name__
+
+
+class _Playing:
+    """A drive whose inputs are a bag's, in a thread of its own. Implements `Activity`."""
+
+    def __init__(
+        self,
+        inputs: Sequence[Input],
+        pilot: Pilot,
+        observers: list[Any],
+        connection: Connection,
+        rate: float,
+        say: Say,
+    ):
+        """Args:
+        rate: times real time.
+        """
+        self.ended: str | None = None
+        self._inputs, self._pilot, self._observers = inputs, pilot, observers
+        self._connection, self._rate, self._say = connection, rate, say
+        self._clock = connection.publisher(_CLOCK, "/clock")
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._play, name="the bag", daemon=True)
+        self._thread.start()
+
+    def stop(self, reason: str) -> None:
+        """See `Activity`."""
+        self._over.set()
+        self._thread.join()
+        _close(self._observers, self._say)
+        self._connection.forget(self._clock)
+
+    def _play(self) -> None:
+        begin_s, first_ns = time.monotonic(), self._inputs[0].now_ns
+        for given in self._inputs:
+            due_s = begin_s + (given.now_ns - first_ns) / 1e9 / self._rate
+            if self._over.wait(max(due_s - time.monotonic(), 0.0)):
+                return
+            clock = message_type(_CLOCK)(clock=self._connection.stamp(given.now_ns))
+            self._connection.publish(self._clock, clock)
+            outcome = self._pilot.handle(given)
+            for observer in self._observers:
+                observer.on_outcome(given, outcome)
+        self.ended = OVER
 
 
 class _Reporter:
@@ -234,8 +285,9 @@ class PreparedBody:
         """
         self.file = file
         _check(file)
-        if args.record is not None:
-            raise BadInput("--record", "records drives: the file names no vehicle")
+        for flag, given in (("--record", args.record), ("--bag", args.bag)):
+            if given is not None:
+                raise BadInput(flag, "is for drives: the file names no vehicle")
         rig, markers = _rig(file, signals), load_markers(_path(file, "markers"))
         navigator = Navigator(
             rig=rig,
@@ -339,6 +391,24 @@ def _check(file: RosFile) -> None:
         expected = ", ".join(PILOT_SELECTORS)
         problem = f"unknown {file.selector!r}: expected one of {expected}"
         raise BadInput(at(file.path, "selector"), problem)
+
+
+def _inputs_of(bag: Path, file: RosFile, setup: DriveSetup, corner_backend: str) -> Sequence[Input]:
+    rig, markers, vehicle = setup.rig, setup.markers, setup.vehicle
+    inputs = read_ros_drive(bag, file, rig, markers, vehicle, corner_backend)
+    if not inputs:
+        raise BadInput(bag, "holds no input")
+    check_inputs(inputs, setup, bag)
+    return inputs
+
+
+def _close(observers: list[Any], say: Say) -> None:
+    """Close observers, and say what they sum up; those that are closed already are gone."""
+    while observers:
+        observer = observers.pop()
+        observer.close()
+        if observer.closing_note is not None:
+            say(observer.closing_note)
 
 
 def _timed(say: Say, compile_all: Callable[[], object]) -> None:
