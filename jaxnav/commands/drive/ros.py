@@ -12,7 +12,9 @@ from functools import partial
 from typing import Any
 
 from jaxnav.commands.drive.arguments import Ros
-from jaxnav.commands.drive.ros_activities import OVER, Activity, PreparedBody, PreparedDrive
+from jaxnav.commands.drive.ros_body import PreparedBody
+from jaxnav.commands.drive.ros_drive import OVER, PreparedDrive
+from jaxnav.commands.drive.ros_setup import Activity
 from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder

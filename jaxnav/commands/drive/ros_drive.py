@@ -1,51 +1,46 @@
-"""What the node of ROS 2 does while it is active: drive a car, or track a rig that moves freely."""
+"""A car in the node of ROS 2: driven, localised while another one drives, or played from a bag."""
 
 import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from jaxnav.belief.constant_velocity import ConstantVelocity
-from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.drive.arguments import Ros, Run
 from jaxnav.commands.drive.observers import DriveRecorder
+from jaxnav.commands.drive.ros_setup import (
+    Activity,
+    Say,
+    check_selector,
+    path_of,
+    publisher_for,
+    rig_for,
+    timed,
+)
 from jaxnav.commands.drive.run import Drive, compiled_pilot, guarding_process, searches_for
-from jaxnav.compiling.step import compiled_step
 from jaxnav.configuration import step_folder
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput
 from jaxnav.files import (
-    Params,
     Route,
-    apply_params,
     load_markers,
     load_params,
-    load_rig,
     load_route,
     load_vehicle,
 )
 from jaxnav.files.ros import RosFile
-from jaxnav.files.validation import at
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Camera, Frame, Setup
+from jaxnav.loop.interfaces import Frame, Setup
 from jaxnav.loop.pilot import Input, Outcome, Pilot
-from jaxnav.loop.seeing import Search
 from jaxnav.loop.signals import Signals
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.navigator import Navigator
 from jaxnav.recording.drive_replay import check_inputs
-from jaxnav.recording.drive_setup import PILOT_SELECTORS, DriveSetup
-from jaxnav.ros.body import BodyTracker
+from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.estimates import Report, report_of_drive
-from jaxnav.ros.lenses import await_lenses, with_lenses
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
-from jaxnav.ros.publisher import FrameNames, OdomPose, Publisher
-from jaxnav.vehicles.ros2_cameras import open_cameras
+from jaxnav.ros.publisher import OdomPose
 
 OVER = "the bag is over"
 _CLOCK = "rosgraph_msgs/msg/Clock"
@@ -53,19 +48,6 @@ _CAMERAS = "jaxnav.vehicles.ros2_cameras:open_cameras"
 _LOOK_S = 0.05
 _LEAST_NS = 18_000_000  # between two estimates of which the later has no new corners
 _NOWHERE = Route(((0.0, 0.0),), 0.15, (0.0, 0.0, 0.0))  # of who does not drive
-
-Say = Callable[[str], None]
-
-
-class Activity(Protocol):
-    """What the node does between `activate` and `deactivate`."""
-
-    ended: str | None
-    """Why it ended by itself; None while it goes on."""
-
-    def stop(self, reason: str) -> None:
-        """Stop it and wait until all is closed. May be called any number of times."""
-        ...
 
 
 class PreparedDrive:
@@ -86,12 +68,12 @@ class PreparedDrive:
         self.file, self._args, self._signals, self._say = file, args, signals, say
         self._connection, self._drives = connection, file.route is not None
         self._begun = 0
-        _check(file)
+        check_selector(file)
         setup = DriveSetup(
-            rig=_rig(file, signals),
-            markers=load_markers(_path(file, "markers")),
-            vehicle=load_vehicle(_path(file, "vehicle")),
-            route=load_route(_path(file, "route")) if self._drives else _NOWHERE,
+            rig=rig_for(file, signals),
+            markers=load_markers(path_of(file, "markers")),
+            vehicle=load_vehicle(path_of(file, "vehicle")),
+            route=load_route(path_of(file, "route")) if self._drives else _NOWHERE,
             selector=file.selector,
             float64=args.float64,
             drives=self._drives,
@@ -109,7 +91,7 @@ class PreparedDrive:
             headless=True,
         )
         self._searches = searches_for(args.corner_backend, setup.rig, setup.markers)
-        _timed(say, lambda: compiled_pilot(self._run, setup, self._searches))
+        timed(say, lambda: compiled_pilot(self._run, setup, self._searches))
         odom, self._listening, self._inputs = None, [], None
         if args.bag is not None:
             self._inputs = _inputs_of(args.bag, file, setup, args.corner_backend)
@@ -118,7 +100,7 @@ class PreparedDrive:
             odom = OdomPose()
             take = partial(_add_odometry, odom, connection)
             self._listening = [connection.listen(NAV_ODOMETRY, file.odometry, take)]
-        self._publisher = _publisher(file, connection, setup.markers, odom)
+        self._publisher = publisher_for(file, connection, setup.markers, odom)
 
     def begin(self) -> Activity:
         """Begin a drive in which nothing is known."""
@@ -268,131 +250,6 @@ class _Reporter:
         """See `Onlooker`."""
 
 
-class PreparedBody:
-    """A rig that moves freely, with its files read and its step compiled.
-
-    Attributes:
-        file: the node's.
-    """
-
-    def __init__(
-        self, args: Ros, file: RosFile, connection: Connection, signals: Signals, say: Say
-    ):
-        """Read and compile.
-
-        Raises:
-            BadInput: a file is wrong; names file and key.
-        """
-        self.file = file
-        _check(file)
-        for flag, given in (("--record", args.record), ("--bag", args.bag)):
-            if given is not None:
-                raise BadInput(flag, "is for drives: the file names no vehicle")
-        rig, markers = _rig(file, signals), load_markers(_path(file, "markers"))
-        navigator = Navigator(
-            rig=rig,
-            markers=markers,
-            selector=make_selector(file.selector),
-            motion=ConstantVelocity(),
-            corner_sigma_px=file.corner_sigma_px,
-        )
-        params = file.file("params")
-        params_read = Params.of({}, "") if params is None else load_params(params)
-        self._navigator = apply_params(navigator, params_read)
-        self._searches = searches_for(args.corner_backend, rig, markers)
-        connection.ros_time = True  # the same stamps give the same poses, whenever they come
-        self._step = compiled_step(self._navigator, step_folder())
-        _timed(say, BodyTracker(self._navigator, self._step, 1, lambda report: None).warm_up)
-        self._publisher = _publisher(file, connection, markers, None)
-        nothing: Any = None
-        options = file.options(False, connection.sim_time) | {"stamps": "ros"}
-        self._setup = Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
-
-    def begin(self) -> Activity:
-        """Begin to track it, with nothing known."""
-        count = len(self.file.cameras)
-        tracker = BodyTracker(self._navigator, self._step, count, self._publisher.publish)
-        return _Tracking(tracker, open_cameras(self._setup, None), self._searches)
-
-    def close(self) -> None:
-        """Leave the topics."""
-        self._publisher.close()
-
-
-class _Tracking:
-    """The tracking of a rig, with a thread for each camera. Implements `Activity`."""
-
-    ended: str | None = None
-
-    def __init__(self, tracker: BodyTracker, cameras: Sequence[Camera], searches: Sequence[Search]):
-        self._tracker, self._cameras, self._searches = tracker, cameras, searches
-        self._over = threading.Event()
-        tracker.start()
-        self._threads = [
-            threading.Thread(target=self._look, args=(index,), daemon=True)
-            for index in range(len(cameras))
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def stop(self, reason: str) -> None:
-        """See `Activity`."""
-        self._over.set()
-        for camera in self._cameras:
-            camera.close()
-        for thread in self._threads:
-            thread.join(1.0)
-        self._tracker.close()
-
-    def _look(self, index: int) -> None:
-        try:
-            while not self._over.is_set():
-                frame = self._cameras[index].read(_LOOK_S)
-                if frame is None:
-                    continue
-                sighted = self._searches[index].look(frame, None)
-                if sighted.detections is not None:
-                    self._tracker.add(index, sighted.stamp_ns, sighted.detections)
-        except Exception as error:  # whatever it is, a camera that is not read any more is said
-            self.ended = f"camera {self._cameras[index].name}: {type(error).__name__}: {error}"
-
-
-def _publisher(
-    file: RosFile, connection: Connection, markers: MarkerMap, odom: OdomPose | None
-) -> Publisher:
-    frames = FrameNames(file.frames.map, file.frames.odom, file.frames.base)
-    try:
-        return Publisher(connection, frames, markers, odom, file.tf_tolerance_s)
-    except ImportError as error:
-        problem = f"a message package of ROS 2 is missing ({error}): see docs/guide/ros.md"
-        raise BadInput("jaxnav ros", problem) from None
-
-
-def _path(file: RosFile, key: str) -> Path:
-    path = file.file(key)
-    assert path is not None  # the file has the key
-    return path
-
-
-def _rig(file: RosFile, signals: Signals) -> CameraRig:
-    """The rig of the file, with the lenses that topics tell."""
-    rig = load_rig(_path(file, "rig"))
-    for key in ("cameras", "camera_info"):
-        for name in getattr(file, key):
-            if name not in rig.names:
-                problem = f"the rig has no such camera: it has {', '.join(rig.names)}"
-                raise BadInput(at(file.path, f"{key}.{name}"), problem)
-    lenses = await_lenses(file.path, file.camera_info, file.is_rectified, signals.check)
-    return with_lenses(rig, lenses) if lenses else rig
-
-
-def _check(file: RosFile) -> None:
-    if file.selector not in PILOT_SELECTORS:
-        expected = ", ".join(PILOT_SELECTORS)
-        problem = f"unknown {file.selector!r}: expected one of {expected}"
-        raise BadInput(at(file.path, "selector"), problem)
-
-
 def _inputs_of(bag: Path, file: RosFile, setup: DriveSetup, corner_backend: str) -> Sequence[Input]:
     rig, markers, vehicle = setup.rig, setup.markers, setup.vehicle
     inputs = read_ros_drive(bag, file, rig, markers, vehicle, corner_backend)
@@ -409,13 +266,6 @@ def _close(observers: list[Any], say: Say) -> None:
         observer.close()
         if observer.closing_note is not None:
             say(observer.closing_note)
-
-
-def _timed(say: Say, compile_all: Callable[[], object]) -> None:
-    say("compiling")
-    began_s = time.monotonic()
-    compile_all()
-    say(f"compiled in {time.monotonic() - began_s:.1f} s")
 
 
 def _add_odometry(odom: OdomPose, connection: Connection, message: Any) -> None:

@@ -1,0 +1,127 @@
+"""A rig that moves freely in the node of ROS 2, without odometry."""
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.selectors import make_selector
+from jaxnav.commands.drive.arguments import Ros
+from jaxnav.commands.drive.ros_setup import (
+    Activity,
+    Say,
+    check_selector,
+    path_of,
+    publisher_for,
+    rig_for,
+    timed,
+)
+from jaxnav.commands.drive.run import searches_for
+from jaxnav.compiling.step import compiled_step
+from jaxnav.configuration import step_folder
+from jaxnav.errors import BadInput
+from jaxnav.files import (
+    Params,
+    apply_params,
+    load_markers,
+    load_params,
+)
+from jaxnav.files.ros import RosFile
+from jaxnav.loop.interfaces import Camera, Setup
+from jaxnav.loop.seeing import Search
+from jaxnav.loop.signals import Signals
+from jaxnav.navigator import Navigator
+from jaxnav.ros.body import BodyTracker
+from jaxnav.ros.connection import Connection
+from jaxnav.vehicles.ros2_cameras import open_cameras
+
+_LOOK_S = 0.05
+
+
+class PreparedBody:
+    """A rig that moves freely, with its files read and its step compiled.
+
+    Attributes:
+        file: the node's.
+    """
+
+    def __init__(
+        self, args: Ros, file: RosFile, connection: Connection, signals: Signals, say: Say
+    ):
+        """Read and compile.
+
+        Raises:
+            BadInput: a file is wrong; names file and key.
+        """
+        self.file = file
+        check_selector(file)
+        for flag, given in (("--record", args.record), ("--bag", args.bag)):
+            if given is not None:
+                raise BadInput(flag, "is for drives: the file names no vehicle")
+        rig, markers = rig_for(file, signals), load_markers(path_of(file, "markers"))
+        navigator = Navigator(
+            rig=rig,
+            markers=markers,
+            selector=make_selector(file.selector),
+            motion=ConstantVelocity(),
+            corner_sigma_px=file.corner_sigma_px,
+        )
+        params = file.file("params")
+        params_read = Params.of({}, "") if params is None else load_params(params)
+        self._navigator = apply_params(navigator, params_read)
+        self._searches = searches_for(args.corner_backend, rig, markers)
+        connection.ros_time = True  # the same stamps give the same poses, whenever they come
+        self._step = compiled_step(self._navigator, step_folder())
+        timed(say, BodyTracker(self._navigator, self._step, 1, lambda report: None).warm_up)
+        self._publisher = publisher_for(file, connection, markers, None)
+        nothing: Any = None
+        options = file.options(False, connection.sim_time) | {"stamps": "ros"}
+        self._setup = Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
+
+    def begin(self) -> Activity:
+        """Begin to track it, with nothing known."""
+        count = len(self.file.cameras)
+        tracker = BodyTracker(self._navigator, self._step, count, self._publisher.publish)
+        return _Tracking(tracker, open_cameras(self._setup, None), self._searches)
+
+    def close(self) -> None:
+        """Leave the topics."""
+        self._publisher.close()
+
+
+class _Tracking:
+    """The tracking of a rig, with a thread for each camera. Implements `Activity`."""
+
+    ended: str | None = None
+
+    def __init__(self, tracker: BodyTracker, cameras: Sequence[Camera], searches: Sequence[Search]):
+        self._tracker, self._cameras, self._searches = tracker, cameras, searches
+        self._over = threading.Event()
+        tracker.start()
+        self._threads = [
+            threading.Thread(target=self._look, args=(index,), daemon=True)
+            for index in range(len(cameras))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self, reason: str) -> None:
+        """See `Activity`."""
+        self._over.set()
+        for camera in self._cameras:
+            camera.close()
+        for thread in self._threads:
+            thread.join(1.0)
+        self._tracker.close()
+
+    def _look(self, index: int) -> None:
+        try:
+            while not self._over.is_set():
+                frame = self._cameras[index].read(_LOOK_S)
+                if frame is None:
+                    continue
+                sighted = self._searches[index].look(frame, None)
+                if sighted.detections is not None:
+                    self._tracker.add(index, sighted.stamp_ns, sighted.detections)
+        except Exception as error:  # whatever it is, a camera that is not read any more is said
+            self.ended = f"camera {self._cameras[index].name}: {type(error).__name__}: {error}"

@@ -1,0 +1,94 @@
+"""What driving a car and tracking a rig share in the node of ROS 2: its files and its topics."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from jaxnav.errors import BadInput
+from jaxnav.files import load_rig
+from jaxnav.files.ros import RosFile
+from jaxnav.files.validation import at
+from jaxnav.loop.signals import Signals
+from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.recording.drive_setup import PILOT_SELECTORS
+from jaxnav.ros.connection import Connection
+from jaxnav.ros.lenses import await_lenses, with_lenses
+from jaxnav.ros.publisher import FrameNames, OdomPose, Publisher
+
+Say = Callable[[str], None]
+
+
+class Activity(Protocol):
+    """What the node does between `activate` and `deactivate`."""
+
+    ended: str | None
+    """Why it ended by itself; None while it goes on."""
+
+    def stop(self, reason: str) -> None:
+        """Stop it and wait until all is closed. May be called any number of times."""
+        ...
+
+
+def publisher_for(
+    file: RosFile, connection: Connection, markers: MarkerMap, odom: OdomPose | None
+) -> Publisher:
+    """The publisher of a node's estimates.
+
+    Raises:
+        BadInput: a message package is missing.
+    """
+    frames = FrameNames(file.frames.map, file.frames.odom, file.frames.base)
+    try:
+        return Publisher(connection, frames, markers, odom, file.tf_tolerance_s)
+    except ImportError as error:
+        problem = f"a message package of ROS 2 is missing ({error}): see docs/guide/ros.md"
+        raise BadInput("jaxnav ros", problem) from None
+
+
+def path_of(file: RosFile, key: str) -> Path:
+    """The path of a file that the node's file must name.
+
+    Raises:
+        BadInput: there is no such file.
+    """
+    path = file.file(key)
+    assert path is not None  # the file has the key
+    return path
+
+
+def rig_for(file: RosFile, signals: Signals) -> CameraRig:
+    """The rig of the file, with the lenses that topics tell.
+
+    Raises:
+        BadInput: the rig lacks a camera that the file names, or no lens is told.
+    """
+    rig = load_rig(path_of(file, "rig"))
+    for key in ("cameras", "camera_info"):
+        for name in getattr(file, key):
+            if name not in rig.names:
+                problem = f"the rig has no such camera: it has {', '.join(rig.names)}"
+                raise BadInput(at(file.path, f"{key}.{name}"), problem)
+    lenses = await_lenses(file.path, file.camera_info, file.is_rectified, signals.check)
+    return with_lenses(rig, lenses) if lenses else rig
+
+
+def check_selector(file: RosFile) -> None:
+    """Refuse a selector that needs what a simulation alone has.
+
+    Raises:
+        BadInput: names file and key.
+    """
+    if file.selector not in PILOT_SELECTORS:
+        expected = ", ".join(PILOT_SELECTORS)
+        problem = f"unknown {file.selector!r}: expected one of {expected}"
+        raise BadInput(at(file.path, "selector"), problem)
+
+
+def timed(say: Say, compile_all: Callable[[], object]) -> None:
+    """Compile, and say for how long."""
+    say("compiling")
+    began_s = time.monotonic()
+    compile_all()
+    say(f"compiled in {time.monotonic() - began_s:.1f} s")
