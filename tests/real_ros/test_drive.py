@@ -120,6 +120,7 @@ def test_it_drives_to_the_goal_and_tells_everybody_where_it_is(tmp_path, listene
         assert not wrong.success
         assert "node.yaml: markers: there is no file" in wrong.message
         check_begun_anew(listener, *load, {"path": str(calib_dir() / "qcar/markers.yaml")})
+        until(lambda: listener.last("/drive"), 30.0, program)  # of another process by now
         program.tell(signal.SIGTERM)
         assert program.ends() == 128 + signal.SIGTERM, program.said
     assert listener.last("/drive").drive.speed == 0
