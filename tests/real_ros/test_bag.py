@@ -13,7 +13,7 @@ from jaxnav.recording.drive_log import read_drive
 from tests.helpers.ros_bags import Bag
 from tests.helpers.simulated import make_setup, simulated
 from tests.real_ros.processes import JAXNAV, ROOT, node
-from tests.real_ros.test_drive import Listener, stamp_s, write_file
+from tests.real_ros.test_node_drives import Listener, stamp_s, write_file
 from tests.worlds import qcar_rig
 
 ORDER = np.argsort(TL_TR_BR_BL["bottom_left"])

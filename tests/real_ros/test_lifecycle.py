@@ -4,7 +4,7 @@ import pytest
 
 from jaxnav.ros.connection import Connection, message_type
 from tests.real_ros.processes import node, until
-from tests.real_ros.test_drive import write_file
+from tests.real_ros.test_node_drives import write_file
 
 CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
 UNCONFIGURED, INACTIVE, ACTIVE = 1, 2, 3
