@@ -21,8 +21,7 @@ import numpy as np
 
 from jaxnav.detection.types import Detections
 from jaxnav.files import calib_dir
-from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
-from jaxnav.ros.camera_messages import APRILTAG_ROS
+from jaxnav.ros.camera_messages import APRILTAG_ROS, detections_message
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
 
@@ -30,20 +29,6 @@ FRONT_PX = np.array([[365.9, 170.4], [385.4, 168.8], [385.4, 195.1], [365.8, 195
 CAMERAS = ("front", "right", "rear", "left")
 WARM_S = 5.0  # not counted
 JAXNAV = (sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())")
-
-
-def message_of(found: Detections, stamp: object) -> object:
-    """An AprilTagDetectionArray."""
-    message = message_type(APRILTAG_ROS)()
-    message.header.stamp = stamp
-    kind, point = (message_type(f"apriltag_msgs/msg/{n}") for n in ("AprilTagDetection", "Point"))
-    order = np.argsort(TL_TR_BR_BL["bottom_left"])
-    for marker, corners_px in zip(found.ids, found.corners_px, strict=True):
-        one = kind(family="tag36h11", id=int(marker))
-        places = corners_px[order] + APRILTAG_PIXEL_EDGE_PX
-        one.corners = [point(x=float(x), y=float(y)) for x, y in places]
-        message.detections.append(one)
-    return message
 
 
 def file_in(folder: Path) -> Path:
@@ -143,7 +128,7 @@ def frames(ros: Connection, cameras: list, rng: np.random.Generator, nothing: De
     )
     now_ns = ros.now_ns()
     for camera, publisher in enumerate(cameras):
-        ros.publish(publisher, message_of(nothing if camera else found, ros.stamp(now_ns)))
+        ros.publish(publisher, detections_message(nothing if camera else found, ros.stamp(now_ns)))
     return now_ns
 
 

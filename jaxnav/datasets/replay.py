@@ -29,10 +29,10 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator, State
 from jaxnav.pose.candidates import find_candidates
 from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot
+from jaxnav.ros.body import MAX_DT_S
 
 CHUNK_FRAMES = 64
 SIGMA_SAMPLES = 512  # detections from which the scatter of a recording's corners is estimated
-MAX_DT_S = 1.0  # between two frames; over a longer pause the motion is predicted for one second
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from jaxnav.errors import BadInput
-from jaxnav.files.reading import read_mapping
-from jaxnav.files.topics import TopicMap
-from jaxnav.files.validation import Entry, Name, NonNegative, Number, Text, at, validate
+from jaxnav.files.topics import TopicMap, read_topics
+from jaxnav.files.validation import Entry, Name, NonNegative, Number, Text, at
 
 Frame = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z_][\w/.\-]{0,99}$")]
 
@@ -136,7 +135,4 @@ def load_ros(path: str | Path) -> RosFile:
     Raises:
         BadInput: one line naming file and key.
     """
-    path = Path(path)
-    node = validate(RosFile, read_mapping(path), path)
-    node._path = path
-    return node
+    return read_topics(RosFile, Path(path))

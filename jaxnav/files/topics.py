@@ -12,7 +12,7 @@ with `bottom_left`; one made for OpenCV's, as jaxnav's own detectors see it, wit
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import Field, PrivateAttr, field_validator
 
@@ -71,13 +71,20 @@ class TopicMap(Entry):
         return odometry
 
 
+Topics = TypeVar("Topics", bound=TopicMap)
+
+
 def load_topics(path: str | Path) -> TopicMap:
     """Read a topic map.
 
     Raises:
         BadInput: one line naming file and key.
     """
-    path = Path(path)
-    topics = validate(TopicMap, read_mapping(path), path)
+    return read_topics(TopicMap, Path(path))
+
+
+def read_topics(kind: type[Topics], path: Path) -> Topics:
+    """Read a topic map, or a file that holds more than one; see `load_topics`."""
+    topics = validate(kind, read_mapping(path), path)
     topics._path = path
     return topics

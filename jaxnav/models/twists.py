@@ -6,6 +6,13 @@ from dataclasses import dataclass
 STANDSTILL_MPS = 0.02  # below it noise in the yaw rate makes any steering angle
 
 
+def twist_of(speed_mps: float, steering_rad: float, wheelbase_m: float) -> tuple[float, float]:
+    """Velocity along the vehicle's x axis, m/s, and yaw rate, rad/s: what `TwistReader` reads."""
+    slope = math.tan(steering_rad)
+    forward_mps = speed_mps / math.hypot(1.0, slope / 2)
+    return forward_mps, forward_mps * slope / wheelbase_m
+
+
 @dataclass
 class TwistReader:
     """Converts the twists of a body to speed along the course and steering of a bicycle.

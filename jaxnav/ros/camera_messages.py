@@ -18,6 +18,7 @@ from jaxtyping import UInt8
 from jaxnav.detection.types import Detections
 from jaxnav.files.images import decode_image
 from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL, FirstCorner
+from jaxnav.ros.connection import message_type
 
 APRILTAG_ROS = "apriltag_msgs/msg/AprilTagDetectionArray"
 TAGSLAM = "apriltag_msgs/msg/ApriltagArrayStamped"
@@ -76,6 +77,27 @@ def detections(
             for tag, i in zip(tags, ids, strict=True)
         ),
     )
+
+
+def detections_message(found: Detections, stamp: Any) -> Any:
+    """The `APRILTAG_ROS` of detections, its corners from the bottom left on, as the tag's own.
+
+    Raises:
+        ImportError: its package is not there.
+    """
+    message, tag, point = (
+        message_type(kind)
+        for kind in (APRILTAG_ROS, "apriltag_msgs/msg/AprilTagDetection", "apriltag_msgs/msg/Point")
+    )
+    order = np.argsort(TL_TR_BR_BL["bottom_left"])
+    places_px = found.corners_px[:, order] + APRILTAG_PIXEL_EDGE_PX
+    told = message()
+    told.header.stamp = stamp
+    told.detections = [
+        tag(family=family, id=int(i), corners=[point(x=float(x), y=float(y)) for x, y in places])
+        for i, family, places in zip(found.ids, found.families, places_px, strict=True)
+    ]
+    return told
 
 
 def grey_image(kind: str, message: Any) -> UInt8[np.ndarray, "rows columns"] | None:

@@ -87,9 +87,7 @@ class Connection:
                     args=args, context=self._context, signal_handler_options=SignalHandlerOptions.NO
                 )
             self.node: Any = (make_node or rclpy.create_node)(name, context=self._context)
-        except (
-            Exception
-        ) as error:  # rclpy's own, of which some are no `Exception` of Python's kinds
+        except Exception as error:  # rclpy raises exceptions of its own
             raise OSError(f"ROS: {type(error).__name__}: {error}") from error
         if sim_time:
             self.node.set_parameters([Parameter("use_sim_time", value=True)])

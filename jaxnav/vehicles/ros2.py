@@ -18,12 +18,13 @@ from __future__ import annotations
 import math
 import threading
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from jaxnav.errors import BadInput
 from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
 from jaxnav.loop.limits import Limits
-from jaxnav.models.twists import TwistReader
+from jaxnav.models.twists import TwistReader, twist_of
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.odometry_messages import ACKERMANN, JOINTS, ODOMETRY_TYPES, WheelJoints, odometry
 from jaxnav.vehicles.options import choice, number
@@ -153,18 +154,14 @@ class RosVehicle:
             message.drive.steering_angle = float(self._steering_rad)
             message.drive.speed = float(speed_mps)
         else:  # the velocity along x is that of the rear axle; see `TwistReader`
-            slope = math.tan(self._steering_rad)
-            forward_mps = speed_mps / math.hypot(1.0, slope / 2)
-            message.linear.x = float(forward_mps)
-            message.angular.z = float(forward_mps * slope / self._wheelbase_m)
+            twist = twist_of(float(speed_mps), float(self._steering_rad), self._wheelbase_m)
+            message.linear.x, message.angular.z = twist
         self._connection.publish(self._publisher, message)
 
     def _take(self, message: Any) -> None:
         reading = odometry(self._kind, message, self._twists, self._joints)
         stamp_ns = self._connection.time_ns(message.header.stamp)
-        self._reading = Odometry(
-            stamp_ns, reading.speed_mps, reading.steering_rad, valid=reading.valid
-        )
+        self._reading = replace(reading, stamp_ns=stamp_ns)
 
 
 def _joints(options: Mapping[str, str]) -> WheelJoints:

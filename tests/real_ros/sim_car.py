@@ -12,12 +12,10 @@ import sys
 import threading
 import time
 
-import numpy as np
-
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.loop.interfaces import Setup
-from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
-from jaxnav.ros.camera_messages import APRILTAG_ROS
+from jaxnav.models.twists import twist_of
+from jaxnav.ros.camera_messages import APRILTAG_ROS, detections_message
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.lenses import CAMERA_INFO
 from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY
@@ -26,20 +24,6 @@ from jaxnav.vehicles.sim import open_cameras, open_vehicle
 WHEELBASE_M = 0.256
 ODOMETRY_S = 0.02
 SILENT_S = 0.5
-
-
-def detections_message(found, stamp):
-    """An AprilTagDetectionArray of `Detections`."""
-    message = message_type(APRILTAG_ROS)()
-    message.header.stamp = stamp
-    kind, point = (message_type(f"apriltag_msgs/msg/{n}") for n in ("AprilTagDetection", "Point"))
-    order = np.argsort(TL_TR_BR_BL["bottom_left"])
-    for marker, family, corners_px in zip(found.ids, found.families, found.corners_px, strict=True):
-        one = kind(family=family, id=int(marker))
-        places = corners_px[order] + APRILTAG_PIXEL_EDGE_PX
-        one.corners = [point(x=float(x), y=float(y)) for x, y in places]
-        message.detections.append(one)
-    return message
 
 
 def tell_lenses(ros, rig, over):
@@ -112,8 +96,7 @@ def main(clocked):
             vehicle.stop()
         reading = vehicle.read()
         slope = math.tan(reading.steering_rad)
-        forward_mps = reading.speed_mps / math.hypot(1.0, slope / 2)
-        rate_radps = forward_mps * slope / WHEELBASE_M
+        forward_mps, rate_radps = twist_of(reading.speed_mps, reading.steering_rad, WHEELBASE_M)
         psi_rad += rate_radps * ODOMETRY_S
         x_m += reading.speed_mps * math.cos(psi_rad + math.atan(slope / 2)) * ODOMETRY_S
         y_m += reading.speed_mps * math.sin(psi_rad + math.atan(slope / 2)) * ODOMETRY_S

@@ -1,6 +1,5 @@
 """A drive in a ROS 2 bag: through the node, and through `jaxnav replay`."""
 
-import math
 import subprocess
 
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 from jaxnav.files import calib_dir
 from jaxnav.loop.flags import Health
 from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
+from jaxnav.models.twists import twist_of
 from jaxnav.recording.drive_log import read_drive
 from tests.helpers.ros_bags import Bag
 from tests.helpers.simulated import make_setup, simulated
@@ -38,10 +38,8 @@ def bag_of_a_drive(kind: str) -> Bag:
             bag.apriltags(topic, given.now_ns, frame.stamp_ns, tags)
         if given.odometry is not None:
             reading = given.odometry
-            slope = math.tan(reading.steering_rad)
-            forward_mps = reading.speed_mps / math.hypot(1.0, slope / 2)
-            yaw_rate = forward_mps * slope / WHEELBASE_M
-            bag.odometry("/odom", given.now_ns, reading.stamp_ns, forward_mps, yaw_rate)
+            twist = twist_of(reading.speed_mps, reading.steering_rad, WHEELBASE_M)
+            bag.odometry("/odom", given.now_ns, reading.stamp_ns, *twist)
     return bag
 
 

@@ -8,10 +8,9 @@ import numpy as np
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.detection.types import Detections
 from jaxnav.files import save_markers, save_rig
-from jaxnav.ros.camera_messages import APRILTAG_ROS
+from jaxnav.ros.camera_messages import APRILTAG_ROS, detections_message
 from jaxnav.ros.connection import Connection
 from tests.real_ros.processes import JAXNAV, ROOT, node, until
-from tests.real_ros.sim_car import detections_message
 
 FRAMES = 150
 SIGMA_PX = 0.5

@@ -20,12 +20,7 @@ from jaxnav.commands.drive.run import searches_for
 from jaxnav.compiling.step import compiled_step
 from jaxnav.configuration import step_folder
 from jaxnav.errors import BadInput
-from jaxnav.files import (
-    Params,
-    apply_params,
-    load_markers,
-    load_params,
-)
+from jaxnav.files import Params, apply_params, load_markers, load_params
 from jaxnav.files.ros import RosFile
 from jaxnav.loop.interfaces import Camera, Setup
 from jaxnav.loop.seeing import Search

@@ -22,13 +22,7 @@ from jaxnav.commands.drive.run import Drive, compiled_pilot, guarding_process, s
 from jaxnav.configuration import step_folder
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput
-from jaxnav.files import (
-    Route,
-    load_markers,
-    load_params,
-    load_route,
-    load_vehicle,
-)
+from jaxnav.files import Route, load_markers, load_params, load_route, load_vehicle
 from jaxnav.files.ros import RosFile
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -148,22 +142,14 @@ class PreparedDrive:
 class _Driving:
     """A drive in a thread of its own. Implements `Activity`."""
 
-    def __init__(
-        self,
-        drive: Drive,
-        run: Callable[[], str],
-        observers: list[Any],
-        say: Say,
-    ):
+    def __init__(self, drive: Drive, run: Callable[[], str], observers: list[Any], say: Say):
         self.ended: str | None = None
         self._drive, self._run, self._observers, self._say = drive, run, observers, say
-        self._stopping: str | None = None
         self._thread = threading.Thread(target=self._drives, name="the loop", daemon=True)
         self._thread.start()
 
     def stop(self, reason: str) -> None:
         """See `Activity`."""
-        self._stopping = reason
         while self._thread.is_alive():
             if self._drive.guard is not None:
                 self._drive.guard.trip(reason)
@@ -175,9 +161,7 @@ class _Driving:
     def _drives(self) -> None:
         try:
             self.ended = self._run()
-        except (
-            BaseException
-        ) as error:  # of a plug-in, or a signal: the node says so and is inactive
+        except BaseException as error:  # a plug-in's, or a signal: the node says so and rests
             self.ended = str(error) or type(error).__name__
 
 
