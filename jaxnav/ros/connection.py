@@ -14,6 +14,7 @@ import importlib
 import threading
 import time
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from jaxnav.errors import libraries_silenced
@@ -35,6 +36,7 @@ def _executor_kind() -> Any:
         return SingleThreadedExecutor
 
 
+@cache
 def message_type(kind: str) -> Any:
     """The class of a message or service, by a name such as nav_msgs/msg/Odometry.
 

@@ -79,12 +79,21 @@ class Report:
         order = np.argsort(-log_weight, kind="stable")
         weight = np.exp(log_weight[order] - np.max(log_weight, initial=-np.inf))
         rows = [_pose_of(self.bank, int(row), self.origin_m) for row in alive[order]]
-        moved = [_at_base(pose, covariance, self.base_x_m) for pose, covariance in rows]
+        poses = [_base_of(pose, self.base_x_m) for pose, _ in rows]
+        covariances = [
+            _at_base(pose, covariance, self.base_x_m)
+            for pose, (_, covariance) in zip(poses, rows, strict=True)
+        ]
         return Hypotheses(
-            np.array([pose for pose, _ in moved]).reshape(-1, 7),
-            np.array([covariance for _, covariance in moved]).reshape(-1, 6, 6),
+            np.array(poses).reshape(-1, 7),
+            np.array(covariances).reshape(-1, 6, 6),
             weight / max(float(np.sum(weight)), 1e-300),
         )
+
+
+def pose_of_drive(outcome: Outcome, base_x_m: float) -> Float[np.ndarray, " 7"]:
+    """T_map_base (7,) of a pilot's outcome."""
+    return _base_of(np.asarray(outcome.T_world_vehicle, float), base_x_m)
 
 
 def report_of_drive(outcome: Outcome, base_x_m: float) -> Report:
@@ -94,9 +103,8 @@ def report_of_drive(outcome: Outcome, base_x_m: float) -> Report:
         base_x_m: where the base is on the vehicle, forward of the middle between its axles.
     """
     output = outcome.output
-    pose, covariance = _at_base(
-        outcome.T_world_vehicle, _among_six(output.pose_covariance), base_x_m
-    )
+    pose = pose_of_drive(outcome, base_x_m)
+    covariance = _at_base(pose, _among_six(output.pose_covariance), base_x_m)
     turn = matrix(pose)[:3, :3].T  # a velocity is in the axes of the world
     velocity = np.zeros(6)
     velocity[PLANAR] = np.asarray(output.velocity, float)
@@ -160,15 +168,16 @@ def _pose_of(bank: Bank, row: int, origin_m: Origin) -> tuple[np.ndarray, np.nda
     return np.asarray(poses_in_world(pose, origin_m), float), _among_six(covariance[row])
 
 
-def _at_base(
-    pose: np.ndarray, covariance: np.ndarray, base_x_m: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The pose and covariance of the base from those of the vehicle."""
-    pose = np.asarray(pose, float)
-    there = compose(pose, np.array([1.0, 0, 0, 0, base_x_m, 0, 0]))
+def _base_of(T_map_vehicle: np.ndarray, base_x_m: float) -> np.ndarray:
+    """T_map_base (7,) of the vehicle's pose (7,)."""
+    return compose(T_map_vehicle, np.array([1.0, 0, 0, 0, base_x_m, 0, 0]))
+
+
+def _at_base(T_map_base: np.ndarray, covariance: np.ndarray, base_x_m: float) -> np.ndarray:
+    """The covariance (6, 6) of the base's pose from that of the vehicle's."""
     J = np.eye(6)
-    J[:3, 3:] = -_cross(there[4:] - pose[4:])
-    return there, J @ covariance @ J.T
+    J[:3, 3:] = -_cross(matrix(T_map_base)[:3, 0] * base_x_m)
+    return np.asarray(J @ covariance @ J.T)
 
 
 def _in_base(

@@ -5,6 +5,7 @@ the latest report when it has time.
 """
 
 import importlib.util
+import math
 import threading
 import time
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.files.poses import compose, inverse
+from jaxnav.files.poses import compose, inverse, rotated
 from jaxnav.loop.loop import Statistics
 from jaxnav.models.markers import MarkerMap
 from jaxnav.ros.connection import Connection, message_type
@@ -103,18 +104,40 @@ class Publisher:
         self._thread = threading.Thread(target=self._tell, name="ros publisher", daemon=True)
         self._thread.start()
 
-    def publish(self, report: Report, seen_ns: int | None = None) -> None:
-        """Send an estimate. Where no pose is decided, tf and pose stay silent.
+    def send_transform(
+        self, now_ns: int, T_map_base: np.ndarray, seen_ns: int | None = None
+    ) -> None:
+        """Send tf of a decided pose (7,), which others wait for before all else.
 
         Args:
             seen_ns: stamp of the corners that it is due to; None without any.
         """
+        child, pose = self._frames.base, T_map_base
+        if self._odom is not None:
+            T_odom_base = self._odom.at(now_ns)
+            if T_odom_base is None:
+                return
+            child, pose = self._frames.odom, compose(pose, inverse(T_odom_base))
+        if not all(map(math.isfinite, pose.tolist())):
+            return
+        message = message_type("tf2_msgs/msg/TFMessage")()
+        one = message_type("geometry_msgs/msg/TransformStamped")()
+        one.header.stamp = self._connection.stamp(now_ns + self._tolerance_ns)
+        one.header.frame_id, one.child_frame_id = self._frames.map, child
+        _place(one.transform.translation, one.transform.rotation, pose)
+        message.transforms = [one]
+        try:
+            self._connection.publish(self._tf, message)
+        except OSError as error:
+            self.failed = str(error)
+        if seen_ns is not None:
+            late_ms = (self._connection.now_ns() - seen_ns) / 1e6
+            self._delays.add(_DELAY, max(late_ms, 0.0))
+
+    def publish(self, report: Report) -> None:
+        """Send an estimate but for its transform; a pose that is not decided is not sent."""
         try:
             if report.decided and report.is_finite:
-                self._publish_tf(report)
-                if seen_ns is not None:
-                    late_ms = (self._connection.now_ns() - seen_ns) / 1e6
-                    self._delays.add(_DELAY, max(late_ms, 0.0))
                 self._publish_pose(report)
         except OSError as error:
             self.failed = str(error)
@@ -141,21 +164,6 @@ class Publisher:
         self._closing.set()
         self._thread.join(1.0)
         self._connection.forget(*self._publishers)
-
-    def _publish_tf(self, report: Report) -> None:
-        child, pose = self._frames.base, report.T_map_base
-        if self._odom is not None:
-            T_odom_base = self._odom.at(report.now_ns)
-            if T_odom_base is None:
-                return
-            child, pose = self._frames.odom, compose(pose, inverse(T_odom_base))
-        message = message_type("tf2_msgs/msg/TFMessage")()
-        one = message_type("geometry_msgs/msg/TransformStamped")()
-        one.header.stamp = self._connection.stamp(report.now_ns + self._tolerance_ns)
-        one.header.frame_id, one.child_frame_id = self._frames.map, child
-        _place(one.transform.translation, one.transform.rotation, pose)
-        message.transforms = [one]
-        self._connection.publish(self._tf, message)
 
     def _publish_pose(self, report: Report) -> None:
         stamped = message_type("geometry_msgs/msg/PoseWithCovarianceStamped")()
@@ -277,9 +285,13 @@ def _place(position: Any, orientation: Any, pose: np.ndarray) -> None:
 
 def _moved(step: np.ndarray) -> np.ndarray:
     """The pose (7,) after a small motion (6,): a turn, and a way along the turn's middle."""
-    angle = float(np.linalg.norm(step[3:]))
-    axis = step[3:] / angle if angle > 0 else np.zeros(3)
-    turned = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
-    half = np.concatenate([[np.cos(angle / 4)], np.sin(angle / 4) * axis, np.zeros(3)])
-    way = compose(half, np.concatenate([[1.0, 0, 0, 0], step[:3]]))[4:]
-    return np.concatenate([turned, way])
+    *way_m, x, y, z = step.tolist()
+    angle_rad = math.hypot(x, y, z)
+    # sin(angle / 2) / angle, which tends to 1/2, and that of half the turn
+    whole, half = (
+        math.sin(part * angle_rad / 2) / angle_rad if angle_rad > 0 else part / 2
+        for part in (1.0, 0.5)
+    )
+    middle = math.cos(angle_rad / 4), half * x, half * y, half * z
+    turn = math.cos(angle_rad / 2), whole * x, whole * y, whole * z
+    return np.array([*turn, *rotated(middle, way_m)])

@@ -28,6 +28,7 @@ from jaxnav.loop.signals import Signals
 from jaxnav.navigator import Navigator
 from jaxnav.ros.body import BodyTracker
 from jaxnav.ros.connection import Connection
+from jaxnav.ros.estimates import Report
 from jaxnav.vehicles.ros2_cameras import open_cameras
 
 _LOOK_S = 0.05
@@ -76,12 +77,17 @@ class PreparedBody:
     def begin(self) -> Activity:
         """Begin to track it, with nothing known."""
         count = len(self.file.cameras)
-        tracker = BodyTracker(self._navigator, self._step, count, self._publisher.publish)
+        tracker = BodyTracker(self._navigator, self._step, count, self._send)
         return _Tracking(tracker, open_cameras(self._setup, None), self._searches)
 
     def close(self) -> None:
         """Leave the topics."""
         self._publisher.close()
+
+    def _send(self, report: Report) -> None:
+        if report.decided:
+            self._publisher.send_transform(report.now_ns, report.T_map_base)
+        self._publisher.publish(report)
 
 
 class _Tracking:

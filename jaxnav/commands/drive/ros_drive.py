@@ -32,9 +32,9 @@ from jaxnav.loop.signals import Signals
 from jaxnav.recording.drive_replay import check_inputs
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.ros.connection import Connection, message_type
-from jaxnav.ros.estimates import Report, report_of_drive
+from jaxnav.ros.estimates import pose_of_drive, report_of_drive
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
-from jaxnav.ros.publisher import OdomPose
+from jaxnav.ros.publisher import OdomPose, Publisher
 
 OVER = "the bag is over"
 _CLOCK = "rosgraph_msgs/msg/Clock"
@@ -101,7 +101,7 @@ class PreparedDrive:
         setup, signals = self._setup, self._signals
         pilot = setup.pilot(step_folder())
         pilot.warm_up()
-        reporter = _Reporter(self._publisher.publish, self.file.base_x_m)
+        reporter = _Reporter(self._publisher, self.file.base_x_m)
         observers: list[Any] = [reporter, *self._record()]
         if self._inputs is not None:
             return _Playing(
@@ -215,8 +215,8 @@ class _Reporter:
     faults = Fault(0)
     closing_note: str | None = None
 
-    def __init__(self, publish: Callable[[Report, int | None], None], base_x_m: float):
-        self._publish, self._base_x_m = publish, base_x_m
+    def __init__(self, publisher: Publisher, base_x_m: float):
+        self._publisher, self._base_x_m = publisher, base_x_m
         self._last_ns = 0
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
@@ -224,8 +224,11 @@ class _Reporter:
         shows = outcome.data is not None and outcome.data.corners_px is not None
         if shows or abs(outcome.now_ns - self._last_ns) > _LEAST_NS:
             self._last_ns = outcome.now_ns
-            seen_ns = outcome.stamp_ns if shows else None
-            self._publish(report_of_drive(outcome, self._base_x_m), seen_ns)
+            if outcome.output.decided:
+                pose = pose_of_drive(outcome, self._base_x_m)
+                seen_ns = outcome.stamp_ns if shows else None
+                self._publisher.send_transform(outcome.now_ns, pose, seen_ns)
+            self._publisher.publish(report_of_drive(outcome, self._base_x_m))
 
     def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""
