@@ -67,12 +67,15 @@ def main() -> None:
     )
     parser.add_argument("--camera-sigma", type=float, nargs=2, metavar=("DEG", "M"),
                         help="of a camera's direction and place; 0 0: exact ones")  # fmt: skip
+    parser.add_argument("--without-odometry", action="store_true")
     args = parser.parse_args()
     head_is_printed = False
     for folder in sorted(DATA.glob("test_*"), key=lambda path: int(path.name[5:])):
         if args.names and folder.name not in args.names:
             continue
         recording = read_recording(folder).first(args.frames)
+        if args.without_odometry:
+            recording = dataclasses.replace(recording, odometry=None)
         if args.camera_sigma is not None:
             turn_rad, shift_m = np.deg2rad(args.camera_sigma[0]), args.camera_sigma[1]
             sigma = np.repeat([[shift_m] * 3 + [turn_rad] * 3], len(recording.rig), axis=0)

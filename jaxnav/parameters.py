@@ -81,6 +81,11 @@ TUNABLES: dict[str, Tunable] = {
         most=(0.5,),
     ),
     "motion.slip_length_m": Tunable("Q: way after which a slip has faded to 1/e", "m", 0.2),
+    "motion.odometry_drift": Tunable(
+        "Q: random walk of a free body's odometry, per way, angle, and time",
+        "m/sqrt(m), rad/sqrt(rad), m/sqrt(s), rad/sqrt(s)",
+        0.01,
+    ),
     "motion.initial_velocity_sigma": Tunable(
         "P0: the velocity before anything tells it", "m/s, rad/s", 1.0
     ),

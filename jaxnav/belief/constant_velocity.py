@@ -1,7 +1,7 @@
 """A filter for bodies that move freely: pose on SE(3) and twist."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -22,18 +22,22 @@ from jaxnav.models.geometry import (
     planar_from_T_world_vehicle,
     rotation_error_rad,
     rotation_matrix,
+    safe_norm,
 )
 from jaxnav.models.rig import CameraRig
 from jaxnav.numerics.small_matrices import cholesky, log_det, matvec, product
 from jaxnav.pose.observation import Observation
+
+_LARGEST_TWIST = 1e3  # m/s and rad/s; a larger one is an error of the sensor
 
 
 class ConstantVelocity(Motion):
     """A body that moves freely: pose on SE(3) and body twist, for hand-held and aerial rigs.
 
     The mean is (wxyz, xyz) of T_world_vehicle followed by the twist (m/s, rad/s) in vehicle axes;
-    the 12 error states are xi in `T_world_vehicle * cay(xi)` and the error of the twist. Odometry
-    is not used.
+    the 12 error states are xi in `T_world_vehicle * cay(xi)` and the error of the twist. Where
+    another estimator (visual-inertial odometry, lidar) tells the motion between observations, it
+    replaces the twist, and its drift the acceleration; where it is silent, the twist carries on.
 
     Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
     """
@@ -48,6 +52,11 @@ class ConstantVelocity(Motion):
     initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
     )  # m/s and rad/s
+    # Random walk of the odometry along each axis: per way, per angle, and twice per time;
+    # m/sqrt(m), rad/sqrt(rad), m/sqrt(s), rad/sqrt(s).
+    odometry_drift: Float[Array, " 4"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.02, 0.01, 0.002, 0.002])
+    )
     camera_states: int = eqx.field(static=True, default=0)  # see `for_rig`
     learn_sigma_rad: float = 0.035  # sigma of the orientation below which errors are estimated
     lost_sigma_m: float = 0.5  # a hypothesis whose position is less certain is forgotten
@@ -62,21 +71,34 @@ class ConstantVelocity(Motion):
         return empty_bank(mean, jnp.eye(12 + self.camera_states, dtype=dtype), 6, hypotheses)
 
     def predict(self, bank: Bank, obs: Observation) -> Bank:
-        """T = T exp(twist dt), P = F P F' + Q with F = [Ad(exp(-twist dt)), dt I; 0, I].
+        """T = T exp(u dt),  P = F P F' + Q.
+
+        u is the twist of the state, F = [Ad(exp(-u dt)), dt I; 0, I] and Q that of a white
+        acceleration; or, where the odometry tells u, F = [Ad(exp(-u dt)), 0; 0, 0] and
+
+            Q = [D, D / dt; D / dt, D / dt^2 + A dt / 3]
+
+        with the drift D in the interval, and the twist at its end off its mean by A dt / 3, A the
+        density of the acceleration.
 
         A hypothesis is forgotten, and started anew by its next pose, where the sigma of its
         position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
         """
         dtype, dt_s = bank.mean.dtype, jnp.asarray(obs.dt_s, bank.mean.dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
+        told, twist = self._told(obs, dtype)
 
         def one(mean: Array, P: Array) -> tuple[Array, Array]:
-            motion = jaxlie.SE3.exp(mean[7:13] * dt_s)
+            u = jnp.where(told, twist, mean[7:13])
+            motion = jaxlie.SE3.exp(u * dt_s)
             T_world_vehicle = (jaxlie.SE3(mean[:7]) @ motion).normalize()
             F = jnp.zeros((6, P.shape[0]), dtype).at[:, :6].set(motion.inverse().adjoint())
-            F = F.at[:, 6:12].set(dt_s * jnp.eye(6, dtype=dtype))
-            P = kalman.replace_first(P, F).at[:12, :12].add(Q)
-            return jnp.append(T_world_vehicle.wxyz_xyz, mean[7:]), P
+            F = F.at[:, 6:12].set(jnp.where(told, 0, dt_s) * jnp.eye(6, dtype=dtype))
+            P = kalman.replace_first(P, F)
+            if obs.twist is not None:
+                P = P.at[6:12].multiply(1 - told).at[:, 6:12].multiply(1 - told)
+            P = P.at[:12, :12].add(jnp.where(told, self._drift(twist, dt_s), Q))
+            return jnp.concatenate([T_world_vehicle.wxyz_xyz, u, mean[13:]]), P
 
         mean, covariance = jax.vmap(one)(bank.mean, bank.covariance)
         variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
@@ -84,6 +106,26 @@ class ConstantVelocity(Motion):
         wrong = self.lost(bank)
         lost = wrong | ~(variance_m2 < self.lost_sigma_m**2)
         return forget_lost(predicted, lost, dt_s)
+
+    def _told(self, obs: Observation, dtype: Any) -> tuple[Bool[Array, ""], Float[Array, " 6"]]:
+        """Whether the odometry tells the motion, and its twist; 0 where it does not."""
+        if obs.twist is None:
+            return jnp.asarray(False), jnp.zeros(6, dtype)
+        twist = jnp.asarray(obs.twist, dtype)
+        usable = jnp.all(jnp.abs(twist) < _LARGEST_TWIST) & (jnp.asarray(obs.dt_s) > 0)
+        return usable, jnp.where(usable, twist, 0)
+
+    def _drift(self, twist: Array, dt_s: Array) -> Array:
+        """Q (12, 12) of an interval in which the odometry told the motion."""
+        dtype = twist.dtype
+        per_m, per_rad, walk_m, walk_rad = jnp.asarray(self.odometry_drift, dtype) ** 2
+        speed, rate = safe_norm(twist[:3]), safe_norm(twist[3:])
+        # The drift over dt: it grows with the way, the angle and the time, which all do with dt.
+        linear, angular = per_m * speed + walk_m, per_rad * rate + walk_rad
+        D = jnp.diag(jnp.concatenate([jnp.full(3, linear), jnp.full(3, angular)]))
+        per_dt = 1 / jnp.where(dt_s > 0, dt_s, 1)
+        A = kalman.as_matrix(self.acceleration_density).astype(dtype)
+        return jnp.block([[D * dt_s, D], [D, D * per_dt + A * dt_s / 3]])
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Whether the gate has contradicted a hypothesis too often or too long."""

@@ -37,6 +37,9 @@ class Ros1Reader(_Ros1Reader):
         _Ros1Reader.__init__(self, path)
         self._budget = Budget.of_file(path)
         self._connections = self._entries = 0
+        # The chunks that were unpacked last: where chunks overlap in time, messages in their order
+        # of time alternate between them.
+        self._kept: dict[int, bytes] = {}
 
     def read_connection(self) -> Connection:
         """See rosbags."""
@@ -54,7 +57,7 @@ class Ros1Reader(_Ros1Reader):
         """See rosbags."""
         chunk = _Ros1Reader.read_chunk(self)
         kind = next(k for k, unpack in _ros1_decompressors.items() if unpack is chunk.decompressor)
-        return chunk._replace(decompressor=partial(self._unpacked, kind))
+        return chunk._replace(decompressor=partial(self._unpacked, kind, chunk.datapos))
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
         """See rosbags. An index counts each time it is read, as two chunks may name the same."""
@@ -70,8 +73,12 @@ class Ros1Reader(_Ros1Reader):
         if self._entries > limits.INDEX_ENTRIES:
             raise ValueError(f"an index of more than {limits.INDEX_ENTRIES} entries")
 
-    def _unpacked(self, kind: str, data: bytes) -> bytes:
-        return unpack_chunk(kind, data, self._budget)
+    def _unpacked(self, kind: str, position: int, data: bytes) -> bytes:
+        if position not in self._kept:
+            self._kept[position] = unpack_chunk(kind, data, self._budget)
+            while len(self._kept) > 1 and sum(map(len, self._kept.values())) > limits.CHUNK_BYTES:
+                del self._kept[next(iter(self._kept))]
+        return self._kept[position]
 
 
 class Ros2Reader(_Ros2Reader):

@@ -1,7 +1,8 @@
 """Reading of ROS 1 bags without ROS, compressed or not.
 
-Message definitions come from the bag itself. Two kinds of its messages are read: marker detections
-(`apriltag_msgs/ApriltagArrayStamped`, TagSLAM's) and transforms (`/tf`).
+Message definitions come from the bag itself. Three kinds of its messages are read: detections of
+markers (`apriltag_msgs/ApriltagArrayStamped`, TagSLAM's), transforms (`/tf`) and odometry with a
+pose (`nav_msgs/Odometry`).
 """
 
 import tempfile
@@ -20,6 +21,7 @@ from jaxnav.files import limits
 from jaxnav.files.ranges import is_within
 from jaxnav.files.unpacking import Budget, copy_bz2
 from jaxnav.ros.camera_messages import TAGSLAM
+from jaxnav.ros.odometry_messages import NAV_ODOMETRY
 from jaxnav.ros.odometry_messages import stamp_ns as header_stamp_ns
 
 _TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
@@ -43,6 +45,8 @@ class Bag:
     detections: dict[str, TopicDetections] = field(default_factory=dict)  # by topic
     # (parent, child) -> stamp in ns -> (7,) wxyz xyz, the pose of the child in the parent
     transforms: dict[tuple[str, str], dict[int, tuple[float, ...]]] = field(default_factory=dict)
+    # topic -> stamp in ns -> (7,) wxyz xyz, the pose of the odometry's body in its own frame
+    odometry: dict[str, dict[int, tuple[float, ...]]] = field(default_factory=dict)
 
 
 def is_bag(path: Path) -> bool:
@@ -61,12 +65,18 @@ def read_bag(path: Path) -> Bag:
         try:
             with Ros1Reader(plain) as reader:
                 bag.topics = {c.topic: c.msgtype for c in reader.connections}
-                kinds = (TAGSLAM, *_TF_TYPES)
+                kinds = (TAGSLAM, NAV_ODOMETRY, *_TF_TYPES)
                 wanted = [c for c in reader.connections if c.msgtype in kinds]
                 for connection, _, message in messages(reader, wanted, {}):
                     if connection.msgtype == TAGSLAM:
                         detections = bag.detections.setdefault(connection.topic, TopicDetections())
                         _add_detections(detections, message)
+                    elif connection.msgtype == NAV_ODOMETRY:
+                        track = bag.odometry.setdefault(connection.topic, {})
+                        pose = message.pose.pose
+                        what = f"a pose on {connection.topic}"
+                        row = _row(pose.orientation, pose.position)
+                        track[header_stamp_ns(message)] = _checked([row], [what])[0]
                     else:
                         _add_transforms(bag.transforms, message)
         except Exception as error:
@@ -115,21 +125,32 @@ def _add_detections(detections: TopicDetections, message: Any) -> None:
 def _add_transforms(
     transforms: dict[tuple[str, str], dict[int, tuple[float, ...]]], message: Any
 ) -> None:
-    rows = []
-    for stamped in message.transforms:
-        q, p = stamped.transform.rotation, stamped.transform.translation
-        rows.append((q.w, q.x, q.y, q.z, p.x, p.y, p.z))
+    rows = [_row(s.transform.rotation, s.transform.translation) for s in message.transforms]
+    edges = [
+        (stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/"))
+        for stamped in message.transforms
+    ]
+    names = [f"the transform from {child} to {parent}" for parent, child in edges]
+    for stamped, edge, row in zip(message.transforms, edges, _checked(rows, names), strict=True):
+        transforms.setdefault(edge, {})[header_stamp_ns(stamped)] = row
+
+
+def _row(q: Any, p: Any) -> tuple[float, ...]:
+    return q.w, q.x, q.y, q.z, p.x, p.y, p.z
+
+
+def _checked(rows: list[tuple[float, ...]], names: list[str]) -> list[tuple[float, ...]]:
+    """The poses (7,) of the names, which are rigid and in the world."""
     poses = np.array(rows, float).reshape(-1, 7)
     off_unit = np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1)
     rigid = np.asarray(np.isfinite(poses).all(axis=1) & (off_unit <= 1e-3))
     near = np.asarray(is_within("position_m", poses[:, 4:]).all(axis=1))
-    for index, stamped in enumerate(message.transforms):
-        edge = (stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/"))
+    for index, name in enumerate(names):
         if not rigid[index]:
-            raise ValueError(f"the transform from {edge[1]} to {edge[0]} is not rigid")
+            raise ValueError(f"{name} is not rigid")
         if not near[index]:
-            raise ValueError(f"the transform from {edge[1]} to {edge[0]} leads out of the world")
-        transforms.setdefault(edge, {})[header_stamp_ns(stamped)] = rows[index]
+            raise ValueError(f"{name} leads out of the world")
+    return rows
 
 
 def list_topics(recorded: Sequence[Bag]) -> str:

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxnav.datasets.odometry import OdometryTrack
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
 from jaxnav.models.conventions import APRILTAG_FIRST_CORNER, TL_TR_BR_BL
@@ -51,6 +52,7 @@ class Recording:
     rig: CameraRig
     markers: MarkerMap
     reference: Reference | None
+    odometry: OdometryTrack | None  # of the vehicle, by other software
     unmapped_detections: int  # of markers that are not in the map
     dropped_detections: int  # reported twice, or with a corner out of range
 
@@ -73,6 +75,11 @@ class Recording:
         seen = np.zeros((len(self), len(self.markers.ids)), bool)
         seen[self.seen_at[0], self.seen_at[2]] = True
         return seen
+
+    @property
+    def twists(self) -> Float[np.ndarray, "F 6"] | None:
+        """Mean twists since the frame before, see `OdometryTrack.twists`; None: no odometry."""
+        return None if self.odometry is None else self.odometry.twists(self.stamps_ns)
 
     def lanes(
         self, frames: Int[np.ndarray, " K"]
@@ -119,6 +126,7 @@ class RecordingSource:
     Attributes:
         markers: returns the map; raises BadInput where there is none, or a broken one.
         reference: returns stamp in ns -> (7,) wxyz xyz of the vehicle in the world, or None.
+        odometry: of the vehicle, by other software.
     """
 
     name: str
@@ -126,6 +134,7 @@ class RecordingSource:
     rig: CameraRig
     markers: Callable[[], MarkerMap]
     reference: Callable[[], dict[int, Float[np.ndarray, " 7"]] | None] = lambda: None
+    odometry: OdometryTrack | None = None
 
 
 def assemble(
@@ -134,11 +143,13 @@ def assemble(
     rig: CameraRig,
     markers: MarkerMap,
     poses: dict[int, Float[np.ndarray, " 7"]] | None = None,
+    odometry: OdometryTrack | None = None,
 ) -> Recording:
     """Make a recording of a table of detections.
 
     Args:
         poses: the reference, stamp in ns -> (7,) wxyz xyz of the vehicle in the world.
+        odometry: of the vehicle, by other software.
 
     Raises:
         BadInput: two families share an id in the map; the detections do not tell families.
@@ -168,6 +179,7 @@ def assemble(
         rig=rig,
         markers=markers,
         reference=None if poses is None else _align(stamps, poses),
+        odometry=odometry,
         unmapped_detections=int(np.sum(~mapped)),
         dropped_detections=int(np.sum(mapped)) - len(used),
     )

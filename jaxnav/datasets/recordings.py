@@ -32,8 +32,14 @@ def read_recording(
     if rig is not None and markers is None and bags.is_bag(path) and path.is_file():
         _no_markers(path)  # before all of it is read
     source = read_source(path, rig)
-    reference = source.reference()
-    return assemble(source.name, source.rows, source.rig, markers or source.markers(), reference)
+    return assemble(
+        source.name,
+        source.rows,
+        source.rig,
+        markers or source.markers(),
+        source.reference(),
+        source.odometry,
+    )
 
 
 def read_source(path: Path, rig: CameraRig | None, also: str = "") -> RecordingSource:

@@ -57,6 +57,7 @@ class _Frames(eqx.Module):
     visible: Bool[Array, "*F C M"]
     dt_s: Float[Array, "*F"]
     T_world_vehicle_true: Float[Array, "*F 7"]
+    twist: Float[Array, "*F 6"] | None  # by odometry; None: of no frame
 
 
 def replay(
@@ -106,12 +107,13 @@ def replay(
         lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)),
         (alone if one_at_a_time else navigator).init(),
     )
-    total = len(recording)
-    run_chunk = _run_chunk.lower(navigator, state, _frames(recording, 0), one_at_a_time).compile()
+    total, twists = len(recording), recording.twists
+    first = _frames(recording, twists, 0)
+    run_chunk = _run_chunk.lower(navigator, state, first, one_at_a_time).compile()
     started = time.perf_counter()
     chunks = []
     for begin in range(0, total, CHUNK_FRAMES):
-        state, outputs = run_chunk(navigator, state, _frames(recording, begin))
+        state, outputs = run_chunk(navigator, state, _frames(recording, twists, begin))
         chunks.append(jax.device_get(outputs))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
@@ -174,7 +176,7 @@ def _run_chunk(
     markers = navigator.markers
 
     def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, _Told]:
-        obs = Observation(frame.corners_px, frame.visible, dt_s=frame.dt_s)
+        obs = Observation(frame.corners_px, frame.visible, dt_s=frame.dt_s, twist=frame.twist)
         state, out = _with_markers(navigator, markers).step(state, obs)
         truth = jaxlie.SE3(frame.T_world_vehicle_true)
         branch = judge_branch(out.candidates, out.selected, truth)
@@ -191,6 +193,7 @@ def _run_chunk(
                 frame.visible[:, marker][:, None],
                 frame.dt_s,
                 frame.T_world_vehicle_true,
+                frame.twist,
             )
             return outputs_of(_single(markers, marker), state, seen_alone)
 
@@ -213,7 +216,7 @@ def _single(markers: MarkerMap, index: Array) -> MarkerMap:
     return MarkerMap(T_world_marker, markers.size_m[index][None], ids=(0,), families=("",))
 
 
-def _frames(recording: Recording, begin: int) -> _Frames:
+def _frames(recording: Recording, twists: np.ndarray | None, begin: int) -> _Frames:
     """A chunk of frames, padded beyond the last one with frames that show nothing."""
     frames = np.arange(begin, min(begin + CHUNK_FRAMES, len(recording)))
     dt_s = (
@@ -225,13 +228,18 @@ def _frames(recording: Recording, begin: int) -> _Frames:
         there = opposite(recording.markers.origin_m)
         truth = poses_in_world(reference.T_world_vehicle[frames], there)
     corners_px, visible = recording.lanes(frames)
+    twists = None if twists is None else twists[frames]
+    # Over a longer pause the motion is predicted for a while only, unless the odometry tells it.
+    told = False if twists is None else np.isfinite(twists).all(axis=1)
+    dt_s = np.where(told, dt_s, np.clip(dt_s, 0, MAX_DT_S))
 
     hidden = np.zeros((CHUNK_FRAMES - len(frames), *visible.shape[1:]), bool)
     return _Frames(
         corners_px=_padded(corners_px, CHUNK_FRAMES),
         visible=jnp.asarray(np.concatenate([visible, hidden])),
-        dt_s=_padded(np.clip(dt_s, 0, MAX_DT_S), CHUNK_FRAMES),
+        dt_s=_padded(dt_s, CHUNK_FRAMES),
         T_world_vehicle_true=_padded(truth, CHUNK_FRAMES),
+        twist=None if twists is None else _padded(twists, CHUNK_FRAMES),
     )
 
 

@@ -1,8 +1,9 @@
 """Reading of TagSLAM's folders: bags with detections and results, and three YAML files.
 
 cameras.yaml       intrinsics (Kalibr's keys), `tagtopic`, `rig_body`
-*.bag[.bz2]        detections; `/tf` with every camera, marker and the rig
-tagslam.yaml       sizes of the markers, and poses of the known ones
+*.bag[.bz2]        detections; `/tf` with every camera, marker and the rig; `odom_topic`
+tagslam.yaml       sizes of the markers, and poses of the known ones; of the rig `odom_topic`, the
+                   odometry of other software, and `T_body_odom`, the pose of its body on the rig
 camera_poses.yaml  poses of the cameras on the rig, where there is no /tf
 """
 
@@ -14,16 +15,18 @@ import numpy as np
 from pydantic import Field
 
 from jaxnav.datasets import bags
+from jaxnav.datasets.odometry import OdometryTrack
 from jaxnav.datasets.recording import RecordingSource
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import rig_from_figures
 from jaxnav.files.markers import marker_map
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import Count, ForeignEntry, Size, Vector, at, validate
+from jaxnav.files.validation import Count, ForeignEntry, Size, Text, Vector, at, validate
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.ros.camera_messages import TAGSLAM
+from jaxnav.ros.odometry_messages import NAV_ODOMETRY
 
 _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 
@@ -48,6 +51,8 @@ class _BodyEntry(ForeignEntry):
     default_tag_size: Size | None = None
     pose: _PoseEntry | None = None
     tags: list[_TagEntry] = Field(default_factory=list)
+    odom_topic: Text | None = None
+    T_body_odom: _PoseEntry | None = None
 
 
 class TagSlamFile(ForeignEntry):
@@ -84,7 +89,12 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> RecordingSource:
         problem = f"has {len(rig)} cameras, but {path / 'cameras.yaml'} has {len(chain)}"
         raise BadInput("--rig", problem)
     return RecordingSource(
-        path.name, rows, rig, lambda: _markers(path, edges), lambda: _reference(edges, body)
+        path.name,
+        rows,
+        rig,
+        lambda: _markers(path, edges),
+        lambda: _reference(edges, body),
+        _odometry(path, body, recorded),
     )
 
 
@@ -115,6 +125,33 @@ def _detections(
     return detections[0]
 
 
+def _odometry(path: Path, body: str, recorded: list[bags.Bag]) -> OdometryTrack | None:
+    """The track of the rig's `odom_topic`; None where tagslam.yaml names none."""
+    file = path / "tagslam.yaml"
+    if not file.is_file():
+        return None
+    entry = _by_name(validate(TagSlamFile, read_mapping(file), file)).get(body)
+    if entry is None or entry.odom_topic is None:
+        return None
+    where = at(file, f"bodies.{body}")
+    if entry.T_body_odom is None:
+        raise BadInput(f"{where}.T_body_odom", f"missing: where is the body of {entry.odom_topic}?")
+    tracks = [
+        bag.odometry[entry.odom_topic] for bag in recorded if entry.odom_topic in bag.odometry
+    ]
+    if len(tracks) != 1:
+        problem = f"{len(tracks) or 'no'} bags have {entry.odom_topic} of {NAV_ODOMETRY}"
+        raise BadInput(f"{where}.odom_topic", f"{problem}; {bags.list_topics(recorded)}")
+    (track,) = tracks
+    stamps = sorted(track)
+    poses_read = np.array([track[stamp] for stamp in stamps]).reshape(-1, 7)
+    return OdometryTrack(np.array(stamps, np.int64), poses_read, entry.T_body_odom.pose())
+
+
+def _by_name(settings: TagSlamFile) -> dict[str, _BodyEntry]:
+    return {name: entry for body in settings.bodies for name, entry in body.items()}
+
+
 def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: Edges, body: str) -> CameraRig:
     cameras = []
     file = path / "camera_poses.yaml"
@@ -135,7 +172,7 @@ def _markers(path: Path, edges: Edges) -> MarkerMap:
     """The map: poses from /tf, or else known ones of tagslam.yaml; sizes from tagslam.yaml."""
     file = path / "tagslam.yaml"
     settings = validate(TagSlamFile, read_mapping(file), file)
-    bodies = {name: entry for body in settings.bodies for name, entry in body.items()}
+    bodies = _by_name(settings)
     entry_of = {(name, tag.id): tag for name, body in bodies.items() for tag in body.tags}
     Ts_world_marker: dict[int, tuple[str, np.ndarray]] = {}
     parents = {child: (parent, stamped) for (parent, child), stamped in edges.items()}

@@ -36,6 +36,9 @@ class Observation(eqx.Module):
     dt_s: Float[Array, ""] | float = 0.0  # since the previous observation
     corner_sigma_px: Float[Array, "C M 4"] | None = None  # None: the estimator's own figure
     has_odometry: Bool[Array, ""] | bool = True  # False: speed and steering are not known
+    # Of a body that moves freely, by another estimator: v m/s and w rad/s in the vehicle's axes,
+    # the mean over `dt_s`, so that exp(twist dt_s) is the motion; a NaN is no reading.
+    twist: Float[Array, " 6"] | None = None
     # Readings of another sensor, for `OrientationGiven`; a NaN is no reading.
     heading_rad: Float[Array, ""] | None = None  # psi in the world
     heading_sigma_rad: Float[Array, ""] | float = 0.02

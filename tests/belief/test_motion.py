@@ -625,6 +625,84 @@ def test_constant_velocity_carries_its_covariance_as_samples_do():
     )
 
 
+def with_twist(obs: Observation, twist) -> Observation:
+    return dataclasses.replace(obs, twist=jnp.asarray(twist, float))
+
+
+def test_odometry_s_motion_carries_its_covariance_as_samples_do():
+    """20 000 bodies that start off by P, and drift off the motion that is told."""
+    drift = jnp.asarray([0.05, 0.04, 0.03, 0.02])
+    A = jnp.asarray([0.3, 0.2, 0.1, 0.2, 0.3, 0.1])
+    motion = ConstantVelocity(acceleration_density=A, odometry_drift=drift)
+    rng = np.random.default_rng(5)
+    root = 0.01 * rng.normal(size=(12, 12))
+    told = np.array([0.4, -0.2, 0.1, 0.3, -0.1, 0.2])
+    T = jaxlie.SE3.exp(jnp.asarray(rng.normal(size=6)))
+    start = eqx.tree_at(
+        lambda b: (b.mean, b.covariance, b.initialised),
+        motion.init(),
+        (
+            jnp.append(T.wxyz_xyz, jnp.full(6, 9.0))[None],  # what the state believes of the twist
+            jnp.asarray((root @ root.T)[None]),
+            jnp.ones(1, bool),
+        ),
+    )
+    dt_s = 0.2
+    predicted = motion.predict(start, with_twist(reading(dt_s=dt_s), told))
+    np.testing.assert_allclose(predicted.mean[0, 7:], told)
+    way_m, angle_rad = (dt_s * np.linalg.norm(part) for part in (told[:3], told[3:]))
+    linear = 0.05**2 * way_m + 0.03**2 * dt_s
+    angular = 0.04**2 * angle_rad + 0.02**2 * dt_s
+
+    @jax.jit
+    @jax.vmap
+    def off(error, drifted, later):
+        truth = T @ jaxlie.SE3.exp(error) @ jaxlie.SE3.exp(told * dt_s) @ jaxlie.SE3.exp(drifted)
+        believed = jaxlie.SE3(predicted.mean[0, :7])
+        return jnp.append((believed.inverse() @ truth).log(), drifted / dt_s + later)
+
+    count = 20_000
+    errors = off(
+        jnp.asarray(rng.normal(size=(count, 12)) @ root.T)[:, :6],
+        jnp.asarray(rng.normal(size=(count, 6)) * np.sqrt(np.repeat([linear, angular], 3))),
+        jnp.asarray(rng.normal(size=(count, 6)) * np.sqrt(A * dt_s / 3)),
+    )
+    factor = np.linalg.cholesky(np.asarray(predicted.covariance[0]))
+    whitened = np.linalg.solve(factor, np.asarray(errors).T)
+    np.testing.assert_allclose(whitened @ whitened.T / count, np.eye(12), atol=5 / np.sqrt(count))
+
+
+def test_odometry_s_drift_does_not_depend_on_how_often_it_is_read():
+    motion = ConstantVelocity(odometry_drift=jnp.asarray([0.05, 0.0, 0.03, 0.0]))
+    T, twist = worlds.planar(0.3, 0.1, 1.0), [0.5, 0, 0, 0, 0, 0]
+    start, _ = free_step(motion, motion.init(), jnp.asarray(0.1), T.wxyz_xyz, jnp.eye(6), True)
+    start = eqx.tree_at(lambda b: b.covariance, start, 1e-8 * jnp.eye(12)[None])
+    predict = jax.jit(motion.predict)
+    seldom = predict(start, with_twist(reading(dt_s=2.0), twist))
+    often = start
+    for _ in range(20):
+        often = predict(often, with_twist(reading(dt_s=0.1), twist))
+    np.testing.assert_allclose(often.mean[0, :7], seldom.mean[0, :7], atol=1e-12)
+    np.testing.assert_allclose(
+        often.covariance[0, :3, :3], seldom.covariance[0, :3, :3], rtol=1e-3, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e4])
+def test_a_twist_that_is_no_motion_is_not_used(bad):
+    motion = ConstantVelocity()
+    start, _ = free_step(
+        motion, motion.init(), jnp.asarray(0.1), worlds.planar(0, 0, 0).wxyz_xyz, jnp.eye(6), True
+    )
+    obs = reading(dt_s=0.1)
+    for left, right in zip(
+        jax.tree.leaves(motion.predict(start, with_twist(obs, [bad, 0, 0, 0, 0, 0]))),
+        jax.tree.leaves(motion.predict(start, obs)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(left, right)
+
+
 def test_constant_velocity_converges_on_a_moving_body():
     """Noisy poses of a body that screws through space: pose and twist are found, errors as said."""
     motion = ConstantVelocity(acceleration_density=jnp.full(6, 0.05**2))
@@ -671,7 +749,7 @@ def test_constant_velocity_forgets_what_it_lost():
     assert nis[0] == 0
 
 
-@pytest.mark.parametrize("kind", ["car", "free"])
+@pytest.mark.parametrize("kind", ["car", "free", "free with odometry"])
 @in_float32
 def test_gradients_are_finite_at_rest_and_at_the_prediction(precision, kind):
     """Of everything by noise parameters, pose and odometry, where innovations are 0."""
@@ -683,6 +761,8 @@ def test_gradients_are_finite_at_rest_and_at_the_prediction(precision, kind):
     def slope(floats, taken):
         motion, wxyz_xyz, speed_mps, dt_s = floats
         obs = reading(speed_mps, dt_s=dt_s)
+        if kind == "free with odometry":
+            obs = with_twist(obs, jnp.zeros(6) * speed_mps)
 
         def look(prior, taken):
             here = chosen(prior, jaxlie.SE3(wxyz_xyz), 1e-4 * jnp.eye(6), taken)

@@ -1,6 +1,8 @@
 """Recordings: the same detections from bags and arrays, and one line for an unreadable one."""
 
 import bz2
+import functools
+import itertools
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -157,8 +159,12 @@ SQUARE_PX = np.array([[10.0, 30], [30, 30], [30, 10], [10, 10]])  # BL BR TR TL 
 Seen = dict[str, list[tuple[int, list[tuple[int, np.ndarray]]]]]
 
 
-def write_bag(path: Path, seen: Seen, transforms: Any = ()) -> Path:
-    """A bag with topic -> [(stamp in ns, [(id, corners)])] and [(parent, child, wxyz xyz)]."""
+def write_bag(path: Path, seen: Seen, transforms: Any = (), odometry: Any = None) -> Path:
+    """A bag with topic -> [(stamp in ns, [(id, corners)])] and [(parent, child, wxyz xyz)].
+
+    Args:
+        odometry: topic -> [(stamp in ns, wxyz xyz)].
+    """
     types = get_typestore(Stores.ROS1_NOETIC)
     types.register(get_types_from_msg(_TAG, "apriltag_msgs/msg/Apriltag"))
     types.register(get_types_from_msg(_ARRAY, "apriltag_msgs/msg/ApriltagArrayStamped"))
@@ -193,6 +199,23 @@ def write_bag(path: Path, seen: Seen, transforms: Any = ()) -> Path:
                 )
                 raw = types.serialize_ros1(make[kind]([stamped]), kind)
                 writer.write(connection, 5, raw)
+        kind, still = "nav_msgs/msg/Odometry", make["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        for topic, poses in (odometry or {}).items():
+            connection = writer.add_connection(topic, kind, typestore=types)
+            for stamp, (w, x, y, z, *position) in poses:
+                pose = make["geometry_msgs/msg/Pose"](
+                    make["geometry_msgs/msg/Point"](*position),
+                    make["geometry_msgs/msg/Quaternion"](x, y, z, w),
+                )
+                message = make[kind](
+                    header(stamp, "odom"),
+                    "body",
+                    make["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
+                    make["geometry_msgs/msg/TwistWithCovariance"](
+                        make["geometry_msgs/msg/Twist"](still, still), np.zeros(36)
+                    ),
+                )
+                writer.write(connection, stamp, types.serialize_ros1(message, kind))
     return path
 
 
@@ -292,6 +315,60 @@ def test_a_folder_with_transforms_takes_its_poses_from_them(folder):
     np.testing.assert_allclose(read.rig.Ts_camera_vehicle.translation()[0], [0, 0, -3], atol=1e-12)
     np.testing.assert_array_equal(read.reference.valid, [True])
     np.testing.assert_allclose(read.reference.T_world_vehicle, [[*UNIT, 7, 8, 9]], atol=1e-12)
+
+
+ODOMETRY = """
+ - cart:
+     is_static: false
+     odom_topic: /vio
+     T_body_odom: {position: {x: 0, y: 0, z: 0.5}, rotation: {x: 0, y: 0, z: 1.5707963267948966}}
+"""
+
+
+def test_a_folder_s_odometry_is_the_motion_of_the_rig(folder):
+    path = folder / "tagslam.yaml"
+    path.write_text(path.read_text().rstrip() + ODOMETRY)
+    assert problem(folder).startswith(f"{path}: bodies.cart.odom_topic: no bags have /vio of nav_")
+    rng = np.random.default_rng(0)
+    times_s = np.array([0.9, 1.0, 1.1, 1.25, 2.5, 2.6])
+    start, twist = jaxlie.SE3.exp(jnp.asarray(rng.normal(size=6))), rng.normal(size=6)
+    T_cart_odom = jaxlie.SE3(jnp.asarray([np.sqrt(0.5), 0, 0, np.sqrt(0.5), 0, 0, 0.5]))
+    poses = [start @ jaxlie.SE3.exp(jnp.asarray(twist * t)) @ T_cart_odom for t in times_s]
+    (folder / "seen.bag").unlink()
+    write_bag(
+        folder / "seen.bag",
+        {"/a/tags": [(int(t * 1e9), [(3, SQUARE_PX)]) for t in (0.5, 1.0, 1.1, 1.25, 2.0, 2.6)]},
+        odometry={
+            "/vio": [
+                (int(t * 1e9), np.asarray(p.wxyz_xyz).tolist())
+                for t, p in zip(times_s, poses, strict=True)
+            ]
+        },
+    )
+    read = read_recording(folder)
+    # Nothing is told before its first pose, nor within a gap of 1.25 s.
+    np.testing.assert_array_equal(np.isfinite(read.twists).all(axis=1), [0, 0, 1, 1, 0, 0])
+    np.testing.assert_allclose(read.twists[2:4], np.tile(twist, (2, 1)), atol=1e-9)
+    assert read.first(3).twists.shape == (3, 6)
+    path.write_text(path.read_text().replace("T_body_odom", "T_odom_body"))
+    assert f"{path}: bodies.cart.T_body_odom: missing" in problem(folder)
+
+
+def test_odometry_between_its_poses(data_dir):
+    """A real one, 30 Hz, against the reference: 1.4 mm and 0.07 degrees in 0.2 s."""
+    read = read_recording(data_dir / "tagslam" / "test_21")
+    rows = np.flatnonzero(read.reference.valid)
+    dt_s = np.diff(read.stamps_ns, prepend=read.stamps_ns[:1]) / 1e9
+    steps = jaxlie.SE3.exp(jnp.asarray(read.twists * dt_s[:, None])).as_matrix()
+    truth = jaxlie.SE3(jnp.asarray(read.reference.T_world_vehicle[rows])).as_matrix()
+    errors = []
+    for index, (begin, end) in enumerate(itertools.pairwise(rows)):
+        told = functools.reduce(np.matmul, np.asarray(steps[begin + 1 : end + 1]))
+        errors.append(np.linalg.inv(told) @ np.linalg.inv(truth[index]) @ truth[index + 1])
+    twists = np.asarray(jaxlie.SE3.from_matrix(jnp.asarray(errors)).log())
+    assert np.isfinite(twists).all()
+    assert np.median(np.linalg.norm(twists[:, :3], axis=1)) < 0.003
+    assert np.median(np.linalg.norm(twists[:, 3:], axis=1)) < np.deg2rad(0.2)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.cli import main
 from jaxnav.datasets import replay as replays
+from jaxnav.datasets.odometry import OdometryTrack
 from jaxnav.datasets.recordings import Recording, read_recording
 from jaxnav.datasets.replay import CHUNK_FRAMES, Replay, errors, frames_in_view, replay
 from jaxnav.files import write_params
@@ -125,6 +126,36 @@ def test_a_replay_is_the_step_over_and_over(test_7):
             atol=1e-9,
         )
     assert result.T_world_vehicle.shape == (CHUNK_FRAMES + 7, 1, 7)
+
+
+def test_without_a_marker_the_pose_goes_on_by_the_odometry_alone(test_7):
+    """Over 10 s, by an odometry in a frame of its own that turns 0.3 degrees a second too far."""
+    begin, end = 60, 110
+    T_world_vehicle = jaxlie.SE3(jnp.asarray(test_7.reference.T_world_vehicle[:end]))
+    away_rad = np.deg2rad(0.3) * (test_7.stamps_ns[:end] - test_7.stamps_ns[0]) / 1e9
+    turned = jnp.zeros((end, 6)).at[:, 5].set(away_rad).at[:, :3].set(1.0)
+    odom = jaxlie.SE3.exp(turned) @ T_world_vehicle
+    track = OdometryTrack(
+        test_7.stamps_ns[:end], np.asarray(odom.wxyz_xyz), np.array([1.0, 0, 0, 0, 0, 0, 0])
+    )
+    kept = test_7.seen_at[0] < begin
+    hidden = dataclasses.replace(
+        test_7.first(end),
+        odometry=track,
+        seen_at=test_7.seen_at[:, kept],
+        seen_px=test_7.seen_px[kept],
+    )
+    result = replay(hidden, LowestReprojection(), corner_sigma_px=1.0)
+    poses = jaxlie.SE3(jnp.asarray(result.T_world_vehicle[:, 0]))
+    last, over = (jaxlie.SE3(poses.wxyz_xyz[row]) for row in (begin - 1, end - 1))
+    there, back = (jaxlie.SE3(odom.wxyz_xyz[row]) for row in (begin - 1, end - 1))
+    expected = last @ there.inverse() @ back
+    np.testing.assert_allclose(over.as_matrix(), expected.as_matrix(), atol=1e-8)
+    assert result.located[-1, 0]
+    assert not result.seen[-1, 0]
+    # Without the odometry it would have been lost.
+    truth = jaxlie.SE3(T_world_vehicle.wxyz_xyz[end - 1])
+    assert np.linalg.norm((over.inverse() @ truth).translation()) < 0.2
 
 
 def test_a_recording_without_a_reference_gives_a_track_and_no_errors(

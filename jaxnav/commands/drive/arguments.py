@@ -206,6 +206,8 @@ class ReplayRecording(Headless):
         float | None, optional("PX", "(default: as the recording tells)"), within("corner_sigma_px")
     ] = None
     """Standard deviation of a corner coordinate."""
+    without_odometry: Switch = False
+    """Localise a rig by its cameras alone, also where other software's odometry is recorded."""
     limit: Annotated[int | None, optional("N", "(default: all)", int), AT_LEAST_1] = None
     """Stop after N frames, of a drive after N inputs."""
     out: ResultsFolder = Path("out")

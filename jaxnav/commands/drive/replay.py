@@ -46,6 +46,8 @@ def run(args: Arguments) -> int:
     )
     if args.limit is not None:
         recording = recording.first(args.limit)
+    if args.without_odometry:
+        recording = dataclasses.replace(recording, odometry=None)
     if not len(recording):
         raise BadInput(args.recording, "holds no frame")
     if params is not None:  # raises on bad input before the folder is made
@@ -77,6 +79,7 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
         "recording": recording.name,
         "markers": "one-at-a-time" if args.one_at_a_time else "all",
         "selector": args.selector,
+        "odometry": recording.odometry is not None,
         "params": args.params,
         "frames": len(recording),
         "frames_located": int(result.seen.any(axis=1).sum()),
@@ -160,7 +163,8 @@ def _report(
 
 def _text(summary: dict[str, Any]) -> str:
     head = (
-        f"{visible(summary['recording'])}, {summary['selector']}, markers {summary['markers']}: "
+        f"{visible(summary['recording'])}, {summary['selector']}, markers {summary['markers']}"
+        f"{', with odometry' if summary['odometry'] else ''}: "
         f"{summary['poses']} poses in {summary['frames']} frames, "
         f"{summary['frames_per_second']:.0f} frames/s"
     )

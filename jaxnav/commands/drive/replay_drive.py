@@ -50,6 +50,7 @@ from jaxnav.recording.recorder import Recorder
 
 EXIT_DIFFERS = 1
 _FILES = ("rig", "markers", "vehicle", "route")
+_FOR_RIGS = ("one_at_a_time", "without_odometry")
 _FOR_DRIVES = ("vehicle", "route", "images", "record_anew")
 _OVERRIDES = (
     *("rig", "markers", "vehicle", "route", "params"),
@@ -144,8 +145,9 @@ def is_for(args: Arguments) -> bool:
     """
     path = args.recording
     if args.topics is not None or profile_of(path) == PROFILE:
-        if args.one_at_a_time:
-            raise BadInput("--one-at-a-time", "goes with recordings of a rig, not with a drive")
+        for name in _FOR_RIGS:
+            if getattr(args, name):
+                raise BadInput(flag_of(name), "goes with recordings of a rig, not with a drive")
         return True
     if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file():
         if path.exists():

@@ -97,6 +97,9 @@ def _apart(one: NamedSequences, other: NamedSequences) -> str | None:
     for what, here, there in zip(("cameras", "markers"), lanes, lanes_other, strict=True):
         if here != there:
             return f"must have as many {what} to be tuned on together, got {here} and {there}"
+    told = [named.recorded.obs.twist is not None for named in (one, other)]
+    if told[0] != told[1]:
+        return "must both have odometry, or neither, to be tuned on together"
     if not _alike(one.recorded, other.recorded):
         return "must be of one kind to be tuned on together, drives or recordings of a rig"
     for what, flag, here, there in (
@@ -222,6 +225,9 @@ def _recorded(
     corners_px = np.where(visible[..., None, None], corners_px, 0.0)
     stamps_ns = recording.stamps_ns[frames]
     dt_s = np.diff(stamps_ns, axis=1, prepend=stamps_ns[:, :1]) / 1e9
+    odometry, told = recording.odometry, {}
+    if odometry is not None:
+        told["twist"] = jnp.asarray([odometry.twists(piece) for piece in stamps_ns], float)
     reference = recording.reference
     truth, judged = np.tile(IDENTITY, (*frames.shape, 1)), np.zeros(frames.shape, bool)
     if reference is not None:
@@ -236,6 +242,7 @@ def _recorded(
             visible=jnp.asarray(visible),
             dt_s=jnp.asarray(dt_s, float),
             has_odometry=jnp.zeros(frames.shape, bool),
+            **told,
         ),
         used=jnp.asarray(used),
         T_world_vehicle_true=jnp.asarray(truth, float),

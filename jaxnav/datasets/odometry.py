@@ -1,0 +1,76 @@
+"""Odometry of a rig that moves freely, by other software: poses in a frame of its own.
+
+A visual-inertial odometry, a lidar or a T265 tells where its body is in a frame that drifts against
+the map. Only the motion between two times is used of it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaxnav.files.poses import inverse, matrix
+
+_MAX_GAP_S = 0.5  # between two poses; what happened in a longer one is not known
+
+
+@dataclass(frozen=True)
+class OdometryTrack:
+    """N poses of the odometry's body in its own frame.
+
+    Attributes:
+        stamps_ns: (N,), increasing.
+        T_odom_sensor: (N, 7) wxyz xyz, of the body whose motion it tells.
+        T_vehicle_sensor: (7,) where that body is in the vehicle's frame.
+    """
+
+    stamps_ns: Int[np.ndarray, " N"]
+    T_odom_sensor: Float[np.ndarray, "N 7"]
+    T_vehicle_sensor: Float[np.ndarray, " 7"]
+
+    def twists(self, stamps_ns: Int[np.ndarray, " F"]) -> Float[np.ndarray, "F 6"]:
+        """The vehicle's mean twist before each stamp since the one before it.
+
+        Returns:
+            (F, 6) m/s and rad/s in the vehicle's axes, with exp(twist dt) the motion; NaN where a
+            pose of either time is not known, and for the first.
+        """
+        twists = np.full((len(stamps_ns), 6), np.nan)
+        known, places = self._at(stamps_ns)
+        dt_s = np.diff(stamps_ns) / 1e9
+        rows = np.flatnonzero(known[1:] & known[:-1] & (dt_s > 0))
+        steps = np.linalg.inv(places[rows]) @ places[rows + 1]
+        twists[rows + 1] = _logarithms(steps) / dt_s[rows, None]
+        return twists
+
+    def _at(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the times are between two poses that are near, and T_odom_vehicle (F, 4, 4)."""
+        T = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
+        if len(self.stamps_ns) < 2:
+            return np.zeros(len(stamps_ns), bool), T
+        after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 1, len(self.stamps_ns) - 1)
+        before_ns, after_ns = self.stamps_ns[after - 1], self.stamps_ns[after]
+        known = (before_ns <= stamps_ns) & (stamps_ns <= after_ns)
+        known &= after_ns - before_ns <= _MAX_GAP_S * 1e9
+        times_s = (self.stamps_ns - self.stamps_ns[0]) / 1e9
+        asked_s = np.clip((stamps_ns - self.stamps_ns[0]) / 1e9, 0, times_s[-1])
+        turns = Slerp(times_s, Rotation.from_quat(np.roll(self.T_odom_sensor[:, :4], -1, axis=1)))
+        T[:, :3, :3] = turns(asked_s).as_matrix()
+        for axis in range(3):
+            T[:, axis, 3] = np.interp(asked_s, times_s, self.T_odom_sensor[:, 4 + axis])
+        return known, T @ matrix(inverse(self.T_vehicle_sensor))
+
+
+def _logarithms(T: Float[np.ndarray, "K 4 4"]) -> Float[np.ndarray, "K 6"]:
+    """Twists (K, 6) for a unit of time. Source: Barfoot (2017), Eqs. 7.35 and 7.37."""
+    turn = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    half = np.linalg.norm(turn, axis=1) / 2
+    small = half < 1e-4
+    safe = np.where(small, 1, half)
+    # (1 - half cot(half)) / (2 half)^2, which tends to 1/12
+    factor = np.where(small, 1 / 12, (1 - safe / np.tan(safe)) / (4 * safe**2))
+    way = T[:, :3, 3]
+    across = np.cross(turn, way)
+    way = way - across / 2 + factor[:, None] * np.cross(turn, across)
+    return np.concatenate([way, turn], axis=1)
