@@ -9,6 +9,7 @@ nearer to the reference in angle, an outlier where none is within 10 degrees.
 
 import argparse
 import dataclasses
+import functools
 import os
 import time
 from pathlib import Path
@@ -18,11 +19,13 @@ from jaxnav.configuration import configure
 configure(float64=True)  # before the first array, as the commands do
 
 import jax.numpy as jnp  # noqa: E402
+import jaxlie  # noqa: E402
 import numpy as np  # noqa: E402
 
 from jaxnav.belief.selectors import make_selector  # noqa: E402
 from jaxnav.datasets.recordings import Recording, read_recording  # noqa: E402
 from jaxnav.datasets.replay import Replay, replay  # noqa: E402
+from jaxnav.files.poses import matrix  # noqa: E402
 
 DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/data")) / "tagslam"
 CLAIM = 1e-3  # a flip probability below it is a claim to be sure
@@ -55,6 +58,39 @@ def score(recording: Recording, result: Replay) -> dict[str, float]:
     }
 
 
+def print_gaps(recording: Recording, gap_s: float) -> None:
+    """How the error grows while no marker is seen, and that of the odometry alone meanwhile."""
+    assert recording.reference is not None
+    assert recording.odometry is not None
+    times_s = (recording.stamps_ns - recording.stamps_ns[0]) / 1e9
+    rows = np.flatnonzero(recording.reference.valid)
+    in_gap = times_s % (1.6 * gap_s) > 0.6 * gap_s
+    kept = ~in_gap[recording.seen_at[0]]
+    hidden = dataclasses.replace(
+        recording, seen_at=recording.seen_at[:, kept], seen_px=recording.seen_px[kept]
+    )
+    found = replay(hidden, make_selector("multi-hypothesis")).T_world_vehicle[rows, 0]
+    truth = recording.reference.T_world_vehicle[rows]
+    stamps_ns, twists = (
+        recording.stamps_ns[rows],
+        recording.odometry.twists(recording.stamps_ns[rows]),
+    )
+    steps = jaxlie.SE3.exp(jnp.asarray(twists[1:] * np.diff(stamps_ns)[:, None] / 1e9)).as_matrix()
+    print(
+        f"| a gap of {gap_s:g} s: error before, mm | after | of the odometry alone |\n|---|---|---|"
+    )
+    pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(in_gap[rows])) + 1)
+    for piece in pieces[:-1]:
+        if not in_gap[rows[piece[0]]] or not piece[0]:
+            continue
+        before, last = piece[0] - 1, piece[-1]
+        T_told = functools.reduce(np.matmul, np.asarray(steps[before:last]), matrix(truth[before]))
+        ends_m = found[before, 4:], found[last, 4:], T_told[:3, 3]
+        there_m = truth[before, 4:], truth[last, 4:], truth[last, 4:]
+        off_mm = 1e3 * np.linalg.norm(np.subtract(ends_m, there_m), axis=1)
+        print("| " + " | ".join(f"{one:.0f}" for one in off_mm) + " |", flush=True)
+
+
 def main() -> None:
     """Print a row for each recording and selector."""
     parser = argparse.ArgumentParser(
@@ -68,6 +104,7 @@ def main() -> None:
     parser.add_argument("--camera-sigma", type=float, nargs=2, metavar=("DEG", "M"),
                         help="of a camera's direction and place; 0 0: exact ones")  # fmt: skip
     parser.add_argument("--without-odometry", action="store_true")
+    parser.add_argument("--gap-s", type=float, help="hide all markers so long, now and then")
     args = parser.parse_args()
     head_is_printed = False
     for folder in sorted(DATA.glob("test_*"), key=lambda path: int(path.name[5:])):
@@ -82,6 +119,9 @@ def main() -> None:
             known = None if not sigma.any() else jnp.asarray(sigma)
             rig = dataclasses.replace(recording.rig, extrinsics_sigma=known)
             recording = dataclasses.replace(recording, rig=rig)
+        if args.gap_s is not None:
+            print_gaps(recording, args.gap_s)
+            continue
         for name in args.selectors:
             begin = time.perf_counter()
             result = replay(recording, make_selector(name), one_at_a_time=True)

@@ -55,7 +55,7 @@ class ConstantVelocity(Motion):
     # Random walk of the odometry along each axis: per way, per angle, and twice per time;
     # m/sqrt(m), rad/sqrt(rad), m/sqrt(s), rad/sqrt(s).
     odometry_drift: Float[Array, " 4"] = eqx.field(
-        default_factory=lambda: jnp.asarray([0.02, 0.01, 0.002, 0.002])
+        default_factory=lambda: jnp.asarray([0.04, 0.02, 0.005, 0.005])
     )
     camera_states: int = eqx.field(static=True, default=0)  # see `for_rig`
     learn_sigma_rad: float = 0.035  # sigma of the orientation below which errors are estimated
