@@ -6,7 +6,11 @@ forward. Lenses, in the conventions of OpenCV and Kalibr:
     none         no distortion
     radtan       k1 k2 p1 p2 k3          (Brown 1966; OpenCV's order)
     rational     k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's, ROS's rational_polynomial)
+    thin_prism   those, then s1 s2 s3 s4 (OpenCV's)
     equidistant  k1 k2 k3 k4             (Kannala and Brandt 2006; OpenCV's fisheye)
+    omni         xi k1 k2 p1 p2          (Mei and Rives 2007; Kalibr's omni-radtan)
+    double_sphere  xi alpha              (Usenko, Demmel, Cremers 2018; Kalibr's ds)
+    eucm         alpha beta              (Khomutenko, Garcia, Martinet 2016; Kalibr's eucm)
 """
 
 from collections.abc import Sequence
@@ -30,7 +34,7 @@ class Camera(eqx.Module):
 
     focal_px: Float[Array, "*batch 2"]  # fx fy
     center_px: Float[Array, "*batch 2"]  # cx cy
-    distortion: Float[Array, "*batch 8"]  # in the order of the lens, zero-padded
+    distortion: Float[Array, "*batch 12"]  # in the order of the lens, zero-padded
     lens_index: Int[Array, "*batch"]
     lenses: tuple[str, ...] = eqx.field(static=True)
 
@@ -46,7 +50,7 @@ class Camera(eqx.Module):
         Args:
             focal_px: fx, fy in pixels.
             center_px: cx, cy in pixels.
-            lens: "none", "radtan", "rational" or "equidistant".
+            lens: a name of `jaxnav.models.lenses.LENSES`.
             distortion: the lens's coefficients; missing ones are zero.
 
         Raises:
@@ -76,13 +80,24 @@ class Camera(eqx.Module):
         rows = [[fx, zero, cx], [zero, fy, cy], [zero, zero, one]]
         return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
+    @property
+    def axis_px(self) -> Float[Array, "2"]:
+        """Pixels a radian on the axis, along x and y, for one camera; vmap over several.
+
+        They are fx and fy, but for a lens with xi, whose files have 1 + xi times as much.
+        """
+        one = jnp.ones_like(self.focal_px)
+        xi = self.distortion[0]  # where the lens has one
+        times = [1 + xi if "xi" in LENSES[lens].coefficients else 1 for lens in self.lenses]
+        return self.focal_px / self._select([one * factor for factor in times])
+
     def project(self, points_camera: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
         """Pixels of points in the camera frame, m, for one camera; vmap over several.
 
             u = f * lens(p) + c                                                      (Eq. 1)
 
-        The result is finite everywhere. Behind a camera without an equidistant lens it is a
-        far-away pixel in the direction of the point; `in_front` tells which points can be seen.
+        The result is finite everywhere. Behind a camera whose lens does not see backwards it is
+        a far-away pixel in the direction of the point; `in_front` tells which points can be seen.
 
         Source: Liu, Schofield, Shan (2023), Eq. 1; lenses as in the module's docstring.
         """
@@ -123,7 +138,7 @@ class Camera(eqx.Module):
         return self._select([bearing_of(lens, normalised, self.distortion) for lens in self.lenses])
 
     def in_front(self, points_camera: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
-        """Whether a point lies before the lens, and before the lens folds: it can be seen."""
+        """Whether a point lies before the lens and before it folds: `unproject` finds its ray."""
         points = jnp.moveaxis(points_camera, -1, 0)
         return self._select([can_be_seen(lens, points, self.distortion) for lens in self.lenses])
 

@@ -18,7 +18,11 @@ LENSES = {
     "none": (),
     "radtan": (0.1, -0.05, 0.002, -0.003, 0.01),
     "rational": (0.1, -0.05, 0.002, -0.003, 0.01, 0.2, -0.03, 0.02),
+    "thin_prism": (0.1, -0.05, 0.002, -0.003, 0.01, 0.2, -0.03, 0.02, 2e-3, -1e-3, 3e-3, 5e-4),
     "equidistant": (-0.02, 0.003, -0.004, 0.001),
+    "omni": (1.2, 0.05, -0.02, 0.002, -0.003),
+    "double_sphere": (-0.2, 0.6),
+    "eucm": (0.6, 1.1),
 }
 SIDE, AXIS, BEHIND, PLANE = (0.3, -0.2, 1.5), (0.0, 0.0, 2.0), (0.4, 0.3, -1.0), (0.5, 0.2, 0.0)
 
@@ -82,7 +86,7 @@ rows_of = jax.jit(lambda rig, seen, points: reprojection_rows(rig, seen)(points)
 
 @pytest.mark.parametrize(
     "lenses",
-    [["none"], ["radtan"], ["rational"], ["equidistant"], ["radtan", "equidistant", "none"]],
+    [[lens] for lens in LENSES] + [["radtan", "equidistant", "none"]],
 )
 @pytest.mark.parametrize("special", [SIDE, AXIS, BEHIND, PLANE])
 def test_residuals_and_slopes_are_those_of_the_projection(lenses, special):

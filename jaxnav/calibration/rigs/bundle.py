@@ -33,6 +33,8 @@ _SETTLED = 1e-3
 # The scale is taken from this quantile, so a fourth of all sightings may be wrong.
 _QUANTILE = 0.75
 
+MOVING = 8  # coefficients of a lens that move; a thin prism's stay as given
+
 
 class RigUnknowns(eqx.Module):
     """Poses, each wxyz_xyz and moved from the right, T * cay(xi); and lenses, if they move.
@@ -45,7 +47,7 @@ class RigUnknowns(eqx.Module):
     Ts_world_vehicle: Float[Array, "F 7"]
     Ts_vehicle_camera: Float[Array, "C 7"]
     Ts_world_marker: Float[Array, "M 7"]
-    lenses: Float[Array, "L 12"]  # fx fy cx cy and eight coefficients; L = C or 0
+    lenses: Float[Array, "L 12"]  # fx fy cx cy and the first eight coefficients; L = C or 0
 
     @property
     def sixes(self) -> int:
@@ -56,12 +58,14 @@ class RigUnknowns(eqx.Module):
 
 def lenses_of(cameras: Camera) -> Float[Array, "*C 12"]:
     """The parameters of the cameras' lenses as unknowns."""
-    return jnp.concatenate([cameras.focal_px, cameras.center_px, cameras.distortion], axis=-1)
+    moving = [cameras.focal_px, cameras.center_px, cameras.distortion[..., :MOVING]]
+    return jnp.concatenate(moving, axis=-1)
 
 
 def with_lenses(cameras: Camera, lenses: Float[Array, "*C 12"]) -> Camera:
-    """The cameras with these lens parameters."""
-    focal_px, center_px, distortion = jnp.split(lenses, [2, 4], axis=-1)
+    """The cameras with these lens parameters; any further coefficients stay."""
+    focal_px, center_px, moving = jnp.split(lenses, [2, 4], axis=-1)
+    distortion = jnp.concatenate([moving, cameras.distortion[..., MOVING:]], axis=-1)
     return Camera(focal_px, center_px, distortion, cameras.lens_index, cameras.lenses)
 
 
