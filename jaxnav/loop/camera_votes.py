@@ -13,6 +13,7 @@ another camera has seen markers where they should be, since.
 
 import math
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -32,8 +33,8 @@ class CameraVotes:
 
     def __init__(self, navigator: Navigator):
         self._names = np.array(navigator.rig.names)
-        focal_px = np.asarray(navigator.rig.cameras.focal_px).mean(axis=1)
-        self._most_px = math.tan(_OFF_RAD) * focal_px
+        axis_px = jax.vmap(lambda camera: camera.axis_px)(navigator.rig.cameras)
+        self._most_px = math.tan(_OFF_RAD) * np.asarray(axis_px).mean(axis=1)
         count = len(self._names)
         self._votes = np.zeros(count, int)
         self._off_px, self._off_ns = np.zeros(count), np.full(count, _LONG_AGO_NS)

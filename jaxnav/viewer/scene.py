@@ -137,12 +137,13 @@ class RerunScene:
             T_vehicle_camera = poses.inverse(
                 np.asarray(rig.Ts_camera_vehicle.wxyz_xyz[index], float)
             )
-            entity = f"world/vehicle/{name}"
+            camera, entity = rig.camera(index), f"world/vehicle/{name}"
             self._still(entity, self._transform(T_vehicle_camera))
             self._still(
                 entity,
                 rerun.Pinhole(
-                    image_from_camera=np.asarray(rig.camera(index).K),
+                    focal_length=np.asarray(camera.axis_px),
+                    principal_point=np.asarray(camera.center_px),
                     resolution=rig.image_sizes_px[index],
                     camera_xyz=rerun.ViewCoordinates.RDF,
                     image_plane_distance=_IMAGE_PLANE_M,
