@@ -9,7 +9,7 @@ import numpy as np
 from jaxnav.datasets.recording import RecordingSource, Rows
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import CameraFigures, rig_from_figures
+from jaxnav.files.figures import CameraFigures, coefficients_problem, rig_from_figures
 from jaxnav.files.markers import marker_map
 from jaxnav.files.npz import read_npz
 from jaxnav.files.ranges import is_within, pinhole_problem, problem_of
@@ -178,6 +178,8 @@ def _rig(path: Path, stored: dict[str, np.ndarray]) -> CameraRig:
         count = LENS_COEFFICIENTS[lens]
         if np.any(distortion[count:]):
             raise BadInput(f"{path}: dist[{index}]", f"only the first {count} may differ from zero")
+        if wrong := coefficients_problem(lens, distortion.tolist()):
+            raise BadInput(f"{path}: dist[{index}]", wrong)
         corners = stored["corners_px"][stored["cam"] == index].reshape(-1, 2)
         inside = is_within("image_px", corners)
         furthest = np.max(corners, axis=0, initial=0, where=inside)

@@ -5,6 +5,7 @@ Every reader of camera files makes these and every writer takes them; from files
 for bit.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,9 +17,19 @@ from jaxtyping import Float
 
 from jaxnav.files import poses
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.lenses import LENSES
 from jaxnav.models.rig import PLACED_BY_HAND, CameraRig
 
-Lens = Literal["none", "radtan", "rational", "equidistant"]
+Lens = Literal[
+    "none",
+    "radtan",
+    "rational",
+    "thin_prism",
+    "equidistant",
+    "omni",
+    "double_sphere",
+    "eucm",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +89,17 @@ class CameraFigures:
     def camera(self) -> Camera:
         """The camera without its place, in the process's precision."""
         return Camera.create(self.focal_px, self.center_px, self.lens, self.distortion)
+
+
+def coefficients_problem(lens: str, coefficients: Sequence[float]) -> str | None:
+    """What is wrong with a lens's coefficients, in its order; None where nothing is."""
+    kind = LENSES[lens]
+    for name, value in zip(kind.coefficients, coefficients, strict=False):
+        least, most = kind.within.get(name, (-math.inf, math.inf))
+        if not least <= value <= most:
+            allowed = f"from {least:g} to {most:g}" if most < math.inf else f"at least {least:g}"
+            return f"{name} of the lens {lens} must be {allowed}, got {value:g}"
+    return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from pydantic import Field, field_validator, model_validator
 
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import CameraFigures, Lens, unread_keys
+from jaxnav.files.figures import CameraFigures, Lens, coefficients_problem, unread_keys
 from jaxnav.files.ranges import pinhole_problem, placed_within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import (
@@ -40,6 +40,16 @@ _LENS: dict[str, Lens] = {
     "equi": "equidistant",
     "none": "none",
 }
+# Camera models that are lenses: what precedes fu fv pu pv in their intrinsics are coefficients.
+_SPHERES: dict[str, Lens] = {"omni": "omni", "ds": "double_sphere", "eucm": "eucm"}
+_CAMERA_MODELS = ("pinhole", *_SPHERES)
+_LEADING = {"pinhole": (), "omni": ("xi",), "ds": ("xi", "alpha"), "eucm": ("alpha", "beta")}
+_BENT_BY = {
+    "pinhole": tuple(_LENS),
+    "omni": ("radtan", "plumb_bob", "none"),
+    "ds": ("none",),
+    "eucm": ("none",),
+}
 _CAMERA_KEY = re.compile(r"cam(0|[1-9][0-9]?)")
 _TOPIC = re.compile(r"/([^/].*)/image_raw")  # of the camera of that name
 
@@ -61,27 +71,34 @@ class KalibrCamera(ForeignEntry):
 
     @field_validator("camera_model")
     @classmethod
-    def _pinhole(cls, model: str) -> str:
-        if model != "pinhole":
-            raise ValueError(
-                f"must be 'pinhole', got {model!r}: calibrate with pinhole-radtan or pinhole-equi"
-            )
+    def _known_camera(cls, model: str) -> str:
+        if model not in _CAMERA_MODELS:
+            raise ValueError(f"must be one of {', '.join(_CAMERA_MODELS)}, got {model!r}")
         return model
 
     @field_validator("intrinsics")
     @classmethod
-    def _fu_fv_pu_pv(cls, intrinsics: list[float]) -> list[float]:
-        if len(intrinsics) != 4:
-            raise ValueError(f"must be fu fv pu pv, got {len(intrinsics)} numbers")
-        if min(intrinsics[:2]) <= 0:
-            raise ValueError(f"the focal lengths must be > 0, got {intrinsics[:2]}")
+    def _fu_fv_pu_pv(cls, intrinsics: list[float], info: Any) -> list[float]:
+        model = info.data.get("camera_model", "pinhole")
+        leading = _LEADING[model]
+        if len(intrinsics) != len(leading) + 4:
+            expected = " ".join([*leading, "fu fv pu pv"])
+            raise ValueError(f"must be {expected}, got {len(intrinsics)} numbers")
+        *coefficients, fu, fv, _, _ = intrinsics
+        if min(fu, fv) <= 0:
+            raise ValueError(f"the focal lengths must be > 0, got {[fu, fv]}")
+        if leading and (problem := coefficients_problem(_SPHERES[model], coefficients)):
+            raise ValueError(problem)
         return intrinsics
 
     @field_validator("distortion_model")
     @classmethod
-    def _known_lens(cls, model: str) -> str:
-        if model not in _LENS:
-            raise ValueError(f"must be one of {', '.join(_LENS)}, got {model!r}")
+    def _known_lens(cls, model: str, info: Any) -> str:
+        camera_model = info.data.get("camera_model", "pinhole")
+        known = _BENT_BY[camera_model]
+        if model not in known:
+            of_which = "" if camera_model == "pinhole" else f" for camera_model {camera_model}"
+            raise ValueError(f"must be one of {', '.join(known)}{of_which}, got {model!r}")
         return model
 
     @field_validator("distortion_coeffs")
@@ -92,6 +109,8 @@ class KalibrCamera(ForeignEntry):
         if lens == "none" and any(coefficients):
             raise ValueError("must be empty for distortion_model none")
         allowed = {"none": [len(coefficients)], "radtan": [4, 5], "equidistant": [4]}[lens]
+        if info.data.get("camera_model") == "omni":
+            allowed = allowed[:1]
         if len(coefficients) not in allowed:
             expected = " or ".join(map(str, allowed))
             raise ValueError(f"must have {expected} numbers, got {len(coefficients)}")
@@ -99,7 +118,7 @@ class KalibrCamera(ForeignEntry):
 
     @model_validator(mode="after")
     def _fits_the_images(self) -> "KalibrCamera":
-        if problem := pinhole_problem(self.intrinsics, self.resolution):
+        if problem := pinhole_problem(self.intrinsics[-4:], self.resolution):
             raise ValueError(f"intrinsics, resolution: {problem}")
         return self
 
@@ -109,11 +128,18 @@ class KalibrCamera(ForeignEntry):
         T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None,
     ) -> CameraFigures:
         """The camera under a given name at a given place, which Kalibr has calibrated."""
-        lens = _LENS[self.distortion_model]
-        coefficients = [] if lens == "none" else self.distortion_coeffs
+        bend = _LENS[self.distortion_model]
+        lens = _SPHERES.get(self.camera_model, bend)
+        coefficients = [*self.intrinsics[:-4], *(() if bend == "none" else self.distortion_coeffs)]
         sigma = None if T_camera_vehicle is None else PLACED_BY_CALIBRATION
         return CameraFigures.create(
-            name, lens, self.intrinsics, coefficients, self.resolution, T_camera_vehicle, sigma
+            name,
+            lens,
+            self.intrinsics[-4:],
+            coefficients,
+            self.resolution,
+            T_camera_vehicle,
+            sigma,
         )
 
 
@@ -181,13 +207,13 @@ def camchain_text(cameras: Sequence[CameraFigures]) -> str:
     """The cameras as the text of a camchain; a single camera may have no place.
 
     Raises:
-        BadInput: a camera with k3, which Kalibr does not know, or one of several without a place.
+        BadInput: a lens that Kalibr does not know, or one of several cameras without a place.
     """
     data: dict[str, Any] = {}
     Ts: list[np.ndarray] = []
     for index, camera in enumerate(cameras):
         where = f"--to kalibr: {camera.name}"
-        entry: dict[str, Any] = {"cam_overlaps": [], "camera_model": "pinhole"}
+        entry: dict[str, Any] = {"cam_overlaps": [], **_lens_entry(where, camera)}
         if camera.T_camera_vehicle is not None:
             Ts.append(poses.matrix_as_read(camera.T_camera_vehicle))
             entry["T_cam_imu"] = Ts[-1].tolist()
@@ -197,25 +223,36 @@ def camchain_text(cameras: Sequence[CameraFigures]) -> str:
             entry["T_cn_cnm1"] = (
                 Ts[-1] @ poses.matrix(poses.inverse(poses.pose_from_matrix(Ts[-2])))
             ).tolist()
-        coefficients = list(camera.distortion)
-        if camera.lens == "rational":
-            raise BadInput(
-                f"{where}.lens",
-                "is rational, and Kalibr has radtan and equidistant: calibrate again with one",
-            )
-        if camera.lens == "radtan" and coefficients.pop():
-            raise BadInput(
-                f"{where}.distortion",
-                "has k3, and Kalibr's radtan is k1 k2 p1 p2: calibrate again without k3",
-            )
         data[f"cam{index}"] = entry | {
-            "distortion_coeffs": coefficients,
-            "distortion_model": camera.lens,
-            "intrinsics": [*camera.focal_px, *camera.center_px],
             "resolution": list(camera.image_size_px),
             "rostopic": _topic_of(where, camera.name),
         }
     return yaml_text(data)
+
+
+def _lens_entry(where: str, camera: CameraFigures) -> dict[str, Any]:
+    """What a camchain says of a camera's lens."""
+    coefficients = list(camera.distortion)
+    model = next((key for key, lens in _SPHERES.items() if lens == camera.lens), "pinhole")
+    leading, bend = coefficients[: len(_LEADING[model])], coefficients[len(_LEADING[model]) :]
+    if model == "pinhole" and camera.lens not in _LENS:
+        known = ", ".join(["radtan", "equidistant", *list(_SPHERES.values())[:-1]])
+        raise BadInput(
+            f"{where}.lens",
+            f"is {camera.lens}, and Kalibr has {known} and eucm: calibrate again with one",
+        )
+    if camera.lens == "radtan" and bend.pop():
+        raise BadInput(
+            f"{where}.distortion",
+            "has k3, and Kalibr's radtan is k1 k2 p1 p2: calibrate again without k3",
+        )
+    bent_by = "radtan" if model == "omni" else "none"
+    return {
+        "camera_model": model,
+        "distortion_coeffs": bend,
+        "distortion_model": camera.lens if model == "pinhole" else bent_by,
+        "intrinsics": [*leading, *camera.focal_px, *camera.center_px],
+    }
 
 
 def _name_of(topic: str) -> str:

@@ -13,7 +13,7 @@ PhotonVision keeps snapshots of the board and results from them (`observations`)
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -40,12 +40,15 @@ _LENS: dict[str, Lens] = {
     "rational_polynomial": "radtan",
     "equidistant": "equidistant",
 }
-_MODEL: dict[Lens, str] = {
+# ROS's tools hand the coefficients of a rational_polynomial to OpenCV, however many there are.
+_MODEL: dict[str, str] = {
     "none": "plumb_bob",
     "radtan": "plumb_bob",
     "rational": "rational_polynomial",
+    "thin_prism": "rational_polynomial",
     "equidistant": "equidistant",
 }
+_PHOTONVISION_LENSES = ("none", "radtan", "rational")
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 _OPENCV_K = ("camera_matrix", "cameraMatrix", "K")
 _OPENCV_D = ("distortion_coefficients", "distCoeffs", "D")
@@ -219,7 +222,12 @@ class PhotonVisionCamera(MatrixCamera):
 
 
 def camera_info_text(camera: CameraFigures) -> str:
-    """The camera as the text of ROS's camera_info file."""
+    """The camera as the text of ROS's camera_info file.
+
+    Raises:
+        BadInput: a lens that ROS has no name for.
+    """
+    _require_held("ros", "ROS's camera_info knows radtan, rational and equidistant", camera, _MODEL)
     K, D = _pinhole_matrix(camera), _coefficients(camera)
     data = {
         "image_width": camera.image_size_px[0],
@@ -235,7 +243,12 @@ def camera_info_text(camera: CameraFigures) -> str:
 
 
 def opencv_text(camera: CameraFigures) -> str:
-    """The camera as the text of OpenCV's FileStorage file."""
+    """The camera as the text of OpenCV's FileStorage file.
+
+    Raises:
+        BadInput: a lens that OpenCV has no functions for.
+    """
+    _require_held("opencv", "OpenCV knows radtan, rational and its fisheye", camera, _MODEL)
 
     def matrix(name: str, rows: int, cols: int, data: list[float]) -> str:
         numbers = ", ".join(repr(number) for number in data)
@@ -258,13 +271,9 @@ def photonvision_text(camera: CameraFigures) -> str:
     """The camera as PhotonVision's JSON, with no snapshots.
 
     Raises:
-        BadInput: a fisheye lens, which PhotonVision does not know.
+        BadInput: a lens that PhotonVision does not know.
     """
-    if camera.lens == "equidistant":
-        raise BadInput(
-            f"--to photonvision: {camera.name}.lens",
-            "is equidistant, and PhotonVision knows radtan alone: calibrate again with radtan",
-        )
+    _require_held("photonvision", "PhotonVision knows radtan alone", camera, _PHOTONVISION_LENSES)
     width, height = camera.image_size_px
     D = _coefficients(camera)
     data = {
@@ -280,6 +289,14 @@ def photonvision_text(camera: CameraFigures) -> str:
     return json.dumps(data, indent=2) + "\n"
 
 
+def _require_held(to: str, what: str, camera: CameraFigures, lenses: Container[str]) -> None:
+    if camera.lens not in lenses:
+        raise BadInput(
+            f"--to {to}: {camera.name}.lens",
+            f"is {camera.lens}, and {what}: calibrate again with --lens radtan",
+        )
+
+
 def _figures_from_matrices(
     name: str,
     image_size_px: Sequence[int],
@@ -293,7 +310,8 @@ def _figures_from_matrices(
         BadInput: not calibrated, skewed, or a lens with more coefficients than ours.
 
     Returns:
-        The camera; a `radtan` lens with more than five coefficients that matter is `rational`.
+        The camera; a `radtan` lens with more than five coefficients that matter is `rational`,
+        with more than eight `thin_prism`.
     """
     where, K = matrix
     if len(K) != 9:
@@ -311,14 +329,14 @@ def _figures_from_matrices(
         raise BadInput(where, f"{problem} ({sizes})")
     where, coefficients = distortion
     if lens == "radtan" and any(coefficients[5:]):
-        lens = "rational"
+        lens = "thin_prism" if any(coefficients[8:]) else "rational"
     most = LENS_COEFFICIENTS[lens]
     if lens == "equidistant" and len(coefficients) != 4:
         raise BadInput(where, f"must be k1 k2 k3 k4 for a fisheye lens, got {len(coefficients)}")
     if any(coefficients[most:]):
         raise BadInput(
-            where, "has thin prism or tilt coefficients that are not zero: calibrate again with "
-            "eight (rational) or five (plumb_bob, radtan)",
+            where, "has tilt coefficients that are not zero: calibrate again with twelve "
+            "(thin_prism), eight (rational) or five (plumb_bob, radtan)",
         )  # fmt: skip
     for index, value in enumerate(coefficients[:most]):
         if problem := problem_of("distortion", value):
@@ -338,7 +356,8 @@ def _projection(K: list[float]) -> list[float]:
 
 
 def _coefficients(camera: CameraFigures) -> list[float]:
-    """D of a camera: k1 k2 p1 p2 k3 [k4 k5 k6], k1 k2 k3 k4 of a fisheye, zeros without a lens."""
+    """D of a camera: k1 k2 p1 p2 k3 [k4 k5 k6 [s1 s2 s3 s4]], k1 k2 k3 k4 of a fisheye, zeros
+    without a lens."""
     return list(camera.distortion) if camera.lens != "none" else [0.0] * 5
 
 

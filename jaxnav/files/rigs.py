@@ -2,7 +2,8 @@
 
     cameras:
       - name: front
-        lens: equidistant                # none, radtan, rational or equidistant, see models/camera
+        lens: equidistant                # none, radtan, rational, thin_prism, equidistant,
+                                         # omni, double_sphere or eucm, see models/camera
         focal_px: [319.0, 319.0]
         center_px: [401.0, 202.0]        # the centre of the top-left pixel is (0, 0)
         distortion: [0.0, 0.0, 0.0, 0.0] # may be left out: zeros
@@ -33,6 +34,7 @@ from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import (
     CameraFigures,
     Lens,
+    coefficients_problem,
     figures_of_rig,
     rig_from_figures,
 )
@@ -126,6 +128,8 @@ class CameraEntry(Entry):
             raise ValueError(
                 f"must have {expected} coefficients for the lens {lens}, got {len(coefficients)}"
             )
+        if problem := coefficients_problem(lens, coefficients):
+            raise ValueError(problem)
         return coefficients
 
     @model_validator(mode="after")

@@ -96,10 +96,13 @@ def test_ros_own_file_keeps_every_number(tmp_path, capsys):
 
 
 K = np.array([[400.1, 0, 320.12345678901234], [0, 401.0 / 3, 240.0], [0, 0, 1]])
-D = np.array([1 / 3, -2e-7, 1e-20, 5.0, 3e-3, 0.25, 0.0, 1e-9])
+D = np.array([1 / 3, -2e-7, 1e-20, 5.0, 3e-3, 0.25, 0.0, 1e-9, 2e-3, -1 / 7, 3e-3, 5e-4])
 
 
-@pytest.mark.parametrize(("lens", "count"), [("radtan", 5), ("rational", 8), ("equidistant", 4)])
+@pytest.mark.parametrize(
+    ("lens", "count"),
+    [("radtan", 5), ("rational", 8), ("thin_prism", 12), ("equidistant", 4)],
+)
 def test_opencv_reads_what_is_written_and_is_read(tmp_path, lens, count):
     """cv2 of this machine writes the file, and reads ours."""
     path = tmp_path / "cv.yml"
@@ -192,13 +195,15 @@ def test_the_field_is_what_the_map_spans_unless_it_is_told(tmp_path, capsys):
 PROJECT: dict[str, Callable] = {
     "radtan": cv2.projectPoints,
     "rational": cv2.projectPoints,
+    "thin_prism": cv2.projectPoints,
     "equidistant": lambda points, r, t, K, D: cv2.fisheye.projectPoints(points, r, t, K, D),
 }
 
 
 @pytest.mark.parametrize(("to", "lens"), HELD)
 def test_opencv_projects_with_the_numbers_of_the_file_to_our_pixels(tmp_path, to, lens):
-    coefficients = [-0.21, 0.04, 0.003, -0.002, 0.01, 0.1, -0.02, 0.03][: LENS_COEFFICIENTS[lens]]
+    coefficients = [-0.21, 0.04, 0.003, -0.002, 0.01, 0.1, -0.02, 0.03, 2e-3, -1e-3, 3e-3, 5e-4]
+    coefficients = coefficients[: LENS_COEFFICIENTS[lens]]
     camera = CameraFigures.create(
         "c", lens, [410.5, 409.0, 321.25, 239.5], coefficients, (640, 480), np.eye(4)
     )

@@ -20,6 +20,7 @@ from jaxnav.files import poses
 from jaxnav.files.images import decode_image
 from jaxnav.files.rigs import CameraSigma
 from jaxnav.models.rig import PLACED_BY_HAND
+from tests.helpers import seed_texts
 
 QCAR = files.calib_dir() / "qcar"
 LOADERS: dict[str, Callable[[Path], Any]] = {
@@ -272,10 +273,19 @@ BAD_CAMERAS = [
     ({"center_px": [1e300, 1]}, "cameras.front.center_px[0]: must be <= 1e+09, got 1e+300"),
     (
         {"lens": "fisheye"},
-        "cameras.front.lens: must be 'none', 'radtan', 'rational' or 'equidistant'",
+        "cameras.front.lens: must be 'none', 'radtan', 'rational', 'thin_prism', ",
     ),
     ({"distortion": [1, 2, 3]}, "cameras.front.distortion: must have 4 coefficients"),
     ({"lens": "radtan", "distortion": [1] * 3}, "front.distortion: must have 4 or 5 coefficients"),
+    ({"lens": "eucm", "distortion": [0.6]}, "front.distortion: must have 2 coefficients for the"),
+    (
+        {"lens": "double_sphere", "distortion": [0.1, 1.2]},
+        "front.distortion: alpha of the lens double_sphere must be from 0 to 1, got 1.2",
+    ),
+    (
+        {"lens": "omni", "distortion": [-0.1, 0, 0, 0, 0]},
+        "front.distortion: xi of the lens omni must be at least 0, got -0.1",
+    ),
     ({"lens": "none", "distortion": [1]}, "front.distortion: must have 0 coefficients"),
     ({"image_size_px": [820.5, 410]}, "front.image_size_px[0]: must be a whole number, got 820.5"),
     ({"image_size_px": [820, 0]}, "cameras.front.image_size_px[1]: must be >= 1, got 0"),
@@ -483,7 +493,45 @@ def test_a_camchain_may_have_k3(tmp_path):
         data["cam1"] |= {"distortion_model": model, "distortion_coeffs": coefficients}
         camera = files.load_rig(write(tmp_path, data)).cameras
         assert camera.lenses[int(camera.lens_index[1])] == "radtan"
-        np.testing.assert_array_equal(camera.distortion[1], [*coefficients, 0, 0, 0])
+        np.testing.assert_array_equal(camera.distortion[1], [*coefficients, *[0] * 7])
+
+
+def test_a_camchain_may_have_lenses_beside_the_pinhole(tmp_path):
+    path = write(tmp_path, seed_texts.SPHERES)
+    for name, lens, focal_px, coefficients in (
+        ("cam0", "omni", 1200, [1.5, -0.1, 0.02, 0.001, 0.002]),
+        ("cam1", "double_sphere", 380, [-0.2, 0.6]),
+        ("cam2", "eucm", 470, [0.6, 1.1]),
+    ):
+        camera, _ = files.load_camera(path, name)
+        assert camera.lenses == (lens,)
+        np.testing.assert_array_equal(camera.focal_px, [focal_px, focal_px + 1.5])
+        np.testing.assert_array_equal(camera.center_px, [639.7, 524.4])
+        np.testing.assert_array_equal(camera.distortion[: len(coefficients)], coefficients)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("[1.5, 1200", "[1200", "cam0.intrinsics: must be xi fu fv pu pv, got 4 numbers"),
+        ("[1.5, ", "[-0.5, ", "cam0.intrinsics: xi of the lens omni must be at least 0, got -0.5"),
+        ("0.6, 380", "1.6, 380", "cam1.intrinsics: alpha of the lens double_sphere must be from 0"),
+        ("1.1, 470", "1.1, -470", "cam2.intrinsics: the focal lengths must be > 0"),
+        ("model: radtan", "model: equi", "cam0.distortion_model: must be one of radtan, plumb_bob"),
+        (
+            "camera_model: ds",
+            "distortion_model: radtan\n  camera_model: ds",
+            "cam1.distortion_model: must",
+        ),
+        ("0.001, 0.002]", "0.001]", "cam0.distortion_coeffs: must have 4 numbers, got 3"),
+    ],
+)
+def test_a_bad_lens_of_a_camchain_is_named_with_its_key(tmp_path, old, new, expected):
+    assert old in seed_texts.SPHERES
+    line = problem(
+        files.load_camera, write(tmp_path, seed_texts.SPHERES.replace(old, new, 1)), "cam0"
+    )
+    assert expected in line
 
 
 def test_a_camchain_is_chained(tmp_path):
@@ -504,9 +552,16 @@ def test_a_camchain_is_chained(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("camera_model: pinhole", "camera_model: omni", "cam0.camera_model: must be 'pinhole'"),
-        ("camera_model: pinhole", "camera_model: ds", "cam0.camera_model: must be 'pinhole'"),
-        ("camera_model: pinhole", "camera_model: eucm", "cam0.camera_model: must be 'pinhole'"),
+        (
+            "camera_model: pinhole",
+            "camera_model: fov",
+            "cam0.camera_model: must be one of pinhole, omni, ds, eucm, got 'fov'",
+        ),
+        (
+            "camera_model: pinhole",
+            "camera_model: ds",
+            "cam0.intrinsics: must be xi alpha fu fv pu pv, got 4 numbers",
+        ),
         (
             "distortion_model: equi",
             "distortion_model: fov",
@@ -597,8 +652,8 @@ def test_a_camera_is_chosen_by_name(tmp_path):
         ("image_width: 640", "", "image_width: missing"),
         (
             "cols: 5, data: [0.1,",
-            "cols: 9, data: [0.1, 0.2, 0.3, 0.4, 0.5,",
-            "has thin prism or tilt coefficients",
+            "cols: 14, data: [0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0, 0, 0,",
+            "has tilt coefficients that are not zero",
         ),
     ],
 )

@@ -16,7 +16,7 @@ from jaxnav.files.cameras import camera_file
 from jaxnav.files.figures import CameraFigures, MarkerFigures
 from jaxnav.files.markers import MarkerFile
 from jaxnav.files.reading import read_mapping
-from jaxnav.models.camera import LENS_COEFFICIENTS
+from jaxnav.models.lenses import LENSES
 
 QCAR = files.calib_dir() / "qcar"
 
@@ -55,14 +55,13 @@ def written(folder: Path, name: str, text: str) -> Path:
     return folder / name
 
 
+MATRIX_LENSES = ("radtan", "rational", "thin_prism", "equidistant")
 # What holds which lens, of the formats with one camera a file.
 HELD = [
-    *((to, lens) for to in ("ros", "opencv") for lens in ("radtan", "rational", "equidistant")),
+    *((to, lens) for to in ("ros", "opencv") for lens in MATRIX_LENSES),
     ("photonvision", "radtan"),
     ("photonvision", "rational"),
 ]
-
-COEFFICIENTS = st.floats(-10, 10)
 
 
 def numbers(least: float, most: float) -> st.SearchStrategy[float]:
@@ -71,11 +70,15 @@ def numbers(least: float, most: float) -> st.SearchStrategy[float]:
 
 @st.composite
 def a_camera(draw, lens: str, name: str = "front", k3: bool = True) -> CameraFigures:
-    coefficients = [draw(COEFFICIENTS) for _ in range(LENS_COEFFICIENTS[lens])]
+    within = LENSES[lens].within
+    bounds = [within.get(key, (-10.0, 10.0)) for key in LENSES[lens].coefficients]
+    coefficients = [draw(st.floats(least, min(most, 10.0))) for least, most in bounds]
     if lens == "radtan" and not k3:
         coefficients[4] = 0.0
     if lens == "rational" and not any(coefficients[5:]):
         coefficients[5] = 0.5  # or it is radtan
+    if lens == "thin_prism" and not any(coefficients[8:]):
+        coefficients[8] = 0.5  # or it is rational
     q = np.array([draw(st.floats(-1, 1)) for _ in range(4)])
     q = q / np.linalg.norm(q) if np.linalg.norm(q) > 0.1 else np.array([1.0, 0, 0, 0])
     T = np.array([*q, *(draw(numbers(-500, 500)) for _ in range(3))])

@@ -44,6 +44,7 @@ from tests.helpers.seed_texts import (
     PARAMS,
     PHOTONVISION,
     SIMULATED,
+    SPHERES,
     STUDY,
     TAGSLAM,
     WPILIB,
@@ -283,6 +284,7 @@ STRUCTURED = {
     "Kalibr camera": Loader(
         _written("chain.yaml", KALIBR), lambda path: files.load_camera(path, "cam1")
     ),
+    "Kalibr spheres": Loader(_written("chain.yaml", SPHERES), _cameras),
     "Kalibr chain": Loader(_written("chain.yaml", KALIBR), _cameras),
     "WPILib": Loader(_written("layout.json", WPILIB), _layout),
     "camera_info": Loader(_written("camera.yaml", CAMERA_INFO), files.load_camera),

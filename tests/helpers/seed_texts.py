@@ -18,6 +18,22 @@ cam1:
   resolution: [640, 480]
   T_cn_cnm1: [[0, 0, 1, 0.5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
 """
+SPHERES = """
+cam0:
+  camera_model: omni
+  distortion_model: radtan
+  distortion_coeffs: [-0.1, 0.02, 0.001, 0.002]
+  intrinsics: [1.5, 1200, 1201.5, 639.7, 524.4]
+  resolution: [1280, 1024]
+cam1:
+  camera_model: ds
+  intrinsics: [-0.2, 0.6, 380, 381.5, 639.7, 524.4]
+  resolution: [1280, 1024]
+cam2:
+  camera_model: eucm
+  intrinsics: [0.6, 1.1, 470, 471.5, 639.7, 524.4]
+  resolution: [1280, 1024]
+"""
 CAMERA_INFO = """
 image_width: 640
 image_height: 480

@@ -18,7 +18,8 @@ from jaxnav.files import Params, Route
 from jaxnav.files.markers import marker_map
 from jaxnav.loop.health import Timeouts
 from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.models.camera import Camera
+from jaxnav.models.lenses import LENSES
 from jaxnav.models.rig import CameraRig
 from jaxnav.parameters import parameters_of
 from jaxnav.recording.drive_format import decode, encode
@@ -53,12 +54,19 @@ small = st.floats(-10, 10)
 positive = st.floats(0.01, 100)
 quaternions = st.lists(st.floats(-0.4, 0.4), min_size=4, max_size=4)
 poses = st.tuples(quaternions, st.lists(small, min_size=3, max_size=3))
-cameras = st.sampled_from(sorted(LENS_COEFFICIENTS)).flatmap(
+cameras = st.sampled_from(sorted(LENSES)).flatmap(
     lambda lens: st.tuples(
         st.tuples(st.floats(66, 6e4), st.floats(66, 6e4)),
         st.tuples(st.floats(-60, 120), st.floats(-60, 120)),
         st.just(lens),
-        st.lists(small, min_size=LENS_COEFFICIENTS[lens], max_size=LENS_COEFFICIENTS[lens]),
+        st.tuples(
+            *(
+                st.floats(least, min(most, 10))
+                for least, most in (
+                    LENSES[lens].within.get(name, (-10, 10)) for name in LENSES[lens].coefficients
+                )
+            )
+        ),
     )
 )
 sizes_px = st.tuples(st.integers(60, 65536), st.integers(60, 65536))
@@ -239,7 +247,7 @@ def _without(header: dict, key: str) -> dict:
         ),
         (
             lambda h: h | {"rig": {"cameras": [h["rig"]["cameras"][0] | {"lens": "fish"}]}},
-            "rig.cameras.front.lens: must be 'none', 'radtan', 'rational' or 'equidistant'",
+            "rig.cameras.front.lens: must be 'none', 'radtan', 'rational', 'thin_prism', ",
         ),
         (
             lambda h: h | {"route": h["route"] | {"start_pose": [1.0]}},

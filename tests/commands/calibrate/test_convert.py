@@ -74,7 +74,7 @@ def test_a_camera_comes_back_bit_for_bit(to, lens):
 @settings(drawn, max_examples=40)
 @given(st.data())
 def test_a_rig_goes_through_a_camchain_bit_for_bit(data):
-    lenses = [lens for lens in LENS_COEFFICIENTS if lens != "rational"]
+    lenses = [lens for lens in LENS_COEFFICIENTS if lens not in ("rational", "thin_prism")]
     lenses = data.draw(st.lists(st.sampled_from(lenses), min_size=1, max_size=3))
     rig = [data.draw(a_camera(lens, f"c/{n}", k3=False)) for n, lens in enumerate(lenses)]
     with tempfile.TemporaryDirectory() as name:

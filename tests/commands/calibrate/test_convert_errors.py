@@ -33,7 +33,11 @@ def camera(lens: str, distortion: list[float] | None = None, name: str = "front"
 
 REFUSED = [
     (camera("radtan", [0.1, 0, 0, 0, 0.2]), "kalibr", "front.distortion: has k3, and Kalibr's"),
-    (camera("rational"), "kalibr", "front.lens: is rational, and Kalibr has radtan and"),
+    (camera("rational"), "kalibr", "front.lens: is rational, and Kalibr has radtan, equidistant, "),
+    (camera("thin_prism"), "kalibr", "front.lens: is thin_prism, and Kalibr has radtan, equid"),
+    (camera("omni"), "ros", "--to ros: front.lens: is omni, and ROS's camera_info knows radtan"),
+    (camera("double_sphere"), "opencv", "front.lens: is double_sphere, and OpenCV knows radtan"),
+    (camera("eucm"), "photonvision", "front.lens: is eucm, and PhotonVision knows radtan alone"),
     (camera("equidistant"), "photonvision", "front.lens: is equidistant, and PhotonVision knows"),
     (camera("none"), "jaxnav", "is jaxnav's already: nothing to convert"),
     (camera("none"), "wpilib", "holds cameras, and a WPILib layout holds markers"),
