@@ -103,7 +103,7 @@ def _unseen_sides(fit: LensFit) -> list[str]:
 def advice(fit: LensFit) -> tuple[str, ...]:
     """Sentences on what to collect next, or one that says that nothing is missing."""
     said = []
-    focal = float(np.max(fit.sigma[:2] / fit.parameters[:2]))
+    focal = float(np.max(fit.focal_sigma))
     center_px = float(np.max(fit.sigma[2:4]))
     views = int(np.sum(fit.view_weights > 0))
     tilt_deg, _ = tilts_deg(fit)

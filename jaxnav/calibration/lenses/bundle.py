@@ -25,9 +25,12 @@ from jaxnav.numerics.levenberg_marquardt import LMState
 from jaxnav.numerics.schur import Blocks, SchurLM, reduce
 
 # Names of the shared unknowns, in order; unknowns that a lens doesn't have are fixed at zero.
-FITTED = ("none", "radtan", "equidistant")
+FITTED = ("none", "radtan", "equidistant", "omni", "double_sphere", "eucm")
+TRIED = ("none", "radtan", "equidistant")  # where nobody asks for one: each costs a fit
 NAMES = {lens: ("fx", "fy", "cx", "cy", *LENSES[lens].coefficients) for lens in FITTED}
 COUNT = 9
+_ABOVE_ZERO = dict.fromkeys(("fx", "fy"), (0.0, np.inf))
+_BOUNDS = {lens: _ABOVE_ZERO | dict(LENSES[lens].within) for lens in FITTED}
 NO_CUT = 1e8  # in sigmas: plain least squares
 _BATCH = 16  # views are padded to a multiple of this, so that few sizes are compiled
 
@@ -67,6 +70,19 @@ def camera_of(lens: str, parameters: Float[Array, " 9"]) -> Camera:
     """The camera with these nine parameters."""
     coefficients = jnp.pad(parameters[4:], (0, MOST_COEFFICIENTS + 4 - COUNT))
     return Camera(parameters[:2], parameters[2:4], coefficients, jnp.asarray(0), (lens,))
+
+
+@partial(jax.jit, static_argnames="lens")
+def axis_px(lens: str, parameters: Float[Array, " 9"]) -> tuple[Float[Array, " 2"], Array]:
+    """`Camera.axis_px`, and its derivatives (2, 9) by the nine.
+
+    Of a lens with xi, views tell fx and fy much worse: that coefficient makes up for them.
+    """
+
+    def on_axis(parameters: Array) -> Array:
+        return camera_of(lens, parameters).axis_px
+
+    return on_axis(parameters), jax.jacfwd(on_axis)(parameters)
 
 
 def padded_corners(views: BoardViews) -> BoardCorners:
@@ -144,7 +160,9 @@ def _solved(
 
     solution: optx.Solution = optx.least_squares(
         fn,
-        SchurLM(rtol=1e-12, atol=1e-12, norm=optx.max_norm, retract=_moved, free=free),
+        SchurLM(
+            rtol=1e-12, atol=1e-12, norm=optx.max_norm, retract=partial(_moved, lens), free=free
+        ),
         start,
         has_aux=True,
         max_steps=100,
@@ -258,8 +276,12 @@ def normal_equations(
     )
 
 
-def _moved(y: LensUnknowns, own: Array, shared: Array) -> LensUnknowns:
-    # A negative focal length would mirror the image, so a step at most halves it.
-    lens = y.lens + shared
-    lens = lens.at[:2].set(jnp.maximum(lens[:2], y.lens[:2] / 2))
-    return LensUnknowns(lens, retracted(y.Ts_camera_board, own))
+def _moved(lens: str, y: LensUnknowns, own: Array, shared: Array) -> LensUnknowns:
+    # A negative focal length would mirror the image, and formulas have bounds: a step goes at most
+    # half the way to one.
+    anywhere = -np.inf, np.inf
+    bounds = [_BOUNDS[lens].get(name, anywhere) for name in NAMES[lens]]
+    bounds += [anywhere] * (COUNT - len(bounds))
+    least, most = jnp.asarray(bounds, y.lens.dtype).T
+    moved = jnp.clip(y.lens + shared, (y.lens + least) / 2, (y.lens + most) / 2)
+    return LensUnknowns(moved, retracted(y.Ts_camera_board, own))

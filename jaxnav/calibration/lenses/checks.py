@@ -27,7 +27,7 @@ def border_px(image_size_px: tuple[int, int]) -> Float[np.ndarray, "N 2"]:
 def rim_sigma_px(fit: LensFit) -> float:
     """The largest standard deviation of a ray's projection at the image's border, px.
 
-    It counts focal length and radial coefficients alone: the camera's direction makes up for an
+    It counts all but the centre and tangential coefficients: the camera's direction makes up for an
     error of the centre. It is infinite where the fitted lens doesn't reach the image's border.
     """
     pixels = border_px(fit.views.image_size_px)
@@ -36,7 +36,7 @@ def rim_sigma_px(fit: LensFit) -> float:
     )
     if np.max(np.abs(drawn_px - pixels)) > 1:
         return np.inf
-    radial = np.array([name[0] in "fk" for name in fit.names], float)
+    radial = np.array([name[0] not in "cp" for name in fit.names], float)
     J = J[..., : len(radial)] * radial
     covariance = fit.covariance[: len(radial), : len(radial)]
     squared = np.einsum("nci,ij,ncj->n", J, covariance, J)

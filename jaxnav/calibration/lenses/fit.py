@@ -86,6 +86,13 @@ class LensFit:
         return np.sqrt(np.diag(self.covariance))
 
     @property
+    def focal_sigma(self) -> Float[np.ndarray, " 2"]:
+        """(2,) standard deviations of the focal lengths on the axis, over these."""
+        on_axis_px, J = lens_bundle.axis_px(self.lens, jnp.asarray(self.parameters, float))
+        variance = np.einsum("ci,ij,cj->c", J, self.covariance, J)
+        return np.asarray(np.sqrt(variance) / np.abs(on_axis_px))
+
+    @property
     def rms_px(self) -> float:
         """RMS distance of the corners in the fit from their predictions, as OpenCV defines it."""
         return float(np.sqrt(np.mean(np.sum(self.residual_px[self.used] ** 2, axis=-1))))

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxnav.calibration.boards.board import Board
 from jaxnav.calibration.boards.images import Bar, CollectedViews, collect_views
-from jaxnav.calibration.lenses.bundle import FITTED
+from jaxnav.calibration.lenses.bundle import TRIED
 from jaxnav.calibration.lenses.fit import LensFit, fit_lens
 from jaxnav.calibration.lenses.intrinsics import (
     FEWEST_VIEWS,
@@ -74,7 +74,7 @@ def _camera_of_marker(
         if len(views.views) < FEWEST_VIEWS:
             return seen_by
         fits = []
-        for one in FITTED if lens == "auto" else (lens,):
+        for one in TRIED if lens == "auto" else (lens,):
             start = before.parameters if before is not None and before.lens == one else None
             fits.append(fit_lens(views, one, start=start))
         best = within_reach(min(fits, key=lambda fit: fit.sigma_px), tell)

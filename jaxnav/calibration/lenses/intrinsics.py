@@ -44,6 +44,9 @@ _LAST_FIRST = {
     "none": (),
     "radtan": ("k3", "k2", "k1"),
     "equidistant": ("k4", "k3", "k2", "k1"),
+    "omni": ("k2", "k1"),
+    "double_sphere": ("xi",),
+    "eucm": (),
 }
 
 
@@ -88,7 +91,7 @@ def calibrate_lens(
     """Calibrate the lens that explains the views best.
 
     Args:
-        lens: "none", "radtan", "equidistant", or "auto" for the one best at unseen views.
+        lens: one of `bundle.FITTED`, or "auto" for that of `bundle.TRIED` best at unseen views.
         max_views: the most views to fit; those that tell most are taken.
         where: the source of the views as the user gave it, for messages.
         tell: called with a word for every stage.
@@ -99,7 +102,7 @@ def calibrate_lens(
     """
     good, left_out = screened(views)
     _require_views(good, {**left_out, **gone}, where)
-    lenses = lens_bundle.FITTED if lens == "auto" else (lens,)
+    lenses = lens_bundle.TRIED if lens == "auto" else (lens,)
     tell("start")
     starts = {one: lens_start(good, one) for one in lenses}
     rough = min(starts, key=lambda one: starts[one][1])
@@ -112,7 +115,7 @@ def calibrate_lens(
     chosen = informative(good, rough, starts[rough][0], max_views)
     good = replace(good, views=tuple(good.views[i] for i in chosen))
     fits = {}
-    for one in sorted(lens_bundle.FITTED, key=lambda one: one not in lenses):
+    for one in dict.fromkeys((*lenses, *lens_bundle.TRIED)):
         if one in lenses or len(good.views) >= lens_comparison.FEWEST_VIEWS:
             tell(f"fit {one}")
             start = starts[one][0] if one in starts else None
@@ -233,7 +236,7 @@ def _require_sound(fit: LensFit, where: str) -> None:
             f"the board is parallel to itself in all views, within {spread_deg:.1f} deg, so focal "
             "length and distance can't be told apart: tilt it by 30 to 45 deg, to all sides",
         )
-    if not _relative_focal(fit) < _NO_FOCAL:
+    if not float(np.max(fit.focal_sigma)) < _NO_FOCAL:
         raise BadInput(
             where,
             "the views don't tell the focal length at all: tilt the board by 30 to 45 deg, to all "
@@ -241,14 +244,9 @@ def _require_sound(fit: LensFit, where: str) -> None:
         )
 
 
-def _relative_focal(fit: LensFit) -> float:
-    """The larger of the relative sigmas of the two focal lengths."""
-    return float(np.max(fit.sigma[:2] / np.abs(fit.parameters[:2])))
-
-
 def _require_observed(fit: LensFit, better: str, where: str) -> None:
     width = fit.views.image_size_px[0]
-    relative = _relative_focal(fit)
+    relative = float(np.max(fit.focal_sigma))
     if not relative < _WRONG_LENS_FOCAL * np.sqrt(fit.inflation) and better != fit.lens:
         raise BadInput(
             where,

@@ -22,6 +22,8 @@ _FOCALS = np.geomspace(0.2, 3.0, 14)  # in image widths: 140 degrees and more, t
 _MOST_VIEWS = 24  # OpenCV's time grows with the cube of their number
 _WIDEST = np.tan(np.deg2rad(80.0))  # from the middle of a view; steeper rays weigh too much
 _FEWEST = 4  # points a pose can be found from
+# Coefficients of wide lenses that OpenCV does not calibrate, typical ones; others start at zero.
+_TYPICAL = {"omni": (1.0,), "double_sphere": (0.0, 0.6), "eucm": (0.6, 1.0)}
 
 
 def lens_start(views: BoardViews, lens: str) -> tuple[Float[np.ndarray, " 9"], float]:
@@ -32,9 +34,13 @@ def lens_start(views: BoardViews, lens: str) -> tuple[Float[np.ndarray, " 9"], f
     some = np.unique(np.linspace(0, len(views.views) - 1, _MOST_VIEWS).round().astype(int))
     few = BoardViews(views.points_board_m, views.image_size_px, tuple(views.views[i] for i in some))
     width, height = views.image_size_px
-    middle = [(width - 1) / 2, (height - 1) / 2, *[0.0] * 5]
-    guesses = [np.array([f * width, f * width, *middle]) for f in _FOCALS]
-    candidates = [*guesses, *_opencv(few, lens)]
+    guess = np.zeros(lens_bundle.COUNT)
+    typical = _TYPICAL.get(lens, ())
+    guess[: 4 + len(typical)] = [1.0, 1.0, (width - 1) / 2, (height - 1) / 2, *typical]
+    on_axis_px, _ = lens_bundle.axis_px(lens, jnp.asarray(guess))
+    guesses = np.tile(guess, (len(_FOCALS), 1))
+    guesses[:, :2] = _FOCALS[:, None] * width / np.asarray(on_axis_px)
+    candidates = [*guesses, *(() if typical else _opencv(few, lens))]
     misfits_px = [_misfit_px(few, lens, candidate) for candidate in candidates]
     best = int(np.argmin(misfits_px))
     return candidates[best], misfits_px[best]

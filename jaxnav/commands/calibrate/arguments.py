@@ -143,8 +143,9 @@ class CalibrateIntrinsics(Headless):
     """Images, folders of images, videos. Of several cameras at once: front=DIR left=DIR ..."""
     board: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """The board: board.yaml of `jaxnav calibrate board`, or Kalibr's."""
-    lens: Literal["auto", "radtan", "equidistant", "none"] = "auto"
-    """The lens model; auto takes whichever explains pictures best that it was not fitted to."""
+    lens: Literal["auto", "radtan", "equidistant", "omni", "double_sphere", "eucm", "none"] = "auto"
+    """The lens model; auto takes radtan, equidistant or none, whichever explains pictures best that
+    it was not fitted to."""
     name: str = "camera"
     """Of the camera, where the sources don't say it."""
     max_views: int = 100

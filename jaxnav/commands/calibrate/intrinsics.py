@@ -103,7 +103,8 @@ def _entry(name: str, calibration: LensCalibration, placed: CameraEntry | None) 
         "distortion": fit.parameters[coefficients].tolist(),
         "image_size_px": list(fit.views.image_size_px),
         "sigma": CameraSigma(
-            focal_px=fit.sigma[:2].tolist(),
+            # Of the focal length on the axis: what xi makes up for does not move an image.
+            focal_px=(fit.parameters[:2] * fit.focal_sigma).tolist(),
             center_px=fit.sigma[2:4].tolist(),
             distortion=fit.sigma[coefficients].tolist() or None,
             position_m=before.position_m,
@@ -198,7 +199,7 @@ def _text(name: str, calibration: LensCalibration, collected: CollectedViews) ->
     for number, parameter in enumerate(fit.names):
         value, sigma = fit.parameters[number], fit.sigma[number]
         sure = "held at zero" if parameter in fit.fixed else f"+- {sigma:.2g}"
-        lines.append(f"  {parameter:>2} {value:12.6g} {sure}")
+        lines.append(f"  {parameter:>5} {value:12.6g} {sure}")
     lines += [f"  left out: {view}: {why}" for view, why in calibration.left_out.items()]
     lines += [f"  left out: {view}: {why}" for view, why in collected.unreadable]
     lines += [f"  left out: {view}: repeats {twin}" for view, twin in collected.duplicates]

@@ -9,6 +9,7 @@ from scipy import stats
 
 from jaxnav.calibration.lenses import start as lens_start
 from jaxnav.calibration.lenses.board_shape import check_board
+from jaxnav.calibration.lenses.checks import rim_sigma_px
 from jaxnav.calibration.lenses.choice import informative
 from jaxnav.calibration.lenses.fit import fit_lens
 from jaxnav.calibration.lenses.intrinsics import calibrate_lens
@@ -23,13 +24,17 @@ TRUTHS = {
     "none": (600.0, 600.0, 411.0, 212.0),
     "radtan": (619.0, 620.0, 411.0, 212.0, -0.25, 0.08, 1e-3, -5e-4, 0.01),
     "equidistant": (319.0, 320.0, 401.0, 202.0, 0.01, -5e-3, 2e-3, -4e-4),
+    "omni": (600.0, 602.0, 401.0, 202.0, 0.9, -0.05, 0.01, 1e-3, -5e-4),
+    "double_sphere": (280.0, 281.0, 401.0, 202.0, -0.12, 0.58),
+    "eucm": (319.0, 320.0, 401.0, 202.0, 0.62, 1.1),
 }
+WIDE = ("equidistant", "omni", "double_sphere", "eucm")
 
 
 def views_of(lens, seed=0, count=16, points_m=POINTS_M, **how):
     truth = TRUTHS[lens]
     camera = Camera.create(truth[:2], truth[2:4], lens, truth[4:])
-    how = {"distances_m": (0.15, 0.5) if lens == "equidistant" else (0.25, 0.8)} | how
+    how = {"distances_m": (0.15, 0.5) if lens in WIDE else (0.25, 0.8)} | how
     rng = np.random.default_rng(seed)
     return simulated_views(camera, SIZE_PX, points_m, count, rng, SIGMA_PX, **how)
 
@@ -115,6 +120,26 @@ def test_the_lens_is_told_by_views_it_was_not_fitted_to(lens) -> None:
     assert found.fit.lens == lens
     assert not found.fit.fixed
     assert found.held_out_px[lens] == pytest.approx(SIGMA_PX, rel=0.15)
+
+
+@pytest.mark.parametrize("lens", WIDE[1:])
+def test_a_wide_lens_of_another_kind_is_fitted_where_it_is_asked_for(lens) -> None:
+    """From no start, to within its sigmas; nothing keeps it from the true values."""
+    truth = np.array(TRUTHS[lens])
+    fit = fit_lens(views_of(lens, seed=1)[0], lens)
+    known = len(truth)
+    assert fit.converged
+    assert np.all(fit.view_weights == 1)
+    assert fit.sigma_px == pytest.approx(SIGMA_PX, rel=0.1)
+    error = fit.parameters[:known] - truth
+    assert np.all(np.abs(error) < 4 * fit.sigma[:known])
+    # The focal length on the axis is known, whatever xi makes up for in the figure of the file.
+    camera = Camera.create(truth[:2].tolist(), truth[2:4].tolist(), lens, truth[4:].tolist())
+    on_axis = np.asarray(fit.camera.axis_px) / np.asarray(camera.axis_px)
+    assert np.all(np.abs(on_axis - 1) < 4 * fit.focal_sigma)
+    assert np.all(fit.focal_sigma < 0.002)
+    assert np.isfinite(rim_sigma_px(fit))
+    assert rim_sigma_px(fit) < 0.5
 
 
 def test_a_lens_that_does_not_fit_is_said_to() -> None:

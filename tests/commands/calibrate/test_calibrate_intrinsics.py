@@ -22,6 +22,7 @@ from jaxnav.commands.calibrate.board import write_board
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.reading import read_mapping
+from jaxnav.models.camera import Camera
 from jaxnav.simulation.boards import BoardRenderer
 from jaxnav.simulation.sensor import Sensor
 
@@ -33,11 +34,11 @@ BOARD = Board("charuco", 7, 6, 0.04, marker_m=0.03, family="4x4_50")
 MARKER = Board("marker", 1, 1, 0.12, family="tag36h11", first_id=4)
 
 
-def rendered(folder, board, count, seed, **how):
-    """Images of a board by the QCar's front camera, 0.png and so on."""
+def rendered(folder, board, count, seed, camera=None, **how):
+    """Images of a board by the QCar's front camera, or another, 0.png and so on."""
     folder.mkdir()
     rig = load_rig(QCAR)
-    camera, size_px = rig.camera(0), rig.image_sizes_px[0]
+    camera, size_px = camera or rig.camera(0), rig.image_sizes_px[0]
     sheet = sheet_of(board)
     renderer = BoardRenderer(camera, size_px, sheet.ink, sheet.module_m, Sensor(psf_sigma_px=0.5))
     rng = np.random.default_rng(seed)
@@ -80,7 +81,8 @@ def test_rendered_images_become_a_rig_with_its_sigmas(shots, tmp_path, capsys) -
     assert report["data_sha256"] == data["calibrated"]["data_sha256"]
     front = report["cameras"]["front"]
     assert front["parameters"]["fx"]["value"] == data["cameras"][0]["focal_px"][0]
-    assert front["parameters"]["fx"]["sigma"] == data["cameras"][0]["sigma"]["focal_px"][0]
+    of_fx = data["cameras"][0]["sigma"]["focal_px"][0]
+    assert front["parameters"]["fx"]["sigma"] == pytest.approx(of_fx, rel=1e-12)
     assert front["views"]["given"] == VIEWS
     assert 0 < front["corner_sigma_px"] < 0.05
     assert sum(map(sum, front["coverage"]["corners_in_cells"])) == front["corners"]
@@ -90,6 +92,30 @@ def test_rendered_images_become_a_rig_with_its_sigmas(shots, tmp_path, capsys) -
     out = capsys.readouterr().out
     assert "front: equidistant" in out
     assert "next: take more views" in out
+
+
+@pytest.mark.parametrize(
+    ("lens", "focal_px", "coefficients"),
+    [
+        ("omni", 606.0, [0.9, -0.05, 0.01, 1e-3, -5e-4]),
+        ("double_sphere", 280.0, [-0.12, 0.58]),
+        ("eucm", 319.0, [0.62, 1.1]),
+    ],
+)
+def test_rendered_images_of_another_wide_lens_tell_it(tmp_path, lens, focal_px, coefficients):
+    """In the file that `load_rig` and the other commands take."""
+    camera = Camera.create((focal_px, focal_px), (401.0, 202.0), lens, coefficients)
+    write_board(tmp_path / "board.yaml", BOARD)
+    rendered(tmp_path / "front", BOARD, VIEWS, seed=3, camera=camera)
+    args = arguments(tmp_path, tmp_path / "out", f"front={tmp_path / 'front'}", lens=lens)
+    assert calibrate_intrinsics.run(args) == 0
+    found = load_rig(tmp_path / "out" / "camera.yaml").camera(0)
+    sigma = read_mapping(tmp_path / "out" / "camera.yaml")["cameras"][0]["sigma"]
+    relative = np.array(sigma["focal_px"]) / np.asarray(found.focal_px)
+    ratio = np.asarray(found.axis_px) / np.asarray(camera.axis_px)
+    assert np.all(np.abs(ratio - 1) < 4 * relative)
+    assert np.all(relative < 2e-3)
+    np.testing.assert_allclose(found.center_px, camera.center_px, atol=0.5)
 
 
 def test_a_camera_that_the_rig_does_not_have_is_refused(shots, tmp_path) -> None:
