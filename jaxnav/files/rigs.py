@@ -238,10 +238,19 @@ def save_rig(
     Raises:
         BadInput: the file can't be written.
     """
+    atomic_write(path, rig_file_text(rig, calibrated, sigmas))
+
+
+def rig_file_text(
+    rig: CameraRig,
+    calibrated: Calibrated | None = None,
+    sigmas: Sequence[CameraSigma] | None = None,
+) -> str:
+    """What `save_rig` writes."""
     data = rig_data(rig)
     for entry, sigma in zip(data["cameras"], sigmas or (), strict=bool(sigmas)):
         entry["sigma"] = entry.get("sigma", {}) | sigma.model_dump(exclude_none=True)
-    atomic_write(path, yaml_text(with_provenance(data, calibrated)))
+    return yaml_text(with_provenance(data, calibrated))
 
 
 def with_provenance(data: dict[str, Any], calibrated: Calibrated | None) -> dict[str, Any]:

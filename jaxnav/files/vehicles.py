@@ -166,11 +166,20 @@ def save_vehicle(
     Raises:
         BadInput: the file can't be written.
     """
+    atomic_write(path, vehicle_file_text(vehicle, calibrated, sigma))
+
+
+def vehicle_file_text(
+    vehicle: Vehicle,
+    calibrated: Calibrated | None = None,
+    sigma: Mapping[str, float] | None = None,
+) -> str:
+    """What `save_vehicle` writes."""
     data = vehicle_data(vehicle)
     if sigma:
         found = {name: float(value) for name, value in sigma.items()}
         data["sigma"] = data.get("sigma", {}) | found
-    atomic_write(path, yaml_text(with_provenance(data, calibrated)))
+    return yaml_text(with_provenance(data, calibrated))
 
 
 def load_route(path: str | Path) -> Route:

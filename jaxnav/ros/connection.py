@@ -41,10 +41,13 @@ def message_type(kind: str) -> Any:
     """The class of a message or service, by a name such as nav_msgs/msg/Odometry.
 
     Raises:
-        ImportError: its package is not there.
+        ImportError: its package is not there, or is an older one without it.
     """
     package, group, name = kind.split("/")
-    return getattr(importlib.import_module(f"{package}.{group}"), name)
+    module = importlib.import_module(f"{package}.{group}")
+    if not hasattr(module, name):
+        raise ImportError(f"{package} has no {name}")
+    return getattr(module, name)
 
 
 class Connection:

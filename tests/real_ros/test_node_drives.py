@@ -4,11 +4,12 @@ import math
 import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaxnav.files import calib_dir
+from jaxnav.files import calib_dir, load_rig, load_vehicle
 from jaxnav.files.poses import compose
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY
@@ -113,6 +114,7 @@ def test_it_drives_to_the_goal_and_tells_everybody_where_it_is(tmp_path, listene
         # It stays where it has arrived, and goes on to say where that is.
         listener.forget()
         until(lambda: len(listener.heard["/jaxnav/pose"]) > 20, 20.0, program)
+        check_saved(listener, tmp_path)
         reset = "std_srvs/srv/Trigger", "/jaxnav/reset", {}
         check_begun_anew(listener, *reset)
         load = "jaxnav_msgs/srv/LoadMarkers", "/jaxnav/load_markers"
@@ -197,6 +199,24 @@ def check_begun_anew(listener: Listener, kind: str, name: str, values: dict) -> 
     assert answer.success, answer.message
     listener.forget()
     until(listener.decided, 60.0)
+
+
+def check_saved(listener: Listener, folder: Path) -> None:
+    """What the drive has learnt is in new files, surer than the old ones, and never over others."""
+    save = "jaxnav_msgs/srv/Save", "/jaxnav/save"
+    (folder / "learnt").mkdir()
+    saved = answer_of(listener, *save, {"folder": "learnt"})
+    assert saved.success, saved.message
+    assert saved.message.startswith(f"rig.yaml, vehicle.yaml in {folder}/learnt: ")
+    assert "calibrated:" in (folder / "learnt/rig.yaml").read_text()
+    old, new = calib_dir() / "qcar", folder / "learnt"
+    turns = (load_rig(at / "rig.yaml").extrinsics_sigma[:, 3:] for at in (new, old))
+    assert np.all(np.less_equal(*turns))
+    of_sensors = (load_vehicle(at / "vehicle.yaml").sensor_sigma for at in (new, old))
+    assert np.all(np.less_equal(*of_sensors))
+    assert not answer_of(listener, *save, {"folder": "learnt"}).success
+    wrong = answer_of(listener, *save, {"folder": "none"})
+    assert wrong.message == f"save: there is no folder {folder}/none"
 
 
 def test_it_drives_by_the_time_of_a_simulation_and_by_lenses_that_topics_tell(tmp_path, listener):

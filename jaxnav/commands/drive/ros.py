@@ -8,6 +8,7 @@ deactivate   stops the vehicle and leaves the topics
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -76,13 +77,13 @@ class _Node:
         given = self._node.declare_parameter("file", "").value
         self._file = str(args.file or given)
         self._timer = self._node.create_timer(_LOOK_S, self._look)
-        serve = self._node.create_service
-        serve(message_type("std_srvs/srv/Trigger"), "~/reset", self._reset)
-        try:
-            kind = message_type("jaxnav_msgs/srv/LoadMarkers")
-        except ImportError:  # our messages were not built
-            return
-        serve(kind, "~/load_markers", self._load_markers)
+        for kind, name, answer in (
+            ("std_srvs/srv/Trigger", "~/reset", self._reset),
+            ("jaxnav_msgs/srv/LoadMarkers", "~/load_markers", self._load_markers),
+            ("jaxnav_msgs/srv/Save", "~/save", self._save),
+        ):
+            with suppress(ImportError):  # our messages were not built, or older ones
+                self._node.create_service(message_type(kind), name, answer)
 
     def begin(self) -> None:
         """Configure and activate.
@@ -176,6 +177,16 @@ class _Node:
             return response
         file = prepared.file.with_markers(str(request.path))
         return self._anew("another map", lambda: self._prepare(file), response)
+
+    def _save(self, request: Any, response: Any) -> Any:
+        """Write what the drive has learnt into new files."""
+        try:
+            if self._activity is None:
+                raise BadInput("save", "the node is not active")
+            response.success, response.message = True, self._activity.save(str(request.folder))
+        except BadInput as error:
+            response.success, response.message = False, str(error)
+        return response
 
     def _anew(self, why: str, change: Callable[[], None], response: Any) -> Any:
         """Stop, change something, and go on if it was active before; what fails changes nothing."""

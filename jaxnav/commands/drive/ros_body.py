@@ -115,6 +115,10 @@ class _Tracking:
             thread.join(1.0)
         self._tracker.close()
 
+    def save(self, folder: str) -> str:
+        """See `Activity`."""
+        raise BadInput("save", "a rig that moves freely learns nothing of its cameras")
+
     def _look(self, index: int) -> None:
         try:
             while not self._over.is_set():

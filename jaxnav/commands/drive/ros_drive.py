@@ -9,6 +9,7 @@ from typing import Any
 
 from jaxnav.commands.drive.arguments import Ros, Run
 from jaxnav.commands.drive.observers import DriveRecorder
+from jaxnav.commands.drive.ros_save import LearntKeeper
 from jaxnav.commands.drive.ros_setup import (
     Activity,
     Say,
@@ -102,10 +103,11 @@ class PreparedDrive:
         pilot = setup.pilot(step_folder())
         pilot.warm_up()
         reporter = _Reporter(self._publisher, self.file.base_x_m)
-        observers: list[Any] = [reporter, *self._record()]
+        keeper = LearntKeeper(self.file, setup)
+        observers: list[Any] = [reporter, keeper, *self._record()]
         if self._inputs is not None:
             return _Playing(
-                self._inputs, pilot, observers, self._connection, self._args.rate, self._say
+                self._inputs, pilot, observers, keeper, self._connection, self._args.rate, self._say
             )
         guarding = guarding_process(self._run)
         if guarding is not None:
@@ -121,7 +123,7 @@ class PreparedDrive:
             now_ns=self._connection.now_ns,
         )
         run = partial(drive.run, pilot, self._searches, observers)
-        return _Driving(drive, run, observers, self._say)
+        return _Driving(drive, run, observers, keeper, self._say)
 
     def close(self) -> None:
         """Leave the topics."""
@@ -142,8 +144,16 @@ class PreparedDrive:
 class _Driving:
     """A drive in a thread of its own. Implements `Activity`."""
 
-    def __init__(self, drive: Drive, run: Callable[[], str], observers: list[Any], say: Say):
+    def __init__(
+        self,
+        drive: Drive,
+        run: Callable[[], str],
+        observers: list[Any],
+        keeper: LearntKeeper,
+        say: Say,
+    ):
         self.ended: str | None = None
+        self.save = keeper.save
         self._drive, self._run, self._observers, self._say = drive, run, observers, say
         self._thread = threading.Thread(target=self._drives, name="the loop", daemon=True)
         self._thread.start()
@@ -173,6 +183,7 @@ class _Playing:
         inputs: Sequence[Input],
         pilot: Pilot,
         observers: list[Any],
+        keeper: LearntKeeper,
         connection: Connection,
         rate: float,
         say: Say,
@@ -181,6 +192,7 @@ class _Playing:
         rate: times real time.
         """
         self.ended: str | None = None
+        self.save = keeper.save
         self._inputs, self._pilot, self._observers = inputs, pilot, observers
         self._connection, self._rate, self._say = connection, rate, say
         self._clock = connection.publisher(_CLOCK, "/clock")

@@ -30,6 +30,14 @@ class Activity(Protocol):
         """Stop it and wait until all is closed. May be called any number of times."""
         ...
 
+    def save(self, folder: str) -> str:
+        """Write what it has learnt into new files in a folder; return what was written.
+
+        Raises:
+            BadInput: it can't, and has written nothing.
+        """
+        ...
+
 
 def publisher_for(
     file: RosFile, connection: Connection, markers: MarkerMap, odom: OdomPose | None

@@ -1,0 +1,123 @@
+"""What the service `~/save` of the node writes: the files that `calibrate adopt` makes of the same
+drive's recording."""
+
+import dataclasses
+
+import pytest
+import yaml
+
+from jaxnav.commands.drive.ros_save import LearntKeeper
+from jaxnav.errors import BadInput
+from jaxnav.files import load_rig, load_vehicle, save_rig, save_vehicle
+from jaxnav.files.ros import load_ros
+from jaxnav.loop.pilot import Input
+from jaxnav.recording.drive_setup import DriveSetup
+from tests.commands.calibrate.test_adopt import adopt, learnt_outcome, record, setup_of
+
+NAMES = ("rig", "vehicle")
+NODE = """\
+rig: rig.yaml
+vehicle: vehicle.yaml
+markers: markers.yaml
+cameras: {front: /front/detections}
+odometry: /odom
+"""
+
+
+def content(path):
+    """What a file holds beside its provenance, which it must have."""
+    held = yaml.safe_load(path.read_text())
+    assert held.pop("calibrated")["tool"].startswith("jaxnav ")
+    return held
+
+
+def rounded(value):
+    """Content that equals what differs by the rounding of a recording."""
+    if isinstance(value, dict):
+        return {key: rounded(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [rounded(inner) for inner in value]
+    return pytest.approx(value, rel=1e-7, abs=1e-8) if isinstance(value, float) else value
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The node's file with rig and vehicle as they are driven with."""
+    setup = setup_of()
+    save_rig(tmp_path / "rig.yaml", setup.rig)
+    save_vehicle(tmp_path / "vehicle.yaml", setup.vehicle)
+    (tmp_path / "node.yaml").write_text(NODE)
+    (tmp_path / "new").mkdir()
+    return tmp_path
+
+
+def keeper_of(folder, outcomes, setup: DriveSetup | None = None) -> LearntKeeper:
+    keeper = LearntKeeper(load_ros(folder / "node.yaml"), setup or setup_of())
+    for outcome in outcomes:
+        keeper.on_outcome(Input(outcome.now_ns), outcome)
+    return keeper
+
+
+def test_it_writes_what_adopt_makes_of_the_recording(folder):
+    outcomes = [learnt_outcome(index, decided=index < 10) for index in range(12)]
+    said = keeper_of(folder, outcomes).save("new")
+    assert said.startswith(f"rig.yaml, vehicle.yaml in {folder / 'new'}: camera ")
+    assert "looks 1.20 deg too far left" in said
+    recording = record(folder / "drive.mcap", outcomes)
+    files = [f"--{name}={folder / name}.yaml" for name in NAMES]
+    assert adopt(recording, *files, "--out", folder / "adopted") == 0
+    for name in ("rig.yaml", "vehicle.yaml"):
+        assert content(folder / "new" / name) == rounded(content(folder / "adopted" / name))
+    assert load_rig(folder / "new/rig.yaml").extrinsics_sigma is not None
+    assert load_vehicle(folder / "new/vehicle.yaml").camera_delay_s == pytest.approx(0.022)
+
+
+def test_a_vehicle_that_is_exact_is_not_written(folder):
+    exact = dataclasses.replace(setup_of().vehicle, sensor_sigma=None)
+    setup = dataclasses.replace(setup_of(), vehicle=exact)
+    said = keeper_of(folder, [learnt_outcome(9)], setup).save(str(folder / "new"))
+    assert said.startswith(f"rig.yaml in {folder / 'new'}: ")
+    assert [path.name for path in (folder / "new").iterdir()] == ["rig.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "name", "expected"),
+    [
+        ([], "new", "save: the drive never was sure of a pose"),
+        ([learnt_outcome(3, decided=False)], "new", "save: the drive never was sure of a pose"),
+        ([learnt_outcome(3, learnt=False)], "new", "save: the drive tells no errors"),
+        ([learnt_outcome(3)], "none", "save: there is no folder {folder}/none"),
+        ([learnt_outcome(3)], "", "save: there is no folder ''"),
+        ([learnt_outcome(3)], "node.yaml", "save: there is no folder {folder}/node.yaml"),
+        ([learnt_outcome(3)], ".", "{folder}/rig.yaml: is there already"),
+    ],
+)
+def test_where_it_can_not_one_line_says_why_and_nothing_is_written(
+    folder, outcomes, name, expected
+):
+    before = {path: path.read_bytes() for path in folder.glob("*.yaml")}
+    with pytest.raises(BadInput) as refused:
+        keeper_of(folder, outcomes).save(name)
+    assert str(refused.value).startswith(expected.format(folder=folder))
+    assert {path: path.read_bytes() for path in folder.glob("**/*.yaml")} == before
+
+
+def test_of_two_files_one_that_is_there_keeps_the_other_away(folder):
+    (folder / "new/vehicle.yaml").write_text("mine\n")
+    with pytest.raises(BadInput, match=r"vehicle\.yaml: is there already"):
+        keeper_of(folder, [learnt_outcome(9)]).save("new")
+    assert [path.name for path in (folder / "new").iterdir()] == ["vehicle.yaml"]
+    assert (folder / "new/vehicle.yaml").read_text() == "mine\n"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_file_that_was_changed_since_is_not_corrected(folder, name):
+    keeper = keeper_of(folder, [learnt_outcome(9)])
+    path, setup = folder / f"{name}.yaml", setup_of()
+    if name == "rig":
+        path.write_text(path.read_text().replace("name: front", "name: bow"))
+    else:
+        save_vehicle(path, dataclasses.replace(setup.vehicle, speed_scale=1.2))
+    with pytest.raises(BadInput, match=f"{name}.yaml: has other"):
+        keeper.save("new")
+    assert not list((folder / "new").iterdir())
