@@ -11,6 +11,7 @@ camera_type: apriltag_msgs/msg/AprilTagDetectionArray   # or sensor_msgs/msg/Ima
 corner_sigma_px: 0.3
 odometry: /odom
 odometry_type: nav_msgs/msg/Odometry
+odom_tf: false                 # true: odom -> base is what /tf says, not the odometry's pose
 joints: {driven: [rear_left, rear_right], steered: [front_left], wheel_radius_m: 0.033}
 command: /drive
 command_type: ackermann        # ackermann_msgs/AckermannDriveStamped; or twist
@@ -62,6 +63,7 @@ class RosFile(TopicMap):
         "geometry_msgs/msg/TwistStamped",
         "sensor_msgs/msg/JointState",
     ] = "nav_msgs/msg/Odometry"
+    odom_tf: Annotated[bool, Field(strict=True)] = False
     command: Name = "/drive"
     command_type: Literal["ackermann", "twist"] = "ackermann"
     frames: FramesEntry = Field(default_factory=FramesEntry)

@@ -4,7 +4,8 @@
     loop.run()
 
 One thread reads the odometer at a steady rate, takes the sightings of the cameras' threads, and
-writes a command after each. Nothing here waits for a disk or a screen.
+writes a command after each. Nothing here waits for a disk or a screen. While the clock stands, as
+that of a paused simulation does, the command is no speed.
 """
 
 import time
@@ -24,6 +25,7 @@ from jaxnav.loop.interfaces import Ending, Frame, Vehicle
 from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.loop.priority import before_siblings
 from jaxnav.loop.seeing import Eyes, Region, group_frames
+from jaxnav.loop.standing_clock import StandingClock
 
 _THREAD = "the loop"
 _STAYS_S = 0.5  # the drive ends this long after the last waypoint is reached
@@ -101,7 +103,7 @@ class Loop:
         self.stopped = False
         self._vehicle, self._eyes, self._observers = vehicle, eyes, list(observers)
         self._period_ns = int(period_s * 1e9)
-        self._now_ns = now_ns
+        self._now_ns, self._clock = now_ns, StandingClock()
         self._outcome: Outcome | None = None
         self._odometry_ns: int | None = None
         # Frames without markers, kept for the next tick.
@@ -136,6 +138,8 @@ class Loop:
         self.guard.beat(_THREAD)
         while not self.guard.tripped:
             now_ns = self._now_ns()
+            if self._clock.stands(now_ns):
+                self._hold()
             if now_ns >= due_ns:
                 late = now_ns - due_ns > self._period_ns
                 self._tick(Fault.DEADLINE_MISSED if late else Fault(0))
@@ -155,6 +159,11 @@ class Loop:
             self._eyes.wait((due_ns - self._now_ns()) / 1e9)
         self.stopped = True
         return self.guard.reason or "stopped"
+
+    def _hold(self) -> None:
+        """Command no speed while the clock stands: no input comes, and the guard waits for none."""
+        steering_rad = 0.0 if self._outcome is None else self._outcome.steering_rad
+        self.guard.write(steering_rad, 0.0)
 
     def _tick(self, faults: Fault) -> None:
         frames, self._blank = self._blank, ()
@@ -183,7 +192,8 @@ class Loop:
     def _handle(self, given: Input) -> None:
         begin_s = time.perf_counter()
         outcome = self.pilot.handle(given)
-        success = self.guard.write(outcome.steering_rad, outcome.throttle)
+        throttle = 0.0 if self._clock.stands(given.now_ns) else outcome.throttle
+        success = self.guard.write(outcome.steering_rad, throttle)
         end_s = time.perf_counter()
         kind = "odometry" if given.odometry else "frames" if given.frames else "tick"
         self.statistics.add(f"handle {kind}", (end_s - begin_s) * 1e3)

@@ -18,10 +18,11 @@ from functools import cache
 from typing import Any
 
 from jaxnav.errors import libraries_silenced
+from jaxnav.ros.source_clock import SourceClock, SteadyOffset
 
 _QUEUE = 10
+_LATCHED = 100  # messages of as many publishers
 _WAIT_S = 0.05  # how long the thread sleeps where no message comes
-_OLDEST_NS = 1_000_000_000  # a message that claims to be older was stamped by another clock
 
 
 def _executor_kind() -> Any:
@@ -98,6 +99,7 @@ class Connection:
             self.node.set_parameters([Parameter("use_sim_time", value=True)])
         self.sim_time = bool(self.node.get_parameter("use_sim_time").value)
         self.ros_time = ros_time or self.sim_time
+        self._offset = SteadyOffset(self._ros_ns)
         self._executor = _executor_kind()(context=self._context)
         self._executor.add_node(self.node)
         self._closing = threading.Event()
@@ -115,15 +117,22 @@ class Connection:
         quality = QoSProfile(depth=1 if latched else _QUEUE, durability=durability)
         return self.node.create_publisher(message_type(kind), topic, quality)
 
-    def listen(self, kind: str, topic: str, take: Callable[[Any], None]) -> Any:
+    def listen(
+        self, kind: str, topic: str, take: Callable[[Any], None], latched: bool = False
+    ) -> Any:
         """Pass every message of a topic to a function, in the thread of `run`.
+
+        Args:
+            latched: also those that were sent before.
 
         Returns:
             The subscription, for `forget`.
         """
-        from rclpy.qos import qos_profile_sensor_data  # reliable publishers suit it too
+        from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 
-        quality = qos_profile_sensor_data
+        quality = qos_profile_sensor_data  # best effort, which reliable publishers suit too
+        if latched:
+            quality = QoSProfile(depth=_LATCHED, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         return self.node.create_subscription(message_type(kind), topic, take, quality)
 
     def forget(self, *ends: Any) -> None:
@@ -169,16 +178,9 @@ class Connection:
         age_ns = time.monotonic_ns() - now_ns
         return self._Time(nanoseconds=max(self._ros_ns() - age_ns, 0)).to_msg()
 
-    def time_ns(self, stamp: Any) -> int:
-        """Convert a ROS stamp to the time of the program.
-
-        On the monotonic clock a missing stamp, or one of another computer's clock, is now.
-        """
-        stamped_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-        if self.ros_time:
-            return stamped_ns
-        age_ns = self._ros_ns() - stamped_ns
-        return time.monotonic_ns() - (age_ns if 0 <= age_ns <= _OLDEST_NS else 0)
+    def source_clock(self) -> SourceClock:
+        """A clock that converts the stamps of one source to times of the program."""
+        return SourceClock(None if self.ros_time else self._offset)
 
     def close(self) -> None:
         """Leave ROS. May be called any number of times."""

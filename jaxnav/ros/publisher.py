@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.files.poses import compose, inverse, rotated
+from jaxnav.files.poses import compose, inverse
 from jaxnav.loop.loop import Statistics
 from jaxnav.models.markers import MarkerMap
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.estimates import Report
+from jaxnav.ros.odom_frame import OdomFrame
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
 
 _GHOSTS = 24  # arrows of hypotheses at most
 _PERIOD_S = 0.1  # of the bank and of the pictures
 _DIAGNOSTICS_S = 1.0
-_STALE_NS = 200_000_000  # an older odometry is not carried on by its own twist
 _DELAY = "camera to tf"
 _WELL = ("", "OK", "DEAD_RECKONING")  # states of health that are no warning
 
@@ -37,33 +37,6 @@ class FrameNames:
     base: str = "base_link"
 
 
-class OdomPose:
-    """Where the odometry believes the base to be, carried on to the present by its twist."""
-
-    def __init__(self) -> None:
-        self._last: tuple[int, np.ndarray, np.ndarray] | None = None
-
-    def add(self, stamp_ns: int, message: Any) -> None:
-        """Take a nav_msgs/Odometry, whose pose is T_odom_base."""
-        p, q = message.pose.pose.position, message.pose.pose.orientation
-        pose = np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
-        norm = float(np.linalg.norm(pose[:4]))
-        twist = message.twist.twist
-        v, w = twist.linear, twist.angular
-        rates = np.array([v.x, v.y, v.z, w.x, w.y, w.z])
-        if norm > 0.5 and np.isfinite(pose).all() and np.isfinite(rates).all():
-            pose[:4] /= norm
-            self._last = stamp_ns, pose, rates
-
-    def at(self, now_ns: int) -> np.ndarray | None:
-        """T_odom_base (7,) at a time; None before the first message."""
-        if self._last is None:
-            return None
-        stamp_ns, pose, rates = self._last
-        step = rates * min(max(now_ns - stamp_ns, 0), _STALE_NS) / 1e9
-        return compose(pose, _moved(step))
-
-
 class Publisher:
     """The publisher of one node's estimates. `close` ends its thread."""
 
@@ -72,11 +45,11 @@ class Publisher:
         connection: Connection,
         frames: FrameNames,
         markers: MarkerMap,
-        odom: OdomPose | None,
+        odom: OdomFrame | None,
         tolerance_s: float = 0.0,
     ):
         """Args:
-        odom: whose pose map -> odom completes; None: map -> base is sent.
+        odom: what map -> odom completes; None: map -> base is sent.
         tolerance_s: tf is stamped so far in the future, for who asks about the present.
         """
         self._connection, self._frames, self._odom = connection, frames, odom
@@ -281,17 +254,3 @@ def _place(position: Any, orientation: Any, pose: np.ndarray) -> None:
     w, x, y, z, x_m, y_m, z_m = pose.tolist()
     orientation.w, orientation.x, orientation.y, orientation.z = w, x, y, z
     position.x, position.y, position.z = x_m, y_m, z_m
-
-
-def _moved(step: np.ndarray) -> np.ndarray:
-    """The pose (7,) after a small motion (6,): a turn, and a way along the turn's middle."""
-    *way_m, x, y, z = step.tolist()
-    angle_rad = math.hypot(x, y, z)
-    # sin(angle / 2) / angle, which tends to 1/2, and that of half the turn
-    whole, half = (
-        math.sin(part * angle_rad / 2) / angle_rad if angle_rad > 0 else part / 2
-        for part in (1.0, 0.5)
-    )
-    middle = math.cos(angle_rad / 4), half * x, half * y, half * z
-    turn = math.cos(angle_rad / 2), whole * x, whole * y, whole * z
-    return np.array([*turn, *rotated(middle, way_m)])

@@ -77,6 +77,7 @@ class RosVehicle:
         self._stops = 0
         sim_time = choice(options, "sim_time", ("false", "true")) == "true"
         self._connection = Connection("jaxnav_vehicle", sim_time)
+        self._clock = self._connection.source_clock()
         self._publisher, self._command_type = None, None
         if command != "none":
             topic, kind = options.get("command_topic", "/drive"), _COMMANDS[command]
@@ -160,7 +161,7 @@ class RosVehicle:
 
     def _take(self, message: Any) -> None:
         reading = odometry(self._kind, message, self._twists, self._joints)
-        stamp_ns = self._connection.time_ns(message.header.stamp)
+        stamp_ns = self._clock.time_ns(message.header.stamp)
         self._reading = replace(reading, stamp_ns=stamp_ns)
 
 

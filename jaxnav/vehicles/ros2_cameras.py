@@ -22,6 +22,7 @@ from jaxnav.loop.interfaces import Camera, Frame, Setup, Vehicle
 from jaxnav.models.conventions import FirstCorner
 from jaxnav.ros.camera_messages import APRILTAG_ROS, COMPRESSED, IMAGE, detections, grey_image
 from jaxnav.ros.connection import Connection
+from jaxnav.ros.source_clock import SourceClock
 from jaxnav.vehicles.options import choice, number
 
 _PREFIX = "camera."
@@ -89,8 +90,8 @@ def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
     def seen(message: Any) -> Detections:
         return detections(kind, message, first_corner, sigma_px, families)
 
-    def take(camera: RosCamera, message: Any) -> None:
-        stamp_ns = connection.time_ns(message.header.stamp)
+    def take(camera: RosCamera, clock: SourceClock, message: Any) -> None:
+        stamp_ns = clock.time_ns(message.header.stamp)
         try:
             if kind == APRILTAG_ROS:
                 frame = Frame(stamp_ns, detections=seen(message))
@@ -103,6 +104,8 @@ def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
     cameras = [RosCamera(name, connection.close) for name in names]
     for camera in cameras:
         if camera.name in topics:
-            connection.listen(kind, topics[camera.name], partial(take, camera))
+            connection.listen(
+                kind, topics[camera.name], partial(take, camera, connection.source_clock())
+            )
     connection.run()
     return list(cameras)

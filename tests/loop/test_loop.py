@@ -16,6 +16,7 @@ from jaxnav.loop.interfaces import Frame, Odometry
 from jaxnav.loop.loop import Loop
 from jaxnav.loop.pilot import Input, Pilot
 from jaxnav.loop.seeing import Eyes, Region, Search, SearchedFrame, group_frames, image_fault
+from jaxnav.loop.standing_clock import STANDS_S, StandingClock
 from jaxnav.navigator import Navigator
 from tests import worlds
 
@@ -118,7 +119,9 @@ class Drive:
         self.looks = [Look() for _ in self.cameras]
         self.guard = Guard(self.car, pilot.limits)
         self.eyes = Eyes(self.cameras, self.looks, self.guard)
-        self.loop = Loop(pilot, self.guard, self.car, self.eyes)
+        self.clock = time.monotonic_ns
+        now_ns = lambda: self.clock()  # noqa: E731
+        self.loop = Loop(pilot, self.guard, self.car, self.eyes, now_ns=now_ns)
         self.ended = None
         self.thread = threading.Thread(target=self._run, daemon=True)
 
@@ -157,6 +160,32 @@ def hang():
 
 def fail():
     raise RuntimeError("somewhere")
+
+
+def test_while_its_clock_stands_the_vehicle_stands_and_then_drives_on(standing):
+    with Drive(standing) as drive:
+        stands_ns = time.monotonic_ns()
+        drive.clock = lambda: stands_ns
+        time.sleep(STANDS_S + 0.1)
+        since, handled = time.monotonic(), len(drive.pilot.handled)
+        time.sleep(3 * TIMEOUT_S)
+        held = [throttle for at, throttle in drive.car.told if at > since]
+        assert len(held) > 10
+        assert set(held) == {0.0}
+        assert len(drive.pilot.handled) == handled  # no time has passed for it
+        drive.clock = lambda: stands_ns + time.monotonic_ns() - int(1e9 * since)
+        time.sleep(0.2)
+        assert not drive.guard.tripped, drive.guard.reason
+        assert drive.car.told[-1][1] == pytest.approx(0.2)
+
+
+def test_a_clock_stands_once_it_has_for_a_while():
+    now_s = [5.0]
+    clock = StandingClock(lambda: now_s[0])
+    stands = []
+    for now_s[0], clock_ns in ((5.0, 1), (5.09, 1), (5.11, 1), (5.2, 2), (5.29, 2), (9.0, 2)):
+        stands.append(clock.stands(clock_ns))
+    assert stands == [False, False, True, False, False, True]
 
 
 @pytest.mark.parametrize("act", [hang, fail])

@@ -14,7 +14,7 @@ from jaxnav.models.geometry import cayley
 from jaxnav.navigator import Navigator
 from jaxnav.pose.observation import Observation
 from jaxnav.ros.estimates import report_of_body, report_of_drive
-from jaxnav.ros.publisher import OdomPose
+from jaxnav.ros.odom_frame import OdomPose
 from jaxnav.testing.lockstep import Step
 from tests.helpers.simulated import make_setup, simulated
 from tests.worlds import paper_markers, qcar_rig

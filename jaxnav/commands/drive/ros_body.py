@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from jaxnav.belief.constant_velocity import ConstantVelocity
@@ -11,6 +12,7 @@ from jaxnav.commands.drive.ros_setup import (
     Activity,
     Say,
     check_selector,
+    odom_for,
     path_of,
     publisher_for,
     rig_for,
@@ -69,7 +71,9 @@ class PreparedBody:
         connection.ros_time = True  # the same stamps give the same poses, whenever they come
         self._step = compiled_step(self._navigator, step_folder())
         timed(say, BodyTracker(self._navigator, self._step, 1, lambda report: None).warm_up)
-        self._publisher = publisher_for(file, connection, markers, None)
+        odom, listening = odom_for(file, connection)
+        self._leave = partial(connection.forget, *listening)
+        self._publisher = publisher_for(file, connection, markers, odom)
         nothing: Any = None
         options = file.options(False, connection.sim_time) | {"stamps": "ros"}
         self._setup = Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
@@ -83,6 +87,7 @@ class PreparedBody:
     def close(self) -> None:
         """Leave the topics."""
         self._publisher.close()
+        self._leave()
 
     def _send(self, report: Report) -> None:
         if report.decided:

@@ -14,6 +14,7 @@ from jaxnav.commands.drive.ros_setup import (
     Activity,
     Say,
     check_selector,
+    odom_for,
     path_of,
     publisher_for,
     rig_for,
@@ -34,8 +35,8 @@ from jaxnav.recording.drive_replay import check_inputs
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.estimates import pose_of_drive, report_of_drive
-from jaxnav.ros.odometry_messages import NAV_ODOMETRY
-from jaxnav.ros.publisher import OdomPose, Publisher
+from jaxnav.ros.odom_frame import OdomFrame
+from jaxnav.ros.publisher import Publisher
 
 OVER = "the bag is over"
 _CLOCK = "rosgraph_msgs/msg/Clock"
@@ -55,7 +56,7 @@ class PreparedDrive:
     def __init__(
         self, args: Ros, file: RosFile, connection: Connection, signals: Signals, say: Say
     ):
-        """Read, compile, and begin to listen to the odometry's own pose.
+        """Read, compile, and begin to listen to who knows odom -> base.
 
         Raises:
             BadInput: a file is wrong; names file and key.
@@ -87,14 +88,14 @@ class PreparedDrive:
         )
         self._searches = searches_for(args.corner_backend, setup.rig, setup.markers)
         timed(say, lambda: compiled_pilot(self._run, setup, self._searches))
-        odom, self._listening, self._inputs = None, [], None
+        odom: OdomFrame | None = None
+        self._listening: list[Any] = []
+        self._inputs: Sequence[Input] | None = None
         if args.bag is not None:
             self._inputs = _inputs_of(args.bag, file, setup, args.corner_backend)
             connection.ros_time = True  # the bag's
-        elif file.odometry_type == NAV_ODOMETRY and file.odometry is not None:
-            odom = OdomPose()
-            take = partial(_add_odometry, odom, connection)
-            self._listening = [connection.listen(NAV_ODOMETRY, file.odometry, take)]
+        else:
+            odom, self._listening = odom_for(file, connection)
         self._publisher = publisher_for(file, connection, setup.markers, odom)
 
     def begin(self) -> Activity:
@@ -265,7 +266,3 @@ def _close(observers: list[Any], say: Say) -> None:
         observer.close()
         if observer.closing_note is not None:
             say(observer.closing_note)
-
-
-def _add_odometry(odom: OdomPose, connection: Connection, message: Any) -> None:
-    odom.add(connection.time_ns(message.header.stamp), message)

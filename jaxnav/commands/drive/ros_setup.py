@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from jaxnav.errors import BadInput
 from jaxnav.files import load_rig
@@ -15,9 +15,12 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import PILOT_SELECTORS
 from jaxnav.ros.connection import Connection
 from jaxnav.ros.lenses import await_lenses, with_lenses
-from jaxnav.ros.publisher import FrameNames, OdomPose, Publisher
+from jaxnav.ros.odom_frame import OdomFrame, OdomPose, OdomTf
+from jaxnav.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.ros.publisher import FrameNames, Publisher
 
 Say = Callable[[str], None]
+_TF = "tf2_msgs/msg/TFMessage"
 
 
 class Activity(Protocol):
@@ -40,7 +43,7 @@ class Activity(Protocol):
 
 
 def publisher_for(
-    file: RosFile, connection: Connection, markers: MarkerMap, odom: OdomPose | None
+    file: RosFile, connection: Connection, markers: MarkerMap, odom: OdomFrame | None
 ) -> Publisher:
     """The publisher of a node's estimates.
 
@@ -53,6 +56,24 @@ def publisher_for(
     except ImportError as error:
         problem = f"a message package of ROS 2 is missing ({error}): see docs/guide/ros.md"
         raise BadInput("jaxnav ros", problem) from None
+
+
+def odom_for(file: RosFile, connection: Connection) -> tuple[OdomFrame | None, list[Any]]:
+    """What knows odom -> base, and the subscriptions that tell it; None where nothing does."""
+    if file.odom_tf:
+        of_tf = OdomTf(file.frames.odom, file.frames.base, connection.source_clock)
+        return of_tf, [
+            connection.listen(_TF, "/tf", of_tf.take),
+            connection.listen(_TF, "/tf_static", of_tf.take_static, latched=True),
+        ]
+    if file.odometry_type != NAV_ODOMETRY or file.odometry is None:
+        return None, []
+    of_pose, clock = OdomPose(), connection.source_clock()
+
+    def take(message: Any) -> None:
+        of_pose.add(clock.time_ns(message.header.stamp), message)
+
+    return of_pose, [connection.listen(NAV_ODOMETRY, file.odometry, take)]
 
 
 def path_of(file: RosFile, key: str) -> Path:
