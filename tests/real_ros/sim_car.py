@@ -1,9 +1,14 @@
 """A simulated car behind ROS topics, as a process: python -m tests.real_ros.sim_car.
 
-With --clock it sends /clock, and its stamps are of that: seconds since it began, and 100.
-
 It publishes /odom (with a pose that drifts), /NAME/detections of each camera of the QCar, and the
 true pose on /truth; it obeys /drive, and stops by itself 0.5 s after the last command.
+
+    --clock    sends /clock, and its stamps are of that: seconds since it began, and 100. SIGUSR1
+               pauses it, and lets it go on.
+    --tf       sends /twist too, and the pose of /odom on /tf: odom -> base_footprint, with a fixed
+               base_footprint -> base_link on /tf_static
+    --images   sends rendered pictures instead of detections: /NAME/image_raw, and compressed ones
+               on /NAME/image_raw/compressed
 """
 
 import math
@@ -11,16 +16,23 @@ import signal
 import sys
 import threading
 import time
+from array import array
+
+import cv2
+import numpy as np
 
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.loop.interfaces import Setup
 from jaxnav.models.twists import twist_of
-from jaxnav.ros.camera_messages import APRILTAG_ROS, detections_message
+from jaxnav.ros.camera_messages import APRILTAG_ROS, COMPRESSED, IMAGE, detections_message
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.lenses import CAMERA_INFO
-from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY
+from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY, TWIST_WITH_COVARIANCE
 from jaxnav.vehicles.sim import open_cameras, open_vehicle
 
+TF, POSE = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/Pose"
+IMAGES = {"image_raw": IMAGE, "image_raw/compressed": COMPRESSED}
+COLORED = ("front", "rear")
 WHEELBASE_M = 0.256
 ODOMETRY_S = 0.02
 SILENT_S = 0.5
@@ -41,15 +53,18 @@ def tell_lenses(ros, rig, over):
             ros.publish(topic, info)
 
 
-def main(clocked):
+def main(words):
     """Simulate until a signal comes."""
+    clocked = "--clock" in words
     over = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: over.set())
     qcar = calib_dir() / "qcar"
     rig, route = load_rig(qcar / "rig.yaml"), load_route(qcar / "route.yaml")
     vehicle_model = load_vehicle(qcar / "vehicle.yaml")
-    setup = Setup(rig, load_markers(qcar / "markers.yaml"), vehicle_model, route.start_pose)
+    shown = {"images": "true", "rate_hz": "8"} if "--images" in words else {}
+    markers = load_markers(qcar / "markers.yaml")
+    setup = Setup(rig, markers, vehicle_model, route.start_pose, options=shown)
     vehicle = open_vehicle(setup)
     cameras = open_cameras(setup, vehicle)
     ros = Connection("sim_car")
@@ -57,10 +72,18 @@ def main(clocked):
     heard_s = [time.monotonic()]
     began_ns, time_of = time.monotonic_ns(), message_type("builtin_interfaces/msg/Time")
 
+    pauses = [0, 0]  # ns in all of those that are over, and when this one began
+
+    def pause(*_):
+        now_ns = time.monotonic_ns()
+        pauses[:] = [pauses[0] + now_ns - pauses[1], 0] if pauses[1] else [pauses[0], now_ns]
+
+    signal.signal(signal.SIGUSR1, pause)
+
     def stamp_of(now_ns):
         if not clocked:
             return ros.stamp(now_ns)
-        since_ns = now_ns - began_ns + 100 * 10**9
+        since_ns = min(now_ns, pauses[1] or now_ns) - pauses[0] - began_ns + 100 * 10**9
         return time_of(sec=since_ns // 10**9, nanosec=since_ns % 10**9)
 
     def tick():
@@ -73,12 +96,15 @@ def main(clocked):
         heard_s[0] = time.monotonic()
         vehicle.write(message.drive.steering_angle, message.drive.speed / per_throttle_mps)
 
-    def look(camera, publisher):
+    def look(camera, publishers):
         while not over.is_set():
             frame = camera.read(0.1)
-            if frame is not None:
+            if frame is not None and not pauses[1]:
                 stamp = stamp_of(frame.stamp_ns)
-                ros.publish(publisher, detections_message(frame.detections, stamp))
+                for publisher, message in zip(
+                    publishers, messages_of(camera.name, frame, stamp), strict=True
+                ):
+                    ros.publish(publisher, message)
 
     ros.listen(ACKERMANN, "/drive", obey)
     odom = ros.publisher(NAV_ODOMETRY, "/odom")
@@ -88,12 +114,21 @@ def main(clocked):
         threading.Thread(target=tick, daemon=True).start()
     threading.Thread(target=tell_lenses, args=(ros, rig, over), daemon=True).start()
     for camera in cameras:
-        publisher = ros.publisher(APRILTAG_ROS, f"/{camera.name}/detections")
-        threading.Thread(target=look, args=(camera, publisher), daemon=True).start()
+        kinds = IMAGES if "--images" in words else {"detections": APRILTAG_ROS}
+        publishers = [ros.publisher(kind, f"/{camera.name}/{n}") for n, kind in kinds.items()]
+        threading.Thread(target=look, args=(camera, publishers), daemon=True).start()
+    if "--tf" in words:
+        twist, tf = ros.publisher(TWIST_WITH_COVARIANCE, "/twist"), ros.publisher(TF, "/tf")
+        fixed, nowhere = ros.publisher(TF, "/tf_static", True), message_type(POSE)()
+        place(nowhere, 0.0, 0.0, 0.0)
+        told = transform("base_footprint", "base_link", nowhere, stamp_of(began_ns))
+        ros.publish(fixed, message_type(TF)(transforms=[told]))
     x_m = y_m = psi_rad = 0.0
     while not over.wait(ODOMETRY_S):
         if time.monotonic() - heard_s[0] > SILENT_S:
             vehicle.stop()
+        if pauses[1]:
+            continue
         reading = vehicle.read()
         slope = math.tan(reading.steering_rad)
         forward_mps, rate_radps = twist_of(reading.speed_mps, reading.steering_rad, WHEELBASE_M)
@@ -106,6 +141,12 @@ def main(clocked):
         place(message.pose.pose, x_m, y_m, psi_rad)
         message.twist.twist.linear.x, message.twist.twist.angular.z = forward_mps, rate_radps
         ros.publish(odom, message)
+        if "--tf" in words:
+            twist_of_odom = message_type(TWIST_WITH_COVARIANCE)(header=message.header)
+            twist_of_odom.twist = message.twist
+            ros.publish(twist, twist_of_odom)
+            told = transform("odom", "base_footprint", message.pose.pose, message.header.stamp)
+            ros.publish(tf, message_type(TF)(transforms=[told]))
         true = message_type("geometry_msgs/msg/PoseStamped")()
         now_ns = time.monotonic_ns()
         true.header.stamp = stamp_of(now_ns)
@@ -117,6 +158,33 @@ def main(clocked):
     ros.close()
 
 
+def transform(parent, child, pose, stamp):
+    """The geometry_msgs/TransformStamped of a pose."""
+    one = message_type("geometry_msgs/msg/TransformStamped")()
+    one.header.stamp, one.header.frame_id, one.child_frame_id = stamp, parent, child
+    p, moved = pose.position, one.transform.translation
+    moved.x, moved.y, moved.z = p.x, p.y, p.z
+    one.transform.rotation = pose.orientation
+    return one
+
+
+def messages_of(name, frame, stamp):
+    """The messages of a camera's frame: its detections, or a picture as it is and compressed."""
+    if frame.detections is not None:
+        return [detections_message(frame.detections, stamp)]
+    grey, (rows, columns) = frame.image, frame.image.shape
+    colored = name in COLORED
+    pixels = np.repeat(grey[..., None], 3, axis=2) if colored else grey
+    raw, compressed = (message_type(kind)() for kind in IMAGES.values())
+    raw.header.stamp = compressed.header.stamp = stamp
+    raw.height, raw.width, raw.step = rows, columns, columns * (3 if colored else 1)
+    raw.encoding = "bgr8" if colored else "mono8"
+    raw.data = array("B", pixels.tobytes())
+    compressed.format = "png"
+    compressed.data = array("B", cv2.imencode(".png", grey)[1].tobytes())
+    return [raw, compressed]
+
+
 def place(pose, x_m, y_m, psi_rad):
     """Write a planar pose into a message."""
     pose.position.x, pose.position.y = x_m, y_m
@@ -124,4 +192,4 @@ def place(pose, x_m, y_m, psi_rad):
 
 
 if __name__ == "__main__":
-    main("--clock" in sys.argv)
+    main(sys.argv[1:])
