@@ -7,8 +7,8 @@ true pose on /truth; it obeys /drive, and stops by itself 0.5 s after the last c
                pauses it, and lets it go on.
     --tf       sends /twist too, and the pose of /odom on /tf: odom -> base_footprint, with a fixed
                base_footprint -> base_link on /tf_static
-    --images   sends rendered pictures instead of detections: /NAME/image_raw, and compressed ones
-               on /NAME/image_raw/compressed
+    --images   sends rendered pictures on /NAME/image_raw instead of detections
+    --compressed    the same on /NAME/image_raw/compressed
 """
 
 import math
@@ -31,7 +31,8 @@ from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY, TWIST_WITH_COV
 from jaxnav.vehicles.sim import open_cameras, open_vehicle
 
 TF, POSE = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/Pose"
-IMAGES = {"image_raw": IMAGE, "image_raw/compressed": COMPRESSED}
+PICTURES = {"--images": IMAGE, "--compressed": COMPRESSED}
+TOPICS = {APRILTAG_ROS: "detections", IMAGE: "image_raw", COMPRESSED: "image_raw/compressed"}
 COLORED = ("front", "rear")
 WHEELBASE_M = 0.256
 ODOMETRY_S = 0.02
@@ -62,7 +63,8 @@ def main(words):
     qcar = calib_dir() / "qcar"
     rig, route = load_rig(qcar / "rig.yaml"), load_route(qcar / "route.yaml")
     vehicle_model = load_vehicle(qcar / "vehicle.yaml")
-    shown = {"images": "true", "rate_hz": "8"} if "--images" in words else {}
+    kind = next((kind for word, kind in PICTURES.items() if word in words), APRILTAG_ROS)
+    shown = {} if kind == APRILTAG_ROS else {"images": "true", "rate_hz": "8"}
     markers = load_markers(qcar / "markers.yaml")
     setup = Setup(rig, markers, vehicle_model, route.start_pose, options=shown)
     vehicle = open_vehicle(setup)
@@ -96,15 +98,12 @@ def main(words):
         heard_s[0] = time.monotonic()
         vehicle.write(message.drive.steering_angle, message.drive.speed / per_throttle_mps)
 
-    def look(camera, publishers):
+    def look(camera, publisher):
         while not over.is_set():
             frame = camera.read(0.1)
             if frame is not None and not pauses[1]:
                 stamp = stamp_of(frame.stamp_ns)
-                for publisher, message in zip(
-                    publishers, messages_of(camera.name, frame, stamp), strict=True
-                ):
-                    ros.publish(publisher, message)
+                ros.publish(publisher, message_of(kind, camera.name, frame, stamp))
 
     ros.listen(ACKERMANN, "/drive", obey)
     odom = ros.publisher(NAV_ODOMETRY, "/odom")
@@ -114,9 +113,8 @@ def main(words):
         threading.Thread(target=tick, daemon=True).start()
     threading.Thread(target=tell_lenses, args=(ros, rig, over), daemon=True).start()
     for camera in cameras:
-        kinds = IMAGES if "--images" in words else {"detections": APRILTAG_ROS}
-        publishers = [ros.publisher(kind, f"/{camera.name}/{n}") for n, kind in kinds.items()]
-        threading.Thread(target=look, args=(camera, publishers), daemon=True).start()
+        publisher = ros.publisher(kind, f"/{camera.name}/{TOPICS[kind]}")
+        threading.Thread(target=look, args=(camera, publisher), daemon=True).start()
     if "--tf" in words:
         twist, tf = ros.publisher(TWIST_WITH_COVARIANCE, "/twist"), ros.publisher(TF, "/tf")
         fixed, nowhere = ros.publisher(TF, "/tf_static", True), message_type(POSE)()
@@ -168,21 +166,24 @@ def transform(parent, child, pose, stamp):
     return one
 
 
-def messages_of(name, frame, stamp):
-    """The messages of a camera's frame: its detections, or a picture as it is and compressed."""
-    if frame.detections is not None:
-        return [detections_message(frame.detections, stamp)]
-    grey, (rows, columns) = frame.image, frame.image.shape
+def message_of(kind, name, frame, stamp):
+    """The message of a camera's frame: its detections, or a picture as it is or compressed."""
+    if kind == APRILTAG_ROS:
+        return detections_message(frame.detections, stamp)
+    message = message_type(kind)()
+    message.header.stamp = stamp
+    if kind == COMPRESSED:
+        message.format = "jpeg"
+        best = [cv2.IMWRITE_JPEG_QUALITY, 95]
+        message.data = array("B", cv2.imencode(".jpg", frame.image, best)[1].tobytes())
+        return message
     colored = name in COLORED
-    pixels = np.repeat(grey[..., None], 3, axis=2) if colored else grey
-    raw, compressed = (message_type(kind)() for kind in IMAGES.values())
-    raw.header.stamp = compressed.header.stamp = stamp
-    raw.height, raw.width, raw.step = rows, columns, columns * (3 if colored else 1)
-    raw.encoding = "bgr8" if colored else "mono8"
-    raw.data = array("B", pixels.tobytes())
-    compressed.format = "png"
-    compressed.data = array("B", cv2.imencode(".png", grey)[1].tobytes())
-    return [raw, compressed]
+    pixels = np.repeat(frame.image[..., None], 3, axis=2) if colored else frame.image
+    message.height, message.width = pixels.shape[:2]
+    message.step = pixels.shape[1] * (3 if colored else 1)
+    message.encoding = "bgr8" if colored else "mono8"
+    message.data = array("B", pixels.tobytes())
+    return message
 
 
 def place(pose, x_m, y_m, psi_rad):

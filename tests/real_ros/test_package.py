@@ -6,6 +6,8 @@ import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -61,13 +63,59 @@ def test_a_node_reads_the_parameters() -> None:
     assert read == written
 
 
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The installed packages jaxnav_msgs and jaxnav_ros, as colcon builds them on this ROS."""
+    pytest.importorskip("colcon_ros", reason="colcon-ros is not installed: make ros installs it")
+    folder = tmp_path_factory.mktemp("workspace")
+    for source in (SOURCE, SOURCE.parent / "jaxnav_msgs"):
+        shutil.copytree(source, folder / "src" / source.name)
+    build = import_module("ros.environment.build")
+    environment = build.Environment(Path(sys.prefix))
+    environment.run(
+        *(sys.executable, "-m", "colcon", "--log-base", folder / "log", "build"),
+        *("--base-paths", folder / "src", "--executor", "sequential"),
+        *("--build-base", folder / "build", "--install-base", folder / "install"),
+        *("--cmake-args", "-G", "Ninja", f"-DPython3_EXECUTABLE={sys.executable}"),
+        *("-DPython3_FIND_VIRTUALENV=ONLY", "-DBUILD_TESTING=OFF"),
+    )
+    return folder / "install"
+
+
+def sourced(install: Path, command: str) -> tuple[str, ...]:
+    """A command line in which the workspace is sourced, and this checkout's jaxnav comes first."""
+    path = f"export PYTHONPATH={ROOT}:$PYTHONPATH"
+    return "bash", "-c", f". {install}/setup.bash && {path} && exec {command}"
+
+
+def test_colcon_builds_both_packages(workspace: Path) -> None:
+    ask = "import jaxnav_msgs; from jaxnav_msgs.srv import Save; print(Save.Request(folder='new'))"
+    command = f'{sys.executable} -c "{ask}; print(jaxnav_msgs.__file__)"'
+    done = subprocess.run(sourced(workspace, command), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    request, place = done.stdout.splitlines()
+    assert "folder='new'" in request
+    assert Path(place).is_relative_to(workspace)
+    index = "share/ament_index/resource_index/packages/jaxnav_ros"
+    assert (workspace / "jaxnav_ros" / index).is_file()
+
+
+def test_the_executable_that_colcon_installs_is_the_node(workspace: Path, tmp_path: Path) -> None:
+    words = f"--ros-args --params-file {PARAMETERS}"
+    check_node(tmp_path, *sourced(workspace, f"{workspace}/jaxnav_ros/lib/jaxnav_ros/node {words}"))
+
+
 def test_its_executable_is_the_node(installed: Path, tmp_path: Path) -> None:
     words = ("--ros-args", "--params-file", str(PARAMETERS))
     run = "import sys; from jaxnav_ros.node import main; sys.exit(main())"
     packages = next(installed.glob("lib/python*/site-packages"))
     env = os.environ | {"PYTHONPATH": f"{packages}:{ROOT}"}
-    program = Program(tmp_path / "log", sys.executable, "-c", run, *words, env=env)
-    with program:
+    check_node(tmp_path, sys.executable, "-c", run, *words, env=env)
+
+
+def check_node(folder: Path, *words: str, env: Mapping[str, str] | None = None) -> None:
+    """A program is the node: it configures when told, and says what is wrong with the file."""
+    with Program(folder / "log", *words, env=env) as program:
         manager = Manager()
         try:
             assert not manager.go(CONFIGURE)
