@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+ENDED_S = 5.0  # what a program's guard has to do is done by then
 JAXNAV = (sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())")
 
 
@@ -52,11 +53,14 @@ class Program:
 
 
 def until(happens, timeout_s: float, program: Program | None = None) -> None:
-    """Wait until something happens."""
+    """Wait until something happens; once the program has ended, not for much longer."""
     end_s = time.monotonic() + timeout_s
+    ended = False
     while not happens():
         what = "" if program is None else program.said
-        assert time.monotonic() < end_s, f"waited {timeout_s} s in vain; {what}"
+        if program is not None and not ended and program.process.poll() is not None:
+            ended, end_s = True, min(end_s, time.monotonic() + ENDED_S)
+        assert time.monotonic() < end_s, f"waited in vain, for at most {timeout_s} s; {what}"
         time.sleep(0.02)
 
 
