@@ -8,7 +8,6 @@ true pose on /truth; it obeys /drive, and stops by itself 0.5 s after the last c
     --tf       sends /twist too, and the pose of /odom on /tf: odom -> base_footprint, with a fixed
                base_footprint -> base_link on /tf_static
     --images   sends rendered pictures on /NAME/image_raw instead of detections
-    --compressed    the same on /NAME/image_raw/compressed
 """
 
 import math
@@ -18,21 +17,19 @@ import threading
 import time
 from array import array
 
-import cv2
 import numpy as np
 
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.loop.interfaces import Setup
 from jaxnav.models.twists import twist_of
-from jaxnav.ros.camera_messages import APRILTAG_ROS, COMPRESSED, IMAGE, detections_message
+from jaxnav.ros.camera_messages import APRILTAG_ROS, IMAGE, detections_message
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.lenses import CAMERA_INFO
 from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY, TWIST_WITH_COVARIANCE
 from jaxnav.vehicles.sim import open_cameras, open_vehicle
 
 TF, POSE = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/Pose"
-PICTURES = {"--images": IMAGE, "--compressed": COMPRESSED}
-TOPICS = {APRILTAG_ROS: "detections", IMAGE: "image_raw", COMPRESSED: "image_raw/compressed"}
+TOPICS = {APRILTAG_ROS: "detections", IMAGE: "image_raw"}
 COLORED = ("front", "rear")
 WHEELBASE_M = 0.256
 ODOMETRY_S = 0.02
@@ -63,7 +60,7 @@ def main(words):
     qcar = calib_dir() / "qcar"
     rig, route = load_rig(qcar / "rig.yaml"), load_route(qcar / "route.yaml")
     vehicle_model = load_vehicle(qcar / "vehicle.yaml")
-    kind = next((kind for word, kind in PICTURES.items() if word in words), APRILTAG_ROS)
+    kind = IMAGE if "--images" in words else APRILTAG_ROS
     shown = {} if kind == APRILTAG_ROS else {"images": "true", "rate_hz": "8"}
     markers = load_markers(qcar / "markers.yaml")
     setup = Setup(rig, markers, vehicle_model, route.start_pose, options=shown)
@@ -167,16 +164,11 @@ def transform(parent, child, pose, stamp):
 
 
 def message_of(kind, name, frame, stamp):
-    """The message of a camera's frame: its detections, or a picture as it is or compressed."""
+    """The message of a camera's frame: its detections, or its picture."""
     if kind == APRILTAG_ROS:
         return detections_message(frame.detections, stamp)
     message = message_type(kind)()
     message.header.stamp = stamp
-    if kind == COMPRESSED:
-        message.format = "jpeg"
-        best = [cv2.IMWRITE_JPEG_QUALITY, 95]
-        message.data = array("B", cv2.imencode(".jpg", frame.image, best)[1].tobytes())
-        return message
     colored = name in COLORED
     pixels = np.repeat(frame.image[..., None], 3, axis=2) if colored else frame.image
     message.height, message.width = pixels.shape[:2]

@@ -1,9 +1,8 @@
 """Pictures over real DDS: the node searches them itself, and localises."""
 
-import pytest
-
+from jaxnav.ros.camera_messages import IMAGE
 from tests.real_ros.processes import node, sim_car, until
-from tests.real_ros.sim_car import PICTURES, TOPICS
+from tests.real_ros.sim_car import TOPICS
 from tests.real_ros.test_node_drives import (
     CAMERAS,
     PATIENT,
@@ -14,16 +13,14 @@ from tests.real_ros.test_node_drives import (
 )
 
 
-# Two cameras send bgr8, two mono8.
-@pytest.mark.parametrize("word", PICTURES)
-def test_a_car_is_localised_by_its_cameras_pictures(tmp_path, word):
-    kind = PICTURES[word]
-    topics = ", ".join(f"{name}: /{name}/{TOPICS[kind]}" for name in CAMERAS)
-    file = write_file(tmp_path, cameras=f"{{{topics}}}", camera_type=kind)
+def test_a_car_is_localised_by_its_cameras_pictures(tmp_path):
+    """Two cameras send bgr8, two mono8."""
+    topics = ", ".join(f"{name}: /{name}/{TOPICS[IMAGE]}" for name in CAMERAS)
+    file = write_file(tmp_path, cameras=f"{{{topics}}}", camera_type=IMAGE)
     listener = Listener()
     try:
         with (
-            sim_car(tmp_path, word),
+            sim_car(tmp_path, "--images"),
             node(tmp_path, str(file), *PATIENT) as program,
         ):
             until(lambda: len(listener.heard["/jaxnav/pose"]) > 150, 240.0, program)

@@ -94,17 +94,10 @@ def test_rendered_images_become_a_rig_with_its_sigmas(shots, tmp_path, capsys) -
     assert "next: take more views" in out
 
 
-@pytest.mark.parametrize(
-    ("lens", "focal_px", "coefficients"),
-    [
-        ("omni", 606.0, [0.9, -0.05, 0.01, 1e-3, -5e-4]),
-        ("double_sphere", 280.0, [-0.12, 0.58]),
-        ("eucm", 319.0, [0.62, 1.1]),
-    ],
-)
-def test_rendered_images_of_another_wide_lens_tell_it(tmp_path, lens, focal_px, coefficients):
+def test_rendered_images_of_another_wide_lens_tell_it(tmp_path):
     """In the file that `load_rig` and the other commands take."""
-    camera = Camera.create((focal_px, focal_px), (401.0, 202.0), lens, coefficients)
+    lens, bent = "omni", [0.9, -0.05, 0.01, 1e-3, -5e-4]
+    camera = Camera.create((606.0, 606.0), (401.0, 202.0), lens, bent)
     write_board(tmp_path / "board.yaml", BOARD)
     rendered(tmp_path / "front", BOARD, VIEWS, seed=3, camera=camera)
     args = arguments(tmp_path, tmp_path / "out", f"front={tmp_path / 'front'}", lens=lens)
