@@ -20,12 +20,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxnav.datasets.odometry import OdometryTrack
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
 from jaxnav.models.conventions import APRILTAG_FIRST_CORNER, TL_TR_BR_BL
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.ros.odometry_track import OdometryTrack
 
 TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER]
 

@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field
 
 from jaxnav.datasets import bags
-from jaxnav.datasets.odometry import OdometryTrack
 from jaxnav.datasets.recording import RecordingSource
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
@@ -27,6 +26,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.ros.camera_messages import TAGSLAM
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.ros.odometry_track import OdometryTrack
 
 _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 

@@ -9,8 +9,9 @@ selector: multi-hypothesis
 cameras: {front: /front/detections, left: /left/detections}     # as in topics.yaml
 camera_type: apriltag_msgs/msg/AprilTagDetectionArray   # or sensor_msgs/msg/Image
 corner_sigma_px: 0.3
-odometry: /odom
+odometry: /odom                # of a rig that moves freely: by other software, may be left out
 odometry_type: nav_msgs/msg/Odometry
+T_vehicle_odometry: {wxyz: [1, 0, 0, 0], xyz_m: [0, 0, 0]}    # its body on a rig that moves freely
 odom_tf: false                 # true: odom -> base is what /tf says, not the odometry's pose
 joints: {driven: [rear_left, rear_right], steered: [front_left], wheel_radius_m: 0.033}
 command: /drive
@@ -23,11 +24,24 @@ tf_tolerance_s: 0.0            # tf is stamped so far in the future
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
+from jaxtyping import Float
 from pydantic import Field, model_validator
 
 from jaxnav.errors import BadInput
+from jaxnav.files import poses
+from jaxnav.files.rigs import written_pose
 from jaxnav.files.topics import TopicMap, read_topics
-from jaxnav.files.validation import Entry, Name, NonNegative, Number, Text, at
+from jaxnav.files.validation import (
+    Entry,
+    MountPose,
+    Name,
+    NonNegative,
+    Number,
+    QuaternionPose,
+    Text,
+    at,
+)
 
 Frame = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z_][\w/.\-]{0,99}$")]
 
@@ -63,6 +77,9 @@ class RosFile(TopicMap):
         "geometry_msgs/msg/TwistStamped",
         "sensor_msgs/msg/JointState",
     ] = "nav_msgs/msg/Odometry"
+    T_vehicle_odometry: MountPose = Field(
+        default_factory=lambda: QuaternionPose(wxyz=[1, 0, 0, 0], xyz_m=[0, 0, 0])
+    )
     odom_tf: Annotated[bool, Field(strict=True)] = False
     command: Name = "/drive"
     command_type: Literal["ackermann", "twist"] = "ackermann"
@@ -73,11 +90,17 @@ class RosFile(TopicMap):
     @model_validator(mode="after")
     def _fits_together(self) -> "RosFile":
         if self.vehicle is None:
-            for key in ("route", "odometry", "joints"):
+            for key in ("route", "joints"):
                 if getattr(self, key) is not None:
                     raise ValueError(f"{key} needs a vehicle")
+            if self.odometry_type != "nav_msgs/msg/Odometry":
+                raise ValueError(
+                    "without a vehicle odometry_type is nav_msgs/msg/Odometry, which has a pose"
+                )
         elif self.odometry is None:
             raise ValueError("a vehicle needs odometry: its topic")
+        elif "T_vehicle_odometry" in self.model_fields_set:
+            raise ValueError("T_vehicle_odometry is for a rig that moves freely, without a vehicle")
         if (self.joints is not None) != (self.odometry_type == "sensor_msgs/msg/JointState"):
             raise ValueError("joints go with the odometry_type sensor_msgs/msg/JointState")
         return self
@@ -101,6 +124,11 @@ class RosFile(TopicMap):
         """Whether corners are pixels of a rectified image; apriltag_ros takes one."""
         detects = self.camera_type == "apriltag_msgs/msg/AprilTagDetectionArray"
         return detects if self.rectified is None else self.rectified
+
+    @property
+    def T_vehicle_sensor(self) -> Float[np.ndarray, " 7"]:
+        """Where the body of a free rig's odometry is on it, (7,) wxyz xyz."""
+        return poses.pose_as_read(written_pose(self.T_vehicle_odometry))
 
     def with_markers(self, path: str) -> "RosFile":
         """The same with another marker file, whose path counts from this file's folder."""

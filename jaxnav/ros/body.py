@@ -1,7 +1,8 @@
-"""Localise a rig that moves freely, without odometry, from frames that arrive camera by camera.
+"""Localise a rig that moves freely from frames that arrive camera by camera, and any odometry.
 
-Frames of one stamp are one observation. Observations are taken in the order of their stamps, so
-that who comes first changes nothing: what `jaxnav replay` makes of the same frames is the same.
+Frames of one stamp are one observation. Observations are taken in the order of their stamps, and
+wait for the odometry, so that who comes first changes nothing: what `jaxnav replay` makes of the
+same frames is the same.
 """
 
 import threading
@@ -16,9 +17,10 @@ from jaxnav.detection.types import Detections
 from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.observation import Observation
 from jaxnav.ros.estimates import Report, report_of_body
+from jaxnav.ros.odometry_track import GrowingTrack
 
 MAX_DT_S = 1.0  # over a longer pause the motion is predicted for one second
-_PATIENCE_S = 0.1  # an observation waits so long for the frames of its other cameras
+_PATIENCE_S = 0.1  # an observation waits so long for its other cameras and the odometry
 _NONE = Detections.concatenate([])
 
 
@@ -30,15 +32,21 @@ class BodyTracker:
     """
 
     def __init__(
-        self, navigator: Navigator, step: Step, cameras: int, tell: Callable[[Report], None]
+        self,
+        navigator: Navigator,
+        step: Step,
+        cameras: int,
+        tell: Callable[[Report], None],
+        odometry: GrowingTrack | None = None,
     ):
         """Args:
         step: compiled `navigator.step`.
         cameras: how many give frames.
         tell: gets the report of each observation, in the tracker's thread.
+        odometry: of the rig, by other software, see `add_odometry`; None: there is none.
         """
         self._navigator, self._step, self._tell = navigator, step, tell
-        self._cameras = cameras
+        self._cameras, self._odometry = cameras, odometry
         self._state = navigator.init()
         self._last_ns: int | None = None
         self._sets: dict[int, tuple[float, dict[int, Detections]]] = {}  # by stamp
@@ -49,7 +57,7 @@ class BodyTracker:
 
     def warm_up(self) -> None:
         """Compile without changing the state."""
-        self._step(self._state, self._observation({}, 0.0))
+        self._step(self._state, self._observation({}, 0, 0))
 
     def start(self) -> None:
         """Begin to track."""
@@ -62,6 +70,13 @@ class BodyTracker:
                 self.late += 1
                 return
             self._sets.setdefault(stamp_ns, (time.monotonic(), {}))[1][camera] = detections
+            self._came.notify()
+
+    def add_odometry(self, stamp_ns: int, T_odom_sensor: np.ndarray) -> None:
+        """Take a pose (7,) of the odometry's body in its own frame."""
+        assert self._odometry is not None
+        with self._came:
+            self._odometry.add(stamp_ns, T_odom_sensor)
             self._came.notify()
 
     def close(self) -> None:
@@ -77,8 +92,8 @@ class BodyTracker:
             stamp_ns, frames = taken
             before_ns = stamp_ns if self._last_ns is None else self._last_ns
             self._last_ns = stamp_ns
-            dt_s = min(max((stamp_ns - before_ns) / 1e9, 0.0), MAX_DT_S)
-            self._state, output = self._step(self._state, self._observation(frames, dt_s))
+            obs = self._observation(frames, before_ns, stamp_ns)
+            self._state, output = self._step(self._state, obs)
             belief = self._state.belief
             restarts, origin_m = int(belief.restarts), self._navigator.markers.origin_m
             self._tell(report_of_body(output, belief.bank, restarts, stamp_ns, origin_m))
@@ -91,7 +106,8 @@ class BodyTracker:
                     stamp_ns = min(self._sets)
                     came_s, frames = self._sets[stamp_ns]
                     waits_s = came_s + _PATIENCE_S - time.monotonic()
-                    if len(frames) >= self._cameras or waits_s <= 0:
+                    told = self._odometry is None or self._odometry.reaches(stamp_ns)
+                    if (told and len(frames) >= self._cameras) or waits_s <= 0:
                         del self._sets[stamp_ns]
                         return stamp_ns, frames
                     self._came.wait(waits_s)
@@ -99,12 +115,21 @@ class BodyTracker:
                     self._came.wait()
             return None
 
-    def _observation(self, frames: dict[int, Detections], dt_s: float) -> Observation:
+    def _observation(
+        self, frames: dict[int, Detections], before_ns: int, stamp_ns: int
+    ) -> Observation:
         count = len(self._navigator.rig)
         lanes = observe([frames.get(c, _NONE) for c in range(count)], self._navigator.markers)
         dtype = np.asarray(self._navigator.corner_sigma_px).dtype
+        dt_s, twist = max((stamp_ns - before_ns) / 1e9, 0.0), None
+        if self._odometry is not None:
+            with self._came:
+                twist = self._odometry.twist(before_ns, stamp_ns)
+        if twist is None or not np.isfinite(twist).all():
+            dt_s = min(dt_s, MAX_DT_S)
         return Observation(
             jnp.asarray(lanes.corners_px, dtype),
             jnp.asarray(lanes.visible),
             dt_s=jnp.asarray(dt_s, dtype),
+            twist=None if twist is None else jnp.asarray(twist, dtype),
         )

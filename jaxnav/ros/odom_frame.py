@@ -15,6 +15,7 @@ import numpy as np
 from jaxnav.files.poses import compose, inverse, pose_from_rotation_vector, rotated
 from jaxnav.ros.source_clock import SourceClock
 
+IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])  # wxyz xyz
 _STALE_NS = 200_000_000  # an older odometry is not carried on
 _KEPT = 64  # transforms of a frame, of which the estimate's time must lie near the last
 _RATE_NS = 50_000_000  # a frame's motion is told by transforms at least so far apart
@@ -32,12 +33,16 @@ class OdomFrame(Protocol):
 class OdomPose:
     """The pose of an odometry's last message, carried on to the present by its twist."""
 
-    def __init__(self) -> None:
+    def __init__(self, T_base_sensor: np.ndarray = IDENTITY) -> None:
+        """Args:
+        T_base_sensor: (7,) where the body of the odometry is on the base.
+        """
         self._last: tuple[int, np.ndarray, np.ndarray] | None = None
+        self._T_sensor_base = inverse(T_base_sensor)
 
     def add(self, stamp_ns: int, message: Any) -> None:
-        """Take a nav_msgs/Odometry, whose pose is T_odom_base."""
-        pose = _pose(message.pose.pose.position, message.pose.pose.orientation)
+        """Take a nav_msgs/Odometry, whose pose is T_odom_sensor."""
+        pose = pose_of(message.pose.pose.position, message.pose.pose.orientation)
         twist = message.twist.twist
         v, w = twist.linear, twist.angular
         rates = np.array([v.x, v.y, v.z, w.x, w.y, w.z])
@@ -50,7 +55,7 @@ class OdomPose:
             return None
         stamp_ns, pose, rates = self._last
         step = rates * min(max(now_ns - stamp_ns, 0), _STALE_NS) / 1e9
-        return compose(pose, _moved(step))
+        return compose(compose(pose, _moved(step)), self._T_sensor_base)
 
 
 @dataclass
@@ -104,7 +109,7 @@ class OdomTf:
 
     def at(self, now_ns: int) -> np.ndarray | None:
         """See `OdomFrame`."""
-        frame, T = self._base, np.array([1.0, 0, 0, 0, 0, 0, 0])
+        frame, T = self._base, IDENTITY
         for _ in range(_LONGEST):
             link = self._links.get(frame)
             if link is None:
@@ -116,7 +121,7 @@ class OdomTf:
 
     def _add(self, told: Any, is_static: bool) -> None:
         frame, parent = told.child_frame_id.lstrip("/"), told.header.frame_id.lstrip("/")
-        pose = _pose(told.transform.translation, told.transform.rotation)
+        pose = pose_of(told.transform.translation, told.transform.rotation)
         if pose is None or frame == self._odom:  # above odom stands our own transform
             return
         link = self._links.get(frame)
@@ -132,7 +137,7 @@ class OdomTf:
         self._links[frame] = link  # only now, as `at` reads it in another thread
 
 
-def _pose(position: Any, orientation: Any) -> np.ndarray | None:
+def pose_of(position: Any, orientation: Any) -> np.ndarray | None:
     """The pose (7,) in two parts of a message; None where it is none."""
     p, q = position, orientation
     pose = np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])

@@ -14,12 +14,12 @@ from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.cli import main
 from jaxnav.datasets import replay as replays
-from jaxnav.datasets.odometry import OdometryTrack
 from jaxnav.datasets.recordings import Recording, read_recording
 from jaxnav.datasets.replay import CHUNK_FRAMES, Replay, errors, frames_in_view, replay
 from jaxnav.files import write_params
 from jaxnav.navigator import Navigator
 from jaxnav.pose.observation import Observation
+from jaxnav.ros.odometry_track import OdometryTrack
 from tests.helpers.compiling import jit_to_run
 
 

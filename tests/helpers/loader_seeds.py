@@ -264,6 +264,13 @@ camera_info: {{front: /front/camera_info}}
 rectified: false
 tf_tolerance_s: 0.1
 """
+ROS_BODY = """
+rig: rig.yaml
+markers: markers.yaml
+cameras: {front: /front/detections}
+odometry: /vio/odom
+T_vehicle_odometry: {wxyz: [0, 0, 0, 1], xyz_m: [0.1, 0, -0.2]}
+"""
 STRUCTURED = {
     "rig": Loader(_written("rig.yaml", (QCAR / "rig.yaml").read_bytes()), files.load_rig),
     "saved rig": Loader(_saved("rig.yaml", files.save_rig, qcar_rig), files.load_rig),
@@ -280,6 +287,7 @@ STRUCTURED = {
     "params": Loader(_written("params.yaml", PARAMS), _applied),
     "topics": Loader(_written("topics.yaml", TOPICS), files.load_topics),
     "ROS node": Loader(_written("node.yaml", ROS_NODE), load_ros),
+    "ROS node of a free rig": Loader(_written("node.yaml", ROS_BODY), load_ros),
     "Kalibr rig": Loader(_written("chain.yaml", KALIBR), files.load_rig),
     "Kalibr camera": Loader(
         _written("chain.yaml", KALIBR), lambda path: files.load_camera(path, "cam1")

@@ -1,7 +1,7 @@
-"""A rig that moves freely in the node of ROS 2, without odometry."""
+"""A rig that moves freely in the node of ROS 2, without odometry or with that of other software."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -31,6 +31,9 @@ from jaxnav.navigator import Navigator
 from jaxnav.ros.body import BodyTracker
 from jaxnav.ros.connection import Connection
 from jaxnav.ros.estimates import Report
+from jaxnav.ros.odom_frame import pose_of
+from jaxnav.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.ros.odometry_track import GrowingTrack
 from jaxnav.vehicles.ros2_cameras import open_cameras
 
 _LOOK_S = 0.05
@@ -70,24 +73,39 @@ class PreparedBody:
         self._searches = searches_for(args.corner_backend, rig, markers)
         connection.ros_time = True  # the same stamps give the same poses, whenever they come
         self._step = compiled_step(self._navigator, step_folder())
-        timed(say, BodyTracker(self._navigator, self._step, 1, lambda report: None).warm_up)
+        timed(say, self._tracker(lambda report: None).warm_up)
         odom, listening = odom_for(file, connection)
         self._leave = partial(connection.forget, *listening)
         self._publisher = publisher_for(file, connection, markers, odom)
+        self._connection = connection
         nothing: Any = None
         options = file.options(False, connection.sim_time) | {"stamps": "ros"}
         self._setup = Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
 
     def begin(self) -> Activity:
         """Begin to track it, with nothing known."""
-        count = len(self.file.cameras)
-        tracker = BodyTracker(self._navigator, self._step, count, self._send)
-        return _Tracking(tracker, open_cameras(self._setup, None), self._searches)
+        tracker, leave = self._tracker(self._send), lambda: None
+        if self.file.odometry is not None:
+            clock = self._connection.source_clock()
+
+            def take(message: Any) -> None:
+                pose = pose_of(message.pose.pose.position, message.pose.pose.orientation)
+                if pose is not None:
+                    tracker.add_odometry(clock.time_ns(message.header.stamp), pose)
+
+            end = self._connection.listen(NAV_ODOMETRY, self.file.odometry, take)
+            leave = partial(self._connection.forget, end)
+        return _Tracking(tracker, open_cameras(self._setup, None), self._searches, leave)
 
     def close(self) -> None:
         """Leave the topics."""
         self._publisher.close()
         self._leave()
+
+    def _tracker(self, tell: Callable[[Report], None]) -> BodyTracker:
+        file = self.file
+        track = None if file.odometry is None else GrowingTrack(file.T_vehicle_sensor)
+        return BodyTracker(self._navigator, self._step, len(file.cameras), tell, track)
 
     def _send(self, report: Report) -> None:
         if report.decided:
@@ -100,8 +118,18 @@ class _Tracking:
 
     ended: str | None = None
 
-    def __init__(self, tracker: BodyTracker, cameras: Sequence[Camera], searches: Sequence[Search]):
+    def __init__(
+        self,
+        tracker: BodyTracker,
+        cameras: Sequence[Camera],
+        searches: Sequence[Search],
+        leave: Callable[[], None],
+    ):
+        """Args:
+        leave: called at the end.
+        """
         self._tracker, self._cameras, self._searches = tracker, cameras, searches
+        self._leave = leave
         self._over = threading.Event()
         tracker.start()
         self._threads = [
@@ -118,6 +146,7 @@ class _Tracking:
             camera.close()
         for thread in self._threads:
             thread.join(1.0)
+        self._leave()
         self._tracker.close()
 
     def save(self, folder: str) -> str:

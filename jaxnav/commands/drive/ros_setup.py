@@ -15,7 +15,7 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import PILOT_SELECTORS
 from jaxnav.ros.connection import Connection
 from jaxnav.ros.lenses import await_lenses, with_lenses
-from jaxnav.ros.odom_frame import OdomFrame, OdomPose, OdomTf
+from jaxnav.ros.odom_frame import IDENTITY, OdomFrame, OdomPose, OdomTf
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
 from jaxnav.ros.publisher import FrameNames, Publisher
 
@@ -68,7 +68,8 @@ def odom_for(file: RosFile, connection: Connection) -> tuple[OdomFrame | None, l
         ]
     if file.odometry_type != NAV_ODOMETRY or file.odometry is None:
         return None, []
-    of_pose, clock = OdomPose(), connection.source_clock()
+    T_base_sensor = file.T_vehicle_sensor if file.vehicle is None else IDENTITY
+    of_pose, clock = OdomPose(T_base_sensor), connection.source_clock()
 
     def take(message: Any) -> None:
         of_pose.add(clock.time_ns(message.header.stamp), message)

@@ -4,6 +4,7 @@ A visual-inertial odometry, a lidar or a T265 tells where its body is in a frame
 the map. Only the motion between two times is used of it.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from jaxnav.files.poses import inverse, matrix
 
 _MAX_GAP_S = 0.5  # between two poses; what happened in a longer one is not known
+_KEPT = 1024  # poses of a track that grows: 2 s at 500 Hz
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,31 @@ class OdometryTrack:
         for axis in range(3):
             T[:, axis, 3] = np.interp(asked_s, times_s, self.T_odom_sensor[:, 4 + axis])
         return known, T @ matrix(inverse(self.T_vehicle_sensor))
+
+
+class GrowingTrack:
+    """The last poses of an odometry that goes on. For one thread at a time."""
+
+    def __init__(self, T_vehicle_sensor: Float[np.ndarray, " 7"]):
+        """See `OdometryTrack`."""
+        self._T_vehicle_sensor = T_vehicle_sensor
+        self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=_KEPT)
+
+    def add(self, stamp_ns: int, T_odom_sensor: Float[np.ndarray, " 7"]) -> None:
+        """Take a pose (7,) wxyz xyz; one that is older than the last is left out."""
+        if not self.reaches(stamp_ns):
+            self._poses.append((stamp_ns, T_odom_sensor))
+
+    def reaches(self, stamp_ns: int) -> bool:
+        """Whether the track tells where the body was until then."""
+        return bool(self._poses) and self._poses[-1][0] >= stamp_ns
+
+    def twist(self, before_ns: int, stamp_ns: int) -> Float[np.ndarray, " 6"]:
+        """The vehicle's mean twist (6,) between two times; NaN where it is not known."""
+        stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._poses], np.int64)
+        poses = np.array([pose for _, pose in self._poses]).reshape(-1, 7)
+        track = OdometryTrack(stamps_ns, poses, self._T_vehicle_sensor)
+        return track.twists(np.array([before_ns, stamp_ns]))[1]
 
 
 def _logarithms(T: Float[np.ndarray, "K 4 4"]) -> Float[np.ndarray, "K 6"]:
