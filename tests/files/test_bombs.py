@@ -15,7 +15,7 @@ import zarr
 from jaxnav.datasets import bag_readers
 from jaxnav.datasets.bags import decompress_bag, read_bag
 from jaxnav.datasets.recordings import read_recording
-from jaxnav.detection import make_detector
+from jaxnav.detection import crowd, make_detector
 from jaxnav.detection.aruco import _CLOSER_LOOK_PX, _worth_a_look
 from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import all_cells
@@ -234,11 +234,18 @@ def chessboard(side_px: int) -> np.ndarray:
     return ((x // side_px + y // side_px) % 2 * 255).astype(np.uint8)
 
 
+def turned(image: np.ndarray, angle_deg: float) -> np.ndarray:
+    about = cv2.getRotationMatrix2D((410, 205), angle_deg, 1)
+    return cv2.warpAffine(image, about, (820, 410), borderMode=cv2.BORDER_REFLECT)
+
+
 CROWDS = {
     "grille": grille(16, 10),
     "mesh": 250 - grille(20, 12),
     "chessboard": chessboard(10),
     "wide chessboard": chessboard(30),
+    "turned grille": turned(grille(16, 10), 25.0),
+    "turned mesh": turned(250 - grille(20, 12), 40.0),
 }
 
 
@@ -267,6 +274,17 @@ def test_an_ordinary_picture_is_left_as_it_is():
     rng = np.random.default_rng(0)
     for image in (rng.integers(0, 256, (410, 820), np.uint8), grille(160, 100)):
         assert thin_crowd(image, "tag36h11", 25.0) is image
+
+
+@pytest.mark.parametrize("grain_px", [2, 3, 4, 6, 8])
+def test_a_textured_wall_is_no_crowd_and_costs_no_search(grain_px, monkeypatch):
+    """A carpet, gravel, plaster: spots by the hundred, hardly a square."""
+    rng = np.random.default_rng(grain_px)
+    grains = rng.normal(110, 25, (410 // grain_px + 1, 820 // grain_px + 1))
+    wall = cv2.resize(grains, (820, 410), interpolation=cv2.INTER_LINEAR)
+    image = np.clip(wall + rng.normal(0, 3, wall.shape), 0, 255).astype(np.uint8)
+    monkeypatch.setattr(crowd, "_quads", lambda *_: pytest.fail("searched"))
+    assert thin_crowd(image, "tag36h11", 25.0) is image
 
 
 def test_what_is_worth_a_look_is_what_it_was():

@@ -179,6 +179,14 @@ def test_while_its_clock_stands_the_vehicle_stands_and_then_drives_on(standing):
         assert drive.car.told[-1][1] == pytest.approx(0.2)
 
 
+def test_a_clock_that_is_set_back_ends_the_drive(standing):
+    with Drive(standing) as drive:
+        drive.clock = lambda: time.monotonic_ns() - 100 * 10**9
+        assert drive.stopped_after(time.monotonic()) < TIMEOUT_S + SLACK_S
+        assert drive.guard.tripped
+        assert drive.car.told[-1][1] == 0
+
+
 def test_a_clock_stands_once_it_has_for_a_while():
     now_s = [5.0]
     clock = StandingClock(lambda: now_s[0])
