@@ -17,6 +17,7 @@ from jaxnav.commands.doctor.route_file import sight_along, turning_radius_m, veh
 from jaxnav.files import Route, calib_dir, load_route, save_rig
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.camera import Camera
+from jaxnav.models.lenses import MOST_COEFFICIENTS
 from jaxnav.models.rig import CameraRig
 from tests.helpers.findings import all_well, the_problem
 from tests.worlds import marker_map, paper_markers, qcar, qcar_rig, upright
@@ -107,7 +108,7 @@ def test_lenses_of_other_images(change, level, words):
 
 @pytest.mark.parametrize(("k1", "level"), [(-0.13, "warning"), (-0.6, "error")])
 def test_a_lens_that_folds_within_the_image(k1, level):
-    found = the_problem(lenses(with_lens(distortion=[k1, *[0] * 7])), level)
+    found = the_problem(lenses(with_lens(distortion=[k1, *[0] * (MOST_COEFFICIENTS - 1)])), level)
     assert found.what.startswith("front: the lens model can be inverted up to")
 
 
