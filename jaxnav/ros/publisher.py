@@ -70,7 +70,7 @@ class Publisher:
             self._publishers.append(self._bank)
         self.show_map(markers)
         self._latest: Report | None = None
-        self._closing = threading.Event()
+        self._closing, self._due = threading.Event(), threading.Event()
         self._told_s = 0.0
         self._delays = Statistics()
         self.failed: str | None = None
@@ -114,7 +114,10 @@ class Publisher:
                 self._publish_pose(report)
         except OSError as error:
             self.failed = str(error)
-        self._latest = report
+        before, self._latest = self._latest, report
+        # A start lasts for some frames only: what is new about it is told at once.
+        if before is None or (before.located, before.decided) != (report.located, report.decided):
+            self._due.set()
 
     def show_map(self, markers: MarkerMap) -> None:
         """Send a picture of the map to whoever listens, now or later."""
@@ -135,6 +138,7 @@ class Publisher:
         if self._closing.is_set():
             return
         self._closing.set()
+        self._due.set()
         self._thread.join(1.0)
         self._connection.forget(*self._publishers)
 
@@ -155,7 +159,9 @@ class Publisher:
 
     def _tell(self) -> None:
         told: Report | None = None
-        while not self._closing.wait(_PERIOD_S):
+        while not self._closing.is_set():
+            self._due.wait(_PERIOD_S)
+            self._due.clear()
             report = self._latest
             if report is None or report is told:
                 continue
