@@ -54,8 +54,11 @@ def is_bag(path: Path) -> bool:
     return path.name.endswith((".bag", ".bag.bz2"))
 
 
-def read_bag(path: Path) -> Bag:
+def read_bag(path: Path, odometry: str | None = None) -> Bag:
     """Read a .bag or .bag.bz2.
+
+    Args:
+        odometry: the topic of odometry that is wanted; what others hold is not looked at.
 
     Raises:
         BadInput: the file is no bag, or ends too early.
@@ -65,8 +68,12 @@ def read_bag(path: Path) -> Bag:
         try:
             with Ros1Reader(plain) as reader:
                 bag.topics = {c.topic: c.msgtype for c in reader.connections}
-                kinds = (TAGSLAM, NAV_ODOMETRY, *_TF_TYPES)
-                wanted = [c for c in reader.connections if c.msgtype in kinds]
+                wanted = [
+                    c
+                    for c in reader.connections
+                    if c.msgtype in (TAGSLAM, *_TF_TYPES)
+                    or (c.msgtype == NAV_ODOMETRY and c.topic == odometry)
+                ]
                 for connection, _, message in messages(reader, wanted, {}):
                     if connection.msgtype == TAGSLAM:
                         detections = bag.detections.setdefault(connection.topic, TopicDetections())

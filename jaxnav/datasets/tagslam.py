@@ -78,12 +78,14 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> RecordingSource:
     if not files:
         raise BadInput(path, "holds no .bag and no .bag.bz2")
     chain = kalibr.camchain(path / "cameras.yaml")
-    recorded = [bags.read_bag(file) for file in files]
+    body = next(iter(chain.values())).rig_body or "rig"
+    moves = _body(path, body)
+    topic = None if moves is None else moves.odom_topic
+    recorded = [bags.read_bag(file, topic) for file in files]
     rows = bags.rows_of_topics(
         [_detections(path, key, entry, recorded) for key, entry in chain.items()]
     )
     edges = {edge: stamped for bag in recorded for edge, stamped in bag.transforms.items()}
-    body = next(iter(chain.values())).rig_body or "rig"
     rig = rig or _rig(path, chain, edges, body)
     if len(rig) != len(chain):
         problem = f"has {len(rig)} cameras, but {path / 'cameras.yaml'} has {len(chain)}"
@@ -94,7 +96,7 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> RecordingSource:
         rig,
         lambda: _markers(path, edges),
         lambda: _reference(edges, body),
-        _odometry(path, body, recorded),
+        None if moves is None else _odometry(path, body, moves, recorded),
     )
 
 
@@ -125,14 +127,21 @@ def _detections(
     return detections[0]
 
 
-def _odometry(path: Path, body: str, recorded: list[bags.Bag]) -> OdometryTrack | None:
-    """The track of the rig's `odom_topic`; None where tagslam.yaml names none."""
+def _body(path: Path, body: str) -> _BodyEntry | None:
+    """The entry of the rig in tagslam.yaml; None without one."""
     file = path / "tagslam.yaml"
     if not file.is_file():
         return None
-    entry = _by_name(validate(TagSlamFile, read_mapping(file), file)).get(body)
-    if entry is None or entry.odom_topic is None:
+    return _by_name(validate(TagSlamFile, read_mapping(file), file)).get(body)
+
+
+def _odometry(
+    path: Path, body: str, entry: _BodyEntry, recorded: list[bags.Bag]
+) -> OdometryTrack | None:
+    """The track of the rig's `odom_topic`; None where its entry names none."""
+    if entry.odom_topic is None:
         return None
+    file = path / "tagslam.yaml"
     where = at(file, f"bodies.{body}")
     if entry.T_body_odom is None:
         raise BadInput(f"{where}.T_body_odom", f"missing: where is the body of {entry.odom_topic}?")

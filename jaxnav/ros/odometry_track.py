@@ -83,8 +83,13 @@ class GrowingTrack:
 
     def twist(self, before_ns: int, stamp_ns: int) -> Float[np.ndarray, " 6"]:
         """The vehicle's mean twist (6,) between two times; NaN where it is not known."""
-        stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._poses], np.int64)
-        poses = np.array([pose for _, pose in self._poses]).reshape(-1, 7)
+        kept = []  # back to the last one before both
+        for one in reversed(self._poses):
+            kept.append(one)
+            if one[0] <= before_ns:
+                break
+        stamps_ns = np.array([one[0] for one in reversed(kept)], np.int64)
+        poses = np.array([one[1] for one in reversed(kept)]).reshape(-1, 7)
         track = OdometryTrack(stamps_ns, poses, self._T_vehicle_sensor)
         return track.twists(np.array([before_ns, stamp_ns]))[1]
 
