@@ -3,8 +3,9 @@
 Source: Liu, Schofield, Shan (2023), Eqs. 16-19.
 """
 
+import abc
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.models.bicycle import Vehicle, curvature_per_m, sideslip_rad
 from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
+from jaxnav.models.twist_base import TwistBase
 
 
 class Command(eqx.Module):
@@ -58,7 +60,96 @@ class Exploration(eqx.Module):
     duration_s: float = 12.0
 
 
-class Controller(eqx.Module):
+class Follower(eqx.Module):
+    """Base class of the controllers: waypoint after waypoint, whatever is commanded."""
+
+    waypoints_m: eqx.AbstractVar[Float[Array, "W 2"]]
+    waypoint_radius_m: eqx.AbstractVar[Float[Array, ""]]
+    vehicle: eqx.AbstractVar[Vehicle | TwistBase]
+
+    @classmethod
+    def along(
+        cls,
+        waypoints_m: Sequence[Sequence[float]] | Float[Array, "W 2"],
+        vehicle: Vehicle | TwistBase | None,
+        **numbers: float,
+    ) -> Self:
+        """A controller of plain numbers, by the names of its fields.
+
+        Raises:
+            ValueError: no vehicle, or waypoints of the wrong shape.
+        """
+        waypoints = jnp.asarray(waypoints_m, float)
+        if vehicle is None:
+            raise ValueError("waypoints_m needs a vehicle to drive")
+        if waypoints.ndim != 2 or waypoints.shape[1] != 2:
+            raise ValueError(f"waypoints_m must be (W, 2), got {waypoints.shape}")
+        arrays: dict[str, Any] = {k: jnp.asarray(number, float) for k, number in numbers.items()}
+        return cls(waypoints_m=waypoints, vehicle=vehicle, **arrays)
+
+    def init(self) -> ControlState:
+        """The state at the first waypoint, with a zero integral."""
+        zero = jnp.zeros_like(self.waypoint_radius_m)
+        return ControlState(jnp.asarray(0), zero, zero, zero)
+
+    def __call__(
+        self,
+        state: ControlState,
+        pose: Float[Array, " 3"],
+        located: Bool[Array, ""],
+        steering_rad: Float[Array, ""],
+        dt_s: Float[Array, ""],
+        decided: Bool[Array, ""] | bool = True,
+        to_marker_m: Float[Array, " 2"] | None = None,
+        speed_mps: Float[Array, ""] | float = np.nan,
+    ) -> tuple[ControlState, Any, Bool[Array, ""], ControlLog]:
+        """One command, towards the next waypoint if the present one is reached.
+
+        Args:
+            state: after the previous command.
+            pose: (x_m, y_m, psi_rad) of the vehicle in the world.
+            located: whether a pose has been estimated yet.
+            steering_rad: measured steering angle, for the sideslip; a NaN is taken as 0.
+            dt_s: time since the previous call; taken as 0 where it is not positive and finite.
+            decided: whether the pose may be acted upon.
+            to_marker_m: (2,) position of the nearest marker in vehicle axes, which is the same
+                under all poses that are still possible. Needed where `decided` may be False.
+            speed_mps: measured speed, which exploration controls; NaN: it drives open-loop.
+
+        Returns:
+            The next state, the command, whether the last waypoint is reached, and the log.
+        """
+        count, index = self.waypoints_m.shape[0], state.waypoint_index
+        short_m = self.short_of(index, pose)
+        arrived = located & decided & (short_m <= 0)
+        index = jnp.minimum(index + (arrived & (index < count)), count)
+        integral_ms = jnp.where(arrived, 0, state.integral_ms)
+        state = ControlState(index, integral_ms, state.explored_s, state.side)
+        return self.towards(
+            state, pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps
+        )
+
+    @abc.abstractmethod
+    def towards(
+        self,
+        state: ControlState,
+        pose: Float[Array, " 3"],
+        located: Bool[Array, ""],
+        steering_rad: Float[Array, ""],
+        dt_s: Float[Array, ""],
+        decided: Bool[Array, ""] | bool = True,
+        to_marker_m: Float[Array, " 2"] | None = None,
+        speed_mps: Float[Array, ""] | float = np.nan,
+    ) -> tuple[ControlState, Any, Bool[Array, ""], ControlLog]:
+        """One command towards the waypoint of the state, whether it is reached or not."""
+
+    def short_of(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
+        """Distance to the circle inside which a waypoint counts as reached, m; negative inside."""
+        waypoint_m = self.waypoints_m[jnp.minimum(index, self.waypoints_m.shape[0] - 1)]
+        return safe_norm(waypoint_m - pose[:2]) - self.waypoint_radius_m
+
+
+class Controller(Follower):
     """Ackermann steering on an arc to the waypoint, and PI throttle on the distance to it.
 
         alpha = atan2(Y_d - y, X_d - x) - psi - beta                               (Eq. 17)
@@ -91,68 +182,6 @@ class Controller(eqx.Module):
     # The throttle is halved where |alpha| is this large; inf: never.
     slows_at_rad: Float[Array, ""] | float = np.inf
     exploration: Exploration = Exploration()
-
-    @classmethod
-    def along(
-        cls,
-        waypoints_m: Sequence[Sequence[float]] | Float[Array, "W 2"],
-        vehicle: Vehicle | None,
-        **numbers: float,
-    ) -> "Controller":
-        """A controller of plain numbers, by the names of its fields.
-
-        Raises:
-            ValueError: no vehicle, or waypoints of the wrong shape.
-        """
-        waypoints = jnp.asarray(waypoints_m, float)
-        if vehicle is None:
-            raise ValueError("waypoints_m needs a vehicle to drive")
-        if waypoints.ndim != 2 or waypoints.shape[1] != 2:
-            raise ValueError(f"waypoints_m must be (W, 2), got {waypoints.shape}")
-        arrays: dict[str, Any] = {k: jnp.asarray(number, float) for k, number in numbers.items()}
-        return cls(waypoints_m=waypoints, vehicle=vehicle, **arrays)
-
-    def init(self) -> ControlState:
-        """The state at the first waypoint, with a zero integral."""
-        zero = jnp.zeros_like(self.waypoint_radius_m)
-        return ControlState(jnp.asarray(0), zero, zero, zero)
-
-    def __call__(
-        self,
-        state: ControlState,
-        pose: Float[Array, " 3"],
-        located: Bool[Array, ""],
-        steering_rad: Float[Array, ""],
-        dt_s: Float[Array, ""],
-        decided: Bool[Array, ""] | bool = True,
-        to_marker_m: Float[Array, " 2"] | None = None,
-        speed_mps: Float[Array, ""] | float = np.nan,
-    ) -> tuple[ControlState, Command, Bool[Array, ""], ControlLog]:
-        """One command, towards the next waypoint if the present one is reached.
-
-        Args:
-            state: after the previous command.
-            pose: (x_m, y_m, psi_rad) of the vehicle in the world.
-            located: whether a pose has been estimated yet.
-            steering_rad: measured steering angle, for the sideslip; a NaN is taken as 0.
-            dt_s: time since the previous call; taken as 0 where it is not positive and finite.
-            decided: whether the pose may be acted upon.
-            to_marker_m: (2,) position of the nearest marker in vehicle axes, which is the same
-                under all poses that are still possible. Needed where `decided` may be False.
-            speed_mps: measured speed, which exploration controls; NaN: it drives open-loop.
-
-        Returns:
-            The next state, the command, whether the last waypoint is reached, and the log.
-        """
-        count, index = self.waypoints_m.shape[0], state.waypoint_index
-        short_m = self.short_of(index, pose)
-        arrived = located & decided & (short_m <= 0)
-        index = jnp.minimum(index + (arrived & (index < count)), count)
-        integral_ms = jnp.where(arrived, 0, state.integral_ms)
-        state = ControlState(index, integral_ms, state.explored_s, state.side)
-        return self.towards(
-            state, pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps
-        )
 
     def towards(
         self,
@@ -230,11 +259,6 @@ class Controller(eqx.Module):
             jnp.where(decided, 0, state.explored_s + dt_s),
             jnp.where(decided, 0, side),
         ), Command(steering, jnp.where(goes, throttle, 0))
-
-    def short_of(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
-        """Distance to the circle inside which a waypoint counts as reached, m; negative inside."""
-        waypoint_m = self.waypoints_m[jnp.minimum(index, self.waypoints_m.shape[0] - 1)]
-        return safe_norm(waypoint_m - pose[:2]) - self.waypoint_radius_m
 
     def _orbited(
         self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""]

@@ -7,6 +7,7 @@ Source: Liu, Schofield, Shan (2023), Algorithm 1.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,13 +23,15 @@ from jaxnav.belief.estimate import Belief, Estimate, Evidence
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.motion import Motion
 from jaxnav.belief.repeats import RepeatedErrors, surprise_of
-from jaxnav.control import Command, Controller, ControlLog, ControlState
+from jaxnav.control import Controller, ControlLog, ControlState, Follower
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.pose.candidates import Candidates, find_candidates
 from jaxnav.pose.consistency import ConsistentSnapshot, remove_outliers
 from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
+from jaxnav.twist_control import TwistController
 
 
 class State(eqx.Module):
@@ -41,7 +44,7 @@ class State(eqx.Module):
 class Output(Estimate):
     """The estimate after one observation, with the command that follows from it."""
 
-    command: Command | None
+    command: Any  # `Command` of a car, `TwistCommand` of another base; None without a route
     done: Bool[Array, ""]  # the last waypoint is reached
     control_log: ControlLog | None
 
@@ -52,8 +55,9 @@ class Navigator(eqx.Module):
         state = navigator.init()
         state, output = navigator.step(state, obs)
 
-    With a vehicle and waypoints it commands the vehicle. Without them it only localises, with the
-    motion model of the body, `ConstantVelocity()` by default.
+    With a vehicle and waypoints it commands the vehicle, a car by steering and throttle, a
+    `TwistBase` by a twist; the gains of the throttle are a car's. Without them it only localises,
+    with the motion model of the body, `ConstantVelocity()` by default.
 
     Coordinates count from `markers.origin_m` (see docs/design.md, Far origins).
     """
@@ -62,7 +66,7 @@ class Navigator(eqx.Module):
     markers: MarkerMap
     selector: Selector
     motion: Motion
-    controller: Controller | None
+    controller: Follower | None
     corner_sigma_px: Float[Array, ""]
     model_sigma_px: Float[Array, ""]
     repeated_errors: RepeatedErrors | None  # None with a single hypothesis, which doubts nothing
@@ -75,7 +79,7 @@ class Navigator(eqx.Module):
         self,
         rig: CameraRig,
         markers: MarkerMap,
-        vehicle: Vehicle | None = None,
+        vehicle: Vehicle | TwistBase | None = None,
         waypoints_m: Sequence[Sequence[float]] | Float[Array, "W 2"] = (),
         waypoint_radius_m: float = 0.15,
         selector: Selector | None = None,
@@ -105,7 +109,11 @@ class Navigator(eqx.Module):
             self.motion = eqx.tree_at(lambda m: m.gate_nis, self.motion, float("inf"))
         self.motion = self.motion.for_rig(rig, self.selector.hypotheses)
         self.controller = None
-        if len(waypoints_m) > 0:
+        if len(waypoints_m) > 0 and isinstance(vehicle, TwistBase):
+            self.controller = TwistController.along(
+                waypoints_m, vehicle, waypoint_radius_m=waypoint_radius_m
+            )
+        elif len(waypoints_m) > 0:
             self.controller = Controller.along(
                 waypoints_m, vehicle, waypoint_radius_m=waypoint_radius_m,
                 proportional_per_m=proportional_per_m, integral_per_ms=integral_per_ms,

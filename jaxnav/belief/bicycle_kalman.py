@@ -1,4 +1,4 @@
-"""The paper's filter for a car: six states, one measured pose, odometry."""
+"""The paper's filter for a vehicle on wheels: six states, one measured pose, odometry, a gyro."""
 
 import dataclasses
 from typing import ClassVar
@@ -16,6 +16,7 @@ from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heav
 from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.gate import Moments, Offer
+from jaxnav.belief.inertial import Turn, bias_at_rest, turn_of, with_turn
 from jaxnav.belief.motion import Motion, Planar, camera_states
 from jaxnav.belief.sensor_errors import (
     SENSORS_END,
@@ -37,13 +38,17 @@ from jaxnav.models.geometry import (
     safe_norm,
     wrap_angle,
 )
+from jaxnav.models.gyro import Gyro
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.numerics.small_matrices import cholesky, log_det, matvec, product, sandwich
 from jaxnav.pose.observation import Observation
 
 
 class BicycleKalman(Motion):
-    """The paper's six-state filter for a car: x, y, psi, v_x, v_y, psi_dot in the world.
+    """The paper's six-state filter in the plane: x, y, psi, v_x, v_y, psi_dot in the world.
+
+    For a car, and for every base whose odometry reads a twist.
 
         x = A x,  P = A P A' + Q,    A = [I, dt I; 0, I]                               (Eq. 9)
         K = P H' (H P H' + R)^-1,  x += K (z - H x)                            (Eqs. 10, 11)
@@ -60,6 +65,7 @@ class BicycleKalman(Motion):
       three of each camera (`camera_errors.py`), where vehicle and rig say that there are any. The
       corners show the pose x - tau v; the odometer's scale has a part that stays and one that comes
       and goes, the slip of the wheels.
+    * Where the vehicle has a gyro, it tells the turn of every interval (`inertial.py`).
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
       floor, since errors of successive frames are correlated.
 
@@ -67,7 +73,7 @@ class BicycleKalman(Motion):
     """
 
     states: ClassVar[int] = SIX
-    vehicle: Vehicle
+    vehicle: Vehicle | TwistBase
     acceleration_density: Float[Array, " 3"] | Float[Array, "3 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.1**2, 0.1**2, 0.3**2])
     )  # along, across, turning: (m/s^2)^2/Hz twice, (rad/s^2)^2/Hz; or the matrix
@@ -92,7 +98,7 @@ class BicycleKalman(Motion):
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
-        dtype = self.vehicle.wheelbase_m.dtype
+        dtype = self.vehicle.dtype
         variance = jnp.append(jnp.ones(SIX, dtype), self._error_variance())
         return empty_bank(jnp.zeros_like(variance), jnp.diag(variance), 3, hypotheses)
 
@@ -113,7 +119,16 @@ class BicycleKalman(Motion):
         dt_s = jnp.asarray(obs.dt_s, bank.mean.dtype)
 
         def one(mean: Array, P: Array, lead: Array) -> tuple[Array, Array, Array]:
-            later, P = self._with_odometry(*self._later(mean, P, obs), obs, dt_s)
+            gyro, before_mps = self.vehicle.gyro, mean[3:5]
+            if gyro is None:
+                later, P = self._with_odometry(*self._later(mean, P, obs), obs, dt_s)
+            else:
+                density = kalman.as_matrix(self.acceleration_density)[2, 2].astype(mean.dtype)
+                turn = turn_of(gyro, obs, mean, density)
+                later, P = self._with_odometry(
+                    *self._later(mean, P, obs, turn), obs, dt_s, turn.told
+                )
+                later, P = self._at_rest(gyro, turn, before_mps, later, P, obs)
             change = _in_body(later) - _in_body(mean)
             return later, P, lead_after(lead, change, dt_s)
 
@@ -139,13 +154,13 @@ class BicycleKalman(Motion):
         def in_body(P: Array, seen: Array, slope: Array) -> tuple[Array, Array]:
             H = product(freedom, product(planar_rotation(-seen[2]), slope))
             of_pose = product(H, P)
-            return kalman.symmetrise(product(of_pose, H.T)), of_pose[:, SENSORS_END:]
+            return kalman.symmetrise(product(of_pose, H.T)), of_pose[:, self._cameras]
 
         covariance, cross = jax.vmap(in_body)(bank.covariance, seen, slopes)
         errors = None
         if self.camera_states:
-            of_cameras = bank.covariance[:, SENSORS_END:, SENSORS_END:]
-            errors = CameraErrors(bank.mean[:, SENSORS_END:], of_cameras, cross)
+            at = self._cameras
+            errors = CameraErrors(bank.mean[:, at], bank.covariance[:, at, at], cross)
         return PoseBelief(
             T_world_vehicle_from_planar(seen),
             covariance,
@@ -192,6 +207,7 @@ class BicycleKalman(Motion):
             measured,
             freedom,
             self.states,
+            0 if self.vehicle.gyro is None else 1,
         )
         P = kalman.replace_first(
             P, jnp.eye(3, P.shape[0], dtype=P.dtype).at[:, :3].set(planar_rotation(pose[2]))
@@ -210,8 +226,8 @@ class BicycleKalman(Motion):
     def for_rig(self, rig: CameraRig, hypotheses: int) -> "BicycleKalman":
         """The model with the errors of cameras and sensors; the paper's six states for one rule."""
         vehicle = self.vehicle
-        if hypotheses == 1 and vehicle.sensor_sigma is not None:
-            vehicle = eqx.tree_at(lambda v: v.sensor_sigma, vehicle, None)
+        if hypotheses == 1:
+            vehicle = dataclasses.replace(vehicle, sensor_sigma=None, gyro=None)
         count = camera_states(rig, hypotheses)
         return dataclasses.replace(self, vehicle=vehicle, camera_states=count)
 
@@ -258,51 +274,81 @@ class BicycleKalman(Motion):
             # d q / d (x, y, psi) in the world, of the errors in view
             slope = product(errors.slope, planar_rotation(-pose[2]))
             cross = product(covariance, product(slope.T, errors.rows))
-            P = P.at[:3, SENSORS_END:].set(cross).at[SENSORS_END:, :3].set(cross.T)
+            P = P.at[:3, self._cameras].set(cross).at[self._cameras, :3].set(cross.T)
         start = jnp.append(pose, jnp.zeros_like(variance[3:]))
         return _at_stamp(*self._with_odometry(start, P, obs), lead)
 
+    @property
+    def _cameras(self) -> slice:
+        """Where in the state the errors of the cameras are."""
+        return slice(SENSORS_END, SENSORS_END + self.camera_states)
+
     def _error_variance(self) -> Array:
         """Variances (p,) of the errors that the state holds behind pose and velocity."""
-        sigma, dtype = self.vehicle.sensor_sigma, self.vehicle.wheelbase_m.dtype
-        if sigma is None and not self.camera_states:
+        sigma, gyro, dtype = self.vehicle.sensor_sigma, self.vehicle.gyro, self.vehicle.dtype
+        if sigma is None and gyro is None and not self.camera_states:
             return jnp.zeros(0, dtype)
         of_sensors = jnp.zeros(4, dtype) if sigma is None else jnp.asarray(sigma, dtype) ** 2
         slip = self._slip_sigma()[None] ** 2
-        return jnp.concatenate([slip, of_sensors, jnp.ones(self.camera_states, dtype)])
+        variance = jnp.concatenate([slip, of_sensors, jnp.ones(self.camera_states, dtype)])
+        if gyro is None:
+            return variance
+        return jnp.append(variance, jnp.asarray(gyro.bias_sigma_radps, dtype) ** 2)
 
     def _slip_sigma(self) -> Array:
         """Standard deviation of the slip; 0 where the sensors are exact."""
-        dtype = self.vehicle.wheelbase_m.dtype
+        dtype = self.vehicle.dtype
         return jnp.asarray(0.0 if self.vehicle.sensor_sigma is None else self.slip_sigma, dtype)
 
-    def _later(self, mean: Array, P: Array, obs: Observation) -> Moments:
-        """The state `dt_s` later (Eq. 9)."""
+    def _later(self, mean: Array, P: Array, obs: Observation, turn: Turn | None = None) -> Moments:
+        """The state `dt_s` later (Eq. 9), turned as a gyro has told."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         A = jnp.eye(3, mean.shape[0], dtype=dtype).at[:, 3:SIX].set(dt_s * jnp.eye(3, dtype=dtype))
         density = sandwich(planar_rotation(mean[2]), kalman.as_matrix(self.acceleration_density))
         Q = kalman.white_acceleration(density, dt_s).astype(dtype)
-        P = kalman.replace_first(P, A).at[:SIX, :SIX].add(Q)
         pose = mean[:3] + dt_s * mean[3:SIX]
+        if turn is not None:
+            A, Q = with_turn(turn, A, Q)
+            pose = pose.at[2].set(jnp.where(turn.told, turn.psi_rad, pose[2]))
+            mean = mean.at[5].set(jnp.where(turn.told, turn.rate_radps, mean[5]))
+        P = kalman.replace_first(P, A).at[:SIX, :SIX].add(Q)
         later = mean.at[:3].set(pose.at[2].set(wrap_angle(pose[2])))
         way_m = safe_norm(mean[3:5]) * dt_s
+        if self.vehicle.gyro is not None:
+            P = P.at[-1, -1].add(jnp.asarray(self.vehicle.gyro.bias_walk, dtype) ** 2 * dt_s)
         return slipped(later, P, way_m, self._slip_sigma(), jnp.asarray(self.slip_length_m, dtype))
 
-    def _with_odometry(
-        self, mean: Array, P: Array, obs: Observation, since_s: Array | float = 0.0
+    def _at_rest(
+        self, gyro: Gyro, turn: Turn, before_mps: Array, mean: Array, P: Array, obs: Observation
     ) -> Moments:
-        """The state after speed and steering were measured, at its own heading.
+        """The state after the gyro was compared with wheels that stand, if they do."""
+        read = read_velocity(self.vehicle, obs, mean)
+        wheels = jnp.where(read.present > 0, read.velocity, jnp.nan)
+        sigma_radps = jnp.sqrt(kalman.as_covariance(self.odometry_sigma)[2, 2]).astype(mean.dtype)
+        dt_s = jnp.asarray(obs.dt_s, mean.dtype)
+        return bias_at_rest(gyro, turn, before_mps, wheels, sigma_radps, dt_s, mean, P)
+
+    def _with_odometry(
+        self,
+        mean: Array,
+        P: Array,
+        obs: Observation,
+        since_s: Array | float = 0.0,
+        turns: Array | None = None,
+    ) -> Moments:
+        """The state after the odometry has measured its velocity, at its own heading.
 
         What the sensors read says nothing of their own errors, which are only considered.
 
         Args:
             since_s: time of the prediction, in which the velocity has changed.
+            turns: whether a gyro has told the turn, so that the wheels' is not looked at.
         """
         dtype = mean.dtype
-        speed_mps, steering_rad = (
-            jnp.asarray(value, dtype) for value in (obs.speed_mps, obs.steering_rad)
-        )
-        read = read_velocity(speed_mps, steering_rad, mean, self.vehicle.wheelbase_m)
+        read = read_velocity(self.vehicle, obs, mean)
+        present = read.present
+        if turns is not None:
+            present = present.at[2].multiply(jnp.where(turns, 0, 1))
         H = jnp.eye(3, mean.shape[0], k=3, dtype=dtype)
         H = (
             H.at[:, 2]
@@ -313,12 +359,11 @@ class BicycleKalman(Motion):
         R = sandwich(planar_rotation(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(
             dtype
         )
-        present = jnp.asarray(obs.has_odometry, dtype)
         change = read.velocity - mean[3:SIX]
         step, dt_s = present * change, jnp.asarray(since_s, dtype)
         moments = jnp.stack([dt_s**2 / 3, dt_s / 2, dt_s / 2, jnp.ones_like(dt_s)]).reshape(2, 2)
         P = P.at[:SIX, :SIX].add(jnp.kron(moments, step[:, None] * step[None]))
-        seen = kalman.hide_rows(change, H, R, jnp.full(3, present))
+        seen = kalman.hide_rows(change, H, R, present)
         correction, after, _ = kalman.update(P, *seen)
         return self.considered(jnp.asarray(False), (mean, P), (self.moved(mean, correction), after))
 

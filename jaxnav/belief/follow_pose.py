@@ -25,6 +25,7 @@ def follow_pose(
     posterior: PosePosterior,
     freedom: Float[Array, "6 d"],
     states: int,
+    behind: int = 0,
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """The whole state after its pose was corrected: the rest follows by regression.
 
@@ -42,16 +43,18 @@ def follow_pose(
     Args:
         P: (n, n) of the predicted state, whose first d entries are
             xi = freedom' cay^-1(T_world_prior^-1 T_world_vehicle), and whose last ones are the
-            cameras' errors.
+            cameras' errors, but for `behind`.
         T_world_prior: the predicted pose.
         posterior: the corrected pose, with a covariance in its own axes, and the errors in view.
         freedom: (6, d), the directions in which the vehicle can move.
         states: of pose and velocity, before the errors.
+        behind: states behind the cameras' errors.
 
     Returns:
         Correction (n,) of the state, the pose's d entries included, and the covariance after it.
     """
     d, n = freedom.shape[1], P.shape[0]
+    end = n - behind
     away = inverse_cayley(T_world_prior.inverse() @ posterior.T_world_vehicle)
     xi = matvec(freedom.T, away)
     C = sandwich(freedom.T, posterior.covariance) / posterior.inflation
@@ -63,8 +66,8 @@ def follow_pose(
         M = jnp.concatenate([M, errors.slope])
         y = jnp.append(xi, errors.change)
         e = errors.rows.shape[1]
-        P_y = jnp.concatenate([P_y, product(errors.rows, P[n - e :])])
-        of_errors = product(P_y[:, n - e :], errors.rows.T)
+        P_y = jnp.concatenate([P_y, product(errors.rows, P[end - e : end])])
+        of_errors = product(P_y[:, end - e : end], errors.rows.T)
         P_yy = jnp.block([[P_yy, of_errors[:d]], [of_errors[:d].T, of_errors[d:]]])
         hidden = 1 - jnp.sum(errors.rows, axis=1)
         P_yy = P_yy + jnp.diag(jnp.append(jnp.zeros(d, P.dtype), hidden + ridge(P.dtype)))

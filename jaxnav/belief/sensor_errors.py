@@ -2,8 +2,13 @@
 
     p = (s, k, g, o, tau)
 
-The odometer's true speed is (1 + s + k) times the one that it reads, the true steering angle is
-(1 + g) read + o, rad, and corners show the vehicle where it was tau s before their stamp:
+A car's true speed is (1 + s + k) times the one that its odometer reads, and its true steering angle
+is (1 + g) read + o, rad. Of a base whose odometry is a twist,
+
+    (v_x, v_y) = (1 + s + k) read,    omega = (1 + s + k) ((1 + g) read + o v_x read),
+
+where g is that of the effective track width and o, rad/m, that of unequal wheels. Corners show the
+vehicle where it was tau s before their stamp:
 
     seen = pose - tau (v - c l),    c = clip(tau / 2 T, 0, 1)
 
@@ -19,18 +24,23 @@ its own mistake. Once the heading is known they are estimated like every other s
 
 Source: Schmidt (1966), "Application of state-space methods to navigation problems"; Bar-Shalom,
 Li, Kirubarajan (2001), section 10.2 (augmented states); Gelb (1974), "Applied Optimal Estimation"
-(first-order Gauss-Markov process).
+(first-order Gauss-Markov process); Borenstein, Feng (1996), "Measurement and correction of
+systematic odometry errors in mobile robots" (UMBmark: track width and unequal wheels).
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnav.models import bicycle
+from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import planar_rotation
-from jaxnav.numerics.small_matrices import matvec
+from jaxnav.models.twist_base import TwistBase
+from jaxnav.numerics.small_matrices import matvec, product
+from jaxnav.pose.observation import Observation
 
 SIX = 6  # states before the errors: pose and velocity
 SLIP = SIX
@@ -38,6 +48,9 @@ LEARNT = SLIP + 1  # the errors from here on are constant
 SENSORS_END = LEARNT + 4  # the errors of cameras come behind those of sensors
 _DELAY = SENSORS_END - 1
 MEMORY_S = 0.025  # T
+_PLANAR = np.array([0, 1, 5])  # of a twist: v_x, v_y, omega
+# A reading beyond this, m/s or rad/s, is an error of the sensor or of its unit.
+_LARGEST_TWIST = 1e3
 
 
 class ReadVelocity(NamedTuple):
@@ -46,9 +59,57 @@ class ReadVelocity(NamedTuple):
     velocity: Float[Array, " 3"]
     by_heading: Float[Array, " 3"]
     by_errors: Float[Array, "3 p"]  # p = 0 or 5
+    present: Float[Array, " 3"]  # 1 where the odometry reads it, 0 elsewhere
 
 
 def read_velocity(
+    vehicle: Vehicle | TwistBase, obs: Observation, mean: Float[Array, " n"]
+) -> ReadVelocity:
+    """The velocity that a vehicle's odometry means to a state.
+
+    Args:
+        mean: (6,), or longer with the errors p behind.
+    """
+    if isinstance(vehicle, TwistBase):
+        return velocity_of_twist(obs.twist, mean)
+    speed_mps, steering_rad = (
+        jnp.asarray(value, mean.dtype) for value in (obs.speed_mps, obs.steering_rad)
+    )
+    read = velocity_of_bicycle(speed_mps, steering_rad, mean, vehicle.wheelbase_m)
+    return read._replace(present=jnp.full(3, jnp.asarray(obs.has_odometry, mean.dtype)))
+
+
+def velocity_of_twist(twist: Float[Array, " 6"] | None, mean: Float[Array, " n"]) -> ReadVelocity:
+    """The velocity that a twist in the vehicle's axes means to a state, in the world.
+
+    Args:
+        twist: of it v_x, v_y and omega are used; where one of the first two is NaN, neither is.
+        mean: (6,), or longer with the errors p behind.
+    """
+    dtype, errors = mean.dtype, mean[SIX:SENSORS_END]
+    read = jnp.full(3, jnp.nan, dtype) if twist is None else jnp.asarray(twist, dtype)[_PLANAR]
+    usable = jnp.abs(read) < _LARGEST_TWIST
+    moves = usable[0] & usable[1]
+    present = jnp.stack([moves, moves, usable[2]])
+    read = jnp.where(present, read, 0)
+    R = planar_rotation(mean[2])
+    scale, gain, offset = jnp.ones((), dtype), jnp.ones((), dtype), jnp.zeros((), dtype)
+    if errors.shape[0]:
+        slip, k, g, o, _ = errors
+        scale, gain, offset = 1 + slip + k, 1 + g, o
+    nothing = jnp.zeros_like(scale)
+    by_scale = jnp.stack([read[0], read[1], gain * read[2] + offset * read[0]])
+    velocity = matvec(R, scale * by_scale)
+    by_heading = jnp.stack([-velocity[1], velocity[0], nothing])
+    by_errors = jnp.zeros((3, 0), dtype)
+    if errors.shape[0]:
+        turns = [jnp.stack([nothing, nothing, scale * x]) for x in (read[2], read[0])]
+        columns = [by_scale, by_scale, *turns, jnp.zeros_like(by_scale)]
+        by_errors = product(R, jnp.stack(columns, axis=1))
+    return ReadVelocity(velocity, by_heading, by_errors, present.astype(dtype))
+
+
+def velocity_of_bicycle(
     speed_mps: Float[Array, ""],
     steering_rad: Float[Array, ""],
     mean: Float[Array, " n"],
@@ -71,12 +132,13 @@ def read_velocity(
     unit, by_steering = jax.jvp(at, (steering,), (jnp.ones_like(steering),))
     velocity = speed * unit
     by_heading = jnp.stack([-velocity[1], velocity[0], jnp.zeros_like(speed)])
+    present = jnp.ones_like(velocity)
     if not errors.shape[0]:
-        return ReadVelocity(velocity, by_heading, jnp.zeros((3, 0), mean.dtype))
+        return ReadVelocity(velocity, by_heading, jnp.zeros((3, 0), mean.dtype), present)
     by_angle = speed * by_steering
     by_scale = speed_mps * unit
     columns = [by_scale, by_scale, steering_rad * by_angle, by_angle, jnp.zeros_like(by_angle)]
-    return ReadVelocity(velocity, by_heading, jnp.stack(columns, axis=1))
+    return ReadVelocity(velocity, by_heading, jnp.stack(columns, axis=1), present)
 
 
 def slipped(

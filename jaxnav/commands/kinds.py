@@ -29,8 +29,11 @@ Scenario = Literal[
     "approach",
     "orbit",
     "tunnel",
+    "long-tunnel",
     "kidnapped",
     "slip",
+    "slip-30",
+    "gyro-late",
     "miscalibrated",
     "blur",
     "late",
@@ -40,6 +43,8 @@ Scenario = Literal[
     "everything",
     "as-told",
 ]
+Base = Literal["ackermann", "differential", "omni"]
+Imu = Literal["none", "consumer", "tactical"]
 StudyKind = Literal["ambiguity", "drive"]
 CornerBackend = Literal["aruco", "apriltag"]
 Switch = tyro.conf.FlagCreatePairsOff[bool]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnav.models.geometry import safe_sinc
+from jaxnav.models.gyro import Gyro
 
 # Errors of the sensors that a filter keeps, and their standard deviations where nobody says.
 SENSOR_ERRORS = ("speed_scale", "steering_gain", "steering_offset_rad", "camera_delay_s")
@@ -28,6 +29,7 @@ class Vehicle(eqx.Module):
     # Standard deviations of what is left of the errors below, as in `SENSORS_AS_TOLD`; None: the
     # sensors are exact but for white noise.
     sensor_sigma: Float[Array, " 4"] | None = None
+    gyro: Gyro | None = None
     # Calibration of its sensors. `jaxnav.loop.corrections` applies it; the core reads corrected
     # values only.
     speed_scale: float = eqx.field(static=True, default=1.0)  # true speed per speed read
@@ -48,6 +50,7 @@ class Vehicle(eqx.Module):
         steering_offset_rad: float = 0.0,
         camera_delay_s: float = 0.0,
         sensor_sigma: Float[Array | np.ndarray, " 4"] | None = None,
+        gyro: Gyro | None = None,
     ) -> "Vehicle":
         """A vehicle from plain numbers."""
         return Vehicle(
@@ -58,11 +61,17 @@ class Vehicle(eqx.Module):
             jnp.asarray(speed_per_throttle_mps, float),
             jnp.asarray(speed_time_constant_s, float),
             None if sensor_sigma is None else jnp.asarray(sensor_sigma, float),
+            gyro,
             speed_scale=float(speed_scale),
             steering_gain=float(steering_gain),
             steering_offset_rad=float(steering_offset_rad),
             camera_delay_s=float(camera_delay_s),
         )
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        """Of its numbers."""
+        return self.wheelbase_m.dtype
 
 
 def sideslip_rad(steering_rad: Float[Array, ""]) -> Float[Array, ""]:

@@ -36,8 +36,9 @@ class Observation(eqx.Module):
     dt_s: Float[Array, ""] | float = 0.0  # since the previous observation
     corner_sigma_px: Float[Array, "C M 4"] | None = None  # None: the estimator's own figure
     has_odometry: Bool[Array, ""] | bool = True  # False: speed and steering are not known
-    # Of a body that moves freely, by another estimator: v m/s and w rad/s in the vehicle's axes,
-    # the mean over `dt_s`, so that exp(twist dt_s) is the motion; a NaN is no reading.
+    # v m/s and w rad/s in the vehicle's axes; a NaN is no reading. Of a body that moves freely, by
+    # another estimator: the mean over `dt_s`, so that exp(twist dt_s) is the motion. Of a
+    # `TwistBase`, by its wheels: v_x, v_y and w_z (entries 0, 1, 5) at the stamp.
     twist: Float[Array, " 6"] | None = None
     # Readings of another sensor, for `OrientationGiven`; a NaN is no reading.
     heading_rad: Float[Array, ""] | None = None  # psi in the world
@@ -45,6 +46,9 @@ class Observation(eqx.Module):
     normals_camera: Float[Array, "C M 3"] | None = None  # unit normal of each marker
     normal_sigma_rad: Float[Array, ""] | float = 0.05
     T_world_vehicle_true: jaxlie.SE3 | None = None  # simulations only, for `Oracle`
+    # Mean angular velocity over `dt_s` in the vehicle's axes, by a gyroscope; a NaN is no reading.
+    # The planar filter reads z, where its vehicle has a gyro.
+    gyro_radps: Float[Array, " 3"] | None = None
 
     def usable(self) -> "Observation":
         """The observation with all readings finite that a filter uses.

@@ -1,9 +1,12 @@
-"""Simulate the car: its true motion under a command.
+"""Simulate the vehicle: its true motion under a command.
 
-Speed follows the throttle with a first-order lag, the servo turns at a bounded rate, and the
-bicycle model moves the car along arcs. Pure JAX functions, so that a rollout can be scanned,
-vmapped and differentiated.
+A car's speed follows the throttle with a first-order lag, its servo turns at a bounded rate, and
+the bicycle model moves it along arcs. Each part of another base's twist follows the one commanded
+with a first-order lag. Pure JAX functions, so that a rollout can be scanned, vmapped and
+differentiated.
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,8 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from jaxnav.control import Command
-from jaxnav.models import bicycle
+from jaxnav.models import bicycle, twist_base
 from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.twist_base import TwistBase
+from jaxnav.twist_control import TwistCommand
 
 
 class CarState(eqx.Module):
@@ -23,13 +28,23 @@ class CarState(eqx.Module):
     steering_rad: Float[Array, "*batch"]
 
 
+class BaseState(eqx.Module):
+    """The true state of a base that is no car. The heading is not wrapped: it counts turns."""
+
+    pose: Float[Array, "*batch 3"]  # x_m, y_m, psi_rad
+    twist: Float[Array, "*batch 3"]  # v_x_mps, v_y_mps, omega_radps in its own axes
+
+
 class OdometryNoise(eqx.Module):
-    """The errors of the wheel odometer and the steering sensor."""
+    """The errors of the wheel odometer and the steering sensor, or of a base's twist."""
 
     speed_sigma_mps: float = 0.01
     steering_sigma_rad: float = 0.005
     speed_scale: float = 1.0  # 1.1: the odometer reports 10 % too much
     steering_offset_rad: float = 0.0  # what the sensor reports with the wheels straight ahead
+    turn_sigma_radps: float = 0.01  # of a base that is no car, as are the next two
+    turn_scale: float = 1.0  # 1.1: it reports 10 % more turn than its wheels' way means
+    turn_offset_radpm: float = 0.0  # what it reports on a straight way, unequal wheels
     spin: float = 0.0  # 0.5: while the wheels spin, the odometer reports another 50 % more
     spin_s: float = 1.0  # how long they spin
     spin_period_s: float = 3.0  # from the begin of one spin to that of the next
@@ -40,7 +55,9 @@ class OdometryNoise(eqx.Module):
         return 1 + self.spin * ((stamp_s - self.spin_from_s) % self.spin_period_s < self.spin_s)
 
 
-def move(vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""]) -> CarState:
+def move_car(
+    vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""]
+) -> CarState:
     """The car's state after a time short against the speed's time constant and the turn."""
     turn_limit = vehicle.steering_rate_limit_radps * dt_s
     wanted = jnp.clip(command.steering_rad, -vehicle.steering_limit_rad, vehicle.steering_limit_rad)
@@ -60,12 +77,28 @@ def move(vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array,
     return CarState(pose, speed, steering)
 
 
-def move_through(
-    vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""], substeps: int
-) -> CarState:
-    """The car's state at `substeps` evenly spaced instants up to dt, leading axis (substeps,)."""
+def move_base(
+    base: TwistBase, state: BaseState, command: TwistCommand, dt_s: Float[Array, ""]
+) -> BaseState:
+    """The base's state after a time short against its time constant and the turn."""
+    wanted = jnp.stack([command.forward_mps, command.left_mps, command.turn_radps])
+    wanted = jnp.clip(wanted, -base.limits, base.limits)
+    twist = wanted + (state.twist - wanted) * jnp.exp(-dt_s / base.time_constant_s)
+    return BaseState(twist_base.advance(state.pose, (state.twist + twist) / 2, dt_s), twist)
 
-    def one(state: CarState, _: None) -> tuple[CarState, CarState]:
+
+def move(vehicle: Any, state: Any, command: Any, dt_s: Float[Array, ""]) -> Any:
+    """The state of a car or of another base after a short time."""
+    mover: Any = move_base if isinstance(vehicle, TwistBase) else move_car
+    return mover(vehicle, state, command, dt_s)
+
+
+def move_through(
+    vehicle: Any, state: Any, command: Any, dt_s: Float[Array, ""], substeps: int
+) -> Any:
+    """Its state at `substeps` evenly spaced instants up to dt, leading axis (substeps,)."""
+
+    def one(state: Any, _: None) -> tuple[Any, Any]:
         moved = move(vehicle, state, command, dt_s / substeps)
         return moved, moved
 
@@ -91,3 +124,50 @@ def read_odometry(
         speed_scale * state.speed_mps + noise.speed_sigma_mps * speed_error,
         state.steering_rad + noise.steering_offset_rad + noise.steering_sigma_rad * steering_error,
     )
+
+
+def read_twist(
+    state: BaseState,
+    noise: OdometryNoise,
+    key: Key[Array, ""],
+    speed_scale: Float[Array, ""] | float | None = None,
+    stamp_s: Float[Array, ""] | float = 0.0,
+) -> Float[Array, " 6"]:
+    """The twist as a base's odometry reports it at a time since the start; see `read_odometry`."""
+    speed_scale = noise.speed_scale if speed_scale is None else speed_scale
+    if noise.spin:
+        speed_scale = speed_scale * noise.scale_at(stamp_s)
+    errors = jax.random.normal(key, (3,), state.twist.dtype)
+    x, y, turn = state.twist
+    turn = noise.turn_scale * turn + noise.turn_offset_radpm * x
+    sigmas = (noise.speed_sigma_mps, noise.speed_sigma_mps, noise.turn_sigma_radps)
+    x, y, turn = (
+        speed_scale * part + sigma * error
+        for part, sigma, error in zip((x, y, turn), sigmas, errors, strict=True)
+    )
+    zero = jnp.zeros_like(x)
+    return jnp.stack([x, y, zero, zero, zero, turn])
+
+
+def at_rest(vehicle: Vehicle | TwistBase, pose: Float[Array, " 3"]) -> CarState | BaseState:
+    """The state of a car or of another base that stands."""
+    if isinstance(vehicle, TwistBase):
+        return BaseState(pose, jnp.zeros_like(pose))
+    zero = jnp.zeros_like(pose[0])
+    return CarState(pose, zero, zero)
+
+
+def standing(vehicle: Vehicle | TwistBase, dtype: jnp.dtype) -> Command | TwistCommand:
+    """The command that lets it stand."""
+    zero = jnp.zeros((), dtype)
+    return TwistCommand(zero, zero, zero) if isinstance(vehicle, TwistBase) else Command(zero, zero)
+
+
+def odometry(
+    vehicle: Vehicle | TwistBase, state: Any, noise: OdometryNoise, *args: Any
+) -> dict[str, Any]:
+    """The fields of an `Observation` that the wheels fill; `args` as `read_odometry` takes them."""
+    if isinstance(vehicle, TwistBase):
+        return {"twist": read_twist(state, noise, *args)}
+    speed_mps, steering_rad = read_odometry(state, noise, *args)
+    return {"speed_mps": speed_mps, "steering_rad": steering_rad}

@@ -14,22 +14,31 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from jaxnav.belief.kalman import nis
-from jaxnav.control import Command
 from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import T_world_vehicle_from_planar, safe_norm, wrap_angle
 from jaxnav.models.markers import MarkerMap
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.observation import Observation
 from jaxnav.simulation.batch_jit import jit_with
 from jaxnav.simulation.corners import drifted, see
 from jaxnav.simulation.drive import PASSED_M
-from jaxnav.simulation.plant import CarState, move_through, read_odometry
+from jaxnav.simulation.gyro import read_gyro, switched_on
+from jaxnav.simulation.plant import (
+    BaseState,
+    CarState,
+    at_rest,
+    move_through,
+    odometry,
+    standing,
+)
 from jaxnav.simulation.queue import run_lanes
 from jaxnav.simulation.regimes import step_by_regime
 from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.traces import DriveTraces
 from jaxnav.simulation.world import DriveState, Spread, nominal
+from jaxnav.twist_control import TwistCommand
 
 _SUBSTEPS = 4  # for each of the two parts of a frame period
 
@@ -67,7 +76,7 @@ class Rollout(eqx.Module):
     """
 
     navigator: Navigator
-    vehicle: Vehicle
+    vehicle: Vehicle | TwistBase
     markers: MarkerMap
     scenario: Scenario = eqx.field(static=True)
     corner_noise_px: Float[Array, ""] = eqx.field(converter=jnp.asarray)
@@ -161,7 +170,6 @@ class Rollout(eqx.Module):
         start = jnp.asarray(start_pose) + spread * jax.random.uniform(
             start_key, (3,), spread.dtype, -1, 1
         )
-        zero = jnp.zeros_like(start[0])
         corners = (len(self.navigator.rig), len(self.markers.ids), 4, 2)
         drift = jax.random.normal(jax.random.fold_in(rig_key, 1), corners, start.dtype)
         told_key = jax.random.fold_in(rig_key, 3)
@@ -169,15 +177,27 @@ class Rollout(eqx.Module):
         if self.spread is not None:
             truth_key = jax.random.fold_in(rig_key, 2)
             truth = self.spread.draw(truth_key, truth, scenario.frame_period_s)
+        gyro = None
+        if truth.vehicle.gyro is not None:
+            gyro_key = jax.random.fold_in(rig_key, 4)
+            gyro = switched_on(
+                truth.vehicle.gyro,
+                scenario.gyro_late_s,
+                scenario.frame_period_s,
+                gyro_key,
+                start.dtype,
+            )
+        stands = standing(truth.vehicle, start.dtype)
         return DriveState(
             key=key,
             rig=scenario.true_rig(self.navigator.rig, rig_key),
             truth=truth,
             drift=drift,
             start_pose=start,
-            car=CarState(start, zero, zero),
-            acting=Command(zero, zero),
-            command=Command(zero, zero),
+            car=at_rest(truth.vehicle, start),
+            acting=stands,
+            command=stands,
+            gyro=gyro,
             state=self.navigator.init(),
             frame=jnp.asarray(0),
             passed=jnp.asarray(0),
@@ -197,6 +217,7 @@ class Rollout(eqx.Module):
             self._moved(world, period_s),
             world.car,
         )
+        turned_rad = car.pose[2] - world.car.pose[2]
         car = scenario.displaced(car, stamp_s, period_s)
         key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, world.frame))
 
@@ -213,20 +234,26 @@ class Rollout(eqx.Module):
         noise_px = noise_px + drift * (scenario.corner_drift_px if given_px is None else given_px)
         visible = visible & ~scenario.hidden(stamp_s)
         corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
-        speed_mps, steering_rad = read_odometry(
+        dt_s = jnp.where(moves, period_s, 0)
+        wheels = odometry(
+            self.vehicle,
             world.truth.sensed(car),
             scenario.odometry,
             key_odometry,
             world.truth.odometer_scale,
             stamp_s,
         )
+        gyro, gyro_radps = world.gyro, None
+        if gyro is not None:
+            key_gyro = jax.random.fold_in(key_odometry, 1)
+            gyro, gyro_radps = read_gyro(world.truth.vehicle.gyro, gyro, turned_rad, dt_s, key_gyro)
         truth = T_world_vehicle_from_planar(car.pose)
         obs = Observation(
             corners_px=corners_px,
             visible=visible,
-            speed_mps=speed_mps,
-            steering_rad=steering_rad,
-            dt_s=jnp.where(moves, period_s, 0),
+            dt_s=dt_s,
+            gyro_radps=gyro_radps,
+            **wheels,
             **scenario.other_sensors(car, truth, key_odometry),
         )
         state, out = step(world.state, obs)
@@ -254,7 +281,10 @@ class Rollout(eqx.Module):
             passed=passed,
             done=out.done,
         )
-        command = Command(*(jnp.zeros_like(x_m),) * 2)
+        command = standing(self.vehicle, x_m.dtype)
+        if isinstance(command, TwistCommand) and scenario.turns_radps:
+            turn = jnp.full_like(command.turn_radps, scenario.turns_radps)
+            command = dataclasses.replace(command, turn_radps=turn)
         if out.command is not None and scenario.drives:
             command = out.command
         frame = world.frame + 1
@@ -267,6 +297,7 @@ class Rollout(eqx.Module):
             car=car,
             acting=world.command,
             command=command,
+            gyro=gyro,
             state=state,
             frame=frame,
             passed=passed,
@@ -274,7 +305,7 @@ class Rollout(eqx.Module):
             on_floor=on_floor,
         ), trace
 
-    def _moved(self, world: DriveState, period_s: Array) -> CarState:
+    def _moved(self, world: DriveState, period_s: Array) -> CarState | BaseState:
         """The car one period later: a command acts `latency_s` after the frame it came from."""
         car, latency_s = world.car, world.truth.latency_s
         for command, dt_s in ((world.acting, latency_s), (world.command, period_s - latency_s)):

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxnav.models.rig import CameraRig
-from jaxnav.simulation.plant import CarState, OdometryNoise
+from jaxnav.simulation.plant import BaseState, CarState, OdometryNoise
 
 HEADING_SIGMA_RAD = 0.05  # noise of the compass heading given to `OrientationGiven`
 _LAP_M = ((1.2, -0.2), (0.0, 0.6), (-1.2, -0.2), (0.0, -1.2))  # counter-clockwise, marker in view
@@ -49,6 +49,8 @@ class Scenario:
     # Beside the white noise, each coordinate of each corner has a part that stays or drifts.
     corner_drift_px: float = 0.0  # its standard deviation
     corner_correlation: float = 0.95  # from frame to frame; 1: constant through a drive
+    gyro_late_s: float = 0.0  # a gyro's readings are later by this than it is told
+    turns_radps: float = 0.0  # parked, a base that is no car turns on the spot
     scored_after_s: tuple[float, ...] = ()  # errors of the frames from then on count apart, too
 
     def __post_init__(self) -> None:
@@ -71,8 +73,8 @@ class Scenario:
         return (stamp_s >= begin_s) & (stamp_s < end_s)
 
     def displaced(
-        self, car: CarState, stamp_s: Float[Array, ""], period_s: Float[Array, ""]
-    ) -> CarState:
+        self, car: CarState | BaseState, stamp_s: Float[Array, ""], period_s: Float[Array, ""]
+    ) -> CarState | BaseState:
         """The car's state, displaced if the kidnapping falls into this frame."""
         now = (stamp_s >= self.kidnapped_s) & (stamp_s < self.kidnapped_s + period_s)
         shift = jnp.where(now, jnp.asarray(self.kidnapped_by, car.pose.dtype), 0)
@@ -94,7 +96,7 @@ class Scenario:
         return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, jaxlie.SE3(wxyz_xyz))
 
     def other_sensors(
-        self, car: CarState, T_world_vehicle: jaxlie.SE3, key: Key[Array, ""]
+        self, car: CarState | BaseState, T_world_vehicle: jaxlie.SE3, key: Key[Array, ""]
     ) -> dict[str, Any]:
         """The further measurements that only `OrientationGiven` and `Oracle` use."""
         error = jax.random.normal(key, (), car.pose.dtype)
@@ -174,7 +176,11 @@ def _everything() -> Scenario:
         corner_drift_px=0.25,
         extrinsics_off=(float(np.deg2rad(0.5)), 0.005),
         odometry=OdometryNoise(
-            speed_scale=1.05, steering_offset_rad=float(np.deg2rad(0.5)), spin=0.25
+            speed_scale=1.05,
+            steering_offset_rad=float(np.deg2rad(0.5)),
+            turn_scale=1.025,
+            turn_offset_radpm=0.015,
+            spin=0.25,
         ),
     )
 
@@ -184,7 +190,12 @@ def scenarios() -> dict[str, Scenario]:
     paper = _paper()
     vary = dataclasses.replace
     off = (float(np.deg2rad(1.0)), 0.01)  # of each camera: rad, m
-    uneven = OdometryNoise(steering_offset_rad=float(np.deg2rad(1.0)), spin=0.5)
+    uneven = OdometryNoise(
+        steering_offset_rad=float(np.deg2rad(1.0)),
+        turn_scale=1.05,
+        turn_offset_radpm=0.03,
+        spin=0.5,
+    )
     return {
         "paper": paper,
         "static": vary(paper, drives=False, duration_s=10.0, start_spread=(0.3, 0.3, np.pi)),
@@ -194,7 +205,12 @@ def scenarios() -> dict[str, Scenario]:
         "orbit": _orbit(),
         "tunnel": vary(paper, hidden_s=(2.0, 4.0)),
         "kidnapped": vary(paper, kidnapped_s=3.0, kidnapped_by=(0.7, -0.7, float(np.pi / 2))),
+        "long-tunnel": vary(on_laps(paper, laps=2), hidden_s=(8.0, 20.0)),
         "slip": vary(paper, odometry=OdometryNoise(speed_scale=1.1)),
+        "slip-30": vary(paper, odometry=OdometryNoise(speed_scale=1.3)),
+        "gyro-late": vary(
+            paper, drives=False, duration_s=10.0, turns_radps=float(2 * np.pi), gyro_late_s=0.01
+        ),
         "miscalibrated": vary(
             paper,
             extrinsics_off=off,

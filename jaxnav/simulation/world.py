@@ -11,22 +11,29 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxnav.control import Command
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import State
-from jaxnav.simulation.plant import CarState
+from jaxnav.simulation.gyro import GyroState
+from jaxnav.simulation.plant import BaseState, CarState
 from jaxnav.simulation.scenarios import Scenario
+from jaxnav.twist_control import TwistCommand
 
 
 class Truth(eqx.Module):
     """The true car of one drive, unknown to the navigator."""
 
-    vehicle: Vehicle
+    vehicle: Vehicle | TwistBase
     odometer_scale: Float[Array, ""]  # reported speed over true speed
     latency_s: Float[Array, ""]  # from the stamp of a frame until its command acts
-    sensor_errors: Float[Array, " 4"]  # see `SENSOR_ERRORS`
+    sensor_errors: Float[Array, " 4"]  # see `SENSOR_ERRORS`, `TWIST_ERRORS`
 
-    def sensed(self, car: CarState) -> CarState:
+    def sensed(self, car: CarState | BaseState) -> CarState | BaseState:
         """The car as its sensors would show it without noise."""
         scale, gain, offset_rad, _ = self.sensor_errors
+        if isinstance(car, BaseState):
+            x, y, turn = car.twist / (1 + scale)
+            turn = (turn - offset_rad * x) / (1 + gain)  # here the offset is in rad/m
+            return dataclasses.replace(car, twist=jnp.stack([x, y, turn]))
         return dataclasses.replace(
             car,
             speed_mps=car.speed_mps / (1 + scale),
@@ -38,8 +45,9 @@ class Truth(eqx.Module):
 class Spread:
     """The ranges (low, high) from which each drive's true car is drawn uniformly.
 
-    The first three are factors on the vehicle's or the scenario's own numbers; the latency is added
-    to the scenario's, and the sum is clipped to between 0 and a frame period.
+    The first three are factors on the vehicle's or the scenario's own numbers, the first one a
+    car's alone; the latency is added to the scenario's, and the sum is clipped to between 0 and a
+    frame period.
     """
 
     speed_per_throttle: tuple[float, float] = (0.8, 1.2)
@@ -62,14 +70,15 @@ class Spread:
         )
         low, high = (jnp.asarray(ends, dtype) for ends in zip(*ranges, strict=True))
         gain, lag, scale, later_s = low + (high - low) * jax.random.uniform(key, (4,), dtype)
-        vehicle = eqx.tree_at(
-            lambda v: (v.speed_per_throttle_mps, v.speed_time_constant_s),
-            truth.vehicle,
-            (
-                truth.vehicle.speed_per_throttle_mps * gain,
-                truth.vehicle.speed_time_constant_s * lag,
-            ),
-        )
+        car = truth.vehicle
+        if isinstance(car, TwistBase):
+            vehicle = eqx.tree_at(lambda v: v.time_constant_s, car, car.time_constant_s * lag)
+        else:
+            vehicle = eqx.tree_at(
+                lambda v: (v.speed_per_throttle_mps, v.speed_time_constant_s),
+                car,
+                (car.speed_per_throttle_mps * gain, car.speed_time_constant_s * lag),
+            )
         latency_s = jnp.clip(truth.latency_s + later_s, 0, longest_s)
         return dataclasses.replace(
             truth,
@@ -87,9 +96,10 @@ class DriveState(eqx.Module):
     truth: Truth
     drift: Float[Array, "C M 4 2"]  # of the corners, in standard deviations
     start_pose: Float[Array, " 3"]
-    car: CarState
-    acting: Command  # in effect until the latency of `command` is over
-    command: Command
+    car: CarState | BaseState
+    acting: Command | TwistCommand  # in effect until the latency of `command` is over
+    command: Command | TwistCommand
+    gyro: GyroState | None
     state: State
     frame: Int[Array, ""]  # index of the next frame
     passed: Int[Array, ""]
@@ -97,7 +107,9 @@ class DriveState(eqx.Module):
     on_floor: Bool[Array, ""]
 
 
-def nominal(vehicle: Vehicle, scenario: Scenario, key: Key[Array, ""], dtype: jnp.dtype) -> Truth:
+def nominal(
+    vehicle: Vehicle | TwistBase, scenario: Scenario, key: Key[Array, ""], dtype: jnp.dtype
+) -> Truth:
     """The scenario's car, without any spread."""
     errors = jnp.zeros(4, dtype).at[-1].set(scenario.corner_lag_s)
     if scenario.as_told and vehicle.sensor_sigma is not None:

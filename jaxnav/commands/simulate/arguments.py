@@ -7,9 +7,11 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
+    Base,
     Count,
     Detector,
     Headless,
+    Imu,
     NotNegative,
     NotNegativeCount,
     OptionalFile,
@@ -82,6 +84,11 @@ class Simulate(Headless):
 
     scenario: Scenario = "paper"
     """What happens: the paper's drive, or one with trouble in it."""
+    base: Base = "ackermann"
+    """What drives: the vehicle, or a base of the QCar's size that is commanded by a twist."""
+    imu: Imu = "none"
+    """The vehicle's gyro: as its file says, or one of that class, with errors drawn anew for each
+    drive."""
     laps: NotNegativeCount = 0
     """Drive this many laps before the marker, 6 m and 18 s each, instead of the scenario's
     own route, for errors that repeat: `paper` is then the clean drive to compare with."""
@@ -108,6 +115,8 @@ class Simulate(Headless):
     """Keep the rows that --json holds already."""
 
     def _check(self) -> None:
+        named = self.base == "ackermann" or self.vehicle is None
+        require(named, "--base", f"{self.base} takes the place of --vehicle: give one of them")
         require(self.laps <= 100, "--laps", f"must be at most 100, got {self.laps}")
         require(bool(self.selector), "--selector", "names no selector")
         require(bool(self.corner_noise_px), "--corner-noise-px", "holds no number")

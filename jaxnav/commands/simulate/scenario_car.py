@@ -10,7 +10,9 @@ from jaxnav.files import Params, apply_params, calib_dir, load_markers, load_rig
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
+from jaxnav.simulation.bases import equipped
 from jaxnav.simulation.scenarios import Scenario
 
 
@@ -20,7 +22,7 @@ class ScenarioCar:
 
     rig: CameraRig
     markers: MarkerMap
-    vehicle: Vehicle
+    vehicle: Vehicle | TwistBase
     params: Params | None
 
     @staticmethod
@@ -33,10 +35,13 @@ class ScenarioCar:
             BadInput: a file that is not valid.
         """
         qcar = calib_dir() / "qcar"
+        vehicle = load_vehicle(files.vehicle or qcar / "vehicle.yaml")
+        if isinstance(files, Simulate):
+            vehicle = equipped(vehicle, files.base, files.imu)
         return ScenarioCar(
             rig=load_rig(files.rig or qcar / "rig.yaml"),
             markers=load_markers(files.markers or qcar / "markers.yaml"),
-            vehicle=load_vehicle(files.vehicle or qcar / "vehicle.yaml"),
+            vehicle=vehicle,
             params=params,
         )
 

@@ -21,10 +21,14 @@ from jaxnav.files.locking import sole_writer
 from jaxnav.files.reading import parse_json, read_text
 from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.files.writing import plain_data
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import Scenario, on_laps, scenarios
 from jaxnav.simulation.scores import Drives
+
+# What a result of a version without these keys was made with.
+_OLDER = {"params": None, "laps": 0, "base": "ackermann", "imu": "none"}
 
 
 def run(args: Arguments) -> int:
@@ -46,8 +50,7 @@ def _run(args: Arguments) -> int:
     print(_header(scenario))
     for name, noise_px in wanted:
         key = _key(args, car, name, noise_px)
-        # A result of a version without parameters or laps has no such key.
-        matches = [one for one in done if {"params": None, "laps": 0} | one["run"] == key]
+        matches = [one for one in done if _OLDER | one["run"] == key]
         result = matches[0] if matches else {"run": key} | _drive(args, car, scenario, key)
         if not matches:
             done.append(result)
@@ -70,6 +73,8 @@ def _scenario(args: Arguments) -> Scenario:
 def _load(args: Arguments, scenario: Scenario) -> ScenarioCar:
     params = None if args.params is None else load_params(args.params)
     car = ScenarioCar.load(args, params)
+    if scenario.turns_radps and not isinstance(car.vehicle, TwistBase):
+        raise BadInput("--scenario", f"{args.scenario} turns on the spot: needs another --base")
     _navigator(car, scenario, "multi-hypothesis", told_noise_px=1.0)  # raises on bad input
     return car
 
@@ -110,6 +115,8 @@ def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[
     return {
         "scenario": args.scenario,
         "laps": args.laps,
+        "base": args.base,
+        "imu": args.imu,
         "selector": name,
         "corner_noise_px": noise_px,
         "told_noise_px": told_noise_px if args.told_noise_px is None else args.told_noise_px,
