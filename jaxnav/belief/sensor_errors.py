@@ -71,7 +71,8 @@ def read_velocity(
         mean: (6,), or longer with the errors p behind.
     """
     if isinstance(vehicle, TwistBase):
-        return velocity_of_twist(obs.twist, mean)
+        read = velocity_of_twist(obs.twist, mean)
+        return read._replace(present=read.present * jnp.asarray(obs.has_odometry, mean.dtype))
     speed_mps, steering_rad = (
         jnp.asarray(value, mean.dtype) for value in (obs.speed_mps, obs.steering_rad)
     )

@@ -12,7 +12,7 @@ from jaxnav.files.markers import load_markers, save_markers
 from jaxnav.files.params import Params, apply_params, load_params, write_params
 from jaxnav.files.rigs import load_rig, save_rig
 from jaxnav.files.topics import TopicMap, load_topics
-from jaxnav.files.vehicles import Route, load_route, load_vehicle, save_vehicle
+from jaxnav.files.vehicles import Route, load_car, load_route, load_vehicle, save_vehicle
 from jaxnav.files.writing import atomic_path, atomic_write, output_folder, write_json, write_tum
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "atomic_write",
     "calib_dir",
     "load_camera",
+    "load_car",
     "load_markers",
     "load_params",
     "load_rig",

@@ -15,17 +15,21 @@ is `camera_delay_s` later than the odometer's of the same instant. Left out, the
 a sensor be off by that much, and learns by how much it is. Left out it is 3 % of the speed, 3 % of
 the steering angle, 0.5 degrees (0.0087 rad) of its offset and 20 ms. Four zeros make the sensors
 exact.
+
+A base that is no car, and a gyro: see `bases.py`.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
 
+from jaxnav.errors import BadInput
+from jaxnav.files.bases import ACKERMANN, BaseFile, GyroEntry, base_data, gyro_data
 from jaxnav.files.provenance import Calibrated
 from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
@@ -44,14 +48,17 @@ from jaxnav.files.validation import (
 from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.bicycle import SENSOR_ERRORS, SENSORS_AS_TOLD, Vehicle
 from jaxnav.models.origin import Origin, opposite, planar_in_world, points_in_world
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.parameters import TUNABLES
 
 _MOST_SIGMA = TUNABLES["motion.vehicle.sensor_sigma"].most
+_NO_FIGURES = ("base", "calibrated", "gyro", "sigma")
 
 
 class VehicleFile(Entry):
     """A vehicle file: the arguments of `Vehicle.create`."""
 
+    base: Literal["ackermann"] = "ackermann"
     wheelbase_m: Annotated[Positive, within("wheelbase_m")]
     steering_limit_rad: Annotated[Positive, Field(lt=math.pi / 2), within("steering_limit_rad")]
     throttle_limit: Annotated[Positive, within("throttle")]
@@ -63,6 +70,7 @@ class VehicleFile(Entry):
     steering_offset_rad: Annotated[Number, within("offset_rad")] = 0.0
     camera_delay_s: Annotated[Number, within("delay_s")] = 0.0
     calibrated: Calibrated | None = None
+    gyro: GyroEntry | None = None
     sigma: dict[str, NonNegative] = Field(default_factory=dict)  # of the keys above, by their names
 
     @field_validator("sigma")
@@ -76,17 +84,18 @@ class VehicleFile(Entry):
 
     def vehicle(self) -> Vehicle:
         """The vehicle, in the process's precision."""
-        figures = self.model_dump(exclude={"calibrated", "sigma"}, exclude_none=True)
+        figures = self.model_dump(exclude={*_NO_FIGURES}, exclude_none=True)
         told = zip(SENSOR_ERRORS, SENSORS_AS_TOLD, strict=True)
         sigma = np.asarray([self.sigma.get(name, default) for name, default in told])
-        return Vehicle.create(**figures, sensor_sigma=sigma if np.any(sigma) else None)
+        gyro = None if self.gyro is None else self.gyro.gyro()
+        return Vehicle.create(**figures, sensor_sigma=sigma if np.any(sigma) else None, gyro=gyro)
 
 
 # Name -> its default; that of a correction corrects nothing.
 _FIGURES = {
     name: field.default
     for name, field in VehicleFile.model_fields.items()
-    if name not in ("calibrated", "sigma")
+    if name not in _NO_FIGURES
 }
 
 
@@ -126,25 +135,45 @@ class Route:
         )
 
 
-def load_vehicle(path: str | Path) -> Vehicle:
-    """Read a vehicle's bicycle parameters and limits.
+def load_vehicle(path: str | Path) -> Vehicle | TwistBase:
+    """Read a vehicle's parameters and limits: of a car, or of another base.
 
     Raises:
         BadInput: one line naming file and key.
     """
     path = Path(path)
-    return validate(VehicleFile, read_mapping(path), path).vehicle()
+    data = read_mapping(path)
+    other = data.get("base", ACKERMANN) != ACKERMANN
+    if other:
+        return validate(BaseFile, data, path).vehicle()
+    return validate(VehicleFile, data, path).vehicle()
 
 
-def vehicle_data(vehicle: Vehicle) -> dict[str, Any]:
+def load_car(path: str | Path) -> Vehicle:
+    """Read the vehicle of what drives, calibrates or replays a car, and nothing else so far.
+
+    Raises:
+        BadInput: as `load_vehicle`; or the vehicle is no Ackermann car, or has a gyro.
+    """
+    vehicle = load_vehicle(path)
+    if isinstance(vehicle, TwistBase):
+        raise BadInput(f"{path}: base", "must be ackermann here: so far only cars are driven")
+    if vehicle.gyro is not None:
+        raise BadInput(f"{path}: gyro", "must be left out here: so far no vehicle's gyro is read")
+    return vehicle
+
+
+def vehicle_data(vehicle: Vehicle | TwistBase) -> dict[str, Any]:
     """The content of a vehicle's file, all numbers bit for bit; see `VehicleFile`."""
+    if isinstance(vehicle, TwistBase):
+        return base_data(vehicle)
     data = {name: float(getattr(vehicle, name)) for name in _FIGURES}
     # Without corrections that correct nothing, any version of the program reads the file.
     written: dict[str, Any] = {n: value for n, value in data.items() if _FIGURES[n] != value}
     sigma = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma, float)
     if not np.array_equal(sigma, SENSORS_AS_TOLD.astype(_dtype(vehicle))):
         written["sigma"] = dict(zip(SENSOR_ERRORS, sigma.tolist(), strict=True))
-    return written
+    return written | gyro_data(vehicle.gyro)
 
 
 def _dtype(vehicle: Vehicle) -> np.dtype[Any]:
@@ -153,7 +182,7 @@ def _dtype(vehicle: Vehicle) -> np.dtype[Any]:
 
 def save_vehicle(
     path: str | Path,
-    vehicle: Vehicle,
+    vehicle: Vehicle | TwistBase,
     calibrated: Calibrated | None = None,
     sigma: Mapping[str, float] | None = None,
 ) -> None:
@@ -170,7 +199,7 @@ def save_vehicle(
 
 
 def vehicle_file_text(
-    vehicle: Vehicle,
+    vehicle: Vehicle | TwistBase,
     calibrated: Calibrated | None = None,
     sigma: Mapping[str, float] | None = None,
 ) -> str:

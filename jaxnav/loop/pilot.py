@@ -36,6 +36,7 @@ from jaxnav.loop.stamps import Stamps
 from jaxnav.loop.standstill import Standstill, Way
 from jaxnav.loop.support import Support
 from jaxnav.loop.ways import Fix
+from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.navigator import Navigator, Output
 
@@ -164,6 +165,8 @@ class Pilot:
         """
         if navigator.controller is None:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
+        if not isinstance(navigator.controller.vehicle, Vehicle):
+            raise ValueError("a pilot drives Ackermann cars alone")
         self.navigator = navigator
         self._origin_m = navigator.markers.origin_m
         self.limits = Limits.of(navigator.controller.vehicle)

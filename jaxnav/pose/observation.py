@@ -35,7 +35,7 @@ class Observation(eqx.Module):
     steering_rad: Float[Array, ""] | float = 0.0
     dt_s: Float[Array, ""] | float = 0.0  # since the previous observation
     corner_sigma_px: Float[Array, "C M 4"] | None = None  # None: the estimator's own figure
-    has_odometry: Bool[Array, ""] | bool = True  # False: speed and steering are not known
+    has_odometry: Bool[Array, ""] | bool = True  # False: the wheels tell nothing
     # v m/s and w rad/s in the vehicle's axes; a NaN is no reading. Of a body that moves freely, by
     # another estimator: the mean over `dt_s`, so that exp(twist dt_s) is the motion. Of a
     # `TwistBase`, by its wheels: v_x, v_y and w_z (entries 0, 1, 5) at the stamp.

@@ -243,10 +243,10 @@ class Rollout(eqx.Module):
             world.truth.odometer_scale,
             stamp_s,
         )
-        gyro, gyro_radps = world.gyro, None
-        if gyro is not None:
+        gyro, gyro_radps, has = world.gyro, None, world.truth.vehicle.gyro
+        if gyro is not None and has is not None:
             key_gyro = jax.random.fold_in(key_odometry, 1)
-            gyro, gyro_radps = read_gyro(world.truth.vehicle.gyro, gyro, turned_rad, dt_s, key_gyro)
+            gyro, gyro_radps = read_gyro(has, gyro, turned_rad, dt_s, key_gyro)
         truth = T_world_vehicle_from_planar(car.pose)
         obs = Observation(
             corners_px=corners_px,

@@ -19,7 +19,9 @@ from jaxnav.belief.selectors import SELECTORS, make_selector
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
+from jaxnav.simulation.bases import BASES, IMUS, equipped
 from jaxnav.simulation.rollout import Rollout, Trace
 from jaxnav.simulation.scenarios import Scenario, on_laps, scenarios
 from jaxnav.simulation.scores import Drives
@@ -44,6 +46,16 @@ PARAMETERS = {
     "scenario": Parameter("what happens", "", "paper", choices=tuple(scenarios()), static=True),
     "selector": Parameter(
         "which pose is believed", "", "multi-hypothesis", choices=tuple(SELECTORS), static=True
+    ),
+    "base": Parameter(
+        "what drives: the vehicle, or a base of the QCar's size",
+        "",
+        "ackermann",
+        choices=BASES,
+        static=True,
+    ),
+    "imu": Parameter(
+        "gyro of that class; none: the vehicle's", "", "none", choices=IMUS, static=True
     ),
     "cameras": cameras("the first ones of the rig; by default all"),
     "corner_noise_px": Parameter("standard deviation of a corner coordinate", "px", 1.0, low=0.0),
@@ -118,7 +130,9 @@ class DriveStudy(Study):
 
     schema = SCHEMA
 
-    def __init__(self, config: Config, rig: CameraRig, markers: MarkerMap, vehicle: Vehicle):
+    def __init__(
+        self, config: Config, rig: CameraRig, markers: MarkerMap, vehicle: Vehicle | TwistBase
+    ):
         super().__init__(config)
         world = (rig, markers, vehicle)
         self.rig, self.markers, self.vehicle = in_precision(world, config.precision)
@@ -179,8 +193,9 @@ class DriveStudy(Study):
         """The simulation of a cell's drives."""
         value: dict[str, Any] = dict(cell)
         rig, markers = self._world(value)
+        vehicle = equipped(self.vehicle, value["base"], value["imu"])
         motion = BicycleKalman(
-            self.vehicle,
+            vehicle,
             tilt_sigma_rad=scenario.told_tilt_sigma_rad,
             height_sigma_m=scenario.told_height_sigma_m,
         )
@@ -196,7 +211,7 @@ class DriveStudy(Study):
         navigator = Navigator(
             rig=rig,
             markers=markers,
-            vehicle=self.vehicle,
+            vehicle=vehicle,
             waypoints_m=scenario.waypoints_m,
             waypoint_radius_m=value["waypoint_radius_m"],
             selector=make_selector(value["selector"]),
@@ -209,7 +224,7 @@ class DriveStudy(Study):
         start = list(map(_given, starts, scenario.start_pose))
         return Rollout(
             navigator,
-            self.vehicle,
+            vehicle,
             markers,
             scenario,
             value["corner_noise_px"],

@@ -16,11 +16,14 @@ from jaxnav.belief.bank import Bank, heaviest
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.kalman import nis
 from jaxnav.belief.motion import Motion
+from jaxnav.belief.sensor_errors import SIX, velocity_of_twist
+from jaxnav.models import twist_base
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import (
     T_world_vehicle_from_planar,
     planar_from_T_world_vehicle,
 )
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator, State
 from jaxnav.pose.observation import Observation
 from jaxnav.simulation.batch_jit import batch_jit
@@ -121,7 +124,7 @@ def _carried_back(
     """
     if not isinstance(navigator.motion, BicycleKalman):
         return T_world_vehicle
-    wheelbase_m = navigator.motion.vehicle.wheelbase_m
+    vehicle = navigator.motion.vehicle
 
     def one(obs: Observation, pose: Array, frame: Array) -> Array:
         def back(pose: Array, now: tuple[Observation, Array]) -> tuple[Array, None]:
@@ -129,7 +132,11 @@ def _carried_back(
             speed_mps, steering_rad, dt_s = (
                 jnp.asarray(x, pose.dtype) for x in (obs.speed_mps, obs.steering_rad, obs.dt_s)
             )
-            before = advance(pose, -speed_mps, steering_rad, dt_s, wheelbase_m)
+            if isinstance(vehicle, TwistBase):
+                read = velocity_of_twist(obs.twist, jnp.zeros(SIX, pose.dtype)).velocity
+                before = twist_base.advance(pose, -read, dt_s)
+            else:
+                before = advance(pose, -speed_mps, steering_rad, dt_s, vehicle.wheelbase_m)
             return jnp.where((index > 0) & (index <= frame), before, pose), None
 
         indices = jnp.arange(obs.visible.shape[0])

@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxnav.control import Command
+from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import safe_norm, safe_sqrt
 from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.world import DriveState
@@ -109,6 +111,9 @@ class _Course(eqx.Module):
 
 def _course(before: DriveState, after: DriveState, count: int) -> _Course:
     was, now, car = before.state.control, after.state.control, after.truth.vehicle
+    commands = before.command, after.command
+    if not isinstance(car, Vehicle):
+        raise ValueError("only the drives of a car have a loss")
     limits = jnp.stack([car.throttle_limit, car.steering_limit_rad])[:, None]
     if isinstance(was, SoftState) and isinstance(now, SoftState):
         old, new = (state.commands / limits for state in (was, now))
@@ -125,8 +130,9 @@ def _course(before: DriveState, after: DriveState, count: int) -> _Course:
     if now is None:
         raise ValueError("a navigator without waypoints has no drive to be tuned")
     old, new = (
-        jnp.stack([world.command.throttle, world.command.steering_rad])[:, None] / limits
-        for world in (before, after)
+        jnp.stack([command.throttle, command.steering_rad])[:, None] / limits
+        for command in commands
+        if isinstance(command, Command)
     )
     shares = (jnp.arange(count + 1) == now.waypoint_index).astype(new.dtype)
     effort, change = jnp.sum(new**2, axis=0), jnp.sum((new - old) ** 2, axis=0)

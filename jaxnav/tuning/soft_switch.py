@@ -98,10 +98,12 @@ def soften_switch(navigator: Navigator, softness_m: float | Float[Array, ""]) ->
     """The navigator, with a soft switch from waypoint to waypoint.
 
     Raises:
-        ValueError: it has no route.
+        ValueError: it has no route, or drives no car.
     """
     if navigator.controller is None:
         raise ValueError("a navigator without waypoints has no drive to be tuned")
+    if not isinstance(navigator.controller, Controller):
+        raise ValueError("only the gains of a car's controller can be tuned")
     soft = SoftController(
         navigator.controller,
         jnp.asarray(softness_m, navigator.controller.waypoint_radius_m.dtype),

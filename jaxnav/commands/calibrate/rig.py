@@ -22,7 +22,7 @@ from jaxnav.commands.calibrate.report import (
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput, visible
-from jaxnav.files import calib_dir, load_vehicle, output_folder, write_json
+from jaxnav.files import calib_dir, load_car, output_folder, write_json
 from jaxnav.plots.rig import rig_report
 
 _WRONG_SCALE = 3.0  # ratio of found to given distances between cameras
@@ -128,7 +128,7 @@ def _wheelbase_m(args: Arguments, data: RigData) -> float:
     if len(data.parts) != 1 or not any(one.valid for one in data.parts[0].odometry):
         problem = "needs one recording, of a drive with odometry (a .mcap)"
         raise BadInput("--vehicle-frame drive", problem)
-    vehicle = load_vehicle(args.vehicle or calib_dir() / "qcar" / "vehicle.yaml")
+    vehicle = load_car(args.vehicle or calib_dir() / "qcar" / "vehicle.yaml")
     return float(vehicle.wheelbase_m)
 
 

@@ -4,7 +4,7 @@ from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.drive.arguments import Faults
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
-from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
+from jaxnav.files import calib_dir, load_car, load_markers, load_rig, write_json
 from jaxnav.loop.flags import names
 from jaxnav.testing.faults import HEADER, Result, Trial, line, run_trial
 from jaxnav.testing.matrix import matrix
@@ -19,7 +19,7 @@ def run(args: Faults) -> int:
     trial = Trial(
         load_rig(args.rig or qcar / "rig.yaml"),
         load_markers(args.markers or qcar / "markers.yaml"),
-        load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
+        load_car(args.vehicle or qcar / "vehicle.yaml"),
     )
     rows = [row for row in matrix() if not args.only or any(p in row.name for p in args.only)]
     if not rows:

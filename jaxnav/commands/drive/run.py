@@ -24,7 +24,7 @@ from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder
 from jaxnav.detection import make_detectors
 from jaxnav.errors import BadInput, visible
-from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
+from jaxnav.files import calib_dir, load_car, load_markers, load_params, load_rig, load_route
 from jaxnav.loop import plugins
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.guard import Guard
@@ -105,7 +105,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     return DriveSetup(
         rig=chosen("rig", args.rig, load_rig),
         markers=chosen("markers", args.markers, load_markers),
-        vehicle=chosen("vehicle", args.vehicle, load_vehicle),
+        vehicle=chosen("vehicle", args.vehicle, load_car),
         route=chosen("route", args.route, load_route),
         selector=args.selector,
         float64=args.float64,

@@ -14,11 +14,11 @@ from jaxnav.errors import BadInput
 from jaxnav.files import (
     Params,
     calib_dir,
+    load_car,
     load_markers,
     load_params,
     load_rig,
     load_route,
-    load_vehicle,
 )
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import T_world_vehicle_from_planar
@@ -63,7 +63,7 @@ class RenderedWorld:
                 f"the last row would be read after the command is due "
                 f"({DriveSettings.latency_s * 1e3:.0f} ms after the stamp), got {args.exposure_ms}",
             )
-        vehicle = load_vehicle(args.vehicle or qcar / "vehicle.yaml")
+        vehicle = load_car(args.vehicle or qcar / "vehicle.yaml")
         route = load_route(args.route or qcar / "demo_route.yaml")
         return RenderedWorld(
             DriveSetup(rig, markers, vehicle, route, float64=True),

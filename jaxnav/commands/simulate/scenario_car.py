@@ -35,7 +35,7 @@ class ScenarioCar:
             BadInput: a file that is not valid.
         """
         qcar = calib_dir() / "qcar"
-        vehicle = load_vehicle(files.vehicle or qcar / "vehicle.yaml")
+        vehicle: Vehicle | TwistBase = load_vehicle(files.vehicle or qcar / "vehicle.yaml")
         if isinstance(files, Simulate):
             vehicle = equipped(vehicle, files.base, files.imu)
         return ScenarioCar(

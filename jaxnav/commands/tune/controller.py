@@ -17,6 +17,7 @@ from jaxnav.commands.tune.arguments import TuneController as Arguments
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, load_params, output_folder
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
 from jaxnav.plots.tuning import ControllerScores, controller_report
@@ -81,6 +82,8 @@ def closed_loop(args: Arguments, name: str, params: Params | None = None) -> Clo
     if not scenario.drives:
         raise BadInput("--scenario", f"nothing drives in {name}")
     car = ScenarioCar.load(args, params)
+    if isinstance(car.vehicle, TwistBase):
+        raise BadInput("--vehicle", "is no Ackermann car: only the gains of a car can be learned")
     navigator = car.navigator(scenario, make_selector(args.selector))
     noise_px = jnp.asarray(args.corner_noise_px)
     rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px, spread=_CARS)
