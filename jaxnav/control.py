@@ -5,7 +5,7 @@ Source: Liu, Schofield, Shan (2023), Eqs. 16-19.
 
 import abc
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.models.bicycle import Vehicle, curvature_per_m, sideslip_rad
 from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
 from jaxnav.models.twist_base import TwistBase
+
+Kind = TypeVar("Kind", bound="Follower")
 
 
 class Command(eqx.Module):
@@ -69,11 +71,11 @@ class Follower(eqx.Module):
 
     @classmethod
     def along(
-        cls,
+        cls: type[Kind],
         waypoints_m: Sequence[Sequence[float]] | Float[Array, "W 2"],
         vehicle: Vehicle | TwistBase | None,
         **numbers: float,
-    ) -> Self:
+    ) -> Kind:
         """A controller of plain numbers, by the names of its fields.
 
         Raises:

@@ -16,7 +16,7 @@ from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heav
 from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.gate import Moments, Offer
-from jaxnav.belief.inertial import Turn, bias_at_rest, turn_of, with_turn
+from jaxnav.belief.inertial import Turn, bias_at_rest, turn_of, turned
 from jaxnav.belief.motion import Motion, Planar, camera_states
 from jaxnav.belief.sensor_errors import (
     SENSORS_END,
@@ -308,9 +308,8 @@ class BicycleKalman(Motion):
         Q = kalman.white_acceleration(density, dt_s).astype(dtype)
         pose = mean[:3] + dt_s * mean[3:SIX]
         if turn is not None:
-            A, Q = with_turn(turn, A, Q)
-            pose = pose.at[2].set(jnp.where(turn.told, turn.psi_rad, pose[2]))
-            mean = mean.at[5].set(jnp.where(turn.told, turn.rate_radps, mean[5]))
+            six, A, Q = turned(turn, mean, jnp.append(pose, mean[3:SIX]), A, Q, dt_s)
+            pose, mean = six[:3], mean.at[3:SIX].set(six[3:])
         P = kalman.replace_first(P, A).at[:SIX, :SIX].add(Q)
         later = mean.at[:3].set(pose.at[2].set(wrap_angle(pose[2])))
         way_m = safe_norm(mean[3:5]) * dt_s

@@ -18,25 +18,25 @@ Source: Titterton, Weston (2004), "Strapdown Inertial Navigation Technology", ch
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.sensor_errors import SIX
+from jaxnav.models.geometry import planar_rotation, safe_sinc
 from jaxnav.models.gyro import Gyro
+from jaxnav.numerics.small_matrices import matvec, sandwich
 from jaxnav.pose.observation import Observation
 
-_TURNS = np.array([2, 5])  # heading and turn rate in the state
 # Below these the wheels stand: above the noise of an odometer, below what a wheel creeps at.
 _STANDS_MPS, _STANDS_RADPS = 0.03, 0.05
 _STEADY_RADPS = 0.005  # a rate that changes by less, and its noise, does not
 
 
 class Turn(NamedTuple):
-    """What a gyro says of an interval dt: heading and turn rate at its end."""
+    """What a gyro says of an interval: the turn in it, and the turn rate at its end."""
 
     told: Bool[Array, ""]
-    psi_rad: Float[Array, ""]
+    turn_rad: Float[Array, ""]
     rate_radps: Float[Array, ""]
     changed_radps: Float[Array, ""]  # the rate, since the state before
     slopes: Float[Array, "2 n"]  # of heading and rate by the state before
@@ -68,24 +68,57 @@ def turn_of(
     of_angle = white * dt_s + (gyro.delay_sigma_s * changed) ** 2 + gyro.scale_sigma**2 * angle_rad
     of_rate = white / dt_s + acceleration_density * dt_s / 3 + changed**2 / 4
     noise = jnp.stack([jnp.stack([of_angle, white]), jnp.stack([white, of_rate])])
-    psi = mean[2] + dt_s * rate + delay_s * changed
-    return Turn(told, psi, rate, changed, slopes, noise.astype(dtype))
+    turn_rad = dt_s * rate + delay_s * changed
+    return Turn(told, turn_rad, rate, changed, slopes, noise.astype(dtype))
 
 
-def with_turn(
-    turn: Turn, A: Float[Array, "3 n"], Q: Float[Array, "6 6"]
-) -> tuple[Float[Array, "6 n"], Float[Array, "6 6"]]:
-    """The rows of Eq. 9 for pose and velocity, and their noise, with the turn that was told.
+def turned(
+    turn: Turn,
+    mean: Float[Array, " n"],
+    later: Float[Array, " 6"],
+    A: Float[Array, "3 n"],
+    Q: Float[Array, "6 6"],
+    dt_s: Float[Array, ""],
+) -> tuple[Float[Array, " 6"], Float[Array, "6 n"], Float[Array, "6 6"]]:
+    """Pose and velocity after an interval (Eq. 9), their rows and their noise, with its turn.
+
+    The velocity turns along. Left in the world it would lag behind the heading in every curve, and
+    the wheels, which read it at the heading, would say that the vehicle has turned less.
 
     Args:
+        mean: of the state before.
+        later: pose and velocity after it without a gyro.
         A: the rows of the pose without a gyro.
-        Q: noise of pose and velocity without it.
+        Q: the noise of pose and velocity without it.
     """
-    of_turn = jnp.zeros(SIX, bool).at[_TURNS].set(turn.told)
-    rows = jnp.eye(SIX, A.shape[1], dtype=A.dtype).at[:3].set(A)
-    rows = jnp.where(of_turn[:, None], jnp.zeros_like(rows).at[_TURNS].set(turn.slopes), rows)
-    noise = jnp.zeros_like(Q).at[_TURNS[:, None], _TURNS].set(turn.noise)
-    return rows, jnp.where(of_turn[:, None] | of_turn[None], noise, Q)
+    eye = jnp.eye(SIX, mean.shape[0], dtype=mean.dtype)
+    by_turn = turn.slopes[0] - eye[2]  # of the turn, by the state before
+    half, whole = planar_rotation(turn.turn_rad / 2)[:2, :2], planar_rotation(turn.turn_rad)[:2, :2]
+    chord_s = dt_s * safe_sinc(turn.turn_rad / 2)
+    way_m, velocity = chord_s * matvec(half, mean[3:5]), matvec(whole, mean[3:5])
+    way_by_turn, velocity_by_turn = _across(way_m) / 2, _across(velocity)
+    place = eye[:2].at[:, 3:5].set(chord_s * half) + way_by_turn[:, None] * by_turn[None]
+    moves = (
+        jnp.zeros_like(eye[:2]).at[:, 3:5].set(whole) + velocity_by_turn[:, None] * by_turn[None]
+    )
+    rows = jnp.concatenate([place, turn.slopes[:1], moves, turn.slopes[1:]])
+    zero, one = jnp.zeros((1,), mean.dtype), jnp.ones((1,), mean.dtype)
+    of_turn = jnp.concatenate([way_by_turn, one, velocity_by_turn, zero])
+    by_noise = jnp.stack([of_turn, eye[5, :SIX]], axis=1)
+    linear = jnp.asarray([1, 1, 0, 1, 1, 0], mean.dtype)
+    noise = Q * linear[:, None] * linear[None] + sandwich(by_noise, turn.noise)
+    psi_rad = mean[2] + turn.turn_rad
+    parts = (mean[:2] + way_m, psi_rad[None], velocity, turn.rate_radps[None])
+    return (
+        jnp.where(turn.told, jnp.concatenate(parts), later),
+        jnp.where(turn.told, rows, eye.at[:3].set(A)),
+        jnp.where(turn.told, noise, Q),
+    )
+
+
+def _across(vector: Float[Array, " 2"]) -> Float[Array, " 2"]:
+    """The derivative of a vector by its turn."""
+    return jnp.stack([-vector[1], vector[0]])
 
 
 def bias_at_rest(
