@@ -42,10 +42,12 @@ if TYPE_CHECKING:
     from jaxnav.files import load_vehicle as load_vehicle
     from jaxnav.models.bicycle import Vehicle as Vehicle
     from jaxnav.models.camera import Camera as Camera
+    from jaxnav.models.gyro import Gyro as Gyro
     from jaxnav.models.markers import MarkerMap as MarkerMap
     from jaxnav.models.origin import planar_in_world as planar_in_world
     from jaxnav.models.origin import poses_in_world as poses_in_world
     from jaxnav.models.rig import CameraRig as CameraRig
+    from jaxnav.models.twist_base import TwistBase as TwistBase
     from jaxnav.navigator import Navigator as Navigator
     from jaxnav.navigator import Output as Output
     from jaxnav.navigator import State as State
@@ -59,6 +61,8 @@ if TYPE_CHECKING:
     from jaxnav.pose.refine import solve_markers as solve_markers
     from jaxnav.pose.residuals import e1 as e1
     from jaxnav.pose.residuals import e2 as e2
+    from jaxnav.twist_control import TwistCommand as TwistCommand
+    from jaxnav.twist_control import TwistController as TwistController
 
     __version__: str
 
@@ -74,6 +78,7 @@ _MODULE_OF = {
     "ConstantVelocity": "belief.constant_velocity",
     "Controller": "control",
     "Estimate": "belief.estimate",
+    "Gyro": "models.gyro",
     "LowestReprojection": "belief.ambiguity",
     "Mahalanobis": "belief.ambiguity",
     "MarkerMap": "models.markers",
@@ -92,6 +97,9 @@ _MODULE_OF = {
     "Selector": "belief.ambiguity",
     "Snapshot": "pose.observation",
     "State": "navigator",
+    "TwistBase": "models.twist_base",
+    "TwistCommand": "twist_control",
+    "TwistController": "twist_control",
     "Ungated": "belief.ambiguity",
     "Vehicle": "models.bicycle",
     "configure": "configuration",

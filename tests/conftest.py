@@ -51,7 +51,7 @@ CORE = [
     f"jaxnav.{name}"
     for name in (
         "belief", "control", "lanes", "models", "navigator", "numerics", "parameters", "pose",
-        "timeline",
+        "timeline", "twist_control",
     )
 ]  # fmt: skip
 tests.helpers.shapes.wrap_arrays_alone()

@@ -17,7 +17,7 @@ LAYERS = {
     "numerics": {"lanes", "numerics"},
     "models": {"models"},
     "pose": {"pose"},
-    "belief & control": {"belief", "control"},
+    "belief & control": {"belief", "control", "twist_control"},
     "navigator": {"navigator", "parameters", "timeline"},
     "users": {
         "calibration",
@@ -43,6 +43,7 @@ PURE_CORE = set(ORDER[: ORDER.index("users")])
 # What stands side by side in a layer: these arrows alone lead from one to another.
 SIDE_BY_SIDE = {
     "timeline": {"navigator"},
+    "twist_control": {"control"},
     "compiling": {"files"},
     "detection": {"compiling"},
     "loop": {"compiling", "detection", "files"},

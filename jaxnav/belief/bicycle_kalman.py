@@ -16,7 +16,7 @@ from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heav
 from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.gate import Moments, Offer
-from jaxnav.belief.inertial import Turn, bias_at_rest, turn_of, turned
+from jaxnav.belief.inertial import Turn, bias_at_rest, slip_of, turn_of, turned
 from jaxnav.belief.motion import Motion, Planar, camera_states
 from jaxnav.belief.sensor_errors import (
     SENSORS_END,
@@ -119,16 +119,10 @@ class BicycleKalman(Motion):
         dt_s = jnp.asarray(obs.dt_s, bank.mean.dtype)
 
         def one(mean: Array, P: Array, lead: Array) -> tuple[Array, Array, Array]:
-            gyro, before_mps = self.vehicle.gyro, mean[3:5]
-            if gyro is None:
+            if self.vehicle.gyro is None:
                 later, P = self._with_odometry(*self._later(mean, P, obs), obs, dt_s)
             else:
-                density = kalman.as_matrix(self.acceleration_density)[2, 2].astype(mean.dtype)
-                turn = turn_of(gyro, obs, mean, density)
-                later, P = self._with_odometry(
-                    *self._later(mean, P, obs, turn), obs, dt_s, turn.told
-                )
-                later, P = self._at_rest(gyro, turn, before_mps, later, P, obs)
+                later, P = self._with_gyro(self.vehicle.gyro, mean, P, obs)
             change = _in_body(later) - _in_body(mean)
             return later, P, lead_after(lead, change, dt_s)
 
@@ -317,15 +311,19 @@ class BicycleKalman(Motion):
             P = P.at[-1, -1].add(jnp.asarray(self.vehicle.gyro.bias_walk, dtype) ** 2 * dt_s)
         return slipped(later, P, way_m, self._slip_sigma(), jnp.asarray(self.slip_length_m, dtype))
 
-    def _at_rest(
-        self, gyro: Gyro, turn: Turn, before_mps: Array, mean: Array, P: Array, obs: Observation
-    ) -> Moments:
-        """The state after the gyro was compared with wheels that stand, if they do."""
+    def _with_gyro(self, gyro: Gyro, mean: Array, P: Array, obs: Observation) -> Moments:
+        """The state `dt_s` later, as a gyro and the odometry have told (`inertial.py`)."""
+        dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
+        density = kalman.as_matrix(self.acceleration_density)[2, 2].astype(dtype)
+        sigma_radps = jnp.sqrt(kalman.as_covariance(self.odometry_sigma)[2, 2]).astype(dtype)
+        turn, before_mps = turn_of(gyro, obs, mean, density), mean[3:5]
+        mean, P = self._later(mean, P, obs, turn)
+        if self.vehicle.sensor_sigma is not None:
+            read = read_velocity(self.vehicle, obs, mean)
+            mean, P = slip_of(turn, read, sigma_radps, mean, P)
+        mean, P = self._with_odometry(mean, P, obs, dt_s, turn.told)
         read = read_velocity(self.vehicle, obs, mean)
-        wheels = jnp.where(read.present > 0, read.velocity, jnp.nan)
-        sigma_radps = jnp.sqrt(kalman.as_covariance(self.odometry_sigma)[2, 2]).astype(mean.dtype)
-        dt_s = jnp.asarray(obs.dt_s, mean.dtype)
-        return bias_at_rest(gyro, turn, before_mps, wheels, sigma_radps, dt_s, mean, P)
+        return bias_at_rest(gyro, turn, before_mps, read, sigma_radps, dt_s, mean, P)
 
     def _with_odometry(
         self,

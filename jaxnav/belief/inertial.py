@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
-from jaxnav.belief.sensor_errors import SIX
+from jaxnav.belief.sensor_errors import SENSORS_END, SIX, SLIP, ReadVelocity
 from jaxnav.models.geometry import planar_rotation, safe_sinc
 from jaxnav.models.gyro import Gyro
 from jaxnav.numerics.small_matrices import matvec, sandwich
@@ -29,6 +29,7 @@ from jaxnav.pose.observation import Observation
 
 # Below these the wheels stand: above the noise of an odometer, below what a wheel creeps at.
 _STANDS_MPS, _STANDS_RADPS = 0.03, 0.05
+_TURNS_RADPS, _MOST_SLIP = 0.05, 0.5  # slower turns say nothing of a slip; a share of the speed
 _STEADY_RADPS = 0.005  # a rate that changes by less, and its noise, does not
 
 
@@ -121,11 +122,42 @@ def _across(vector: Float[Array, " 2"]) -> Float[Array, " 2"]:
     return jnp.stack([-vector[1], vector[0]])
 
 
+def slip_of(
+    turn: Turn,
+    read: ReadVelocity,
+    wheels_sigma_radps: Float[Array, ""],
+    mean: Float[Array, " n"],
+    P: Float[Array, "n n"],
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """The state after the wheels' turn rate was compared with the gyro's.
+
+    It teaches the errors of the wheels, and nothing else. Where the two differ by more than those
+    explain, the wheels slip: the variance of the slip grows by what is left.
+
+    Args:
+        read: by the wheels, at the state after the turn.
+        wheels_sigma_radps: noise of the wheels' turn rate.
+    """
+    compared = turn.told & (read.present[2] > 0)
+    H = jnp.zeros_like(mean).at[5].set(1).at[SIX:SENSORS_END].set(-read.by_errors[2])
+    change, by_slip = read.velocity[2] - mean[5], read.by_errors[2, 0]
+    S = jnp.sum(H * matvec(P, H)) + wheels_sigma_radps**2
+    steep = jnp.abs(by_slip) > _TURNS_RADPS
+    slips = jnp.maximum(change**2 - S, 0) / jnp.where(steep, by_slip, 1) ** 2
+    slips = jnp.where(compared & steep, jnp.minimum(slips, _MOST_SLIP**2), 0)
+    P, S = P.at[SLIP, SLIP].add(slips), S + slips * by_slip**2
+    wheels = jnp.zeros_like(mean).at[SIX : SENSORS_END - 1].set(1)  # all but the cameras' delay
+    gain = jnp.where(compared, wheels * matvec(P, H) / S, 0)
+    left = jnp.eye(mean.shape[0], dtype=mean.dtype) - gain[:, None] * H[None]
+    noise = wheels_sigma_radps**2 * gain[:, None] * gain[None]
+    return mean + gain * change, kalman.symmetrise(sandwich(left, P) + noise)
+
+
 def bias_at_rest(
     gyro: Gyro,
     turn: Turn,
     before_mps: Float[Array, " 2"],
-    wheels: Float[Array, " 3"],
+    read: ReadVelocity,
     wheels_sigma_radps: Float[Array, ""],
     dt_s: Float[Array, ""],
     mean: Float[Array, " n"],
@@ -137,18 +169,18 @@ def bias_at_rest(
 
     Args:
         before_mps: the velocity before the interval.
-        wheels: v_x, v_y, omega that the wheels read now; NaN where they read nothing.
+        read: by the wheels, now.
         wheels_sigma_radps: noise of the wheels' turn rate.
     """
     slow = jnp.sum(before_mps**2) < _STANDS_MPS**2
-    slow = slow & (jnp.sum(wheels[:2] ** 2) < _STANDS_MPS**2) & (jnp.abs(wheels[2]) < _STANDS_RADPS)
+    slow = slow & (jnp.sum(read.velocity[:2] ** 2) < _STANDS_MPS**2)
+    slow = slow & (jnp.abs(read.velocity[2]) < _STANDS_RADPS) & jnp.all(read.present > 0)
     white = jnp.asarray(gyro.noise_density, mean.dtype) ** 2 / jnp.where(turn.told, dt_s, 1)
     steady = jnp.abs(turn.changed_radps) < _STEADY_RADPS + 4 * jnp.sqrt(white)
     stands = (turn.told & slow & steady).astype(mean.dtype)
-    wheels_radps = jnp.where(jnp.isfinite(wheels[2]), wheels[2], 0)
     H = jnp.zeros((1, mean.shape[0]), mean.dtype).at[0, -1].set(1)
     R = (wheels_sigma_radps**2 + white)[None, None]
-    seen = kalman.hide_rows((turn.rate_radps - wheels_radps)[None], H, R, stands[None])
+    seen = kalman.hide_rows((turn.rate_radps - read.velocity[2])[None], H, R, stands[None])
     correction, after, _ = kalman.update(P, *seen)
     kept = slice(SIX, -1)
     return mean + correction.at[kept].set(0), after.at[kept, kept].set(P[kept, kept])

@@ -134,8 +134,8 @@ def test_the_heading_is_the_gyros_whatever_the_wheels_say():
     time_s = 40 * DT_S
     assert float(bank.mean[0, 2]) == pytest.approx(0.3 + turned, abs=1e-3)
     expected = 0.02**2 + NOISE**2 * time_s + (BIAS_SIGMA * time_s) ** 2
-    np.testing.assert_allclose(bank.covariance[0, 2, 2], expected, rtol=0.02)
-    np.testing.assert_allclose(bank.covariance[0, 2, -1], -(BIAS_SIGMA**2) * time_s, rtol=0.02)
+    np.testing.assert_allclose(bank.covariance[0, 2, 2], expected, rtol=0.05)
+    np.testing.assert_allclose(bank.covariance[0, 2, -1], -(BIAS_SIGMA**2) * time_s, rtol=0.05)
     assert np.all(np.linalg.eigvalsh(bank.covariance[0]) > -1e-12)
 
 

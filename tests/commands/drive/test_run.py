@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import EXIT_BAD_INPUT, main
-from jaxnav.files import write_params
+from jaxnav.files import save_vehicle, write_params
 from jaxnav.loop.flags import Health
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
@@ -362,6 +363,10 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
         (["--record", "/dev/full"], "/dev/full: can't be written: no space left on device"),
         (["--params", "nowhere.yaml"], "nowhere.yaml: can't be read: no such file or directory"),
         (["--params", "p.yaml"], "p.yaml: parameters.motion.vision_floor: must have 3 entries or"),
+        (
+            ["--vehicle", "base.yaml"],
+            "base.yaml: base: must be ackermann here: so far",
+        ),
         (["--record-images"], "--record-images: needs --record"),
         (["--period-s", "5"], "--period-s: must be from 0.002 to 0.1, got 5.0"),
     ],
@@ -369,6 +374,7 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
 def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys, arguments, line):
     monkeypatch.chdir(tmp_path)
     write_params("p.yaml", {"motion.vision_floor": [1.0] * 6})
+    save_vehicle("base.yaml", TwistBase.create(1.0, 3.0, 0.1))
     monkeypatch.setattr("jaxnav.commands.drive.run.configure_jax", lambda **_: None)
     vehicle = [] if "--car" in arguments else ["--car", recorded_vehicle.NAME]
     log = tmp_path / "told"
