@@ -10,6 +10,7 @@ import pytest
 
 from jaxnav.belief.ambiguity import PoseMeasurement, Selection
 from jaxnav.belief.bicycle_kalman import BicycleKalman
+from jaxnav.belief.inertial import slip_of, turn_of
 from jaxnav.belief.sensor_errors import SENSORS_END, SIX, read_velocity, velocity_of_twist
 from jaxnav.models.bicycle import velocity_world
 from jaxnav.models.gyro import GYROS, Gyro
@@ -174,6 +175,38 @@ def test_standing_teaches_the_bias_alone_and_every_hypothesis_alike():
     block = np.asarray(bank.covariance[:, SIX:SENSORS_END, SIX:SENSORS_END])
     np.testing.assert_allclose(block, [told, told], atol=1e-9)
     np.testing.assert_allclose(bank.mean[:, 2], [0.3, -0.8], atol=2e-3)
+
+
+@pytest.mark.parametrize("rate_radps", [0.82, 1.3])
+def test_a_gyro_teaches_wheels_their_errors_and_their_slip(rate_radps):
+    """The rows of a dense Kalman gain that belong to s, k, g, o, where the mismatch is as likely as
+    not; beyond, with a slip as wide as it takes."""
+    rng = np.random.default_rng(4)
+    n = SENSORS_END + 1
+    scale = np.concatenate([np.full(SIX, 0.02), [0.05], TWIST_AS_TOLD, [BIAS_SIGMA]])
+    A = rng.normal(size=(n, 2 * n)) / np.sqrt(2 * n)
+    P, mean = scale[:, None] * (A @ A.T) * scale, np.zeros(n)
+    mean[5] = 0.8
+    read = read_velocity(base(), reading((0.5, 0.0, rate_radps)), jnp.asarray(mean))
+    turn = turn_of(GYRO, reading(gyro_radps=0.8), jnp.asarray(mean), jnp.asarray(0.0))
+    after, P_after = jax.jit(slip_of)(
+        turn, read, jnp.asarray(0.01), jnp.asarray(mean), jnp.asarray(P)
+    )
+    H = np.zeros(n)
+    H[5], H[SIX:SENSORS_END] = 1, -np.asarray(read.by_errors[2])
+    change = rate_radps - 0.8
+    S = H @ P @ H + 0.01**2
+    assert (change**2 > S) == (rate_radps == 1.3)
+    if change**2 > S:
+        P[SIX, SIX] += (change**2 - S) / H[SIX] ** 2
+        S = change**2
+    gain = P @ H / S
+    gain[:SIX], gain[SENSORS_END - 1 :] = 0, 0
+    left = np.eye(n) - np.outer(gain, H)
+    np.testing.assert_allclose(after, mean + gain * change, atol=1e-12)
+    np.testing.assert_allclose(P_after, left @ P @ left.T + 1e-4 * np.outer(gain, gain), atol=1e-12)
+    np.testing.assert_allclose(P_after[:SIX, :SIX], P[:SIX, :SIX], atol=1e-15)
+    assert after[SIX] < 0  # the wheels read too much
 
 
 @pytest.mark.parametrize(
