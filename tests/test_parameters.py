@@ -11,6 +11,7 @@ from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.control import ControlState
 from jaxnav.models.bicycle import sideslip_rad
 from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 from tests import worlds
@@ -46,7 +47,8 @@ def test_a_name_is_the_path_of_its_number():
 
 
 def test_every_tunable_is_some_navigator_s():
-    names = {*parameters_of(DRIVER), *parameters_of(HANDHELD)}
+    base = Navigator(RIG, MARKERS, TwistBase.create(1.0, 3.0, 0.1), worlds.WAYPOINTS_M)
+    names = {*parameters_of(DRIVER), *parameters_of(HANDHELD), *parameters_of(base)}
     assert names == set(TUNABLES)
     assert not [name for name in parameters_of(HANDHELD) if name.startswith("controller.")]
     assert not [name for name in parameters_of(HANDHELD) if name.startswith("selector.")]

@@ -221,7 +221,12 @@ class BicycleKalman(Motion):
         """The model with the errors of cameras and sensors; the paper's six states for one rule."""
         vehicle = self.vehicle
         if hypotheses == 1:
-            vehicle = dataclasses.replace(vehicle, sensor_sigma=None, gyro=None)
+            vehicle = eqx.tree_at(
+                lambda v: (v.sensor_sigma, v.gyro),
+                vehicle,
+                (None, None),
+                is_leaf=lambda leaf: leaf is None,
+            )
         count = camera_states(rig, hypotheses)
         return dataclasses.replace(self, vehicle=vehicle, camera_states=count)
 

@@ -1,6 +1,6 @@
 """Bases other than the QCar, of its size, to simulate by name, and the gyros that they may have."""
 
-import dataclasses
+import equinox as eqx
 
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.gyro import GYROS
@@ -23,4 +23,9 @@ def equipped(vehicle: Vehicle | TwistBase, base: str, imu: str) -> Vehicle | Twi
         vehicle = TwistBase.create(
             1.0, 7.0, 0.15, left_limit_mps, sensor_sigma=TWIST_AS_TOLD, gyro=vehicle.gyro
         )
-    return vehicle if imu == "none" else dataclasses.replace(vehicle, gyro=GYROS[imu])
+    if imu == "none":
+        return vehicle
+    with_gyro: Vehicle | TwistBase = eqx.tree_at(
+        lambda v: v.gyro, vehicle, GYROS[imu], is_leaf=lambda leaf: leaf is None
+    )
+    return with_gyro

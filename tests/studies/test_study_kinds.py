@@ -17,7 +17,10 @@ from jaxnav.belief.selectors import SELECTORS
 from jaxnav.cli import main
 from jaxnav.commands.study.studies import load_study, shipped_configs
 from jaxnav.errors import BadInput
+from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.gyro import GYROS
 from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import on_laps, scenarios
 from jaxnav.simulation.scores import Drives
@@ -224,6 +227,26 @@ def test_a_drive_study_varies_errors_that_repeat(tmp_path: Path) -> None:
     assert isinstance(own, DriveStudy)
     cell = own.grid.cell((0,))
     assert float(own.rollout(cell, own.scenario(cell)).corner_drift_px) == 0.5
+
+
+def test_a_drive_study_varies_what_drives_and_its_gyro(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text(
+        "trials: 2\naxes: {base: [ackermann, omni]}\nfixed: {imu: tactical}\n"
+    )
+    study = load_study("drive", tmp_path / "s.yaml")
+    assert isinstance(study, DriveStudy)
+    car, omni = (
+        study.rollout(cell, study.scenario(cell))
+        for cell in (study.grid.cell((index,)) for index in range(2))
+    )
+    assert isinstance(car.vehicle, Vehicle)
+    assert isinstance(omni.vehicle, TwistBase)
+    for rollout in (car, omni):
+        assert rollout.vehicle.gyro == GYROS["tactical"]
+        assert rollout.navigator.controller.vehicle is rollout.vehicle
+    (tmp_path / "s.yaml").write_text("trials: 2\naxes: {base: [boat]}\n")
+    with pytest.raises(BadInput, match=r"axes\.base\[0\]: unknown 'boat'"):
+        load_study("drive", tmp_path / "s.yaml")
 
 
 def command(*args: object, **environment: str) -> "subprocess.Popen[str]":
