@@ -328,7 +328,8 @@ class BicycleKalman(Motion):
             mean, P = slip_of(turn, read, sigma_radps, mean, P)
         mean, P = self._with_odometry(mean, P, obs, dt_s, turn.told)
         read = read_velocity(self.vehicle, obs, mean)
-        return bias_at_rest(gyro, turn, before_mps, read, sigma_radps, dt_s, mean, P)
+        mean, P = bias_at_rest(gyro, turn, before_mps, read, sigma_radps, dt_s, mean, P)
+        return mean.at[2].set(wrap_angle(mean[2])), P
 
     def _with_odometry(
         self,

@@ -3,10 +3,11 @@
     psi += dt r + delay (r - psi_dot),    psi_dot = r,    r = z - b
 
 The wheels read the velocity at the end of an interval, and a turn rate that slips with them; the
-gyro reads the whole turn. So where it has told, the wheels' turn rate is not looked at, and between
-them only one thing is compared: while the wheels stand, z is the bias. That holds whichever pose
-is the true one, so it teaches every hypothesis. Corners teach the bias as they do the errors of the
-other sensors, once the heading is known: a mirrored pose would learn the bias that fits it.
+gyro reads the whole turn. So where it has told, the wheels' turn rate moves nothing. The two are
+compared twice, which teaches every hypothesis, since it holds whichever pose is the true one:
+while the wheels stand, z is the bias; while they turn, they show what they get wrong. Corners teach
+the bias as they do the errors of the other sensors, once the heading is known: a mirrored pose
+would learn the bias that fits it.
 
 What the delay is off by moves the heading where the rate changes; an error of the scale grows with
 the turn, and as a random walk is right at 1 rad.
