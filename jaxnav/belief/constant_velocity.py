@@ -1,37 +1,23 @@
 """A filter for bodies that move freely: pose on SE(3) and twist."""
 
-import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
-from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
-from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heaviest, known_to
-from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
-from jaxnav.belief.follow_pose import follow_pose
-from jaxnav.belief.gate import Moments, Offer
-from jaxnav.belief.motion import Motion, camera_states
-from jaxnav.models.geometry import (
-    cayley,
-    inverse_cayley,
-    planar_from_T_world_vehicle,
-    rotation_error_rad,
-    rotation_matrix,
-    safe_norm,
-)
-from jaxnav.models.rig import CameraRig
-from jaxnav.numerics.small_matrices import cholesky, log_det, matvec, product
+from jaxnav.belief.bank import Bank
+from jaxnav.belief.free_body import FreeBody, moved_by_twist
+from jaxnav.belief.gate import Moments
+from jaxnav.models.geometry import safe_norm
 from jaxnav.pose.observation import Observation
 
 _LARGEST_TWIST = 1e3  # m/s and rad/s; a larger one is an error of the sensor
 
 
-class ConstantVelocity(Motion):
+class ConstantVelocity(FreeBody):
     """A body that moves freely: pose on SE(3) and body twist, for hand-held and aerial rigs.
 
     The mean is (wxyz, xyz) of T_world_vehicle followed by the twist (m/s, rad/s) in vehicle axes;
@@ -64,12 +50,6 @@ class ConstantVelocity(Motion):
     max_rejections: int = eqx.field(static=True, default=10)  # in a row that agree: forgotten
     max_rejected_s: float = 7.0  # of rejections, whether they agree or not: forgotten
 
-    def init(self, hypotheses: int = 1) -> Bank:
-        """A bank of K hypotheses before the first pose."""
-        dtype = self.acceleration_density.dtype
-        mean = jnp.zeros(13 + self.camera_states, dtype).at[0].set(1)
-        return empty_bank(mean, jnp.eye(12 + self.camera_states, dtype=dtype), 6, hypotheses)
-
     def predict(self, bank: Bank, obs: Observation) -> Bank:
         """T = T exp(u dt),  P = F P F' + Q.
 
@@ -90,22 +70,12 @@ class ConstantVelocity(Motion):
 
         def one(mean: Array, P: Array) -> tuple[Array, Array]:
             u = jnp.where(told, twist, mean[7:13])
-            motion = jaxlie.SE3.exp(u * dt_s)
-            T_world_vehicle = (jaxlie.SE3(mean[:7]) @ motion).normalize()
-            F = jnp.zeros((6, P.shape[0]), dtype).at[:, :6].set(motion.inverse().adjoint())
-            F = F.at[:, 6:12].set(jnp.where(told, 0, dt_s) * jnp.eye(6, dtype=dtype))
-            P = kalman.replace_first(P, F)
+            mean, P = moved_by_twist(mean, P, u, dt_s, ~told)
             if obs.twist is not None:
                 P = P.at[6:12].multiply(1 - told).at[:, 6:12].multiply(1 - told)
-            P = P.at[:12, :12].add(jnp.where(told, self._drift(twist, dt_s), Q))
-            return jnp.concatenate([T_world_vehicle.wxyz_xyz, u, mean[13:]]), P
+            return mean, P.at[:12, :12].add(jnp.where(told, self._drift(twist, dt_s), Q))
 
-        mean, covariance = jax.vmap(one)(bank.mean, bank.covariance)
-        variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
-        predicted = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, (mean, covariance))
-        wrong = self.lost(bank)
-        lost = wrong | ~(variance_m2 < self.lost_sigma_m**2)
-        return forget_lost(predicted, lost, dt_s)
+        return self.without_lost(bank, *jax.vmap(one)(bank.mean, bank.covariance), dt_s)
 
     def _told(self, obs: Observation, dtype: Any) -> tuple[Bool[Array, ""], Float[Array, " 6"]]:
         """Whether the odometry tells the motion, and its twist; 0 where it does not."""
@@ -127,109 +97,7 @@ class ConstantVelocity(Motion):
         A = kalman.as_matrix(self.acceleration_density).astype(dtype)
         return jnp.block([[D * dt_s, D], [D, D * per_dt + A * dt_s / 3]])
 
-    def lost(self, bank: Bank) -> Bool[Array, " K"]:
-        """Whether the gate has contradicted a hypothesis too often or too long."""
-        return contradicted(bank, self.max_rejections, self.max_rejected_s)
-
-    def poses(self, bank: Bank) -> PoseBelief:
-        """The pose part of the state: free in six directions, without nuisances."""
-        return PoseBelief(
-            jaxlie.SE3(bank.mean[:, :7]),
-            bank.covariance[:, :6, :6],
-            bank.log_weight,
-            bank.initialised,
-            jnp.eye(6, dtype=bank.mean.dtype),
-            jnp.zeros((6, 0), bank.mean.dtype),
-            self.gate_nis,
-            self._camera_errors(bank),
-        )
-
-    def _camera_errors(self, bank: Bank) -> CameraErrors | None:
-        if not self.camera_states:
-            return None
-        P = bank.covariance
-        return CameraErrors(bank.mean[:, 13:], P[:, 12:, 12:], P[:, :6, 12:])
-
-    def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
-        """The offer to one hypothesis whose selector has chosen a candidate, in 6 dof."""
-        mean, P = bank.mean, bank.covariance
-        wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
-        log_volume = log_det(cholesky(measured.covariance)) / 2
-        R = measured.covariance + kalman.as_covariance(self.vision_floor)
-        innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
-        correction, posterior, S = kalman.update(
-            P, innovation, jnp.eye(6, P.shape[0], dtype=P.dtype), R
-        )
-        return Offer(
-            kalman.whiten(innovation, S),
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
-            first=self._first(wxyz_xyz, R, None),
-            posterior=(self.moved(mean, correction), posterior),
-        )
-
-    def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
-        """The offer to one hypothesis whose selector has corrected its pose, in 6 dof."""
-        T = measured.T_world_vehicle
-        correction, P = follow_pose(
-            bank.covariance,
-            jaxlie.SE3(bank.mean[:7]),
-            measured,
-            jnp.eye(6, dtype=bank.mean.dtype),
-            self.states,
-        )
-        return Offer(
-            measured.innovation,
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_likelihood,
-            inflation=measured.inflation,
-            first=self._first(T.wxyz_xyz, measured.covariance, measured.errors),
-            posterior=(jnp.append(T.wxyz_xyz, bank.mean[7:] + correction[6:]), P),
-        )
-
-    def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
-        """(xi, difference of the twists), (12,): mean = base * cay(xi), in the axes of `base`."""
-        T_base_other = jaxlie.SE3(base[:7]).inverse() @ jaxlie.SE3(mean[:7])
-        return jnp.append(inverse_cayley(T_base_other), mean[7:] - base[7:])
-
-    def moved(self, base: Float[Array, " n"], error: Float[Array, " d"]) -> Float[Array, " n"]:
-        """The mean (13,) at an error (12,): base * cay(xi), and the twist plus its error."""
-        T = (jaxlie.SE3(base[:7]) @ cayley(error[:6])).normalize()
-        return jnp.append(T.wxyz_xyz, base[7:] + error[6:])
-
-    def T_world_vehicle(self, mean: Float[Array, " n"]) -> jaxlie.SE3:
-        """The pose of a mean."""
-        return jaxlie.SE3(mean[:7])
-
-    def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
-        """(x, y, psi) and (v_x, v_y, psi_dot) in the world: pose and motion seen from above."""
-        T_world_vehicle = jaxlie.SE3(mean[:7])
-        R_world_vehicle = rotation_matrix(T_world_vehicle.rotation())
-        v_mps, w_radps = matvec(R_world_vehicle, mean[7:10]), matvec(R_world_vehicle, mean[10:13])
-        # psi is the direction of the x axis, which moves by w x (R e_x).
-        x, y, up = R_world_vehicle[:, 0]
-        level = jnp.maximum(x**2 + y**2, jnp.finfo(mean.dtype).eps)
-        turn_radps = w_radps[2] - up * (x * w_radps[0] + y * w_radps[1]) / level
-        return planar_from_T_world_vehicle(T_world_vehicle), jnp.append(v_mps[:2], turn_radps)
-
-    def for_rig(self, rig: CameraRig, hypotheses: int) -> "ConstantVelocity":
-        """The model with the errors of the rig's cameras among its states."""
-        return dataclasses.replace(self, camera_states=camera_states(rig, hypotheses))
-
-    def learns(self, bank: Bank) -> Bool[Array, ""]:
-        """Whether the orientation is known to `learn_sigma_rad`."""
-        best = jaxlie.SE3(bank.mean[heaviest(bank), :7])
-        apart = jax.vmap(lambda mean: rotation_error_rad(jaxlie.SE3(mean[:7]), best))(bank.mean)
-        variance = jnp.trace(bank.covariance[:, 3:6, 3:6], axis1=1, axis2=2)
-        return known_to(bank, apart, variance) < self.learn_sigma_rad**2
-
-    def _first(self, wxyz_xyz: Array, covariance: Array, errors: ErrorsPosterior | None) -> Moments:
-        """A hypothesis that starts at a pose, with an unknown velocity."""
-        velocity = jnp.asarray(self.initial_velocity_sigma, wxyz_xyz.dtype) ** 2
-        ones = jnp.ones(self.camera_states, wxyz_xyz.dtype)
-        variance = jnp.concatenate([jnp.zeros_like(velocity), velocity, ones])
-        P = jnp.diag(variance).at[:6, :6].set(covariance)
-        if errors is not None:
-            cross = product(covariance, product(errors.slope.T, errors.rows))
-            P = P.at[:6, 12:].set(cross).at[12:, :6].set(cross.T)
-        return jnp.append(wxyz_xyz, jnp.zeros_like(variance[6:])), P
+    def at_first(self) -> Moments:
+        """No velocity, with `initial_velocity_sigma`."""
+        sigma = jnp.asarray(self.initial_velocity_sigma, float)
+        return jnp.zeros_like(sigma), jnp.diag(sigma**2)

@@ -3,6 +3,7 @@
 Pure NumPy, for the boundary where recordings and simulations become observations.
 """
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -83,7 +84,7 @@ class ImuSamples:
         hole |= np.diff(samples_s) > _GAP_PERIODS * period_s
         rows = [
             _cut(samples_s, values, *bounds, hole, period_s)
-            for bounds in zip(bounds_s[:-1], bounds_s[1:], strict=True)
+            for bounds in itertools.pairwise(bounds_s)
         ]
         rows = [np.zeros((0, 8)), *rows]
         for begin in range(0, len(rows), _CHUNK):

@@ -129,14 +129,16 @@ class Preintegrated(eqx.Module):
             jnp.asarray(False),
         )
 
-    def usable(self) -> "Preintegrated":
+    def usable(self, dtype: Any = float) -> "Preintegrated":
         """The same, or `none` where a number is not finite or the duration is not positive."""
-        numbers = jnp.concatenate(
-            [jnp.ravel(leaf) for leaf in jax.tree.leaves(self) if leaf.dtype != bool]
-        )
-        good = jnp.all(jnp.isfinite(numbers)) & (self.duration_s > 0)
-        none = Preintegrated.none(self.velocity_mps.dtype)
-        result: Preintegrated = jax.tree.map(lambda a, b: jnp.where(good, a, b), self, none)
+        told = [leaf for leaf in jax.tree.leaves(self) if leaf.dtype != bool]
+        good = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in told])))
+        good = good & (self.duration_s > 0)
+
+        def kept(leaf: Array, other: Array) -> Array:
+            return jnp.where(good, leaf.astype(other.dtype), other)
+
+        result: Preintegrated = jax.tree.map(kept, self, Preintegrated.none(dtype))
         return result
 
     def at_biases(
@@ -176,7 +178,7 @@ def preintegrate(
     bridged_s = jnp.sum(jnp.where(readings.bridged, readings.dt_s, 0))
     per_bridged = noise.bridged_variances().astype(dtype) * bridged_s
 
-    def step(carry: tuple[Array, ...], row: tuple[Array, ...]) -> tuple[tuple[Array, ...], None]:
+    def step(carry: Any, row: Any) -> tuple[Any, None]:
         wxyz, v, p, P, chain = carry
         gyro, accel, dt, bridged = row
         dR = jaxlie.SO3(wxyz)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.models.camera import Camera
 from jaxnav.models.markers import MarkerMap
+from jaxnav.models.preintegration import Preintegrated
 from jaxnav.models.rig import CameraRig
 from jaxnav.numerics.small_matrices import in_order
 
@@ -40,6 +41,8 @@ class Observation(eqx.Module):
     # another estimator: the mean over `dt_s`, so that exp(twist dt_s) is the motion. Of a
     # `TwistBase`, by its wheels: v_x, v_y and w_z (entries 0, 1, 5) at the stamp.
     twist: Float[Array, " 6"] | None = None
+    # What an IMU tells of the motion in `dt_s`, in the vehicle's axes; see `InertialMotion`.
+    imu: Preintegrated | None = None
     # Readings of another sensor, for `OrientationGiven`; a NaN is no reading.
     heading_rad: Float[Array, ""] | None = None  # psi in the world
     heading_sigma_rad: Float[Array, ""] | float = 0.02

@@ -14,8 +14,8 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from jaxnav.belief.bank import Bank
-from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief
+from jaxnav.belief.free_body import FreeBody
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.kalman import log_likelihood
 from jaxnav.belief.motion import Motion
@@ -45,7 +45,7 @@ def trust_corners(navigator: Navigator) -> Navigator:
     """The navigator without its guards against outliers, which would hide a wrong Q or R."""
     motion, selector = navigator.motion, navigator.selector
     navigator = eqx.tree_at(lambda n: n.motion.gate_nis, navigator, float("inf"))
-    if isinstance(motion, ConstantVelocity):
+    if isinstance(motion, FreeBody):
         navigator = eqx.tree_at(lambda n: n.motion.lost_sigma_m, navigator, float("inf"))
     if isinstance(selector, MultiHypothesis):
         navigator = eqx.tree_at(

@@ -139,7 +139,7 @@ def of_gtsam(measured):
 def in_our_order(covariance, turn, biases=False):
     """GTSAM's (rotation vector, p, v, accelerometer's bias, gyroscope's) as ours.
 
-    GTSAM counts what a bias has walked from the end to the beginning.
+    Between increments and walks GTSAM 4.3 has the other sign; differences, above, tell which.
     """
     J = np.diag(np.r_[np.ones(9), -np.ones(6)][: len(covariance)])
     J[:3, :3] = right_jacobian(jnp.asarray(turn))
@@ -197,7 +197,13 @@ def smooth(times_s):
     )
     w = (R_before.inv() * R_after).as_rotvec() / (2 * h)
     a = (after - 2 * p + before) / h**2
-    return R.as_matrix(), p, (after - before) / (2 * h), w, R.inv().apply(a + [0, 0, 9.81])
+    return (
+        R.as_matrix(),
+        p,
+        (after - before) / (2 * h),
+        w,
+        R.inv().apply(a + np.array([0, 0, 9.81])),
+    )
 
 
 def samples(rate_hz=200.0, end_s=1.1, noise=NOISE, **options) -> ImuSamples:
