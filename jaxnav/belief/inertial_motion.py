@@ -78,7 +78,7 @@ class InertialMotion(FreeBody):
     def in_any_world(noise: ImuNoise = CONSUMER, **fields: object) -> "InertialMotion":
         """The model where nobody knows the direction of gravity in the map's axes."""
         unknown = {"gravity_mps2": jnp.zeros(3), "gravity_sigma_mps2": jnp.full(3, 10.0)}
-        return InertialMotion(noise, **(unknown | fields))  # type: ignore[arg-type]
+        return InertialMotion(noise=noise, **(unknown | fields))  # type: ignore[arg-type]
 
     def at_first(self) -> Moments:
         """No velocity and no biases, gravity as the map has it."""
@@ -147,7 +147,7 @@ class InertialMotion(FreeBody):
         Q = sandwich(slopes[:, states:], imu.covariance)
         # The rate is the mean of the interval; at its end a white acceleration has changed it.
         A = kalman.as_matrix(self.acceleration_density).astype(dtype)[3:, 3:]
-        Q = Q.at[9:12, 9:12].add(A * imu.duration_s / 3)
+        Q = Q.at[9:12, 9:12].add(jnp.where(imu.still, 0, A * imu.duration_s / 3))
         return after, P.at[:states, :states].add(kalman.symmetrise(Q))
 
     def _after(self, mean: Array, noise: Array, imu: Preintegrated) -> Array:

@@ -23,7 +23,9 @@ from jaxtyping import Bool, Float, Int
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
 from jaxnav.models.conventions import APRILTAG_FIRST_CORNER, TL_TR_BR_BL
+from jaxnav.models.imu_samples import ImuSamples
 from jaxnav.models.markers import MarkerMap
+from jaxnav.models.preintegration import Preintegrated
 from jaxnav.models.rig import CameraRig
 from jaxnav.ros.odometry_track import OdometryTrack
 
@@ -53,6 +55,7 @@ class Recording:
     markers: MarkerMap
     reference: Reference | None
     odometry: OdometryTrack | None  # of the vehicle, by other software
+    imu: ImuSamples | None  # on the vehicle
     unmapped_detections: int  # of markers that are not in the map
     dropped_detections: int  # reported twice, or with a corner out of range
 
@@ -80,6 +83,11 @@ class Recording:
     def twists(self) -> Float[np.ndarray, "F 6"] | None:
         """Mean twists since the frame before, see `OdometryTrack.twists`; None: no odometry."""
         return None if self.odometry is None else self.odometry.twists(self.stamps_ns)
+
+    @property
+    def preintegrated(self) -> Preintegrated | None:
+        """What the IMU tells since the frame before, (F,) in every leaf; None: there is none."""
+        return None if self.imu is None else self.imu.between(self.stamps_ns)
 
     def lanes(
         self, frames: Int[np.ndarray, " K"]
@@ -144,12 +152,14 @@ def assemble(
     markers: MarkerMap,
     poses: dict[int, Float[np.ndarray, " 7"]] | None = None,
     odometry: OdometryTrack | None = None,
+    imu: ImuSamples | None = None,
 ) -> Recording:
     """Make a recording of a table of detections.
 
     Args:
         poses: the reference, stamp in ns -> (7,) wxyz xyz of the vehicle in the world.
         odometry: of the vehicle, by other software.
+        imu: on the vehicle.
 
     Raises:
         BadInput: two families share an id in the map; the detections do not tell families.
@@ -180,6 +190,7 @@ def assemble(
         markers=markers,
         reference=None if poses is None else _align(stamps, poses),
         odometry=odometry,
+        imu=imu,
         unmapped_detections=int(np.sum(~mapped)),
         dropped_detections=int(np.sum(mapped)) - len(used),
     )

@@ -6,8 +6,10 @@ from typing import NoReturn
 from jaxnav.datasets import bags
 from jaxnav.datasets.decoded import read_decoded
 from jaxnav.datasets.recording import Recording, RecordingSource, Reference, assemble
+from jaxnav.datasets.ros_rigs import read_ros_rig
 from jaxnav.datasets.tagslam import read_tagslam
 from jaxnav.errors import BadInput
+from jaxnav.files.topics import TopicMap
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.ros.camera_messages import TAGSLAM
@@ -16,7 +18,10 @@ __all__ = ["Recording", "Reference", "read_recording"]
 
 
 def read_recording(
-    path: str | Path, rig: CameraRig | None = None, markers: MarkerMap | None = None
+    path: str | Path,
+    rig: CameraRig | None = None,
+    markers: MarkerMap | None = None,
+    topics: TopicMap | None = None,
 ) -> Recording:
     """Read a recording.
 
@@ -24,11 +29,16 @@ def read_recording(
         path: a TagSLAM folder, a .bag or .bag.bz2, or an .npz.
         rig: needed with a bag; replaces the recorded one otherwise.
         markers: the same for the marker map.
+        topics: which topic of a ROS bag, of ROS 1 or 2, is what; needs a rig and markers.
 
     Raises:
         BadInput: one line naming the file and what is wrong in it, or the flag that is missing.
     """
     path = Path(path)
+    if topics is not None:
+        if rig is None:
+            _no_rig(path)
+        return read_ros_rig(path, topics, rig, markers or _no_markers(path))
     if rig is not None and markers is None and bags.is_bag(path) and path.is_file():
         _no_markers(path)  # before all of it is read
     source = read_source(path, rig)
@@ -66,11 +76,15 @@ def read_source(path: Path, rig: CameraRig | None, also: str = "") -> RecordingS
 def _read_single_bag(path: Path, rig: CameraRig | None) -> RecordingSource:
     """Read a bag of detections, in which a rig's cameras are named like the topics."""
     if rig is None:
-        raise BadInput("--rig", f"missing: {path} alone does not say what its cameras are")
+        _no_rig(path)
     bag = bags.read_bag(path)
     topics = [_topic_of(path, bag, name) for name in rig.names]
     rows = bags.rows_of_topics([bag.detections[t] for t in topics])
     return RecordingSource(path.name, rows, rig, lambda: _no_markers(path))
+
+
+def _no_rig(path: Path) -> NoReturn:
+    raise BadInput("--rig", f"missing: {path} alone does not say what its cameras are")
 
 
 def _no_markers(path: Path) -> NoReturn:

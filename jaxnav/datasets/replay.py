@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.belief.ambiguity import Selector
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.evaluation import Branch, judge_branch
+from jaxnav.belief.free_body import FreeBody
+from jaxnav.belief.inertial_motion import InertialMotion
 from jaxnav.belief.kalman import nis
 from jaxnav.datasets.recording import Recording
 from jaxnav.errors import BadInput
@@ -25,6 +27,7 @@ from jaxnav.files import Params, apply_params, limits
 from jaxnav.models.geometry import inverse_cayley
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import opposite, poses_in_world
+from jaxnav.models.preintegration import Preintegrated
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator, State
 from jaxnav.pose.candidates import find_candidates
@@ -58,6 +61,7 @@ class _Frames(eqx.Module):
     dt_s: Float[Array, "*F"]
     T_world_vehicle_true: Float[Array, "*F 7"]
     twist: Float[Array, "*F 6"] | None  # by odometry; None: of no frame
+    imu: Preintegrated | None  # the same
 
 
 def replay(
@@ -91,7 +95,7 @@ def replay(
         rig=recording.rig,
         markers=recording.markers,
         selector=selector,
-        motion=ConstantVelocity(),
+        motion=motion_of(recording),
         corner_sigma_px=1.0 if corner_sigma_px is None else corner_sigma_px,
     )
     navigator = apply_params(navigator, params)
@@ -107,13 +111,13 @@ def replay(
         lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)),
         (alone if one_at_a_time else navigator).init(),
     )
-    total, twists = len(recording), recording.twists
-    first = _frames(recording, twists, 0)
+    total, told = len(recording), (recording.twists, recording.preintegrated)
+    first = _frames(recording, told, 0)
     run_chunk = _run_chunk.lower(navigator, state, first, one_at_a_time).compile()
     started = time.perf_counter()
     chunks = []
     for begin in range(0, total, CHUNK_FRAMES):
-        state, outputs = run_chunk(navigator, state, _frames(recording, twists, begin))
+        state, outputs = run_chunk(navigator, state, _frames(recording, told, begin))
         chunks.append(jax.device_get(outputs))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
@@ -131,6 +135,16 @@ def replay(
         total / elapsed_s,
         corner_sigma_px,
     )
+
+
+def motion_of(recording: Recording) -> FreeBody:
+    """The filter of a recorded rig: with an IMU where one is recorded."""
+    if recording.imu is None:
+        return ConstantVelocity()
+    arm_m, noise = jnp.asarray(recording.imu.lever_arm_m, float), recording.imu.noise
+    if recording.imu.level:
+        return InertialMotion(noise=noise, lever_arm_m=arm_m)
+    return InertialMotion.in_any_world(noise, lever_arm_m=arm_m)
 
 
 def estimate_corner_sigma_px(recording: Recording) -> float:
@@ -176,7 +190,9 @@ def _run_chunk(
     markers = navigator.markers
 
     def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, _Told]:
-        obs = Observation(frame.corners_px, frame.visible, dt_s=frame.dt_s, twist=frame.twist)
+        obs = Observation(
+            frame.corners_px, frame.visible, dt_s=frame.dt_s, twist=frame.twist, imu=frame.imu
+        )
         state, out = _with_markers(navigator, markers).step(state, obs)
         truth = jaxlie.SE3(frame.T_world_vehicle_true)
         branch = judge_branch(out.candidates, out.selected, truth)
@@ -194,6 +210,7 @@ def _run_chunk(
                 frame.dt_s,
                 frame.T_world_vehicle_true,
                 frame.twist,
+                frame.imu,
             )
             return outputs_of(_single(markers, marker), state, seen_alone)
 
@@ -216,7 +233,10 @@ def _single(markers: MarkerMap, index: Array) -> MarkerMap:
     return MarkerMap(T_world_marker, markers.size_m[index][None], ids=(0,), families=("",))
 
 
-def _frames(recording: Recording, twists: np.ndarray | None, begin: int) -> _Frames:
+_Motions = tuple[np.ndarray | None, Preintegrated | None]  # by odometry, by an IMU
+
+
+def _frames(recording: Recording, motions: _Motions, begin: int) -> _Frames:
     """A chunk of frames, padded beyond the last one with frames that show nothing."""
     frames = np.arange(begin, min(begin + CHUNK_FRAMES, len(recording)))
     dt_s = (
@@ -228,9 +248,10 @@ def _frames(recording: Recording, twists: np.ndarray | None, begin: int) -> _Fra
         there = opposite(recording.markers.origin_m)
         truth = poses_in_world(reference.T_world_vehicle[frames], there)
     corners_px, visible = recording.lanes(frames)
-    twists = None if twists is None else twists[frames]
-    # Over a longer pause the motion is predicted for a while only, unless the odometry tells it.
+    twists, imu = jax.tree.map(lambda rows: rows[frames], motions)
+    # Over a longer pause the motion is predicted for a while only, unless a sensor tells it.
     told = False if twists is None else np.isfinite(twists).all(axis=1)
+    told = told if imu is None else told | (imu.duration_s > 0)
     dt_s = np.where(told, dt_s, np.clip(dt_s, 0, MAX_DT_S))
 
     hidden = np.zeros((CHUNK_FRAMES - len(frames), *visible.shape[1:]), bool)
@@ -240,6 +261,7 @@ def _frames(recording: Recording, twists: np.ndarray | None, begin: int) -> _Fra
         dt_s=_padded(dt_s, CHUNK_FRAMES),
         T_world_vehicle_true=_padded(truth, CHUNK_FRAMES),
         twist=None if twists is None else _padded(twists, CHUNK_FRAMES),
+        imu=jax.tree.map(lambda rows: _padded(rows, CHUNK_FRAMES), imu),
     )
 
 

@@ -16,7 +16,7 @@ from jaxnav.datasets.ros_bags import ReceivedMessage, one_line, read_messages
 from jaxnav.detection import Detections
 from jaxnav.detection.image_search import ImageSearch, size_problem
 from jaxnav.errors import BadInput
-from jaxnav.files.topics import TopicMap
+from jaxnav.files.topics import TopicMap, same_topic
 from jaxnav.files.validation import at
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -26,6 +26,7 @@ from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.models.twists import TwistReader
 from jaxnav.ros import camera_messages, odometry_messages
+from jaxnav.ros.imu_messages import IMU
 from jaxnav.ros.odometry_messages import WheelJoints
 
 TOGETHER_NS = 100_000_000  # frames of one stamp that come later than this are not joined
@@ -53,11 +54,9 @@ def read_ros_drive(
         BadInput: one line naming the file and the topic or key.
     """
     path = Path(path)
-    for name in topics.cameras:
-        if name not in rig.names:
-            problem = f"the rig has no such camera: it has {', '.join(rig.names)}"
-            raise BadInput(at(topics.path, f"cameras.{name}"), problem)
-    reader = _Reader(path, topics, rig, markers, corner_backend)
+    # A car's filter does not take an IMU.
+    of_a_car = topics.model_copy(update={"imu": None})
+    reader = MessageReader(path, of_a_car, rig, markers, corner_backend)
     joints = None
     if topics.joints is not None:
         told = topics.joints
@@ -68,7 +67,7 @@ def read_ros_drive(
     with closing(read_messages(path, reader.choose)) as messages:
         for received in messages:
             try:
-                if _same(received.topic, topics.odometry):
+                if same_topic(received.topic, topics.odometry):
                     reading = odometry_messages.odometry(
                         received.kind, received.message, twists, joints
                     )
@@ -109,7 +108,7 @@ def join_frames(frames: Iterable[tuple[int, FrameDetections]]) -> list[Input]:
 
 
 @dataclass
-class _Reader:
+class MessageReader:
     """A reader that turns the messages of the cameras' topics into `FrameDetections`."""
 
     path: Path
@@ -120,6 +119,10 @@ class _Reader:
     _images: ImageSearch | None = None
 
     def __post_init__(self) -> None:
+        for name in self.topics.cameras:
+            if name not in self.rig.names:
+                problem = f"the rig has no such camera: it has {', '.join(self.rig.names)}"
+                raise BadInput(at(self.topics.path, f"cameras.{name}"), problem)
         self._camera_of = {
             topic.strip("/"): self.rig.names.index(name)
             for name, topic in self.topics.cameras.items()
@@ -134,6 +137,8 @@ class _Reader:
         }
         if self.topics.odometry is not None:
             wanted["odometry"] = (self.topics.odometry, odometry_messages.ODOMETRY_TYPES)
+        if self.topics.imu is not None:
+            wanted["imu"] = (self.topics.imu.name, (IMU,))
         chosen = [self._find(kinds, key, *entry) for key, entry in wanted.items()]
         if odometry_messages.JOINTS in [kinds[topic] for topic in chosen]:
             if self.topics.joints is None:
@@ -149,7 +154,7 @@ class _Reader:
         self, kinds: Mapping[str, str], key: str, topic: str, expected: tuple[str, ...]
     ) -> str:
         where = at(self.topics.path, key)
-        matches = [recorded for recorded in kinds if _same(recorded, topic)]
+        matches = [recorded for recorded in kinds if same_topic(recorded, topic)]
         if not matches:
             listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(kinds.items()))
             problem = f"{self.path} has no topic {topic}; topics found: {listed or 'none'}"
@@ -184,8 +189,3 @@ class _Reader:
         if problem := size_problem(self.rig, camera, image):
             raise BadInput(self.path, f"{received.topic}: {problem}")
         return self._images.detections(camera, image)
-
-
-def _same(topic: str, other: str | None) -> bool:
-    """Whether two spellings of a topic's name mean the same topic."""
-    return other is not None and topic.strip("/") == other.strip("/")

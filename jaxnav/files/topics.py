@@ -3,6 +3,7 @@
     cameras: {front: /front/detections, left: /left/image_raw}   # names as in the rig
     odometry: /odom                # of a type in jaxnav/ros/odometry_messages.py
     joints: {driven: [rear_left, rear_right], steered: [front], wheel_radius_m: 0.033}  # JointState
+    imu: {topic: /imu, preset: consumer, T_vehicle_imu: [[1, 0, 0, 0.1], ...]}    # sensor_msgs/Imu
     corner_sigma_px: 0.3           # of detections in the bag; may be left out
     first_corner: bottom_left      # of detections in the bag; may be left out
 
@@ -11,14 +12,30 @@ OpenCV's picture of the same marker stands on its head. A map made for AprilTag'
 with `bottom_left`; one made for OpenCV's, as jaxnav's own detectors see it, with `top_right`.
 """
 
+import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, PrivateAttr, field_validator
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
+from jaxnav.files import poses
+from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import CornerSigma, Entry, Name, Positive, validate
+from jaxnav.files.validation import (
+    CornerSigma,
+    Entry,
+    MountPose,
+    Name,
+    NonNegative,
+    Number,
+    Positive,
+    QuaternionPose,
+    validate,
+)
 from jaxnav.models.conventions import FirstCorner
+from jaxnav.models.preintegration import PRESETS, ImuNoise
 
 
 class JointsEntry(Entry):
@@ -29,6 +46,66 @@ class JointsEntry(Entry):
     wheel_radius_m: Annotated[Positive, Field(le=10)]
 
 
+class ImuEntry(Entry):
+    """An inertial measurement unit: its topic, its place, and how good it is.
+
+    The densities and walks, `rostopic` and `update_rate` are those of Kalibr's imu.yaml.
+
+    Attributes:
+        topic: of sensor_msgs/Imu; or `rostopic`.
+        T_vehicle_imu: where it is on the vehicle, its axes in the vehicle's.
+        preset: a kind of sensor, for what is not given one by one.
+        gyroscope_noise_density: rad/s/sqrt(Hz); the accelerometer's m/s^2/sqrt(Hz).
+        gyroscope_random_walk: rad/s^2/sqrt(Hz); the accelerometer's m/s^3/sqrt(Hz).
+        gyroscope_bias_sigma: rad/s; the accelerometer's m/s^2.
+        update_rate: Hz; not looked at, as the stamps tell it.
+        imu_delay_s: its samples were taken so long before their stamps, on the cameras' clock.
+        max_gyro_radps, max_accel_mps2: its range, beyond which a reading is saturated.
+        level: the map's z points up within two degrees; else gravity is found on the way.
+    """
+
+    topic: Name | None = None
+    rostopic: Name | None = None
+    T_vehicle_imu: MountPose
+    preset: Literal["consumer", "tactical"] = "consumer"
+    gyroscope_noise_density: Positive | None = None
+    accelerometer_noise_density: Positive | None = None
+    gyroscope_random_walk: NonNegative | None = None
+    accelerometer_random_walk: NonNegative | None = None
+    gyroscope_bias_sigma: Positive | None = None
+    accelerometer_bias_sigma: Positive | None = None
+    update_rate: Positive | None = None
+    imu_delay_s: Annotated[Number, within("delay_s")] = 0.0
+    max_gyro_radps: Positive = 1e6
+    max_accel_mps2: Positive = 1e6
+    level: Annotated[bool, Field(strict=True)] = True
+
+    @model_validator(mode="after")
+    def _one_topic(self) -> "ImuEntry":
+        if (self.topic is None) == (self.rostopic is None):
+            raise ValueError("give one of topic and rostopic")
+        return self
+
+    @property
+    def name(self) -> str:
+        """The topic."""
+        return self.topic or self.rostopic or ""
+
+    def noise(self) -> ImuNoise:
+        """The errors of its readings."""
+        preset = PRESETS[self.preset]
+        names = [field.name for field in dataclasses.fields(preset)]
+        given = {name: getattr(self, name, None) for name in names}
+        return dataclasses.replace(preset, **{k: v for k, v in given.items() if v is not None})
+
+    def T_matrix(self) -> Float[np.ndarray, "4 4"]:
+        """T_vehicle_imu, (4, 4)."""
+        T = self.T_vehicle_imu
+        if isinstance(T, QuaternionPose):
+            return poses.matrix(np.array([*T.wxyz, *T.xyz_m]))
+        return poses.matrix(poses.pose_from_matrix(T))
+
+
 class TopicMap(Entry):
     """The topics of a ROS bag that hold the cameras' frames and the odometry.
 
@@ -36,6 +113,7 @@ class TopicMap(Entry):
         cameras: name in the rig -> topic of detections or of images.
         odometry: the topic; None where the bag has none.
         joints: of a topic of JointState.
+        imu: of a rig that moves freely; None where the bag has none. Cars do not look at it.
         corner_sigma_px: standard deviation of a detected corner along one axis.
         first_corner: the corner, as the marker map sees the marker, that a detection begins with;
             the others follow counter-clockwise.
@@ -45,6 +123,7 @@ class TopicMap(Entry):
     cameras: Annotated[dict[str, Name], Field(min_length=1, max_length=64)]
     odometry: Name | None = None
     joints: JointsEntry | None = None
+    imu: ImuEntry | None = None
     corner_sigma_px: CornerSigma = 0.3
     first_corner: FirstCorner = "bottom_left"
 
@@ -69,6 +148,11 @@ class TopicMap(Entry):
             if odometry is not None and topic.strip("/") == odometry.strip("/"):
                 raise ValueError(f"{topic} is the topic of the camera {camera!r} already")
         return odometry
+
+
+def same_topic(topic: str, other: str | None) -> bool:
+    """Whether two spellings of a topic's name mean the same topic."""
+    return other is not None and topic.strip("/") == other.strip("/")
 
 
 Topics = TypeVar("Topics", bound=TopicMap)

@@ -34,6 +34,7 @@ class ImuSamples:
         noise: of its readings.
         delay_s: a sample was taken so long before its stamp.
         max_gyro_radps, max_accel_mps2: its range; a reading there is saturated.
+        level: the z of the map in which it moves points up.
     """
 
     stamps_ns: Int[np.ndarray, " N"]
@@ -44,6 +45,7 @@ class ImuSamples:
     delay_s: float = 0.0
     max_gyro_radps: float = np.inf
     max_accel_mps2: float = np.inf
+    level: bool = True
 
     @property
     def lever_arm_m(self) -> Float[np.ndarray, " 3"]:

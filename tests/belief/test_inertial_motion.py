@@ -19,6 +19,7 @@ from jaxnav.models.preintegration import (
     preintegrate,
 )
 from jaxnav.pose.observation import Observation
+from tests.derivatives import in_float32
 
 NOISE = ImuNoise(2e-3, 3e-2, 4e-3, 5e-2, 0.05, 0.2)
 ARM_M = np.array([0.2, -0.1, 0.3])
@@ -211,3 +212,125 @@ def test_gtsam_s_combined_factor_has_the_same_mean_and_covariance_of_the_predict
     assert np.max(gap) < 2e-3
     # The prior alone is far from it, and so is the noise alone.
     assert np.max(np.abs(J @ before @ J.T - expected) / scale / scale[:, None]) > 0.1
+
+
+def test_a_filter_that_carries_samples_has_their_covariance():
+    """20 000 bodies off by P, whose increments are off by theirs, and whose biases walk."""
+    mean, P = random_state(8, size=0.005)
+    motion = InertialMotion(NOISE, lever_arm_m=jnp.asarray(ARM_M))
+    imu = measured(2)
+    after = predict(motion, started(motion, mean, P), at(0.2, imu))
+    rng = np.random.default_rng(0)
+    errors = jnp.asarray(rng.normal(size=(20_000, 21)) @ np.linalg.cholesky(P).T)
+    off = rng.normal(size=(20_000, 15)) @ np.linalg.cholesky(imu.covariance + 1e-16 * np.eye(15)).T
+
+    @jax.jit
+    @jax.vmap
+    def ends(error, off):
+        """In matrices of the world, as Forster et al. have it."""
+        start = motion.moved(jnp.asarray(mean), error)
+        T, t = jaxlie.SE3(start[:7]), imu.duration_s
+        R, g = T.rotation(), start[19:]
+        dR, dv, dp = imu.at_biases(start[13:16], start[16:19])
+        dR = dR @ jaxlie.SO3.exp(off[:3])
+        R_after = R @ dR
+        p = T.translation() + R @ ARM_M + R @ start[7:10] * t + g * t**2 / 2 + R @ (dp + off[6:9])
+        v = R @ (start[7:10] + dv + off[3:6]) + g * t
+        T_after = jaxlie.SE3.from_rotation_and_translation(R_after, p - R_after @ ARM_M)
+        rest = R_after.inverse() @ v, after.mean[0, 10:13], start[13:19] + off[9:], g
+        return motion.difference(jnp.concatenate([T_after.wxyz_xyz, *rest]), after.mean[0])
+
+    found = np.asarray(ends(errors, jnp.asarray(off)))
+    free = np.r_[0:9, 12:21]  # the turn rate has its own white acceleration
+    P_after = np.asarray(after.covariance[0])[np.ix_(free, free)]
+    whitened = np.linalg.solve(np.linalg.cholesky(P_after), found[:, free].T)
+    # Sampling noise, and 2 % for what is not linear.
+    tolerance = 0.02 + 5 / np.sqrt(20_000)
+    np.testing.assert_allclose(whitened @ whitened.T / 20_000, np.eye(18), atol=tolerance)
+
+
+def test_a_body_at_rest_tells_the_gyroscope_s_bias_and_the_lean_of_the_map():
+    """Ten seconds on a table, in a map that leans by 2 degrees."""
+    motion = InertialMotion(NOISE)
+    bias, lean = np.array([0.04, -0.03, 0.02]), np.deg2rad(2.0)
+    gravity = 9.81 * np.array([np.sin(lean), 0, -np.cos(lean)])
+    rows = np.tile(bias, (20, 1)), np.tile(-gravity, (20, 1)), np.full(20, 0.005)
+    numbers = [jnp.asarray(row, float) for row in rows]
+    readings = Readings(*numbers, jnp.zeros(20, bool), jnp.asarray(True))
+    imu = preintegrate(readings, NOISE)
+    first = motion.at_first()
+    mean = np.concatenate([[1, 0, 0, 0, 0, 0, 0], first[0]])
+    P = np.zeros((21, 21))
+    P[6:, 6:], P[:6, :6] = first[1], 1e-6 * np.eye(6)
+    bank = started(motion, mean, P)
+    for _ in range(100):
+        bank = predict(motion, bank, at(0.1, imu))
+    found, P = np.asarray(bank.mean[0]), np.asarray(bank.covariance[0])
+    np.testing.assert_allclose(found[7:13], 0, atol=0.01)
+    np.testing.assert_allclose(found[13:16], bias, atol=0.003)
+    assert np.all(np.sqrt(np.diag(P))[12:15] < 0.005)
+    # Lean and accelerometer's bias look alike on a table: what they do together is known.
+    along = found[16:19] - found[19:22]
+    np.testing.assert_allclose(along, -gravity, atol=0.05)
+    assert abs(found[19]) > 0.1
+    # In flight nothing of it is done.
+    moving = dataclasses.replace(imu, still=jnp.asarray(False))
+    free = predict(motion, started(motion, mean, P), at(0.1, moving))
+    np.testing.assert_array_equal(free.mean[0, 13:], mean[13:])
+
+
+def test_rest_weighs_the_hypotheses_by_how_well_they_rest():
+    """One lies as gravity says, the other on its side; and a fast one is not stopped."""
+    motion = InertialMotion(NOISE)
+    first = motion.at_first()
+    P = np.zeros((21, 21))
+    P[6:, 6:], P[:6, :6] = first[1], 1e-4 * np.eye(6)
+    P[6:9, 6:9] = 1e-4 * np.eye(3)
+    side = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
+    means = np.stack([np.concatenate([q, np.zeros(3), first[0]]) for q in (side, [1, 0, 0, 0.0])])
+    bank = eqx.tree_at(
+        lambda b: (b.mean, b.covariance, b.initialised, b.log_weight),
+        motion.init(2),
+        (jnp.asarray(means), jnp.asarray(np.stack([P] * 2)), jnp.ones(2, bool),
+         jnp.log(jnp.asarray([0.5, 0.5]))),
+    )  # fmt: skip
+    rows = jnp.zeros((20, 3)), jnp.tile(jnp.asarray([0, 0, 9.81]), (20, 1)), jnp.full(20, 0.01)
+    imu = preintegrate(Readings(*rows, jnp.zeros(20, bool), jnp.asarray(True)), NOISE)
+    weights = np.exp(np.asarray(predict(motion, bank, at(0.2, imu)).log_weight))
+    assert weights.sum() == pytest.approx(1)
+    assert weights[0] < 0.01
+    anywhere = InertialMotion.in_any_world(NOISE)
+    wide = eqx.tree_at(
+        lambda b: b.covariance, bank, bank.covariance.at[:, 18:, 18:].set(100 * jnp.eye(3))
+    )
+    weights = np.exp(np.asarray(predict(anywhere, wide, at(0.2, imu)).log_weight))
+    assert 0.2 < weights[0] < 0.6
+    fast = eqx.tree_at(lambda b: b.mean, bank, bank.mean.at[:, 7].set(1.0))
+    after = predict(motion, fast, at(0.2, imu))
+    assert after.mean[1, 7] == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(after.log_weight, bank.log_weight)
+
+
+@in_float32
+def test_gradients_are_finite_at_rest_and_without_a_reading(precision):
+    """Of a prediction by its readings, the priors, and the state."""
+
+    @jax.jit
+    @jax.grad
+    def slope(floats, still):
+        motion, mean, gyro, accel, dt_s = floats
+        rows = gyro, accel, dt_s
+        imu = preintegrate(Readings(*rows, jnp.zeros(4, bool), still), motion.noise)
+        bank = started(motion, jnp.eye(22)[0], 1e-4 * jnp.eye(21))
+        bank = eqx.tree_at(lambda b: b.mean, bank, bank.mean + mean[None])
+        obs = at(jnp.sum(dt_s), imu)
+        bank = motion.predict(motion.predict(bank, obs), obs)
+        return jnp.sum(bank.mean) + jnp.sum(bank.covariance) + jnp.sum(bank.log_weight)
+
+    zero = jnp.zeros((4, 3))
+    for still in (True, False):
+        for dt_s in (jnp.full(4, 0.01), jnp.zeros(4)):
+            floats = InertialMotion(), jnp.zeros(22), zero, zero, dt_s
+            for leaf in jax.tree.leaves(slope(floats, jnp.asarray(still))):
+                assert np.all(np.isfinite(leaf))
+                assert leaf.dtype == precision

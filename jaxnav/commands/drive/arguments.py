@@ -169,8 +169,9 @@ class ReplayRecording(Headless):
     where it differs.
 
     A rig is localised in 6 degrees of freedom from a folder with bags and their calibration as
-    TagSLAM writes it, a ROS 1 bag with --rig and --markers, or an .npz of detections. Where
-    there is a reference trajectory the errors against it are measured.
+    TagSLAM writes it, a ROS 1 bag with --rig and --markers, an .npz of detections, or any ROS bag
+    with --rig, --markers and a --topics that has an IMU. Where there is a reference trajectory the
+    errors against it are measured.
 
     Written to --out: a TUM trajectory, summary.json, and a PNG where something is to be compared.
     """
@@ -188,7 +189,7 @@ class ReplayRecording(Headless):
     params: OptionalFile = None
     """Tuned parameters, of a drive in place of all of its own; --corner-sigma-px goes before."""
     topics: OptionalFile = None
-    """Which topic of a ROS bag is what: it is a drive then."""
+    """Which topic of a ROS bag is what: it is a drive then, or with an IMU a rig's recording."""
     images: Switch = False
     """Look for the markers once more in the drive's recorded images."""
     corner_backend: CornerBackend = "aruco"
@@ -207,7 +208,7 @@ class ReplayRecording(Headless):
     ] = None
     """Standard deviation of a corner coordinate."""
     without_odometry: Switch = False
-    """Localise a rig by its cameras alone, also where other software's odometry is recorded."""
+    """Localise a rig by its cameras alone, also where an IMU or odometry is recorded."""
     limit: Annotated[int | None, optional("N", "(default: all)", int), AT_LEAST_1] = None
     """Stop after N frames, of a drive after N inputs."""
     out: ResultsFolder = Path("out")

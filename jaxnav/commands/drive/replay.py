@@ -14,13 +14,14 @@ from jaxnav.commands.kinds import Selector
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.datasets.recordings import Recording, read_recording
-from jaxnav.datasets.replay import Replay, errors, frames_in_view, replay
+from jaxnav.datasets.replay import Replay, errors, frames_in_view, motion_of, replay
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     apply_params,
     load_markers,
     load_params,
     load_rig,
+    load_topics,
     output_folder,
     write_json,
     write_tum,
@@ -43,15 +44,18 @@ def run(args: Arguments) -> int:
         args.recording,
         None if args.rig is None else load_rig(args.rig),
         None if args.markers is None else load_markers(args.markers),
+        None if args.topics is None else load_topics(args.topics),
     )
     if args.limit is not None:
         recording = recording.first(args.limit)
     if args.without_odometry:
-        recording = dataclasses.replace(recording, odometry=None)
+        recording = dataclasses.replace(recording, odometry=None, imu=None)
     if not len(recording):
         raise BadInput(args.recording, "holds no frame")
     if params is not None:  # raises on bad input before the folder is made
-        apply_params(Navigator(recording.rig, recording.markers), params)
+        apply_params(
+            Navigator(recording.rig, recording.markers, motion=motion_of(recording)), params
+        )
     out = output_folder(args.out)
     if params is not None:
         print(params.describe())
@@ -80,6 +84,7 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
         "markers": "one-at-a-time" if args.one_at_a_time else "all",
         "selector": args.selector,
         "odometry": recording.odometry is not None,
+        "imu": recording.imu is not None,
         "params": args.params,
         "frames": len(recording),
         "frames_located": int(result.seen.any(axis=1).sum()),
@@ -164,7 +169,8 @@ def _report(
 def _text(summary: dict[str, Any]) -> str:
     head = (
         f"{visible(summary['recording'])}, {summary['selector']}, markers {summary['markers']}"
-        f"{', with odometry' if summary['odometry'] else ''}: "
+        f"{', with odometry' if summary['odometry'] else ''}"
+        f"{', with an IMU' if summary['imu'] else ''}: "
         f"{summary['poses']} poses in {summary['frames']} frames, "
         f"{summary['frames_per_second']:.0f} frames/s"
     )

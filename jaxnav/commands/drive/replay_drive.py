@@ -144,6 +144,12 @@ def is_for(args: Arguments) -> bool:
         BadInput: a flag that does not go with such a recording.
     """
     path = args.recording
+    moves_freely = args.topics is not None and load_topics(args.topics).imu is not None
+    if moves_freely and not (args.vehicle or args.route):
+        for name in _FOR_DRIVES:
+            if getattr(args, name):
+                raise BadInput(flag_of(name), f"is for drives, and {path} with an IMU is a rig's")
+        return False
     if args.topics is not None or profile_of(path) == PROFILE:
         for name in _FOR_RIGS:
             if getattr(args, name):
