@@ -8,6 +8,8 @@ Position and turn are sums of sines about a stand from which the vehicle's x axi
 velocity, acceleration and turn rate are their derivatives, of the IMU's place too.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -166,24 +168,14 @@ def observe(
         samples: of the IMU; None: there is none.
         hidden: frames in which no marker is in view, whatever the rig would see.
     """
+    count = len(stamps_ns)
     times_s = jnp.asarray(stamps_ns / 1e9, float)
-    corners_px, visible, wxyz_xyz = _all_frames(path, rig, markers, times_s)
-    noise = jax.random.normal(key, corners_px.shape, corners_px.dtype)
-    if hidden is not None:
-        visible = visible & ~jnp.asarray(hidden)[:, None, None]
-    dt_s = np.diff(stamps_ns, prepend=stamps_ns[:1]) / 1e9
-    return Observation(
-        corners_px + corner_noise_px * noise,
-        visible,
-        dt_s=jnp.asarray(dt_s, float),
-        speed_mps=jnp.zeros(len(stamps_ns)),
-        steering_rad=jnp.zeros(len(stamps_ns)),
-        has_odometry=jnp.zeros(len(stamps_ns), bool),
-        imu=None if samples is None else jax.tree.map(jnp.asarray, samples.between(stamps_ns)),
-        heading_sigma_rad=jnp.full(len(stamps_ns), 0.02),
-        normal_sigma_rad=jnp.full(len(stamps_ns), 0.05),
-        T_world_vehicle_true=jaxlie.SE3(wxyz_xyz),
-    )
+    dt_s = jnp.asarray(np.diff(stamps_ns, prepend=stamps_ns[:1]) / 1e9, float)
+    shown = jnp.ones(count, bool) if hidden is None else ~jnp.asarray(hidden)
+    imu = None if samples is None else jax.tree.map(jnp.asarray, samples.between(stamps_ns))
+    rows = times_s, dt_s, shown, jax.random.split(key, count), imu
+    frames: Observation = _all_frames(path, rig, markers, corner_noise_px, rows)
+    return frames
 
 
 @jax.jit
@@ -195,10 +187,19 @@ def _all_readings(
 
 @jax.jit
 def _all_frames(
-    path: HandHeld, rig: CameraRig, markers: MarkerMap, times_s: Array
-) -> tuple[Array, Array, Array]:
-    def frame(t: Array) -> tuple[Array, Array, Array]:
+    path: HandHeld, rig: CameraRig, markers: MarkerMap, corner_noise_px: Array, rows: Any
+) -> Any:
+    def frame(t: Array, dt_s: Array, shown: Array, key: Array, imu: Any) -> Observation:
         T_world_vehicle = path.T_world_vehicle(t)
-        return *see(rig, markers, T_world_vehicle), T_world_vehicle.wxyz_xyz
+        corners_px, visible = see(rig, markers, T_world_vehicle)
+        noise_px = corner_noise_px * jax.random.normal(key, corners_px.shape, corners_px.dtype)
+        return Observation(
+            corners_px + noise_px,
+            visible & shown,
+            dt_s=dt_s,
+            has_odometry=jnp.asarray(False),
+            imu=imu,
+            T_world_vehicle_true=T_world_vehicle,
+        )
 
-    return jax.vmap(frame)(times_s)
+    return jax.vmap(frame)(*rows)

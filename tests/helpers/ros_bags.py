@@ -16,6 +16,7 @@ APRILTAGS = "apriltag_msgs/msg/AprilTagDetectionArray"
 TAGSLAM = "apriltag_msgs/msg/ApriltagArrayStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 
@@ -148,6 +149,23 @@ class Bag:
         drive = self.make("ackermann_msgs/AckermannDrive", steering_rad, 0.0, speed_mps, 0.0, 0.0)
         message = self.make("ackermann_msgs/AckermannDriveStamped", self.header(stamp_ns), drive)
         self.add(topic, ACKERMANN, received_ns, message)
+
+    def imu(
+        self, topic: str, received_ns: int, stamp_ns: int, gyro: np.ndarray, accel: np.ndarray
+    ) -> None:
+        """A sample of an IMU that knows no orientation."""
+        unknown = np.zeros(9)
+        message = self.make(
+            "sensor_msgs/Imu",
+            self.header(stamp_ns),
+            self.make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0),
+            unknown,
+            self.make("geometry_msgs/Vector3", *map(float, gyro)),
+            unknown,
+            self.make("geometry_msgs/Vector3", *map(float, accel)),
+            unknown,
+        )
+        self.add(topic, IMU, received_ns, message)
 
     def image(
         self,
