@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from jaxnav.belief.estimate import Belief as Belief
     from jaxnav.belief.estimate import Estimate as Estimate
     from jaxnav.belief.hypotheses import MultiHypothesis as MultiHypothesis
+    from jaxnav.belief.inertial_motion import InertialMotion as InertialMotion
     from jaxnav.belief.motion import Motion as Motion
     from jaxnav.configuration import configure as configure
     from jaxnav.control import Command as Command
@@ -79,6 +80,7 @@ _MODULE_OF = {
     "Controller": "control",
     "Estimate": "belief.estimate",
     "Gyro": "models.gyro",
+    "InertialMotion": "belief.inertial_motion",
     "LowestReprojection": "belief.ambiguity",
     "Mahalanobis": "belief.ambiguity",
     "MarkerMap": "models.markers",

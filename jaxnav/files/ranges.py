@@ -81,6 +81,8 @@ RANGES: dict[str, Range] = {
     "gain": Range(0.1, 10.0, "", "scale of speed and steering readings"),
     "offset_rad": Range(-0.5, 0.5, "rad", "offset of the steering"),
     "delay_s": Range(-0.5, 0.5, "s", "delay of the cameras behind the odometer"),
+    "imu_noise": Range(0.0, 100.0, "SI", "noise, random walk and bias of an IMU"),
+    "imu_range": Range(0.1, 1e6, "rad/s, m/s^2", "largest reading of an IMU"),
     # Noise and tuning.
     "corner_sigma_px": Range(1e-3, 100.0, "px", "standard deviation of a corner, of a whole file"),
     "sigma": Range(-1e9, 1e9, "", "standard deviation that a calibration tells; only shown"),

@@ -89,6 +89,8 @@ class RosFile(TopicMap):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "RosFile":
+        if self.imu is not None:
+            raise ValueError("imu is for recordings: the node takes none")
         if self.vehicle is None:
             for key in ("route", "joints"):
                 if getattr(self, key) is not None:

@@ -23,6 +23,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from jaxnav.files import poses
 from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import written_pose
 from jaxnav.files.validation import (
     CornerSigma,
     Entry,
@@ -31,7 +32,6 @@ from jaxnav.files.validation import (
     NonNegative,
     Number,
     Positive,
-    QuaternionPose,
     validate,
 )
 from jaxnav.models.conventions import FirstCorner
@@ -44,6 +44,11 @@ class JointsEntry(Entry):
     driven: Annotated[list[Name], Field(min_length=1, max_length=16)]
     steered: Annotated[list[Name], Field(min_length=1, max_length=16)]
     wheel_radius_m: Annotated[Positive, Field(le=10)]
+
+
+_Noise = Annotated[Positive, within("imu_noise")]
+_Walk = Annotated[NonNegative, within("imu_noise")]
+_Range = Annotated[Positive, within("imu_range")]
 
 
 class ImuEntry(Entry):
@@ -68,16 +73,16 @@ class ImuEntry(Entry):
     rostopic: Name | None = None
     T_vehicle_imu: MountPose
     preset: Literal["consumer", "tactical"] = "consumer"
-    gyroscope_noise_density: Positive | None = None
-    accelerometer_noise_density: Positive | None = None
-    gyroscope_random_walk: NonNegative | None = None
-    accelerometer_random_walk: NonNegative | None = None
-    gyroscope_bias_sigma: Positive | None = None
-    accelerometer_bias_sigma: Positive | None = None
+    gyroscope_noise_density: _Noise | None = None
+    accelerometer_noise_density: _Noise | None = None
+    gyroscope_random_walk: _Walk | None = None
+    accelerometer_random_walk: _Walk | None = None
+    gyroscope_bias_sigma: _Noise | None = None
+    accelerometer_bias_sigma: _Noise | None = None
     update_rate: Positive | None = None
     imu_delay_s: Annotated[Number, within("delay_s")] = 0.0
-    max_gyro_radps: Positive = 1e6
-    max_accel_mps2: Positive = 1e6
+    max_gyro_radps: _Range = 1e6
+    max_accel_mps2: _Range = 1e6
     level: Annotated[bool, Field(strict=True)] = True
 
     @model_validator(mode="after")
@@ -100,10 +105,7 @@ class ImuEntry(Entry):
 
     def T_matrix(self) -> Float[np.ndarray, "4 4"]:
         """T_vehicle_imu, (4, 4)."""
-        T = self.T_vehicle_imu
-        if isinstance(T, QuaternionPose):
-            return poses.matrix(np.array([*T.wxyz, *T.xyz_m]))
-        return poses.matrix(poses.pose_from_matrix(T))
+        return poses.matrix(poses.pose_as_read(written_pose(self.T_vehicle_imu)))
 
 
 class TopicMap(Entry):

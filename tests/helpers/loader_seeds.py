@@ -33,7 +33,7 @@ from jaxnav.recording.recorder import Recorder
 from jaxnav.studies.store import open_store
 from tests.helpers.drives import record_drive
 from tests.helpers.ros_bags import FORMATS, Bag
-from tests.helpers.ros_drives import BEGIN_NS, MS, SQUARE_PX, TOPICS
+from tests.helpers.ros_drives import BEGIN_NS, IMU, MS, SQUARE_PX, TOPICS
 from tests.helpers.ros_drives import drive as ros_drive
 from tests.helpers.seed_texts import (
     AMBIGUITY,
@@ -286,6 +286,7 @@ STRUCTURED = {
     "route": Loader(_written("route.yaml", (QCAR / "route.yaml").read_bytes()), files.load_route),
     "params": Loader(_written("params.yaml", PARAMS), _applied),
     "topics": Loader(_written("topics.yaml", TOPICS), files.load_topics),
+    "topics with an IMU": Loader(_written("topics.yaml", TOPICS + IMU), files.load_topics),
     "ROS node": Loader(_written("node.yaml", ROS_NODE), load_ros),
     "ROS node of a free rig": Loader(_written("node.yaml", ROS_BODY), load_ros),
     "Kalibr rig": Loader(_written("chain.yaml", KALIBR), files.load_rig),

@@ -25,6 +25,17 @@ corner_sigma_px: 0.25
 """
 
 
+IMU = """
+imu:
+  topic: /imu
+  T_vehicle_imu: {wxyz: [1, 0, 0, 0], xyz_m: [0.1, 0, 0.2]}
+  gyroscope_noise_density: 0.001
+  imu_delay_s: 0.004
+  max_accel_mps2: 160.0
+  level: false
+"""
+
+
 def drive(kind: str) -> Bag:
     """Two cameras, one of apriltag_ros and one of TagSLAM, and odometry."""
     bag = Bag(kind)
