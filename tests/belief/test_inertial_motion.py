@@ -19,6 +19,7 @@ from jaxnav.models.preintegration import (
     preintegrate,
 )
 from jaxnav.pose.observation import Observation
+from tests import worlds
 from tests.derivatives import in_float32
 
 NOISE = ImuNoise(2e-3, 3e-2, 4e-3, 5e-2, 0.05, 0.2)
@@ -334,3 +335,29 @@ def test_gradients_are_finite_at_rest_and_without_a_reading(precision):
             for leaf in jax.tree.leaves(slope(floats, jnp.asarray(still))):
                 assert np.all(np.isfinite(leaf))
                 assert leaf.dtype == precision
+
+
+def test_the_cameras_errors_stay_and_keep_what_they_have_to_do_with_the_pose():
+    """Twelve of a rig of four behind the state; the rest is as without them."""
+    mean, P = random_state(4)
+    rig = worlds.qcar_rig_by_hand()
+    motion = InertialMotion(NOISE).for_rig(rig, 24)
+    assert motion.camera_states == 12
+    rng = np.random.default_rng(9)
+    root = 0.1 * rng.normal(size=(33, 33))
+    whole = root @ root.T
+    whole[:21, :21] += P
+    alone = predict(InertialMotion(NOISE), started(InertialMotion(NOISE), mean, whole[:21, :21]),
+                    at(0.2, measured()))  # fmt: skip
+    bank = started(motion, np.append(mean, np.arange(12.0)), whole)
+    after = predict(motion, bank, at(0.2, measured()))
+    np.testing.assert_allclose(after.mean[0, :22], alone.mean[0], atol=1e-12)
+    np.testing.assert_array_equal(after.mean[0, 22:], np.arange(12.0))
+    found = np.asarray(after.covariance[0])
+    np.testing.assert_allclose(found[:21, :21], alone.covariance[0], atol=1e-10)
+    np.testing.assert_allclose(found[21:, 21:], whole[21:, 21:], atol=1e-12)
+    assert np.linalg.eigvalsh(found)[0] > 0
+    errors = motion.poses(after).errors
+    np.testing.assert_array_equal(errors.mean[0], np.arange(12.0))
+    np.testing.assert_array_equal(errors.cross[0], found[:6, 21:])
+    assert np.max(np.abs(found[:6, 21:] - whole[:6, 21:])) > 1e-3
