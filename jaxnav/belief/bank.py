@@ -34,6 +34,7 @@ class Bank(eqx.Module):
     number: Int[Array, "*K"]  # identity of a hypothesis, kept when it changes its slot
     # Velocity, in the vehicle's axes, less its mean over the last moments; zero without odometry.
     velocity_lead: Float[Array, "*K m"]
+    parent: Int[Array, "*K"]  # slot at the last observation; -1: it has started at this one
 
 
 def empty_bank(
@@ -53,6 +54,7 @@ def empty_bank(
             jnp.zeros(hypotheses, mean.dtype),
         ),
         velocity_lead=jnp.zeros((hypotheses, pose_states), mean.dtype),
+        parent=jnp.full(hypotheses, -1),
     )
 
 
@@ -87,7 +89,9 @@ def mixture_log_mean(bank: Bank, log_values: Float[Array, " K"]) -> Float[Array,
 
 
 def forget_lost(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Bank:
-    """The bank with the hypotheses that are `lost` no longer initialised: a pose starts them anew.
+    """The predicted bank without those that are `lost`, which a pose starts anew.
+
+    Every slot continues itself.
 
     Args:
         dt_s: time since the last observation of any kind, added to `waited_s` of the others.
@@ -95,9 +99,9 @@ def forget_lost(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | fl
     waited_s = jnp.minimum(bank.rejections.waited_s + dt_s, _PAUSE_S)
     rejections = dataclasses.replace(bank.rejections, waited_s=waited_s.astype(bank.mean.dtype))
     return eqx.tree_at(
-        lambda b: (b.initialised, b.rejections),
+        lambda b: (b.initialised, b.rejections, b.parent),
         bank,
-        (bank.initialised & ~lost, cleared(rejections, lost)),
+        (bank.initialised & ~lost, cleared(rejections, lost), jnp.arange(lost.shape[0])),
     )
 
 

@@ -64,18 +64,19 @@ class ConstantVelocity(FreeBody):
         A hypothesis is forgotten, and started anew by its next pose, where the sigma of its
         position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
         """
-        dtype, dt_s = bank.mean.dtype, jnp.asarray(obs.dt_s, bank.mean.dtype)
+        moments = jax.vmap(lambda mean, P: self.evolve(mean, P, obs))(bank.mean, bank.covariance)
+        return self.without_lost(bank, *moments, jnp.asarray(obs.dt_s, bank.mean.dtype))
+
+    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
+        """One hypothesis `obs.dt_s` later; see `predict`."""
+        dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
         told, twist = self._told(obs, dtype)
-
-        def one(mean: Array, P: Array) -> tuple[Array, Array]:
-            u = jnp.where(told, twist, mean[7:13])
-            mean, P = moved_by_twist(mean, P, u, dt_s, ~told)
-            if obs.twist is not None:
-                P = P.at[6:12].multiply(1 - told).at[:, 6:12].multiply(1 - told)
-            return mean, P.at[:12, :12].add(jnp.where(told, self._drift(twist, dt_s), Q))
-
-        return self.without_lost(bank, *jax.vmap(one)(bank.mean, bank.covariance), dt_s)
+        u = jnp.where(told, twist, mean[7:13])
+        mean, P = moved_by_twist(mean, P, u, dt_s, ~told)
+        if obs.twist is not None:
+            P = P.at[6:12].multiply(1 - told).at[:, 6:12].multiply(1 - told)
+        return mean, P.at[:12, :12].add(jnp.where(told, self._drift(twist, dt_s), Q))
 
     def _told(self, obs: Observation, dtype: Any) -> tuple[Bool[Array, ""], Float[Array, " 6"]]:
         """Whether the odometry tells the motion, and its twist; 0 where it does not."""

@@ -57,6 +57,7 @@ def apply_gate(
             cleared(_and_another(bank.rejections, offered, offer.innovation), agrees | starts),
             bank.number,
             bank.velocity_lead,
+            jnp.where(starts, -1, bank.parent),
         ),
         jnp.where(offered, nis, 0),
         accepted | starts,

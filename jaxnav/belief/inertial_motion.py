@@ -1,6 +1,6 @@
 """A filter for bodies that move freely and carry an inertial measurement unit (IMU)."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -106,18 +106,24 @@ class InertialMotion(FreeBody):
         At rest velocity and turn rate are zero: that tells the biases and the lean, and weighs the
         hypotheses as every measurement does.
         """
-        dtype, dt_s = bank.mean.dtype, jnp.asarray(obs.dt_s, bank.mean.dtype)
-        imu = None if obs.imu is None else obs.imu.usable(dtype)
-        told = jnp.asarray(False)
-        if imu is not None:
-            told = (imu.duration_s > 0) & (jnp.abs(imu.duration_s - dt_s) < _SAME_S)
-
-        def one(mean: Array, P: Array) -> Moments:
-            coasted = self._coasted(mean, P, dt_s)
-            return coasted if imu is None else where(told, self._carried(mean, P, imu), coasted)
-
-        predicted = self.without_lost(bank, *jax.vmap(one)(bank.mean, bank.covariance), dt_s)
+        moments = jax.vmap(lambda mean, P: self.evolve(mean, P, obs))(bank.mean, bank.covariance)
+        dt_s = jnp.asarray(obs.dt_s, bank.mean.dtype)
+        predicted = self.without_lost(bank, *moments, dt_s)
+        told, imu = self._told(obs, bank.mean.dtype)
         return predicted if imu is None else self._rested(predicted, told & imu.still)
+
+    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
+        """One hypothesis `obs.dt_s` later, before rest tells it anything; see `predict`."""
+        told, imu = self._told(obs, mean.dtype)
+        coasted = self._coasted(mean, P, jnp.asarray(obs.dt_s, mean.dtype))
+        return coasted if imu is None else where(told, self._carried(mean, P, imu), coasted)
+
+    def _told(self, obs: Observation, dtype: Any) -> tuple[Bool[Array, ""], Preintegrated | None]:
+        """Whether the IMU tells the motion, and what it tells."""
+        if obs.imu is None:
+            return jnp.asarray(False), None
+        imu, dt_s = obs.imu.usable(dtype), jnp.asarray(obs.dt_s, dtype)
+        return (imu.duration_s > 0) & (jnp.abs(imu.duration_s - dt_s) < _SAME_S), imu
 
     def _coasted(self, mean: Array, P: Array, dt_s: Array) -> Moments:
         """As `ConstantVelocity`, in the velocity of the vehicle's origin."""

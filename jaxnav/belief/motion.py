@@ -65,6 +65,13 @@ class Motion(eqx.Module):
         """The bank at this observation, before its corners are looked at."""
 
     @abc.abstractmethod
+    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
+        """One hypothesis at this observation, before any of its readings: F P F' + Q is linear in P.
+
+        What moves the hypothesis, as odometry that tells the motion does, belongs to it.
+        """
+
+    @abc.abstractmethod
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Hypotheses that the gate has contradicted too often or too long: `predict` drops them."""
 

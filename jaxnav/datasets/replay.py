@@ -3,6 +3,7 @@
 The same `Navigator.step` that runs on a vehicle is scanned over the frames, a chunk at a time.
 """
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from jaxnav.belief.free_body import FreeBody
 from jaxnav.belief.inertial_motion import InertialMotion
 from jaxnav.belief.kalman import nis
 from jaxnav.datasets.recording import Recording
+from jaxnav.datasets.smoothed import Behind, Kept, Localised, Packed, smooth_frames
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, limits
 from jaxnav.models.geometry import inverse_cayley
@@ -51,6 +53,7 @@ class Replay:
     branch: Branch  # leaves (F, tracks); meaningless where there is no reference
     frames_per_second: float  # compilation excluded
     corner_sigma_px: float  # the filter's
+    filtered: "Replay | None" = None  # of a smoothed one: as each pose was known at its own time
 
 
 class _Frames(eqx.Module):
@@ -63,6 +66,12 @@ class _Frames(eqx.Module):
     twist: Float[Array, "*F 6"] | None  # by odometry; None: of no frame
     imu: Preintegrated | None  # the same
 
+    def observation(self) -> Observation:
+        """The frames as observations."""
+        return Observation(
+            self.corners_px, self.visible, dt_s=self.dt_s, twist=self.twist, imu=self.imu
+        )
+
 
 def replay(
     recording: Recording,
@@ -71,6 +80,7 @@ def replay(
     corner_sigma_px: float | None = None,
     progress: Callable[[int], object] = lambda frames: None,
     params: Params | None = None,
+    smooth: bool = False,
 ) -> Replay:
     """Localise the rig in every frame.
 
@@ -82,6 +92,7 @@ def replay(
             or an estimate from the recording, see `estimate_corner_sigma_px`.
         progress: called with the number of frames done since the last call.
         params: replace the navigator's own.
+        smooth: whether a pose is told what was seen after it as well as before.
 
     Raises:
         BadInput: a parameter that does not fit a rig that moves freely.
@@ -113,28 +124,46 @@ def replay(
     )
     total, told = len(recording), (recording.twists, recording.preintegrated)
     first = _frames(recording, told, 0)
-    run_chunk = _run_chunk.lower(navigator, state, first, one_at_a_time).compile()
+    run_chunk = _run_chunk.lower(navigator, state, first, one_at_a_time, smooth).compile()
     started = time.perf_counter()
-    chunks = []
-    for begin in range(0, total, CHUNK_FRAMES):
-        state, outputs = run_chunk(navigator, state, _frames(recording, told, begin))
+    begins = range(0, total, CHUNK_FRAMES)
+    chunks, kept = [], []
+    for begin in begins:
+        state, outputs, to_smooth = run_chunk(navigator, state, _frames(recording, told, begin))
         chunks.append(jax.device_get(outputs))
+        if smooth:
+            kept.append(Packed.of(to_smooth))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
-    wxyz_xyz, seen, located, decided, flip_probability, nees, branch = jax.tree.map(
-        lambda *leaves: np.concatenate(leaves)[:total], *chunks
-    )
-    return Replay(
-        np.asarray(poses_in_world(wxyz_xyz, recording.markers.origin_m)),
-        seen,
-        located,
-        decided,
-        flip_probability,
-        nees,
-        branch,
-        total / elapsed_s,
-        corner_sigma_px,
-    )
+
+    def told_of(chunks: list[_Told]) -> Replay:
+        pose, seen, located, decided, flip_probability, nees, branch = jax.tree.map(
+            lambda *leaves: np.concatenate(leaves)[:total], *chunks
+        )
+        return Replay(
+            np.asarray(poses_in_world(pose, recording.markers.origin_m)),
+            seen,
+            located,
+            decided,
+            flip_probability,
+            nees,
+            branch,
+            total / elapsed_s,
+            corner_sigma_px,
+        )
+
+    filtered = told_of(chunks)
+    if not smooth:
+        return filtered
+    obs_of = jax.vmap(_Frames.observation)
+    any_obs = jax.tree.map(lambda leaf: leaf[0], obs_of(first))
+    behind = Behind.nothing(navigator, tracks, any_obs)
+    for index, begin in reversed(list(enumerate(begins))):
+        frames = _frames(recording, told, begin)
+        behind, poses = smooth_frames(navigator, behind, kept.pop().unpack(), obs_of(frames))
+        chunks[index] = jax.device_get(_told_all(poses, frames.T_world_vehicle_true))
+        progress(min(CHUNK_FRAMES, total - begin))
+    return dataclasses.replace(told_of(chunks), filtered=filtered)
 
 
 def motion_of(recording: Recording) -> FreeBody:
@@ -182,45 +211,57 @@ def _best_e1_px2(
 _Told = tuple[Array, Array, Array, Array, Array, Array, Branch]
 
 
-@functools.partial(jax.jit, static_argnums=3)
+def _told(poses: Localised, T_world_vehicle_true: Array) -> _Told:
+    """What is told of one frame of one track, judged against its reference."""
+    truth = jaxlie.SE3(T_world_vehicle_true)
+    T, selected = poses.T_world_vehicle, poses.selected
+    return (
+        T.wxyz_xyz,
+        selected >= 0,
+        poses.located,
+        poses.decided,
+        poses.flip_probability,
+        nis(inverse_cayley(T.inverse() @ truth), poses.covariance),
+        judge_branch(poses.candidates, selected, truth),
+    )
+
+
+_told_all = jax.jit(jax.vmap(jax.vmap(_told, (0, None))))
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
 def _run_chunk(
-    navigator: Navigator, state: State, chunk: _Frames, one_at_a_time: bool
-) -> tuple[State, _Told]:
-    """Run all tracks over the frames of a chunk; `state` has a leading axis (tracks,)."""
+    navigator: Navigator, state: State, chunk: _Frames, one_at_a_time: bool, smooth: bool
+) -> tuple[State, _Told, Kept | None]:
+    """Run all tracks over the frames of a chunk; `state` has a leading axis (tracks,).
+
+    Returns also what a smoother needs of the frames, where it is asked for.
+    """
     markers = navigator.markers
+    Outputs = tuple[_Told, Kept | None]
 
-    def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, _Told]:
-        obs = Observation(
-            frame.corners_px, frame.visible, dt_s=frame.dt_s, twist=frame.twist, imu=frame.imu
-        )
-        state, out = _with_markers(navigator, markers).step(state, obs)
-        truth = jaxlie.SE3(frame.T_world_vehicle_true)
-        branch = judge_branch(out.candidates, out.selected, truth)
-        error = inverse_cayley(out.T_world_vehicle.inverse() @ truth)
-        nees = nis(error, out.covariance[:6, :6])
-        pose, seen = out.T_world_vehicle.wxyz_xyz, out.selected >= 0
-        told = (pose, seen, out.located, out.decided, out.flip_probability, nees, branch)
-        return state, told
+    def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, Outputs]:
+        state, out = _with_markers(navigator, markers).step(state, frame.observation())
+        told = _told(Localised.of(out), frame.T_world_vehicle_true)
+        return state, (told, Kept.of(state.belief, out) if smooth else None)
 
-    def step(state: State, frame: _Frames) -> tuple[State, _Told]:
-        def alone(state: State, marker: Array) -> tuple[State, _Told]:
-            seen_alone = _Frames(
-                frame.corners_px[:, marker][:, None],
-                frame.visible[:, marker][:, None],
-                frame.dt_s,
-                frame.T_world_vehicle_true,
-                frame.twist,
-                frame.imu,
+    def step(state: State, frame: _Frames) -> tuple[State, Outputs]:
+        def alone(state: State, marker: Array) -> tuple[State, Outputs]:
+            seen_alone = dataclasses.replace(
+                frame,
+                corners_px=frame.corners_px[:, marker][:, None],
+                visible=frame.visible[:, marker][:, None],
             )
             return outputs_of(_single(markers, marker), state, seen_alone)
 
-        def together(state: State, _: Array) -> tuple[State, _Told]:
+        def together(state: State, _: Array) -> tuple[State, Outputs]:
             return outputs_of(markers, state, frame)
 
         tracks = jnp.arange(len(markers.ids) if one_at_a_time else 1)
         return jax.vmap(alone if one_at_a_time else together)(state, tracks)
 
-    return jax.lax.scan(step, state, chunk)
+    state, (told, kept) = jax.lax.scan(step, state, chunk)
+    return state, told, kept
 
 
 def _with_markers(navigator: Navigator, markers: MarkerMap) -> Navigator:

@@ -43,8 +43,9 @@ def keep_the_compile_cache(monkeypatch):
 @pytest.fixture
 def run_banks_fast(monkeypatch):
     """A bank takes longer over a whole recording than to be optimised."""
-    chunk = jit_to_run(replays._run_chunk.__wrapped__, static_argnums=3)
+    chunk = jit_to_run(replays._run_chunk.__wrapped__, static_argnums=(3, 4))
     monkeypatch.setattr(replays, "_run_chunk", chunk)
+    monkeypatch.setattr(replays, "smooth_frames", jit_to_run(replays.smooth_frames.__wrapped__))
 
 
 @pytest.mark.parametrize(
@@ -88,15 +89,48 @@ def test_one_marker_at_a_time_takes_few_wrong_branches(test_7, alone):
     assert np.nanmedian(rotation_deg) < 0.52
 
 
-def test_the_bank_halves_the_wrong_branches_at_least(test_7, alone, run_banks_fast):
+def test_the_bank_halves_the_wrong_branches_and_smoothing_decides_the_others(
+    test_7, alone, run_banks_fast
+):
     """Every marker by itself, no odometry, every detection judged that has two poses or one."""
-    wrong = []
-    for result in (alone, replay(test_7, MultiHypothesis(), one_at_a_time=True)):
+    smooth = replay(test_7, MultiHypothesis(), one_at_a_time=True, smooth=True)
+    bank, wrong = smooth.filtered, []
+    for result in (alone, bank, smooth):
         judged = result.seen & test_7.reference.valid[:, None]
         wrong.append(int((result.branch.wrong & judged).sum()))
         assert np.all(result.located[judged])
     assert wrong[0] >= 5
     assert wrong[1] <= wrong[0] / 2
+    # What was open at first is decided by what follows.
+    np.testing.assert_array_equal(smooth.seen, bank.seen)
+    undecided = [int((result.seen & ~result.decided).sum()) for result in (bank, smooth)]
+    assert wrong[2] <= wrong[1]
+    assert undecided[0] >= 20
+    assert undecided[1] <= undecided[0] / 4
+    error_m = [errors(result, test_7)[0] for result in (bank, smooth)]
+    percentile_m = [np.nanpercentile(error, 95) for error in error_m]
+    assert percentile_m[1] < 0.95 * percentile_m[0]
+    # The last pose of a marker is told no more than before.
+    last = len(test_7) - 1 - np.argmax(smooth.located[::-1], axis=0)
+    for track in np.flatnonzero(smooth.located.any(axis=0)):
+        pose = smooth.T_world_vehicle[last[track], track], bank.T_world_vehicle[last[track], track]
+        np.testing.assert_allclose(*pose, atol=1e-12)
+
+
+def test_poses_between_two_sightings_are_smoothed(test_7):
+    """Where no marker is seen for a while, the track goes on, and ends where the next one says."""
+    few, gap = test_7.first(64), slice(40, 43)
+    hides = (few.seen_at[0] >= gap.start) & (few.seen_at[0] < gap.stop)
+    hidden = dataclasses.replace(few, seen_at=few.seen_at[:, ~hides], seen_px=few.seen_px[~hides])
+    result = replay(hidden, LowestReprojection(), corner_sigma_px=1.0, smooth=True)
+    assert result.filtered.located[gap].all()
+    assert not result.seen[gap].any()
+    reference_m = few.reference.T_world_vehicle[gap, 4:]
+    filtered_m, smooth_m = (
+        np.linalg.norm(one.T_world_vehicle[gap, 0, 4:] - reference_m, axis=1)
+        for one in (result.filtered, result)
+    )
+    assert smooth_m.max() < filtered_m.max() / 3
 
 
 def test_frames_in_view_are_counted_from_every_appearance():

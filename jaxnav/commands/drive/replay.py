@@ -59,7 +59,8 @@ def run(args: Arguments) -> int:
     out = output_folder(args.out)
     if params is not None:
         print(params.describe())
-    with progress_bar(total=len(recording), unit="frame", disable=args.headless) as bar:
+    passes = 2 if args.smooth else 1
+    with progress_bar(total=passes * len(recording), unit="frame", disable=args.headless) as bar:
         result = replay(
             recording,
             make_selector(str(args.selector)),
@@ -67,6 +68,7 @@ def run(args: Arguments) -> int:
             corner_sigma_px=args.corner_sigma_px,
             progress=update_after_compiling(bar),
             params=params,
+            smooth=args.smooth,
         )
     summary = summarise(args, recording, result)
     _write_tracks(args, recording, result)
@@ -85,6 +87,7 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
         "selector": args.selector,
         "odometry": recording.odometry is not None,
         "imu": recording.imu is not None,
+        "smoothed": args.smooth,
         "params": args.params,
         "frames": len(recording),
         "frames_located": int(result.seen.any(axis=1).sum()),
@@ -97,6 +100,14 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
     }
     if recording.reference is None:
         return summary
+    summary |= _against_reference(recording, result)
+    if result.filtered is not None:
+        summary["filtered"] = _against_reference(recording, result.filtered)
+    return summary
+
+
+def _against_reference(recording: Recording, result: Replay) -> dict[str, Any]:
+    assert recording.reference is not None
     position_m, rotation_deg = errors(result, recording)
     judged = result.seen & recording.reference.valid[:, None]
     settled = judged & (frames_in_view(result.seen) > SETTLED_FRAMES)
@@ -106,7 +117,7 @@ def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str
     def fraction(of: np.ndarray, among: np.ndarray) -> float:
         return float((of & among).sum()) / max(int(among.sum()), 1)
 
-    return summary | {
+    return {
         "poses_with_reference": int(judged.sum()),
         "position_error_m": _spread(position_m),
         "rotation_error_deg": _spread(rotation_deg),
@@ -130,8 +141,8 @@ def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None
         name = "trajectory"
         if args.one_at_a_time:
             name = f"trajectory_marker_{recording.markers.ids[track]}"
-        seen = result.seen[:, track]
-        write_tum(args.out / f"{name}.tum", stamps_s[seen], result.T_world_vehicle[seen, track])
+        told = (result.located if args.smooth else result.seen)[:, track]
+        write_tum(args.out / f"{name}.tum", stamps_s[told], result.T_world_vehicle[told, track])
     if recording.reference is not None:
         valid = recording.reference.valid
         write_tum(
@@ -170,16 +181,24 @@ def _text(summary: dict[str, Any]) -> str:
     head = (
         f"{visible(summary['recording'])}, {summary['selector']}, markers {summary['markers']}"
         f"{', with odometry' if summary['odometry'] else ''}"
-        f"{', with an IMU' if summary['imu'] else ''}: "
+        f"{', with an IMU' if summary['imu'] else ''}"
+        f"{', smoothed' if summary['smoothed'] else ''}: "
         f"{summary['poses']} poses in {summary['frames']} frames, "
         f"{summary['frames_per_second']:.0f} frames/s"
     )
     if "position_error_m" not in summary:
         return head
-    position, rotation = summary["position_error_m"], summary["rotation_error_deg"]
+    text = f"{head}\n{_errors_text(summary)}"
+    if "filtered" in summary:
+        text += f"\nbefore smoothing: {_errors_text(summary['filtered'])}"
+    return text
+
+
+def _errors_text(scores: dict[str, Any]) -> str:
+    position, rotation = scores["position_error_m"], scores["rotation_error_deg"]
     return (
-        f"{head}\nposition error {position['median'] * 1e3:.1f} mm median, "
+        f"position error {position['median'] * 1e3:.1f} mm median, "
         f"{position['p95'] * 1e3:.1f} mm 95 %; rotation {rotation['median']:.2f} / "
-        f"{rotation['p95']:.2f} deg; wrong branch {summary['wrong_branch_fraction']:.2%}, "
-        f"outliers {summary['outlier_fraction']:.2%}"
+        f"{rotation['p95']:.2f} deg; wrong branch {scores['wrong_branch_fraction']:.2%}, "
+        f"outliers {scores['outlier_fraction']:.2%}"
     )

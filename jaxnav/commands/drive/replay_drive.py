@@ -50,7 +50,7 @@ from jaxnav.recording.recorder import Recorder
 
 EXIT_DIFFERS = 1
 _FILES = ("rig", "markers", "vehicle", "route")
-_FOR_RIGS = ("one_at_a_time", "without_odometry")
+_FOR_RIGS = ("one_at_a_time", "without_odometry", "smooth")
 _FOR_DRIVES = ("vehicle", "route", "images", "record_anew")
 _OVERRIDES = (
     *("rig", "markers", "vehicle", "route", "params"),
