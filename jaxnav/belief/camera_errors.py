@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from jaxnav.models.geometry import safe_norm
 from jaxnav.numerics.small_matrices import (
     cholesky,
     gram,
@@ -114,6 +115,47 @@ class ErrorsInView(eqx.Module):
     @staticmethod
     def _moved(by: Float[Array, "t n K"], slopes: Float[Array, "t m"]) -> Float[Array, "n m K"]:
         return jnp.sum(by[:, :, None] * slopes[:, None, :, None], axis=0)
+
+
+def common_turn(errors: ErrorsPosterior, sigma_rad: Float[Array, "C 3"]) -> Float[Array, "e 3"]:
+    """Errors by which all cameras in view turn alike, about each axis, of length 1; else 0.
+
+    A body that turns the other way sees the same: where no odometry tells how it moves, nothing
+    does. A filter would learn that turn all the same, of the changes of its own twist, and grow
+    sure of it: 4 degrees on test_5 of TagSLAM, with a sigma of 0.1 (Huang, Mourikis, Roumeliotis,
+    2010, "Observability-based rules for designing consistent EKF SLAM estimators").
+
+    Args:
+        errors: of one hypothesis.
+        sigma_rad: prior of the cameras' turns.
+    """
+    turns = jnp.sum(errors.rows, axis=0).reshape(-1, EACH) / sigma_rad
+    length = safe_norm(turns.T)
+    turns = turns / jnp.where(length > 0, length, 1)[None]
+    return (turns[:, :, None] * jnp.eye(EACH, dtype=turns.dtype)[None]).reshape(-1, EACH)
+
+
+def not_told(
+    directions: Float[Array, "e u"],
+    before: Float[Array, "n n"],
+    correction: Float[Array, " n"],
+    P: Float[Array, "n n"],
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """A correction and its covariance in which some directions of the errors are only considered.
+
+    Args:
+        directions: orthonormal, of the e errors at the end of the state; or 0.
+        before: covariance before the correction.
+
+    Source: Schmidt (1966), "Application of state-space methods to navigation problems".
+    """
+    first = P.shape[0] - directions.shape[0]
+    back = product(directions, directions.T)
+    narrowed = before[first:, first:] - P[first:, first:]
+    return (
+        correction.at[first:].add(-matvec(back, correction[first:])),
+        P.at[first:, first:].add(sandwich(back, narrowed)),
+    )
 
 
 def times(A: Float[Array, "n m K"], B: Float[Array, "k m K"]) -> Float[Array, "n k K"]:

@@ -44,6 +44,7 @@ class ConstantVelocity(FreeBody):
         default_factory=lambda: jnp.asarray([0.04, 0.02, 0.005, 0.005])
     )
     camera_states: int = eqx.field(static=True, default=0)  # see `for_rig`
+    camera_turn_sigma_rad: Float[Array, "C 3"] | None = None  # see `for_rig`
     learn_sigma_rad: float = 0.035  # sigma of the orientation below which errors are estimated
     lost_sigma_m: float = 0.5  # a hypothesis whose position is less certain is forgotten
     gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 %; inf: no gate

@@ -12,7 +12,13 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
 from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heaviest, known_to
-from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
+from jaxnav.belief.camera_errors import (
+    EACH,
+    CameraErrors,
+    ErrorsPosterior,
+    common_turn,
+    not_told,
+)
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.gate import Moments, Offer
 from jaxnav.belief.motion import Motion, camera_states
@@ -39,6 +45,7 @@ class FreeBody(Motion):
     acceleration_density: eqx.AbstractVar[Float[Array, " 6"] | Float[Array, "6 6"]]
     vision_floor: eqx.AbstractVar[Float[Array, " 6"] | Float[Array, "6 6"]]
     camera_states: eqx.AbstractVar[int]
+    camera_turn_sigma_rad: eqx.AbstractVar[Float[Array, "C 3"] | None]
     learn_sigma_rad: eqx.AbstractVar[float]
     lost_sigma_m: eqx.AbstractVar[float]
     gate_nis: eqx.AbstractVar[float]
@@ -121,6 +128,10 @@ class FreeBody(Motion):
             jnp.eye(6, dtype=bank.mean.dtype),
             self.states,
         )
+        if measured.errors is not None and self.camera_turn_sigma_rad is not None:
+            sigma_rad = jnp.asarray(self.camera_turn_sigma_rad, P.dtype)
+            common = common_turn(measured.errors, sigma_rad)
+            correction, P = not_told(common, bank.covariance, correction, P)
         return Offer(
             measured.innovation,
             gate_nis=self.gate_nis,
@@ -157,7 +168,10 @@ class FreeBody(Motion):
 
     def for_rig(self, rig: CameraRig, hypotheses: int) -> "FreeBody":
         """The model with the errors of the rig's cameras among its states."""
-        return dataclasses.replace(self, camera_states=camera_states(rig, hypotheses))
+        count = camera_states(rig, hypotheses)
+        turns = None if rig.extrinsics_sigma is None else rig.extrinsics_sigma[:, EACH:]
+        turns = turns if count else None
+        return dataclasses.replace(self, camera_states=count, camera_turn_sigma_rad=turns)
 
     def learns(self, bank: Bank) -> Bool[Array, ""]:
         """Whether the orientation is known to `learn_sigma_rad`."""

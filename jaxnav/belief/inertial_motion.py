@@ -68,6 +68,7 @@ class InertialMotion(FreeBody):
         default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
     )
     camera_states: int = eqx.field(static=True, default=0)
+    camera_turn_sigma_rad: Float[Array, "C 3"] | None = None
     learn_sigma_rad: float = 0.035
     lost_sigma_m: float = 0.5
     gate_nis: float = 27.9

@@ -66,7 +66,7 @@ class Motion(eqx.Module):
 
     @abc.abstractmethod
     def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
-        """One hypothesis at this observation, before any of its readings: F P F' + Q is linear in P.
+        """One hypothesis at this observation, before its readings: F P F' + Q, linear in P.
 
         What moves the hypothesis, as odometry that tells the motion does, belongs to it.
         """

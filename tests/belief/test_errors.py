@@ -12,23 +12,25 @@ from scipy.optimize import least_squares
 
 from jaxnav.belief.ambiguity import PoseMeasurement, PosePosterior
 from jaxnav.belief.bicycle_kalman import BicycleKalman
-from jaxnav.belief.camera_errors import EACH, ErrorsPosterior
+from jaxnav.belief.camera_errors import EACH, ErrorsPosterior, common_turn, not_told
+from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.map_fit import fit_poses
 from jaxnav.belief.sensor_errors import SENSORS_END, SIX, SLIP
-from jaxnav.models.geometry import ON_GROUND, cayley
+from jaxnav.models.geometry import ON_GROUND, T_world_vehicle_from_planar, cayley
 from jaxnav.models.rig import PLACED_BY_HAND
 from jaxnav.navigator import Navigator
 from jaxnav.pose.linearised import reprojection_rows
 from jaxnav.pose.nuisance import camera_slopes
-from jaxnav.pose.observation import Snapshot
+from jaxnav.pose.observation import Observation, Snapshot
 from tests import worlds
 
 SIGMA = np.array([0.03, 0.03, 0.01, 0.02])
 SLIP_SIGMA = 0.05
 VIEW = worlds.OVERLAP_VIEW  # two cameras see the marker
 PLANAR = jnp.asarray(ON_GROUND, float)
+NOTHING = Observation(jnp.zeros((4, 1, 4, 2)), jnp.zeros((4, 1), bool))
 
 
 def off_rig():
@@ -434,6 +436,75 @@ def test_the_delay_of_corners_is_learnt_as_well_as_it_claims(
     z = (tau - delay_s) / sigma_s
     assert np.mean(z**2) < most_z2, (tau, sigma_s)
     assert abs(np.mean(tau) - delay_s) < most_off_s, (tau, sigma_s)
+
+
+def test_a_body_that_moves_freely_learns_how_cameras_differ_and_not_how_they_turn_alike():
+    """Two of four cameras in view: what turns both alike turns a body the other way, unseen."""
+    rng, rig = np.random.default_rng(11), off_rig()
+    navigator = Navigator(rig, worlds.paper_markers(), selector=MultiHypothesis())
+    bank, n = navigator.motion.init(1), 12 + 4 * EACH
+    T = T_world_vehicle_from_planar(jnp.asarray(VIEW))
+    before = dataclasses.replace(
+        jax.tree.map(lambda leaf: leaf[0], bank),
+        mean=jnp.zeros(n + 1).at[:7].set(T.wxyz_xyz),
+        covariance=jnp.asarray(spd(n, rng, np.append(np.full(12, 0.05), np.ones(12)))),
+        initialised=jnp.asarray(True),
+    )
+    seen = [0, 2]
+    rows = np.zeros((2 * EACH, 4 * EACH))
+    for slot, camera in enumerate(seen):
+        rows[EACH * slot : EACH * slot + EACH, EACH * camera : EACH * camera + EACH] = np.eye(EACH)
+    errors = ErrorsPosterior(
+        change=jnp.asarray(0.3 * rng.normal(size=2 * EACH)),
+        slope=jnp.asarray(rng.normal(size=(2 * EACH, 6))),
+        covariance=jnp.asarray(spd(2 * EACH, rng, np.full(2 * EACH, 0.2))),
+        rows=jnp.asarray(rows),
+    )
+    measured = PosePosterior(
+        T_world_vehicle=T @ cayley(jnp.asarray(0.01 * rng.normal(size=6))),
+        covariance=jnp.asarray(spd(6, rng, np.full(6, 0.005))),
+        log_likelihood=jnp.asarray(0.0),
+        innovation=jnp.zeros(6),
+        inflation=jnp.asarray(1.0),
+        valid=jnp.asarray(True),
+        errors=errors,
+    )
+    mean, P = jax.jit(ConstantVelocity.follow)(
+        navigator.motion, before, measured, NOTHING
+    ).posterior
+    alike = np.zeros((4, EACH, EACH))
+    alike[seen] = np.eye(EACH) / np.sqrt(2)
+    alike = alike.reshape(4 * EACH, EACH)
+    np.testing.assert_allclose(alike.T @ mean[13:], 0, atol=1e-12)
+    block, prior = P[12:, 12:], before.covariance[12:, 12:]
+    np.testing.assert_allclose(alike.T @ block @ alike, alike.T @ prior @ alike, rtol=1e-12)
+    differ = np.zeros((4, EACH, EACH))
+    differ[seen] = np.eye(EACH)[None] * np.array([1, -1])[:, None, None] / np.sqrt(2)
+    differ = differ.reshape(4 * EACH, EACH)
+    assert np.all(np.abs(differ.T @ mean[13:]) > 1e-3)
+    assert np.all(np.diag(differ.T @ block @ differ) < 0.9 * np.diag(differ.T @ prior @ differ))
+    assert np.linalg.eigvalsh(P)[0] > 0
+
+
+@pytest.mark.parametrize("unseen", [(), (1,), (0, 1)])
+def test_the_turn_of_cameras_alike_counts_in_radians_and_those_in_view(unseen):
+    sigma_rad = jnp.asarray([[0.01, 0.02, 0.005], [0.02, 0.01, 0.005]])
+    rows = np.eye(2 * EACH)
+    for camera in unseen:
+        rows[EACH * camera : EACH * camera + EACH] = 0
+    errors = ErrorsPosterior(jnp.zeros(6), jnp.zeros((6, 6)), jnp.eye(6), jnp.asarray(rows))
+    found = np.asarray(common_turn(errors, sigma_rad)).reshape(2, EACH, EACH)
+    for axis in range(EACH):
+        turns = np.where(np.isin(np.arange(2), unseen), 0, 0.1) / np.asarray(sigma_rad)[:, axis]
+        length = np.linalg.norm(turns)
+        expected = np.zeros((2, EACH))
+        expected[:, axis] = turns / length if length else 0
+        np.testing.assert_allclose(found[:, :, axis], expected, atol=1e-14)
+    # Nothing in view: nothing is kept from being corrected.
+    correction, P = jnp.arange(8.0), jnp.eye(8)
+    kept, wider = not_told(jnp.zeros((6, EACH)), 4 * P, correction, P)
+    np.testing.assert_array_equal(kept, correction)
+    np.testing.assert_array_equal(wider, P)
 
 
 def test_a_rule_has_the_paper_s_six_states():
