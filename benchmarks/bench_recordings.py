@@ -1,6 +1,6 @@
 """Score selectors on recordings with a reference, every marker by itself.
 
-    python benchmarks/bench_recordings.py [NAME ...] [--frames N]
+    python benchmarks/bench_recordings.py [NAME ...] [--frames N] [--smooth] [--all-markers]
 
 The recordings are the folders of `JAXNAV_DATA`/tagslam, or of ../shared/data/tagslam. A pose of a
 marker is judged as `jaxnav replay --one-at-a-time` does: wrong where another candidate is
@@ -24,7 +24,7 @@ import numpy as np  # noqa: E402
 
 from jaxnav.belief.selectors import make_selector  # noqa: E402
 from jaxnav.datasets.recordings import Recording, read_recording  # noqa: E402
-from jaxnav.datasets.replay import Replay, replay  # noqa: E402
+from jaxnav.datasets.replay import Replay, errors, replay  # noqa: E402
 from jaxnav.files.poses import matrix  # noqa: E402
 
 DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/data")) / "tagslam"
@@ -44,6 +44,7 @@ def score(recording: Recording, result: Replay) -> dict[str, float]:
     probability = np.clip(doubt, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)[~outlier]
     log_score = -np.where(wrong[~outlier], np.log(probability), np.log1p(-probability))
     nees = result.nees[judged & result.located]
+    position_m, rotation_deg = (error[np.isfinite(error)] for error in errors(result, recording))
     constant = max(float(np.mean(wrong[~outlier])), 1e-12)
     return {
         "poses": len(wrong),
@@ -55,6 +56,10 @@ def score(recording: Recording, result: Replay) -> dict[str, float]:
         "of a constant": -(constant * np.log(constant) + (1 - constant) * np.log1p(-constant)),
         "ANEES": float(np.mean(nees)),
         "NEES median": float(np.median(nees)),
+        "mm": 1e3 * float(np.median(position_m)),
+        "mm, 95 %": 1e3 * float(np.percentile(position_m, 95)),
+        "deg": float(np.median(rotation_deg)),
+        "deg, 95 %": float(np.percentile(rotation_deg, 95)),
     }
 
 
@@ -104,6 +109,8 @@ def main() -> None:
     parser.add_argument("--camera-sigma", type=float, nargs=2, metavar=("DEG", "M"),
                         help="of a camera's direction and place; 0 0: exact ones")  # fmt: skip
     parser.add_argument("--without-odometry", action="store_true")
+    parser.add_argument("--smooth", action="store_true", help="and the smoothed poses beside")
+    parser.add_argument("--all-markers", action="store_true", help="one pose from all in view")
     parser.add_argument("--gap-s", type=float, help="hide all markers so long, now and then")
     args = parser.parse_args()
     head_is_printed = False
@@ -124,14 +131,19 @@ def main() -> None:
             continue
         for name in args.selectors:
             begin = time.perf_counter()
-            result = replay(recording, make_selector(name), one_at_a_time=True)
-            row = score(recording, result)
-            if not head_is_printed:
-                head = ["recording", "selector", *row, "s"]
-                print("| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
-                head_is_printed = True
-            cells = [folder.name, name, *(f"{value:.4g}" for value in row.values())]
-            print(f"| {' | '.join(cells)} | {time.perf_counter() - begin:.0f} |", flush=True)
+            one = not args.all_markers
+            result = replay(recording, make_selector(name), one_at_a_time=one, smooth=args.smooth)
+            scored = {name: result.filtered or result}
+            if result.filtered is not None:
+                scored[f"{name}, smoothed"] = result
+            for title, found in scored.items():
+                row = score(recording, found)
+                if not head_is_printed:
+                    head = ["recording", "selector", *row, "s"]
+                    print("| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
+                    head_is_printed = True
+                cells = [folder.name, title, *(f"{value:.4g}" for value in row.values())]
+                print(f"| {' | '.join(cells)} | {time.perf_counter() - begin:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

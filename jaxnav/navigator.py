@@ -21,6 +21,7 @@ from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief, Estimate, Evidence
 from jaxnav.belief.hypotheses import MultiHypothesis
+from jaxnav.belief.lag import Lagged, Window
 from jaxnav.belief.motion import Motion
 from jaxnav.belief.repeats import RepeatedErrors, surprise_of
 from jaxnav.control import Controller, ControlLog, ControlState, Follower
@@ -39,6 +40,7 @@ class State(eqx.Module):
 
     belief: Belief
     control: ControlState | None  # None without a route
+    window: Window | None = None  # None without a lag
 
 
 class Output(Estimate):
@@ -47,6 +49,7 @@ class Output(Estimate):
     command: Any  # `Command` of a car, `TwistCommand` of another base; None without a route
     done: Bool[Array, ""]  # the last waypoint is reached
     control_log: ControlLog | None
+    lagged: Lagged | None = None  # the smoothed pose of `lag_s` ago; None without a lag
 
 
 class Navigator(eqx.Module):
@@ -74,6 +77,8 @@ class Navigator(eqx.Module):
     max_candidates: int = eqx.field(static=True)
     max_lm_steps: int = eqx.field(static=True)
     ground_plane: bool = eqx.field(static=True)
+    lag_s: float = eqx.field(static=True)
+    lag_observations: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -94,12 +99,20 @@ class Navigator(eqx.Module):
         max_candidates: int = 4,
         max_lm_steps: int = 12,
         ground_plane: bool = False,
+        lag_s: float = 0.0,
+        lag_observations: int = 64,
     ):
         """See the fields of `Controller`, `Snapshot`, `find_candidates` and the motion models.
 
+        Args:
+            lag_s: `step` also tells the pose of so long ago by all that was seen since; 0: not.
+            lag_observations: how many are kept for it: `lag_s` times their rate, at least.
+
         Raises:
-            ValueError: waypoints without a vehicle, or of the wrong shape.
+            ValueError: waypoints without a vehicle, or of the wrong shape; a lag that is no time.
         """
+        if not 0 <= lag_s < float("inf") or lag_observations < 1:
+            raise ValueError(f"no lag: {lag_s} s in {lag_observations} observations")
         self.rig = rig
         self.markers = markers
         self.selector = selector or MultiHypothesis()
@@ -128,6 +141,8 @@ class Navigator(eqx.Module):
         self.max_candidates = max_candidates
         self.max_lm_steps = max_lm_steps
         self.ground_plane = ground_plane
+        self.lag_s = lag_s
+        self.lag_observations = lag_observations
 
     @classmethod
     def like(cls, navigator: "Navigator") -> "Navigator":
@@ -140,7 +155,12 @@ class Navigator(eqx.Module):
     def init(self) -> State:
         """The state before the first observation, at the first waypoint."""
         belief = self.believe(self.motion.init(self.selector.hypotheses))
-        return State(belief, None if self.controller is None else self.controller.init())
+        control = None if self.controller is None else self.controller.init()
+        if not self.lag_s:
+            return State(belief, control)
+        hypotheses = self.selector.hypotheses
+        window = Window.begin(self.motion, hypotheses, self.lag_s, self.lag_observations)
+        return State(belief, control, window)
 
     def believe(self, bank: Bank) -> Belief:
         """The belief in these hypotheses before the first observation."""
@@ -157,7 +177,12 @@ class Navigator(eqx.Module):
         """
         belief, estimate = self.sense(state.belief, obs)
         control, output = self.act(state.control, estimate, obs)
-        return State(belief, control), output
+        if state.window is None:
+            return State(belief, control), output
+        before = state.belief.bank
+        window = state.window.after(self.motion, before, belief.bank, obs.usable())
+        output = replace(output, lagged=window.look_back(self.motion, belief))
+        return State(belief, control, window), output
 
     def sense(self, belief: Belief, obs: Observation) -> tuple[Belief, Estimate]:
         """Fuse an observation: the next belief, and the estimate that is reported of it."""

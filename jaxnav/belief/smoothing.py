@@ -70,8 +70,7 @@ class Trail(eqx.Module):
             parent: slots of `bank` that the later one's continue.
             obs: the later observation, whose interval and odometry lie between the two.
         """
-        slots = jnp.where(self.slots >= 0, parent[self.slots], -1)
-        slots = jnp.where((slots >= 0) & bank.initialised[slots], slots, -1)
+        slots = continued(self.slots, parent, bank.initialised)
         own = slots[self.best]
         filtered = bank.mean[own], bank.covariance[own]
         mean, covariance = smoothed(motion, filtered, (self.mean, self.covariance), obs)
@@ -93,6 +92,54 @@ class Trail(eqx.Module):
         )
 
 
+def continued(
+    slots: Int[Array, " K"], parent: Int[Array, " K"], initialised: Bool[Array, " K"]
+) -> Int[Array, " K"]:
+    """The slots one observation earlier, -1 where there was none; see `Trail.back`."""
+    earlier = jnp.where(slots >= 0, parent[slots], -1)
+    return jnp.where((earlier >= 0) & initialised[earlier], earlier, -1)
+
+
+class Link(eqx.Module):
+    """An earlier state by a later one: x_s = x + G (x'_s - x'), P_s = D + G P'_s G'."""
+
+    mean: Float[Array, "*K n"]  # x, as filtered
+    predicted: Float[Array, "*K n"]  # x'
+    gain: Float[Array, "*K d d"]  # G
+    rest: Float[Array, "*K d d"]  # D, what even an exact later state would leave
+
+    @staticmethod
+    def of(motion: Motion, filtered: Moments, obs: Observation) -> "Link":
+        """The link of one hypothesis to its prediction.
+
+        Args:
+            filtered: after the earlier observation.
+            obs: the later one.
+        """
+        x, P = filtered
+        predicted, Q = motion.evolve(x, jnp.zeros_like(P), obs)
+
+        def evolved(error: Array) -> Array:
+            return motion.difference(motion.evolve(motion.moved(x, error), P, obs)[0], predicted)
+
+        F = jax.jacfwd(evolved)(jnp.zeros(P.shape[0], P.dtype))
+        P_predicted = F @ P @ F.T + Q
+        # Scaled: variances of m^2, rad^2 and of errors that hardly change lie far apart.
+        scale = safe_sqrt(jnp.diagonal(P_predicted))
+        scale = 1 / jnp.where(scale > 0, scale, 1)
+        eye = jnp.eye(P.shape[0], dtype=P.dtype)
+        S = P_predicted * scale[:, None] * scale[None] + 4 * jnp.finfo(P.dtype).eps * eye
+        C = scale[:, None] * F @ P
+        G = (scale[:, None] * jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(S), True), C)).T
+        left = eye - G @ F
+        return Link(x, predicted, G, symmetrise(left @ P @ left.T + G @ Q @ G.T))
+
+    def back(self, motion: Motion, later: Moments) -> Moments:
+        """The earlier moments, of one hypothesis, by the smoothed ones at the later observation."""
+        mean = motion.moved(self.mean, self.gain @ motion.difference(later[0], self.predicted))
+        return mean, self.rest + symmetrise(self.gain @ later[1] @ self.gain.T)
+
+
 def smoothed(motion: Motion, filtered: Moments, later: Moments, obs: Observation) -> Moments:
     """Mean and covariance of one hypothesis, corrected by those one observation later.
 
@@ -104,24 +151,7 @@ def smoothed(motion: Motion, filtered: Moments, later: Moments, obs: Observation
     Returns:
         The moments at the earlier instant; the filtered ones where the later ones are not finite.
     """
-    x, P = filtered
-    predicted, Q = motion.evolve(x, jnp.zeros_like(P), obs)
-
-    def evolved(error: Array) -> Array:
-        return motion.difference(motion.evolve(motion.moved(x, error), P, obs)[0], predicted)
-
-    F = jax.jacfwd(evolved)(jnp.zeros(P.shape[0], P.dtype))
-    P_predicted = F @ P @ F.T + Q
-    # Scaled: variances of m^2, rad^2 and of errors that hardly change lie far apart.
-    scale = safe_sqrt(jnp.diagonal(P_predicted))
-    scale = 1 / jnp.where(scale > 0, scale, 1)
-    eye = jnp.eye(P.shape[0], dtype=P.dtype)
-    S = P_predicted * scale[:, None] * scale[None] + 4 * jnp.finfo(P.dtype).eps * eye
-    C = scale[:, None] * F @ P
-    G = (scale[:, None] * jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(S), True), C)).T
-    left = eye - G @ F
-    covariance = symmetrise(left @ P @ left.T + G @ (later[1] + Q) @ G.T)
-    mean = motion.moved(x, G @ motion.difference(later[0], predicted))
+    mean, covariance = Link.of(motion, filtered, obs).back(motion, later)
     finite = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
     return where(finite, (mean, covariance), filtered)
 
