@@ -21,6 +21,7 @@ from jaxnav.belief.motion import Motion, Planar, camera_states
 from jaxnav.belief.sensor_errors import (
     SENSORS_END,
     SIX,
+    ReadVelocity,
     from_seen,
     lead_after,
     read_velocity,
@@ -120,7 +121,7 @@ class BicycleKalman(Motion):
 
         def one(mean: Array, P: Array, lead: Array) -> tuple[Array, Array, Array]:
             if self.vehicle.gyro is None:
-                later, P = self._with_odometry(*self._later(mean, P, obs), obs, dt_s)
+                later, P = self._read(*self.evolve(mean, P, obs), obs)
             else:
                 later, P = self._with_gyro(self.vehicle.gyro, mean, P, obs)
             change = _in_body(later) - _in_body(mean)
@@ -132,6 +133,15 @@ class BicycleKalman(Motion):
             jax.vmap(one)(bank.mean, bank.covariance, bank.velocity_lead),
         )
         return forget_lost(predicted, self.lost(bank), obs.dt_s)
+
+    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "n n"], obs: Observation) -> Moments:
+        """One hypothesis before its odometry measures it; see `predict`."""
+        turn = None
+        if self.vehicle.gyro is not None:
+            turn = self._turn(self.vehicle.gyro, obs, mean)
+        later, P = self._later(mean, P, obs, turn)
+        dt_s = jnp.asarray(obs.dt_s, mean.dtype)
+        return later, self._stepped(later, P, obs, dt_s, None if turn is None else turn.told)
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Whether the gate has contradicted a hypothesis too often or too long."""
@@ -316,12 +326,15 @@ class BicycleKalman(Motion):
             P = P.at[-1, -1].add(jnp.asarray(self.vehicle.gyro.bias_walk, dtype) ** 2 * dt_s)
         return slipped(later, P, way_m, self._slip_sigma(), jnp.asarray(self.slip_length_m, dtype))
 
+    def _turn(self, gyro: Gyro, obs: Observation, mean: Array) -> Turn:
+        density = kalman.as_matrix(self.acceleration_density)[2, 2].astype(mean.dtype)
+        return turn_of(gyro, obs, mean, density)
+
     def _with_gyro(self, gyro: Gyro, mean: Array, P: Array, obs: Observation) -> Moments:
         """The state `dt_s` later, as a gyro and the odometry have told (`inertial.py`)."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
-        density = kalman.as_matrix(self.acceleration_density)[2, 2].astype(dtype)
         sigma_radps = jnp.sqrt(kalman.as_covariance(self.odometry_sigma)[2, 2]).astype(dtype)
-        turn, before_mps = turn_of(gyro, obs, mean, density), mean[3:5]
+        turn, before_mps = self._turn(gyro, obs, mean), mean[3:5]
         mean, P = self._later(mean, P, obs, turn)
         if self.vehicle.sensor_sigma is not None:
             read = read_velocity(self.vehicle, obs, mean)
@@ -347,11 +360,22 @@ class BicycleKalman(Motion):
             since_s: time of the prediction, in which the velocity has changed.
             turns: whether a gyro has told the turn, so that the wheels' is not looked at.
         """
+        return self._read(mean, self._stepped(mean, P, obs, since_s, turns), obs, turns)
+
+    def _stepped(
+        self, mean: Array, P: Array, obs: Observation, since_s: Array | float, turns: Array | None
+    ) -> Array:
+        """The covariance of a velocity that has changed by a step to what is read."""
+        read = read_velocity(self.vehicle, obs, mean)
+        step = _present(read, turns) * (read.velocity - mean[3:SIX])
+        dt_s = jnp.asarray(since_s, mean.dtype)
+        moments = jnp.stack([dt_s**2 / 3, dt_s / 2, dt_s / 2, jnp.ones_like(dt_s)]).reshape(2, 2)
+        return P.at[:SIX, :SIX].add(jnp.kron(moments, step[:, None] * step[None]))
+
+    def _read(self, mean: Array, P: Array, obs: Observation, turns: Array | None = None) -> Moments:
+        """The state whose velocity the odometry has measured."""
         dtype = mean.dtype
         read = read_velocity(self.vehicle, obs, mean)
-        present = read.present
-        if turns is not None:
-            present = present.at[2].multiply(jnp.where(turns, 0, 1))
         H = jnp.eye(3, mean.shape[0], k=3, dtype=dtype)
         H = (
             H.at[:, 2]
@@ -362,13 +386,16 @@ class BicycleKalman(Motion):
         R = sandwich(planar_rotation(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(
             dtype
         )
-        change = read.velocity - mean[3:SIX]
-        step, dt_s = present * change, jnp.asarray(since_s, dtype)
-        moments = jnp.stack([dt_s**2 / 3, dt_s / 2, dt_s / 2, jnp.ones_like(dt_s)]).reshape(2, 2)
-        P = P.at[:SIX, :SIX].add(jnp.kron(moments, step[:, None] * step[None]))
-        seen = kalman.hide_rows(change, H, R, present)
-        correction, after, _ = kalman.update(P, *seen)
+        change, present = read.velocity - mean[3:SIX], _present(read, turns)
+        correction, after, _ = kalman.update(P, *kalman.hide_rows(change, H, R, present))
         return self.considered(jnp.asarray(False), (mean, P), (self.moved(mean, correction), after))
+
+
+def _present(read: ReadVelocity, turns: Array | None) -> Float[Array, " 3"]:
+    """Which rows of a velocity count; see `BicycleKalman._with_odometry`."""
+    if turns is None:
+        return read.present
+    return read.present.at[2].multiply(jnp.where(turns, 0, 1))
 
 
 def planar_poses(

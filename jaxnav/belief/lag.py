@@ -22,6 +22,10 @@ from jaxnav.belief.smoothing import Link
 from jaxnav.pose.observation import Observation
 
 
+# On the way back: observations passed, slot, time passed, mean and covariance there.
+_Place = tuple[Array, Array, Array, Array, Array]
+
+
 class Lagged(eqx.Module):
     """The reported hypothesis a while ago."""
 
@@ -59,8 +63,9 @@ class Window(eqx.Module):
             after: at this one.
             obs: this one.
         """
-        link = jax.vmap(lambda mean, P: Link.of(motion, (mean, P), obs))
-        links = link(before.mean, before.covariance)
+        links = jax.vmap(lambda mean, P: Link.of(motion, (mean, P), obs))(
+            before.mean, before.covariance
+        )
         lives = (after.parent >= 0) & before.initialised[after.parent] & after.initialised
         at = (self.last + 1) % self.dt_s.shape[0]
         rows = links, jnp.where(lives, after.parent, -1), jnp.asarray(obs.dt_s, self.dt_s.dtype)
@@ -75,13 +80,13 @@ class Window(eqx.Module):
         def at(steps: Array) -> Array:
             return (self.last - steps) % count
 
-        def goes_on(carry: tuple[Array, ...]) -> Array:
+        def goes_on(carry: _Place) -> Array:
             steps, slot, age_s, *_ = carry
             row = at(steps)
             further = (steps < count) & (self.parent[row, slot] >= 0)
             return further & (age_s + self.dt_s[row] / 2 < self.lag_s)
 
-        def back(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        def back(carry: _Place) -> _Place:
             steps, slot, age_s, mean, P = carry
             row = at(steps)
             earlier = self.parent[row, slot]
