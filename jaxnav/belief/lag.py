@@ -21,7 +21,6 @@ from jaxnav.belief.motion import Motion
 from jaxnav.belief.smoothing import Link
 from jaxnav.pose.observation import Observation
 
-
 # On the way back: observations passed, slot, time passed, mean and covariance there.
 _Place = tuple[Array, Array, Array, Array, Array]
 

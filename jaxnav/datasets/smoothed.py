@@ -128,9 +128,9 @@ def smooth_frames(
 
     def back(behind: Behind, frame: tuple[Kept, Observation]) -> tuple[Behind, Localised]:
         kept, obs = frame
-        trail, smoothed = jax.vmap(lambda *track: one(*track, behind.obs))(
-            behind.trail, behind.parent, kept
-        )
+        trail, smoothed = jax.vmap(
+            lambda trail, parent, kept: one(trail, parent, kept, behind.obs)
+        )(behind.trail, behind.parent, kept)
         return Behind(trail, kept.belief.bank.parent, obs), smoothed
 
     smoothed: tuple[Behind, Localised] = jax.lax.scan(back, behind, (kept, obs), reverse=True)

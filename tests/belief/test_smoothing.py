@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from jaxnav.belief import kalman
+from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.smoothing import Trail, doubt, smoothed
 from jaxnav.models.geometry import cayley, inverse_cayley
 from jaxnav.pose.observation import Observation
+from tests import worlds
 
 STEPS = 12
 DT_S = 0.1
@@ -89,6 +91,67 @@ def test_small_motions_are_smoothed_as_by_one_least_squares_over_all_of_them():
     for step in range(STEPS):
         block = covariance[12 * step : 12 * step + 12, 12 * step : 12 * step + 12]
         np.testing.assert_allclose(P[step], block, atol=1e-4 * block.max())
+
+
+def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
+    """Straight on at 1 m/s: deviations are linear, and the wheels measure v against the heading."""
+    car, small, rng = worlds.qcar(), 1e-7, np.random.default_rng(5)
+    motion = BicycleKalman(dataclasses.replace(car, sensor_sigma=None))
+    obs = dataclasses.replace(
+        after(DT_S), speed_mps=jnp.asarray(1.0), steering_rad=jnp.asarray(0.0)
+    )
+    nominal = jnp.zeros((STEPS, 6)).at[:, 0].set(DT_S * jnp.arange(STEPS)).at[:, 3].set(1)
+    P, R, H = (
+        jnp.diag(jnp.asarray([0.1] * 3 + [0.5] * 3) ** 2),
+        np.diag([0.02, 0.03, 0.01]) ** 2,
+        np.eye(3, 6),
+    )
+    z = small * rng.normal(size=(STEPS, 3))
+
+    def correct(moments, measured):
+        mean, P = moments
+        innovation = measured - mean[:3]
+        correction, P, _ = kalman.update(P, innovation, jnp.asarray(H), jnp.asarray(R))
+        return motion.moved(mean, correction), P
+
+    @jax.jit
+    def both_ways(z):
+        measured = nominal[:, :3] + z
+        filtered = [correct((nominal[0], P), measured[0])]
+        for pose in measured[1:]:
+            mean, before = filtered[-1]
+            bank = motion.init(1)
+            bank = dataclasses.replace(bank, mean=mean[None], covariance=before[None])
+            bank = motion.predict(bank, obs)
+            filtered.append(correct((bank.mean[0], bank.covariance[0]), pose))
+        trail = filtered[-1:]
+        for moments in filtered[-2::-1]:
+            trail.insert(0, smoothed(motion, moments, trail[0], obs))
+        return trail
+
+    A = np.eye(6) + DT_S * np.eye(6, k=3)
+    Q = np.asarray(kalman.white_acceleration(motion.acceleration_density, DT_S))
+    wheels = np.eye(3, 6, k=3)
+    wheels[1, 2] = -1  # v_y - v psi
+    of_wheels = np.diag(1 / np.asarray(motion.odometry_sigma) ** 2)
+    size = 6 * STEPS
+    information, right = np.zeros((size, size)), np.zeros(size)
+    information[:6, :6] += np.linalg.inv(P)
+    for step in range(STEPS):
+        at = slice(6 * step, 6 * step + 6)
+        information[at, at] += H.T @ np.linalg.solve(R, H)
+        right[at] += H.T @ np.linalg.solve(R, z[step])
+        if step:
+            rows = np.zeros((6, size))
+            rows[:, 6 * step - 6 : 6 * step], rows[:, at] = -A, np.eye(6)
+            information += rows.T @ np.linalg.solve(Q, rows)
+            information[at, at] += wheels.T @ of_wheels @ wheels
+    covariance = np.linalg.inv(information)
+    expected = (covariance @ right).reshape(STEPS, 6)
+    for step, (mean, found) in enumerate(both_ways(jnp.asarray(z))):
+        block = covariance[6 * step : 6 * step + 6, 6 * step : 6 * step + 6]
+        np.testing.assert_allclose(mean - nominal[step], expected[step], atol=1e-4 * small)
+        np.testing.assert_allclose(found, block, atol=1e-5 * block.max())
 
 
 def simulated(motion, key):
