@@ -368,7 +368,7 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     belief = Bank(
         jnp.asarray(means), jnp.asarray(covariances), jnp.log(weights), jnp.asarray(alive),
         empty_bank(jnp.zeros(n), jnp.eye(n), 3, count).rejections, jnp.arange(count),
-        jnp.zeros((count, 3)),
+        jnp.zeros((count, 3)), jnp.arange(count),
     )  # fmt: skip
 
     def difference(mean, base):
@@ -435,7 +435,7 @@ def test_nobody_merges_with_itself():
     motionless = Bank(
         jnp.ones((3, 2)), jnp.tile(jnp.eye(2), (3, 1, 1)), jnp.log(jnp.asarray([0.2, 0.3, 0.5])),
         jnp.asarray([True, False, True]), empty_bank(jnp.zeros(2), jnp.eye(2), 1, 3).rejections,
-        jnp.arange(3), jnp.zeros((3, 1)),
+        jnp.arange(3), jnp.zeros((3, 1)), jnp.arange(3),
     )  # fmt: skip
     after = merge_heirs(motionless, jnp.arange(3), lambda m, b: m - b, lambda m, e: m + e)
     for one, other in zip(jax.tree.leaves(after), jax.tree.leaves(motionless), strict=True):

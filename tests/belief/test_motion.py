@@ -511,6 +511,7 @@ def test_poses_of_a_car_are_level_and_carry_the_planar_covariance():
         motion.init().rejections,
         jnp.zeros(1, int),
         motion.init().velocity_lead,
+        jnp.zeros(1, int),
     )
     found = motion.poses(belief)
     expected = np.asarray(worlds.planar(0.3, -0.4, 2.0).wxyz_xyz)
@@ -604,6 +605,7 @@ def test_constant_velocity_carries_its_covariance_as_samples_do():
         motion.init().rejections,
         jnp.zeros(1, int),
         motion.init().velocity_lead,
+        jnp.zeros(1, int),
     )
     dt_s = 0.1
     predicted = motion.predict(belief, reading(dt_s=dt_s))

@@ -114,6 +114,7 @@ def make_belief(rng: np.random.Generator, dtype: type = float) -> Belief:
         rejections=Rejections(jnp.zeros(4, int), random(4, 3), random(4), jnp.zeros(4, dtype)),
         number=jnp.arange(4),
         velocity_lead=random(4, 3),
+        parent=jnp.arange(4),
     )
     decided, restarts = jnp.asarray(True), jnp.asarray(1, jnp.int32)
     count = random(2, 3)
