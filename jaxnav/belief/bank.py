@@ -54,7 +54,7 @@ def empty_bank(
             jnp.zeros(hypotheses, mean.dtype),
         ),
         velocity_lead=jnp.zeros((hypotheses, pose_states), mean.dtype),
-        parent=jnp.full(hypotheses, -1),
+        parent=-jnp.ones(hypotheses, int),
     )
 
 

@@ -1,9 +1,9 @@
 """A fixed-lag smoother: the pose of a while ago, by all that was seen since.
 
-Beside the bank it keeps, for each of the last observations and each hypothesis, the link to what
-followed (`smoothing.Link`), in a ring. Going back along the reported hypothesis costs two products
-of matrices for each observation. What lies behind the ring is in its oldest link: nothing has to
-be marginalised.
+Beside the bank it keeps, for each of the last observations and its heaviest hypotheses, the link to
+what followed (`smoothing.Link`), in a ring. Going back along the reported hypothesis costs two
+products of matrices for each observation. What lies behind the ring is in its oldest link: nothing
+has to be marginalised.
 
 Source: Rauch, Tung, Striebel (1965), "Maximum likelihood estimates of linear dynamic systems";
 Simon (2006), "Optimal State Estimation", section 9.3 (fixed lag).
@@ -25,6 +25,11 @@ from jaxnav.pose.observation import Observation
 _Place = tuple[Array, Array, Array, Array, Array]
 
 
+# Hypotheses of an observation that are kept: once a bank is decided one or two live, and the time
+# of a step goes into copying the ring.
+_KEPT = 8
+
+
 class Lagged(eqx.Module):
     """The reported hypothesis a while ago."""
 
@@ -37,7 +42,8 @@ class Lagged(eqx.Module):
 class Window(eqx.Module):
     """What links the banks of the last L observations, a ring whose newest is at `last`."""
 
-    links: Link  # leaves (L, K, ...)
+    links: Link  # leaves (L, k, ...), of the k heaviest hypotheses of the earlier bank
+    slots: Int[Array, "L k"]  # which these are; -1: none
     parent: Int[Array, "L K"]  # slots of the earlier bank that the later one's continue; -1: none
     dt_s: Float[Array, " L"]
     last: Int[Array, ""]
@@ -47,12 +53,13 @@ class Window(eqx.Module):
     def begin(motion: Motion, hypotheses: int, lag_s: float, observations: int) -> "Window":
         """A window that has seen nothing."""
         bank = motion.init(hypotheses)
-        P = jnp.zeros_like(bank.covariance)
-        links = Link(bank.mean, bank.mean, P, P)
-        wide = jax.tree.map(lambda leaf: jnp.tile(leaf, (observations, *[1] * leaf.ndim)), links)
-        none = jnp.full((observations, hypotheses), -1, bank.parent.dtype)
+        kept = jax.tree.map(lambda leaf: leaf[:_KEPT], bank)
+        P = jnp.zeros_like(kept.covariance)
+        none = -jnp.ones_like(bank.parent)
+        rows = Link(kept.mean, kept.mean, P, P), none[:_KEPT], none
+        wide = jax.tree.map(lambda leaf: jnp.tile(leaf, (observations, *[1] * leaf.ndim)), rows)
         dt_s = jnp.zeros(observations, P.dtype)
-        return Window(wide, none, dt_s, jnp.asarray(0), jnp.asarray(lag_s, P.dtype))
+        return Window(*wide, dt_s, jnp.asarray(0), jnp.asarray(lag_s, P.dtype))
 
     def after(self, motion: Motion, before: Bank, after: Bank, obs: Observation) -> "Window":
         """The window with the step from one bank to the next.
@@ -62,15 +69,19 @@ class Window(eqx.Module):
             after: at this one.
             obs: this one.
         """
+        weight = jnp.where(before.initialised, before.log_weight, -jnp.inf)
+        slots = jax.lax.top_k(weight, self.slots.shape[1])[1].astype(self.slots.dtype)
         links = jax.vmap(lambda mean, P: Link.of(motion, (mean, P), obs))(
-            before.mean, before.covariance
+            before.mean[slots], before.covariance[slots]
         )
+        slots = jnp.where(before.initialised[slots], slots, -1)
         lives = (after.parent >= 0) & before.initialised[after.parent] & after.initialised
+        parent = jnp.where(lives, after.parent, -1)
         at = (self.last + 1) % self.dt_s.shape[0]
-        rows = links, jnp.where(lives, after.parent, -1), jnp.asarray(obs.dt_s, self.dt_s.dtype)
-        kept = self.links, self.parent, self.dt_s
-        links, parent, dt_s = jax.tree.map(lambda ring, row: ring.at[at].set(row), kept, rows)
-        return Window(links, parent, dt_s, at, self.lag_s)
+        rows = links, slots, parent, jnp.asarray(obs.dt_s, self.dt_s.dtype)
+        kept = self.links, self.slots, self.parent, self.dt_s
+        kept = jax.tree.map(lambda ring, row: ring.at[at].set(row), kept, rows)
+        return Window(*kept, at, self.lag_s)
 
     def look_back(self, motion: Motion, belief: Belief) -> Lagged:
         """The reported hypothesis where it was `lag_s` ago, or as far back as it is known."""
@@ -82,14 +93,16 @@ class Window(eqx.Module):
         def goes_on(carry: _Place) -> Array:
             steps, slot, age_s, *_ = carry
             row = at(steps)
-            further = (steps < count) & (self.parent[row, slot] >= 0)
+            earlier = self.parent[row, slot]
+            further = (steps < count) & (earlier >= 0) & jnp.any(self.slots[row] == earlier)
             return further & (age_s + self.dt_s[row] / 2 < self.lag_s)
 
         def back(carry: _Place) -> _Place:
             steps, slot, age_s, mean, P = carry
             row = at(steps)
             earlier = self.parent[row, slot]
-            link = jax.tree.map(lambda leaf: leaf[row, earlier], self.links)
+            which = jnp.argmax(self.slots[row] == earlier)
+            link = jax.tree.map(lambda leaf: leaf[row, which], self.links)
             mean, P = link.back(motion, (mean, P))
             return steps + 1, earlier, age_s + self.dt_s[row], mean, P
 
