@@ -57,9 +57,11 @@ class Window(eqx.Module):
         P = jnp.zeros_like(kept.covariance)
         none = -jnp.ones_like(bank.parent)
         rows = Link(kept.mean, kept.mean, P, P), none[:_KEPT], none
-        wide = jax.tree.map(lambda leaf: jnp.tile(leaf, (observations, *[1] * leaf.ndim)), rows)
+        links, slots, parent = jax.tree.map(
+            lambda leaf: jnp.tile(leaf, (observations, *[1] * leaf.ndim)), rows
+        )
         dt_s = jnp.zeros(observations, P.dtype)
-        return Window(*wide, dt_s, jnp.asarray(0), jnp.asarray(lag_s, P.dtype))
+        return Window(links, slots, parent, dt_s, jnp.asarray(0), jnp.asarray(lag_s, P.dtype))
 
     def after(self, motion: Motion, before: Bank, after: Bank, obs: Observation) -> "Window":
         """The window with the step from one bank to the next.
@@ -80,8 +82,10 @@ class Window(eqx.Module):
         at = (self.last + 1) % self.dt_s.shape[0]
         rows = links, slots, parent, jnp.asarray(obs.dt_s, self.dt_s.dtype)
         kept = self.links, self.slots, self.parent, self.dt_s
-        kept = jax.tree.map(lambda ring, row: ring.at[at].set(row), kept, rows)
-        return Window(*kept, at, self.lag_s)
+        links, slots, parent, dt_s = jax.tree.map(
+            lambda ring, row: ring.at[at].set(row), kept, rows
+        )
+        return Window(links, slots, parent, dt_s, at, self.lag_s)
 
     def look_back(self, motion: Motion, belief: Belief) -> Lagged:
         """The reported hypothesis where it was `lag_s` ago, or as far back as it is known."""
