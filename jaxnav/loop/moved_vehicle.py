@@ -108,7 +108,7 @@ class GuardProcess:
         numbers = {
             field.name: float(getattr(setup.vehicle, field.name))
             for field in fields(setup.vehicle)
-            if field.name != "sensor_sigma"  # a driver has no use for it
+            if field.name not in ("sensor_sigma", "gyro")  # a driver has no use for them
         }
         changes = {
             "setup": {
