@@ -146,7 +146,7 @@ def _report(navigator: Navigator, trail: Trail, kept: Kept) -> Localised:
     flip_probability, decided = belief.flip_probability, trail.decided
     if isinstance(selector, MultiHypothesis):
         flip_probability = doubt(motion, bank, selector.far_rad)
-        decided = decided & (flip_probability < selector.decided_mass)
+        decided = bank.initialised[best] & (flip_probability < selector.decided_mass)
     candidates = kept.candidates
     off_rad = jax.vmap(lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T))(
         candidates.T_vehicle_world
