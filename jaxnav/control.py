@@ -43,6 +43,17 @@ class ControlState(eqx.Module):
     explored_s: Float[Array, ""]  # duration of the exploration since the pose was last decided
     side: Float[Array, ""]  # of the line of sight, where it explores: 1 left, -1 right, 0 none
 
+    def exploring(
+        self, decided: Bool[Array, ""] | bool, dt_s: Float[Array, ""], side: Float[Array, ""]
+    ) -> "ControlState":
+        """The state after exploring to a side for `dt_s`; a decided pose ends the exploration."""
+        return ControlState(
+            self.waypoint_index,
+            self.integral_ms,
+            jnp.where(decided, 0, self.explored_s + dt_s),
+            jnp.where(decided, 0, side),
+        )
+
 
 class Exploration(eqx.Module):
     """Motion of a car while several poses are possible.
@@ -255,12 +266,8 @@ class Controller(Follower):
         short_mps = jnp.where(jnp.isfinite(short_mps), short_mps, 0)
         throttle = (explore.speed_mps + lead * short_mps) / self.vehicle.speed_per_throttle_mps
         throttle = jnp.clip(throttle, 0, self.vehicle.throttle_limit)
-        return ControlState(
-            state.waypoint_index,
-            state.integral_ms,
-            jnp.where(decided, 0, state.explored_s + dt_s),
-            jnp.where(decided, 0, side),
-        ), Command(steering, jnp.where(goes, throttle, 0))
+        command = Command(steering, jnp.where(goes, throttle, 0))
+        return state.exploring(decided, dt_s, side), command
 
     def _orbited(
         self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""]

@@ -119,12 +119,7 @@ class TwistController(Follower):
         twist = self._twist(alpha_rad, reach_m, speed)
         twist = twist.at[0].multiply(jnp.where(backs, -1, 1))
         goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
-        return ControlState(
-            state.waypoint_index,
-            state.integral_ms,
-            jnp.where(decided, 0, state.explored_s + dt_s),
-            jnp.where(decided, 0, side),
-        ), jnp.where(goes, twist, 0)
+        return state.exploring(decided, dt_s, side), jnp.where(goes, twist, 0)
 
     def _limited(self, twist: Float[Array, " 3"]) -> Float[Array, " 3"]:
         """The twist, scaled down until it is inside the limits."""

@@ -54,6 +54,13 @@ class OdometryNoise(eqx.Module):
         """What the spinning wheels multiply the reported speed by at a time."""
         return 1 + self.spin * ((stamp_s - self.spin_from_s) % self.spin_period_s < self.spin_s)
 
+    def scaled(
+        self, speed_scale: Float[Array, ""] | float | None, stamp_s: Float[Array, ""] | float
+    ) -> Float[Array, ""] | float:
+        """A drive's scale of the speed, or that of these errors, with what spinning adds."""
+        speed_scale = self.speed_scale if speed_scale is None else speed_scale
+        return speed_scale * self.scale_at(stamp_s) if self.spin else speed_scale
+
 
 def move_car(
     vehicle: Vehicle, state: CarState, command: Command, dt_s: Float[Array, ""]
@@ -116,9 +123,7 @@ def read_odometry(
 
     The scale is `noise`'s by default; that of spinning wheels comes on top.
     """
-    speed_scale = noise.speed_scale if speed_scale is None else speed_scale
-    if noise.spin:
-        speed_scale = speed_scale * noise.scale_at(stamp_s)
+    speed_scale = noise.scaled(speed_scale, stamp_s)
     speed_error, steering_error = jax.random.normal(key, (2,), state.speed_mps.dtype)
     return (
         speed_scale * state.speed_mps + noise.speed_sigma_mps * speed_error,
@@ -134,9 +139,7 @@ def read_twist(
     stamp_s: Float[Array, ""] | float = 0.0,
 ) -> Float[Array, " 6"]:
     """The twist as a base's odometry reports it at a time since the start; see `read_odometry`."""
-    speed_scale = noise.speed_scale if speed_scale is None else speed_scale
-    if noise.spin:
-        speed_scale = speed_scale * noise.scale_at(stamp_s)
+    speed_scale = noise.scaled(speed_scale, stamp_s)
     errors = jax.random.normal(key, (3,), state.twist.dtype)
     x, y, turn = state.twist
     turn = noise.turn_scale * turn + noise.turn_offset_radpm * x
