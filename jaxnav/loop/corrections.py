@@ -12,15 +12,20 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.limits import turns_by_twist
+
 if TYPE_CHECKING:  # the guard's process corrects without JAX and OpenCV
     from jaxnav.loop.frames import FrameDetections
-    from jaxnav.loop.interfaces import Odometry
+    from jaxnav.loop.interfaces import Reading
+    from jaxnav.loop.limits import Command
     from jaxnav.models.bicycle import Vehicle
+    from jaxnav.models.twist_base import TwistBase
 
 
 @dataclass(frozen=True)
 class Corrections:
-    """The corrections of one vehicle; see `Vehicle` in `models.bicycle`."""
+    """The corrections of one vehicle; see `Vehicle` in `models.bicycle`. Other bases have none."""
 
     speed_scale: float = 1.0
     steering_gain: float = 1.0
@@ -29,8 +34,10 @@ class Corrections:
     steering_limit_rad: float = math.inf  # of the servo, to either side
 
     @staticmethod
-    def of(vehicle: Vehicle) -> Corrections:
+    def of(vehicle: Vehicle | TwistBase) -> Corrections:
         """The corrections in a vehicle's description."""
+        if turns_by_twist(vehicle):
+            return Corrections()
         return Corrections(
             vehicle.speed_scale,
             vehicle.steering_gain,
@@ -54,9 +61,9 @@ class Corrections:
     def _is_neutral(self) -> bool:
         return (self.speed_scale, self.steering_gain, self.steering_offset_rad) == (1, 1, 0)
 
-    def correct_reading(self, read: Odometry) -> Odometry:
+    def correct_reading(self, read: Reading) -> Reading:
         """A reading in true units, its stamp corrected."""
-        if self._is_neutral and not self.reading_late_ns:
+        if (self._is_neutral and not self.reading_late_ns) or not isinstance(read, Odometry):
             return read
         return replace(
             read,
@@ -77,6 +84,10 @@ class Corrections:
         """A frame with its stamp corrected to the odometer's clock."""
         late_ns = self.frame_late_ns
         return replace(seen, stamp_ns=seen.stamp_ns - late_ns) if late_ns else seen
+
+    def told(self, command: Command) -> Command:
+        """The command that the vehicle's driver is told for a true one; see `servo_rad`."""
+        return command if self._is_neutral else (self.servo_rad(command[0]), command[1])
 
     def servo_rad(self, steering_rad: float) -> float:
         """The servo angle that turns the wheels to an angle, within the servo's limit."""

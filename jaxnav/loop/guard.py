@@ -2,7 +2,7 @@
 
     guard = Guard(vehicle, limits)
     guard.arm()
-    guard.write(steering_rad, throttle)     # again and again, or it stops the vehicle
+    guard.write(*command)                   # again and again, or it stops the vehicle
     guard.close()
 
 It has its own thread, uses the monotonic clock, and imports no JAX. It stops the vehicle when no
@@ -23,8 +23,8 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.interfaces import Vehicle
-from jaxnav.loop.limits import Limits
+from jaxnav.loop.interfaces import AnyVehicle
+from jaxnav.loop.limits import CommandLimits
 
 TIMEOUT_S = 0.2
 _LOOK_S = 0.02  # period of the watchdog
@@ -43,13 +43,13 @@ class Guard:
 
     def __init__(
         self,
-        vehicle: Vehicle,
-        limits: Limits,
+        vehicle: AnyVehicle,
+        limits: CommandLimits,
         timeout_s: float = TIMEOUT_S,
         now_ns: Callable[[], int] = time.monotonic_ns,
         corrections: Corrections | None = None,
     ):
-        """Start disarmed: only zero throttle gets through.
+        """Start disarmed: only commands to stand get through.
 
         Args:
             corrections: convert true angles to servo angles; by default they are the same.
@@ -64,7 +64,7 @@ class Guard:
         self._tripped = threading.Event()
         self._closed = threading.Event()
         self._beats: dict[str, int] = {}  # time of each watched thread's last sign of life
-        self._steering_rad, self._written_ns = 0.0, now_ns()
+        self._command, self._written_ns = limits.zero, now_ns()
         self._deadline_ns = self._written_ns
         self.unheard: str | None = None
         self._stopped_s = 0.0  # time of the last stop that reached it
@@ -98,18 +98,19 @@ class Guard:
         """Stop watching a thread that ends normally."""
         self._beats.pop(name, None)
 
-    def write(self, steering_rad: float, throttle: float, deadline_ns: int | None = None) -> bool:
+    def write(self, *command: float, deadline_ns: int | None = None) -> bool:
         """Write a command to the vehicle, clamped to the limits.
 
         Args:
+            command: its numbers, as the vehicle's `write` takes them.
             deadline_ns: time by which the next command must come; by default now plus the guard's
                 timeout. A command whose own deadline is over is not obeyed.
 
         Returns:
             Whether the vehicle took the command. A driver that fails to write gets the next one.
         """
-        if not (math.isfinite(steering_rad) and math.isfinite(throttle)):
-            self.trip(f"the command was no number: {steering_rad}, {throttle}")
+        if not all(map(math.isfinite, command)):
+            self.trip(f"the command was no number: {', '.join(map(str, command))}")
             return False
         if not self._thread.is_alive() and not self._closed.is_set():
             self.trip("the guard's own thread has ended")
@@ -118,17 +119,16 @@ class Guard:
             if self.tripped or (deadline_ns is not None and deadline_ns <= now_ns):
                 return False
             elapsed_s = (now_ns - self._written_ns) / 1e9
-            steering_rad, throttle = self._limits.apply(
-                steering_rad, throttle if self._armed else 0.0, self._steering_rad, elapsed_s
-            )
+            allowed = command if self._armed else self._limits.standing(command)
+            allowed = self._limits.within(allowed, self._command, elapsed_s)
             try:
-                self._vehicle.write(self._corrections.servo_rad(steering_rad), throttle)
+                self._vehicle.write(*self._corrections.told(allowed))
             except OSError:
                 return False
             finally:
                 if self.tripped:  # during the write: the last thing written must not be a throttle
                     self._stop()
-            self._steering_rad, self._written_ns = steering_rad, now_ns
+            self._command, self._written_ns = allowed, now_ns
             self._deadline_ns = now_ns + self._timeout_ns if deadline_ns is None else deadline_ns
             return True
 

@@ -23,6 +23,7 @@ import socket
 import struct
 import sys
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,18 +33,62 @@ from jaxnav.errors import BadInput
 from jaxnav.loop import plugins
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.guard import Guard
-from jaxnav.loop.interfaces import Ending, Setup, SharesProcess, Vehicle
-from jaxnav.loop.limits import Limits
+from jaxnav.loop.interfaces import (
+    AnyVehicle,
+    Ending,
+    GyroReading,
+    HasGyro,
+    Reading,
+    Setup,
+    SharesProcess,
+    reading_of,
+)
+from jaxnav.loop.limits import Command, limits_from
 from jaxnav.loop.output import FreeOutput
 from jaxnav.loop.priority import NICE, lower_nice
 
-COMMAND = struct.Struct("<cQqdd")  # kind, sequence, deadline_ns, steering_rad, throttle
-READING = struct.Struct("<cqdd?")  # kind, stamp_ns, speed_mps, steering_rad, valid
+_COMMAND = struct.Struct("<cQq")  # kind, sequence, deadline_ns; then the numbers of the command
+# Kind, stamp_ns, valid, how many numbers follow, how many gyro readings; then these, then a text.
+_READING = struct.Struct("<cq?BB")
+_GYRO = struct.Struct("<qd")  # stamp_ns, turn_radps
+_MOST_GYRO = 255
 KIND_COMMAND, KIND_TEXT, KIND_READING, KIND_FAILED = b"c", b"t", b"r", b"f"
 HEARD_WITHIN_S = 600.0  # an orphan repeats the stop for this long to a vehicle that does not hear
 _HEAVY = ("jax", "cv2")  # modules that the guard's process must not import
 _PRIORITY = 20  # in the real-time class: above the computing process, below the kernel's threads
 _LARGEST = 2**24
+
+
+def command_frame(sequence: int, deadline_ns: int, command: Command) -> bytes:
+    """The frame of a command."""
+    numbers = struct.pack(f"<{len(command)}d", *command)
+    return _COMMAND.pack(KIND_COMMAND, sequence, deadline_ns) + numbers
+
+
+def command_of(frame: bytes) -> tuple[int, int, Command]:
+    """The sequence, deadline_ns and command of a frame."""
+    _, sequence, deadline_ns = _COMMAND.unpack_from(frame)
+    count = (len(frame) - _COMMAND.size) // 8
+    return sequence, deadline_ns, struct.unpack_from(f"<{count}d", frame, _COMMAND.size)
+
+
+def reading_frame(read: Reading, gyro: Sequence[GyroReading], over: str) -> bytes:
+    """The frame of a reading, the newest gyro readings, and why the drive is over or nothing."""
+    gyro = gyro[-_MOST_GYRO:]
+    head = _READING.pack(KIND_READING, read.stamp_ns, read.valid, len(read.values), len(gyro))
+    numbers = struct.pack(f"<{len(read.values)}d", *read.values)
+    turns = b"".join(_GYRO.pack(one.stamp_ns, one.turn_radps) for one in gyro)
+    return head + numbers + turns + over.encode()
+
+
+def reading_from(frame: bytes) -> tuple[Reading, tuple[GyroReading, ...], str]:
+    """The parts of a `reading_frame`."""
+    _, stamp_ns, valid, count, turns = _READING.unpack_from(frame)
+    values = struct.unpack_from(f"<{count}d", frame, _READING.size)
+    begin = _READING.size + 8 * count
+    end = begin + _GYRO.size * turns
+    gyro = tuple(GyroReading(*row) for row in _GYRO.iter_unpack(frame[begin:end]))
+    return reading_of(stamp_ns, values, valid), gyro, frame[end:].decode()
 
 
 class Link:
@@ -138,7 +183,7 @@ def main(commands: int, readings: int) -> None:
         priority = _preferred()  # of this thread, and of the guard's thread, which it starts
         guard = Guard(
             vehicle,
-            Limits(**order["limits"]),
+            limits_from(order["limits"]),
             order["timeout_s"],
             corrections=Corrections(**order["corrections"]),
         )
@@ -155,7 +200,7 @@ def main(commands: int, readings: int) -> None:
 class _Server:
     """The server of both sockets, until it is told to close."""
 
-    def __init__(self, vehicle: Vehicle, guard: Guard, link: Link, asked: Link, signals: int):
+    def __init__(self, vehicle: AnyVehicle, guard: Guard, link: Link, asked: Link, signals: int):
         self._vehicle, self._guard = vehicle, guard
         self._link, self._asked, self._signals = link, asked, signals
         self._sequence = 0
@@ -188,27 +233,25 @@ class _Server:
             if "stop" in said:
                 self._guard.trip(said["stop"])
             return "close" not in said
-        _, sequence, deadline_ns, steering_rad, throttle = COMMAND.unpack(frame)
+        sequence, deadline_ns, command = command_of(frame)
         if sequence > self._sequence:
             if not self._sequence:
                 self._guard.arm()  # the first command: from now on commands must come in time
             self._sequence = sequence
-            self._guard.write(steering_rad, throttle, deadline_ns)
+            self._guard.write(*command, deadline_ns=deadline_ns)
         return True
 
     def _reading(self) -> bytes:
         over = self._vehicle.over if isinstance(self._vehicle, Ending) else None
         try:
             read = self._vehicle.read()
-            numbers = READING.pack(
-                KIND_READING, read.stamp_ns, read.speed_mps, read.steering_rad, read.valid
-            )
+            gyro = self._vehicle.read_gyro() if isinstance(self._vehicle, HasGyro) else ()
+            return reading_frame(read, gyro, over or "")
         except OSError as error:
             return KIND_FAILED + str(error).encode()[:1000]
         except Exception as error:  # its meaning is unknown: the vehicle stops
             self._guard.trip(f"the vehicle: {type(error).__name__}: {error}")
             return KIND_FAILED + f"{type(error).__name__}: {error}".encode()[:1000]
-        return numbers + (over or "").encode()
 
 
 def _report(guard: Guard, link: Link) -> None:
@@ -228,7 +271,7 @@ def _factory(name: str, path: list[str]) -> Any:
     return factory
 
 
-def _opened(factory: Any, order: dict[str, Any]) -> Vehicle:
+def _opened(factory: Any, order: dict[str, Any]) -> AnyVehicle:
     received: Any = order["setup"]
     missing: Any = _Missing
     numbers: Any = SimpleNamespace(**received["vehicle"])
@@ -239,9 +282,9 @@ def _opened(factory: Any, order: dict[str, Any]) -> Vehicle:
     return plugins.opened_vehicle(order["vehicle"], factory, setup)
 
 
-def _stop_for_good(vehicle: Vehicle, order: dict[str, Any]) -> None:
+def _stop_for_good(vehicle: AnyVehicle, order: dict[str, Any]) -> None:
     """Stop and close the vehicle of a guard's process that has died."""
-    guard = Guard(vehicle, Limits(**order["limits"]), order["timeout_s"])
+    guard = Guard(vehicle, limits_from(order["limits"]), order["timeout_s"])
     guard.close(HEARD_WITHIN_S)
 
 

@@ -1,10 +1,13 @@
-"""The interfaces of a vehicle and of a camera: implement these to drive any car.
+"""The interfaces of a vehicle and of a camera: implement these to drive any car or other base.
 
 A plug-in is a factory, found by an entry point of the group `jaxnav.vehicles` or
 `jaxnav.cameras`, or as `module:name`:
 
     def open_vehicle(setup: Setup) -> Vehicle
     def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]   # one for each of the rig
+
+A car is a `Vehicle`; a base that is driven by a twist (`base:` in its file) is a `TwistVehicle`, the
+same but for the numbers that it reads and is told. Either may have a gyro, see `HasGyro`.
 
 `jaxnav.testing.check_vehicle` and `check_cameras` test whether a plug-in keeps these promises. A
 vehicle may also be `Ending`, and its factory may be `HasOwnFiles` or `SharesProcess`.
@@ -21,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:  # plug-ins import this file in the guard's process, which has none of these
     import numpy as np
@@ -32,6 +35,7 @@ if TYPE_CHECKING:  # plug-ins import this file in the guard's process, which has
     from jaxnav.models.bicycle import Vehicle as VehicleModel
     from jaxnav.models.markers import MarkerMap
     from jaxnav.models.rig import CameraRig
+    from jaxnav.models.twist_base import TwistBase
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class Setup:
 
     rig: CameraRig
     markers: MarkerMap
-    vehicle: VehicleModel
+    vehicle: VehicleModel | TwistBase
     start_pose: tuple[float, float, float]  # x_m, y_m, psi_rad on the map; for simulations
     seed: int = 0  # for simulations
     options: Mapping[str, str] = field(default_factory=dict)  # --option KEY=VALUE
@@ -61,6 +65,57 @@ class Odometry:
     speed_mps: float
     steering_rad: float
     valid: bool = True
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """What was read: speed_mps, steering_rad."""
+        return self.speed_mps, self.steering_rad
+
+
+@dataclass(frozen=True)
+class TwistOdometry:
+    """One reading of the odometer of a base that is driven by a twist, in its own axes.
+
+    Attributes:
+        stamp_ns: time of measurement, `time.monotonic_ns()` of this machine.
+        forward_mps, left_mps: velocity of its origin; `left_mps` is 0 of what can't move sideways.
+        turn_radps: positive to the left.
+        valid: False where the driver knows that it could not read.
+    """
+
+    stamp_ns: int
+    forward_mps: float
+    left_mps: float
+    turn_radps: float
+    valid: bool = True
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """What was read: forward_mps, left_mps, turn_radps."""
+        return self.forward_mps, self.left_mps, self.turn_radps
+
+
+Reading = Odometry | TwistOdometry
+
+
+def reading_of(stamp_ns: int, values: Sequence[float], valid: bool) -> Reading:
+    """The reading with these `values`: two of a car, three of another base."""
+    if len(values) == 2:
+        return Odometry(stamp_ns, *values, valid=valid)
+    return TwistOdometry(stamp_ns, *values, valid=valid)
+
+
+@dataclass(frozen=True)
+class GyroReading:
+    """One reading of a gyro about the vehicle's vertical axis.
+
+    Attributes:
+        stamp_ns: time of measurement, `time.monotonic_ns()` of this machine.
+        turn_radps: the turn rate then, or its mean since the reading before; positive to the left.
+    """
+
+    stamp_ns: int
+    turn_radps: float
 
 
 @dataclass(frozen=True)
@@ -114,12 +169,55 @@ class Vehicle(Protocol):
 
 
 @runtime_checkable
+class TwistVehicle(Protocol):
+    """A base that is driven by a twist; all that is not said here is as in `Vehicle`."""
+
+    @property
+    def timeout_s(self) -> float:
+        """See `Vehicle`."""
+        ...
+
+    def read(self) -> TwistOdometry:
+        """See `Vehicle`."""
+        ...
+
+    def write(self, forward_mps: float, left_mps: float, turn_radps: float) -> None:
+        """Apply a twist in the base's own axes until the next call; see `Vehicle`."""
+        ...
+
+    def stop(self) -> None:
+        """Set all of the twist to zero now; see `Vehicle`."""
+        ...
+
+    def close(self) -> None:
+        """See `Vehicle`."""
+        ...
+
+
+AnyVehicle = Vehicle | TwistVehicle
+
+
+@runtime_checkable
 class Ending(Protocol):
     """Optional part of a vehicle whose drive can end by itself, as a recording's does."""
 
     @property
     def over(self) -> str | None:
         """Why the drive is over, which ends the loop in good order; None while it goes on."""
+        ...
+
+
+@runtime_checkable
+class HasGyro(Protocol):
+    """Optional part of a vehicle that has a gyro; its file says how good it is (`gyro:`)."""
+
+    def read_gyro(self) -> Sequence[GyroReading]:
+        """The readings since the last call, the oldest first; none where there are none. It does
+        not wait. Called by the thread that calls `read`, after it.
+
+        Raises:
+            OSError: no reading is possible now; the loop goes on without it and asks again.
+        """
         ...
 
 
@@ -145,8 +243,8 @@ class Camera(Protocol):
         ...
 
 
-OpenVehicle = Callable[[Setup], Vehicle]
-OpenCameras = Callable[[Setup, Vehicle], Sequence[Camera]]
+OpenVehicle = Callable[[Setup], AnyVehicle]
+OpenCameras = Callable[[Setup, Any], Sequence[Camera]]
 
 
 @runtime_checkable
@@ -162,7 +260,7 @@ class OwnFiles:
 
     rig: CameraRig
     markers: MarkerMap
-    vehicle: VehicleModel
+    vehicle: VehicleModel | TwistBase
     route: Route
 
 

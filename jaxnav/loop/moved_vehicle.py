@@ -23,15 +23,14 @@ from typing import Any
 from jaxnav.errors import BadInput
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.guard_process import (
-    COMMAND,
-    KIND_COMMAND,
     KIND_FAILED,
     KIND_READING,
-    READING,
     Link,
+    command_frame,
+    reading_from,
 )
-from jaxnav.loop.interfaces import Odometry, Setup
-from jaxnav.loop.limits import Limits
+from jaxnav.loop.interfaces import GyroReading, Setup
+from jaxnav.loop.limits import CommandLimits
 
 _MODULE = "jaxnav.loop.guard_process"
 _READ_S = 0.02  # timeout of a reading: a tick of the loop
@@ -90,7 +89,7 @@ class GuardProcess:
     def open(
         self,
         setup: Setup,
-        limits: Limits,
+        limits: CommandLimits,
         timeout_s: float,
         check: Callable[[], None] = lambda: None,
     ) -> MovedVehicle | None:
@@ -117,7 +116,7 @@ class GuardProcess:
                 "seed": setup.seed,
                 "options": dict(setup.options),
             },
-            "limits": asdict(limits),
+            "limits": asdict(limits),  # type: ignore[call-overload]
             "corrections": asdict(Corrections.of(setup.vehicle)),
             "timeout_s": timeout_s,
         }
@@ -170,7 +169,7 @@ class GuardProcess:
 
 
 class MovedVehicle:
-    """A `Vehicle` in another process. It sends commands without waiting, and requests readings."""
+    """A vehicle in another process. It sends commands without waiting, and requests readings."""
 
     def __init__(
         self, guarding: GuardProcess, own_timeout_s: float, priority: str, timeout_s: float
@@ -180,6 +179,7 @@ class MovedVehicle:
         self._timeout_ns = int((timeout_s - _LATEST_S) * 1e9)
         self._sequence = 0
         self._over: str | None = None
+        self._gyro: tuple[GyroReading, ...] = ()  # that came with readings, and were not asked for
         self._asked_s: float | None = None  # when the pending reading was requested
         self._closing = self._closed = False
         self._dead: str | None = None
@@ -209,8 +209,8 @@ class MovedVehicle:
         self._report = report
         self._thread.start()
 
-    def read(self) -> Odometry:
-        """See `Vehicle`.
+    def read(self) -> Any:
+        """See `Vehicle` and `TwistVehicle`.
 
         Raises:
             OSError: no answer within a tick, or the plug-in's own error.
@@ -236,12 +236,18 @@ class MovedVehicle:
         if kind != KIND_READING:
             assert kind == KIND_FAILED
             raise OSError(answer[-1][1:].decode(errors="replace"))
-        _, stamp_ns, speed_mps, steering_rad, valid = READING.unpack_from(answer[-1])
-        self._over = answer[-1][READING.size :].decode() or None
-        return Odometry(stamp_ns, speed_mps, steering_rad, valid)
+        reading, gyro, over = reading_from(answer[-1])
+        self._over = over or None
+        self._gyro += gyro
+        return reading
 
-    def write(self, steering_rad: float, throttle: float) -> None:
-        """See `Vehicle`. Limits and corrections are applied there.
+    def read_gyro(self) -> tuple[GyroReading, ...]:
+        """See `HasGyro`: what came with the readings since; nothing of a vehicle without one."""
+        gyro, self._gyro = self._gyro, ()
+        return gyro
+
+    def write(self, *command: float) -> None:
+        """See `Vehicle` and `TwistVehicle`. Limits and corrections are applied there.
 
         Raises:
             OSError: the process is gone, or has not read for long.
@@ -250,9 +256,7 @@ class MovedVehicle:
             raise OSError(self._dead or "the vehicle is closed")
         self._sequence += 1
         deadline_ns = time.monotonic_ns() + self._timeout_ns
-        self._guarding.commands.send(
-            COMMAND.pack(KIND_COMMAND, self._sequence, deadline_ns, steering_rad, throttle)
-        )
+        self._guarding.commands.send(command_frame(self._sequence, deadline_ns, command))
 
     def stop(self) -> None:
         """See `Vehicle`: the guard there trips, and repeats the stop until the vehicle hears it.

@@ -217,8 +217,8 @@ def test_a_dog_that_is_gone_is_missed(car, guard, monkeypatch):
 
 def test_a_command_after_its_own_deadline_is_not_obeyed(car, guard):
     guard.arm()
-    assert guard.write(0.0, 0.1, time.monotonic_ns() + 10**8)
-    assert not guard.write(0.0, 0.2, time.monotonic_ns() - 1)
+    assert guard.write(0.0, 0.1, deadline_ns=time.monotonic_ns() + 10**8)
+    assert not guard.write(0.0, 0.2, deadline_ns=time.monotonic_ns() - 1)
     assert car.told[-1][2] == 0.1
 
 
