@@ -46,6 +46,12 @@ class Events(eqx.Module):
     has_odometry: Bool[Array, " N"]
     # None where no event has corners: that program takes a third of the time of the other.
     corners: Corners | None
+    # Of a `TwistBase`, in place of speed and steering: v_x, v_y, omega.
+    twists: Float[Array, "N 3"] | None = None
+    # Of a vehicle with a gyro: its mean rate since the reading before, and since the last one; NaN
+    # where it has told none.
+    gyro_radps: Float[Array, " N"] | None = None
+    gyro_since_radps: Float[Array, ""] | None = None
 
     def at(
         self, index: Int[Array, ""], dt_s: Float[Array, ""], lanes: tuple[int, int]
@@ -66,6 +72,8 @@ class Events(eqx.Module):
             dt_s=dt_s,
             corner_sigma_px=None if seen is None else seen.corner_sigma_px[index],
             has_odometry=self.has_odometry[index],
+            twist=None if self.twists is None else _twist(self.twists[index]),
+            gyro_radps=None if self.gyro_radps is None else _about_z(self.gyro_radps[index]),
         )
 
 
@@ -125,7 +133,13 @@ def advance(
     last_us = jnp.where(count > 0, events.stamps_us[jnp.maximum(count - 1, 0)], 0)
     age_us = now_us - last_us
     obs = events.at(new, seconds(elapsed_us), lanes)
-    unheard = dataclasses.replace(obs, has_odometry=jnp.asarray(False), dt_s=seconds(age_us))
+    since = events.gyro_since_radps
+    unheard = dataclasses.replace(
+        obs,
+        has_odometry=jnp.asarray(False),
+        dt_s=seconds(age_us),
+        gyro_radps=None if since is None else _about_z(since),
+    )
     present: Belief = jax.lax.cond(
         age_us > FRESH_US,
         lambda: navigator.coast(navigator.predict(belief, unheard.usable()))[0],
@@ -135,3 +149,15 @@ def advance(
     last_heard = dataclasses.replace(obs, has_odometry=jnp.asarray(True))
     control, output = navigator.act(control, estimate, last_heard)
     return belief, then, control, output
+
+
+def _twist(planar: Float[Array, " 3"]) -> Float[Array, " 6"]:
+    """The twist of a motion (v_x, v_y, omega) in the plane."""
+    zeros = jnp.zeros_like(planar)
+    return jnp.concatenate([planar[:2], zeros, planar[2:]])
+
+
+def _about_z(rate_radps: Float[Array, ""]) -> Float[Array, " 3"]:
+    """The angular velocity of a turn in the plane."""
+    zero = jnp.zeros_like(rate_radps)
+    return jnp.stack([zero, zero, rate_radps])

@@ -86,7 +86,7 @@ class TwistController(Follower):
     ) -> Float[Array, " 3"]:
         """The twist to a point at an angle and a distance."""
         c, s = jnp.cos(alpha_rad), jnp.sin(alpha_rad)
-        spot = np.cos(self.spot_rad)
+        spot = jnp.cos(self.spot_rad)
         part = jnp.maximum((c - spot) / (1 - spot), 0)
         curvature = 2 * s / jnp.maximum(distance_m, 1e-3)
         turn = part * speed * curvature + (1 - part) * self.turns_per_s * alpha_rad

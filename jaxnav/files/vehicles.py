@@ -143,23 +143,39 @@ def load_vehicle(path: str | Path) -> Vehicle | TwistBase:
     """
     path = Path(path)
     data = read_mapping(path)
-    other = data.get("base", ACKERMANN) != ACKERMANN
-    if other:
+    if is_base_file(data):
         return validate(BaseFile, data, path).vehicle()
     return validate(VehicleFile, data, path).vehicle()
 
 
+def is_base_file(data: Mapping[str, Any]) -> bool:
+    """Whether this is a vehicle file of a base that is no car."""
+    return bool(data.get("base", ACKERMANN) != ACKERMANN)
+
+
 def load_car(path: str | Path) -> Vehicle:
-    """Read the vehicle of what drives, calibrates or replays a car, and nothing else so far.
+    """Read the vehicle of what is for cars alone so far: calibrations, tuning, the fault matrix.
 
     Raises:
         BadInput: as `load_vehicle`; or the vehicle is no Ackermann car, or has a gyro.
     """
-    vehicle = load_vehicle(path)
-    if isinstance(vehicle, TwistBase):
-        raise BadInput(f"{path}: base", "must be ackermann here: so far only cars are driven")
+    vehicle = as_car(load_vehicle(path), path)
     if vehicle.gyro is not None:
-        raise BadInput(f"{path}: gyro", "must be left out here: so far no vehicle's gyro is read")
+        raise BadInput(f"{path}: gyro", "must be left out here: a gyro is only read while it drives")
+    return vehicle
+
+
+def as_car(vehicle: Vehicle | TwistBase, where: str | Path) -> Vehicle:
+    """The vehicle, if it is a car.
+
+    Args:
+        where: the file that holds it.
+
+    Raises:
+        BadInput: it is another base.
+    """
+    if isinstance(vehicle, TwistBase):
+        raise BadInput(f"{where}: base", "must be ackermann here: this is for cars alone so far")
     return vehicle
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +15,8 @@ from jaxnav.belief.estimate import Belief, Evidence
 from jaxnav.compiling.packing import Packed, PackedLayout
 from jaxnav.compiling.step import compile_or_load
 from jaxnav.loop.history import EventData, History, HistoryEntry
+from jaxnav.models.gyro import Gyro
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator, Output
 from jaxnav.timeline import Corners, Events, advance
 
@@ -23,6 +26,7 @@ _NOTHING = EventData()
 
 # (belief, control, events, numbers) -> (belief, then, control, output), see `advance_packed`
 Program = Callable[..., tuple[Packed, Packed, Packed, Packed]]
+MeanRate = Callable[[int, int], float]  # of the interval between two times, ns
 
 
 def advance_packed(
@@ -64,16 +68,25 @@ class FusionResult:
 class Estimator:
     """The estimator of one drive. The same calls give the same bits."""
 
-    def __init__(self, navigator: Navigator, program: Program | None = None):
+    def __init__(
+        self,
+        navigator: Navigator,
+        program: Program | None = None,
+        mean_radps: MeanRate | None = None,
+    ):
         """Args:
         navigator: the navigator to run.
+        mean_radps: what a gyro tells of the interval between two times, NaN where it tells nothing;
+            of a motion whose vehicle has a gyro.
         program: compiled `advance_packed` of the navigator; by default compiled by `jax.jit`, see
             `compile_or_load`.
         """
         self._program = program or compile_or_load(advance_packed, navigator, None)
         self._first, self._control = compile_or_load(_beginning, navigator, None)()
         self._layouts = {seeing: _layout(navigator, seeing) for seeing in (False, True)}
-        self._odometry = (np.nan, np.nan)  # the last speed_mps, steering_rad
+        self._mean_radps = mean_radps or (lambda begin_ns, end_ns: np.nan)
+        # The last reading's values; those of another base are not commanded by.
+        self._odometry: tuple[float, ...] = (np.nan, np.nan)
         self.reset()
 
     def reset(self) -> None:
@@ -84,13 +97,13 @@ class Estimator:
 
     def forget_speed(self) -> None:
         """Command as if the speed had never been known: the last reading was wrong."""
-        self._odometry = (np.nan, self._odometry[1])
+        self._odometry = (np.nan, *self._odometry[1:])
 
     def warm_up(self) -> None:
         """Compile, once for events with corners and once for those without."""
         for seeing in (False, True):
             numbers = np.zeros(4, np.int32)
-            self._program(self._first, self._control, self._events([], 0, seeing), numbers)
+            self._program(self._first, self._control, self._events([], 0, 0, seeing), numbers)
 
     def fuse(
         self, data: EventData | None, stamp_ns: int, now_ns: int, elapsed_ns: int
@@ -165,27 +178,38 @@ class Estimator:
         elapsed_ns: int,
     ) -> tuple[Packed, Packed, Packed]:
         seeing = any(data.corners_px is not None for _, data in rows)
-        events = self._events(rows, base_ns, seeing)
+        events = self._events(rows, base_ns, now_ns, seeing)
         now_us, elapsed_us = _us_between(base_ns, now_ns), elapsed_ns // 1000
         numbers = np.array([len(rows), new, _int32(now_us), _int32(elapsed_us)], np.int32)
         belief, then, self._control, output = self._program(belief, self._control, events, numbers)
         return belief, then, output
 
-    def _events(self, rows: Sequence[tuple[int, EventData]], base_ns: int, seeing: bool) -> Packed:
+    def _events(
+        self, rows: Sequence[tuple[int, EventData]], base_ns: int, now_ns: int, seeing: bool
+    ) -> Packed:
         packed, events = self._layouts[seeing].room()
         # Numbers that float32 can't hold become infinite, and the filter leaves them out.
         with np.errstate(over="ignore"):
             self._fill(events, rows, base_ns)
+            if vars(events)["gyro_radps"] is not None:
+                stamps_ns = [base_ns, *(stamp_ns for stamp_ns, _ in rows), now_ns]
+                rates = [self._mean_radps(*pair) for pair in pairwise(stamps_ns)]
+                vars(events)["gyro_radps"][: len(rows)] = rates[:-1]
+                vars(events)["gyro_since_radps"][...] = rates[-1]
         return packed
 
     def _fill(self, events: Events, rows: Sequence[tuple[int, EventData]], base_ns: int) -> None:
         into = vars(events)  # reading an attribute of an equinox module takes 1 us
-        speed_mps, steering_rad = into["speed_mps"], into["steering_rad"]
-        speed_mps[:], steering_rad[:] = self._odometry
+        twists, speed_mps, steering_rad = into["twists"], into["speed_mps"], into["steering_rad"]
+        if twists is None:
+            speed_mps[:], steering_rad[:] = self._odometry
         for index, (stamp_ns, data) in enumerate(rows):
             into["stamps_us"][index] = _int32(_us_between(base_ns, stamp_ns))
             if data.odometry is not None:
-                speed_mps[index], steering_rad[index] = data.odometry
+                if twists is None:
+                    speed_mps[index], steering_rad[index] = data.odometry
+                else:
+                    twists[index] = data.odometry
                 into["has_odometry"][index] = True
             if data.corners_px is not None:
                 corners = vars(into["corners"])
@@ -204,10 +228,18 @@ def _with_evidence(output: Output, of_new: Output) -> Output:
     return completed
 
 
+def gyro_of(navigator: Navigator) -> Gyro | None:
+    """The gyro that a navigator's filter reads; None: its vehicle has none, or it looks at none."""
+    vehicle = getattr(navigator.motion, "vehicle", None)
+    return None if vehicle is None else vehicle.gyro
+
+
 def _layout(navigator: Navigator, seeing: bool) -> PackedLayout:
     """The layout of `EVENTS` events, with or without room for corners."""
     lanes = EVENTS, len(navigator.rig), len(navigator.markers.ids)
     dtype = navigator.corner_sigma_px.dtype
+    vehicle = getattr(navigator.motion, "vehicle", None)
+    turns = gyro_of(navigator) is not None
 
     def events() -> Events:
         corners = Corners(
@@ -221,6 +253,9 @@ def _layout(navigator: Navigator, seeing: bool) -> PackedLayout:
             steering_rad=jnp.zeros(EVENTS, dtype),
             has_odometry=jnp.zeros(EVENTS, bool),
             corners=corners if seeing else None,
+            twists=jnp.zeros((EVENTS, 3), dtype) if isinstance(vehicle, TwistBase) else None,
+            gyro_radps=jnp.zeros(EVENTS, dtype) if turns else None,
+            gyro_since_radps=jnp.zeros((), dtype) if turns else None,
         )
 
     return PackedLayout.of(jax.eval_shape(events))

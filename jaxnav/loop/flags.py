@@ -37,6 +37,9 @@ class Fault(enum.IntFlag):
     MARKER_OUTVOTED = enum.auto()  # its corners contradict what the others agree on
     CAMERA_LATE = enum.auto()  # images are older or newer than their stamps; health stays as it is
     CAMERA_OUTVOTED = enum.auto()  # it does not see markers where another does
+    # The estimate goes on without the gyro, and health stays as it is.
+    GYRO_STALE = enum.auto()  # its file says that there is one, and it gave no rate in time
+    GYRO_INVALID = enum.auto()  # a reading is not finite, at the gyro's limit, or repeats itself
 
 
 class Reject(enum.IntFlag):

@@ -245,13 +245,19 @@ class _Server:
         over = self._vehicle.over if isinstance(self._vehicle, Ending) else None
         try:
             read = self._vehicle.read()
-            gyro = self._vehicle.read_gyro() if isinstance(self._vehicle, HasGyro) else ()
-            return reading_frame(read, gyro, over or "")
+            return reading_frame(read, self._turns(), over or "")
         except OSError as error:
             return KIND_FAILED + str(error).encode()[:1000]
         except Exception as error:  # its meaning is unknown: the vehicle stops
             self._guard.trip(f"the vehicle: {type(error).__name__}: {error}")
             return KIND_FAILED + f"{type(error).__name__}: {error}".encode()[:1000]
+
+
+    def _turns(self) -> Sequence[GyroReading]:
+        """The gyro's readings, of which none is no reason to go without the odometer."""
+        with suppress(OSError):
+            return self._vehicle.read_gyro() if isinstance(self._vehicle, HasGyro) else ()
+        return ()
 
 
 def _report(guard: Guard, link: Link) -> None:

@@ -25,7 +25,7 @@ KEPT = 420
 class EventData:
     """The data of an event: odometry, corners of some cameras, or both."""
 
-    odometry: tuple[float, float] | None = None  # speed_mps, steering_rad
+    odometry: tuple[float, ...] | None = None  # the values of a reading, see `interfaces`
     corners_px: Float[np.ndarray, "C M 4 2"] | None = None  # finite
     visible: Bool[np.ndarray, "C M"] | None = None
     sigma_px: Float[np.ndarray, "C M 4"] | None = None  # positive

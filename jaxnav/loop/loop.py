@@ -10,6 +10,7 @@ that of a paused simulation does, the command is no speed.
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -21,7 +22,7 @@ from jaxnav.loop.expect import Expected, expect_corners
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import Guard
-from jaxnav.loop.interfaces import Ending, Frame, Vehicle
+from jaxnav.loop.interfaces import AnyVehicle, Ending, Frame, GyroReading, HasGyro, Reading
 from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.loop.priority import before_siblings
 from jaxnav.loop.seeing import Eyes, Region, group_frames
@@ -87,7 +88,7 @@ class Loop:
         self,
         pilot: Pilot,
         guard: Guard,
-        vehicle: Vehicle,
+        vehicle: AnyVehicle,
         eyes: Eyes,
         observers: Sequence[Observer] = (),
         period_s: float = 0.02,
@@ -162,13 +163,13 @@ class Loop:
 
     def _hold(self) -> None:
         """Command no speed while the clock stands: no input comes, and the guard waits for none."""
-        steering_rad = 0.0 if self._outcome is None else self._outcome.steering_rad
-        self.guard.write(steering_rad, 0.0)
+        limits, outcome = self.pilot.limits, self._outcome
+        self.guard.write(*limits.standing(limits.zero if outcome is None else outcome.command))
 
     def _tick(self, faults: Fault) -> None:
         frames, self._blank = self._blank, ()
         faults |= self._failures()
-        reading = None
+        reading: Reading | None = None
         try:
             reading = self._vehicle.read()
         except OSError:
@@ -177,7 +178,13 @@ class Loop:
             reading = None  # nothing new yet
         if reading is not None:
             self._odometry_ns = reading.stamp_ns
-        self._handle(Input(self._now_ns(), reading, frames, faults))
+        self._handle(Input(self._now_ns(), reading, frames, faults, self._gyro()))
+
+    def _gyro(self) -> tuple[GyroReading, ...]:
+        """What the vehicle's gyro has told since the tick before; nothing without one."""
+        with suppress(OSError):
+            return tuple(self._vehicle.read_gyro()) if isinstance(self._vehicle, HasGyro) else ()
+        return ()
 
     def _sighted(self) -> list[tuple[FrameDetections, ...]]:
         """The frames that show markers, in groups; the other frames wait for the next tick."""
@@ -192,8 +199,10 @@ class Loop:
     def _handle(self, given: Input) -> None:
         begin_s = time.perf_counter()
         outcome = self.pilot.handle(given)
-        throttle = 0.0 if self._clock.stands(given.now_ns) else outcome.throttle
-        success = self.guard.write(outcome.steering_rad, throttle)
+        command = outcome.command
+        if self._clock.stands(given.now_ns):
+            command = self.pilot.limits.standing(command)
+        success = self.guard.write(*command)
         end_s = time.perf_counter()
         kind = "odometry" if given.odometry else "frames" if given.frames else "tick"
         self.statistics.add(f"handle {kind}", (end_s - begin_s) * 1e3)

@@ -1,12 +1,16 @@
-"""Decide which odometry to believe: a wheel can't do everything that its sensor says."""
+"""Decide which odometry to believe: a wheel can't do everything that its sensor says.
+
+Every driven part of the vehicle is judged by itself (see `chassis`), in m/s, and all of them are
+believed or none is.
+"""
 
 import math
 from collections import deque
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from jaxnav.loop.chassis import Chassis
 from jaxnav.loop.flags import Fault
-from jaxnav.models.bicycle import Vehicle
 
 _MARGIN_MPS = 0.05  # beside what the vehicle can reach
 _SIGMAS = 2.0
@@ -20,56 +24,88 @@ _PULLED_MPS = 0.1  # a change of speed that any encoder shows
 _MAX_GAP_NS = 1_000_000_000
 
 
+_Rest = float | tuple[float, ...]  # what is read beside a speed
+_Reading = tuple[float, _Rest]
+
+
+class Odometers:
+    """The judge of all driven parts of a vehicle."""
+
+    def __init__(self, chassis: Chassis):
+        self.parts = [Odometer(top_mps, chassis.time_constant_s) for top_mps in chassis.tops_mps]
+
+    def judge(
+        self,
+        driven_mps: tuple[float, ...],
+        values: tuple[float, ...],
+        stamp_ns: int,
+        believed: tuple[tuple[float, float], ...] | None,
+        seeing: bool,
+        wanted_mps: tuple[float, ...] | None,
+        contradicted: bool = False,
+    ) -> tuple[bool, Fault]:
+        """Whether to fuse a reading, and the faults of the sensor; see `Odometer.judge`.
+
+        Args:
+            driven_mps: what it tells of each part.
+            values: all that was read.
+            believed, wanted_mps: of each part.
+        """
+        believable, faults = True, Fault(0)
+        for index, part in enumerate(self.parts):
+            taken, fault = part.judge(
+                driven_mps[index],
+                values,
+                stamp_ns,
+                None if believed is None else believed[index],
+                seeing,
+                None if wanted_mps is None else wanted_mps[index],
+                contradicted,
+            )
+            believable, faults = believable and taken, faults | fault
+        return believable, faults
+
+
 @dataclass
 class Odometer:
-    """The judge of an odometer's readings: it refuses physically impossible ones."""
+    """The judge of one driven part's readings: it refuses physically impossible ones."""
 
     max_mps: float
-    speed_per_throttle_mps: float
     time_constant_s: float
-    last: tuple[float, float] | None = None  # speed_mps, steering_rad, believed
+    last: _Reading | None = None  # the speed, and the rest of the reading, believed
     _last_ns: int = 0
-    _raw: tuple[float, float] | None = None
+    _raw: _Reading | None = None
     _raw_ns: int = 0
     _repeated: int = 0
     _same_speed: int = 0
-    _pulled_mps: float = 0.0  # speed expected from the throttle commands
+    _pulled_mps: float = 0.0  # speed expected from the commands
     _pulled_range_mps: tuple[float, float] = (0.0, 0.0)  # since the measured speed changed
     _refused_mps: float = 0.0
     _refusals: int = 0
     _path: deque[tuple[int, float, float]] = field(default_factory=deque)  # see _agrees
 
-    @staticmethod
-    def of(vehicle: Vehicle) -> "Odometer":
-        """The judge for a vehicle, with its top speed and its time constant."""
-        speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
-        return Odometer(
-            float(vehicle.throttle_limit) * speed_per_throttle_mps,
-            speed_per_throttle_mps,
-            float(vehicle.speed_time_constant_s),
-        )
-
     def judge(
         self,
         speed_mps: float,
-        steering_rad: float,
+        rest: _Rest,
         stamp_ns: int,
         believed: tuple[float, float] | None,
         seeing: bool,
-        throttle: float | None,
+        wanted_mps: float | None,
         contradicted: bool = False,
     ) -> tuple[bool, Fault]:
         """Whether to fuse a reading, and the faults of the sensor.
 
         Args:
+            rest: what else was read, the steering of a car; it is only compared.
             believed: the estimate's speed and its sigma, m/s; None: not known.
             seeing: cameras tell the speed too, so persistent impossible readings stay refused.
-            throttle: last commanded; None: by somebody else, who may pull as hard as it goes.
-            contradicted: corners have moved for a while, but the reading says that the car stands.
+            wanted_mps: last commanded; None: by somebody else, who may pull as hard as it goes.
+            contradicted: corners have moved for a while, but the reading says that it stands.
         """
-        if self._stuck(speed_mps, steering_rad, stamp_ns, throttle) or contradicted:
+        if self._stuck(speed_mps, rest, stamp_ns, wanted_mps) or contradicted:
             return False, Fault.ODOMETRY_STUCK
-        if self._possible(speed_mps, stamp_ns, believed, throttle):
+        if self._possible(speed_mps, stamp_ns, believed, wanted_mps):
             if (
                 seeing
                 and self._refusals >= _DISTRUSTED
@@ -86,7 +122,7 @@ class Odometer:
             insists = self._refusals > _AGREEING and abs(speed_mps) <= 1.5 * self.max_mps
             if seeing or not insists:
                 return False, Fault(0)
-        self.last, self._last_ns = (speed_mps, steering_rad), stamp_ns
+        self.last, self._last_ns = (speed_mps, rest), stamp_ns
         return True, Fault(0)
 
     def _possible(
@@ -94,7 +130,7 @@ class Odometer:
         speed_mps: float,
         stamp_ns: int,
         believed: tuple[float, float] | None,
-        throttle: float | None,
+        wanted_mps: float | None,
     ) -> bool:
         if abs(speed_mps) > 1.5 * self.max_mps + _MARGIN_MPS:
             return False
@@ -104,9 +140,10 @@ class Odometer:
                 return True
             reference = self.last[0]
         gap_s = min(max(stamp_ns - self._last_ns, 0), _MAX_GAP_NS) / 1e9
-        # The throttle pulls towards a speed of its own, brakes and friction towards zero.
+        # The command pulls towards a speed of its own, brakes and friction towards zero.
         done = 1 - math.exp(-gap_s / self.time_constant_s)
-        pulled = self._towards(throttle, math.copysign(self.max_mps, speed_mps - reference))
+        most_mps = math.copysign(self.max_mps, speed_mps - reference)
+        pulled = most_mps if wanted_mps is None else wanted_mps
         targets = (reference, pulled, 0.0)
         reached = [reference + done * (target - reference) for target in targets]
         margin = _MARGIN_MPS + _SIGMAS * sigma
@@ -132,21 +169,18 @@ class Odometer:
         long_enough = stamp_ns - stamps[0] > _PATH_NS / 2
         return long_enough and abs(off_m) < _PATH_M + _PATH_SHARE * way_m
 
-    def _towards(self, throttle: float | None, otherwise_mps: float) -> float:
-        """The speed towards which the throttle pulls, or another one where it is not known."""
-        return otherwise_mps if throttle is None else throttle * self.speed_per_throttle_mps
-
     def _stuck(
-        self, speed_mps: float, steering_rad: float, stamp_ns: int, throttle: float | None
+        self, speed_mps: float, rest: _Rest, stamp_ns: int, wanted_mps: float | None
     ) -> bool:
-        """Whether readings repeat too often: all of it, or only the speed although the throttle has
+        """Whether readings repeat too often: all of it, or only the speed although the command has
         changed it meanwhile (a driver without a steering sensor reports the commanded angle)."""
         gap_s = min(max(stamp_ns - self._raw_ns, 0), _MAX_GAP_NS) / 1e9
         done = 1 - math.exp(-gap_s / self.time_constant_s)
-        self._pulled_mps += done * (self._towards(throttle, self._pulled_mps) - self._pulled_mps)
+        towards_mps = self._pulled_mps if wanted_mps is None else wanted_mps
+        self._pulled_mps += done * (towards_mps - self._pulled_mps)
         same_speed = speed_mps != 0 and self._raw is not None and self._raw[0] == speed_mps
-        same = same_speed and self._raw == (speed_mps, steering_rad)
-        self._raw, self._raw_ns = (speed_mps, steering_rad), stamp_ns
+        same = same_speed and self._raw == (speed_mps, rest)
+        self._raw, self._raw_ns = (speed_mps, rest), stamp_ns
         self._repeated = self._repeated + 1 if same else 0
         self._same_speed = self._same_speed + 1 if same_speed else 0
         least, most = self._pulled_range_mps if same_speed else (math.inf, -math.inf)

@@ -21,26 +21,28 @@ from jaxtyping import Float
 from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.belief.estimate import Belief
 from jaxnav.loop.camera_votes import CameraVotes
+from jaxnav.loop.chassis import chassis_of, pace_mps, root_of_sum
 from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.estimator import Estimator, Program
+from jaxnav.loop.estimator import Estimator, Program, gyro_of
 from jaxnav.loop.expect import Place, due_px, quads_px
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.frames import FrameDetections, FrameIntake
+from jaxnav.loop.gyro_track import GyroTrack
 from jaxnav.loop.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
 from jaxnav.loop.history import EventData
-from jaxnav.loop.interfaces import Odometry
-from jaxnav.loop.limits import Limits
-from jaxnav.loop.odometer import Odometer
+from jaxnav.loop.interfaces import GyroReading, Reading
+from jaxnav.loop.limits import Command
+from jaxnav.loop.odometer import Odometers
 from jaxnav.loop.outvoted import MarkerVotes
 from jaxnav.loop.stamps import Stamps
 from jaxnav.loop.standstill import Standstill, Way
 from jaxnav.loop.support import Support
 from jaxnav.loop.ways import Fix
-from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.navigator import Navigator, Output
 
 SLEPT_NS = 1_000_000_000  # after a pause this long in the loop, its belief is out of date
+GYRO_STALE_S = 0.1  # as the odometer
 _SEEING_NS = 500_000_000  # this long after a fix, the estimate's speed is as good as the odometer's
 _NO_FAULT, _NO_REJECT = Fault(0), Reject(0)
 
@@ -50,19 +52,26 @@ class Input:
     """The data that reach the pilot at one instant: odometry, frames, both, or neither (a tick).
 
     Attributes:
+        gyro: readings since the input before, the oldest first.
         frames: from different cameras. Frames that show markers were captured together.
         faults: found by the caller.
     """
 
     now_ns: int
-    odometry: Odometry | None = None
+    odometry: Reading | None = None
     frames: tuple[FrameDetections, ...] = ()
     faults: Fault = _NO_FAULT
+    gyro: tuple[GyroReading, ...] = ()
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The pilot's result for one event. Coordinates of output and belief count from `origin_m`."""
+    """The pilot's result for one event. Coordinates of output and belief count from `origin_m`.
+
+    Attributes:
+        steering_rad, throttle: the command of a car, within the limits; 0 of another base.
+        twist: that of another base: forward_mps, left_mps, turn_radps; None of a car.
+    """
 
     now_ns: int
     health: Health
@@ -79,6 +88,12 @@ class Outcome:
     outvoted: tuple[int, ...] = ()  # ids of markers left out because others contradict them
     outvoted_cameras: tuple[str, ...] = ()  # names of those that are left out
     origin_m: Origin = ZERO  # see `MarkerMap`
+    twist: Command | None = None
+
+    @property
+    def command(self) -> Command:
+        """The command, as the vehicle's `write` takes it."""
+        return (self.steering_rad, self.throttle) if self.twist is None else self.twist
 
     @property
     def pose(self) -> Float[np.ndarray, " 3"]:
@@ -103,8 +118,7 @@ class _Known(NamedTuple):
     accepted: bool
     nis: float
     gate_nis: float
-    steering_rad: float
-    throttle: float
+    command: Command
 
     @staticmethod
     def of(output: Output) -> "_Known":
@@ -120,8 +134,7 @@ class _Known(NamedTuple):
             bool(of_output["accepted"]),
             float(of_output["nis"]),
             float(of_output["gate_nis"]),
-            float(command["steering_rad"]),
-            float(command["throttle"]),
+            tuple(map(float, command.values())),
         )
 
     @property
@@ -131,15 +144,7 @@ class _Known(NamedTuple):
 
     @property
     def position_sigma_m(self) -> float:
-        return _root_of_sum(self.pose_covariance)
-
-    @property
-    def speed_mps(self) -> tuple[float, float]:
-        """The speed along the course and its sigma, m/s."""
-        heading, (x_mps, y_mps, _) = float(self.pose[2]), self.velocity.tolist()
-        forward_mps = math.cos(heading) * x_mps + math.sin(heading) * y_mps
-        speed_mps = math.copysign(math.hypot(x_mps, y_mps), forward_mps)
-        return speed_mps, _root_of_sum(self.velocity_covariance)
+        return root_of_sum(self.pose_covariance)
 
 
 class Pilot:
@@ -165,25 +170,23 @@ class Pilot:
         """
         if navigator.controller is None:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
-        if not isinstance(navigator.controller.vehicle, Vehicle):
-            raise ValueError("a pilot drives Ackermann cars alone")
         self.navigator = navigator
         self._origin_m = navigator.markers.origin_m
-        self.limits = Limits.of(navigator.controller.vehicle)
+        self._chassis = chassis_of(navigator.controller.vehicle)
+        self.limits = self._chassis.limits
         self._corrections = Corrections.of(navigator.controller.vehicle)
-        self._estimator = Estimator(navigator, program)
+        gyro = gyro_of(navigator)
+        self._gyro = None if gyro is None else GyroTrack(float(gyro.saturation_radps))
+        mean_radps = None if self._gyro is None else self._gyro.mean_radps
+        self._estimator = Estimator(navigator, program, mean_radps)
         self._frames = FrameIntake(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
         self._drives = drives
         self._odometry_stamps = Stamps()
-        self._odometer = Odometer.of(navigator.controller.vehicle)
-        self._standstill = Standstill(
-            Way(float(navigator.controller.vehicle.wheelbase_m)),
-            self._odometer.speed_per_throttle_mps,
-            self._odometer.time_constant_s,
-        )
+        self._odometers = Odometers(self._chassis)
+        self._standstill = Standstill(Way(self._chassis.lever_m), self._chassis.time_constant_s)
         self._frozen = partial(self._standstill.is_frozen, due=self._due_px)
-        self._support = Support(navigator.controller.vehicle, relocate)
+        self._support = Support(self._chassis, relocate)
         self._marker_votes = MarkerVotes(navigator.markers.ids)
         self._camera_votes = CameraVotes(navigator)
         self._sure = False  # whether the estimate may judge cameras
@@ -197,7 +200,7 @@ class Pilot:
         self._restart_reason = ""
         self._restarts_ns: deque[int] = deque()  # times of the recent restarts
         self._left: _Known | None = None  # the estimate before a restart
-        self._command = (0.0, 0.0)
+        self._command = self.limits.zero
         self._commanded_ns: int | None = None
 
     def warm_up(self) -> None:
@@ -208,6 +211,8 @@ class Pilot:
     def handle(self, given: Input) -> Outcome:
         """Fuse an input, frames first. `now_ns` must not be less than in the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
+        if self._gyro is not None:
+            faults |= self._gyro.take(given.gyro, now_ns)
         frames = [self._corrections.correct_frame(frame) for frame in given.frames]
         data, stamp_ns, seen_faults = self._frames.check(frames, now_ns, self._frozen)
         faults |= seen_faults
@@ -222,26 +227,26 @@ class Pilot:
             return self._odometry(self._corrections.correct_reading(given.odometry), now_ns, faults)
         return outcome if data is not None else self._tick(now_ns, faults)
 
-    def _odometry(self, reading: Odometry, now_ns: int, faults: Fault) -> Outcome:
-        known, jumps = self._known, self._odometry_stamps.jumps
-        throttle = self._command[1] if self._drives else None
+    def _odometry(self, reading: Reading, now_ns: int, faults: Fault) -> Outcome:
+        known, jumps, chassis = self._known, self._odometry_stamps.jumps, self._chassis
+        wanted_mps = chassis.wanted_mps(self._command) if self._drives else None
         stamp_ns = self._odometry_stamps.take(reading.stamp_ns, now_ns)
-        if not reading.valid or not (
-            math.isfinite(reading.speed_mps) and math.isfinite(reading.steering_rad)
-        ):
+        if not (reading.valid and chassis.reads(reading)):
             return self._tick(now_ns, faults | Fault.ODOMETRY_INVALID)
         if stamp_ns is None:
             return self._tick(now_ns, faults | Fault.STAMP_INVALID)
         if self._odometry_stamps.jumps > jumps:
             faults |= Fault.CLOCK_JUMPED
-        believable, faults_seen = self._odometer.judge(
-            reading.speed_mps,
-            reading.steering_rad,
+        driven_mps, motion = chassis.driven_mps(reading), chassis.motion(reading)
+        pace = pace_mps(driven_mps)
+        believable, faults_seen = self._odometers.judge(
+            driven_mps,
+            reading.values,
             stamp_ns,
-            known.speed_mps if known is not None and known.decided else None,
+            self._believed_mps(),
             self._seeing(now_ns),
-            throttle,
-            self._standstill.add_reading(stamp_ns, now_ns, reading.speed_mps),
+            wanted_mps,
+            self._standstill.add_reading(stamp_ns, now_ns, pace),
         )
         faults |= faults_seen
         if Fault.ODOMETRY_STUCK in faults_seen:
@@ -250,18 +255,14 @@ class Pilot:
             return self._tick(now_ns, faults, Reject.ODOMETRY)
         if self._odometer_ns is not None:
             gap_s = min(max(stamp_ns - self._odometer_ns, 0), SLEPT_NS) / 1e9
-            self._distance_m += abs(reading.speed_mps) * gap_s
+            self._distance_m += pace * gap_s
+            heading_rad = 0.0 if known is None else float(known.pose[2])
             self._support.add_odometry(
-                reading.speed_mps,
-                reading.steering_rad,
-                0.0 if known is None else float(known.pose[2]),
-                gap_s,
-                throttle,
-                self._seeing(now_ns),
+                driven_mps, motion, heading_rad, gap_s, wanted_mps, self._seeing(now_ns)
             )
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
-        self._standstill.add_believed(stamp_ns, now_ns, reading.speed_mps, reading.steering_rad)
-        data = EventData(odometry=(reading.speed_mps, reading.steering_rad))
+        self._standstill.add_believed(stamp_ns, now_ns, pace, motion)
+        data = EventData(odometry=reading.values)
         return self._fuse(data, stamp_ns, now_ns, faults, _NO_REJECT)
 
     def _tick(self, now_ns: int, faults: Fault, rejects: Reject = _NO_REJECT) -> Outcome:
@@ -304,8 +305,11 @@ class Pilot:
         self._known, self._now_ns = known, now_ns
         if self._standstill.nothing_moves:
             faults |= Fault.NOTHING_MOVES
+        if self._gyro is not None and self._age_s(self._gyro.newest_ns, now_ns) > GYRO_STALE_S:
+            faults |= Fault.GYRO_STALE
         health, faults = self._monitor.look(self._senses(known, now_ns, faults))
-        steering_rad, throttle = self._limited(known, health, now_ns, elapsed_ns)
+        command = self._limited(known, health, now_ns, elapsed_ns)
+        steering_rad, throttle = command if len(command) == 2 else (0.0, 0.0)
         return Outcome(
             now_ns,
             health,
@@ -322,7 +326,16 @@ class Pilot:
             markers,
             cameras,
             self._origin_m,
+            None if len(command) == 2 else command,
         )
+
+    def _believed_mps(self) -> tuple[tuple[float, float], ...] | None:
+        """The speeds of the driven parts by a decided estimate; None without one."""
+        known = self._known
+        if known is None or not known.decided:
+            return None
+        moves = known.velocity, known.velocity_covariance
+        return self._chassis.believed_mps(float(known.pose[2]), *moves)
 
     def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
         """Use the corners to confirm or doubt the estimate; return their `Reject` flags."""
@@ -376,26 +389,18 @@ class Pilot:
 
     def _limited(
         self, known: _Known, health: Health, now_ns: int, elapsed_ns: int
-    ) -> tuple[float, float]:
+    ) -> Command:
         if self._drives:
-            self._command = self.limits.apply(
-                known.steering_rad,
-                known.throttle * SPEED_FACTOR[health],
-                self._command[0],
-                elapsed_ns / 1e9,
-            )
+            wanted = self.limits.slowed(known.command, SPEED_FACTOR[health])
+            self._command = self.limits.within(wanted, self._command, elapsed_ns / 1e9)
         self._commanded_ns = now_ns
-        self._standstill.add_command(self._command[1], now_ns)
+        self._standstill.add_command(self._chassis.wanted_mps(self._command), now_ns)
         return self._command
 
     def _senses(self, known: _Known, now_ns: int, faults: Fault) -> Senses:
-        began_ns = self._began_ns if self._began_ns is not None else now_ns
         while self._restarts_ns and now_ns - self._restarts_ns[0] > RESTARTS_S * 1e9:
             self._restarts_ns.popleft()
-
-        def age_s(stamp_ns: int | None) -> float:
-            return max(now_ns - (began_ns if stamp_ns is None else stamp_ns), 0) / 1e9
-
+        age_s = partial(self._age_s, now_ns=now_ns)
         return Senses(
             located=known.located,
             decided=known.decided,
@@ -409,6 +414,12 @@ class Pilot:
             confirmed=self._support.confirmed,
             refused=self._support.refused,
         )
+
+    def _age_s(self, stamp_ns: int | None, now_ns: int) -> float:
+        """The age of a stamp, s; of none that since the drive began."""
+        if stamp_ns is None:
+            stamp_ns = now_ns if self._began_ns is None else self._began_ns
+        return max(now_ns - stamp_ns, 0) / 1e9
 
     def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
         """See `due_px`."""
@@ -443,12 +454,7 @@ def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
     """The fix of a pose (x_m, y_m, psi_rad) and its covariance."""
     x_m, y_m, psi_rad = map(float, pose[:3])
     sigma_rad = math.sqrt(max(float(covariance[2, 2]), 0.0))
-    return Fix(x_m, y_m, psi_rad, _root_of_sum(covariance), sigma_rad)
-
-
-def _root_of_sum(covariance: np.ndarray) -> float:
-    """Sigma of the first two coordinates together."""
-    return math.sqrt(max(float(covariance[0, 0]) + float(covariance[1, 1]), 0.0))
+    return Fix(x_m, y_m, psi_rad, root_of_sum(covariance), sigma_rad)
 
 
 def _apart(pose: np.ndarray, other: np.ndarray) -> str:

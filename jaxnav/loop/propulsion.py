@@ -1,6 +1,6 @@
 """Compare the odometer with the throttle, the only check of it while no marker is in view.
 
-    propulsion.add_reading(speed_mps, throttle, gap_s, seeing, disputed)
+    propulsion.add_reading(speed_mps, wanted_mps, gap_s, seeing, disputed)
     propulsion.doubtful, propulsion.off_m
 
 With nominal parameters, a low battery or a slope, the throttle tells the speed within a factor of
@@ -11,8 +11,6 @@ wrong as right: the car may be blocked, or its encoder dead.
 import math
 from dataclasses import dataclass
 
-from jaxnav.models.bicycle import Vehicle
-
 _FACTOR = 2.0  # of speed and of time constant, see above
 _MARGIN_MPS = 0.05  # below it a motor may not turn at all, and `Odometer` allows as much
 DOUBT_M = 0.05  # beyond it nothing is decided any more: the error allowed in a fault-free drive
@@ -21,14 +19,13 @@ _UNTRUE = 10  # excess of contradicting readings with markers in view: then the 
 
 @dataclass
 class Propulsion:
-    """The speed range expected from the throttle, and the odometer's deviation from it.
+    """The speed range of a driven part expected from its command, and the deviation from it.
 
     Attributes:
         off_m: difference of the ways by odometer and by throttle since the last `confirm`, summed
             while they contradict each other.
     """
 
-    speed_per_throttle_mps: float
     time_constant_s: float
     off_m: float = 0.0
     _nominal_mps: float = 0.0
@@ -36,31 +33,24 @@ class Propulsion:
     _most_mps: float = 0.0
     _untrue: int = 0
 
-    @staticmethod
-    def of(vehicle: Vehicle) -> "Propulsion":
-        """The comparison for a vehicle, before any reading."""
-        return Propulsion(
-            float(vehicle.speed_per_throttle_mps), float(vehicle.speed_time_constant_s)
-        )
-
     @property
     def doubtful(self) -> bool:
         """Whether the throttle contradicts the odometer, and nothing has confirmed it since."""
         return self.off_m > DOUBT_M
 
     def add_reading(
-        self, speed_mps: float, throttle: float, gap_s: float, seeing: bool, disputed: bool
+        self, speed_mps: float, wanted_mps: float, gap_s: float, seeing: bool, disputed: bool
     ) -> None:
         """Take a reading that was believed.
 
         Args:
-            throttle: commanded since the reading before.
+            wanted_mps: towards which the command since the reading before drives.
             gap_s: time since then.
             seeing: corners tell the way too.
             disputed: the corners' way differs from the odometer's. Where the two agree, the
                 throttle is wrong: the car is carried, towed, replayed, or not as in its file.
         """
-        target = throttle * self.speed_per_throttle_mps
+        target = wanted_mps
         slow = 1 - math.exp(-gap_s / (_FACTOR * self.time_constant_s))
         least, most = sorted((target / _FACTOR, target * _FACTOR))
         # Brakes and a better motor act at once.

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxnav.loop.chassis import Motion, pace_mps
 from jaxnav.loop.expect import Place
 
 # The corners before and after a motion (x_m, y_m, psi_rad, in the vehicle's earlier axes);
@@ -60,22 +61,25 @@ _AHEAD_NS = 100_000_000  # the newest reading is extrapolated for this long: it 
 
 @dataclass
 class Way:
-    """The vehicle's way of the last 1.5 s by odometry alone, in a frame of its own."""
+    """The vehicle's way of the last 1.5 s by odometry alone, in a frame of its own.
 
-    wheelbase_m: float
+    Attributes:
+        lever_m: of the vehicle's rim; see `Chassis`.
+    """
+
+    lever_m: float = 0.0
     number: int = 0  # of the way: places on different ways can't be compared
     _track: deque[tuple[int, Place]] = field(default_factory=deque)
-    _speed_mps: float = 0.0
-    _steering_rad: float = 0.0
+    _motion: Motion = Motion(0.0, 0.0, 0.0)
 
-    def go(self, stamp_ns: int, speed_mps: float, steering_rad: float) -> None:
-        """Take a reading; a late one is left out, and after a pause a new way begins."""
+    def go(self, stamp_ns: int, motion: Motion) -> None:
+        """Take what a reading tells; a late one is left out, and after a pause a new way begins."""
         if self._track and not 0 < stamp_ns - self._track[-1][0] <= _SILENT_NS:
             if stamp_ns <= self._track[-1][0]:
                 return
             self._track.clear()
             self.number += 1
-        self._speed_mps, self._steering_rad = speed_mps, steering_rad
+        self._motion = motion
         place = self._beyond(stamp_ns) if self._track else (0.0, 0.0, 0.0)
         self._track.append((stamp_ns, place))
         while self._track[0][0] < stamp_ns - _KEPT_NS:
@@ -95,18 +99,21 @@ class Way:
         return x_m, y_m, psi_rad
 
     def _beyond(self, stamp_ns: int) -> Place:
-        """The place extrapolated from the newest reading (see `bicycle.velocity_world`)."""
+        """The place extrapolated from the newest reading, along the chord of an arc."""
         before_ns, (x_m, y_m, psi_rad) = self._track[-1]
-        tangent = math.tan(self._steering_rad)
-        beta_rad = math.atan(tangent / 2)
-        gone_m = self._speed_mps * (stamp_ns - before_ns) / 1e9
-        turned_rad = gone_m * math.cos(beta_rad) * tangent / self.wheelbase_m
-        course_rad = psi_rad + beta_rad + turned_rad / 2
+        forward_mps, left_mps, turn_radps = self._motion
+        gap_s = (stamp_ns - before_ns) / 1e9
+        turned_rad = turn_radps * gap_s
+        c, s = math.cos(psi_rad + turned_rad / 2), math.sin(psi_rad + turned_rad / 2)
         return (
-            x_m + gone_m * math.cos(course_rad),
-            y_m + gone_m * math.sin(course_rad),
+            x_m + (c * forward_mps - s * left_mps) * gap_s,
+            y_m + (s * forward_mps + c * left_mps) * gap_s,
             psi_rad + turned_rad,
         )
+
+    def length_m(self, motion: Place) -> float:
+        """The length of a motion, with that of the rim by its turn."""
+        return math.hypot(motion[0], motion[1]) + self.lever_m * abs(motion[2])
 
 
 def between(place: Place, other: Place) -> Place:
@@ -140,21 +147,20 @@ class Standstill:
     """
 
     way: Way
-    speed_per_throttle_mps: float
     time_constant_s: float
     nothing_moves: bool = False
     _rests: dict[int, _Rest] = field(default_factory=dict)
     _quiet_ns: int | None = None  # stamp of the reading since which the odometer says it stands
     _told_ns: int = 0  # stamp of the last reading, believed or not
     _contradicted_ns: int | None = None  # stamp of the last corners that moved meanwhile
-    _pulled_mps: float = 0.0
+    _pulled_mps: tuple[float, ...] = ()  # speed of each driven part expected from the commands
     _pulled_m: float = 0.0  # expected way since something moved
     _moved_ns: int | None = None  # time when something moved
     _commanded_ns: int | None = None
     _claimed_ns: int | None = None  # time of the last data from any sensor
 
     def add_reading(self, stamp_ns: int, now_ns: int, speed_mps: float) -> bool:
-        """Take any reading; return whether corners move while the odometer says it stands."""
+        """Take the pace of any reading; return whether corners move while it says that it stands."""
         self._claimed_ns = now_ns
         self._told_ns = max(stamp_ns, self._told_ns)
         if abs(speed_mps) >= _RESTS_MPS:
@@ -164,28 +170,34 @@ class Standstill:
         since_ns = self._contradicted_ns
         return since_ns is not None and stamp_ns - since_ns < _PAUSE_NS
 
-    def add_believed(
-        self, stamp_ns: int, now_ns: int, speed_mps: float, steering_rad: float
-    ) -> None:
-        """Take a reading that is believed and not stuck."""
-        self.way.go(stamp_ns, speed_mps, steering_rad)
+    def add_believed(self, stamp_ns: int, now_ns: int, speed_mps: float, motion: Motion) -> None:
+        """Take the pace of a reading that is believed and not stuck, and the motion it tells."""
+        self.way.go(stamp_ns, motion)
         goes_mps = _GOES_MPS
         if not self.nothing_moves:
-            goes_mps = min(goes_mps, _GOES_SHARE * abs(self._pulled_mps))
+            goes_mps = min(goes_mps, _GOES_SHARE * self._pull_mps)
         if abs(speed_mps) >= goes_mps:
             self._moves(now_ns)
 
-    def add_command(self, throttle: float, now_ns: int) -> None:
-        """Take a throttle command, and update the speed and way expected from all commands."""
+    @property
+    def _pull_mps(self) -> float:
+        """The pace expected from all commands."""
+        return pace_mps(self._pulled_mps) if self._pulled_mps else 0.0
+
+    def add_command(self, wanted_mps: tuple[float, ...], now_ns: int) -> None:
+        """Take the speeds that a command wants, and update speed and way expected from them."""
         before_ns = now_ns if self._commanded_ns is None else self._commanded_ns
         self._commanded_ns = now_ns
         gap_s = min(max(now_ns - before_ns, 0), _MAX_GAP_NS) / 1e9
-        target_mps = throttle * self.speed_per_throttle_mps
         done = 1 - math.exp(-gap_s / self.time_constant_s)
-        self._pulled_mps += done * (target_mps - self._pulled_mps)
-        self._pulled_m += abs(self._pulled_mps) * gap_s
+        pulled_mps = self._pulled_mps or (0.0,) * len(wanted_mps)
+        self._pulled_mps = tuple(
+            part + done * (wanted - part)
+            for part, wanted in zip(pulled_mps, wanted_mps, strict=True)
+        )
+        self._pulled_m += self._pull_mps * gap_s
         claims = self._claimed_ns is not None and now_ns - self._claimed_ns < _MAX_GAP_NS
-        if self._moved_ns is None or throttle == 0 or not claims:
+        if self._moved_ns is None or not any(wanted_mps) or not claims:
             self._moved_ns, self._pulled_m = now_ns, 0.0
         if self._pulled_m >= _PULLS_M and now_ns - self._moved_ns >= _PULLS_NS:
             self.nothing_moves = True
@@ -234,7 +246,7 @@ class Standstill:
         if place is None or rest.place is None:
             return False
         motion = between(rest.place, place)
-        if math.hypot(motion[0], motion[1]) < _WAY_M or (quads_px := due(motion)) is None:
+        if self.way.length_m(motion) < _WAY_M or (quads_px := due(motion)) is None:
             return False
         due_px = (quads_px[1] - quads_px[0])[camera][both]
         rest.doubts = rest.doubts + 1 if _withheld(due_px, seen_px, sigma_px) else 0
@@ -251,7 +263,7 @@ class Standstill:
         now.moving_ns = before.moving_ns if goes_on else before.stamp_ns
         if self._quiet_ns is not None and now.stamp_ns < self._told_ns + _SLOW_NS:
             since_ns = max(now.moving_ns, self._quiet_ns + _SLOW_NS)
-            pulled = abs(self._pulled_mps) >= _GOES_MPS
+            pulled = self._pull_mps >= _GOES_MPS
             if (
                 now.moves >= (_PULLED_MOVES if pulled else _MOVES)
                 and now.stamp_ns - since_ns >= _MOVES_NS

@@ -1,7 +1,7 @@
 """Check what supports an estimate, and so decide whether to act on it.
 
     # With each reading:
-    support.add_odometry(speed_mps, steering_rad, heading_rad, gap_s, throttle, seeing)
+    support.add_odometry(driven_mps, motion, heading_rad, gap_s, wanted_mps, seeing)
     is_fix = support.add_corners(accepted, agrees, now_ns, fix, possible)  # with every frame
     support.doubt(contradicted)
 
@@ -14,10 +14,10 @@ copy of the marker elsewhere looks like the marker.
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from jaxnav.loop.chassis import Chassis, Motion, pace_mps
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.propulsion import Propulsion
 from jaxnav.loop.ways import Fix, Ways
-from jaxnav.models.bicycle import Vehicle
 
 CONFIRMED = 2  # frames in a row, with the first: a single one never confirms
 # Way driven slowly after a relocation, so that a person can look at the car: about five seconds at
@@ -43,15 +43,15 @@ class Support:
         relocations: number of relocations so far.
     """
 
-    def __init__(self, vehicle: Vehicle, relocate: bool = True):
+    def __init__(self, chassis: Chassis, relocate: bool = True):
         """Args:
         relocate: whether to believe, after a while, a pose that no slip explains.
         """
         self.refused = False
         self.relocations = 0
         self._relocate = relocate
-        self._ways = Ways(float(vehicle.wheelbase_m))
-        self._propulsion = Propulsion.of(vehicle)
+        self._ways = Ways(chassis.slides_m)
+        self._propulsions = [Propulsion(chassis.time_constant_s) for _ in chassis.tops_mps]
         self._confirmations, self._needed = 0, CONFIRMED
         self._restarted = False
         self._slow_until_m = 0.0
@@ -72,27 +72,30 @@ class Support:
         faults = Fault.RELOCATED if self.relocated else _NO_FAULT
         if self._ways.disputed:
             faults |= Fault.WAYS_DISPUTED
-        if self._propulsion.doubtful:
+        if self._doubtful:
             faults |= Fault.ODOMETRY_DOUBTFUL
         return faults
 
     def add_odometry(
         self,
-        speed_mps: float,
-        steering_rad: float,
+        driven_mps: tuple[float, ...],
+        motion: Motion,
         heading_rad: float,
         gap_s: float,
-        throttle: float | None,
+        wanted_mps: tuple[float, ...] | None,
         seeing: bool,
     ) -> None:
         """Take a reading of the odometer that was believed; see `Ways` and `Propulsion`.
 
         Args:
-            throttle: None where somebody else commands it: it contradicts nothing.
+            driven_mps, motion: that it tells; see `Chassis`.
+            wanted_mps: None where somebody else commands them: they contradict nothing.
         """
-        self._ways.add_odometry(speed_mps, steering_rad, heading_rad, gap_s)
-        if throttle is not None:
-            self._propulsion.add_reading(speed_mps, throttle, gap_s, seeing, self._ways.disputed)
+        self._ways.add_odometry(motion, pace_mps(driven_mps), heading_rad, gap_s)
+        if wanted_mps is not None:
+            parts = zip(self._propulsions, driven_mps, wanted_mps, strict=True)
+            for propulsion, speed_mps, part_mps in parts:
+                propulsion.add_reading(speed_mps, part_mps, gap_s, seeing, self._ways.disputed)
 
     def note_restart(self) -> None:
         """The filter has restarted: confirm the pose anew, and check it against the last fix."""
@@ -130,7 +133,7 @@ class Support:
         self._confirmations += agrees
         if not self.confirmed:
             return False
-        slack_m = self._propulsion.off_m
+        slack_m = self._off_m
         if fix is None:
             if self._restarted and not self._relocate:
                 self.refused = all(self._ways.out_of_reach(one, slack_m) for one in possible())
@@ -143,7 +146,8 @@ class Support:
             self._slow_until_m = self._ways.way_m + SLOW_M
             self._ways.forget()
         self._restarted = self.refused = False
-        self._propulsion.confirm()
+        for propulsion in self._propulsions:
+            propulsion.confirm()
         self._ways.add_fix(now_ns, fix)
         return True
 
@@ -153,9 +157,19 @@ class Support:
         Args:
             contradicted: the corners contradict it more often than not.
         """
-        doubtful = self._propulsion.doubtful
-        off_m = self._propulsion.off_m if doubtful else 0.0
+        doubtful = self._doubtful
+        off_m = self._off_m if doubtful else 0.0
         if contradicted or self.refused:
             off_m += self._ways.since_fix_m
         is_doubted = not self.confirmed or self.refused or contradicted or doubtful
         return Doubt(is_doubted, off_m)
+
+    @property
+    def _doubtful(self) -> bool:
+        """Whether the command of any driven part contradicts the odometer; see `Propulsion`."""
+        return any(propulsion.doubtful for propulsion in self._propulsions)
+
+    @property
+    def _off_m(self) -> float:
+        """By how much the odometer contradicts the commands, of all driven parts together."""
+        return sum(propulsion.off_m for propulsion in self._propulsions)

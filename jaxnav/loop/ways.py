@@ -1,6 +1,6 @@
 """Compare the vehicle's way by the corners with its way by the odometer.
 
-    ways.add_odometry(speed_mps, steering_rad, heading_rad, gap_s)  # with every odometry
+    ways.add_odometry(motion, pace_mps, heading_rad, gap_s)   # with every odometry
     ways.note_corners(now_ns)                             # with every frame that shows markers
     ways.add_fix(now_ns, fix)                             # with every pose to be trusted
     ways.out_of_reach(fix)                                # before that
@@ -21,6 +21,8 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 from typing import NamedTuple
+
+from jaxnav.loop.chassis import Motion
 
 # Error of the corners themselves while the car goes round a marker, with cameras off by 1 deg or
 # 2 %. It is also how near a car that was carried off must come.
@@ -63,12 +65,13 @@ class Ways:
     """The ways of one drive by corners and by odometer.
 
     Attributes:
-        wheelbase_m: of the vehicle.
+        slides_m: of the vehicle; see `Chassis`.
         disputed: the two ways differ.
-        way_m: length by odometry, forwards or backwards, since the drive began.
+        way_m: length by odometry, forwards or backwards, since the drive began; with that of the
+            rim of what turns on the spot.
     """
 
-    wheelbase_m: float
+    slides_m: float
     disputed: bool = False
     way_m: float = 0.0
     _turned_rad: float = 0.0  # sum of turns in both directions
@@ -79,9 +82,9 @@ class Ways:
     _window: deque[_Anchor] = field(default_factory=deque)
 
     def add_odometry(
-        self, speed_mps: float, steering_rad: float, heading_rad: float, gap_s: float
+        self, motion: Motion, pace_mps: float, heading_rad: float, gap_s: float
     ) -> None:
-        """Take a reading of the odometer.
+        """Take a reading of the odometer: the motion that it tells, and its pace.
 
         Args:
             heading_rad: the estimated heading, so that a steering sensor's offset does not add up.
@@ -90,14 +93,11 @@ class Ways:
         if gap_s > _SILENT_S:
             self._window.clear()
             self.disputed = False
-        step_m = speed_mps * gap_s
-        # Eqs. 4 to 7 of the paper, see `bicycle.velocity_world`.
-        beta_rad = math.atan(math.tan(steering_rad) / 2)
-        course_rad = heading_rad + beta_rad
-        self._x_m += step_m * math.cos(course_rad)
-        self._y_m += step_m * math.sin(course_rad)
-        self.way_m += abs(step_m)
-        self._turned_rad += abs(step_m * math.sin(beta_rad)) * 2 / self.wheelbase_m
+        c, s = math.cos(heading_rad), math.sin(heading_rad)
+        self._x_m += (c * motion.forward_mps - s * motion.left_mps) * gap_s
+        self._y_m += (s * motion.forward_mps + c * motion.left_mps) * gap_s
+        self.way_m += pace_mps * gap_s
+        self._turned_rad += abs(motion.turn_radps) * gap_s
 
     def note_corners(self, now_ns: int) -> None:
         """Note that corners were seen, believed or not."""
@@ -142,8 +142,7 @@ class Ways:
         way_m, turned_rad = self.way_m - self._last.way_m, self._turned_rad - self._last.turned_rad
         off_m = math.hypot(fix.x_m - before.x_m, fix.y_m - before.y_m)
         off_rad = abs(math.remainder(fix.psi_rad - before.psi_rad, math.tau))
-        # Sliding about one axle, a car turns by way / wheelbase.
-        sliding_rad = (way_m + slack_m) / self.wheelbase_m
+        sliding_rad = (way_m + slack_m) / self.slides_m
         return off_m > DRIFT_M + way_m + slack_m + _SIGMAS * (
             before.sigma_m + fix.sigma_m
         ) or off_rad > REACH_RAD + turned_rad + sliding_rad + _SIGMAS * (

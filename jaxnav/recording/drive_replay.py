@@ -137,7 +137,7 @@ def first_difference(log: DriveLog, outcomes: Iterable[Outcome]) -> Difference |
 
 def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: float) -> str | None:
     def pair(name: str) -> tuple[Any, Any]:
-        return getattr(recorded, name)[index], COLUMNS[name].value(outcome)
+        return getattr(recorded, name)[index], COLUMNS[name].compared(outcome)
 
     for name in _EXACT:
         before, now = pair(name)

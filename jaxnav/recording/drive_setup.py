@@ -41,7 +41,8 @@ from jaxnav.files.validation import (
     at,
     validate,
 )
-from jaxnav.files.vehicles import VehicleFile, vehicle_data
+from jaxnav.files.bases import BaseFile
+from jaxnav.files.vehicles import VehicleFile, is_base_file, vehicle_data
 from jaxnav.loop.estimator import advance_packed
 from jaxnav.loop.health import Timeouts
 from jaxnav.loop.pilot import Pilot
@@ -49,6 +50,7 @@ from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import ZERO
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.recording.message_fields import Flag
 
@@ -116,6 +118,12 @@ class SetupEntry(Entry):
         return selector
 
 
+class BaseSetupEntry(SetupEntry):
+    """The header of a drive of a base that is driven by a twist."""
+
+    vehicle: BaseFile  # type: ignore[assignment]
+
+
 @dataclass(frozen=True, eq=False)
 class DriveSetup:
     """The setup of a drive.
@@ -133,7 +141,7 @@ class DriveSetup:
 
     rig: CameraRig
     markers: MarkerMap
-    vehicle: Vehicle
+    vehicle: Vehicle | TwistBase
     route: Route
     selector: str = "multi-hypothesis"
     corner_sigma_px: float | None = None
@@ -273,4 +281,6 @@ def _checked(header: dict[str, Any], where: Path) -> SetupEntry:
     if isinstance(setup_version, int) and setup_version != SETUP_VERSION:
         problem = f"this program reads {SETUP_VERSION}, the file has {setup_version}"
         raise BadInput(at(where, "header.setup_version"), problem)
-    return validate(SetupEntry, header, where, "header")
+    vehicle = header.get("vehicle")
+    of_base = isinstance(vehicle, dict) and is_base_file(vehicle)
+    return validate(BaseSetupEntry if of_base else SetupEntry, header, where, "header")

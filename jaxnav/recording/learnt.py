@@ -1,4 +1,4 @@
-"""The errors of a car's sensors and cameras that its bank has learnt, in units that a file has."""
+"""The errors of a vehicle's sensors and cameras that its bank has learnt, in a file's units."""
 
 from dataclasses import dataclass
 
@@ -12,6 +12,7 @@ from jaxnav.belief.sensor_errors import LEARNT, SENSORS_END
 from jaxnav.files import poses
 from jaxnav.models.bicycle import SENSOR_ERRORS, Vehicle
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TWIST_ERRORS, TwistBase
 
 _SURE = 3.0  # an error of less than so many of its sigmas is not worth a word
 _CONTRADICTS = 3.0  # an error of more sigmas of its file is more than that allows for
@@ -27,10 +28,10 @@ _WORDS = (
 def errors_of(
     bank: Bank,
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """The errors that the heaviest hypothesis of a car keeps, and their sigmas.
+    """The errors that the heaviest hypothesis of a vehicle keeps, and their sigmas.
 
-    (k, g, o, tau) of `sensor_errors`, then three turns a camera in units of their prior's sigma.
-    Empty where the bank keeps none.
+    (k, g, o, tau) of `sensor_errors`, then three turns a camera in units of their prior's sigma,
+    then the bias of a gyro, rad/s, where there is one. Empty where the bank keeps none.
 
     Args:
         bank: of NumPy, with its leading axis (K,).
@@ -56,10 +57,17 @@ def as_filed(
 ) -> tuple[Float[np.ndarray, " sensors"], Float[np.ndarray, " turns"]]:
     """The errors against the files: those of the sensors, and three turns a camera.
 
-    The filter keeps the turn that takes a camera back to where its file has it.
+    The filter keeps the turn that takes a camera back to where its file has it. A gyro's bias is
+    left out.
     """
     of_sensors = SENSORS_END - LEARNT
-    return errors[:of_sensors], -errors[of_sensors:]
+    of_cameras = (len(errors) - of_sensors) // EACH * EACH
+    return errors[:of_sensors], -errors[of_sensors : of_sensors + of_cameras]
+
+
+def sensor_errors(vehicle: Vehicle | TwistBase) -> tuple[str, ...]:
+    """The names of the errors of a vehicle's sensors, in their order."""
+    return TWIST_ERRORS if isinstance(vehicle, TwistBase) else SENSOR_ERRORS
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,8 @@ class Learnt:
     """What a drive has taught of the errors that repeat, beside what the files had said.
 
     Attributes:
-        sensors: (4,) by which the `SENSOR_ERRORS` of the vehicle's file are to be corrected.
+        sensors: (4,) errors of the vehicle's sensors, by which a car's file is to be corrected.
+        sensor_names: what they are called; see `sensor_errors`.
         turns_rad: (C, 3) by which each camera is turned, against the rig's file, about the
             vehicle's axes x, y, z.
         sensors_sigma, turns_sigma_rad: standard deviations now.
@@ -82,20 +91,22 @@ class Learnt:
     turns_sigma_rad: Float[np.ndarray, "C 3"]
     turns_prior_rad: Float[np.ndarray, "C 3"]
     rig: CameraRig
+    sensor_names: tuple[str, ...] = SENSOR_ERRORS
 
     @staticmethod
     def of(
         errors: Float[np.ndarray, " e"],
         sigma: Float[np.ndarray, " e"],
         rig: CameraRig,
-        vehicle: Vehicle,
+        vehicle: Vehicle | TwistBase,
     ) -> "Learnt | None":
         """What `errors_of` a bank says for this rig and vehicle; None if the bank keeps none."""
         if not errors.size:
             return None
         cameras = len(rig)
         sensors, turned = as_filed(errors)
-        sensors_sigma, turned_sigma = sigma[: len(sensors)], sigma[len(sensors) :]
+        sensors_sigma = sigma[: len(sensors)]
+        turned_sigma = sigma[len(sensors) : len(sensors) + len(turned)]
         exact = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma)
         prior = np.zeros((cameras, 3))
         turns, turns_sigma = np.zeros((2, cameras, 3))
@@ -104,7 +115,7 @@ class Learnt:
             turns = turned.reshape(cameras, EACH) * prior
             turns_sigma = turned_sigma.reshape(cameras, EACH) * prior
         of_sensors = sensors, sensors_sigma, exact.astype(float)
-        return Learnt(*of_sensors, turns, turns_sigma, prior, rig)
+        return Learnt(*of_sensors, turns, turns_sigma, prior, rig, sensor_errors(vehicle))
 
     def sentences(self) -> list[str]:
         """An error a line, of those that the drive has told apart from none."""
@@ -127,7 +138,8 @@ class Learnt:
                     told = does.format(f"{turn_deg:.2f} deg")
                     told = f"camera {name} {told} (sigma {sigma_deg:.2f})"
                     sentences[name, does] = told + _contradiction(turns[axis], priors[axis])
-        rows = zip(SENSOR_ERRORS, self.sensors, self.sensors_sigma, self.sensors_prior, strict=True)
+        of_sensors = self.sensors, self.sensors_sigma, self.sensors_prior
+        rows = zip(self.sensor_names, *of_sensors, strict=True)
         for name, value, sigma, prior in rows:
             if _is_learnt(value, sigma, prior):
                 told = f"{name} is off by {value:+.4f} (sigma {sigma:.4f})"

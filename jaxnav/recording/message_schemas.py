@@ -1,13 +1,15 @@
 """The messages of a recorded drive: one model of each gives its JSON schema and its check.
 
     topic       schema              one for
-    /odometry   jaxnav.Odometry     a reading of the odometer, as it was read
+    /odometry   jaxnav.Odometry     a reading of a car's odometer, as it was read
+    /twist      jaxnav.Twist        a reading of another base's odometer
     /frames     jaxnav.Frames       what cameras saw at one instant
     /tick       jaxnav.Tick         an input without data
     /outcome    jaxnav.Outcome      what the pilot made of an input
     of images   foxglove.CompressedImage
 
-The first three are the pilot's inputs, in the order in which it handled them.
+The first four are the pilot's inputs, in the order in which it handled them. Each may hold what a
+gyro has told since the one before.
 """
 
 import json
@@ -32,7 +34,7 @@ from jaxnav.recording.message_fields import (
 )
 from jaxnav.recording.outcomes import OUTCOME_MESSAGE, OutcomeMessage
 
-ODOMETRY, FRAMES, TICK, OUTCOME = "/odometry", "/frames", "/tick", "/outcome"
+ODOMETRY, TWIST, FRAMES, TICK, OUTCOME = "/odometry", "/twist", "/frames", "/tick", "/outcome"
 IMAGE_SCHEMA = "foxglove.CompressedImage"
 
 
@@ -61,31 +63,60 @@ class SightedMessage(Entry):
         return self
 
 
-class OdometryMessage(Entry):
-    """An `Input` with `Odometry`, and with the frames that showed nothing."""
+class GyroMessage(Entry):
+    """A `GyroReading`."""
+
+    stamp_ns: Stamp
+    turn_radps: Real
+
+
+class InputMessage(Entry):
+    """What all inputs have."""
 
     now_ns: Now
+    faults: Faults
+    gyro: list[GyroMessage] = Field(default_factory=list, max_length=limits.IN_VIEW)
+
+
+class OdometryMessage(InputMessage):
+    """An `Input` with `Odometry`, and with the frames that showed nothing."""
+
     stamp_ns: Stamp
     speed_mps: Real
     steering_rad: Real
     valid: Flag
-    faults: Faults
     frames: list[SightedMessage] = Field(default_factory=list)
 
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The values of the reading."""
+        return self.speed_mps, self.steering_rad
 
-class FramesMessage(Entry):
+
+class TwistMessage(InputMessage):
+    """An `Input` with `TwistOdometry`, and with the frames that showed nothing."""
+
+    stamp_ns: Stamp
+    forward_mps: Real
+    left_mps: Real
+    turn_radps: Real
+    valid: Flag
+    frames: list[SightedMessage] = Field(default_factory=list)
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The values of the reading."""
+        return self.forward_mps, self.left_mps, self.turn_radps
+
+
+class FramesMessage(InputMessage):
     """An `Input` of frames that were handled together."""
 
-    now_ns: Now
     frames: Annotated[list[SightedMessage], Field(min_length=1)]
-    faults: Faults
 
 
-class TickMessage(Entry):
-    """An `Input` without data."""
-
-    now_ns: Now
-    faults: Faults
+class TickMessage(InputMessage):
+    """An `Input` without odometry and frames."""
 
 
 class TimeMessage(Entry):
@@ -104,11 +135,13 @@ class ImageMessage(Entry):
     format: Word
 
 
-AnyMessage = OdometryMessage | FramesMessage | TickMessage | OutcomeMessage
+AnyInputMessage = OdometryMessage | TwistMessage | FramesMessage | TickMessage
+AnyMessage = AnyInputMessage | OutcomeMessage
 
 # topic -> the name of its schema and its model
 MESSAGES: dict[str, tuple[str, type[AnyMessage]]] = {
     ODOMETRY: ("jaxnav.Odometry", OdometryMessage),
+    TWIST: ("jaxnav.Twist", TwistMessage),
     FRAMES: ("jaxnav.Frames", FramesMessage),
     TICK: ("jaxnav.Tick", TickMessage),
     OUTCOME: ("jaxnav.Outcome", OUTCOME_MESSAGE),

@@ -13,17 +13,19 @@ import jax
 from jaxnav.detection.types import Detections
 from jaxnav.files.ranges import RANGES
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.interfaces import GyroReading, Odometry, reading_of
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.recording.message_fields import Rows
 from jaxnav.recording.message_schemas import (
     FRAMES,
     ODOMETRY,
     TICK,
-    FramesMessage,
+    TWIST,
+    AnyInputMessage,
     OdometryMessage,
     SightedMessage,
     TickMessage,
+    TwistMessage,
 )
 
 # `Stamps` refuses a stamp outside of this range; it refuses the clamped one in the recording too.
@@ -36,26 +38,32 @@ def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
     message: dict[str, Any] = {"now_ns": given.now_ns, "faults": given.faults}
     if given.frames:
         message["frames"] = [_sighted_message(frame) for frame in given.frames]
+    if given.gyro:
+        message["gyro"] = [_gyro_message(one) for one in given.gyro]
     if given.odometry is None:
         topic, stamp_ns = (FRAMES, given.frames[0].stamp_ns) if given.frames else (TICK, None)
         return topic, given.now_ns if stamp_ns is None else stamp_ns, message
     reading = given.odometry
-    message |= {
-        "stamp_ns": _recordable(reading.stamp_ns),
-        "speed_mps": float(reading.speed_mps),
-        "steering_rad": float(reading.steering_rad),
-        "valid": bool(reading.valid),
-    }
-    return ODOMETRY, reading.stamp_ns, message
+    of_car = isinstance(reading, Odometry)
+    names = ("speed_mps", "steering_rad") if of_car else ("forward_mps", "left_mps", "turn_radps")
+    message["stamp_ns"] = _recordable(reading.stamp_ns)
+    message |= zip(names, map(float, reading.values), strict=True)
+    message["valid"] = bool(reading.valid)
+    return ODOMETRY if of_car else TWIST, reading.stamp_ns, message
 
 
-def input_of(message: OdometryMessage | FramesMessage | TickMessage) -> Input:
+def input_of(message: AnyInputMessage) -> Input:
     """The input of a message."""
     reading = None
-    if isinstance(message, OdometryMessage):
-        reading = Odometry(message.stamp_ns, message.speed_mps, message.steering_rad, message.valid)
+    if isinstance(message, OdometryMessage | TwistMessage):
+        reading = reading_of(message.stamp_ns, message.values, message.valid)
     frames = () if isinstance(message, TickMessage) else tuple(map(_sighted, message.frames))
-    return Input(message.now_ns, reading, frames, message.faults)
+    gyro = tuple(GyroReading(one.stamp_ns, one.turn_radps) for one in message.gyro)
+    return Input(message.now_ns, reading, frames, message.faults, gyro)
+
+
+def _gyro_message(reading: GyroReading) -> dict[str, Any]:
+    return {"stamp_ns": _recordable(reading.stamp_ns), "turn_radps": float(reading.turn_radps)}
 
 
 def _sighted_message(frame: FrameDetections) -> dict[str, Any]:
@@ -96,5 +104,6 @@ def digest(outcome: Outcome) -> str:
     state = hashlib.blake2b(digest_size=8)
     for leaf in jax.tree.leaves(numbers):
         state.update(leaf.tobytes())
-    state.update(struct.pack("<2d", outcome.steering_rad, outcome.throttle))
+    command = outcome.command
+    state.update(struct.pack(f"<{len(command)}d", *command))
     return state.hexdigest()

@@ -68,6 +68,11 @@ class Column:
         value = self.of(outcome)
         return value.values if isinstance(value, Rows) else value
 
+    def compared(self, outcome: Outcome) -> Any:
+        """The value of the pilot's outcome, as a row of the column has it."""
+        value = self.value(outcome)
+        return np.full(self.shape, self.missing) if value is None else value
+
     def column(
         self, values: Sequence[Any], where: str
     ) -> Shaped[np.ndarray, "..."] | tuple[Any, ...]:
@@ -178,7 +183,7 @@ class Outcomes:
     Attributes:
         now_ns, stamp_ns: (N,), time of each outcome, timestamp of the data that was fused.
         health, faults, rejects: (N,), values of `Health`, `Fault` and `Reject`.
-        steering_rad, throttle: (N,), the command, within the limits.
+        steering_rad, throttle: (N,), the command, within the limits; 0 of a base that is no car.
         restarts, reason: how many so far, and the reason of the last one.
         digest: of the pilot's state, to compare a replay with; "" where none was taken.
         pose: (N, 3), x_m y_m psi_rad.
@@ -186,11 +191,13 @@ class Outcomes:
         hypotheses, log_weight: N arrays, (K, 3) and (K,), of the hypotheses alive.
         Ts_vehicle_world, costs: N arrays, (M, 7) wxyz_xyz and (M,), of the valid candidates.
         selected: (N,) int, index of the selected candidate.
-        errors, errors_sigma: (N, e), of sensors and cameras, see `jaxnav.recording.learnt`; older
-            drives have none.
+        errors, errors_sigma: (N, e), of sensors, cameras and gyro, see `jaxnav.recording.learnt`;
+            older drives have none.
         outvoted: N lists, ids of markers that others have voted against; older drives have none.
         outvoted_cameras: N lists, names of cameras that were left out; older drives have none.
         repeated_share: (N,), of the corners' variance that repeats; NaN in older drives.
+        twist: (N, 3), the command forward_mps, left_mps, turn_radps, within the limits; NaN of a
+            car.
     """
 
     now_ns: Annotated[Int[np.ndarray, " N"], _field(Now, "now_ns", np.int64)]
@@ -247,6 +254,13 @@ class Outcomes:
         Float[np.ndarray, " N"],
         _field(Real, lambda one: repeated_share(one.belief), float, default=None, missing=np.nan),
     ]
+    twist: Annotated[
+        Float[np.ndarray, "N 3"],
+        _field(
+            Annotated[np.ndarray, Array("number", (3,))], "twist", float,
+            shape=(3,), default=None, missing=np.nan, slack=1,
+        ),
+    ]  # fmt: skip
 
     @cached_property
     def times_s(self) -> Float[np.ndarray, " N"]:

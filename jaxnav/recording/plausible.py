@@ -23,6 +23,7 @@ def keep_plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
     posed = _all(is_within("pose", outcomes.pose))
     commanded = np.stack([outcomes.steering_rad, outcomes.throttle], axis=1)
     odd = (outcomes.located & ~posed) | ~(np.abs(commanded) <= _MOST).all(axis=1)
+    odd |= (np.abs(outcomes.twist) > _MOST).any(axis=1)
     spread = _all(np.abs(outcomes.covariance).reshape(len(posed), -1) <= _MOST**2)
     odd |= outcomes.located & ~spread
     hypotheses, log_weight = _paired(outcomes.hypotheses, outcomes.log_weight)
@@ -37,6 +38,7 @@ def keep_plausible(outcomes: Outcomes) -> tuple[Outcomes, int]:
         covariance=np.where(spread[:, None, None], outcomes.covariance, np.nan),
         steering_rad=_tame(outcomes.steering_rad),
         throttle=_tame(outcomes.throttle),
+        twist=_tame(outcomes.twist),
         nis=_tame(outcomes.nis),
         hypotheses=_kept(hypotheses, banks),
         log_weight=_kept(log_weight, banks),

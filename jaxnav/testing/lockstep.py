@@ -1,4 +1,4 @@
-"""Drive the simulated car event by event, without threads, as fast as the machine can.
+"""Drive the simulated vehicle event by event, without threads, as fast as the machine can.
 
 Data may be changed on their way to the pilot: that is how faults are tried.
 """
@@ -14,7 +14,6 @@ from jaxtyping import Float
 from jaxnav.loop.camera_delays import CameraDelays
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.vehicles.world import SimWorld
 
@@ -33,11 +32,11 @@ class Rates:
 
 @dataclass(frozen=True)
 class Step:
-    """One event, the pilot's outcome, and the truth: x_m y_m psi_rad speed steering."""
+    """One event, the pilot's outcome, and the truth as `SimWorld.state` has it."""
 
     input: Input
     outcome: Outcome
-    truth: Float[np.ndarray, " 5"]
+    truth: Float[np.ndarray, " n"]
 
 
 # An input -> the inputs that reach the pilot instead, each at its own time, not before.
@@ -81,7 +80,7 @@ def drive(
             delays.add_outcome(outcome)
             while delays.due:
                 delays.solve()
-        world.write(outcome.steering_rad, outcome.throttle, given.now_ns)
+        world.write(*outcome.command, given.now_ns)
         yield Step(given, outcome, world.state(given.now_ns))
 
 
@@ -106,7 +105,7 @@ def _inputs(
         def made(now_ns: int = now_ns, number: int = number) -> Input:
             happens(now_ns, world)
             if number < 0:
-                return Input(now_ns, Odometry(now_ns, *world.odometry(now_ns)))
+                return Input(now_ns, world.reading(now_ns), gyro=world.gyro(now_ns))
             stamp_ns = now_ns - delay_ns
             detections = world.detections(stamp_ns)
             return Input(

@@ -1,4 +1,4 @@
-"""Run the simulated car in real time: a vehicle and cameras like any other.
+"""Run the simulated vehicle in real time: a vehicle and cameras like any other.
 
 jaxnav run --car sim                           # cameras that detect markers themselves
 jaxnav run --car sim --option images=true      # rendered images
@@ -7,12 +7,14 @@ jaxnav run --car sim --option images=true      # rendered images
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from jaxnav.errors import BadInput
 from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.interfaces import Camera, Frame, Odometry, Setup, Vehicle
+from jaxnav.loop.interfaces import AnyVehicle, Camera, Frame, GyroReading, Odometry, Setup
+from jaxnav.loop.limits import limits_of
 from jaxnav.vehicles.options import choice, number
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
 from jaxnav.vehicles.world import SimWorld, WorldSettings
@@ -21,7 +23,7 @@ _LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are
 
 
 class SimVehicle:
-    """The car of a `SimWorld`, which stops by itself without commands.
+    """The car or other base of a `SimWorld`, which stops by itself without commands.
 
     Its odometer, servo and stamps have the errors in the vehicle's description.
     """
@@ -32,24 +34,31 @@ class SimVehicle:
         self._corrections = Corrections.of(world.vehicle)
         self._closed = False
 
-    def read(self) -> Odometry:
-        """See `Vehicle`."""
+    def read(self) -> Any:
+        """See `Vehicle` and `TwistVehicle`."""
         if self._closed:
             raise OSError("the vehicle is closed")
-        now_ns = time.monotonic_ns()
-        stamp_ns = now_ns + self._corrections.reading_late_ns
-        return Odometry(stamp_ns, *self._corrections.read(*self.world.odometry(now_ns)))
+        reading = self.world.reading(time.monotonic_ns())
+        if not isinstance(reading, Odometry):
+            return reading
+        stamp_ns = reading.stamp_ns + self._corrections.reading_late_ns
+        return Odometry(stamp_ns, *self._corrections.read(*reading.values))
 
-    def write(self, steering_rad: float, throttle: float) -> None:
-        """See `Vehicle`."""
+    def read_gyro(self) -> tuple[GyroReading, ...]:
+        """See `HasGyro`."""
+        return self.world.gyro(time.monotonic_ns())
+
+    def write(self, *command: float) -> None:
+        """See `Vehicle` and `TwistVehicle`."""
         if self._closed:
             raise OSError("the vehicle is closed")
-        true_rad = self._corrections.true_rad(steering_rad)
-        self.world.write(true_rad, throttle, time.monotonic_ns())
+        if len(command) == 2:
+            command = self._corrections.true_rad(command[0]), command[1]
+        self.world.write(*command, time.monotonic_ns())
 
     def stop(self) -> None:
-        """See `Vehicle`."""
-        self.world.write(0.0, 0.0, time.monotonic_ns())
+        """See `Vehicle` and `TwistVehicle`."""
+        self.world.write(*limits_of(self.world.vehicle).zero, time.monotonic_ns())
 
     def close(self) -> None:
         """See `Vehicle`."""
@@ -139,7 +148,7 @@ class SimCamera:
 
 
 def open_vehicle(setup: Setup) -> SimVehicle:
-    """Open the simulated car at the start of its route.
+    """Open the simulated vehicle at the start of its route.
 
     Options: corner_sigma_px (0.3).
     """
@@ -158,8 +167,8 @@ def open_vehicle(setup: Setup) -> SimVehicle:
 setattr(open_vehicle, "shares_process", True)  # noqa: B010  (mypy: a function has no such field)
 
 
-def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
-    """Open the cameras of the simulated car, or of any vehicle that has a `world: SimWorld`.
+def open_cameras(setup: Setup, vehicle: AnyVehicle) -> Sequence[Camera]:
+    """Open the cameras of the simulated vehicle, or of any vehicle that has a `world: SimWorld`.
 
     Options: rate_hz (30), images (false).
     """

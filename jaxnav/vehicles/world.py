@@ -1,5 +1,6 @@
-"""Simulate a car in its world at any instant of real time or of a test's time."""
+"""Simulate a car or another base in its world at any instant of real time or of a test's time."""
 
+import math
 import threading
 from collections import deque
 from dataclasses import dataclass, field
@@ -14,20 +15,30 @@ from jaxtyping import Float
 from jaxnav.compiling.executables import kept
 from jaxnav.control import Command
 from jaxnav.detection.types import Detections
+from jaxnav.loop.interfaces import GyroReading, Reading, reading_of
 from jaxnav.models.bicycle import Vehicle as VehicleModel
 from jaxnav.models.geometry import T_world_vehicle_from_planar
+from jaxnav.models.gyro import Gyro
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.simulation.corners import see
-from jaxnav.simulation.plant import CarState, OdometryNoise, move
+from jaxnav.simulation.plant import BaseState, CarState, OdometryNoise, move
+from jaxnav.twist_control import TwistCommand
 
 _SUBSTEP_NS = 5_000_000
+_GYRO_NS = 10_000_000  # period of the gyro
 _KEPT = 400  # substeps: two seconds into the past
 
 
 @kept
-def _moved(vehicle: VehicleModel, row: jax.Array, command: jax.Array, dt_s: jax.Array) -> jax.Array:
-    """`move` on plain arrays: (x_m, y_m, psi_rad, speed_mps, steering_rad)."""
+def _moved(
+    vehicle: VehicleModel | TwistBase, row: jax.Array, command: jax.Array, dt_s: jax.Array
+) -> jax.Array:
+    """`move` on plain arrays: x_m, y_m, psi_rad, then speed_mps and steering_rad or a twist."""
+    if isinstance(vehicle, TwistBase):
+        base = move(vehicle, BaseState(row[:3], row[3:]), TwistCommand(*command), dt_s)
+        return jnp.concatenate([base.pose, base.twist])
     car = CarState(row[:3], row[3], row[4])
     car = move(vehicle, car, Command(command[0], command[1]), dt_s)
     return jnp.concatenate([car.pose, jnp.stack([car.speed_mps, car.steering_rad])])
@@ -40,7 +51,7 @@ def _seen(rig: CameraRig, markers: MarkerMap, pose: jax.Array) -> tuple[jax.Arra
 
 @dataclass(frozen=True)
 class WorldSettings:
-    """The noise, delay and timeout of the simulated car."""
+    """The noise, delay and timeout of the simulated vehicle."""
 
     corner_sigma_px: float = 0.3
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
@@ -49,47 +60,60 @@ class WorldSettings:
 
 
 class SimWorld:
-    """The simulated car and its track of the last two seconds. Thread-safe."""
+    """The simulated vehicle and its track of the last two seconds. Thread-safe.
+
+    Its gyro, where its description has one, has the errors that this allows for, drawn once.
+    """
 
     def __init__(
         self,
         rig: CameraRig,
         markers: MarkerMap,
-        vehicle: VehicleModel,
+        vehicle: VehicleModel | TwistBase,
         start_pose: tuple[float, float, float],
         begin_ns: int,
         settings: WorldSettings | None = None,
         seed: int = 0,
     ):
-        """Place the car at rest at its start."""
+        """Place the vehicle at rest at its start."""
         self.rig, self.markers, self.vehicle = rig, markers, vehicle
         self.settings = settings or WorldSettings()
         self.rng = np.random.default_rng(seed)
         self._lock = threading.Lock()
-        self._dtype = np.asarray(vehicle.wheelbase_m).dtype
-        self._row = np.array([*start_pose, 0.0, 0.0], self._dtype)
+        turns = isinstance(vehicle, TwistBase)
+        rest = (0.0,) * (3 if turns else 2)  # also as a command
+        self._dtype = np.asarray(vehicle.time_constant_s if turns else vehicle.wheelbase_m).dtype
+        self._row = np.array([*start_pose, *rest], self._dtype)
         self._time_ns = begin_ns
         self._track: deque[tuple[int, np.ndarray]] = deque([(begin_ns, self._row)], maxlen=_KEPT)
         # Commands and the times at which they act: the last one that is due is obeyed.
-        self._commands: deque[tuple[int, float, float]] = deque([(begin_ns, 0.0, 0.0)])
-        self._written_ns = begin_ns
+        self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(begin_ns, rest)])
+        self._written_ns = self._gyro_ns = begin_ns
+        self._gyro = None if vehicle.gyro is None else _Gyro.switched_on(vehicle.gyro, seed)
         self._held = False
 
-    def write(self, steering_rad: float, throttle: float, now_ns: int) -> None:
-        """Take a command, which acts after the actuation delay."""
+    def write(self, *told: float) -> None:
+        """Take a command, which acts after the actuation delay.
+
+        Args:
+            told: its numbers, and then the time, ns.
+        """
+        command, now_ns = told[:-1], int(told[-1])
         with self._lock:
             self._advance(now_ns)
             due_ns = now_ns + int(self.settings.actuation_delay_s * 1e9)
-            self._commands.append((due_ns, steering_rad, throttle))
+            self._commands.append((due_ns, command))
             self._written_ns = now_ns
 
     def carry_off(self, by: tuple[float, float, float]) -> None:
-        """Move the car by (m, m, rad) in the world, as a person would."""
+        """Move the vehicle by (m, m, rad) in the world, as a person would."""
         with self._lock:
-            self._row = self._row + np.array([*by, 0.0, 0.0], self._dtype)
+            moved = self._row.copy()
+            moved[:3] += np.array(by, self._dtype)
+            self._row = moved
 
     def hold(self, held: bool) -> None:
-        """Hold the car fast, wheels included, or let it go."""
+        """Hold the vehicle fast, wheels included, or let it go."""
         with self._lock:
             self._held = held
 
@@ -112,8 +136,11 @@ class SimWorld:
             turned = Ts.at[camera].set((turn @ jaxlie.SE3(Ts[camera])).wxyz_xyz)
             self.rig = eqx.tree_at(lambda r: r.Ts_camera_vehicle.wxyz_xyz, self.rig, turned)
 
-    def state(self, at_ns: int) -> Float[np.ndarray, " 5"]:
-        """(x_m, y_m, psi_rad, speed_mps, steering_rad) at an instant of the last two seconds."""
+    def state(self, at_ns: int) -> Float[np.ndarray, " n"]:
+        """The truth at an instant of the last two seconds.
+
+        x_m, y_m, psi_rad, then speed_mps and steering_rad of a car, the twist of another base.
+        """
         with self._lock:
             self._advance(at_ns)
             newer = self._track[-1]
@@ -131,16 +158,42 @@ class SimWorld:
         x_m, y_m, psi_rad = self.state(at_ns)[:3]
         return np.array([np.cos(psi_rad / 2), 0, 0, np.sin(psi_rad / 2), x_m, y_m, 0])
 
-    def odometry(self, at_ns: int) -> tuple[float, float]:
-        """The noisy (speed_mps, steering_rad) of the sensors."""
+    def reading(self, at_ns: int) -> Reading:
+        """The reading of the odometer at an instant, without corrections."""
+        return reading_of(at_ns, self.odometry(at_ns), valid=True)
+
+    def odometry(self, at_ns: int) -> tuple[float, ...]:
+        """The noisy (speed_mps, steering_rad) of a car's sensors, or another base's twist."""
         noise, state = self.settings.odometry, self.state(at_ns)
         with self._lock:
-            errors = self.rng.standard_normal(2)
+            errors = self.rng.standard_normal(len(state) - 3)
         scale = noise.speed_scale * float(noise.scale_at(at_ns * 1e-9))
+        if len(errors) == 3:
+            turn_radps = noise.turn_scale * state[5] + noise.turn_offset_radpm * state[3]
+            sigmas = noise.speed_sigma_mps, noise.speed_sigma_mps, noise.turn_sigma_radps
+            parts = zip((state[3], state[4], turn_radps), sigmas, errors, strict=True)
+            return tuple(float(scale * part + sigma * error) for part, sigma, error in parts)
         return (
             float(scale * state[3] + noise.speed_sigma_mps * errors[0]),
             float(state[4] + noise.steering_offset_rad + noise.steering_sigma_rad * errors[1]),
         )
+
+    def gyro(self, until_ns: int) -> tuple[GyroReading, ...]:
+        """The gyro's readings since the last call, up to an instant; none without a gyro."""
+        readings: list[GyroReading] = []
+        while self._gyro is not None and self._gyro_ns + _GYRO_NS <= until_ns:
+            begin_ns, self._gyro_ns = self._gyro_ns, self._gyro_ns + _GYRO_NS
+            late_ns = self._gyro.late_ns
+            begin_rad, end_rad = (
+                self.state(max(at_ns - late_ns, self._track[0][0]))[2]
+                for at_ns in (begin_ns, self._gyro_ns)
+            )
+            turned_rad = float(end_rad - begin_rad)
+            with self._lock:
+                error = float(self.rng.standard_normal())
+            rate = self._gyro.rate_radps(turned_rad, _GYRO_NS / 1e9, error)
+            readings.append(GyroReading(begin_ns + _GYRO_NS // 2, rate))
+        return tuple(readings)
 
     def detections(self, at_ns: int) -> list[Detections]:
         """The detections of each camera, with noise on the corners."""
@@ -165,20 +218,50 @@ class SimWorld:
     def _advance(self, until_ns: int) -> None:
         while self._time_ns < until_ns:
             step_ns = min(_SUBSTEP_NS, until_ns - self._time_ns)
-            steering_rad, throttle = self._obeyed(self._time_ns)
-            command = np.array([steering_rad, throttle], self._dtype)
+            command = np.array(self._obeyed(self._time_ns), self._dtype)
             dt_s = np.asarray(step_ns / 1e9, self._dtype)
             moved = np.asarray(_moved(self.vehicle, self._row, command, dt_s))
-            # A held car keeps its pose; its wheels are steered nevertheless.
-            self._row = (
-                np.array([*self._row[:3], 0, moved[4]], self._dtype) if self._held else moved
-            )
+            if self._held:  # it keeps its pose; a car's wheels are steered nevertheless
+                steered = moved[4:] if len(moved) == 5 else np.zeros(2)
+                moved = np.array([*self._row[:3], 0, *steered], self._dtype)
+            self._row = moved
             self._time_ns += step_ns
             self._track.append((self._time_ns, self._row))
 
-    def _obeyed(self, time_ns: int) -> tuple[float, float]:
+    def _obeyed(self, time_ns: int) -> tuple[float, ...]:
         while len(self._commands) > 1 and self._commands[1][0] <= time_ns:
             self._commands.popleft()
-        _, steering_rad, throttle = self._commands[0]
+        command = self._commands[0][1]
         silent_s = (time_ns - self._written_ns) / 1e9
-        return steering_rad, 0.0 if silent_s > self.settings.vehicle_timeout_s else throttle
+        if silent_s <= self.settings.vehicle_timeout_s:
+            return command
+        return (command[0], 0.0) if len(command) == 2 else (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Gyro:
+    """What one drive's gyro gets wrong; see `Gyro`. Its bias does not walk."""
+
+    gyro: Gyro
+    bias_radps: float
+    scale: float
+    late_ns: int
+
+    @staticmethod
+    def switched_on(gyro: Gyro, seed: int) -> "_Gyro":
+        """Errors as the gyro tells of them; its numbers are not those of the other sensors."""
+        bias, scale, late = np.random.default_rng([seed, 1]).standard_normal(3)
+        late_s = float(gyro.delay_s) + float(gyro.delay_sigma_s) * late
+        return _Gyro(
+            gyro,
+            float(gyro.bias_sigma_radps) * bias,
+            1 + float(gyro.scale_sigma) * scale,
+            int(max(late_s, 0.0) * 1e9),
+        )
+
+    def rate_radps(self, turned_rad: float, dt_s: float, error: float) -> float:
+        """The mean rate that is read of a turn; `error` is a standard normal number."""
+        rate = self.scale * turned_rad / dt_s + self.bias_radps
+        rate += float(self.gyro.noise_density) / math.sqrt(dt_s) * error
+        most = float(self.gyro.saturation_radps)
+        return min(max(rate, -most), most)

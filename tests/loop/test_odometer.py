@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxnav.loop.chassis import chassis_of
 from jaxnav.loop.flags import Fault
-from jaxnav.loop.odometer import Odometer
+from jaxnav.loop.odometer import Odometer, Odometers
 from tests import worlds
 
 MAX_MPS, PER_THROTTLE, LAG_S = 3.0, 10.0, 0.3
@@ -19,7 +20,7 @@ class Drive:
     """Readings every 20 ms."""
 
     def __init__(self):
-        self.odometer = Odometer(MAX_MPS, PER_THROTTLE, LAG_S)
+        self.odometer = Odometer(MAX_MPS, LAG_S)
         self.count = 0
 
     def tell(self, speed_mps, believed=None, seeing=False, throttle=0.0, steering_rad=None):
@@ -27,7 +28,8 @@ class Drive:
         self.count += 1
         stamp_ns = BEGIN_NS + self.count * PERIOD_NS
         steering_rad = 1e-6 * self.count if steering_rad is None else steering_rad
-        return self.odometer.judge(speed_mps, steering_rad, stamp_ns, believed, seeing, throttle)
+        wanted_mps = throttle * PER_THROTTLE
+        return self.odometer.judge(speed_mps, steering_rad, stamp_ns, believed, seeing, wanted_mps)
 
     def accelerate(self, throttle: float, count: int) -> tuple[float, list[bool]]:
         """As the car does: a lag of first order."""
@@ -81,7 +83,7 @@ def test_a_speed_that_the_motor_was_told_to_change_and_that_stays_is_stuck():
 
 
 def test_a_sensor_that_stands_while_corners_move_is_stuck():
-    odometer = Odometer(MAX_MPS, PER_THROTTLE, LAG_S)
+    odometer = Odometer(MAX_MPS, LAG_S)
     told = [odometer.judge(0.0, 0.0, BEGIN_NS + n, None, True, 0.0, n == 1) for n in (0, 1, 2)]
     assert told == [(True, Fault(0)), (False, Fault.ODOMETRY_STUCK), (True, Fault(0))]
 
@@ -132,10 +134,11 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
     )
 )
 def test_whatever_is_told_no_impossible_speed_is_believed(readings):
-    odometer = Odometer(MAX_MPS, PER_THROTTLE, LAG_S)
+    odometer = Odometer(MAX_MPS, LAG_S)
     for speed_mps, steering_rad, off_ns, believed, seeing, throttle in readings:
         stamp_ns = BEGIN_NS + off_ns
-        taken, fault = odometer.judge(speed_mps, steering_rad, stamp_ns, believed, seeing, throttle)
+        told = stamp_ns, believed, seeing, throttle * PER_THROTTLE
+        taken, fault = odometer.judge(speed_mps, steering_rad, *told)
         assert fault in (Fault(0), Fault.ODOMETRY_STUCK)
         if taken:
             assert abs(speed_mps) <= 1.5 * MAX_MPS + 0.05
@@ -144,7 +147,7 @@ def test_whatever_is_told_no_impossible_speed_is_believed(readings):
 
 def test_the_limits_are_the_vehicles():
     vehicle = worlds.qcar()
-    odometer = Odometer.of(vehicle)
+    (odometer,) = Odometers(chassis_of(vehicle)).parts
     assert odometer.max_mps == pytest.approx(
         float(vehicle.throttle_limit) * float(vehicle.speed_per_throttle_mps)
     )

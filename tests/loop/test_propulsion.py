@@ -15,14 +15,15 @@ class Car:
     """A lag of first order, whose odometer can lie."""
 
     def __init__(self, gain: float = 1.0, lag_s: float = LAG_S):
-        self.propulsion = Propulsion(PER_THROTTLE, LAG_S)
+        self.propulsion = Propulsion(LAG_S)
         self.gain, self.lag_s, self.speed_mps = gain, lag_s, 0.0
 
     def drive(self, throttle, seconds, lie=lambda v: v, seeing=False, disputed=False) -> bool:
         for _ in range(round(seconds / GAP_S)):
             target = self.gain * throttle * PER_THROTTLE
             self.speed_mps += (target - self.speed_mps) * (1 - math.exp(-GAP_S / self.lag_s))
-            self.propulsion.add_reading(lie(self.speed_mps), throttle, GAP_S, seeing, disputed)
+            wanted_mps = throttle * PER_THROTTLE
+            self.propulsion.add_reading(lie(self.speed_mps), wanted_mps, GAP_S, seeing, disputed)
         return self.propulsion.doubtful
 
 

@@ -5,11 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxnav.loop.chassis import Motion, car_motion
 from jaxnav.loop.standstill import Standstill, Way, between
 
 MS = 1_000_000
 BEGIN_NS = 10**12
 SIGMA_PX = 0.3
+WHEELBASE_M = 0.256
 PX_PER_M = 100.0  # a focal length of 300 px, 3 m away
 QUAD_PX = np.array([[[400.0, 200.0], [420.0, 200.0], [420.0, 220.0], [400.0, 220.0]]])
 VISIBLE = np.ones(1, bool)
@@ -29,7 +31,7 @@ class Drive:
     """Odometry each 20 ms, a frame each 40 ms."""
 
     def __init__(self, seed=0):
-        self.standstill = Standstill(Way(0.256), 10.0, 0.3)
+        self.standstill = Standstill(Way(), 0.3)
         self.now_ns = BEGIN_NS
         self.x_m = 0.0  # of what the camera shows
         self.rng = np.random.default_rng(seed)
@@ -45,7 +47,8 @@ class Drive:
             if "odometry" not in silent:
                 contradicted.append(self.standstill.add_reading(self.now_ns, self.now_ns, told_mps))
                 if not contradicted[-1] and "refused" not in silent:
-                    self.standstill.add_believed(self.now_ns, self.now_ns, told_mps, 0.0)
+                    ahead = Motion(told_mps, 0.0, 0.0)
+                    self.standstill.add_believed(self.now_ns, self.now_ns, told_mps, ahead)
             if count % 2 == 0 and "frames" not in silent:
                 noise = noise_px * self.rng.standard_normal(QUAD_PX.shape)
                 corners_px = of((self.x_m, 0.0, 0.0))[1][0] + noise
@@ -54,7 +57,7 @@ class Drive:
                         0, self.now_ns, self.now_ns, corners_px, VISIBLE, SIGMA_PX, of
                     )
                 )
-            self.standstill.add_command(throttle, self.now_ns)
+            self.standstill.add_command((10.0 * throttle,), self.now_ns)
         return frozen, contradicted
 
 
@@ -164,21 +167,22 @@ def test_whatever_is_told_nothing_raises(events):
         drive.now_ns += 10 * MS
         drive.standstill.add_reading(drive.now_ns + off_ns, drive.now_ns, speed_mps)
         if abs(speed_mps) < 10:
-            drive.standstill.add_believed(drive.now_ns + off_ns, drive.now_ns, speed_mps, 0.1)
+            motion = car_motion(speed_mps, 0.1, WHEELBASE_M)
+            drive.standstill.add_believed(drive.now_ns + off_ns, drive.now_ns, speed_mps, motion)
         quad_px = np.array(corners_px).reshape(1, 4, 2)
         told = drive.now_ns + off_ns, drive.now_ns, quad_px, VISIBLE, sigma_px, due
         assert drive.standstill.is_frozen(0, *told) in (False, True)
-        drive.standstill.add_command(throttle, drive.now_ns)
+        drive.standstill.add_command((10.0 * throttle,), drive.now_ns)
 
 
 def test_the_way_of_an_odometer_is_that_of_the_bicycle():
     """A quarter of a circle, in steps of 20 ms."""
-    way = Way(0.256)
+    way = Way()
     tangent = np.tan(0.3)
     radius_m = 0.256 / (np.cos(np.arctan(tangent / 2)) * tangent)
     count = 200
     for step in range(count + 1):
-        way.go(step * 20 * MS, radius_m * np.pi / 2 / (count * 0.02), 0.3)
+        way.go(step * 20 * MS, car_motion(radius_m * np.pi / 2 / (count * 0.02), 0.3, WHEELBASE_M))
     begin, end = way.at(way_begin := (count - 50) * 20 * MS), way.at(count * 20 * MS)
     x_m, y_m, psi_rad = between(begin, end)
     assert psi_rad == pytest.approx(np.pi / 8)
@@ -188,15 +192,15 @@ def test_the_way_of_an_odometer_is_that_of_the_bicycle():
 
 
 def test_nobody_knows_the_way_before_its_time_after_it_or_across_a_pause():
-    way = Way(0.256)
+    way = Way()
     for step in range(100):
-        way.go(step * 20 * MS, 0.5, 0.0)
+        way.go(step * 20 * MS, car_motion(0.5, 0.0, WHEELBASE_M))
     assert way.at(1980 * MS - 1600 * MS) is None
     assert way.at(1980 * MS + 150 * MS) is None
     assert between(way.at(1900 * MS), way.at(2030 * MS))[0] == pytest.approx(0.065)
     number = way.number
-    way.go(2300 * MS, 0.5, 0.0)
+    way.go(2300 * MS, car_motion(0.5, 0.0, WHEELBASE_M))
     assert way.number == number + 1
     assert way.at(2200 * MS) is None
-    way.go(2290 * MS, 5.0, 0.0)  # late
+    way.go(2290 * MS, car_motion(5.0, 0.0, WHEELBASE_M))  # late
     assert way.at(2290 * MS) is None

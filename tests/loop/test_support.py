@@ -2,6 +2,7 @@
 
 import pytest
 
+from jaxnav.loop.chassis import Motion, chassis_of
 from jaxnav.loop.support import CONFIRMED, SLOW_M, Support
 from jaxnav.loop.ways import Fix
 from tests import worlds
@@ -14,7 +15,8 @@ class Seeing:
     """Frames at 30 Hz."""
 
     def __init__(self, **how):
-        self.support = Support(worlds.qcar(), **how)
+        self.chassis = chassis_of(worlds.qcar())
+        self.support = Support(self.chassis, **how)
         self.now_ns = 10**9
 
     def frames(self, count, fix=HERE, believed=True, possible=(), agrees=True) -> list[bool]:
@@ -27,7 +29,9 @@ class Seeing:
 
     def drives(self, way_m: float) -> None:
         for _ in range(50):
-            self.support.add_odometry(way_m, 0.0, 0.0, 0.02, way_m / 10, True)
+            wanted_mps = self.chassis.wanted_mps((0.0, way_m / 10))
+            told = (way_m,), Motion(way_m, 0.0, 0.0), 0.0, 0.02, wanted_mps, True
+            self.support.add_odometry(*told)
 
 
 def test_no_single_frame_confirms():

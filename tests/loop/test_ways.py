@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxnav.loop.chassis import Motion, car_motion
 from jaxnav.loop.ways import Fix, Ways
 
 MS = 1_000_000
@@ -25,7 +26,8 @@ class Drive:
         self.now_ns += 20 * MS
         self.x_m += 0.02 * self.speed_mps
         self.off_m += 0.02 * drag_mps
-        self.ways.add_odometry(self.scale * self.speed_mps, 0.0, 0.0, 0.02)
+        told_mps = self.scale * self.speed_mps
+        self.ways.add_odometry(Motion(told_mps, 0.0, 0.0), abs(told_mps), 0.0, 0.02)
         if looks:
             self.ways.note_corners(self.now_ns)
             self.ways.add_fix(self.now_ns, self.fix())
@@ -113,7 +115,7 @@ def test_a_turn_is_the_bicycles():
     ways = Ways(WHEELBASE_M)
     ways.add_fix(0, Fix(0.0, 0.0, 0.0, 0.0, 0.0))
     for _ in range(50):
-        ways.add_odometry(-0.5, 0.4, 0.0, 0.02)
+        ways.add_odometry(car_motion(-0.5, 0.4, WHEELBASE_M), 0.5, 0.0, 0.02)
     curvature_per_m = math.cos(math.atan(math.tan(0.4) / 2)) * math.tan(0.4) / WHEELBASE_M
     assert ways._turned_rad == pytest.approx(0.5 * curvature_per_m)
 
@@ -122,6 +124,6 @@ def test_a_silent_odometer_disputes_nothing_when_it_is_back():
     drive = Drive(0.4)
     drive.seconds(3)
     assert drive.seconds(3, drag_mps=0.5)[-1]
-    drive.ways.add_odometry(0.4, 0.0, 0.0, 0.2)
+    drive.ways.add_odometry(Motion(0.4, 0.0, 0.0), 0.4, 0.0, 0.2)
     assert not drive.ways.disputed
     assert not drive.step()
