@@ -8,12 +8,12 @@ from typing import Any
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.kinds import flag_of
 from jaxnav.errors import BadInput
-from jaxnav.files import load_car, load_markers, load_rig, load_route
+from jaxnav.files import load_markers, load_rig, load_route, load_vehicle
 from jaxnav.recording.drive_log import DriveLog, read_drive
 
 _PATIENCE_S = 2.0
 _LOADS = {
-    "rig": load_rig, "markers": load_markers, "vehicle": load_car, "route": load_route,
+    "rig": load_rig, "markers": load_markers, "vehicle": load_vehicle, "route": load_route,
 }  # fmt: skip
 
 

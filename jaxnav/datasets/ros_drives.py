@@ -24,6 +24,7 @@ from jaxnav.loop.pilot import Input
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.models.twists import TwistReader
 from jaxnav.ros import camera_messages, odometry_messages
 from jaxnav.ros.imu_messages import IMU
@@ -37,7 +38,7 @@ def read_ros_drive(
     topics: TopicMap,
     rig: CameraRig,
     markers: MarkerMap,
-    vehicle: Vehicle,
+    vehicle: Vehicle | TwistBase,
     corner_backend: str = "aruco",
 ) -> list[Input]:
     """Read all inputs of a bag, in the order of their reception.
@@ -47,7 +48,8 @@ def read_ros_drive(
         topics: the topics to read. Cameras of the rig that it leaves out never have a frame.
         markers: their families are searched for in images, and give the family of an id that
             comes without one.
-        vehicle: its figures turn a yaw rate into steering.
+        vehicle: a car's figures turn a yaw rate into steering; the twist of another base is read
+            as it is.
         corner_backend: see `make_detector`; for images.
 
     Raises:
@@ -61,13 +63,18 @@ def read_ros_drive(
     if topics.joints is not None:
         told = topics.joints
         joints = WheelJoints(tuple(told.driven), tuple(told.steered), told.wheel_radius_m)
-    twists = TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
+    twists = None
+    if isinstance(vehicle, Vehicle):
+        twists = TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
     inputs: list[Input] = []
     frames: list[tuple[int, FrameDetections]] = []
     with closing(read_messages(path, reader.choose)) as messages:
         for received in messages:
             try:
                 if same_topic(received.topic, topics.odometry):
+                    if twists is None and received.kind not in odometry_messages.TWIST_TYPES:
+                        problem = f"{received.topic}: {received.kind} is a car's odometry"
+                        raise BadInput(path, problem)
                     reading = odometry_messages.odometry(
                         received.kind, received.message, twists, joints
                     )

@@ -101,7 +101,9 @@ def _of_drive(path: Path, rig: CameraRig | None) -> RecordedSightings:
             ids=ids,
             corners_px=np.array(corners_px, float).reshape(-1, 4, 2),
             families=tuple(row[3] for row in rows),
-            odometry=tuple(given.odometry for given in log.inputs if given.odometry is not None),
+            odometry=tuple(
+                given.odometry for given in log.inputs if isinstance(given.odometry, Odometry)
+            ),
         )
     )
 

@@ -161,7 +161,9 @@ def load_car(path: str | Path) -> Vehicle:
     """
     vehicle = as_car(load_vehicle(path), path)
     if vehicle.gyro is not None:
-        raise BadInput(f"{path}: gyro", "must be left out here: a gyro is only read while it drives")
+        raise BadInput(
+            f"{path}: gyro", "must be left out here: a gyro is only read while it drives"
+        )
     return vehicle
 
 

@@ -8,7 +8,7 @@
 The checks of the loop ask whether a reading can be, whether anything moves, and how far. So they
 look at driven parts, each of which follows its command with a lag of first order and has its speed
 in m/s. A car has one, its speed along its course. Another base has three: its speeds ahead and to
-its left, and that of its rim, which its turn moves, so that a turn on the spot is a way like others.
+its left, and that of its rim, which its turn moves: a turn on the spot is a way like others.
 """
 
 from __future__ import annotations
@@ -48,11 +48,16 @@ class Chassis(Protocol):
         slides_m: way on which the wheels may turn the vehicle by 1 rad where they slide.
     """
 
-    limits: Limits | TwistLimits
-    tops_mps: tuple[float, ...]
-    time_constant_s: float
-    lever_m: float
-    slides_m: float
+    @property
+    def limits(self) -> Limits | TwistLimits: ...
+    @property
+    def tops_mps(self) -> tuple[float, ...]: ...
+    @property
+    def time_constant_s(self) -> float: ...
+    @property
+    def lever_m(self) -> float: ...
+    @property
+    def slides_m(self) -> float: ...
 
     def reads(self, reading: Reading) -> bool:
         """Whether a reading is of this kind of vehicle, and finite."""
@@ -217,10 +222,7 @@ class BaseChassis:
 
 def chassis_of(vehicle: Vehicle | TwistBase) -> CarChassis | BaseChassis:
     """That of a vehicle's description."""
-    kind: type[CarChassis] | type[BaseChassis] = (
-        BaseChassis if turns_by_twist(vehicle) else CarChassis
-    )
-    return kind.of(vehicle)  # type: ignore[arg-type]
+    return BaseChassis.of(vehicle) if turns_by_twist(vehicle) else CarChassis.of(vehicle)
 
 
 def car_motion(speed_mps: float, steering_rad: float, wheelbase_m: float) -> Motion:

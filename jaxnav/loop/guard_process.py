@@ -252,7 +252,6 @@ class _Server:
             self._guard.trip(f"the vehicle: {type(error).__name__}: {error}")
             return KIND_FAILED + f"{type(error).__name__}: {error}".encode()[:1000]
 
-
     def _turns(self) -> Sequence[GyroReading]:
         """The gyro's readings, of which none is no reason to go without the odometer."""
         with suppress(OSError):

@@ -6,7 +6,7 @@ A plug-in is a factory, found by an entry point of the group `jaxnav.vehicles` o
     def open_vehicle(setup: Setup) -> Vehicle
     def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]   # one for each of the rig
 
-A car is a `Vehicle`; a base that is driven by a twist (`base:` in its file) is a `TwistVehicle`, the
+A car is a `Vehicle`. A base that is driven by a twist (`base:` in its file) is a `TwistVehicle`: the
 same but for the numbers that it reads and is told. Either may have a gyro, see `HasGyro`.
 
 `jaxnav.testing.check_vehicle` and `check_cameras` test whether a plug-in keeps these promises. A
@@ -101,8 +101,8 @@ Reading = Odometry | TwistOdometry
 def reading_of(stamp_ns: int, values: Sequence[float], valid: bool) -> Reading:
     """The reading with these `values`: two of a car, three of another base."""
     if len(values) == 2:
-        return Odometry(stamp_ns, *values, valid=valid)
-    return TwistOdometry(stamp_ns, *values, valid=valid)
+        return Odometry(stamp_ns, values[0], values[1], valid)
+    return TwistOdometry(stamp_ns, values[0], values[1], values[2], valid)
 
 
 @dataclass(frozen=True)

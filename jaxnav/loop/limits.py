@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:  # the guard's process knows a vehicle's numbers without JAX
+    from typing_extensions import TypeIs
+
     from jaxnav.models.bicycle import Vehicle
     from jaxnav.models.twist_base import TwistBase
 
@@ -141,15 +143,14 @@ class TwistLimits:
         return self.zero
 
 
-def turns_by_twist(vehicle: Vehicle | TwistBase) -> bool:
+def turns_by_twist(vehicle: Vehicle | TwistBase) -> TypeIs[TwistBase]:
     """Whether a vehicle's description, or its plain numbers, are those of a `TwistBase`."""
     return "turn_limit_radps" in vars(vehicle)
 
 
 def limits_of(vehicle: Vehicle | TwistBase) -> Limits | TwistLimits:
     """The limits in a vehicle's description."""
-    kind: type[Limits] | type[TwistLimits] = TwistLimits if turns_by_twist(vehicle) else Limits
-    return kind.of(vehicle)  # type: ignore[arg-type]
+    return TwistLimits.of(vehicle) if turns_by_twist(vehicle) else Limits.of(vehicle)
 
 
 def limits_from(numbers: Mapping[str, float]) -> Limits | TwistLimits:

@@ -387,9 +387,7 @@ class Pilot:
         )
         return honest, known._replace(pose_covariance=covariances[0])
 
-    def _limited(
-        self, known: _Known, health: Health, now_ns: int, elapsed_ns: int
-    ) -> Command:
+    def _limited(self, known: _Known, health: Health, now_ns: int, elapsed_ns: int) -> Command:
         if self._drives:
             wanted = self.limits.slowed(known.command, SPEED_FACTOR[health])
             self._command = self.limits.within(wanted, self._command, elapsed_ns / 1e9)

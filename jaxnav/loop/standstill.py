@@ -70,7 +70,7 @@ class Way:
     lever_m: float = 0.0
     number: int = 0  # of the way: places on different ways can't be compared
     _track: deque[tuple[int, Place]] = field(default_factory=deque)
-    _motion: Motion = Motion(0.0, 0.0, 0.0)
+    _motion: Motion = field(default_factory=lambda: Motion(0.0, 0.0, 0.0))
 
     def go(self, stamp_ns: int, motion: Motion) -> None:
         """Take what a reading tells; a late one is left out, and after a pause a new way begins."""
@@ -160,7 +160,7 @@ class Standstill:
     _claimed_ns: int | None = None  # time of the last data from any sensor
 
     def add_reading(self, stamp_ns: int, now_ns: int, speed_mps: float) -> bool:
-        """Take the pace of any reading; return whether corners move while it says that it stands."""
+        """Take the pace of any reading; return whether corners move while it says it stands."""
         self._claimed_ns = now_ns
         self._told_ns = max(stamp_ns, self._told_ns)
         if abs(speed_mps) >= _RESTS_MPS:

@@ -188,6 +188,16 @@ def _draw_nis(axes: Axes, outcomes: Outcomes, gate_nis: float) -> None:
 
 
 def _draw_commands(axes: Axes, outcomes: Outcomes) -> None:
+    """Of a car throttle and steering; of another base its speeds, and how fast it turns."""
+    if not np.isnan(outcomes.twist).all():
+        for part, color in enumerate((BLUE, GREEN)):
+            speeds_mps = outcomes.twist[:, part]
+            axes.step(outcomes.times_s, speeds_mps, where="post", color=color, lw=1.2)
+        axes.set_ylabel("ahead, left (m/s)", color=BLUE)
+        right = _right_of(axes, "turn (deg/s)")
+        turns = np.rad2deg(outcomes.twist[:, 2])
+        right.step(outcomes.times_s, turns, where="post", color=VERMILION, lw=1.2, ls="--")
+        return
     axes.step(outcomes.times_s, outcomes.throttle, where="post", color=BLUE, lw=1.2)
     axes.set_ylabel("throttle", color=BLUE)
     right = _right_of(axes, "steering (deg)")

@@ -4,6 +4,7 @@ texts = adopted_files(setup, learnt, calibrated)     # {"rig.yaml": ..., "vehicl
 """
 
 import dataclasses
+from pathlib import Path
 
 import jax.numpy as jnp
 import jaxlie
@@ -33,7 +34,7 @@ def adopted_files(
     rig: CameraRig | None = None,
     vehicle: Vehicle | None = None,
 ) -> dict[str, str]:
-    """The new files by their names, of what a drive with this setup keeps errors of.
+    """The new files by their names, of what a drive of a car with this setup keeps errors of.
 
     As exact as they are learnt only in a process, or a block, of double precision.
 
@@ -45,7 +46,7 @@ def adopted_files(
         texts["rig.yaml"] = rig_file_text(adopted_rig(rig or setup.rig, learnt), calibrated)
     if setup.vehicle.sensor_sigma is not None:
         told = dict(zip(SENSOR_ERRORS, learnt.sensors_sigma.tolist(), strict=True))
-        adopted = adopted_vehicle(vehicle or setup.vehicle, learnt)
+        adopted = adopted_vehicle(vehicle or setup.car(Path("DriveSetup")), learnt)
         texts["vehicle.yaml"] = vehicle_file_text(adopted, calibrated, told)
     return texts
 

@@ -42,7 +42,7 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.bases import BaseFile
-from jaxnav.files.vehicles import VehicleFile, is_base_file, vehicle_data
+from jaxnav.files.vehicles import VehicleFile, as_car, is_base_file, vehicle_data
 from jaxnav.loop.estimator import advance_packed
 from jaxnav.loop.health import Timeouts
 from jaxnav.loop.pilot import Pilot
@@ -166,6 +166,17 @@ class DriveSetup:
         if sigma is not None and vehicle.sensor_sigma is not None:
             vehicle = replace(vehicle, sensor_sigma=jnp.asarray(sigma, float))
         return replace(self, rig=rig, vehicle=vehicle, parameters=params.plain())
+
+    def car(self, where: Path) -> Vehicle:
+        """The vehicle, for what is for cars alone so far.
+
+        Args:
+            where: the file that it was read from.
+
+        Raises:
+            BadInput: it is another base.
+        """
+        return as_car(self.vehicle, at(where, "header.vehicle"))
 
     @property
     def route_on_map(self) -> Route:

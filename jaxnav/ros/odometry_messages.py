@@ -1,8 +1,8 @@
-"""Conversion of ROS messages into speed and steering, without ROS, OpenCV or JAX.
+"""Conversion of ROS messages into readings of an odometer, without ROS, OpenCV or JAX.
 
-nav_msgs/Odometry                           speed and yaw rate
+nav_msgs/Odometry                           a car's speed and yaw rate, another base's twist
 geometry_msgs/TwistStamped, TwistWithCovarianceStamped      the same
-ackermann_msgs/AckermannDriveStamped        speed and steering angle
+ackermann_msgs/AckermannDriveStamped        a car's speed and steering angle
 sensor_msgs/JointState                      wheels and the joints that steer, by their names
 """
 
@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.interfaces import Odometry, Reading, TwistOdometry
 from jaxnav.models.twists import TwistReader
 
 NAV_ODOMETRY = "nav_msgs/msg/Odometry"
@@ -19,6 +19,7 @@ TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 JOINTS = "sensor_msgs/msg/JointState"
 ODOMETRY_TYPES = (NAV_ODOMETRY, ACKERMANN, TWIST_WITH_COVARIANCE, TWIST, JOINTS)
+TWIST_TYPES = (NAV_ODOMETRY, TWIST_WITH_COVARIANCE, TWIST)  # of a base that is no car
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,19 @@ def stamp_ns(message: Any) -> int:
 
 
 def odometry(
-    kind: str, message: Any, twists: TwistReader, joints: WheelJoints | None = None
-) -> Odometry:
-    """The odometry in a message of one of `ODOMETRY_TYPES`; what is no number is not valid.
+    kind: str, message: Any, twists: TwistReader | None, joints: WheelJoints | None = None
+) -> Reading:
+    """The reading in a message of one of `ODOMETRY_TYPES`; what is no number is not valid.
 
     Args:
-        twists: must read all messages of one topic, in their order.
+        twists: must read all messages of one topic, in their order; None of a base that is no car,
+            whose messages are of `TWIST_TYPES`.
         joints: of a JointState.
     """
+    if twists is None:
+        twist = message.twist if kind == TWIST else message.twist.twist
+        parts = float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
+        return TwistOdometry(stamp_ns(message), *parts, valid=all(map(math.isfinite, parts)))
     speed_mps, steering_rad = _speed_and_steering(kind, message, twists, joints)
     finite = math.isfinite(speed_mps) and math.isfinite(steering_rad)
     return Odometry(stamp_ns(message), speed_mps, steering_rad, valid=finite)

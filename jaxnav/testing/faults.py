@@ -222,11 +222,12 @@ def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:
         said.append(f"recovered after {result.recovered_s:.1f} s")
     limits = pilot.limits
     for step in steps:
-        steering_rad, throttle = step.outcome.steering_rad, step.outcome.throttle
-        if not (abs(steering_rad) <= limits.steering_rad and abs(throttle) <= limits.throttle):
-            said.append(f"command {steering_rad}, {throttle}")
+        command = step.outcome.command
+        if limits.within(command, command, 0.0) != command:
+            said.append(f"command {', '.join(map(str, command))}")
             break
-        if step.outcome.health in (Health.STOP, Health.INIT) and throttle != 0:
+        stands = limits.standing(command) == command
+        if step.outcome.health in (Health.STOP, Health.INIT) and not stands:
             said.append("drives in STOP")
             break
     return said

@@ -43,10 +43,10 @@ def frames(edit: EditFrame) -> Change:
 
 
 def odometry(edit: EditOdometry) -> Change:
-    """Edit all readings of the odometer."""
+    """Edit all readings of a car's odometer."""
 
     def change(given: Input) -> list[Input]:
-        if given.odometry is None:
+        if not isinstance(given.odometry, Odometry):
             return [given]
         edited = edit(given.odometry)
         return [] if edited is None else [dataclasses.replace(given, odometry=edited)]

@@ -11,8 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.loop.interfaces import Odometry, OpenVehicle, Setup, Vehicle
-from jaxnav.loop.limits import Limits
+from jaxnav.loop.interfaces import (
+    GyroReading,
+    HasGyro,
+    Odometry,
+    OpenVehicle,
+    Reading,
+    Setup,
+    TwistOdometry,
+    Vehicle,
+)
+from jaxnav.loop.limits import Command, Limits, TwistLimits, limits_of
 from jaxnav.loop.plugins import missing_members
 from jaxnav.testing.calls import HANGS_S, Worker, check_stamp, start_call
 
@@ -31,7 +40,8 @@ def check_vehicle(
     """Open a vehicle, read it, drive it, stop it and close it.
 
     Args:
-        throttle_of: returns the last throttle of the vehicle's motor; None: not known.
+        throttle_of: returns the last throttle of a car's motor, or the largest part of the twist
+            that another base was last told; None: not known.
 
     Raises:
         AssertionError: its message says which promise is broken.
@@ -39,7 +49,7 @@ def check_vehicle(
     vehicle = factory(setup)
     lacking = missing_members(vehicle, Vehicle)
     assert not lacking, f"the vehicle has no {', '.join(lacking)}"
-    check = _Check(vehicle, Limits.of(setup.vehicle), throttle_of)
+    check = _Check(vehicle, limits_of(setup.vehicle), throttle_of)
     try:
         check.timeout()
         check.readings()
@@ -55,8 +65,14 @@ def check_vehicle(
 class _Check:
     """The checks of one vehicle, which one thread reads and writes, and another stops."""
 
-    def __init__(self, vehicle: Any, limits: Limits, throttle_of: Callable[[Any], float] | None):
+    def __init__(
+        self,
+        vehicle: Any,
+        limits: Limits | TwistLimits,
+        throttle_of: Callable[[Any], float] | None,
+    ):
         self._vehicle, self._limits, self._throttle_of = vehicle, limits, throttle_of
+        self._kind = Odometry if isinstance(limits, Limits) else TwistOdometry
         self._driver, self._watchdog = Worker(), Worker()
 
     def end(self) -> None:
@@ -72,7 +88,7 @@ class _Check:
 
     def readings(self) -> None:
         """Check the readings at rest, read faster than any driver measures."""
-        readings: list[Odometry] = []
+        readings: list[Reading] = []
         slow, failure = 0, None
         begin_s = time.monotonic()
         while time.monotonic() - begin_s < _PATIENCE_S:
@@ -80,7 +96,7 @@ class _Check:
             reading, failure = self._driver.call("read()", self._vehicle.read)
             slow += time.monotonic() - called_s > _READ_S
             if failure is None:
-                _check_reading(reading)
+                _check_reading(reading, self._kind)
                 readings.append(reading)
             if len(readings) >= _READINGS and readings[-1].stamp_ns != readings[0].stamp_ns:
                 break
@@ -92,13 +108,20 @@ class _Check:
         assert stamps == sorted(stamps), "the stamps of read() go back in time"
         assert stamps[-1] > stamps[0], f"the stamps of read() stood still for {_PATIENCE_S:g} s"
         assert any(reading.valid for reading in readings), "no reading of read() was valid"
+        if isinstance(self._vehicle, HasGyro):
+            told, failure = self._driver.call("read_gyro()", self._vehicle.read_gyro)
+            for one in () if failure is not None else told:
+                _check_gyro(one)
 
     def writes(self) -> None:
         """Check commands at rest, then at the limits, each followed by a read as in a loop."""
-        steps = [(0, 0), (1, 0), (-1, 0), (0.5, 0.5), (0, 1), (0, -1), (0, 0)]
+        steps: list[Command] = [(0, 0), (1, 0), (-1, 0), (0.5, 0.5), (0, 1), (0, -1), (0, 0)]
+        if isinstance(self._limits, TwistLimits):
+            steps = [(0, 0, 0), (0, 0, 1), (0, 0, -1), (0, 1, 0), (0.5, 0, 0.5), (1, 0, 0)]
+            steps += [(-1, 0, 0), (0, 0, 0)]
         try:
-            for steering, throttle in steps:
-                self._write(steering, throttle)
+            for shares in steps:
+                self._write(shares)
                 self._read()
                 time.sleep(0.005)
         finally:
@@ -111,7 +134,7 @@ class _Check:
         def drive() -> None:
             while not done.is_set():
                 with contextlib.suppress(OSError):
-                    self._vehicle.write(0.0, self._limits.throttle)
+                    self._vehicle.write(*self._command(self._full))
                 with contextlib.suppress(OSError):
                     self._vehicle.read()
 
@@ -129,7 +152,7 @@ class _Check:
             driving("write() and read() beside stop()", HANGS_S)
             self._stop()
         self._stands("after stop()")
-        self._write(0, 1)
+        self._write(self._full)
         if self._throttle_of is not None:
             throttle = self._throttle_of(self._vehicle)
             assert throttle != 0, "throttle_of() says 0 after write() with full throttle"
@@ -140,13 +163,13 @@ class _Check:
 
     def closed(self) -> None:
         """Check `close` while the vehicle drives, and all calls that are allowed afterwards."""
-        self._write(0, 1)
+        self._write(self._full)
         for what in ("close()", "a second close()"):
             self._watchdog.begin(self._vehicle.close)(what, HANGS_S)
         self._stands("after close()")
         self._stop("after close()")
         self._read(" after close()")
-        self._write(0, 1, " after close()")
+        self._write(self._full, " after close()")
         self._stands("when it is written after close()")
         self._stop("after close()")
         self._watchdog.begin(self._vehicle.close)("a third close()", HANGS_S)
@@ -154,9 +177,22 @@ class _Check:
     def _read(self, when: str = "") -> None:
         self._driver.call(f"read(){when}", self._vehicle.read)
 
-    def _write(self, steering: float, throttle: float, when: str = "") -> None:
+    @property
+    def _full(self) -> Command:
+        """Full throttle, or full speed ahead, in shares of the limits."""
+        return (0, 1) if isinstance(self._limits, Limits) else (1, 0, 0)
+
+    def _command(self, shares: Command) -> Command:
+        """The command of these shares of the limits."""
+        limits = self._limits
+        if isinstance(limits, Limits):
+            return shares[0] * limits.steering_rad, shares[1] * limits.throttle
+        most = limits.forward_mps, limits.left_mps, limits.turn_radps
+        return tuple(share * limit for share, limit in zip(shares, most, strict=True))
+
+    def _write(self, shares: Command, when: str = "") -> None:
         """Write a command, given in shares of the limits."""
-        command = steering * self._limits.steering_rad, throttle * self._limits.throttle
+        command = self._command(shares)
         self._driver.call(f"write{command}{when}", partial(self._vehicle.write, *command))
 
     def _stop(self, when: str = "") -> None:
@@ -178,12 +214,22 @@ def _check_stop(took_s: float, when: str) -> None:
     assert took_s < _STOP_S, f"stop() took {took_s:.2g} s {when}".strip()
 
 
-def _check_reading(reading: object) -> None:
-    assert isinstance(reading, Odometry), f"read() gives {reading!r}, expected an Odometry"
-    check_stamp("an Odometry", reading.stamp_ns)
+def _check_reading(reading: object, kind: type[Odometry] | type[TwistOdometry]) -> None:
+    name = kind.__name__
+    article = "an" if kind is Odometry else "a"
+    assert isinstance(reading, kind), f"read() gives {reading!r}, expected {article} {name}"
+    check_stamp(f"{article} {name}", reading.stamp_ns)
     if not reading.valid:
         return
-    for name in ("speed_mps", "steering_rad"):
-        value = getattr(reading, name)
+    of_car = "speed_mps", "steering_rad"
+    fields = of_car if kind is Odometry else ("forward_mps", "left_mps", "turn_radps")
+    for field in fields:
+        value = getattr(reading, field)
         good = isinstance(value, int | float | np.floating) and math.isfinite(value)
-        assert good, f"{name} of a valid Odometry must be a finite number, not {value!r}"
+        assert good, f"{field} of a valid {name} must be a finite number, not {value!r}"
+
+
+def _check_gyro(reading: object) -> None:
+    expected = f"read_gyro() gives {reading!r}, expected a GyroReading"
+    assert isinstance(reading, GyroReading), expected
+    check_stamp("a GyroReading", reading.stamp_ns)

@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxnav.errors import BadInput
 from jaxnav.loop.interfaces import Camera, Frame, Odometry, Setup, Vehicle
-from jaxnav.loop.limits import Limits
+from jaxnav.loop.limits import Limits, turns_by_twist
 from jaxnav.vehicles.grabber import Grabber
 from jaxnav.vehicles.options import latency_ns, whole_number
 
@@ -41,6 +41,8 @@ def open_vehicle(setup: Setup) -> Vehicle:
         ImportError: the maker's software is not there.
         BadInput: an option is wrong, or the board gives no data.
     """
+    if turns_by_twist(setup.vehicle):
+        raise BadInput("--vehicle", "must be that of a car: qcar is one")
     read_mode = whole_number(setup.options, "read_mode", 0, 0, 1)
     frequency = whole_number(setup.options, "frequency", 500, 100, 1000)
     car = _maker("--car qcar").QCar(readMode=read_mode, frequency=frequency)

@@ -12,9 +12,12 @@ its JPEGs if `images` is true.
 import contextlib
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +25,15 @@ from jaxnav.errors import BadInput
 from jaxnav.files.images import decode_image
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Camera, Frame, Odometry, OwnFiles, Setup, Vehicle
+from jaxnav.loop.interfaces import (
+    AnyVehicle,
+    Camera,
+    Frame,
+    GyroReading,
+    OwnFiles,
+    Reading,
+    Setup,
+)
 from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_log import DriveLog, read_drive
 from jaxnav.recording.drive_replay import check_inputs, recorded_pixels
@@ -66,14 +77,14 @@ class Clock:
 
 
 class ReplayVehicle:
-    """The car of a recording: reads give the recorded readings, commands are only counted.
+    """The vehicle of a recording: reads give the recorded readings, commands are only counted.
 
     Attributes:
         recorded: the recording.
         camera_names: names of its cameras, in the order of its rig.
         clock: the clock of the vehicle and its cameras.
         writes: number of commands written.
-        throttle: throttle of the last command; 0 after a stop.
+        throttle: of the last command, or the largest part of a twist; 0 after a stop.
     """
 
     shares_process = True  # its cameras share its clock
@@ -97,7 +108,10 @@ class ReplayVehicle:
             if given.odometry is not None or Fault.VEHICLE_FAILED in given.faults
         ]
         self._next = 0
-        self._reading: Odometry | None = None
+        self._gyro = deque(
+            (given.now_ns, given.gyro) for given in self.recorded.inputs if given.gyro
+        )
+        self._reading: Reading | None = None
         self._closed = False
 
     @staticmethod
@@ -112,8 +126,8 @@ class ReplayVehicle:
         is_over = self.clock.is_running and self.clock.recorded_ns() > self._end_ns
         return "the recording is over" if is_over else None
 
-    def read(self) -> Odometry:
-        """See `Vehicle`. Readings since the last call come one by one, if not too late; at the end
+    def read(self) -> Any:
+        """See `Vehicle` and `TwistVehicle`. Readings since the last call come one by one, if not too late; at the end
         the last one repeats.
 
         Raises:
@@ -128,18 +142,22 @@ class ReplayVehicle:
         if self._closed or self._reading is None:
             raise OSError("the vehicle is closed" if self._closed else "nothing was read")
         reading = self._reading
-        return Odometry(
-            self.clock.present_ns(reading.stamp_ns),
-            reading.speed_mps,
-            reading.steering_rad,
-            reading.valid,
-        )
+        return replace(reading, stamp_ns=self.clock.present_ns(reading.stamp_ns))
 
-    def write(self, steering_rad: float, throttle: float) -> None:
-        """See `Vehicle`. The command moves nothing."""
+    def read_gyro(self) -> list[GyroReading]:
+        """See `HasGyro`."""
+        now_ns, readings = self.clock.recorded_ns(), []
+        while self._gyro and self._gyro[0][0] <= now_ns:
+            for one in self._gyro.popleft()[1]:
+                readings.append(replace(one, stamp_ns=self.clock.present_ns(one.stamp_ns)))
+        return readings
+
+    def write(self, *command: float) -> None:
+        """See `Vehicle` and `TwistVehicle`. The command moves nothing."""
         if self._closed:
             raise OSError("the vehicle is closed")
-        self.writes, self.throttle = self.writes + 1, throttle
+        moves = command[1:] if len(command) == 2 else command
+        self.writes, self.throttle = self.writes + 1, max(moves, key=abs)
 
     def stop(self) -> None:
         """See `Vehicle`."""
@@ -189,7 +207,7 @@ class ReplayCamera:
         self._closed.set()
 
 
-def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]:
+def open_cameras(setup: Setup, vehicle: AnyVehicle) -> Sequence[Camera]:
     """Open the recording's cameras, by their names in the rig.
 
     Options: images (false): show the recorded images, which are then searched for markers.

@@ -80,9 +80,8 @@ class SimWorld:
         self.settings = settings or WorldSettings()
         self.rng = np.random.default_rng(seed)
         self._lock = threading.Lock()
-        turns = isinstance(vehicle, TwistBase)
-        rest = (0.0,) * (3 if turns else 2)  # also as a command
-        self._dtype = np.asarray(vehicle.time_constant_s if turns else vehicle.wheelbase_m).dtype
+        rest = (0.0,) * (3 if isinstance(vehicle, TwistBase) else 2)  # also as a command
+        self._dtype = np.dtype(vehicle.dtype)
         self._row = np.array([*start_pose, *rest], self._dtype)
         self._time_ns = begin_ns
         self._track: deque[tuple[int, np.ndarray]] = deque([(begin_ns, self._row)], maxlen=_KEPT)

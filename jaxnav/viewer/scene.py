@@ -35,6 +35,8 @@ TIMELINE = "drive"  # seconds since the first event
 _CHI2_2DOF_95 = 5.991
 _ARROW_M = 0.15
 _IMAGE_PLANE_M = 0.12  # distance of a drawn image from its camera
+_OF_CAR = ("throttle", "steering_rad")
+_OF_BASE = ("forward_mps", "left_mps", "turn_radps")
 
 
 class RerunScene:
@@ -206,8 +208,7 @@ class RerunScene:
             ("flip_probability", outcomes.flip_probability[index]),
             ("hypotheses", len(outcomes.hypotheses[index])),
             ("nis", nis if nis > 0 else math.nan),
-            ("throttle", outcomes.throttle[index]),
-            ("steering_rad", outcomes.steering_rad[index]),
+            *_command(outcomes, index),
             ("position_sigma_m", sigma_m if outcomes.located[index] else math.nan),
             ("repeated_share", outcomes.repeated_share[index]),
         ):
@@ -240,7 +241,7 @@ class RerunScene:
             blueprint.TimeSeriesView(origin=f"plots/{name}", name=name)
             for name in ("sensor_errors", "camera_errors")
         ]
-        commands = ["plots/throttle", "plots/steering_rad"]
+        commands = [f"plots/{name}" for name in (*_OF_CAR, *_OF_BASE)]
         cameras = [
             blueprint.Spatial2DView(origin=f"world/vehicle/{name}", name=name)
             for name in self._names
@@ -290,3 +291,11 @@ def _x_axis(wxyz: np.ndarray) -> np.ndarray:
     """The x axis of a rotated frame."""
     w, x, y, z = wxyz
     return np.array([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)])
+
+
+def _command(outcomes: Outcomes, index: int) -> list[tuple[str, float]]:
+    """The numbers of a command with their names: of a car, or of another base."""
+    twist = outcomes.twist[index]
+    if np.isnan(twist).all():
+        return [(name, float(getattr(outcomes, name)[index])) for name in _OF_CAR]
+    return list(zip(_OF_BASE, twist.tolist(), strict=True))

@@ -85,9 +85,7 @@ def test_where_somebody_else_drives_it_only_localises(setup, steps, inputs):
 def test_odometry_means_the_same_to_the_program_without_cameras(setup, steps, inputs, monkeypatch):
     """Nobody can tell which of the two was called."""
     seeing = Estimator._events
-    monkeypatch.setattr(
-        Estimator, "_events", lambda self, *told: seeing(self, *told[:-1], True)
-    )
+    monkeypatch.setattr(Estimator, "_events", lambda self, *told: seeing(self, *told[:-1], True))
     _, always = handled(setup, inputs)
     for outcome, step in zip(always, steps, strict=True):
         assert_same_belief(outcome, step.outcome, atol=1e-9)

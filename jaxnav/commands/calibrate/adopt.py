@@ -12,6 +12,7 @@ from jaxnav.commands.reading import given_files, read_shown
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.files.provenance import calibrated_now
+from jaxnav.files.vehicles import as_car
 from jaxnav.files.writing import atomic_write_all
 from jaxnav.models.bicycle import SENSOR_ERRORS
 from jaxnav.plots.learnt import learnt_over_time
@@ -32,11 +33,12 @@ def run(args: CalibrateAdopt) -> int:
     configure_jax(float64=True)
     log = read_shown(args.recording, args.headless)
     setup = DriveSetup.of_header(log.header, log.path)
+    vehicle = setup.car(log.path)
     given = given_files(args, ("rig", "vehicle"))
     _refuse_others(args, setup, given)
     index = _last_sure(log)
     errors, sigma = log.outcomes.errors, log.outcomes.errors_sigma
-    learnt = Learnt.of(errors[index], sigma[index], setup.rig, setup.vehicle)
+    learnt = Learnt.of(errors[index], sigma[index], setup.rig, vehicle)
     assert learnt is not None  # _last_sure
     calibrated = calibrated_now(f"jaxnav {version('jaxnav')} calibrate adopt", [log.path])
     out = output_folder(args.out)
@@ -51,7 +53,7 @@ def run(args: CalibrateAdopt) -> int:
         ),
     }
     write_json(out / "report.json", calibrated.model_dump() | report)
-    save_figure(learnt_over_time(log.outcomes, setup.rig, setup.vehicle), out / "report.png")
+    save_figure(learnt_over_time(log.outcomes, setup.rig, vehicle), out / "report.png")
     for sentence in learnt.sentences() or ["nothing is off by three of its sigmas"]:
         print(visible(sentence))
     print(f"{', '.join([*texts, 'report.json', 'report.png'])} in {visible(out)}")
@@ -62,7 +64,9 @@ def _refuse_others(args: CalibrateAdopt, setup: DriveSetup, given: dict[str, Any
     """What was learnt corrects the files that the drive was driven with, and no others."""
     if "rig" in given and is_other_rig(given["rig"], setup.rig):
         raise BadInput(args.rig, f"{args.recording} was driven with cameras in other places")
-    if "vehicle" in given and is_other_vehicle(given["vehicle"], setup.vehicle):
+    if args.vehicle is None:
+        return
+    if is_other_vehicle(as_car(given["vehicle"], args.vehicle), setup.car(args.recording)):
         raise BadInput(args.vehicle, f"{args.recording} was driven with other corrections")
 
 

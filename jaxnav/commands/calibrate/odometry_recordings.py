@@ -16,6 +16,7 @@ from jaxnav.detection.observe import observe
 from jaxnav.errors import BadInput
 from jaxnav.files import load_topics
 from jaxnav.files.ranges import is_within
+from jaxnav.files.vehicles import as_car
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.models.bicycle import Vehicle
@@ -68,18 +69,22 @@ def _own(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
                 raise BadInput(log.path, problem)
     setup = DriveSetup.of_header(logs[0].header, logs[0].path)
     setup = replace(setup, **given_files(args, _SHARED))
+    vehicle = (
+        setup.car(logs[0].path) if args.vehicle is None else as_car(setup.vehicle, args.vehicle)
+    )
     drives = [
         drive_of(str(log.path), log.inputs, setup.rig, setup.markers, setup.corner_sigma_px)
         for log in logs
     ]
-    return RecordedDrives(tuple(drives), setup.rig, setup.markers, setup.vehicle, files)
+    return RecordedDrives(tuple(drives), setup.rig, setup.markers, vehicle, files)
 
 
 def _ros(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
     assert args.topics is not None
     given = given_files(args, _SHARED, bag=args.recordings[0])
     topics = load_topics(args.topics)
-    rig, markers, vehicle = (given[name] for name in _SHARED)
+    rig, markers = given["rig"], given["markers"]
+    vehicle = as_car(given["vehicle"], args.vehicle or "--vehicle")
     drives = []
     for path in args.recordings:
         inputs = read_ros_drive(path, topics, rig, markers, vehicle, args.corner_backend)
@@ -106,7 +111,7 @@ def drive_of(
     for given in inputs:
         if given.odometry is not None and given.odometry.valid:
             read = given.odometry
-            if _is_sound(read):
+            if isinstance(read, Odometry) and _is_sound(read):
                 readings.append((read.stamp_ns, read.speed_mps, read.steering_rad))
             else:
                 left_out += 1

@@ -11,7 +11,9 @@ from jaxnav.commands.doctor.camera_frames import judge_cameras, watch
 from jaxnav.commands.doctor.findings import Finding, Report, error, ok, said, warning
 from jaxnav.errors import BadInput
 from jaxnav.loop import plugins
-from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
+from jaxnav.loop.chassis import Chassis, chassis_of, pace_mps
+from jaxnav.loop.interfaces import AnyVehicle, Odometry, Setup
+from jaxnav.loop.interfaces import Reading as Read
 from jaxnav.loop.limits import Limits
 from jaxnav.loop.moved_vehicle import GuardProcess
 from jaxnav.testing.calls import HANGS_S, Worker, start_call
@@ -31,7 +33,7 @@ _OPENS_WITHIN_S = 30.0
 class Reading:
     """One `read` of a vehicle: its odometry, when it returned, and how long it took."""
 
-    odometry: Odometry
+    odometry: Read
     now_ns: int
     took_s: float
 
@@ -45,11 +47,11 @@ def plug_ins(
     """
     vehicle: Any = Parked()
     if vehicle_name is not None:
-        opened: list[Vehicle] = []
+        opened: list[AnyVehicle] = []
         report.examine("vehicle", _open_vehicle, vehicle_name, setup, opened)
         if opened:
             vehicle = opened[0]
-            report.examine("odometry", _odometry, vehicle, Limits.of(setup.vehicle))
+            report.examine("odometry", _odometry, vehicle, chassis_of(setup.vehicle))
         elif cameras_name is not None:
             instead = "opened beside a vehicle that stands still instead"
             report.add(Finding("cameras", "note", instead))
@@ -59,7 +61,7 @@ def plug_ins(
         report.examine("vehicle", _close, [vehicle])
 
 
-def _open_vehicle(name: str, setup: Setup, opened: list[Vehicle]) -> Iterator[Finding]:
+def _open_vehicle(name: str, setup: Setup, opened: list[AnyVehicle]) -> Iterator[Finding]:
     plugins.load_factory("--car", plugins.VEHICLES, name)
     vehicle, problems = _open("opening it", plugins.open_vehicle, name, setup)
     yield from problems
@@ -119,7 +121,7 @@ def _close(things: Sequence[Any]) -> Iterator[Finding]:
             yield warning(f"closing failed: {said(failure)}", "the driver's author")
 
 
-def _odometry(vehicle: Vehicle, limits: Limits) -> Iterator[Finding]:
+def _odometry(vehicle: AnyVehicle, chassis: Chassis) -> Iterator[Finding]:
     """Read the vehicle `READINGS` times, in a thread of its own as a driver may hang, and judge."""
     worker = Worker()
     readings: list[Reading] = []
@@ -137,11 +139,11 @@ def _odometry(vehicle: Vehicle, limits: Limits) -> Iterator[Finding]:
             time.sleep(_PAUSE_S)
     finally:
         worker.close()
-    yield from judge_odometry(readings, failures, limits)
+    yield from judge_odometry(readings, failures, chassis)
 
 
 def judge_odometry(
-    readings: Sequence[Reading], failures: Sequence[OSError], limits: Limits
+    readings: Sequence[Reading], failures: Sequence[OSError], chassis: Chassis
 ) -> Iterator[Finding]:
     """Report what is wrong with the readings of a vehicle that stands.
 
@@ -157,7 +159,7 @@ def judge_odometry(
         )
     if not readings:
         return
-    problems = [*_wrong_stamps(readings), *_wrong_values(readings, limits)]
+    problems = [*_wrong_stamps(readings), *_wrong_values(readings, chassis)]
     yield from problems
     if problems or failures:
         return
@@ -166,7 +168,17 @@ def judge_odometry(
     yield ok(
         f"{len(readings)} readings at {_rate_hz(stamps_ns):.0f} Hz, "
         f"{max(_ages_s(readings)) * 1e3:.0f} ms old at most; "
-        f"{last.speed_mps:+.2f} m/s, steering {last.steering_rad:+.2f} rad"
+        f"{_said(last)}"
+    )
+
+
+def _said(read: Read) -> str:
+    """A reading in words."""
+    if isinstance(read, Odometry):
+        return f"{read.speed_mps:+.2f} m/s, steering {read.steering_rad:+.2f} rad"
+    return (
+        f"{read.forward_mps:+.2f} m/s ahead, {read.left_mps:+.2f} to the left, turns "
+        f"{read.turn_radps:+.2f} rad/s"
     )
 
 
@@ -211,9 +223,9 @@ def _wrong_stamps(readings: Sequence[Reading]) -> Iterator[Finding]:
         )
 
 
-def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Finding]:
+def _wrong_values(readings: Sequence[Reading], chassis: Chassis) -> Iterator[Finding]:
     valid = [reading.odometry for reading in readings if reading.odometry.valid]
-    finite = [o for o in valid if math.isfinite(o.speed_mps) and math.isfinite(o.steering_rad)]
+    finite = [o for o in valid if all(map(math.isfinite, o.values))]
     if len(valid) < len(readings):
         yield (warning if valid else error)(
             f"{len(readings) - len(valid)} of {len(readings)} readings are marked as not valid",
@@ -226,17 +238,27 @@ def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Findi
         )
     if not finite:
         return
-    fastest = max(finite, key=lambda o: abs(o.speed_mps))
-    widest = max(finite, key=lambda o: abs(o.steering_rad))
-    if abs(fastest.speed_mps) > _STANDS_MPS:
-        same = len({(o.speed_mps, o.steering_rad) for o in finite}) == 1 < len(finite)
+    of_this_kind = [o for o in finite if chassis.reads(o)]
+    if len(of_this_kind) < len(finite):
+        yield error(
+            f"readings are of the kind {type(finite[0]).__name__}, the file is of another vehicle",
+            "a car reads Odometry, a base that is driven by a twist TwistOdometry",
+        )
+        return
+    fastest = max(finite, key=lambda o: pace_mps(chassis.driven_mps(o)))
+    if pace_mps(chassis.driven_mps(fastest)) > _STANDS_MPS:
+        same = len({o.values for o in finite}) == 1 < len(finite)
         yield warning(
-            f"it says {fastest.speed_mps:+.2f} m/s"
+            f"it says {_moves(fastest)}"
             + (f", {len(finite)} times the very same" if same else "")
             + ": does the car stand?",
             "a car at rest must read 0: look at the encoder and its offset, at a driver that "
             "repeats old values",
         )
+    cars, limits = [o for o in finite if isinstance(o, Odometry)], chassis.limits
+    if not cars or not isinstance(limits, Limits):
+        return
+    widest = max(cars, key=lambda o: abs(o.steering_rad))
     if abs(widest.steering_rad) > 1.1 * limits.steering_rad:
         yield warning(
             f"steering reads {widest.steering_rad:+.2f} rad, its limit is "
@@ -245,7 +267,11 @@ def _wrong_values(readings: Sequence[Reading], limits: Limits) -> Iterator[Findi
         )
 
 
-def _cameras(name: str, setup: Setup, vehicle: Vehicle) -> Iterator[Finding]:
+def _moves(read: Read) -> str:
+    return f"{read.speed_mps:+.2f} m/s" if isinstance(read, Odometry) else _said(read)
+
+
+def _cameras(name: str, setup: Setup, vehicle: AnyVehicle) -> Iterator[Finding]:
     plugins.load_factory("--cameras", plugins.CAMERAS, name)
     cameras, problems = _open("opening them", plugins.open_cameras, name, setup, vehicle)
     yield from problems

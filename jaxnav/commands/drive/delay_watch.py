@@ -4,6 +4,7 @@ import math
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from jaxnav.loop.camera_delays import CameraDelays, Delay
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections, FrameIntake
-from jaxnav.loop.interfaces import Frame
+from jaxnav.loop.interfaces import Frame, Odometry
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.models.origin import opposite, planar_in_world
 from jaxnav.recording.drive_log import DriveLog
@@ -29,10 +30,12 @@ class DelayWatch:
 
     def __init__(self, setup: DriveSetup, warns: bool):
         """Args:
+        setup: of a car.
         warns: on the terminal, as soon as a camera is found to be late.
         """
         self._setup, self._warns = setup, warns
-        self._delays = CameraDelays(setup.rig, setup.markers, setup.vehicle)
+        car = setup.car(Path("DelayWatch"))
+        self._delays = CameraDelays(setup.rig, setup.markers, car)
         self._faults = Fault(0)
         self._wake, self._closing = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="jaxnav-delays", daemon=True)
@@ -80,16 +83,17 @@ class DelayWatch:
 def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
     """A line for each camera whose stamps are surely wrong, or one line for all cameras."""
     camera_delays, together = delays.delays, delays.common_delay
+    told_s = Corrections.of(setup.vehicle).camera_delay_s
     known = [one for one in camera_delays if one.known]
     if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
-        delay_s = setup.vehicle.camera_delay_s + together.delay_s
+        delay_s = told_s + together.delay_s
         do = f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
         yield f"the cameras are {describe_delay(together)}: {do}"
         return
     for name, one in zip(setup.rig.names, camera_delays, strict=True):
         if not one.late:
             continue
-        delay_s = setup.vehicle.camera_delay_s + one.delay_s
+        delay_s = told_s + one.delay_s
         yield (
             f"camera {name!r} is {describe_delay(one)}: "
             f"raise its latency_ms by {one.delay_s * 1e3:.0f}, or "
@@ -111,7 +115,7 @@ def _agree(one: Delay, together: Delay) -> bool:
 
 def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
     """The delays of the cameras in a recorded drive."""
-    delays = CameraDelays(setup.rig, setup.markers, setup.vehicle)
+    delays = CameraDelays(setup.rig, setup.markers, setup.car(log.path))
     corrections = Corrections.of(setup.vehicle)
     frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     outcomes = log.outcomes
@@ -122,7 +126,7 @@ def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
         read = given.odometry
         if read is not None and read.valid:
             right = corrections.correct_reading(read)
-            if math.isfinite(right.speed_mps) and math.isfinite(right.steering_rad):
+            if isinstance(right, Odometry) and all(map(math.isfinite, right.values)):
                 delays.add_reading(right.stamp_ns, right.speed_mps, right.steering_rad)
         seen, stamp_ns, _ = frames.check(
             [corrections.correct_frame(f) for f in given.frames], given.now_ns

@@ -9,6 +9,7 @@ from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.models.bicycle import Vehicle
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.recording.learnt import Learnt, errors_of, repeated_share
 
@@ -30,6 +31,7 @@ class LearntWatch:
         """
         # Of NumPy: the driving thread asks no device.
         self._rig, self._vehicle = jax.device_get((setup.rig, setup.vehicle))
+        self._adopts = isinstance(setup.vehicle, Vehicle)
         self._tells, self._last_ns = tells, 0
         self._told: set[tuple[str, str]] = set()
         self._found: dict[tuple[str, str], str] = {}
@@ -65,4 +67,5 @@ class LearntWatch:
         if not self._found:
             return None
         lines = [f"learnt: {visible(line)}" for line in self._found.values()]
-        return "\n".join([*lines, _ADOPT] if self._found.keys() - {_CORNERS} else lines)
+        adopts = self._adopts and self._found.keys() - {_CORNERS}
+        return "\n".join([*lines, _ADOPT] if adopts else lines)

@@ -19,6 +19,7 @@ from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.loop import Observer
 from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.origin import ZERO
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.recording.message_schemas import OUTCOME
@@ -71,7 +72,8 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
 
         waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
         add(LiveView(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
-    add(DelayWatch(setup, warns=not args.headless))
+    if isinstance(setup.vehicle, Vehicle):  # it knows the motion of a car alone
+        add(DelayWatch(setup, warns=not args.headless))
     add(LearntWatch(setup, tells=not args.headless))
     if not args.headless:
         add(StatusLine())
@@ -203,6 +205,9 @@ class StatusLine:
 def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen: bool) -> str:
     """Rate, latency, health, marker, flip probability, position, command: at most 100 characters.
 
+    The command of a car is throttle and steering, that of another base m/s ahead and to the left
+    and degrees a second.
+
     Far from the world's origin a position takes up more of them, and the units are left out.
 
         30 Hz   4.2 ms OK             marker flip  0.1% x  1.83 y -0.79 m 124 deg thr  0.037 ...
@@ -230,10 +235,20 @@ def status_line(outcome: Outcome, rate_hz: float, latency_ms: float, marker_seen
             "marker" if marker_seen else "  --  ",
             f"flip{flip}%",
             f"x{x} y{y}{m}{psi}{deg}",
+            *_command(outcome, deg),
+        )
+    )
+
+
+def _command(outcome: Outcome, deg: str) -> tuple[str, ...]:
+    if outcome.twist is None:
+        return (
             f"thr {_fixed(outcome.throttle, 6, 3)}",
             f"str {_fixed(math.degrees(outcome.steering_rad), 5, 1)}{deg}",
         )
-    )
+    forward_mps, left_mps, turn_radps = outcome.twist
+    places = _fixed(forward_mps, 5, 2), _fixed(left_mps, 5, 2)
+    return "go", *places, _fixed(math.degrees(turn_radps), 6, 1)
 
 
 def _fixed(value: float, width: int, decimals: int) -> str:
@@ -259,7 +274,12 @@ def notice(outcome: Outcome, before: Fault) -> str | None:
             "corners and odometer tell of different ways: a marker moves, or wheels slip"
         )
     if Fault.ODOMETRY_DOUBTFUL in new:
-        reasons.append("no marker in view, and the odometer contradicts the throttle")
+        commanded = "throttle" if outcome.twist is None else "command"
+        reasons.append(f"no marker in view, and the odometer contradicts the {commanded}")
+    if Fault.GYRO_INVALID in new:
+        reasons.append("the gyro's readings are not finite, at its limit or repeated: left out")
+    if Fault.GYRO_STALE in new:
+        reasons.append("the gyro tells nothing: the drive goes on without it")
     if Fault.MARKER_OUTVOTED in new and outcome.outvoted:
         ids = ", ".join(map(str, outcome.outvoted))
         reasons.append(f"marker {ids} is not where the others say: left out")

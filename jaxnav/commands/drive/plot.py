@@ -1,5 +1,6 @@
 """`jaxnav plot`: a recorded drive as a picture and in a few lines, or the pictures of a study."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder
 from jaxnav.files.ranges import is_within
 from jaxnav.loop.flags import Fault, Health, Reject
+from jaxnav.loop.interfaces import Odometry, Reading
 from jaxnav.plots.drive import drive_log_report
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.plausible import keep_plausible, left_out_note
@@ -96,10 +98,16 @@ def distance_m(log: DriveLog) -> float:
         if given.odometry is not None and given.odometry.valid
     ]
     stamps_s = np.array([reading.stamp_ns for reading in readings], float) / 1e9
-    speeds_mps = np.abs([reading.speed_mps for reading in readings])
+    speeds_mps = np.abs([_speed_mps(reading) for reading in readings])
     usable = is_within("speed_mps", speeds_mps)
     steps_s = np.clip(np.diff(stamps_s[usable]), 0, _LONGEST_STEP_S)
     return float(steps_s @ speeds_mps[usable][1:])
+
+
+def _speed_mps(reading: Reading) -> float:
+    if isinstance(reading, Odometry):
+        return reading.speed_mps
+    return math.hypot(reading.forward_mps, reading.left_mps)
 
 
 def _counted(kind: type[Fault] | type[Reject], values: np.ndarray) -> list[str]:

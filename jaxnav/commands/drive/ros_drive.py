@@ -1,4 +1,4 @@
-"""A car in the node of ROS 2: driven, localised while another one drives, or played from a bag."""
+"""A vehicle in the node of ROS 2: driven, localised while others drive, or played from a bag."""
 
 import threading
 import time
@@ -24,7 +24,7 @@ from jaxnav.commands.drive.run import Drive, compiled_pilot, guarding_process, s
 from jaxnav.configuration import step_folder
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput
-from jaxnav.files import Route, load_car, load_markers, load_params, load_route
+from jaxnav.files import Route, load_markers, load_params, load_route, load_vehicle
 from jaxnav.files.ros import RosFile
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -68,7 +68,7 @@ class PreparedDrive:
         setup = DriveSetup(
             rig=rig_for(file, signals),
             markers=load_markers(path_of(file, "markers")),
-            vehicle=load_car(path_of(file, "vehicle")),
+            vehicle=load_vehicle(path_of(file, "vehicle")),
             route=load_route(path_of(file, "route")) if self._drives else _NOWHERE,
             selector=file.selector,
             float64=args.float64,

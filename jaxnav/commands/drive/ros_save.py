@@ -7,9 +7,10 @@ import numpy as np
 
 from jaxnav.commands.drive.ros_setup import path_of
 from jaxnav.errors import BadInput
-from jaxnav.files import load_car, load_rig
+from jaxnav.files import load_rig, load_vehicle
 from jaxnav.files.provenance import calibrated_now
 from jaxnav.files.ros import RosFile
+from jaxnav.files.vehicles import as_car
 from jaxnav.files.writing import atomic_write_all
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -76,10 +77,10 @@ class LearntKeeper:
             learnt = Learnt.of(*known, setup.rig, setup.vehicle)
             if learnt is None:
                 raise BadInput(_WHERE, f"the drive {NOTHING_KEPT}")
-            rig, vehicle = load_rig(rig_path), load_car(vehicle_path)
+            rig, vehicle = load_rig(rig_path), as_car(load_vehicle(vehicle_path), vehicle_path)
             if is_other_rig(rig, setup.rig):
                 raise BadInput(rig_path, "has other cameras by now than those driven with")
-            if is_other_vehicle(vehicle, setup.vehicle):
+            if is_other_vehicle(vehicle, as_car(setup.vehicle, vehicle_path)):
                 raise BadInput(vehicle_path, "has other corrections by now than those driven with")
             calibrated = calibrated_now(f"jaxnav {version('jaxnav')} ros, ~/save", known)
             texts = adopted_files(setup, learnt, calibrated, rig, vehicle)

@@ -24,12 +24,12 @@ from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder
 from jaxnav.detection import make_detectors
 from jaxnav.errors import BadInput, visible
-from jaxnav.files import calib_dir, load_car, load_markers, load_params, load_rig, load_route
+from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.loop import plugins
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.guard import Guard
-from jaxnav.loop.interfaces import HasOwnFiles, Setup, SharesProcess, Vehicle
-from jaxnav.loop.limits import Limits
+from jaxnav.loop.interfaces import AnyVehicle, HasOwnFiles, Setup, SharesProcess
+from jaxnav.loop.limits import CommandLimits
 from jaxnav.loop.loop import Loop, Observer
 from jaxnav.loop.moved_vehicle import GuardProcess, MovedVehicle
 from jaxnav.loop.pilot import Pilot
@@ -105,7 +105,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     return DriveSetup(
         rig=chosen("rig", args.rig, load_rig),
         markers=chosen("markers", args.markers, load_markers),
-        vehicle=chosen("vehicle", args.vehicle, load_car),
+        vehicle=chosen("vehicle", args.vehicle, load_vehicle),
         route=chosen("route", args.route, load_route),
         selector=args.selector,
         float64=args.float64,
@@ -204,7 +204,7 @@ class Drive:
             duration_s = args.duration_s if args.duration_s is not None else float("inf")
             return self.loop.run(duration_s, self._until_arrival)
 
-    def _guarded(self, limits: Limits) -> tuple[Vehicle, Guard]:
+    def _guarded(self, limits: CommandLimits) -> tuple[Any, Guard]:
         """The vehicle, in a process of its own where possible, and the guard of this process."""
         args, why = self._args, "it shares its process"
         if self._guarding is not None:
@@ -222,7 +222,7 @@ class Drive:
         corrections = Corrections.of(self._setup.vehicle)
         return vehicle, Guard(vehicle, limits, args.timeout_s, corrections=corrections)
 
-    def _close(self, vehicle: Vehicle, guard: Guard) -> None:
+    def _close(self, vehicle: AnyVehicle, guard: Guard) -> None:
         guard.close()
         self.unheard = vehicle.unheard if isinstance(vehicle, MovedVehicle) else guard.unheard
 

@@ -146,7 +146,7 @@ def _drive(
         bar_format="{desc}: {n:.1f} of at most {total:.0f} s [{elapsed}]{postfix}",
     ) as bar:
         bar.set_postfix_str("compiling")
-        for frame in drive(method.navigator, world.setup.vehicle, cameras.look, settings, seed):
+        for frame in drive(method.navigator, world.vehicle, cameras.look, settings, seed):
             if len(record.frames) % KEEP_EVERY == 0:
                 record.kept[len(record.frames)] = cameras.images
             record.frames.append(frame)

@@ -20,6 +20,7 @@ from jaxnav.files import (
     load_rig,
     load_route,
 )
+from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.markers import MarkerMap
@@ -42,6 +43,7 @@ class RenderedWorld:
     """The objects of a demo, built from its files, with a renderer."""
 
     setup: DriveSetup  # without the parameters
+    vehicle: Vehicle  # its own
     params: Params | None
     renderer: Renderer
     cameras: list[Camera]  # those of the rig, one by one
@@ -67,6 +69,7 @@ class RenderedWorld:
         route = load_route(args.route or qcar / "demo_route.yaml")
         return RenderedWorld(
             DriveSetup(rig, markers, vehicle, route, float64=True),
+            vehicle,
             params=None if args.params is None else load_params(args.params),
             renderer=Renderer(Scene.create(markers, seed=args.seed), rig, shutter, SENSOR),
             cameras=[rig.camera(c) for c in range(len(rig))],

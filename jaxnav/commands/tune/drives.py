@@ -133,7 +133,7 @@ def _read_events(
         if reading is None:
             continue
         stamp_ns = stamps.take(reading.stamp_ns, given.now_ns)
-        odometry = (reading.speed_mps, reading.steering_rad)
+        odometry = reading.values
         believed = reading.valid and all(map(math.isfinite, odometry))
         if stamp_ns is not None and believed and given.now_ns not in refused_ns:
             yield Event(stamp_ns, EventData(odometry=odometry))
@@ -186,7 +186,7 @@ class _Rows(NamedTuple):
             visible=np.zeros(lanes, bool),
             sigma_px=np.ones((*lanes, 4)),
         )
-        odometry = (0.0, 0.0)
+        odometry: tuple[float, ...] = (0.0, 0.0)
         for index, (_, data) in enumerate(events):
             odometry = data.odometry or odometry
             rows.odometry[index] = odometry

@@ -16,13 +16,13 @@ from jaxnav.commands.doctor.plug_ins import Reading, judge_odometry, plug_ins
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.loop.interfaces import Frame, Odometry
-from jaxnav.loop.limits import Limits
+from jaxnav.loop.chassis import chassis_of
 from tests.helpers.findings import all_well, the_problem
 from tests.helpers.setups import GoodCamera, GoodVehicle, setup_with
 
 SETUP = setup_with()
 SIZES_PX = SETUP.rig.image_sizes_px
-LIMITS = Limits.of(SETUP.vehicle)
+CHASSIS = chassis_of(SETUP.vehicle)
 BEGIN_NS, PERIOD_NS = 10**12, 20_000_000
 
 
@@ -214,7 +214,7 @@ def readings(count=20, period_ns=PERIOD_NS, age_ns=5_000_000, took_s=0.001, **fi
 
 
 def test_odometry_in_order():
-    (found,) = judge_odometry(readings(), [], LIMITS)
+    (found,) = judge_odometry(readings(), [], CHASSIS)
     assert found.level == "ok"
     assert "20 readings at 50 Hz, 5 ms old at most" in found.what
 
@@ -235,11 +235,11 @@ def test_odometry_in_order():
     ],
 )
 def test_odometry_that_is_wrong(given, level, words):
-    assert words in the_problem(judge_odometry(given, [], LIMITS), level).what
+    assert words in the_problem(judge_odometry(given, [], CHASSIS), level).what
 
 
 def test_readings_that_fail_now_and_then():
-    found = the_problem(judge_odometry(readings(), [OSError("bus")], LIMITS), "warning")
+    found = the_problem(judge_odometry(readings(), [OSError("bus")], CHASSIS), "warning")
     assert found.what == "1 of 21 readings failed: OSError: bus"
 
 
