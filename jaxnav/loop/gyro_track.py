@@ -23,7 +23,7 @@ from jaxnav.loop.stamps import Stamps
 # 5 rad/s^2 it is 6 mrad.
 GAP_NS = 50_000_000
 _KEPT_NS = 1_500_000_000  # more than the age of the oldest event that is fused, see `stamps`
-STUCK_AFTER = 50  # readings to the last bit alike, other than zero: a sensor's noise is never so
+STUCK_AFTER = 25  # readings to the last bit alike, other than zero: a sensor's noise is never so
 
 
 class _Sample(NamedTuple):

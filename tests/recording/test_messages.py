@@ -18,7 +18,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files.validation import validate
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.interfaces import GyroReading, Odometry, TwistOdometry
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_format import decode, encode, header_metadata, header_of
 from jaxnav.recording.message_schemas import MESSAGES, ImageMessage, json_schema
@@ -125,10 +125,14 @@ def _sighted(seed: int) -> FrameDetections:
 
 MOST_NS = 2**62 - 1
 NOW_NS = st.integers(0, MOST_NS)
-READINGS = st.builds(Odometry, st.integers(-MOST_NS, MOST_NS), FLOATS, FLOATS, st.booleans())
+STAMPS = st.integers(-MOST_NS, MOST_NS)
+READINGS = st.builds(Odometry, STAMPS, FLOATS, FLOATS, st.booleans()) | st.builds(
+    TwistOdometry, STAMPS, FLOATS, FLOATS, FLOATS, st.booleans()
+)
+GYRO = st.lists(st.builds(GyroReading, STAMPS, FLOATS), max_size=3).map(tuple)
 FRAMES = st.lists(st.integers(0, 2**32).map(_sighted), min_size=1, max_size=3).map(tuple)
-INPUTS = st.builds(Input, NOW_NS, st.none() | READINGS, st.just(()), FAULTS) | st.builds(
-    Input, NOW_NS, st.none(), FRAMES, FAULTS
+INPUTS = st.builds(Input, NOW_NS, st.none() | READINGS, st.just(()), FAULTS, GYRO) | st.builds(
+    Input, NOW_NS, st.none(), FRAMES, FAULTS, GYRO
 )
 
 

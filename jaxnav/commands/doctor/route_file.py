@@ -13,6 +13,7 @@ from jaxnav.files import Route
 from jaxnav.models.bicycle import Vehicle, curvature_per_m
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 
 READABLE_PX = 12.0  # a marker this wide is read in every second picture of a car at rest
 _ALONG = 48  # poses along the route from which views are computed
@@ -22,17 +23,23 @@ _HIGH_M = 1.5
 _TOP_SPEED_MPS = (0.1, 5.0)
 _TIME_CONSTANT_S = (0.02, 2.0)
 _WHEELBASE_M = (0.05, 4.0)
+_TURN_RADPS = (0.2, 20.0)
 _LEAST_STEERING_RAD = 0.1
 _LEAST_RADIUS_M = 0.05  # the estimate's own error is about that
 
 
-def turning_radius_m(vehicle: Vehicle) -> float:
-    """The smallest turning radius, m, of the point midway between the axles."""
+def turning_radius_m(vehicle: Vehicle | TwistBase) -> float:
+    """The smallest turning radius, m, of the point midway between the axles; 0 on the spot."""
+    if isinstance(vehicle, TwistBase):
+        return 0.0
     return 1 / float(curvature_per_m(vehicle.steering_limit_rad, vehicle.wheelbase_m))
 
 
-def vehicle_file(vehicle: Vehicle) -> Iterator[Finding]:
-    """Check that the figures are those of a small car, in the units that are meant."""
+def vehicle_file(vehicle: Vehicle | TwistBase) -> Iterator[Finding]:
+    """Check that the figures are those of a small vehicle, in the units that are meant."""
+    if isinstance(vehicle, TwistBase):
+        yield from _base_file(vehicle)
+        return
     top_mps = float(vehicle.throttle_limit * vehicle.speed_per_throttle_mps)
     limit_rad, wheelbase_m = float(vehicle.steering_limit_rad), float(vehicle.wheelbase_m)
     lag_s = float(vehicle.speed_time_constant_s)
@@ -67,7 +74,35 @@ def vehicle_file(vehicle: Vehicle) -> Iterator[Finding]:
         )
 
 
-def route_file(route: Route, vehicle: Vehicle, markers: MarkerMap) -> Iterator[Finding]:
+def _base_file(base: TwistBase) -> Iterator[Finding]:
+    """The same of a base that is driven by a twist."""
+    top_mps, turn_radps = float(base.forward_limit_mps), float(base.turn_limit_radps)
+    lag_s = float(base.time_constant_s)
+    problems = [
+        (
+            not _TOP_SPEED_MPS[0] <= top_mps <= _TOP_SPEED_MPS[1],
+            f"forward_limit_mps is {top_mps:.3g}",
+            "it is the largest speed in m/s that is commanded",
+        ),
+        (
+            not _TURN_RADPS[0] <= turn_radps <= _TURN_RADPS[1],
+            f"turn_limit_radps is {turn_radps:.3g}",
+            "it is the largest turn rate in rad/s that is commanded: a turn in a second is 6.28",
+        ),
+        (
+            not _TIME_CONSTANT_S[0] <= lag_s <= _TIME_CONSTANT_S[1],
+            f"time_constant_s is {lag_s:.3g}",
+            "it is the time in s until 63 % of a commanded speed is reached",
+        ),
+    ]
+    for wrong, what, do in problems:
+        if wrong:
+            yield warning(what, do)
+    if not any(wrong for wrong, _, _ in problems):
+        yield ok(f"{top_mps:.2g} m/s and {math.degrees(turn_radps):.0f} deg/s at most")
+
+
+def route_file(route: Route, vehicle: Vehicle | TwistBase, markers: MarkerMap) -> Iterator[Finding]:
     """Check that the waypoints can be driven to, and that no marker stands in the way."""
     poses, length_m = along(route)
     radius_m, turn_m = route.waypoint_radius_m, turning_radius_m(vehicle)

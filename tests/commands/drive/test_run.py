@@ -365,7 +365,7 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
         (["--params", "p.yaml"], "p.yaml: parameters.motion.vision_floor: must have 3 entries or"),
         (
             ["--vehicle", "base.yaml"],
-            "base.yaml: base: must be ackermann here: so far",
+            "base.yaml: base omni needs left_limit_mps",
         ),
         (["--record-images"], "--record-images: needs --record"),
         (["--period-s", "5"], "--period-s: must be from 0.002 to 0.1, got 5.0"),
@@ -375,6 +375,8 @@ def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     write_params("p.yaml", {"motion.vision_floor": [1.0] * 6})
     save_vehicle("base.yaml", TwistBase.create(1.0, 3.0, 0.1))
+    text = Path("base.yaml").read_text()
+    Path("base.yaml").write_text(text.replace("differential", "omni"))
     monkeypatch.setattr("jaxnav.commands.drive.run.configure_jax", lambda **_: None)
     vehicle = [] if "--car" in arguments else ["--car", recorded_vehicle.NAME]
     log = tmp_path / "told"
