@@ -20,6 +20,7 @@ from jaxnav.files.topics import TopicMap, same_topic
 from jaxnav.files.validation import at
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
+from jaxnav.loop.interfaces import GyroReading
 from jaxnav.loop.pilot import Input
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
@@ -27,8 +28,7 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.models.twist_base import TwistBase
 from jaxnav.models.twists import TwistReader
 from jaxnav.ros import camera_messages, odometry_messages
-from jaxnav.ros.imu_messages import IMU
-from jaxnav.ros.odometry_messages import WheelJoints
+from jaxnav.ros.odometry_messages import IMU, WheelJoints
 
 TOGETHER_NS = 100_000_000  # frames of one stamp that come later than this are not joined
 
@@ -56,9 +56,11 @@ def read_ros_drive(
         BadInput: one line naming the file and the topic or key.
     """
     path = Path(path)
-    # A car's filter does not take an IMU.
-    of_a_car = topics.model_copy(update={"imu": None})
-    reader = MessageReader(path, of_a_car, rig, markers, corner_backend)
+    axis = None  # of a gyro, which the filter looks at where the vehicle has one
+    if vehicle.gyro is not None and topics.imu is not None:
+        axis = topics.imu.vertical()
+    read = topics if axis is not None else topics.model_copy(update={"imu": None})
+    reader = MessageReader(path, read, rig, markers, corner_backend)
     joints = None
     if topics.joints is not None:
         told = topics.joints
@@ -67,6 +69,7 @@ def read_ros_drive(
     if isinstance(vehicle, Vehicle):
         twists = TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
     inputs: list[Input] = []
+    turns: list[GyroReading] = []  # since the last reading of the odometer
     frames: list[tuple[int, FrameDetections]] = []
     with closing(read_messages(path, reader.choose)) as messages:
         for received in messages:
@@ -78,7 +81,10 @@ def read_ros_drive(
                     reading = odometry_messages.odometry(
                         received.kind, received.message, twists, joints
                     )
-                    inputs.append(Input(received.received_ns, reading))
+                    inputs.append(Input(received.received_ns, reading, gyro=tuple(turns)))
+                    turns.clear()
+                elif received.kind == IMU and axis is not None:
+                    turns.append(odometry_messages.gyro(received.message, axis))
                 else:
                     frames.append((received.received_ns, reader.sighted(received)))
             except BadInput:

@@ -2,7 +2,7 @@
 
 rig: rig.yaml                  # our files; their paths count from this file's folder
 markers: markers.yaml
-vehicle: vehicle.yaml          # left out: a rig that moves freely, without odometry
+vehicle: vehicle.yaml          # of a car or another base; left out: a rig that moves freely
 route: route.yaml              # left out: somebody else drives, jaxnav only localises
 params: params.yaml            # tuned; may be left out, as all that follows
 selector: multi-hypothesis
@@ -14,8 +14,9 @@ odometry_type: nav_msgs/msg/Odometry
 T_vehicle_odometry: {wxyz: [1, 0, 0, 0], xyz_m: [0, 0, 0]}    # its body on a rig that moves freely
 odom_tf: false                 # true: odom -> base is what /tf says, not the odometry's pose
 joints: {driven: [rear_left, rear_right], steered: [front_left], wheel_radius_m: 0.033}
-command: /drive
-command_type: ackermann        # ackermann_msgs/AckermannDriveStamped; or twist
+imu: {topic: /imu, T_vehicle_imu: {wxyz: [1, 0, 0, 0], xyz_m: [0, 0, 0]}}    # of the vehicle's gyro
+command: /drive                # left out: /drive of a car, /cmd_vel of another base
+command_type: ackermann        # ackermann_msgs/AckermannDriveStamped; or twist, as of other bases
 frames: {map: map, odom: odom, base: base_link}
 base_x_m: -0.128               # of base_link, forward of the middle between the axles
 tf_tolerance_s: 0.0            # tf is stamped so far in the future
@@ -81,18 +82,16 @@ class RosFile(TopicMap):
         default_factory=lambda: QuaternionPose(wxyz=[1, 0, 0, 0], xyz_m=[0, 0, 0])
     )
     odom_tf: Annotated[bool, Field(strict=True)] = False
-    command: Name = "/drive"
-    command_type: Literal["ackermann", "twist"] = "ackermann"
+    command: Name | None = None
+    command_type: Literal["ackermann", "twist"] | None = None
     frames: FramesEntry = Field(default_factory=FramesEntry)
     base_x_m: Annotated[Number, Field(ge=-100, le=100)] = 0.0
     tf_tolerance_s: Annotated[NonNegative, Field(le=10)] = 0.0
 
     @model_validator(mode="after")
     def _fits_together(self) -> "RosFile":
-        if self.imu is not None:
-            raise ValueError("imu is for recordings: the node takes none")
         if self.vehicle is None:
-            for key in ("route", "joints"):
+            for key in ("route", "joints", "imu"):
                 if getattr(self, key) is not None:
                     raise ValueError(f"{key} needs a vehicle")
             if self.odometry_type != "nav_msgs/msg/Odometry":
@@ -152,8 +151,14 @@ class RosFile(TopicMap):
         }
         if self.odometry is not None:
             options |= {"odometry_topic": self.odometry, "odometry_type": self.odometry_type}
-            options |= {"command_topic": self.command}
-            options |= {"command_type": self.command_type if drives else "none"}
+            if self.command is not None:
+                options |= {"command_topic": self.command}
+            kind = self.command_type if drives else "none"
+            if kind is not None:
+                options |= {"command_type": kind}
+        if self.imu is not None:
+            axis = ",".join(map(repr, self.imu.vertical()))
+            options |= {"imu_topic": self.imu.name, "imu_axis": axis}
         if self.joints is not None:
             options |= {"driven": ",".join(self.joints.driven)}
             options |= {"steered": ",".join(self.joints.steered)}

@@ -103,6 +103,11 @@ class ImuEntry(Entry):
         given = {name: getattr(self, name, None) for name in names}
         return dataclasses.replace(preset, **{k: v for k, v in given.items() if v is not None})
 
+    def vertical(self) -> tuple[float, float, float]:
+        """The vehicle's vertical in the axes of the IMU, about which a gyro turns."""
+        x, y, z = self.T_matrix()[2, :3].tolist()
+        return x, y, z
+
     def T_matrix(self) -> Float[np.ndarray, "4 4"]:
         """T_vehicle_imu, (4, 4)."""
         return poses.matrix(poses.pose_as_read(written_pose(self.T_vehicle_imu)))
@@ -115,7 +120,8 @@ class TopicMap(Entry):
         cameras: name in the rig -> topic of detections or of images.
         odometry: the topic; None where the bag has none.
         joints: of a topic of JointState.
-        imu: of a rig that moves freely; None where the bag has none. Cars do not look at it.
+        imu: of a rig that moves freely, or of a vehicle whose file has a gyro, which then tells its
+            turn rate; None where there is none.
         corner_sigma_px: standard deviation of a detected corner along one axis.
         first_corner: the corner, as the marker map sees the marker, that a detection begins with;
             the others follow counter-clockwise.

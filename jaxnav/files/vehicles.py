@@ -167,17 +167,18 @@ def load_car(path: str | Path) -> Vehicle:
     return vehicle
 
 
-def as_car(vehicle: Vehicle | TwistBase, where: str | Path) -> Vehicle:
+def as_car(vehicle: Vehicle | TwistBase, where: str | Path, key: str = "base") -> Vehicle:
     """The vehicle, if it is a car.
 
     Args:
         where: the file that holds it.
+        key: where in the file it says which base it is.
 
     Raises:
         BadInput: it is another base.
     """
     if isinstance(vehicle, TwistBase):
-        raise BadInput(f"{where}: base", "must be ackermann here: this is for cars alone so far")
+        raise BadInput(f"{where}: {key}", "must be ackermann here: this is for cars alone so far")
     return vehicle
 
 

@@ -6,8 +6,8 @@ A plug-in is a factory, found by an entry point of the group `jaxnav.vehicles` o
     def open_vehicle(setup: Setup) -> Vehicle
     def open_cameras(setup: Setup, vehicle: Vehicle) -> Sequence[Camera]   # one for each of the rig
 
-A car is a `Vehicle`. A base that is driven by a twist (`base:` in its file) is a `TwistVehicle`: the
-same but for the numbers that it reads and is told. Either may have a gyro, see `HasGyro`.
+A car is a `Vehicle`. A base that is driven by a twist (`base:` in its file) is a `TwistVehicle`,
+which differs in the numbers that it reads and is told. Either may have a gyro, see `HasGyro`.
 
 `jaxnav.testing.check_vehicle` and `check_cameras` test whether a plug-in keeps these promises. A
 vehicle may also be `Ending`, and its factory may be `HasOwnFiles` or `SharesProcess`.

@@ -27,6 +27,7 @@ from jaxnav.compiling.executables import PACKAGE, sources_digest
 from jaxnav.compiling.step import compile_or_load
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, Route, apply_params
+from jaxnav.files.bases import BaseFile
 from jaxnav.files.markers import MarkerFile, marker_data
 from jaxnav.files.ranges import problem_of
 from jaxnav.files.rigs import RigFile, rig_data
@@ -41,7 +42,6 @@ from jaxnav.files.validation import (
     at,
     validate,
 )
-from jaxnav.files.bases import BaseFile
 from jaxnav.files.vehicles import VehicleFile, as_car, is_base_file, vehicle_data
 from jaxnav.loop.estimator import advance_packed
 from jaxnav.loop.health import Timeouts
@@ -176,7 +176,7 @@ class DriveSetup:
         Raises:
             BadInput: it is another base.
         """
-        return as_car(self.vehicle, at(where, "header.vehicle"))
+        return as_car(self.vehicle, where, "header.vehicle.base")
 
     @property
     def route_on_map(self) -> Route:

@@ -8,8 +8,6 @@ import numpy as np
 from jaxnav.files.topics import ImuEntry
 from jaxnav.models.imu_samples import ImuSamples
 
-IMU = "sensor_msgs/msg/Imu"
-
 
 def row(message: Any) -> tuple[float, ...]:
     """Turn rate, rad/s, and specific force, m/s^2, of a message; orientation is not looked at."""

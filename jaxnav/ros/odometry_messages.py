@@ -4,13 +4,14 @@ nav_msgs/Odometry                           a car's speed and yaw rate, another 
 geometry_msgs/TwistStamped, TwistWithCovarianceStamped      the same
 ackermann_msgs/AckermannDriveStamped        a car's speed and steering angle
 sensor_msgs/JointState                      wheels and the joints that steer, by their names
+sensor_msgs/Imu                             the rate of a gyro about the vehicle's vertical axis
 """
 
 import math
 from dataclasses import dataclass
 from typing import Any
 
-from jaxnav.loop.interfaces import Odometry, Reading, TwistOdometry
+from jaxnav.loop.interfaces import GyroReading, Odometry, Reading, TwistOdometry
 from jaxnav.models.twists import TwistReader
 
 NAV_ODOMETRY = "nav_msgs/msg/Odometry"
@@ -19,6 +20,7 @@ TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 JOINTS = "sensor_msgs/msg/JointState"
 ODOMETRY_TYPES = (NAV_ODOMETRY, ACKERMANN, TWIST_WITH_COVARIANCE, TWIST, JOINTS)
+IMU = "sensor_msgs/msg/Imu"
 TWIST_TYPES = (NAV_ODOMETRY, TWIST_WITH_COVARIANCE, TWIST)  # of a base that is no car
 
 
@@ -40,6 +42,17 @@ class WheelJoints:
 def stamp_ns(message: Any) -> int:
     """The stamp in a message's header, ns, on the clock of the computer that measured."""
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def gyro(message: Any, axis: tuple[float, float, float]) -> GyroReading:
+    """The reading of a gyro in a sensor_msgs/Imu, with the message's own stamp.
+
+    Args:
+        axis: the vehicle's vertical in the axes of the IMU, a unit vector.
+    """
+    rate = message.angular_velocity
+    parts = zip(axis, (float(rate.x), float(rate.y), float(rate.z)), strict=True)
+    return GyroReading(stamp_ns(message), sum(a * w for a, w in parts))
 
 
 def odometry(

@@ -127,8 +127,8 @@ class ReplayVehicle:
         return "the recording is over" if is_over else None
 
     def read(self) -> Any:
-        """See `Vehicle` and `TwistVehicle`. Readings since the last call come one by one, if not too late; at the end
-        the last one repeats.
+        """See `Vehicle` and `TwistVehicle`. Readings since the last call come one by one, if not
+        too late; at the end the last one repeats.
 
         Raises:
             OSError: the recorded read failed, there is no reading yet, or the vehicle is closed.

@@ -5,9 +5,11 @@ Options, `--option KEY=VALUE`:
     odometry_topic (/odom), odometry_type (nav_msgs/msg/Odometry, or another of
         `jaxnav.ros.odometry_messages`; of a JointState also driven, steered: names of joints with
         commas between them, and wheel_radius_m)
-    command_topic (/drive), command_type (ackermann: ackermann_msgs/AckermannDriveStamped whose
-        speed is throttle * speed_per_throttle_mps; twist: geometry_msgs/Twist; none: somebody else
-        drives)
+    command_topic (/drive; /cmd_vel of a base that is no car), command_type (ackermann:
+        ackermann_msgs/AckermannDriveStamped whose speed is throttle * speed_per_throttle_mps, not
+        of such a base; twist: geometry_msgs/Twist; none: somebody else drives)
+    imu_topic, imu_axis (0,0,1): sensor_msgs/Imu of the vehicle's gyro, and the vehicle's vertical
+        in its axes
     sim_time (false): true takes the time of /clock
 
 ROS is not needed to install jaxnav; it is imported when something here is opened.
@@ -18,28 +20,42 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from jaxnav.errors import BadInput
-from jaxnav.loop.interfaces import Odometry, Setup, Vehicle
-from jaxnav.loop.limits import Limits
+from jaxnav.loop.interfaces import AnyVehicle, GyroReading, Reading, Setup
+from jaxnav.loop.limits import Command, limits_of, turns_by_twist
 from jaxnav.models.twists import TwistReader, twist_of
 from jaxnav.ros.connection import Connection, message_type
-from jaxnav.ros.odometry_messages import ACKERMANN, JOINTS, ODOMETRY_TYPES, WheelJoints, odometry
+from jaxnav.ros.odometry_messages import (
+    ACKERMANN,
+    IMU,
+    JOINTS,
+    ODOMETRY_TYPES,
+    TWIST_TYPES,
+    WheelJoints,
+    gyro,
+    odometry,
+)
 from jaxnav.vehicles.options import choice, number
 
 if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
     from collections.abc import Mapping
 
     from jaxnav.models.bicycle import Vehicle as VehicleModel
+    from jaxnav.models.twist_base import TwistBase
 
 _LOCK_PATIENCE_S = 0.03  # a `stop` waits this long for a message that another thread publishes
 _SHORT = {"odometry": ODOMETRY_TYPES[0], "ackermann": ACKERMANN}  # names of earlier releases
 _COMMANDS = {"ackermann": ACKERMANN, "twist": "geometry_msgs/msg/Twist"}
+_CAR_COMMANDS = (*_COMMANDS, "none")
+_MOST_TURNS = 255  # readings of a gyro that wait: at 400 Hz, half a second
+_UNIT = 1e-3  # a vector's length may be off by this
 
 
-def open_vehicle(setup: Setup) -> Vehicle:
+def open_vehicle(setup: Setup) -> AnyVehicle:
     """Open the vehicle behind the topics.
 
     Raises:
@@ -54,23 +70,28 @@ class RosVehicle:
 
     timeout_s = math.inf  # a subscriber may stop by itself, but does not say so
 
-    def __init__(self, vehicle: VehicleModel, options: Mapping[str, str]):
+    def __init__(self, vehicle: VehicleModel | TwistBase, options: Mapping[str, str]):
         """Subscribe to the odometry.
 
         Args:
             options: see the module.
         """
-        kind = choice(options, "odometry_type", (*ODOMETRY_TYPES, *_SHORT))
+        of_base = turns_by_twist(vehicle)
+        kinds = TWIST_TYPES if of_base else (*ODOMETRY_TYPES, *_SHORT)
+        kind = choice(options, "odometry_type", kinds)
         self._kind = _SHORT.get(kind, kind)
         self._joints = _joints(options) if self._kind == JOINTS else None
-        command = choice(options, "command_type", (*_COMMANDS, "none"))
-        self._limits = Limits.of(vehicle)
-        self._wheelbase_m = float(vehicle.wheelbase_m)
-        self._twists = TwistReader(self._wheelbase_m, self._limits.steering_rad)
-        self._speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
+        command = choice(options, "command_type", ("twist", "none") if of_base else _CAR_COMMANDS)
+        self._limits = limits_of(vehicle)
+        self._twists = self._wheelbase_m = self._speed_per_throttle_mps = None
+        if not turns_by_twist(vehicle):
+            self._wheelbase_m = float(vehicle.wheelbase_m)
+            self._twists = TwistReader(self._wheelbase_m, float(vehicle.steering_limit_rad))
+            self._speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
         self._topic = options.get("odometry_topic", "/odom")
-        self._reading: Odometry | None = None
-        self._steering_rad = 0.0
+        self._reading: Reading | None = None
+        self._turns: deque[GyroReading] = deque(maxlen=_MOST_TURNS)
+        self._told = self._limits.zero
         self._written_ns: int | None = None
         self._closed = False
         self._writing = threading.Lock()  # so that no command follows the zero speed of a `stop`
@@ -80,14 +101,19 @@ class RosVehicle:
         self._clock = self._connection.source_clock()
         self._publisher, self._command_type = None, None
         if command != "none":
-            topic, kind = options.get("command_topic", "/drive"), _COMMANDS[command]
+            topic = options.get("command_topic", "/cmd_vel" if of_base else "/drive")
+            kind = _COMMANDS[command]
             self._publisher = self._connection.publisher(kind, topic)
             self._command_type = message_type(kind)
         self._stamped = command == "ackermann"
         self._connection.listen(self._kind, self._topic, self._take)
+        if "imu_topic" in options:
+            self._axis = _axis(options)
+            self._gyro_clock = self._connection.source_clock()
+            self._connection.listen(IMU, options["imu_topic"], self._take_turn)
         self._connection.run()
 
-    def read(self) -> Odometry:
+    def read(self) -> Any:
         """The latest message, with its own stamp.
 
         Raises:
@@ -99,7 +125,14 @@ class RosVehicle:
             raise OSError(f"no message on {self._topic} yet")
         return self._reading
 
-    def write(self, steering_rad: float, throttle: float) -> None:
+    def read_gyro(self) -> list[GyroReading]:
+        """See `HasGyro`: the messages of the IMU since the last call, the newest 255 of them."""
+        readings: list[GyroReading] = []
+        while self._turns:
+            readings.append(self._turns.popleft())
+        return readings
+
+    def write(self, *command: float) -> None:
         """Publish a command, clamped to the limits.
 
         Raises:
@@ -110,16 +143,14 @@ class RosVehicle:
                 raise OSError("the ROS vehicle is closed")
             now_ns = time.monotonic_ns()
             before_ns = now_ns if self._written_ns is None else self._written_ns
-            self._steering_rad, throttle = self._limits.apply(
-                steering_rad, throttle, self._steering_rad, (now_ns - before_ns) / 1e9
-            )
+            self._told = self._limits.within(command, self._told, (now_ns - before_ns) / 1e9)
             self._written_ns = now_ns
             stops = self._stops
             try:
-                self._command(throttle)
+                self._command(self._told)
             finally:
                 if self._stops != stops:  # a stop did not wait for this command, which hung
-                    self._command(0.0)
+                    self._command(self._limits.standing(self._told))
 
     def stop(self) -> None:
         """Publish speed zero, also while ROS hangs with another message.
@@ -131,7 +162,7 @@ class RosVehicle:
         free = self._writing.acquire(timeout=_LOCK_PATIENCE_S)
         try:
             if not self._closed:
-                self._command(0.0)
+                self._command(self._limits.standing(self._told))
         finally:
             if free:
                 self._writing.release()
@@ -146,16 +177,21 @@ class RosVehicle:
             self._closed = True
             self._connection.close()
 
-    def _command(self, throttle: float) -> None:
+    def _command(self, command: Command) -> None:
         if self._command_type is None:
             return
-        speed_mps, message = throttle * self._speed_per_throttle_mps, self._command_type()
+        message = self._command_type()
+        if self._wheelbase_m is None or self._speed_per_throttle_mps is None:
+            message.linear.x, message.linear.y, message.angular.z = map(float, command)
+            self._connection.publish(self._publisher, message)
+            return
+        steering_rad, speed_mps = float(command[0]), command[1] * self._speed_per_throttle_mps
         if self._stamped:
             message.header.stamp = self._connection.stamp(self._connection.now_ns())
-            message.drive.steering_angle = float(self._steering_rad)
+            message.drive.steering_angle = steering_rad
             message.drive.speed = float(speed_mps)
         else:  # the velocity along x is that of the rear axle; see `TwistReader`
-            twist = twist_of(float(speed_mps), float(self._steering_rad), self._wheelbase_m)
+            twist = twist_of(float(speed_mps), steering_rad, self._wheelbase_m)
             message.linear.x, message.angular.z = twist
         self._connection.publish(self._publisher, message)
 
@@ -163,6 +199,28 @@ class RosVehicle:
         reading = odometry(self._kind, message, self._twists, self._joints)
         stamp_ns = self._clock.time_ns(message.header.stamp)
         self._reading = replace(reading, stamp_ns=stamp_ns)
+
+    def _take_turn(self, message: Any) -> None:
+        stamp_ns = self._gyro_clock.time_ns(message.header.stamp)
+        self._turns.append(replace(gyro(message, self._axis), stamp_ns=stamp_ns))
+
+
+def _axis(options: Mapping[str, str]) -> tuple[float, float, float]:
+    """The vehicle's vertical in the axes of its IMU.
+
+    Raises:
+        BadInput: these are no three numbers of a unit vector.
+    """
+    text = options.get("imu_axis", "0,0,1")
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not abs(math.hypot(x, y, z) - 1) < _UNIT:
+        raise BadInput(
+            "--option imu_axis", f"expected three numbers of a unit vector, got {text!r}"
+        )
+    return x, y, z
 
 
 def _joints(options: Mapping[str, str]) -> WheelJoints:

@@ -3,7 +3,7 @@
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import jax
@@ -27,7 +27,7 @@ from jaxnav.simulation.plant import BaseState, CarState, OdometryNoise, move
 from jaxnav.twist_control import TwistCommand
 
 _SUBSTEP_NS = 5_000_000
-_GYRO_NS = 10_000_000  # period of the gyro
+_GYRO_NS, _GYRO_KEPT = 10_000_000, 50  # period of the gyro, and how many readings it keeps
 _KEPT = 400  # substeps: two seconds into the past
 
 
@@ -77,6 +77,7 @@ class SimWorld:
     ):
         """Place the vehicle at rest at its start."""
         self.rig, self.markers, self.vehicle = rig, markers, vehicle
+        self._plant = replace(vehicle, gyro=None)  # what moves: all its leaves are arrays
         self.settings = settings or WorldSettings()
         self.rng = np.random.default_rng(seed)
         self._lock = threading.Lock()
@@ -178,8 +179,12 @@ class SimWorld:
         )
 
     def gyro(self, until_ns: int) -> tuple[GyroReading, ...]:
-        """The gyro's readings since the last call, up to an instant; none without a gyro."""
+        """The gyro's readings since the last call, up to an instant; none without a gyro.
+
+        It keeps those of half a second.
+        """
         readings: list[GyroReading] = []
+        self._gyro_ns = max(self._gyro_ns, until_ns - _GYRO_KEPT * _GYRO_NS)
         while self._gyro is not None and self._gyro_ns + _GYRO_NS <= until_ns:
             begin_ns, self._gyro_ns = self._gyro_ns, self._gyro_ns + _GYRO_NS
             late_ns = self._gyro.late_ns
@@ -219,7 +224,7 @@ class SimWorld:
             step_ns = min(_SUBSTEP_NS, until_ns - self._time_ns)
             command = np.array(self._obeyed(self._time_ns), self._dtype)
             dt_s = np.asarray(step_ns / 1e9, self._dtype)
-            moved = np.asarray(_moved(self.vehicle, self._row, command, dt_s))
+            moved = np.asarray(_moved(self._plant, self._row, command, dt_s))
             if self._held:  # it keeps its pose; a car's wheels are steered nevertheless
                 steered = moved[4:] if len(moved) == 5 else np.zeros(2)
                 moved = np.array([*self._row[:3], 0, *steered], self._dtype)

@@ -278,7 +278,7 @@ def notice(outcome: Outcome, before: Fault) -> str | None:
         reasons.append(f"no marker in view, and the odometer contradicts the {commanded}")
     if Fault.GYRO_INVALID in new:
         reasons.append("the gyro's readings are not finite, at its limit or repeated: left out")
-    if Fault.GYRO_STALE in new:
+    if Fault.GYRO_STALE in new and Fault.ODOMETRY_STALE not in outcome.faults:
         reasons.append("the gyro tells nothing: the drive goes on without it")
     if Fault.MARKER_OUTVOTED in new and outcome.outvoted:
         ids = ", ".join(map(str, outcome.outvoted))

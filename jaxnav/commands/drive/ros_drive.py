@@ -14,6 +14,7 @@ from jaxnav.commands.drive.ros_setup import (
     Activity,
     Say,
     check_selector,
+    check_vehicle,
     odom_for,
     path_of,
     publisher_for,
@@ -76,6 +77,7 @@ class PreparedDrive:
         )
         if (params := file.file("params")) is not None:
             setup = setup.with_params(load_params(params))
+        check_vehicle(file, setup.vehicle)
         self._setup = setup
         self._run = Run(
             car="ros2",

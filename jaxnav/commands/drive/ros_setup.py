@@ -10,13 +10,15 @@ from jaxnav.files import load_rig
 from jaxnav.files.ros import RosFile
 from jaxnav.files.validation import at
 from jaxnav.loop.signals import Signals
+from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.recording.drive_setup import PILOT_SELECTORS
 from jaxnav.ros.connection import Connection
 from jaxnav.ros.lenses import await_lenses, with_lenses
 from jaxnav.ros.odom_frame import IDENTITY, OdomFrame, OdomPose, OdomTf
-from jaxnav.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.ros.odometry_messages import NAV_ODOMETRY, TWIST_TYPES
 from jaxnav.ros.publisher import FrameNames, Publisher
 
 Say = Callable[[str], None]
@@ -102,6 +104,26 @@ def rig_for(file: RosFile, signals: Signals) -> CameraRig:
                 raise BadInput(at(file.path, f"{key}.{name}"), problem)
     lenses = await_lenses(file.path, file.camera_info, file.is_rectified, signals.check)
     return with_lenses(rig, lenses) if lenses else rig
+
+
+def check_vehicle(file: RosFile, vehicle: Vehicle | TwistBase) -> None:
+    """Refuse keys that do not go with the vehicle that the file names.
+
+    Raises:
+        BadInput: names file and key.
+    """
+    if file.imu is not None and vehicle.gyro is None:
+        raise BadInput(at(file.path, "imu"), f"{file.vehicle} has no gyro")
+    if not isinstance(vehicle, TwistBase):
+        return
+    what = "of a base that is no car"
+    if file.odometry_type not in TWIST_TYPES:
+        problem = f"{what} must be one of {', '.join(TWIST_TYPES)}"
+        raise BadInput(at(file.path, "odometry_type"), problem)
+    if file.command_type == "ackermann":
+        raise BadInput(at(file.path, "command_type"), f"{what} must be twist")
+    if file.base_x_m != 0:
+        raise BadInput(at(file.path, "base_x_m"), f"{what} must be 0: its twist is base_link's")
 
 
 def check_selector(file: RosFile) -> None:
