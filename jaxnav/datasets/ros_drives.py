@@ -7,6 +7,7 @@ The time of an input is when the recorder received it; its stamp is the message 
 several cameras with the same stamp are one input, at the time of the last of them.
 """
 
+from collections import deque
 from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from jaxnav.files.topics import TopicMap, same_topic
 from jaxnav.files.validation import at
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import GyroReading
+from jaxnav.loop.interfaces import MOST_TURNS, GyroReading
 from jaxnav.loop.pilot import Input
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
@@ -69,7 +70,7 @@ def read_ros_drive(
     if isinstance(vehicle, Vehicle):
         twists = TwistReader(float(vehicle.wheelbase_m), float(vehicle.steering_limit_rad))
     inputs: list[Input] = []
-    turns: list[GyroReading] = []  # since the last reading of the odometer
+    turns: deque[GyroReading] = deque(maxlen=MOST_TURNS)  # since the last odometry
     frames: list[tuple[int, FrameDetections]] = []
     with closing(read_messages(path, reader.choose)) as messages:
         for received in messages:

@@ -34,6 +34,7 @@ from jaxnav.loop import plugins
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import (
+    MOST_TURNS,
     AnyVehicle,
     Ending,
     GyroReading,
@@ -51,7 +52,6 @@ _COMMAND = struct.Struct("<cQq")  # kind, sequence, deadline_ns; then the number
 # Kind, stamp_ns, valid, how many numbers follow, how many gyro readings; then these, then a text.
 _READING = struct.Struct("<cq?BB")
 _GYRO = struct.Struct("<qd")  # stamp_ns, turn_radps
-_MOST_GYRO = 255
 KIND_COMMAND, KIND_TEXT, KIND_READING, KIND_FAILED = b"c", b"t", b"r", b"f"
 HEARD_WITHIN_S = 600.0  # an orphan repeats the stop for this long to a vehicle that does not hear
 _HEAVY = ("jax", "cv2")  # modules that the guard's process must not import
@@ -74,7 +74,7 @@ def command_of(frame: bytes) -> tuple[int, int, Command]:
 
 def reading_frame(read: Reading, gyro: Sequence[GyroReading], over: str) -> bytes:
     """The frame of a reading, the newest gyro readings, and why the drive is over or nothing."""
-    gyro = gyro[-_MOST_GYRO:]
+    gyro = gyro[-MOST_TURNS:]
     head = _READING.pack(KIND_READING, read.stamp_ns, read.valid, len(read.values), len(gyro))
     numbers = struct.pack(f"<{len(read.values)}d", *read.values)
     turns = b"".join(_GYRO.pack(one.stamp_ns, one.turn_radps) for one in gyro)

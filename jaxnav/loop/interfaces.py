@@ -105,6 +105,9 @@ def reading_of(stamp_ns: int, values: Sequence[float], valid: bool) -> Reading:
     return TwistOdometry(stamp_ns, values[0], values[1], values[2], valid)
 
 
+MOST_TURNS = 255  # readings of a gyro that are taken at once: the newest
+
+
 @dataclass(frozen=True)
 class GyroReading:
     """One reading of a gyro about the vehicle's vertical axis.

@@ -22,7 +22,15 @@ from jaxnav.loop.expect import Expected, expect_corners
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import Guard
-from jaxnav.loop.interfaces import AnyVehicle, Ending, Frame, GyroReading, HasGyro, Reading
+from jaxnav.loop.interfaces import (
+    MOST_TURNS,
+    AnyVehicle,
+    Ending,
+    Frame,
+    GyroReading,
+    HasGyro,
+    Reading,
+)
 from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.loop.priority import before_siblings
 from jaxnav.loop.seeing import Eyes, Region, group_frames
@@ -183,7 +191,8 @@ class Loop:
     def _gyro(self) -> tuple[GyroReading, ...]:
         """What the vehicle's gyro has told since the tick before; nothing without one."""
         with suppress(OSError):
-            return tuple(self._vehicle.read_gyro()) if isinstance(self._vehicle, HasGyro) else ()
+            if isinstance(self._vehicle, HasGyro):
+                return tuple(self._vehicle.read_gyro()[-MOST_TURNS:])
         return ()
 
     def _sighted(self) -> list[tuple[FrameDetections, ...]]:

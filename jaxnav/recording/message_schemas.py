@@ -21,6 +21,7 @@ from pydantic import BaseModel, Field, model_validator
 
 from jaxnav.files import limits
 from jaxnav.files.validation import Count, Entry
+from jaxnav.loop.interfaces import MOST_TURNS
 from jaxnav.recording.drive_format import NOT_FINITE
 from jaxnav.recording.message_fields import (
     Array,
@@ -75,7 +76,7 @@ class InputMessage(Entry):
 
     now_ns: Now
     faults: Faults
-    gyro: list[GyroMessage] = Field(default_factory=list, max_length=limits.IN_VIEW)
+    gyro: list[GyroMessage] = Field(default_factory=list, max_length=MOST_TURNS)
 
 
 class OdometryMessage(InputMessage):

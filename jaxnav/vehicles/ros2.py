@@ -25,7 +25,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from jaxnav.errors import BadInput
-from jaxnav.loop.interfaces import AnyVehicle, GyroReading, Reading, Setup
+from jaxnav.loop.interfaces import MOST_TURNS, AnyVehicle, GyroReading, Reading, Setup
 from jaxnav.loop.limits import Command, limits_of, turns_by_twist
 from jaxnav.models.twists import TwistReader, twist_of
 from jaxnav.ros.connection import Connection, message_type
@@ -51,7 +51,6 @@ _LOCK_PATIENCE_S = 0.03  # a `stop` waits this long for a message that another t
 _SHORT = {"odometry": ODOMETRY_TYPES[0], "ackermann": ACKERMANN}  # names of earlier releases
 _COMMANDS = {"ackermann": ACKERMANN, "twist": "geometry_msgs/msg/Twist"}
 _CAR_COMMANDS = (*_COMMANDS, "none")
-_MOST_TURNS = 255  # readings of a gyro that wait: at 400 Hz, half a second
 _UNIT = 1e-3  # a vector's length may be off by this
 
 
@@ -90,7 +89,7 @@ class RosVehicle:
             self._speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
         self._topic = options.get("odometry_topic", "/odom")
         self._reading: Reading | None = None
-        self._turns: deque[GyroReading] = deque(maxlen=_MOST_TURNS)
+        self._turns: deque[GyroReading] = deque(maxlen=MOST_TURNS)
         self._told = self._limits.zero
         self._written_ns: int | None = None
         self._closed = False
@@ -126,7 +125,7 @@ class RosVehicle:
         return self._reading
 
     def read_gyro(self) -> list[GyroReading]:
-        """See `HasGyro`: the messages of the IMU since the last call, the newest 255 of them."""
+        """See `HasGyro`: the messages of the IMU since the last call, the newest of them."""
         readings: list[GyroReading] = []
         while self._turns:
             readings.append(self._turns.popleft())

@@ -8,6 +8,8 @@ true pose on /truth; it obeys /drive, and stops by itself 0.5 s after the last c
     --tf       sends /twist too, and the pose of /odom on /tf: odom -> base_footprint, with a fixed
                base_footprint -> base_link on /tf_static
     --images   sends rendered pictures on /NAME/image_raw instead of detections
+    --vehicle=FILE   is a base that is no car: it obeys /cmd_vel, and tells its gyro on /imu, which
+               is mounted upside down
 """
 
 import math
@@ -20,12 +22,12 @@ from array import array
 import numpy as np
 
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
-from jaxnav.loop.interfaces import Setup
-from jaxnav.models.twists import twist_of
+from jaxnav.loop.chassis import car_motion
+from jaxnav.loop.interfaces import Odometry, Setup
 from jaxnav.ros.camera_messages import APRILTAG_ROS, IMAGE, detections_message
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.lenses import CAMERA_INFO
-from jaxnav.ros.odometry_messages import ACKERMANN, NAV_ODOMETRY, TWIST_WITH_COVARIANCE
+from jaxnav.ros.odometry_messages import ACKERMANN, IMU, NAV_ODOMETRY, TWIST_WITH_COVARIANCE
 from jaxnav.vehicles.sim import open_cameras, open_vehicle
 
 TF, POSE = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/Pose"
@@ -59,7 +61,8 @@ def main(words):
         signal.signal(number, lambda *_: over.set())
     qcar = calib_dir() / "qcar"
     rig, route = load_rig(qcar / "rig.yaml"), load_route(qcar / "route.yaml")
-    vehicle_model = load_vehicle(qcar / "vehicle.yaml")
+    named = [word.removeprefix("--vehicle=") for word in words if word.startswith("--vehicle=")]
+    vehicle_model = load_vehicle(named[0] if named else qcar / "vehicle.yaml")
     kind = IMAGE if "--images" in words else APRILTAG_ROS
     shown = {} if kind == APRILTAG_ROS else {"images": "true", "rate_hz": "8"}
     markers = load_markers(qcar / "markers.yaml")
@@ -67,7 +70,6 @@ def main(words):
     vehicle = open_vehicle(setup)
     cameras = open_cameras(setup, vehicle)
     ros = Connection("sim_car")
-    per_throttle_mps = float(vehicle_model.speed_per_throttle_mps)
     heard_s = [time.monotonic()]
     began_ns, time_of = time.monotonic_ns(), message_type("builtin_interfaces/msg/Time")
 
@@ -93,6 +95,10 @@ def main(words):
 
     def obey(message):
         heard_s[0] = time.monotonic()
+        if named:
+            vehicle.write(message.linear.x, message.linear.y, message.angular.z)
+            return
+        per_throttle_mps = float(vehicle_model.speed_per_throttle_mps)
         vehicle.write(message.drive.steering_angle, message.drive.speed / per_throttle_mps)
 
     def look(camera, publisher):
@@ -102,7 +108,8 @@ def main(words):
                 stamp = stamp_of(frame.stamp_ns)
                 ros.publish(publisher, message_of(kind, camera.name, frame, stamp))
 
-    ros.listen(ACKERMANN, "/drive", obey)
+    ros.listen(*(("geometry_msgs/msg/Twist", "/cmd_vel") if named else (ACKERMANN, "/drive")), obey)
+    imu = ros.publisher(IMU, "/imu")
     odom = ros.publisher(NAV_ODOMETRY, "/odom")
     truth = ros.publisher("geometry_msgs/msg/PoseStamped", "/truth")
     ros.run()
@@ -125,16 +132,23 @@ def main(words):
         if pauses[1]:
             continue
         reading = vehicle.read()
-        slope = math.tan(reading.steering_rad)
-        forward_mps, rate_radps = twist_of(reading.speed_mps, reading.steering_rad, WHEELBASE_M)
+        forward_mps, left_mps, rate_radps = motion_of(reading)
         psi_rad += rate_radps * ODOMETRY_S
-        x_m += reading.speed_mps * math.cos(psi_rad + math.atan(slope / 2)) * ODOMETRY_S
-        y_m += reading.speed_mps * math.sin(psi_rad + math.atan(slope / 2)) * ODOMETRY_S
+        c, s = math.cos(psi_rad), math.sin(psi_rad)
+        x_m += (c * forward_mps - s * left_mps) * ODOMETRY_S
+        y_m += (s * forward_mps + c * left_mps) * ODOMETRY_S
+        for turn in vehicle.read_gyro():
+            told = message_type(IMU)()
+            told.header.stamp = stamp_of(turn.stamp_ns)
+            told.angular_velocity.z = -turn.turn_radps
+            ros.publish(imu, told)
         message = message_type(NAV_ODOMETRY)()
         message.header.stamp = stamp_of(reading.stamp_ns)
         message.header.frame_id, message.child_frame_id = "odom", "base_link"
         place(message.pose.pose, x_m, y_m, psi_rad)
         message.twist.twist.linear.x, message.twist.twist.angular.z = forward_mps, rate_radps
+        if named:  # of a car the velocity at the rear axle
+            message.twist.twist.linear.y = left_mps
         ros.publish(odom, message)
         if "--tf" in words:
             twist_of_odom = message_type(TWIST_WITH_COVARIANCE)(header=message.header)
@@ -151,6 +165,13 @@ def main(words):
         camera.close()
     vehicle.close()
     ros.close()
+
+
+def motion_of(reading):
+    """Velocity ahead and to the left, and turn rate."""
+    if isinstance(reading, Odometry):
+        return car_motion(*reading.values, WHEELBASE_M)
+    return reading.values
 
 
 def transform(parent, child, pose, stamp):

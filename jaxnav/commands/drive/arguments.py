@@ -49,8 +49,9 @@ def check_times(args: "Run | Ros") -> None:
 class Run(Checked):
     """Drive a vehicle through its route.
 
-    Everything is compiled before the vehicle is armed. The last that it hears, however this ends,
-    is zero throttle: at the last waypoint, on Ctrl-C, Ctrl-Z and any other signal, when data are
+    The vehicle is what its file says: a car, or a base that is driven by a twist. Everything is
+    compiled before it is armed. The last that it hears, however this ends, is zero throttle, or a
+    twist of zero: at the last waypoint, on Ctrl-C, Ctrl-Z and any other signal, when data are
     missing for too long, and when anything hangs, fails or is killed. A vehicle that can be moved
     is opened in a small process of its own, which stops it whatever becomes of this one; others,
     `sim` and `replay` among them, are watched by a thread. `--car sim` is a simulated car in
@@ -110,9 +111,9 @@ class Run(Checked):
 class Ros(Checked):
     """Localise and drive as a lifecycle node of ROS 2, named jaxnav.
 
-    FILE says which topic is what and names our files. With a route the node drives, through the
-    guard that `jaxnav run` has; without one it localises a car that somebody else drives; without
-    a vehicle, a rig that moves freely. It sends tf, pose with covariance, odometry, all
+    FILE says which topic is what and names our files. With a route the node drives a car or another
+    base, through the guard that `jaxnav run` has; without one it localises a vehicle that somebody
+    else drives; without a vehicle, a rig that moves freely. It sends tf, pose with covariance, odometry, all
     hypotheses, diagnostics.
 
     Exit codes: 1 the drive has ended, 2 bad input, 128 plus the number of the signal that ended it.

@@ -1,0 +1,186 @@
+"""The node drives a differential base with a gyro over real DDS, and its last word is zero."""
+
+import math
+import signal
+import threading
+import time
+
+import pytest
+
+from jaxnav.errors import BadInput
+from jaxnav.files import calib_dir, load_vehicle
+from jaxnav.loop.interfaces import Setup, TwistOdometry
+from jaxnav.recording.drive_log import read_drive
+from jaxnav.ros.connection import Connection, message_type
+from jaxnav.ros.odometry_messages import IMU, NAV_ODOMETRY, TWIST, TWIST_WITH_COVARIANCE
+from jaxnav.testing import check_vehicle
+from jaxnav.vehicles.ros2 import open_vehicle
+from tests.real_ros.processes import node, sim_car, until
+
+CAMERAS = ("front", "right", "rear", "left")
+GOAL = 0.50, 0.65
+VELOCITY = "geometry_msgs/msg/Twist"
+BASE = """
+base: differential
+forward_limit_mps: 1.0
+turn_limit_radps: 4.0
+time_constant_s: 0.15
+gyro: {class: consumer}
+"""
+OMNI = BASE.replace("differential", "omni") + "left_limit_mps: 0.5\n"
+
+
+class Peer:
+    """The other side of the topics."""
+
+    def __init__(self) -> None:
+        self.connection = Connection("peer")
+        self.commands: list = []
+        self.truths: list = []
+        self.banks: list = []
+        self.connection.listen(VELOCITY, "/cmd_vel", self.commands.append)
+        self.connection.listen("geometry_msgs/msg/PoseStamped", "/truth", self.truths.append)
+        self.connection.listen("jaxnav_msgs/msg/Bank", "/jaxnav/bank", self.banks.append)
+        self.connection.run()
+        self._publishers: dict = {}
+
+    def send(self, kind: str, topic: str, edit) -> None:
+        """Publish a message that is stamped now."""
+        publisher = self._publishers.get((kind, topic))
+        if publisher is None:
+            publisher = self._publishers[kind, topic] = self.connection.publisher(kind, topic)
+        message = message_type(kind)()
+        message.header.stamp = self.connection.stamp(self.connection.now_ns())
+        edit(message)
+        self.connection.publish(publisher, message)
+
+
+@pytest.fixture
+def peer():
+    peer = Peer()
+    yield peer
+    peer.connection.close()
+
+
+def twist_of(command) -> tuple[float, ...]:
+    return command.linear.x, command.linear.y, command.angular.z
+
+
+def setup_of(folder, text, **options) -> Setup:
+    path = folder / "vehicle.yaml"
+    path.write_text(text)
+    return Setup(None, None, load_vehicle(path), (0.0, 0.0, 0.0), options=options)
+
+
+def test_it_drives_a_differential_base_to_the_goal(tmp_path, peer):
+    qcar, drive = calib_dir() / "qcar", tmp_path / "drive.mcap"
+    (tmp_path / "base.yaml").write_text(BASE)
+    entries = {name: str(qcar / f"{name}.yaml") for name in ("rig", "markers", "route")}
+    entries["vehicle"] = "base.yaml"
+    entries["cameras"] = "{" + ", ".join(f"{n}: /{n}/detections" for n in CAMERAS) + "}"
+    entries["odometry"] = "/odom"
+    upside_down = "{wxyz: [0, 1, 0, 0], xyz_m: [0, 0, 0]}"
+    entries["imu"] = f"{{topic: /imu, T_vehicle_imu: {upside_down}}}"
+    file = tmp_path / "node.yaml"
+    file.write_text("".join(f"{key}: {value}\n" for key, value in entries.items()))
+    words = str(file), "--timeout-s", "2", "--record", str(drive)
+    base = f"--vehicle={tmp_path / 'base.yaml'}"
+    with sim_car(tmp_path, base), node(tmp_path, *words) as program:
+
+        def there() -> bool:
+            at = [(one.pose.position.x, one.pose.position.y) for one in peer.truths[-1:]]
+            return bool(at) and math.dist(at[0], GOAL) < 0.2
+
+        until(there, 300.0, program)
+        until(lambda: twist_of(peer.commands[-1]) == (0.0, 0.0, 0.0), 30.0, program)
+        assert peer.banks[-1].decided
+        assert "OK" in {one.health for one in peer.banks}
+        program.tell(signal.SIGTERM)
+        assert program.ends() == 128 + signal.SIGTERM, program.said
+    twists = [twist_of(command) for command in peer.commands]
+    assert twists[-1] == (0.0, 0.0, 0.0)
+    assert max(abs(turn) for _, _, turn in twists) > 0.3
+    assert {left for _, left, _ in twists} == {0.0}
+    log = read_drive(drive)
+    told = [one for given in log.inputs for one in given.gyro]
+    assert len(told) > 100
+    # Mounted upside down, it tells the turn of the wheels.
+    rates = {one.stamp_ns: one.turn_radps for one in told}
+    pairs = []
+    for given in log.inputs:
+        read = given.odometry
+        if isinstance(read, TwistOdometry) and abs(read.turn_radps) > 0.3:
+            nearest = min(rates, key=lambda stamp_ns: abs(stamp_ns - read.stamp_ns))
+            pairs.append((read.turn_radps, rates[nearest]))
+    assert len(pairs) > 5
+    assert sum(one * other > 0 for one, other in pairs) > 0.9 * len(pairs)
+
+
+@pytest.mark.parametrize("kind", [NAV_ODOMETRY, TWIST_WITH_COVARIANCE, TWIST])
+def test_every_kind_of_odometry_tells_the_same_twist(tmp_path, peer, kind):
+    vehicle = open_vehicle(setup_of(tmp_path, OMNI, odometry_type=kind, imu_topic="/imu"))
+
+    def edit(message):
+        twist = message.twist if kind == TWIST else message.twist.twist
+        twist.linear.x, twist.linear.y, twist.angular.z = 0.3, -0.2, 1.5
+
+    def turn(message):
+        message.angular_velocity.z = 1.4
+
+    try:
+        until(lambda: vehicle._reading or peer.send(kind, "/odom", edit), 20.0)
+        reading = vehicle.read()
+        assert isinstance(reading, TwistOdometry)
+        assert reading.values == (0.3, -0.2, 1.5)
+        assert abs(time.monotonic_ns() - reading.stamp_ns) < 5 * 10**9
+        until(lambda: vehicle._turns or peer.send(IMU, "/imu", turn), 20.0)
+        told = vehicle.read_gyro()
+        assert {one.turn_radps for one in told} == {1.4}
+        assert abs(time.monotonic_ns() - told[-1].stamp_ns) < 5 * 10**9
+    finally:
+        vehicle.close()
+
+
+def test_a_twist_is_cut_at_its_limits_and_zero_is_the_last_word(tmp_path, peer):
+    vehicle = open_vehicle(setup_of(tmp_path, OMNI))
+    try:
+        until(vehicle._publisher.get_subscription_count, 30.0)
+        until(lambda: peer.commands or vehicle.stop(), 30.0)
+        time.sleep(0.2)
+        peer.commands.clear()
+        vehicle.write(9.0, -9.0, 9.0)
+        until(lambda: peer.commands, 20.0)
+        assert twist_of(peer.commands[-1]) == (1.0, -0.5, 4.0)
+    finally:
+        vehicle.close()
+    until(lambda: len(peer.commands) > 1, 20.0)
+    assert twist_of(peer.commands[-1]) == (0.0, 0.0, 0.0)
+
+
+def test_it_keeps_the_promises_of_a_plug_in(tmp_path, peer):
+    done = threading.Event()
+
+    def tell():
+        while not done.wait(0.01):
+            peer.send(NAV_ODOMETRY, "/odom", lambda message: None)
+
+    telling = threading.Thread(target=tell)
+    telling.start()
+    try:
+        check_vehicle(open_vehicle, setup_of(tmp_path, OMNI))
+    finally:
+        done.set()
+        telling.join()
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"command_type": "ackermann"}, "--option command_type: expected twist or none"),
+        ({"odometry_type": "sensor_msgs/msg/JointState"}, "--option odometry_type: expected nav"),
+        ({"imu_topic": "/imu", "imu_axis": "0,0,2"}, "--option imu_axis: expected three numbers"),
+    ],
+)
+def test_what_a_base_can_not_do_is_refused(tmp_path, options, line):
+    with pytest.raises(BadInput, match=line):
+        open_vehicle(setup_of(tmp_path, BASE, **options))
