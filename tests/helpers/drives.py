@@ -15,7 +15,7 @@ from jaxnav.control import Command
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.interfaces import GyroReading, Odometry, TwistOdometry
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.navigator import Output
 from jaxnav.pose.candidates import Candidates
@@ -50,6 +50,15 @@ def make_input(index: int) -> Input:
         )
         return Input(now_ns, frames=frames)
     return Input(now_ns)
+
+
+def make_base_input(index: int) -> Input:
+    """A twist and what a gyro has told, or that alone, in turn."""
+    now_ns, rng = BEGIN_NS + index * PERIOD_NS, np.random.default_rng(index)
+    rates = rng.normal(size=2).tolist()
+    gyro = tuple(GyroReading(now_ns - 9 + k, rate) for k, rate in enumerate(rates))
+    reading = TwistOdometry(now_ns - 7, *rng.normal(size=3).tolist(), valid=index % 4 == 0)
+    return Input(now_ns, reading if index % 2 == 0 else None, gyro=gyro)
 
 
 def make_output(rng: np.random.Generator, dtype: type = float) -> Output:

@@ -1,6 +1,7 @@
 """Every loader of jaxnav with a file that it reads: the beginning of all damage."""
 
 import bz2
+import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -29,9 +30,12 @@ from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recording.messages import input_message
+from jaxnav.recording.outcomes import outcome_message
 from jaxnav.recording.recorder import Recorder
+from jaxnav.simulation.bases import equipped
 from jaxnav.studies.store import open_store
-from tests.helpers.drives import record_drive
+from tests.helpers.drives import make_base_input, make_outcome, record_drive
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import BEGIN_NS, IMU, MS, SQUARE_PX, TOPICS
 from tests.helpers.ros_drives import drive as ros_drive
@@ -168,6 +172,20 @@ def _drive(folder: Path) -> Path:
     return recorder.path
 
 
+def _base_drive(folder: Path) -> Path:
+    """Twists and turn rates, and what the pilot made of them."""
+    base = equipped(qcar(), "omni", "consumer")
+    setup = dataclasses.replace(make_setup(), vehicle=base)
+    recorder = Recorder(folder / "drive.mcap", setup.header())
+    for index in range(6):
+        given = make_base_input(index)
+        recorder.put(*input_message(given))
+        outcome = dataclasses.replace(make_outcome(index), twist=(0.1 * index, -0.2, 0.3))
+        recorder.put("/outcome", given.now_ns, outcome_message(outcome, f"digest {index}"))
+    recorder.close()
+    return recorder.path
+
+
 def _whole_drive(path: Path) -> Any:
     """All that a command reads of it."""
     log = read_drive(path)
@@ -264,6 +282,25 @@ camera_info: {{front: /front/camera_info}}
 rectified: false
 tf_tolerance_s: 0.1
 """
+ROS_BASE = """
+rig: rig.yaml
+markers: markers.yaml
+vehicle: base.yaml
+cameras: {front: /front/detections}
+odometry: /odom
+imu: {topic: /imu, T_vehicle_imu: {wxyz: [0, 1, 0, 0], xyz_m: [0.1, 0, -0.2]}}
+command: /cmd_vel
+command_type: twist
+"""
+BASE = """
+base: omni
+forward_limit_mps: 1.0
+left_limit_mps: 0.5
+turn_limit_radps: 4.0
+time_constant_s: 0.15
+sigma: {speed_scale: 0.01, turn_gain: 0.02}
+gyro: {class: tactical, delay_s: 0.004}
+"""
 ROS_BODY = """
 rig: rig.yaml
 markers: markers.yaml
@@ -283,11 +320,13 @@ STRUCTURED = {
     "vehicle": Loader(
         _written("vehicle.yaml", (QCAR / "vehicle.yaml").read_bytes()), files.load_vehicle
     ),
+    "vehicle of another base": Loader(_written("vehicle.yaml", BASE), files.load_vehicle),
     "route": Loader(_written("route.yaml", (QCAR / "route.yaml").read_bytes()), files.load_route),
     "params": Loader(_written("params.yaml", PARAMS), _applied),
     "topics": Loader(_written("topics.yaml", TOPICS), files.load_topics),
     "topics with an IMU": Loader(_written("topics.yaml", TOPICS + IMU), files.load_topics),
     "ROS node": Loader(_written("node.yaml", ROS_NODE), load_ros),
+    "ROS node of a base": Loader(_written("node.yaml", ROS_BASE), load_ros),
     "ROS node of a free rig": Loader(_written("node.yaml", ROS_BODY), load_ros),
     "Kalibr rig": Loader(_written("chain.yaml", KALIBR), files.load_rig),
     "Kalibr camera": Loader(
@@ -308,6 +347,7 @@ STRUCTURED = {
 }
 BINARY = {
     "drive": Loader(_drive, _whole_drive),
+    "drive of a base": Loader(_base_drive, _whole_drive),
     "bag": Loader(_bag, _from_bag),
     "compressed bag": Loader(_compressed_bag, _from_bag),
     **{f"ROS {kind}": _ros(kind, f"*.{kind}") for kind in FORMATS},

@@ -13,9 +13,18 @@ from jaxnav.errors import BadInput
 from jaxnav.files import save_rig
 from jaxnav.loop.flags import Fault, Health
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Ending, HasOwnFiles, Odometry, Vehicle
+from jaxnav.loop.interfaces import (
+    Ending,
+    GyroReading,
+    HasOwnFiles,
+    Odometry,
+    TwistOdometry,
+    Vehicle,
+)
 from jaxnav.loop.pilot import Input
+from jaxnav.models.gyro import GYROS
 from jaxnav.models.rig import PLACED_BY_HAND
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_replay import first_difference, replay_drive
 from jaxnav.recording.drive_setup import DriveSetup
@@ -397,3 +406,28 @@ def test_flags_go_before_the_recordings_own_files(tmp_path, drive, monkeypatch):
     assert given[0].rig.names == ("front",)
     assert given[0].route == SETUP.route
     assert given[0].selector == "multi-hypothesis"
+
+
+def test_a_base_tells_its_twist_and_its_gyro_again(tmp_path, now):
+    inputs = [
+        Input(at(20), TwistOdometry(at(19), 0.1, 0.0, -0.5), gyro=(GyroReading(at(15), 0.4),)),
+        Input(at(40), gyro=(GyroReading(at(25), 0.5), GyroReading(at(35), 0.6))),
+        Input(at(60), TwistOdometry(at(59), 0.2, 0.0, 0.5)),
+    ]
+    base = TwistBase.create(1.0, 4.0, 0.15, gyro=GYROS["consumer"])
+    header = dataclasses.replace(SETUP, vehicle=base).header()
+    vehicle = opened(recorded(tmp_path / "drive.mcap", inputs, header=header))
+    assert vehicle.own_files({"drive": str(tmp_path / "drive.mcap")}).vehicle.gyro is not None
+    first = vehicle.read()
+    assert first.values == (0.1, 0.0, -0.5)
+    assert [one.turn_radps for one in vehicle.read_gyro()] == [0.4]
+    now.ns += 45 * MS
+    told = vehicle.read_gyro()
+    assert [one.turn_radps for one in told] == [0.5, 0.6]
+    assert [one.stamp_ns - first.stamp_ns for one in told] == [6 * MS, 16 * MS]
+    assert vehicle.read_gyro() == []
+    assert vehicle.read().values == (0.2, 0.0, 0.5)
+    vehicle.write(0.1, 0.0, -2.0)
+    assert (vehicle.writes, vehicle.throttle) == (1, -2.0)
+    vehicle.stop()
+    assert vehicle.throttle == 0
