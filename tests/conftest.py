@@ -70,7 +70,8 @@ install_import_hook(AROUND, "tests.helpers.shapes.check_arrays")
 
 # A file is one worker's: what takes minutes must not come last.
 LONG = """test_navigator test_hypotheses test_replay test_faults test_tune test_following test_demo
-    test_tuning_driving test_rollout test_study_kinds test_studies test_examples""".split()
+    test_tuning_driving test_rollout test_study_kinds test_studies test_examples test_twist_pilot
+    test_run_base""".split()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

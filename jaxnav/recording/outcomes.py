@@ -171,6 +171,10 @@ def _selected(one: Outcome) -> int:
     return sum(_valid(one)[:selected].tolist()) if selected >= 0 else -1
 
 
+def _twist(one: Outcome) -> Float[np.ndarray, " 3"] | None:
+    return None if one.twist is None else np.array(one.twist, float)
+
+
 _HEALTH, _REJECTS = Annotated[Health, Words(Health)], Annotated[Reject, Words(Reject)]
 _SQUARE = Annotated[np.ndarray, Array("number"), AfterValidator(square)]
 
@@ -257,7 +261,7 @@ class Outcomes:
     twist: Annotated[
         Float[np.ndarray, "N 3"],
         _field(
-            Annotated[np.ndarray, Array("number", (3,))], "twist", float,
+            Annotated[np.ndarray, Array("number", (3,))], _twist, float,
             shape=(3,), default=None, missing=np.nan, slack=1,
         ),
     ]  # fmt: skip

@@ -24,6 +24,7 @@ from jaxnav.models.bicycle import SENSOR_ERRORS
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import ZERO, inverses_in_world, opposite, planar_in_world
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TWIST_ERRORS
 from jaxnav.plots.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION
 from jaxnav.recording.learnt import as_filed
 from jaxnav.recording.outcomes import Outcomes
@@ -58,6 +59,7 @@ class RerunScene:
         self._names = () if rig is None else rig.names
         self._from_world = opposite(ZERO if markers is None else markers.origin_m)
         self._begin_ns: int | None = None
+        self._is_base = False  # until an outcome commands a twist
         self._shown_flags = ""
         self._last_m: np.ndarray | None = None
         self._still("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
@@ -214,6 +216,9 @@ class RerunScene:
         ):
             if math.isfinite(value):
                 self._say(f"plots/{entity}", self._rerun.Scalars(float(value)))
+        if not self._is_base and not np.isnan(outcomes.twist[index]).all():
+            self._is_base = True
+            self._still("plots/sensor_errors", self._rerun.SeriesLines(names=list(TWIST_ERRORS)))
         errors = as_filed(outcomes.errors[index])
         for entity, values in zip(("sensor_errors", "camera_errors"), errors, strict=True):
             if values.size and np.isfinite(values).all():

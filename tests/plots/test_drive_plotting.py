@@ -316,3 +316,13 @@ def test_what_is_no_drive_gets_one_line(tmp_path, capsys):
         assert cli.main(arguments) == cli.EXIT_BAD_INPUT
         assert capsys.readouterr() == ("", f"jaxnav plot: {tmp_path / name}: {problem}\n")
     assert not (tmp_path / "out").exists()
+
+
+def test_of_a_base_the_twist_is_drawn(log):
+    twist = np.tile([0.3, 0.0, -0.5], (COUNT, 1))
+    figure = drive_log_report(changed(log, twist=twist), "a drive")
+    labels = {axes.get_ylabel().replace("\n", " ") for axes in figure.axes}
+    assert {"ahead, left (m/s)", "turn (deg/s)"} <= labels
+    assert not {"throttle", "steering (deg)"} & labels
+    lines = [line.get_ydata() for axes in figure.axes for line in axes.lines]
+    assert any(len(y) == COUNT and np.allclose(y, np.rad2deg(-0.5)) for y in lines)

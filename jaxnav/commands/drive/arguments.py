@@ -113,8 +113,8 @@ class Ros(Checked):
 
     FILE says which topic is what and names our files. With a route the node drives a car or another
     base, through the guard that `jaxnav run` has; without one it localises a vehicle that somebody
-    else drives; without a vehicle, a rig that moves freely. It sends tf, pose with covariance, odometry, all
-    hypotheses, diagnostics.
+    else drives; without a vehicle, a rig that moves freely. It sends tf, pose with covariance,
+    odometry, all hypotheses, diagnostics.
 
     Exit codes: 1 the drive has ended, 2 bad input, 128 plus the number of the signal that ended it.
     """
