@@ -36,7 +36,7 @@ def make_setup(**options: Any) -> Setup:
 
 
 class PlainBase:
-    """It reads what it was told, at once. Options: log, the file."""
+    """It reads what it was told, at once. Options: log, the file; broken_gyro, anything."""
 
     timeout_s = math.inf  # it obeys its last command for ever: nothing but the guard stops it
 
@@ -44,6 +44,7 @@ class PlainBase:
         self.limits = setup.vehicle.forward_limit_mps, setup.vehicle.turn_limit_radps
         self._file = os.open(setup.options["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
         self._told = (0.0, 0.0, 0.0)
+        self._broken = "broken_gyro" in setup.options
         self._gyro_ns = time.monotonic_ns()
 
     def read(self) -> TwistOdometry:
@@ -51,6 +52,8 @@ class PlainBase:
 
     def read_gyro(self) -> list[GyroReading]:
         """One each 5 ms."""
+        if self._broken:
+            raise OSError("the gyro's bus is out")
         now_ns, readings = time.monotonic_ns(), []
         while self._gyro_ns + GYRO_NS <= now_ns:
             self._gyro_ns += GYRO_NS

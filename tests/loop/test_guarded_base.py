@@ -167,3 +167,18 @@ def test_readings_limits_and_a_gyro_pass_through_the_guards_process(tmp_path):
         assert last(tmp_path) == ZERO
     finally:
         guarding.end()
+
+
+def test_a_gyro_that_can_not_be_read_is_no_reason_to_go_without_the_odometer(tmp_path):
+    guarding = GuardProcess(plain_base.NAME)
+    try:
+        guarding.prepare(lambda: None)
+        setup = make_setup(log=tmp_path / "log", broken_gyro="yes")
+        vehicle = guarding.open(setup, TwistLimits(1.0, 0.0, 3.0), 5.0)
+        assert vehicle is not None, guarding.stays
+        vehicle.watch(lambda reason: None)
+        assert vehicle.read().values == ZERO
+        assert vehicle.read_gyro() == ()
+        vehicle.close()
+    finally:
+        guarding.end()
