@@ -12,7 +12,7 @@ from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import TIMEOUT_S, Guard
-from jaxnav.loop.interfaces import Frame, Odometry
+from jaxnav.loop.interfaces import MOST_TURNS, Frame, GyroReading, Odometry
 from jaxnav.loop.loop import Loop
 from jaxnav.loop.pilot import Input, Pilot
 from jaxnav.loop.seeing import Eyes, Region, Search, SearchedFrame, group_frames, image_fault
@@ -349,3 +349,29 @@ def test_where_it_is_expected_is_where_it_is_looked_for_first(near, region, aske
         sighted = search.look(Frame(number, picture), regions.get(region))
         assert sighted.detections is not None
     assert finder.asked == asked
+
+
+class TurningCar(Car):
+    """One with a gyro, of which every third look fails."""
+
+    def __init__(self):
+        super().__init__()
+        self.looks = 0
+
+    def read_gyro(self):
+        self.looks += 1
+        if self.looks % 3 == 0:
+            raise OSError("not now")
+        return [GyroReading(time.monotonic_ns(), 0.1 * n) for n in range(2 * MOST_TURNS)]
+
+
+def test_a_gyro_is_asked_at_every_reading_and_may_fail_now_and_then(standing):
+    with Drive(standing, TurningCar()) as drive:
+        time.sleep(0.3)
+    ticks = [given for given in drive.pilot.handled if given.odometry is not None]
+    counts = [len(given.gyro) for given in ticks]
+    assert set(counts) == {0, MOST_TURNS}  # no more than a recording holds, the newest
+    assert counts.count(MOST_TURNS) > counts.count(0) > 2
+    last = next(given for given in reversed(ticks) if given.gyro)
+    assert last.gyro[-1].turn_radps == 0.1 * (2 * MOST_TURNS - 1)
+    assert not any(given.faults & Fault.VEHICLE_FAILED for given in ticks)
