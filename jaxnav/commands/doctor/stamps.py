@@ -16,10 +16,11 @@ def stamps(path: Path) -> Iterator[Finding]:
     """Report each camera's delay against the odometer in a drive that `jaxnav run --record` wrote.
 
     Raises:
-        BadInput: the file is no recording, or damaged.
+        BadInput: the file is no recording, or damaged, or not of a car.
     """
     log = read_drive(path)
     setup = DriveSetup.of_header(log.header, path)
+    setup.car(path)
     delays = delays_of(log, setup)
     for text in warnings(delays, setup):
         what, _, do = text.partition(": ")

@@ -34,7 +34,7 @@ class DelayWatch:
         warns: on the terminal, as soon as a camera is found to be late.
         """
         self._setup, self._warns = setup, warns
-        car = setup.car(Path("DelayWatch"))
+        car = setup.car(Path("the drive"))
         self._delays = CameraDelays(setup.rig, setup.markers, car)
         self._faults = Fault(0)
         self._wake, self._closing = threading.Event(), False
@@ -114,8 +114,8 @@ def _agree(one: Delay, together: Delay) -> bool:
 
 
 def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
-    """The delays of the cameras in a recorded drive."""
-    delays = CameraDelays(setup.rig, setup.markers, setup.car(log.path))
+    """The delays of the cameras in the recorded drive of a car."""
+    delays = CameraDelays(setup.rig, setup.markers, setup.car(Path("the drive")))
     corrections = Corrections.of(setup.vehicle)
     frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     outcomes = log.outcomes
