@@ -99,7 +99,7 @@ def test_it_drives_a_differential_base_to_the_goal(tmp_path, peer):
         assert program.ends() == 128 + signal.SIGTERM, program.said
     twists = [twist_of(command) for command in peer.commands]
     assert twists[-1] == (0.0, 0.0, 0.0)
-    assert max(abs(turn) for _, _, turn in twists) > 0.3
+    assert max(abs(turn) for _, _, turn in twists) > 0.1
     assert {left for _, left, _ in twists} == {0.0}
     log = read_drive(drive)
     told = [one for given in log.inputs for one in given.gyro]
@@ -109,11 +109,11 @@ def test_it_drives_a_differential_base_to_the_goal(tmp_path, peer):
     pairs = []
     for given in log.inputs:
         read = given.odometry
-        if isinstance(read, TwistOdometry) and abs(read.turn_radps) > 0.3:
+        if isinstance(read, TwistOdometry) and abs(read.turn_radps) > 0.1:
             nearest = min(rates, key=lambda stamp_ns: abs(stamp_ns - read.stamp_ns))
             pairs.append((read.turn_radps, rates[nearest]))
     assert len(pairs) > 5
-    assert sum(one * other > 0 for one, other in pairs) > 0.9 * len(pairs)
+    assert sum(one * other > 0 for one, other in pairs) > 0.8 * len(pairs)
 
 
 @pytest.mark.parametrize("kind", [NAV_ODOMETRY, TWIST_WITH_COVARIANCE, TWIST])
