@@ -67,6 +67,30 @@ def score(recording: Recording, result: Replay) -> dict[str, float]:
     }
 
 
+def of_most_seen(recording: Recording, count: int) -> Recording:
+    """The recording with the markers that are seen most, in the map's order."""
+    seen = np.bincount(recording.seen_at[2], minlength=len(recording.markers.ids))
+    chosen = np.sort(np.argsort(-seen, kind="stable")[:count])
+    index = np.full(len(seen), -1)
+    index[chosen] = np.arange(len(chosen))
+    kept = index[recording.seen_at[2]] >= 0
+    frame, camera, marker = recording.seen_at[:, kept]
+    whole = recording.markers
+    markers = dataclasses.replace(
+        whole,
+        Ts_world_marker=jaxlie.SE3(whole.Ts_world_marker.wxyz_xyz[chosen]),
+        size_m=whole.size_m[chosen],
+        ids=tuple(whole.ids[row] for row in chosen),
+        families=tuple(whole.families[row] for row in chosen),
+    )
+    return dataclasses.replace(
+        recording,
+        markers=markers,
+        seen_at=np.stack([frame, camera, index[marker]]),
+        seen_px=recording.seen_px[kept],
+    )
+
+
 def with_made_odometry(recording: Recording, scale: float, yaw_deg: float) -> Recording:
     """The recording with odometry made from its reference, 0.1 m ahead of the rig's origin.
 
@@ -148,6 +172,7 @@ def main() -> None:
     parser.add_argument("--made-odometry", type=float, nargs=2, metavar=("SCALE", "YAW_DEG"),
                         help="make it from the reference, off by so much")  # fmt: skip
     parser.add_argument("--smooth", action="store_true", help="and the smoothed poses beside")
+    parser.add_argument("--markers", type=int, help="only so many, those that are seen most")
     parser.add_argument("--all-markers", action="store_true", help="one pose from all in view")
     parser.add_argument("--gap-s", type=float, help="hide all markers so long, now and then")
     args = parser.parse_args()
@@ -156,6 +181,8 @@ def main() -> None:
         if args.names and folder.name not in args.names:
             continue
         recording = read_recording(folder).first(args.frames)
+        if args.markers is not None:
+            recording = of_most_seen(recording, args.markers)
         if args.without_odometry:
             recording = dataclasses.replace(recording, odometry=None)
         if args.made_odometry is not None:

@@ -1,6 +1,5 @@
 """A free body's odometry that is off in scale and direction: derivatives, drives, and banks."""
 
-
 import jax
 import jax.numpy as jnp
 import jaxlie
