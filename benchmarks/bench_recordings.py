@@ -105,7 +105,7 @@ def with_made_odometry(recording: Recording, scale: float, yaw_deg: float) -> Re
     turned = jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(z_rad))
     body = true @ jaxlie.SE3(jnp.asarray(told)) @ turned
     before, after = (jaxlie.SE3(body.wxyz_xyz[part]) for part in (slice(-1), slice(1, None)))
-    steps = np.asarray((before.inverse() @ after).log())
+    steps = np.array((before.inverse() @ after).log())
     steps[:, :3] *= scale
     way, angle = (np.linalg.norm(steps[:, part], axis=1) for part in (slice(3), slice(3, 6)))
     dt_s = np.diff(recording.stamps_ns[rows]) / 1e9
