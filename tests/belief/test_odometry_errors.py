@@ -1,5 +1,7 @@
 """A free body's odometry that is off in scale and direction: derivatives, drives, and banks."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -8,10 +10,12 @@ import pytest
 
 from jaxnav.belief import kalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
+from jaxnav.belief.merging import merge_heirs
 from jaxnav.belief.smoothing import smoothed
 from jaxnav.models.geometry import cayley, inverse_cayley
 from jaxnav.models.odometry_errors import OdometryErrors, sigma_as_told
 from jaxnav.pose.observation import Observation
+from tests import worlds
 from tests.derivatives import check_derivatives
 
 ARM_M = np.array([0.1, -0.05, 0.2])
@@ -186,3 +190,44 @@ def test_a_scale_that_is_far_off_is_found_and_taken_out(off_by_7_percent_and_2_d
     assert abs(mean[0] - errors[0]) < 0.5 * errors[0]
     assert abs(mean[3] - errors[3]) < 0.5 * errors[3]
     assert np.all(sigma < np.asarray(ERRORS.sigma))
+
+
+def test_a_bank_keeps_what_it_has_learnt_where_it_merges_and_begins_anew_at_the_prior():
+    """As all errors beside pose and twist: considered while the orientation is not known."""
+    bank = MOTION.init(2)
+    rest, P_rest = MOTION.at_first()
+    np.testing.assert_array_equal(bank.mean[0, 7:], rest)
+    errors = jnp.asarray([[0.02, 0.01, 0.0, 0.03], [0.04, 0.01, 0.02, -0.01]])
+    bank = dataclasses.replace(
+        bank,
+        mean=bank.mean.at[:, 13:].set(errors),
+        covariance=1e-6 * bank.covariance,
+        initialised=jnp.ones(2, bool),
+        log_weight=jnp.log(jnp.asarray([0.75, 0.25])),
+    )
+    merged = merge_heirs(bank, jnp.asarray([0, 0]), MOTION.difference, MOTION.moved)
+    np.testing.assert_array_equal(merged.initialised, [True, False])
+    np.testing.assert_allclose(merged.mean[0, 13:], 0.75 * errors[0] + 0.25 * errors[1], atol=1e-12)
+    spread = (errors[0] - errors[1]) * np.sqrt(0.75 * 0.25)
+    np.testing.assert_allclose(
+        merged.covariance[0, 12:, 12:],
+        np.outer(spread, spread) + np.asarray(bank.covariance[0, 12:, 12:]),
+        atol=1e-12,
+    )
+    before, after = (bank.mean[0], bank.covariance[0]), (bank.mean[1], 0.5 * bank.covariance[1])
+    kept, P = MOTION.considered(jnp.asarray(False), before, after)
+    np.testing.assert_array_equal(kept[13:], errors[0])
+    np.testing.assert_array_equal(P[12:, 12:], bank.covariance[0, 12:, 12:])
+    np.testing.assert_array_equal(MOTION.considered(jnp.asarray(True), before, after)[0], after[0])
+    wxyz_xyz = jaxlie.SE3.identity().wxyz_xyz
+    mean, P = MOTION._first(wxyz_xyz, 1e-4 * jnp.eye(6), None)
+    np.testing.assert_array_equal(mean[13:], 0)
+    np.testing.assert_array_equal(P[6:, 6:], P_rest)
+
+
+def test_without_errors_and_for_a_single_rule_there_are_no_states():
+    rig = worlds.handheld_rig()
+    assert MOTION.for_rig(rig, 24).init(3).mean.shape == (3, 17)
+    for motion in (MOTION.for_rig(rig, 1), ConstantVelocity().for_rig(rig, 24)):
+        assert motion.odometry_errors is None
+        assert motion.init(1).mean.shape == (1, 13)
