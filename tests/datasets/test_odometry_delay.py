@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxnav.datasets.odometry_delay import odometry_delay
-from jaxnav.ros.odometry_track import OdometryTrack
+from jaxnav.ros.odometry_track import GrowingTrack, OdometryTrack
 
 STAMPS_NS = np.arange(100) * 200_000_000  # 20 s of frames at 5 Hz
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
@@ -47,3 +47,17 @@ def test_nothing_is_told_where_stamps_fit_or_nothing_turns():
     assert odometry_delay(told(0.4, 0.0), STAMPS_NS, still, seen) is None
     assert odometry_delay(told(0.4, 0.1), STAMPS_NS, shown, seen & False) is None
     assert odometry_delay(told(60.0, 0.1), STAMPS_NS, shown, seen) is None  # none of these times
+
+
+def test_a_track_that_grows_takes_its_delay_away_as_a_whole_one_does():
+    track = told(0.3, 0.1)
+    growing = GrowingTrack(IDENTITY, delay_s=0.3)
+    for stamp_ns, pose in zip(track.stamps_ns, track.T_odom_sensor, strict=True):
+        growing.add(stamp_ns, pose)
+    last_ns = track.stamps_ns[-1] - 300_000_000
+    assert growing.reaches(last_ns)
+    assert not growing.reaches(last_ns + 1)
+    times_ns = np.array([3, 4]) * 200_000_000
+    expected = track.earlier_by(0.3).twists(times_ns)[1]
+    np.testing.assert_allclose(growing.twist(*times_ns), expected, atol=1e-12)
+    assert np.linalg.norm(expected[3:]) > 0.01
