@@ -10,6 +10,7 @@ nearer to the reference in angle, an outlier where none is within 10 degrees.
 import argparse
 import dataclasses
 import functools
+import itertools
 import os
 import time
 from pathlib import Path
@@ -22,10 +23,13 @@ import jax.numpy as jnp  # noqa: E402
 import jaxlie  # noqa: E402
 import numpy as np  # noqa: E402
 
+from jaxnav.belief.constant_velocity import ConstantVelocity  # noqa: E402
 from jaxnav.belief.selectors import make_selector  # noqa: E402
 from jaxnav.datasets.recordings import Recording, read_recording  # noqa: E402
 from jaxnav.datasets.replay import Replay, errors, replay  # noqa: E402
-from jaxnav.files.poses import matrix  # noqa: E402
+from jaxnav.files.poses import matrix, pose_from_matrix  # noqa: E402
+from jaxnav.models.odometry_errors import sigma_as_told  # noqa: E402
+from jaxnav.ros.odometry_track import OdometryTrack  # noqa: E402
 
 DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/data")) / "tagslam"
 CLAIM = 1e-3  # a flip probability below it is a claim to be sure
@@ -61,6 +65,58 @@ def score(recording: Recording, result: Replay) -> dict[str, float]:
         "deg": float(np.median(rotation_deg)),
         "deg, 95 %": float(np.percentile(rotation_deg, 95)),
     }
+
+
+def of_most_seen(recording: Recording, count: int) -> Recording:
+    """The recording with the markers that are seen most, in the map's order."""
+    seen = np.bincount(recording.seen_at[2], minlength=len(recording.markers.ids))
+    chosen = np.sort(np.argsort(-seen, kind="stable")[:count])
+    index = np.full(len(seen), -1)
+    index[chosen] = np.arange(len(chosen))
+    kept = index[recording.seen_at[2]] >= 0
+    frame, camera, marker = recording.seen_at[:, kept]
+    whole = recording.markers
+    markers = dataclasses.replace(
+        whole,
+        Ts_world_marker=jaxlie.SE3(whole.Ts_world_marker.wxyz_xyz[chosen]),
+        size_m=whole.size_m[chosen],
+        ids=tuple(whole.ids[row] for row in chosen),
+        families=tuple(whole.families[row] for row in chosen),
+    )
+    return dataclasses.replace(
+        recording,
+        markers=markers,
+        seen_at=np.stack([frame, camera, index[marker]]),
+        seen_px=recording.seen_px[kept],
+    )
+
+
+def with_made_odometry(recording: Recording, scale: float, yaw_deg: float) -> Recording:
+    """The recording with odometry made from its reference, 0.1 m ahead of the rig's origin.
+
+    Its way is `scale` of the true one, its body is turned by `yaw_deg` beside what is told, and it
+    drifts by half of what `motion.odometry_drift` allows. It is made of the corners it is to help.
+    """
+    assert recording.reference is not None
+    rows = np.flatnonzero(recording.reference.valid)
+    true = jaxlie.SE3(jnp.asarray(recording.reference.T_world_vehicle[rows]))
+    told = np.array([1.0, 0, 0, 0, 0.1, 0, 0])
+    z_rad = jnp.asarray(np.deg2rad(yaw_deg))
+    turned = jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(z_rad))
+    body = true @ jaxlie.SE3(jnp.asarray(told)) @ turned
+    before, after = (jaxlie.SE3(body.wxyz_xyz[part]) for part in (slice(-1), slice(1, None)))
+    steps = np.array((before.inverse() @ after).log())
+    steps[:, :3] *= scale
+    way, angle = (np.linalg.norm(steps[:, part], axis=1) for part in (slice(3), slice(3, 6)))
+    dt_s = np.diff(recording.stamps_ns[rows]) / 1e9
+    per_m, per_rad, walk_m, walk_rad = (np.asarray(ConstantVelocity().odometry_drift) / 2) ** 2
+    sigmas = np.sqrt([per_m * way + walk_m * dt_s] * 3 + [per_rad * angle + walk_rad * dt_s] * 3).T
+    steps = steps + sigmas * np.random.default_rng(0).standard_normal(steps.shape)
+    moves = np.asarray(jaxlie.SE3.exp(jnp.asarray(steps)).as_matrix())
+    places = list(itertools.accumulate(moves, np.matmul, initial=np.eye(4)))
+    poses = np.array([pose_from_matrix(T) for T in places])
+    track = OdometryTrack(recording.stamps_ns[rows], poses, told)
+    return dataclasses.replace(recording, odometry=track)
 
 
 def print_gaps(recording: Recording, gap_s: float) -> None:
@@ -109,7 +165,14 @@ def main() -> None:
     parser.add_argument("--camera-sigma", type=float, nargs=2, metavar=("DEG", "M"),
                         help="of a camera's direction and place; 0 0: exact ones")  # fmt: skip
     parser.add_argument("--without-odometry", action="store_true")
+    parser.add_argument("--odometry-delay-s", type=float, default=0.0,
+                        help="its poses were taken so long before their stamps")  # fmt: skip
+    parser.add_argument("--odometry-sigma", type=float, nargs=2, metavar=("SCALE", "DEG"),
+                        help="of its scale and direction; 0 0: exact ones")  # fmt: skip
+    parser.add_argument("--made-odometry", type=float, nargs=2, metavar=("SCALE", "YAW_DEG"),
+                        help="make it from the reference, off by so much")  # fmt: skip
     parser.add_argument("--smooth", action="store_true", help="and the smoothed poses beside")
+    parser.add_argument("--markers", type=int, help="only so many, those that are seen most")
     parser.add_argument("--all-markers", action="store_true", help="one pose from all in view")
     parser.add_argument("--gap-s", type=float, help="hide all markers so long, now and then")
     args = parser.parse_args()
@@ -118,8 +181,19 @@ def main() -> None:
         if args.names and folder.name not in args.names:
             continue
         recording = read_recording(folder).first(args.frames)
+        if args.markers is not None:
+            recording = of_most_seen(recording, args.markers)
         if args.without_odometry:
             recording = dataclasses.replace(recording, odometry=None)
+        if args.made_odometry is not None:
+            recording = with_made_odometry(recording, *args.made_odometry)
+        if recording.odometry is not None:
+            track = recording.odometry.earlier_by(args.odometry_delay_s)
+            if args.odometry_sigma is not None:
+                scale, turn_deg = args.odometry_sigma
+                sigma = sigma_as_told(scale, np.deg2rad(turn_deg))
+                track = dataclasses.replace(track, sigma=sigma)
+            recording = dataclasses.replace(recording, odometry=track)
         if args.camera_sigma is not None:
             turn_rad, shift_m = np.deg2rad(args.camera_sigma[0]), args.camera_sigma[1]
             sigma = np.repeat([[shift_m] * 3 + [turn_rad] * 3], len(recording.rig), axis=0)

@@ -86,6 +86,12 @@ TUNABLES: dict[str, Tunable] = {
         "m/sqrt(m), rad/sqrt(rad), m/sqrt(s), rad/sqrt(s)",
         0.01,
     ),
+    "motion.odometry_errors.sigma": Tunable(
+        "P0: scale of a free body's odometry, and its direction on the body",
+        "1, rad",
+        0.02,
+        most=(0.5, *3 * (math.radians(15.0),)),
+    ),
     "motion.initial_velocity_sigma": Tunable(
         "P0: the velocity before anything tells it", "m/s, rad/s", 1.0
     ),

@@ -11,6 +11,7 @@ from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.control import ControlState
 from jaxnav.models.bicycle import sideslip_rad
 from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
+from jaxnav.models.odometry_errors import OdometryErrors, sigma_as_told
 from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
@@ -48,7 +49,10 @@ def test_a_name_is_the_path_of_its_number():
 
 def test_every_tunable_is_some_navigator_s():
     base = Navigator(RIG, MARKERS, TwistBase.create(1.0, 3.0, 0.1), worlds.WAYPOINTS_M)
-    names = {*parameters_of(DRIVER), *parameters_of(HANDHELD), *parameters_of(base)}
+    led = ConstantVelocity(odometry_errors=OdometryErrors.create(sigma_as_told(), np.zeros(3)))
+    carried = Navigator(RIG, MARKERS, motion=led)
+    navigators = DRIVER, HANDHELD, base, carried
+    names = {name for navigator in navigators for name in parameters_of(navigator)}
     assert names == set(TUNABLES)
     assert not [name for name in parameters_of(HANDHELD) if name.startswith("controller.")]
     assert not [name for name in parameters_of(HANDHELD) if name.startswith("selector.")]

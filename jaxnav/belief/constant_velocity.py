@@ -1,19 +1,25 @@
 """A filter for bodies that move freely: pose on SE(3) and twist."""
 
+import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief import kalman
 from jaxnav.belief.bank import Bank
 from jaxnav.belief.free_body import FreeBody, moved_by_twist
 from jaxnav.belief.gate import Moments
-from jaxnav.models.geometry import safe_norm
+from jaxnav.models.geometry import inverse_cayley, safe_norm
+from jaxnav.models.odometry_errors import ERRORS, OdometryErrors
+from jaxnav.models.rig import CameraRig
+from jaxnav.numerics.trees import where
 from jaxnav.pose.observation import Observation
 
+_ERRORS = slice(12, 12 + ERRORS)  # of the odometry, among the error states
 _LARGEST_TWIST = 1e3  # m/s and rad/s; a larger one is an error of the sensor
 
 
@@ -24,6 +30,8 @@ class ConstantVelocity(FreeBody):
     the 12 error states are xi in `T_world_vehicle * cay(xi)` and the error of the twist. Where
     another estimator (visual-inertial odometry, lidar) tells the motion between observations, it
     replaces the twist, and its drift the acceleration; where it is silent, the twist carries on.
+    Where `odometry_errors` says how far off its scale and direction may be, these four are states
+    behind the twist, considered until the orientation is known, then estimated.
 
     Source: Liu, Schofield, Shan (2023), end of section II-D; Barfoot (2017), chapter 7.
     """
@@ -43,6 +51,7 @@ class ConstantVelocity(FreeBody):
     odometry_drift: Float[Array, " 4"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.04, 0.02, 0.005, 0.005])
     )
+    odometry_errors: OdometryErrors | None = None  # None: white noise is all that it gets wrong
     camera_states: int = eqx.field(static=True, default=0)  # see `for_rig`
     camera_turn_sigma_rad: Float[Array, "C 3"] | None = None  # see `for_rig`
     learn_sigma_rad: float = 0.035  # sigma of the orientation below which errors are estimated
@@ -60,7 +69,8 @@ class ConstantVelocity(FreeBody):
             Q = [D, D / dt; D / dt, D / dt^2 + A dt / 3]
 
         with the drift D in the interval, and the twist at its end off its mean by A dt / 3, A the
-        density of the acceleration.
+        density of the acceleration. Errors of the odometry turn and scale u, and F has their
+        derivatives of pose and twist.
 
         A hypothesis is forgotten, and started anew by its next pose, where the sigma of its
         position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
@@ -73,6 +83,10 @@ class ConstantVelocity(FreeBody):
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
         told, twist = self._told(obs, dtype)
+        if self.odometry_errors is not None:
+            later, coasted = moved_by_twist(mean, P, mean[7:13], dt_s, True)
+            coasts = later, coasted.at[:12, :12].add(Q)
+            return where(told, self._led(self.odometry_errors, mean, P, twist, dt_s), coasts)
         u = jnp.where(told, twist, mean[7:13])
         mean, P = moved_by_twist(mean, P, u, dt_s, ~told)
         if obs.twist is not None:
@@ -87,6 +101,24 @@ class ConstantVelocity(FreeBody):
         usable = jnp.all(jnp.abs(twist) < _LARGEST_TWIST) & (jnp.asarray(obs.dt_s) > 0)
         return usable, jnp.where(usable, twist, 0)
 
+    def _led(
+        self, errors: OdometryErrors, mean: Array, P: Array, twist: Array, dt_s: Array
+    ) -> Moments:
+        """One hypothesis by odometry whose own errors are states."""
+        dtype, known = mean.dtype, mean[13 : 13 + ERRORS]
+        u = errors.corrected(twist, known)
+        back = jaxlie.SE3.exp(u * dt_s).inverse()
+
+        def off(change: Array) -> Array:
+            led = errors.corrected(twist, known + change)
+            return jnp.append(inverse_cayley(back @ jaxlie.SE3.exp(led * dt_s)), led)
+
+        F = jnp.zeros((12, P.shape[0]), dtype).at[:6, :6].set(back.adjoint())
+        F = F.at[:, _ERRORS].set(jax.jacfwd(off)(jnp.zeros(ERRORS, dtype)))
+        T_world_vehicle = (jaxlie.SE3(mean[:7]) @ back.inverse()).normalize()
+        P = kalman.replace_first(P, F).at[:12, :12].add(self._drift(u, dt_s))
+        return jnp.concatenate([T_world_vehicle.wxyz_xyz, u, mean[13:]]), P
+
     def _drift(self, twist: Array, dt_s: Array) -> Array:
         """Q (12, 12) of an interval in which the odometry told the motion."""
         dtype = twist.dtype
@@ -100,6 +132,13 @@ class ConstantVelocity(FreeBody):
         return jnp.block([[D * dt_s, D], [D, D * per_dt + A * dt_s / 3]])
 
     def at_first(self) -> Moments:
-        """No velocity, with `initial_velocity_sigma`."""
+        """No velocity, with `initial_velocity_sigma`; an odometry that is right, within its own."""
         sigma = jnp.asarray(self.initial_velocity_sigma, float)
+        if self.odometry_errors is not None:
+            sigma = jnp.append(sigma, self.odometry_errors.sigma)
         return jnp.zeros_like(sigma), jnp.diag(sigma**2)
+
+    def for_rig(self, rig: CameraRig, hypotheses: int) -> "FreeBody":
+        """See `Motion`."""
+        errors = self.odometry_errors if hypotheses > 1 else None
+        return FreeBody.for_rig(dataclasses.replace(self, odometry_errors=errors), rig, hypotheses)

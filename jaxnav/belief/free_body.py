@@ -38,8 +38,8 @@ class FreeBody(Motion):
     """A body that is free in six directions.
 
     The mean is (wxyz, xyz) of T_world_vehicle, the twist (m/s, rad/s) in vehicle axes, further
-    states of the model, and the errors of the cameras; the error states are xi in
-    `T_world_vehicle * cay(xi)`, and the errors of all others.
+    states of the model, the errors of its sensors, and those of the cameras; the error states are
+    xi in `T_world_vehicle * cay(xi)`, and the errors of all others.
     """
 
     acceleration_density: eqx.AbstractVar[Float[Array, " 6"] | Float[Array, "6 6"]]
@@ -54,13 +54,14 @@ class FreeBody(Motion):
 
     @abc.abstractmethod
     def at_first(self) -> Moments:
-        """Mean (states - 6,) and covariance of all that a first pose does not tell."""
+        """Mean and covariance of what a first pose does not tell, but for the cameras' errors."""
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
-        dtype, count = self.acceleration_density.dtype, self.states + self.camera_states
+        dtype, rest = self.acceleration_density.dtype, self.at_first()[0]
+        count = 6 + rest.shape[0] + self.camera_states
         mean = jnp.zeros(1 + count, dtype).at[0].set(1)
-        mean = mean.at[7 : 1 + self.states].set(self.at_first()[0].astype(dtype))
+        mean = mean.at[7 : 7 + rest.shape[0]].set(rest.astype(dtype))
         return empty_bank(mean, jnp.eye(count, dtype=dtype), 6, hypotheses)
 
     def without_lost(
@@ -97,7 +98,7 @@ class FreeBody(Motion):
         if not self.camera_states:
             return None
         P = bank.covariance
-        behind = self.states
+        behind = P.shape[-1] - self.camera_states
         return CameraErrors(bank.mean[:, behind + 1 :], P[:, behind:, behind:], P[:, :6, behind:])
 
     def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
@@ -182,8 +183,9 @@ class FreeBody(Motion):
 
     def _first(self, wxyz_xyz: Array, covariance: Array, errors: ErrorsPosterior | None) -> Moments:
         """A hypothesis that starts at a pose."""
-        dtype, behind = wxyz_xyz.dtype, self.states
+        dtype = wxyz_xyz.dtype
         mean, of_rest = (x.astype(dtype) for x in self.at_first())
+        behind = 6 + mean.shape[0]
         cameras = jnp.ones(self.camera_states, dtype)
         P = jnp.diag(jnp.concatenate([jnp.zeros(behind, dtype), cameras]))
         P = P.at[:6, :6].set(covariance).at[6:behind, 6:behind].set(of_rest)

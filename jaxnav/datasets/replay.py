@@ -167,9 +167,10 @@ def replay(
 
 
 def motion_of(recording: Recording) -> FreeBody:
-    """The filter of a recorded rig: with an IMU where one is recorded."""
+    """The filter of a recorded rig: with an IMU where one is recorded, else with odometry."""
     if recording.imu is None:
-        return ConstantVelocity()
+        odometry = recording.odometry
+        return ConstantVelocity(odometry_errors=None if odometry is None else odometry.errors())
     arm_m, noise = jnp.asarray(recording.imu.lever_arm_m, float), recording.imu.noise
     if recording.imu.level:
         return InertialMotion(noise=noise, lever_arm_m=arm_m)

@@ -3,7 +3,9 @@
 cameras.yaml       intrinsics (Kalibr's keys), `tagtopic`, `rig_body`
 *.bag[.bz2]        detections; `/tf` with every camera, marker and the rig; `odom_topic`
 tagslam.yaml       sizes of the markers, and poses of the known ones; of the rig `odom_topic`, the
-                   odometry of other software, and `T_body_odom`, the pose of its body on the rig
+                   odometry of other software, and `T_body_odom`, the pose of its body on the rig;
+                   of ours `odom_delay_s`, how long before their stamps its poses were taken, and
+                   `odom_sigma: {scale: 0.03, turn_deg: 1}`, how far off it may be
 camera_poses.yaml  poses of the cameras on the rig, where there is no /tf
 """
 
@@ -20,8 +22,19 @@ from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import rig_from_figures
 from jaxnav.files.markers import marker_map
+from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import Count, ForeignEntry, Size, Text, Vector, at, validate
+from jaxnav.files.topics import OdometrySigma
+from jaxnav.files.validation import (
+    Count,
+    ForeignEntry,
+    Number,
+    Size,
+    Text,
+    Vector,
+    at,
+    validate,
+)
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.ros.camera_messages import TAGSLAM
@@ -53,6 +66,8 @@ class _BodyEntry(ForeignEntry):
     tags: list[_TagEntry] = Field(default_factory=list)
     odom_topic: Text | None = None
     T_body_odom: _PoseEntry | None = None
+    odom_delay_s: Annotated[Number, within("delay_s")] = 0.0
+    odom_sigma: OdometrySigma = OdometrySigma()
 
 
 class TagSlamFile(ForeignEntry):
@@ -154,7 +169,10 @@ def _odometry(
     (track,) = tracks
     stamps = sorted(track)
     poses_read = np.array([track[stamp] for stamp in stamps]).reshape(-1, 7)
-    return OdometryTrack(np.array(stamps, np.int64), poses_read, entry.T_body_odom.pose())
+    whole = OdometryTrack(
+        np.array(stamps, np.int64), poses_read, entry.T_body_odom.pose(), entry.odom_sigma.sigma()
+    )
+    return whole.earlier_by(entry.odom_delay_s)
 
 
 def _by_name(settings: TagSlamFile) -> dict[str, _BodyEntry]:

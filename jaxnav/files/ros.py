@@ -12,6 +12,8 @@ corner_sigma_px: 0.3
 odometry: /odom                # of a rig that moves freely: by other software, may be left out
 odometry_type: nav_msgs/msg/Odometry
 T_vehicle_odometry: {wxyz: [1, 0, 0, 0], xyz_m: [0, 0, 0]}    # its body on a rig that moves freely
+odometry_delay_s: 0.0          # of such a rig's: its poses were taken so long before their stamps
+odometry_sigma: {scale: 0.03, turn_deg: 1.0}    # and how far off they may be, alike in every step
 odom_tf: false                 # true: odom -> base is what /tf says, not the odometry's pose
 joints: {driven: [rear_left, rear_right], steered: [front_left], wheel_radius_m: 0.033}
 imu: {topic: /imu, T_vehicle_imu: {wxyz: [1, 0, 0, 0], xyz_m: [0, 0, 0]}}    # of the vehicle's gyro
@@ -31,8 +33,9 @@ from pydantic import Field, model_validator
 
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
+from jaxnav.files.ranges import within
 from jaxnav.files.rigs import written_pose
-from jaxnav.files.topics import TopicMap, read_topics
+from jaxnav.files.topics import OdometrySigma, TopicMap, read_topics
 from jaxnav.files.validation import (
     Entry,
     MountPose,
@@ -81,6 +84,8 @@ class RosFile(TopicMap):
     T_vehicle_odometry: MountPose = Field(
         default_factory=lambda: QuaternionPose(wxyz=[1, 0, 0, 0], xyz_m=[0, 0, 0])
     )
+    odometry_delay_s: Annotated[Number, within("delay_s")] = 0.0
+    odometry_sigma: OdometrySigma = OdometrySigma()
     odom_tf: Annotated[bool, Field(strict=True)] = False
     command: Name | None = None
     command_type: Literal["ackermann", "twist"] | None = None
@@ -100,8 +105,9 @@ class RosFile(TopicMap):
                 )
         elif self.odometry is None:
             raise ValueError("a vehicle needs odometry: its topic")
-        elif "T_vehicle_odometry" in self.model_fields_set:
-            raise ValueError("T_vehicle_odometry is for a rig that moves freely, without a vehicle")
+        for key in ("T_vehicle_odometry", "odometry_delay_s", "odometry_sigma"):
+            if self.vehicle is not None and key in self.model_fields_set:
+                raise ValueError(f"{key} is for a rig that moves freely, without a vehicle")
         if (self.joints is not None) != (self.odometry_type == "sensor_msgs/msg/JointState"):
             raise ValueError("joints go with the odometry_type sensor_msgs/msg/JointState")
         return self

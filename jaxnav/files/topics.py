@@ -13,6 +13,7 @@ with `bottom_left`; one made for OpenCV's, as jaxnav's own detectors see it, wit
 """
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -35,7 +36,9 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.models.conventions import FirstCorner
+from jaxnav.models.odometry_errors import SCALE_AS_TOLD, TURN_AS_TOLD_RAD, sigma_as_told
 from jaxnav.models.preintegration import PRESETS, ImuNoise
+from jaxnav.parameters import TUNABLES
 
 
 class JointsEntry(Entry):
@@ -44,6 +47,28 @@ class JointsEntry(Entry):
     driven: Annotated[list[Name], Field(min_length=1, max_length=16)]
     steered: Annotated[list[Name], Field(min_length=1, max_length=16)]
     wheel_radius_m: Annotated[Positive, Field(le=10)]
+
+
+# One that is larger says that nobody knows it, or was written in another unit.
+_MOST_SCALE, *_, _MOST_TURN_RAD = TUNABLES["motion.odometry_errors.sigma"].most
+
+
+class OdometrySigma(Entry):
+    """How far off a free rig's odometry may be beside its drift, alike in every step.
+
+    Attributes:
+        scale: of its way.
+        turn_deg: of the direction of its body on the rig, about each axis.
+    """
+
+    scale: Annotated[NonNegative, Field(le=_MOST_SCALE)] = SCALE_AS_TOLD
+    turn_deg: Annotated[NonNegative, Field(le=round(math.degrees(_MOST_TURN_RAD), 9))] = round(
+        math.degrees(TURN_AS_TOLD_RAD), 9
+    )
+
+    def sigma(self) -> Float[np.ndarray, " 4"]:
+        """Of the scale, and of the direction, rad."""
+        return sigma_as_told(self.scale, math.radians(self.turn_deg))
 
 
 _Noise = Annotated[Positive, within("imu_noise")]

@@ -20,13 +20,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.models.geometry import rotation_matrix, safe_norm, safe_sinc, skew
+from jaxnav.models.imu_classes import IMU_CLASSES
 from jaxnav.numerics.small_matrices import matvec, product, sandwich
-
-_G_MPS2 = 9.80665  # standard gravity, in which datasheets count
 
 
 class ImuNoise(eqx.Module):
@@ -58,25 +56,18 @@ class ImuNoise(eqx.Module):
         return jnp.repeat(jnp.stack([jnp.asarray(sigma, float) for sigma in sigmas]) ** 2, 3)
 
 
-# Noise and offsets of datasheets. These tell no random walk: those are such that a bias wanders by
-# a tenth of its offset in 100 s, as in sensors of these kinds that Kalibr was used on.
-CONSUMER = ImuNoise(  # Bosch Sensortec BMI160, BST-BMI160-DS000: 0.007 deg/s/sqrt(Hz), 3 deg/s
-    gyroscope_noise_density=float(np.deg2rad(0.007)),
-    accelerometer_noise_density=180e-6 * _G_MPS2,
-    gyroscope_random_walk=float(np.deg2rad(3.0)) / 100,
-    accelerometer_random_walk=0.04 * _G_MPS2 / 100,
-    gyroscope_bias_sigma=float(np.deg2rad(3.0)),
-    accelerometer_bias_sigma=0.04 * _G_MPS2,
-)
-TACTICAL = ImuNoise(  # Analog Devices ADIS16488A: 0.0059 deg/s/sqrt(Hz), 0.2 deg/s; 63 ug, 16 mg
-    gyroscope_noise_density=float(np.deg2rad(0.0059)),
-    accelerometer_noise_density=63e-6 * _G_MPS2,
-    gyroscope_random_walk=float(np.deg2rad(0.2)) / 100,
-    accelerometer_random_walk=0.016 * _G_MPS2 / 100,
-    gyroscope_bias_sigma=float(np.deg2rad(0.2)),
-    accelerometer_bias_sigma=0.016 * _G_MPS2,
-)
-PRESETS = {"consumer": CONSUMER, "tactical": TACTICAL}
+PRESETS = {
+    name: ImuNoise(
+        gyroscope_noise_density=figures.gyro_noise,
+        accelerometer_noise_density=figures.accel_noise,
+        gyroscope_random_walk=figures.gyro_walk,
+        accelerometer_random_walk=figures.accel_walk,
+        gyroscope_bias_sigma=figures.gyro_offset_radps,
+        accelerometer_bias_sigma=figures.accel_offset_mps2,
+    )
+    for name, figures in IMU_CLASSES.items()
+}
+CONSUMER, TACTICAL = PRESETS["consumer"], PRESETS["tactical"]
 
 
 class Readings(eqx.Module):

@@ -5,13 +5,14 @@ the map. Only the motion between two times is used of it.
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaxnav.files.poses import inverse, matrix
+from jaxnav.models.odometry_errors import OdometryErrors, sigma_as_told
 
 _MAX_GAP_S = 0.5  # between two poses; what happened in a longer one is not known
 _KEPT = 1024  # poses of a track that grows: 2 s at 500 Hz
@@ -25,11 +26,23 @@ class OdometryTrack:
         stamps_ns: (N,), increasing.
         T_odom_sensor: (N, 7) wxyz xyz, of the body whose motion it tells.
         T_vehicle_sensor: (7,) where that body is in the vehicle's frame.
+        sigma: (4,) how far off its scale (1) and its direction on the vehicle (rad) may be.
     """
 
     stamps_ns: Int[np.ndarray, " N"]
     T_odom_sensor: Float[np.ndarray, "N 7"]
     T_vehicle_sensor: Float[np.ndarray, " 7"]
+    sigma: Float[np.ndarray, " 4"] = field(default_factory=sigma_as_told)
+
+    def errors(self) -> OdometryErrors | None:
+        """The errors that a filter keeps of it; None: it is exact but for its drift."""
+        if not self.sigma.any():
+            return None
+        return OdometryErrors.create(self.sigma, self.T_vehicle_sensor[4:])
+
+    def earlier_by(self, delay_s: float) -> "OdometryTrack":
+        """The track where its poses were taken so long before their stamps."""
+        return replace(self, stamps_ns=self.stamps_ns - round(delay_s * 1e9))
 
     def twists(self, stamps_ns: Int[np.ndarray, " F"]) -> Float[np.ndarray, "F 6"]:
         """The vehicle's mean twist before each stamp since the one before it.
@@ -45,6 +58,13 @@ class OdometryTrack:
         steps = np.linalg.inv(places[rows]) @ places[rows + 1]
         twists[rows + 1] = _logarithms(steps) / dt_s[rows, None]
         return twists
+
+    def rotations(
+        self, stamps_ns: Int[np.ndarray, " F"]
+    ) -> tuple[Bool[np.ndarray, " F"], Rotation]:
+        """Which of the times are between two poses that are near, and R_odom_vehicle (F,)."""
+        known, T_odom_vehicle = self._at(stamps_ns)
+        return known, Rotation.from_matrix(T_odom_vehicle[:, :3, :3])
 
     def _at(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which of the times are between two poses that are near, and T_odom_vehicle (F, 4, 4)."""
@@ -67,15 +87,17 @@ class OdometryTrack:
 class GrowingTrack:
     """The last poses of an odometry that goes on. For one thread at a time."""
 
-    def __init__(self, T_vehicle_sensor: Float[np.ndarray, " 7"]):
-        """See `OdometryTrack`."""
+    def __init__(self, T_vehicle_sensor: Float[np.ndarray, " 7"], delay_s: float = 0.0):
+        """See `OdometryTrack`; `delay_s` as in its `earlier_by`."""
+        self._delay_ns = round(delay_s * 1e9)
         self._T_vehicle_sensor = T_vehicle_sensor
         self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=_KEPT)
 
     def add(self, stamp_ns: int, T_odom_sensor: Float[np.ndarray, " 7"]) -> None:
         """Take a pose (7,) wxyz xyz; one that is older than the last is left out."""
-        if not self.reaches(stamp_ns):
-            self._poses.append((stamp_ns, T_odom_sensor))
+        taken_ns = stamp_ns - self._delay_ns
+        if not self.reaches(taken_ns):
+            self._poses.append((taken_ns, T_odom_sensor))
 
     def reaches(self, stamp_ns: int) -> bool:
         """Whether the track tells where the body was until then."""

@@ -350,7 +350,18 @@ def test_a_folder_s_odometry_is_the_motion_of_the_rig(folder):
     np.testing.assert_array_equal(np.isfinite(read.twists).all(axis=1), [0, 0, 1, 1, 0, 0])
     np.testing.assert_allclose(read.twists[2:4], np.tile(twist, (2, 1)), atol=1e-9)
     assert read.first(3).twists.shape == (3, 6)
-    path.write_text(path.read_text().replace("T_body_odom", "T_odom_body"))
+    np.testing.assert_allclose(read.odometry.sigma, [0.03, *3 * [np.deg2rad(1.0)]])
+    np.testing.assert_allclose(read.odometry.errors().lever_arm_m, [0, 0, 0.5])
+    whole = path.read_text()
+    keys = "odom_topic: /vio\n     odom_delay_s: -0.1\n     odom_sigma: {scale: 0.1, turn_deg: 0}"
+    path.write_text(whole.replace("odom_topic: /vio", keys))
+    late = read_recording(folder)
+    np.testing.assert_allclose(late.odometry.sigma, [0.1, 0, 0, 0])
+    np.testing.assert_array_equal(late.odometry.stamps_ns, read.odometry.stamps_ns + 10**8)
+    for key, value in (("odom_delay_s: -0.1", "odom_delay_s: -46"), ("scale: 0.1", "scale: 7")):
+        path.write_text(whole.replace("odom_topic: /vio", keys.replace(key, value)))
+        assert f"{path}: bodies[2].cart.odom_" in problem(folder)
+    path.write_text(whole.replace("T_body_odom", "T_odom_body"))
     assert f"{path}: bodies.cart.T_body_odom: missing" in problem(folder)
 
 

@@ -307,6 +307,8 @@ markers: markers.yaml
 cameras: {front: /front/detections}
 odometry: /vio/odom
 T_vehicle_odometry: {wxyz: [0, 0, 0, 1], xyz_m: [0.1, 0, -0.2]}
+odometry_delay_s: -0.05
+odometry_sigma: {scale: 0.05, turn_deg: 2.0}
 """
 STRUCTURED = {
     "rig": Loader(_written("rig.yaml", (QCAR / "rig.yaml").read_bytes()), files.load_rig),

@@ -107,7 +107,7 @@ bodies:
      tags:
        - {id: 3, size: 0.25, pose: {position: {x: 2, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}}
        - {id: 4}
- - cart: {is_static: false}
+ - cart: {is_static: false, odom_delay_s: 0.1, odom_sigma: {scale: 0.05, turn_deg: 2}}
 """,
     "camera_poses.yaml": """
 cam0: {pose: {position: {x: 0.1, y: 0, z: 0}, rotation: {x: 0, y: 3.141592653589793, z: 0}}}

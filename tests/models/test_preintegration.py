@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxnav.models.gyro import GYROS
 from jaxnav.models.imu_samples import ImuSamples
 from jaxnav.models.preintegration import (
     CONSUMER,
@@ -346,12 +347,18 @@ def test_rest_is_told_from_a_hand_that_trembles(moving):
 def test_a_datasheet_is_in_si():
     assert TACTICAL.gyroscope_noise_density < CONSUMER.gyroscope_noise_density
     assert set(PRESETS) == {"consumer", "tactical"}
-    # A second of white noise of the gyroscope: 0.007 degrees.
+    # A second of white noise of the gyroscope: 0.014 degrees; of the accelerometer: 175e-6 g s.
     still = run(readings(np.zeros((100, 3)), np.zeros((100, 3)), 0.01), CONSUMER)
-    walk = np.deg2rad(3) / 100
-    assert still.covariance[0, 0] == pytest.approx(
-        np.deg2rad(0.007) ** 2 + walk**2 * 0.99 * 0.985 / 3, rel=0.02
-    )
+    walks = CONSUMER.gyroscope_random_walk, CONSUMER.accelerometer_random_walk
+    whites = np.deg2rad(0.014), 175e-6 * 9.80665
+    for row, walk, white in zip((0, 3), walks, whites, strict=True):
+        expected = white**2 + walk**2 * 0.99 * 0.985 / 3
+        assert still.covariance[row, row] == pytest.approx(expected, rel=0.02)
+    for name, noise in PRESETS.items():  # one table for the gyro of a base and for an IMU
+        gyro = GYROS[name]
+        assert noise.gyroscope_noise_density == gyro.noise_density
+        assert noise.gyroscope_bias_sigma == gyro.bias_sigma_radps
+        assert noise.gyroscope_random_walk == gyro.bias_walk
 
 
 @in_float32

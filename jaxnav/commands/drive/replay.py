@@ -13,6 +13,7 @@ from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import Selector
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.datasets.odometry_delay import OdometryDelay, odometry_delay
 from jaxnav.datasets.recordings import Recording, read_recording
 from jaxnav.datasets.replay import Replay, errors, frames_in_view, motion_of, replay
 from jaxnav.errors import BadInput, visible
@@ -75,8 +76,19 @@ def run(args: Arguments) -> int:
     save_figure(_report(args, recording, result, summary), out / "report.png")
     write_json(out / "summary.json", summary)
     print(_text(summary))
+    if (delay := _delay_of_odometry(recording, result)) is not None:
+        print(f"{delay}: odom_delay_s in tagslam.yaml takes it away")
     print(f"report in {visible(out)}")
     return 0
+
+
+def _delay_of_odometry(recording: Recording, result: Replay) -> OdometryDelay | None:
+    """By how much the stamps of its odometry are off; of the track that sees most."""
+    if recording.odometry is None:
+        return None
+    track = int(np.argmax(result.seen.sum(axis=0)))
+    poses, seen = result.T_world_vehicle[:, track], result.seen[:, track]
+    return odometry_delay(recording.odometry, recording.stamps_ns, poses, seen)
 
 
 def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from jaxnav.files.ros import RosFile
 from jaxnav.loop.interfaces import Camera, Setup
 from jaxnav.loop.seeing import Search
 from jaxnav.loop.signals import Signals
+from jaxnav.models.odometry_errors import OdometryErrors
 from jaxnav.navigator import Navigator
 from jaxnav.ros.body import BodyTracker
 from jaxnav.ros.connection import Connection
@@ -64,7 +65,7 @@ class PreparedBody:
             rig=rig,
             markers=markers,
             selector=make_selector(file.selector),
-            motion=ConstantVelocity(),
+            motion=ConstantVelocity(odometry_errors=_errors(file)),
             corner_sigma_px=file.corner_sigma_px,
         )
         params = file.file("params")
@@ -104,13 +105,22 @@ class PreparedBody:
 
     def _tracker(self, tell: Callable[[Report], None]) -> BodyTracker:
         file = self.file
-        track = None if file.odometry is None else GrowingTrack(file.T_vehicle_sensor)
+        track = None
+        if file.odometry is not None:
+            track = GrowingTrack(file.T_vehicle_sensor, file.odometry_delay_s)
         return BodyTracker(self._navigator, self._step, len(file.cameras), tell, track)
 
     def _send(self, report: Report) -> None:
         if report.decided:
             self._publisher.send_transform(report.now_ns, report.T_map_base)
         self._publisher.publish(report)
+
+
+def _errors(file: RosFile) -> OdometryErrors | None:
+    """The errors that the filter keeps of the odometry; None without one."""
+    if file.odometry is None:
+        return None
+    return OdometryErrors.create(file.odometry_sigma.sigma(), file.T_vehicle_sensor[4:])
 
 
 class _Tracking:
