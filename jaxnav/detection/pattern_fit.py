@@ -1,0 +1,279 @@
+"""Fit of a whole marker of known pattern to the raw pixels around its predicted place.
+
+    I(u) = (1, x, y) white - (1, x, y) contrast dark + shade (shadow - 1) (white - contrast dark)
+           + ground far + bend dark (1 - dark)
+
+dark is the image of the ink, see `image_model`: homography, motion and the lens's blur are fitted
+together with the light. The loss of a pixel is bounded, so that what hides a part of the marker
+does not move the rest. optimistix runs the Levenberg-Marquardt steps, first with a loss as wide as
+the contrast and then with one as wide as the noise.
+
+Source: Geman, McClure (1987), the loss; Madsen, Nielsen, Tingleff (2004), the damping.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from jaxnav.compiling.executables import kept
+from jaxnav.detection.image_model import Exposure, cell_disagreement, expose, ridged
+from jaxnav.detection.paper import on_paper
+from jaxnav.numerics.levenberg_marquardt import Move, NormalEquations, NormalEquationsLM
+from jaxnav.numerics.small_matrices import eliminate
+
+_LIGHTS = 9
+UNKNOWNS = 8 + 2 + 1 + _LIGHTS
+_WIDTH = 3.0  # of the loss, standard deviations
+# What Gaussian noise makes of the estimate's variance under this loss, E[psi^2] / E[psi']^2, over
+# E[w r^2] / E[w]^2.
+_LOSS_VARIANCE = 1.27
+_SCORE_VARIANCE = 0.537  # E[psi^2] / E[w] / that variance
+_NOTICED = 1.3  # a smaller factor may come from so many cells by chance
+_GROUND = 0.15  # standard deviation of the ground beyond the paper, of the contrast
+_LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
+_STEPS = 12
+_COARSER = 2  # at first one of so many pixels
+_LENS_PX2, _LENS_SIGMA_PX2 = 0.4, 0.5
+_MOST_LENS_PX2 = 9.0
+_MOST_STEP = 0.15  # of D: half sides
+# Standard deviations of the light's coefficients, over the contrast: gradients over half a side,
+# shade, ground beyond the paper, curve of the levels.
+_LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 2.0, 0.1)
+
+
+class Window(NamedTuple):
+    """The pixels around one marker's predicted place, and what is expected there.
+
+    M is the first guess in a basis in which it is near the identity; rays are in that basis.
+    """
+
+    rays: Float[Array, "3 N"]
+    rays_px: Float[Array, "2 3 N"]
+    levels: Float[Array, " N"]
+    used: Bool[Array, " N"]
+    K: Float[Array, "k k"]
+    shadow: Float[Array, " N"]  # 1 in the light, 0 in the shadow
+    motion_px: Float[Array, " 2"]  # the expected streak
+    motion_sigma_px: Float[Array, ""]
+    contrast: Float[Array, ""]  # about that of the marker, grey levels
+    most_noise: Float[Array, ""]  # standard deviation of pixels that fit, at most
+
+
+class Unknowns(NamedTuple):
+    M: Float[Array, "3 3"]
+    motion_px: Float[Array, " 2"]
+    lens_px2: Float[Array, ""]
+    light: Float[Array, " L"]  # over the contrast
+
+
+class PatternFit(NamedTuple):
+    """The result of a fit, in paper coordinates."""
+
+    M: Float[Array, "3 3"]
+    motion_px: Float[Array, " 2"]
+    lens_px2: Float[Array, ""]
+    covariance: Float[Array, "8 8"]  # of D in (I + D) M, by rows without the last entry
+    noise: Float[Array, ""]  # standard deviation of the pixels that fit, grey levels
+    contrast: Float[Array, ""]  # white minus black, grey levels
+    weight: Float[Array, " N"]  # of each pixel in the loss, 0 to 1; 0 for padding
+    residual: Float[Array, " N"]  # grey levels
+    marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
+    explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
+    log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
+    converged: Bool[Array, ""]
+
+
+class _PatternLM(NormalEquationsLM):
+    """Steps of D, motion, lens and light, damped in proportion to what is known of each."""
+
+    def solved(self, normal: NormalEquations, damping: Float[Array, ""]) -> Move:
+        information, gradient = normal.information, normal.gradient
+        damping = jnp.where(damping > 0, jnp.maximum(damping, 1e-7), self.initial_damping)
+        diagonal = jnp.maximum(jnp.diagonal(information), 1e-6)
+        move = -eliminate(information + jnp.diag(damping * diagonal), gradient[:, None])[:, 0]
+        move = jnp.where(jnp.isfinite(move), move, 0)
+        shrink = jnp.minimum(1, _MOST_STEP / jnp.maximum(jnp.max(jnp.abs(move[:8])), 1e-9))
+        move = move * shrink
+        promised = -jnp.sum(move * (2 * gradient + information @ move))
+        return Move(move, promised, damping)
+
+    def moved(self, y: Unknowns, move: Float[Array, " n"]) -> Unknowns:
+        D = jnp.append(move[:8], 0).reshape(3, 3)
+        return Unknowns(
+            y.M + D @ y.M,
+            y.motion_px + move[8:10],
+            jnp.clip(y.lens_px2 + move[10], 0, _MOST_LENS_PX2),
+            y.light + move[11:],
+        )
+
+
+def fit_pattern(window: Window, instants: int) -> PatternFit:
+    """Fit a window from M = I and the expected motion; see the module."""
+    start = Unknowns(
+        jnp.eye(3, dtype=window.levels.dtype),
+        window.motion_px,
+        jnp.asarray(_LENS_PX2, window.levels.dtype),
+        jnp.zeros(_LIGHTS, window.levels.dtype),
+    )
+    coarse = window.most_noise
+    few = _first(window, window.levels.shape[0] // _COARSER)
+    y = start._replace(light=_first_light(start, few, instants))
+    y, _ = _minimum(y, few, coarse * jnp.ones_like(few.levels), instants, _STEPS // 2)
+    residual, _, image = _model(y, window, instants)
+    noise = jnp.maximum(_spread(residual, window.used, coarse), _LEAST_NOISE)
+    y, done = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS)
+    return _result(y, window, instants, done)
+
+
+def _first(window: Window, count: int) -> Window:
+    """The window with its first pixels alone."""
+    return window._replace(
+        rays=window.rays[:, :count],
+        rays_px=window.rays_px[:, :, :count],
+        levels=window.levels[:count],
+        used=window.used[:count],
+        shadow=window.shadow[:count],
+    )
+
+
+def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " N"]:
+    """Standard deviation of each pixel: its noise, and the ground's where that shows."""
+    return jnp.sqrt(noise**2 + (_GROUND * window.contrast * image.far) ** 2)
+
+
+def _minimum(
+    y: Unknowns, window: Window, scale: Float[Array, " N"], instants: int, steps: int
+) -> tuple[Unknowns, Array]:
+    def cost(y: Unknowns, args: Any) -> tuple[Array, NormalEquations]:
+        del args
+        residual, J, _ = _model(y, window, instants)
+        loss, weight = _loss(residual / scale, window.used)
+        weighted = J * (weight / scale**2)[None]
+        prior, prior_J = _prior(y, window)
+        return jnp.concatenate([jnp.sqrt(loss), prior]), NormalEquations(
+            weighted @ J.T + prior_J.T @ prior_J, -weighted @ residual + prior_J.T @ prior
+        )
+
+    solver = _PatternLM(rtol=1e-6, atol=1e-2, initial_damping=1e-3)
+    solution = optx.least_squares(cost, solver, y, has_aux=True, max_steps=steps, throw=False)
+    return solution.value, solution.state.done
+
+
+def _model(
+    y: Unknowns, window: Window, instants: int
+) -> tuple[Float[Array, " N"], Float[Array, "n N"], Exposure]:
+    """Residual (N,), slopes (n, N) of the model by all unknowns, and the ink's image."""
+    image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
+    basis = _basis(y, window, image)
+    light = y.light * window.contrast
+    levels = light @ basis
+    x, y_paper = on_paper(y.M, window.rays, window.rays_px)[0]
+    contrast = light[3] + light[4] * x + light[5] * y_paper
+    by_dark = light[8] * (1 - 2 * image.dark) - contrast + light[6] * (1 - window.shadow)
+    J = jnp.concatenate(
+        [by_dark[None] * image.by_D, by_dark[None] * image.by_motion,
+         (by_dark * image.by_lens)[None], window.contrast * basis]
+    )  # fmt: skip
+    return window.levels - levels, J, image
+
+
+def _basis(y: Unknowns, window: Window, image: Exposure) -> Float[Array, "L N"]:
+    (x, y_paper), _ = on_paper(y.M, window.rays, window.rays_px)
+    # Beyond the marker gradients end: the ground there has its own light.
+    x, y_paper = jnp.clip(x, -1.5, 1.5), jnp.clip(y_paper, -1.5, 1.5)
+    dark = image.dark
+    shade = (window.shadow - 1) * (1 - dark)
+    return jnp.stack(
+        [jnp.ones_like(x), x, y_paper, -dark, -dark * x, -dark * y_paper, shade, image.far,
+         dark * (1 - dark)]
+    )  # fmt: skip
+
+
+def _first_light(y: Unknowns, window: Window, instants: int) -> Float[Array, " L"]:
+    image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
+    basis = _basis(y, window, image)
+    weighted = basis * window.used[None]
+    prior = jnp.asarray([1 / s**2 for s in _LIGHT_SIGMA], basis.dtype)
+    gram = weighted @ basis.T + jnp.diag(prior)
+    return eliminate(gram, (weighted @ window.levels / window.contrast)[:, None])[:, 0]
+
+
+def _prior(y: Unknowns, window: Window) -> tuple[Float[Array, " p"], Float[Array, "p n"]]:
+    """What is expected of motion, lens and light, in standard deviations, and its slopes."""
+    sigmas = jnp.asarray([_LENS_SIGMA_PX2, *_LIGHT_SIGMA], y.light.dtype)
+    sigmas = jnp.concatenate([jnp.full(2, 1, y.light.dtype) * window.motion_sigma_px, sigmas])
+    off = jnp.concatenate([y.motion_px - window.motion_px, (y.lens_px2 - _LENS_PX2)[None], y.light])
+    slopes = jnp.eye(UNKNOWNS, dtype=y.light.dtype)[8:] / sigmas[:, None]
+    return off / sigmas, slopes
+
+
+def _loss(r: Array, used: Array) -> tuple[Array, Array]:
+    """The bounded loss of residuals in standard deviations, at most width^2, and its weights."""
+    near = 1 / (1 + (r / _WIDTH) ** 2)
+    return jnp.where(used, r**2 * near, 0), jnp.where(used, near**2, 0)
+
+
+def _spread(residual: Array, used: Array, most: Array) -> Array:
+    """Standard deviation of the residuals that fit, from their median size.
+
+    Args:
+        most: an upper bound. Residuals beyond three times what is found are left out, twice, so
+            that what hides a third of the marker does not count as noise.
+    """
+    size = jnp.abs(residual)
+    spread = most
+    for _ in range(3):
+        near = used & (size < 3 * spread)
+        spread = jnp.minimum(1.4826 * jnp.nanmedian(jnp.where(near, size, jnp.nan)), most)
+    return jnp.where(jnp.isfinite(spread), spread, most)
+
+
+def _result(y: Unknowns, window: Window, instants: int, done: Array) -> PatternFit:
+    residual, J, image = _model(y, window, instants)
+    noise = _spread(residual, window.used, window.most_noise)
+    noise = jnp.maximum(noise, _LEAST_NOISE)
+    scale = _deviation(noise, image, window)
+    _, weight = _loss(residual / scale, window.used)
+    freedom = jnp.maximum(jnp.sum(weight) - UNKNOWNS, 1)
+    variance = _LOSS_VARIANCE * jnp.sum(weight * (residual / scale) ** 2) / freedom
+    _, prior_J = _prior(y, window)
+    information = (J * (weight / scale**2)[None]) @ J.T / variance + prior_J.T @ prior_J
+    units = jnp.eye(UNKNOWNS, dtype=J.dtype)
+    xy, _ = on_paper(y.M, window.rays, window.rays_px)
+    scores = J * (weight * residual / scale**2 / jnp.sqrt(variance * _SCORE_VARIANCE))[None]
+    ratio = cell_disagreement(xy, scores, information, window.K.shape[0] - 1)
+    factor = jnp.where(ratio > _NOTICED, ratio, 1)
+    covariance = eliminate(ridged(information), units) * factor
+    contrast = y.light[3] * window.contrast
+    basis = _basis(y, window, image)
+    marker = (y.light[:6] * window.contrast) @ basis[:6]
+    plain = _plain(basis[:3], window, scale)
+    without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
+    return PatternFit(
+        y.M, y.motion_px, y.lens_px2, covariance[:8, :8], noise, contrast, weight, residual, marker,
+        1 - with_marker / without, (without - with_marker) / 2, done,
+    )  # fmt: skip
+
+
+def _plain(basis: Float[Array, "3 N"], window: Window, scale: Array) -> Float[Array, " N"]:
+    """Residual (N,) of a ground without a marker: a level and its gradient."""
+    weight = window.used / scale**2
+    level = jnp.zeros(3, basis.dtype)
+    for _ in range(3):
+        weighted = basis * weight[None]
+        gram = weighted @ basis.T
+        level = eliminate(
+            gram + 1e-6 * jnp.trace(gram) * jnp.eye(3), (weighted @ window.levels)[:, None]
+        )[:, 0]
+        residual = window.levels - level @ basis
+        weight = _loss(residual / scale, window.used)[1] / scale**2
+    return residual
+
+
+@kept
+def fit_patterns(windows: Window, instants: Float[Array, " J"]) -> PatternFit:
+    """`fit_pattern` of B windows, leading axis B, with as many instants as there are entries."""
+    return jax.vmap(lambda window: fit_pattern(window, len(instants)))(windows)
