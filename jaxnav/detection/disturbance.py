@@ -13,6 +13,7 @@ _REFINED = 3  # halvings of the steps of angle and offset
 _GAINS = (0.15, 0.9)  # of a shadow's light, over that beside it
 _BETTER = 0.75  # a shadow must lower the loss to this part
 _WIDTH = 3.0  # of the loss, standard deviations
+_PIXELS = 256  # that are compared
 _HIDDEN = 3.5  # standard deviations
 
 
@@ -29,48 +30,51 @@ def find_shadow(
         levels: grey levels of the pixels.
         fit: a fit of the marker without a shadow, whose arrays may be longer than the pixels.
     """
-    count = len(levels)
-    marker, noise = np.asarray(fit.marker, float)[:count], float(fit.noise)
-    within = np.all(np.abs(xy) < 1.1, axis=0)
-    scale = noise + 0.02 * float(fit.contrast)
+    within = np.flatnonzero(np.all(np.abs(xy) < 1.1, axis=0))[:_PIXELS]
+    marker, levels, at = np.asarray(fit.marker, float)[within], levels[within], xy[:, within]
+    scale = float(fit.noise) + 0.02 * float(fit.contrast)
 
-    def loss(angle: float, offset: float, soft: float) -> float:
-        lit = _lit(xy, angle, offset, soft)
-        sides = np.stack([marker * lit, marker * (1 - lit)])[:, within]
-        weight = np.ones(sides.shape[1])
+    def losses(lines: np.ndarray) -> np.ndarray:
+        """Loss (L,) of each line (angle, offset, softness), (L, 3)."""
+        lit = marker * _lit(at, lines)
+        dim = marker - lit
+        weight = np.ones_like(lit)
         for _ in range(3):
-            weighted = sides * weight
-            gram = weighted @ sides.T + 1e-6 * np.eye(2) * np.sum(sides**2)
-            gains = np.linalg.solve(gram, weighted @ levels[within])
-            residual = (levels[within] - gains @ sides) / scale
+            a, b, c = (np.sum(weight * x * y, axis=1) for x, y in
+                       ((lit, lit), (lit, dim), (dim, dim)))  # fmt: skip
+            p, q = (np.sum(weight * x * levels, axis=1) for x in (lit, dim))
+            determinant = np.maximum(a * c - b * b, 1e-9 * (a + c) ** 2)
+            light, shade = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+            residual = (levels - light[:, None] * lit - shade[:, None] * dim) / scale
             weight = 1 / (1 + (residual / _WIDTH) ** 2) ** 2
-        if not _GAINS[0] < gains[1] / max(gains[0], 1e-6) < _GAINS[1]:
-            return math.inf
-        return float(np.sum(residual**2 / (1 + (residual / _WIDTH) ** 2)))
+        total = np.sum(residual**2 / (1 + (residual / _WIDTH) ** 2), axis=1)
+        gain = shade / np.maximum(light, 1e-6)
+        return np.where((gain > _GAINS[0]) & (gain < _GAINS[1]), total, np.inf)
 
-    plain = np.asarray(fit.residual, float)[:count][within] / scale
+    plain = np.asarray(fit.residual, float)[within] / scale
     without = float(np.sum(plain**2 / (1 + (plain / _WIDTH) ** 2)))
-    trials = [
-        (loss(angle, offset, _SOFT[0]), angle, offset, _SOFT[0])
-        for angle in np.arange(_ANGLES) * 2 * math.pi / _ANGLES
-        for offset in np.linspace(-0.8, 0.8, _OFFSETS)
-    ]
-    best = min(trials)
+    angles = np.arange(_ANGLES) * 2 * math.pi / _ANGLES
+    offsets = np.linspace(-0.8, 0.8, _OFFSETS)
+    lines = np.stack(np.meshgrid(angles, offsets, _SOFT[:1]), axis=-1).reshape(-1, 3)
     turn, shift = math.pi / _ANGLES, 0.1
-    for _ in range(_REFINED):
-        _, angle, offset, soft = best
-        near = [(angle + turn, offset, soft), (angle - turn, offset, soft),
-                (angle, offset + shift, soft), (angle, offset - shift, soft)]  # fmt: skip
-        near += [(angle, offset, other) for other in _SOFT if other != soft]
-        best = min([best, *((loss(*line), *line) for line in near)])
+    least = math.inf
+    for _ in range(_REFINED + 1):
+        trials = losses(lines)
+        if np.min(trials) < least:
+            least, best = float(np.min(trials)), lines[np.argmin(trials)]
+        if not least < math.inf:
+            return None
+        steps = np.array([[turn, 0, 0], [-turn, 0, 0], [0, shift, 0], [0, -shift, 0]])
+        others = [[best[0], best[1], soft] for soft in _SOFT]
+        lines = np.concatenate([best + steps, others])
         turn, shift = turn / 2, shift / 2
-    if not best[0] < _BETTER * without:
-        return None
-    return _lit(xy, *best[1:])
+    return _lit(xy, best[None])[0] if least < _BETTER * without else None
 
 
-def _lit(xy: np.ndarray, angle: float, offset: float, soft: float) -> np.ndarray:
-    beside = math.cos(angle) * xy[0] + math.sin(angle) * xy[1] - offset
+def _lit(xy: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """The light (L, N), 0 to 1, beside lines of (angle, offset, softness), (L, 3)."""
+    angle, offset, soft = lines.T[:, :, None]
+    beside = np.cos(angle) * xy[0] + np.sin(angle) * xy[1] - offset
     return np.asarray(1 / (1 + np.exp(-np.clip(beside / soft, -30, 30))))
 
 
@@ -80,18 +84,42 @@ def clear_pixels(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> Bool[np.nda
     At the edge of what hides a marker pixels are mixed and may fit by chance. A pixel that does not
     fit, and has no neighbour that does not either, is noise and hides nothing.
     """
+    residual = np.asarray(fit.residual, float)[: len(pixels)]
+    grid, at = _on_grid(pixels, np.abs(residual) > _HIDDEN * float(fit.noise))
+    lumps = grid * (_neighbours(grid) > 0)
+    return np.asarray((lumps + _neighbours(lumps))[at] == 0)
+
+
+def noise_correlation(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> float:
+    """The factor of the variances by which the noise of neighbouring pixels is alike, at least 1.
+
+    Sensors have white noise, but what makes colours of a raw picture or compresses it does not
+    keep it so: the sum of a residual's correlations with its eight neighbours and itself.
+    """
     count = len(pixels)
-    off = np.abs(np.asarray(fit.residual, float)[:count]) > _HIDDEN * float(fit.noise)
+    weight = np.asarray(fit.weight, float)[:count]
+    residual = np.where(weight > 0.5, np.asarray(fit.residual, float)[:count], 0.0)
+    grid, at = _on_grid(pixels, residual)
+    pairs = _neighbours(_on_grid(pixels, weight > 0.5)[0])[at] @ (weight > 0.5)
+    products = float(_neighbours(grid)[at] @ residual)
+    variance = float(residual @ residual) / max(np.sum(weight > 0.5), 1)
+    if not (pairs > 0 and variance > 0):
+        return 1.0
+    return max(1.0, 1 + 8 * products / pairs / variance)
+
+
+def _on_grid(
+    pixels: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Values (N,) of pixels on a grid with an empty border, and their places on it."""
     low = pixels.min(axis=0) - 1
-    size = pixels.max(axis=0) - low + 2
-    grid = np.zeros(size)
-    at = tuple((pixels - low).T)
-    grid[at] = off
-    around = np.zeros_like(grid)
-    for shift in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
-        around += np.roll(grid, shift, axis=(0, 1))
-    lumps = np.where((grid > 0) & (around > 0), 1.0, 0.0)
-    hidden = lumps.copy()
-    for shift in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
-        hidden += np.roll(lumps, shift, axis=(0, 1))
-    return np.asarray(hidden[at] == 0)
+    grid = np.zeros(pixels.max(axis=0) - low + 2)
+    column, row = (pixels - low).T
+    grid[column, row] = values
+    return grid, (column, row)
+
+
+def _neighbours(grid: np.ndarray) -> np.ndarray:
+    """The sum of the eight neighbours of each place of a grid with an empty border."""
+    rows = grid + np.roll(grid, 1, axis=0) + np.roll(grid, -1, axis=0)
+    return np.asarray(rows + np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1) - grid)

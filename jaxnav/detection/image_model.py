@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxnav.detection.paper import blur_on_paper, generators, on_paper
 from jaxnav.numerics.small_matrices import eliminate
@@ -54,7 +54,7 @@ def expose(
     rays: Float[Array, "3 N"],
     rays_px: Float[Array, "2 3 N"],
     K: Float[Array, "k k"],
-    instants: int,
+    instants: Int[Array, ""],
 ) -> Exposure:
     """The image of a marker that moves during the exposure.
 
@@ -67,7 +67,6 @@ def expose(
         K: `step_corners` of the marker.
         instants: number of images that are averaged: one for every 2.5 px of the streak suffice.
     """
-    times = (jnp.arange(instants, dtype=M.dtype) + 0.5) / instants - 0.5
     between = motion_px / instants  # the motion from one instant to the next
     S = jnp.stack([between[0] ** 2, between[0] * between[1], between[1] ** 2]) / 12
     S = S + jnp.asarray([1, 0, 1], M.dtype) * (lens_px2 + PIXEL_VARIANCE_PX2)
@@ -99,7 +98,13 @@ def expose(
             by_blur(units),
         )
 
-    return jax.tree.map(lambda images: jnp.mean(images, axis=0), jax.vmap(at)(times))
+    def add(i: Array, sums: Exposure) -> Exposure:
+        image = at((i + 0.5) / instants - 0.5)
+        return jax.tree.map(lambda total, part: total + part / instants, sums, image)
+
+    shapes = jax.eval_shape(at, jnp.zeros_like(lens_px2))
+    nothing = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
+    return jax.lax.fori_loop(0, instants, add, nothing)
 
 
 def ink(

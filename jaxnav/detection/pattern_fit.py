@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.compiling.executables import kept
 from jaxnav.detection.image_model import Exposure, cell_disagreement, expose, ridged
@@ -34,8 +34,9 @@ _SCORE_VARIANCE = 0.537  # E[psi^2] / E[w] / that variance
 _NOTICED = 1.3  # a smaller factor may come from so many cells by chance
 _GROUND = 0.15  # standard deviation of the ground beyond the paper, of the contrast
 _LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
-_STEPS = 12
-_COARSER = 2  # at first one of so many pixels
+_STEPS = 8
+_COARSE_STEPS = 6
+_COARSER = 4  # at first one of so many pixels
 _LENS_PX2, _LENS_SIGMA_PX2 = 0.4, 0.5
 _MOST_LENS_PX2 = 9.0
 _MOST_STEP = 0.15  # of D: half sides
@@ -81,6 +82,7 @@ class PatternFit(NamedTuple):
     weight: Float[Array, " N"]  # of each pixel in the loss, 0 to 1; 0 for padding
     residual: Float[Array, " N"]  # grey levels
     marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
+    disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
     log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
     converged: Bool[Array, ""]
@@ -110,7 +112,7 @@ class _PatternLM(NormalEquationsLM):
         )
 
 
-def fit_pattern(window: Window, instants: int) -> PatternFit:
+def fit_pattern(window: Window, instants: Int[Array, ""]) -> PatternFit:
     """Fit a window from M = I and the expected motion; see the module."""
     start = Unknowns(
         jnp.eye(3, dtype=window.levels.dtype),
@@ -121,7 +123,7 @@ def fit_pattern(window: Window, instants: int) -> PatternFit:
     coarse = window.most_noise
     few = _first(window, window.levels.shape[0] // _COARSER)
     y = start._replace(light=_first_light(start, few, instants))
-    y, _ = _minimum(y, few, coarse * jnp.ones_like(few.levels), instants, _STEPS // 2)
+    y, _ = _minimum(y, few, coarse * jnp.ones_like(few.levels), instants, _COARSE_STEPS)
     residual, _, image = _model(y, window, instants)
     noise = jnp.maximum(_spread(residual, window.used, coarse), _LEAST_NOISE)
     y, done = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS)
@@ -145,7 +147,7 @@ def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " 
 
 
 def _minimum(
-    y: Unknowns, window: Window, scale: Float[Array, " N"], instants: int, steps: int
+    y: Unknowns, window: Window, scale: Float[Array, " N"], instants: Int[Array, ""], steps: int
 ) -> tuple[Unknowns, Array]:
     def cost(y: Unknowns, args: Any) -> tuple[Array, NormalEquations]:
         del args
@@ -163,7 +165,7 @@ def _minimum(
 
 
 def _model(
-    y: Unknowns, window: Window, instants: int
+    y: Unknowns, window: Window, instants: Int[Array, ""]
 ) -> tuple[Float[Array, " N"], Float[Array, "n N"], Exposure]:
     """Residual (N,), slopes (n, N) of the model by all unknowns, and the ink's image."""
     image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
@@ -192,7 +194,7 @@ def _basis(y: Unknowns, window: Window, image: Exposure) -> Float[Array, "L N"]:
     )  # fmt: skip
 
 
-def _first_light(y: Unknowns, window: Window, instants: int) -> Float[Array, " L"]:
+def _first_light(y: Unknowns, window: Window, instants: Int[Array, ""]) -> Float[Array, " L"]:
     image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
     basis = _basis(y, window, image)
     weighted = basis * window.used[None]
@@ -231,7 +233,7 @@ def _spread(residual: Array, used: Array, most: Array) -> Array:
     return jnp.where(jnp.isfinite(spread), spread, most)
 
 
-def _result(y: Unknowns, window: Window, instants: int, done: Array) -> PatternFit:
+def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) -> PatternFit:
     residual, J, image = _model(y, window, instants)
     noise = _spread(residual, window.used, window.most_noise)
     noise = jnp.maximum(noise, _LEAST_NOISE)
@@ -254,7 +256,7 @@ def _result(y: Unknowns, window: Window, instants: int, done: Array) -> PatternF
     without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
     return PatternFit(
         y.M, y.motion_px, y.lens_px2, covariance[:8, :8], noise, contrast, weight, residual, marker,
-        1 - with_marker / without, (without - with_marker) / 2, done,
+        ratio, 1 - with_marker / without, (without - with_marker) / 2, done,
     )  # fmt: skip
 
 
@@ -274,6 +276,6 @@ def _plain(basis: Float[Array, "3 N"], window: Window, scale: Array) -> Float[Ar
 
 
 @kept
-def fit_patterns(windows: Window, instants: Float[Array, " J"]) -> PatternFit:
-    """`fit_pattern` of B windows, leading axis B, with as many instants as there are entries."""
-    return jax.vmap(lambda window: fit_pattern(window, len(instants)))(windows)
+def fit_patterns(windows: Window, instants: Int[Array, ""]) -> PatternFit:
+    """`fit_pattern` of B windows, leading axis B, each the mean of so many images."""
+    return jax.vmap(lambda window: fit_pattern(window, instants))(windows)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxnav.detection.codes import code_advantage
-from jaxnav.detection.disturbance import clear_pixels, find_shadow
+from jaxnav.detection.disturbance import clear_pixels, find_shadow, noise_correlation
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.lens import Lens
@@ -27,10 +27,10 @@ from jaxnav.detection.refine import corners_of, mean_side_px, pixels_around
 from jaxnav.detection.template import best_match
 from jaxnav.models.camera import Camera
 
-_LANES = (256, 512, 1024)  # pixels of a fit, padded to the next
+_LANES = (256, 512)  # pixels of a fit, padded to the next
 _LEAST_PIXELS = 60
 _INSTANT_PX = 2.5  # of the streak, for each image that is averaged
-_INSTANTS = (1, 2, 4, 16)
+_MOST_INSTANTS = 16
 _LEAST_SIDE_PX = 8.0
 _LEAST_STREAK_PX = 0.5  # of a start: where there is no motion the image has no slope by it
 _LEAST_CONTRAST = 10.0  # grey levels
@@ -38,8 +38,10 @@ _LEAST_CONTRAST = 10.0  # grey levels
 # explains, and by how many noise variances every other code is worse.
 _LEAST_EXPLAINED = 0.5
 _LEAST_ADVANTAGE = 60.0
-_MODEL_SIGMA_PX = 0.01
-_UNDISTURBED = 0.87  # explained; where it is less, something disturbs the picture
+_MODEL_SIGMA_PX = 0.008
+_STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
+# Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.
+_DISAGREE, _WEIGHT = 1.3, 0.78
 _MOST_NOISE = 0.15  # of the contrast
 _BOUND = 9.0  # of a pixel's loss, noise variances
 _HALVES, _HALF = 8, 0.1  # of the marker, a little more than half
@@ -129,8 +131,8 @@ def _track(image: np.ndarray, lens: Lens, target: Target) -> Track | None:
     found = _fit(image, lens, target, start.quad_px, np.asarray(start.streak_px))
     if found is None or not np.all(np.isfinite(found.fit.M)):
         return None
-    if found.fit.explained < _UNDISTURBED:
-        found = _undisturbed(image, lens, target, found) or found
+    if _is_disturbed(found):
+        found = _undisturbed(found) or found
     return _judge(target, lens, found, start.quad_px)
 
 
@@ -158,9 +160,9 @@ def _fitted(M0: np.ndarray, pixels: np.ndarray, window: Window) -> _Fitted:
 def _best_fitted(M0: np.ndarray, pixels: np.ndarray, windows: Sequence[Window]) -> _Fitted:
     """The fit of the window that explains most of all pixels."""
     streak_px = float(np.hypot(*windows[0].motion_px))
-    instants = next((i for i in _INSTANTS if i * _INSTANT_PX >= streak_px), _INSTANTS[-1])
+    instants = min(max(math.ceil(streak_px / _INSTANT_PX), 1), _MOST_INSTANTS)
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
-    fits = jax.device_get(fit_patterns(batch, np.ones(instants, np.float32)))
+    fits = jax.device_get(fit_patterns(batch, np.int32(instants)))
     scale = max(float(np.nanmin(fits.noise)), 1.0)
     off = fits.residual[:, : len(pixels)] ** 2 / scale**2
     losses = np.sum(off / (1 + off / _BOUND), axis=1)
@@ -169,29 +171,27 @@ def _best_fitted(M0: np.ndarray, pixels: np.ndarray, windows: Sequence[Window]) 
     return _Fitted(M0, pixels, windows[best], fit)
 
 
-def _undisturbed(image: np.ndarray, lens: Lens, target: Target, found: _Fitted) -> _Fitted | None:
+def _is_disturbed(found: _Fitted) -> bool:
+    weight = np.sum(found.fit.weight) / max(np.sum(found.window.used), 1)
+    return bool(found.fit.disagreement > _DISAGREE or weight < _WEIGHT)
+
+
+def _undisturbed(found: _Fitted) -> _Fitted | None:
     """The fit with a shadow's edge, and without the pixels of what hides the marker."""
-    corners_px = corners_of(np.asarray(found.fit.M, float) @ found.M0, lens)
-    if not np.all(np.abs(corners_px) < 1e5):
-        return None
-    placed = _place(image, lens, target, corners_px, np.asarray(found.fit.motion_px, float))
-    if placed is None:
-        return None
-    M0, pixels, window = placed
+    M0, pixels, window, _ = found
     count = len(pixels)
-    found = _fitted(M0, pixels, window)
     rays, rays_px = np.asarray(window.rays, float), np.asarray(window.rays_px, float)
     xy, _ = on_paper(np.asarray(found.fit.M, float), rays, rays_px)
     lit = find_shadow(xy[:, :count], window.levels[:count], found.fit)
     if lit is not None:
         window = window._replace(shadow=np.append(lit, window.shadow[count:]).astype(np.float32))
         found = _fitted(M0, pixels, window)
-    if found.fit.explained < _UNDISTURBED:
+    if _is_disturbed(found):
         # Whatever hides a part leaves one of the halves.
         angles = np.arange(_HALVES) * 2 * np.pi / _HALVES
         sides = [np.cos(a) * xy[0] + np.sin(a) * xy[1] < _HALF for a in angles]
         halves = [window._replace(used=window.used & side) for side in sides]
-        found = _best_fitted(M0, pixels, [window, *halves])
+        found = _best_fitted(M0, pixels, halves)
     for _ in range(_ROUNDS):
         clear = np.zeros_like(window.used)
         clear[:count] = clear_pixels(pixels, found.fit)
@@ -201,6 +201,12 @@ def _undisturbed(image: np.ndarray, lens: Lens, target: Target, found: _Fitted) 
         if np.mean(before.window.used != clear) < _SAME:
             break
     return found
+
+
+def _model_sigma_px(fit: PatternFit, side_px: float) -> float:
+    """What residuals don't show: a streak as long as the marker mixes the ground into all of it."""
+    streak_px = float(np.hypot(*fit.motion_px))
+    return _MODEL_SIGMA_PX + _STREAK_SIGMA_PX * min(streak_px / side_px, 2.0) ** 4
 
 
 def _place(
@@ -215,7 +221,8 @@ def _place(
         return None
     # Scattered, so that the first quarter of them shows the whole marker too.
     order = np.argsort((pixels @ np.array([12.9898, 78.233]) * 43758.5453) % 1.0, kind="stable")
-    pixels = pixels[order]
+    pixels = pixels[order][: _LANES[-1]]
+    count = len(pixels)
     lanes = np.minimum(np.arange(next(n for n in _LANES if n >= count)), count - 1)
     rays, rays_px = lens.rays(pixels)
     levels = image[pixels[:, 1], pixels[:, 0]].astype(np.float32)
@@ -260,8 +267,9 @@ def _judge(target: Target, lens: Lens, found: _Fitted, start_px: np.ndarray) -> 
         return None
     _, paper_px = on_paper(M, *lens.rays(corners_px))
     motion = -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
-    covariance = motion @ np.asarray(fit.covariance, float) @ motion.T
-    covariance = covariance + _MODEL_SIGMA_PX**2 * np.eye(8)
+    covariance = noise_correlation(pixels, fit) * np.asarray(fit.covariance, float)
+    covariance = motion @ covariance @ motion.T
+    covariance = covariance + _model_sigma_px(fit, side_px) ** 2 * np.eye(8)
     if not np.all(np.isfinite(covariance)):
         return None
     streak_px = np.asarray(fit.motion_px, float)
