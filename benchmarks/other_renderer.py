@@ -214,7 +214,9 @@ def write_set(mi: Any, kind: str, arguments: argparse.Namespace) -> None:
         cv2.imwrite(str(out / f"{index:03}.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
         pictures.append({"image": f"{index:03}.png"} | truth_of(scene))
         every = {"family": FAMILY, "size_m": SIZE_M, "exposure_s": EXPOSURE_S}
-        text = yaml.safe_dump(every | {"pictures": pictures}, sort_keys=False, width=100)
+        text = yaml.safe_dump(
+            every | {"pictures": pictures}, sort_keys=False, default_flow_style=None, width=100
+        )
         (out / "truth.yaml").write_text(text)
 
 
