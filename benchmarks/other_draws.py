@@ -45,8 +45,13 @@ def draw(kind: str, index: int, seed: int = 0, size_px: tuple[int, int] = (160, 
             scene = _shaded(scene, rng)
         if kind == "hidden":
             scene = _hidden(scene, rng, index)
-        if _fits(scene):
-            return _cluttered(scene, rng)
+        if not _fits(scene):
+            continue
+        scene = _cluttered(scene, rng)
+        if kind != "shadow":
+            return scene
+        if (balanced := _balanced(scene)) is not None:
+            return balanced
 
 
 def _seen(rng: np.random.Generator, kind: str, size_px: tuple[int, int]) -> Scene:
@@ -175,7 +180,6 @@ def _shaded(scene: Scene, rng: np.random.Generator) -> Scene:
         scene,
         things=(plate,),
         light_radius_m=max(float(radius_m), 1e-4),
-        lamp_share=float(1 - lit_part),
         truth=scene.truth
         | {
             "shadow": {
@@ -185,6 +189,32 @@ def _shaded(scene: Scene, rng: np.random.Generator) -> Scene:
             }
         },
     )
+
+
+def _balanced(scene: Scene) -> Scene | None:
+    """With so much of the light from the lamp that the shadow is as dark as was drawn.
+
+    The things keep out some of the light from around as well. None where that alone is too dark.
+    """
+    left = scene.truth["shadow"]["light_left"]
+    points = on_paper(6, SIZE_M)
+    shaded = np.any([t.hides(scene.light_m, points) for t in scene.things], axis=0)
+    rng = np.random.default_rng(0)
+    z, azimuth = np.sqrt(rng.random(400)), rng.uniform(0, 2 * np.pi, 400)  # by Lambert's law
+    r = np.sqrt(1 - z**2)
+    sky = 10 * np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=1)
+    around = np.array(
+        [1 - np.mean(np.any([t.hides(p, p + sky) for t in scene.things], axis=0)) for p in points]
+    )
+    if shaded.all() or not shaded.any():
+        return None
+    dark, bright = around[shaded].mean(), around[~shaded].mean()
+    ratio = (dark - left * bright) / left  # of the lamp's light to that from around
+    if ratio < 0.1:
+        return None
+    share = ratio / (1 + ratio)
+    lit = share + (1 - share) * bright
+    return replace(scene, lamp_share=float(share), white=float(scene.white / lit))
 
 
 def _hidden(scene: Scene, rng: np.random.Generator, index: int) -> Scene:

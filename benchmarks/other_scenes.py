@@ -58,7 +58,7 @@ class Scene:
     light_m: np.ndarray  # place of the lamp, a disc that faces the marker
     light_radius_m: float
     lamp_share: float  # of the light on the marker; the rest comes evenly from all sides
-    white: float  # signal of white paper, of full scale
+    white: float  # signal of white paper that nothing keeps light from, of full scale
     lens_px: float
     response: str  # linear or srgb
     truth: dict = field(default_factory=dict)
