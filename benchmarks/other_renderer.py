@@ -34,7 +34,9 @@ from other_scenes import (
 )
 from other_surfaces import FAMILY
 
-RAYS = 256  # a pixel, of a picture without motion; of a moving one a sub-frame has a sixteenth
+# A pixel, of a picture without motion; of a moving one each sub-frame has a sixteenth. Their own
+# noise is 1 to 2 grey levels, and falls with their root.
+RAYS = 256
 LEAST_SUBFRAMES, SPACING_PX = 24, 0.3
 NOISE = 3.0  # grey levels
 PIXEL_PX = 12**-0.5  # standard deviation of a square pixel
