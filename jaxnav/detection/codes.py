@@ -1,7 +1,7 @@
 """Which code of a family a fitted marker shows: the predicted one, and by how much."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxnav.detection.families import all_cells, codes_of
 from jaxnav.detection.image_model import PIXEL_VARIANCE_PX2
@@ -9,43 +9,46 @@ from jaxnav.detection.paper import blur_on_paper, on_paper
 from jaxnav.detection.pattern_fit import PatternFit, Window
 
 _NODES = 4  # images of a moving marker that are averaged
-_NEAR = 64  # codes that are compared exactly
+_NEAR = 96  # codes that are drawn
+_BOUND = 9.0  # of a pixel's loss, noise variances
+_MOST = 10.0  # standard deviations, of a pixel that helps to choose them
 
 
 def code_advantage(
-    family: str, marker_id: int, fit: PatternFit, window: Window, count: int
+    family: str,
+    marker_id: int,
+    fit: PatternFit,
+    window: Window,
+    shown: Bool[np.ndarray, " N"],
 ) -> float:
     """By how many noise variances every other code, in any quarter turn, is worse than this one.
 
-    Every code is compared through the blur and the homography of the fit, with the light that suits
-    it best. Negative if another code is better.
+    Every code is drawn through the blur, the homography and the light of the fit, and compared with
+    pixels that the fit left out as well: what hides a marker in the eyes of one code may be another
+    code. The loss of a pixel is bounded. Negative if another code is better.
 
     Args:
-        count: number of the window's pixels that are not padding.
+        shown: which of the window's first pixels count.
     """
     n = all_cells(family).shape[1]
+    count = len(shown)
     ink = cell_images(fit, window, n)[:, :count]
-    weight = np.sqrt(np.asarray(fit.weight, float)[:count] / float(fit.noise) ** 2)
-    (x, y), _ = on_paper(np.asarray(fit.M, float), *_rays(window))
-    ground = np.stack([np.ones(count), x[:count], y[:count]]) * weight
-    base, _ = np.linalg.qr(ground.T)
-
-    def without_ground(rows: np.ndarray) -> np.ndarray:
-        return rows - (rows @ base) @ base.T
-
     inside = np.pad(np.ones((n - 2, n - 2), bool), 1).ravel()
-    levels = without_ground(np.asarray(window.levels, float)[:count] * weight)
-    cells = without_ground(ink * weight)
-    frame, cells = cells[~inside].sum(axis=0), cells[inside]
+    frame, cells = ink[~inside].sum(axis=0), ink[inside]
     codes, own = codes_of(family), 4 * marker_id
-    along = frame @ levels + codes @ (cells @ levels)
-    # The lengths of all would take a millisecond, and differ little: those that fit best suffice.
-    near = np.argpartition(along, min(_NEAR, len(along) - 1))[:_NEAR]
+    # By a pixel's own noise: what it would be without ink, and by how much ink darkens it.
+    noise = np.asarray(fit.deviation, float)[:count]
+    light = (
+        np.asarray(window.levels, float)[:count] - np.asarray(fit.white, float)[:count]
+    ) / noise
+    darkens = np.asarray(fit.darkens, float)[:count] / noise
+    # To draw all codes would take some milliseconds: those that correlate best suffice.
+    alike = codes @ (cells @ (darkens * np.clip(light + darkens * frame, -_MOST, _MOST)))
+    near = np.argpartition(alike, min(_NEAR, len(alike) - 1))[:_NEAR]
     near = np.append(near[near != own], own)
-    gram, across = cells @ cells.T, cells @ frame
-    length = frame @ frame + np.sum((2 * across + codes[near] @ gram) * codes[near], axis=1)
-    explained = np.minimum(along[near], 0) ** 2 / np.maximum(length, 1e-9)
-    return float(explained[-1] - np.max(explained[:-1]))
+    residual = light + darkens * (frame + codes[near] @ cells)
+    losses = np.sum(residual**2 / (1 + residual**2 / _BOUND), axis=1)
+    return float(np.min(losses[:-1]) - losses[-1])
 
 
 def cell_images(fit: PatternFit, window: Window, n: int) -> Float[np.ndarray, "cells N"]:

@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -15,6 +16,7 @@ _BETTER = 0.75  # a shadow must lower the loss to this part
 _WIDTH = 3.0  # of the loss, standard deviations
 _PIXELS = 256  # that are compared
 _HIDDEN = 3.5  # standard deviations
+_CELLS = 0.75  # half of the least width of what hides a marker, beside that of its own edge
 
 
 def find_shadow(
@@ -85,9 +87,27 @@ def clear_pixels(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> Bool[np.nda
     fit, and has no neighbour that does not either, is noise and hides nothing.
     """
     residual = np.asarray(fit.residual, float)[: len(pixels)]
-    grid, at = _on_grid(pixels, np.abs(residual) > _HIDDEN * float(fit.noise))
-    lumps = grid * (_neighbours(grid) > 0)
+    grid, at = _on_grid(pixels, np.abs(residual) > _HIDDEN * float(fit.noise), _spacing(pixels))
+    lumps = grid * ((_neighbours(grid) > 0) | (grid > 1))
     return np.asarray((lumps + _neighbours(lumps))[at] == 0)
+
+
+def blank_pixels(
+    pixels: Int[np.ndarray, "N 2"], clear: Bool[np.ndarray, " N"], cell_px: float
+) -> Bool[np.ndarray, " N"]:
+    """Which pixels that are not clear lie within something larger than cells of another code.
+
+    Args:
+        cell_px: side of the marker's cells.
+    """
+    spacing = _spacing(pixels)
+    grid, at = _on_grid(pixels, ~clear, spacing)
+    covered, _ = _on_grid(pixels, np.ones(len(pixels)), spacing)
+    hidden = ((grid > 0) | (covered == 0)).astype(np.uint8)
+    radius = math.ceil((1 + _CELLS * cell_px) / spacing)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    inner = cv2.erode(hidden, disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    return np.asarray(inner[at] > 0) & ~clear
 
 
 def noise_correlation(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> float:
@@ -102,20 +122,25 @@ def noise_correlation(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> float:
     grid, at = _on_grid(pixels, residual)
     pairs = _neighbours(_on_grid(pixels, weight > 0.5)[0])[at] @ (weight > 0.5)
     products = float(_neighbours(grid)[at] @ residual)
-    variance = float(residual @ residual) / max(np.sum(weight > 0.5), 1)
+    variance = float(residual @ residual) / max(int(np.sum(weight > 0.5)), 1)
     if not (pairs > 0 and variance > 0):
         return 1.0
     return max(1.0, 1 + 8 * products / pairs / variance)
 
 
+def _spacing(pixels: np.ndarray) -> float:
+    """Mean distance between neighbouring pixels, some of which may have been left out, px."""
+    width, height = cv2.minAreaRect(pixels.astype(np.float32))[1]
+    return max(1.0, math.sqrt((width + 1) * (height + 1) / len(pixels)))
+
+
 def _on_grid(
-    pixels: np.ndarray, values: np.ndarray
+    pixels: np.ndarray, values: np.ndarray, spacing: float = 1.0
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Values (N,) of pixels on a grid with an empty border, and their places on it."""
-    low = pixels.min(axis=0) - 1
-    grid = np.zeros(pixels.max(axis=0) - low + 2)
-    column, row = (pixels - low).T
-    grid[column, row] = values
+    column, row = (np.floor((pixels - pixels.min(axis=0)) / spacing).astype(int) + 1).T
+    grid = np.zeros((column.max() + 2, row.max() + 2))
+    np.add.at(grid, (column, row), values)
     return grid, (column, row)
 
 

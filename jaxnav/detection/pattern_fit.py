@@ -11,6 +11,7 @@ the contrast and then with one as wide as the noise.
 Source: Geman, McClure (1987), the loss; Madsen, Nielsen, Tingleff (2004), the damping.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.compiling.executables import kept
 from jaxnav.detection.image_model import Exposure, cell_disagreement, expose, ridged
 from jaxnav.detection.paper import on_paper
-from jaxnav.numerics.levenberg_marquardt import Move, NormalEquations, NormalEquationsLM
+from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
 from jaxnav.numerics.small_matrices import eliminate
 
 _LIGHTS = 9
@@ -54,7 +55,8 @@ class Window(NamedTuple):
     rays: Float[Array, "3 N"]
     rays_px: Float[Array, "2 3 N"]
     levels: Float[Array, " N"]
-    used: Bool[Array, " N"]
+    real: Bool[Array, " N"]  # which pixels are no padding
+    used: Bool[Array, " N"]  # which of them count in the fit
     K: Float[Array, "k k"]
     shadow: Float[Array, " N"]  # 1 in the light, 0 in the shadow
     motion_px: Float[Array, " 2"]  # the expected streak
@@ -82,14 +84,22 @@ class PatternFit(NamedTuple):
     weight: Float[Array, " N"]  # of each pixel in the loss, 0 to 1; 0 for padding
     residual: Float[Array, " N"]  # grey levels
     marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
+    white: Float[Array, " N"]  # levels as they would be without ink
+    darkens: Float[Array, " N"]  # by how many levels ink darkens a pixel
+    deviation: Float[Array, " N"]  # standard deviation of a pixel, grey levels
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
     log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
     converged: Bool[Array, ""]
 
 
-class _PatternLM(NormalEquationsLM):
+class _PatternLM(NielsenLM):
     """Steps of D, motion, lens and light, damped in proportion to what is known of each."""
+
+    rtol: float = 1e-6
+    atol: float = 1e-2
+    initial_damping: float = 1e-3
+    norm: Callable[[Any], Float[Array, ""]] = optx.max_norm
 
     def solved(self, normal: NormalEquations, damping: Float[Array, ""]) -> Move:
         information, gradient = normal.information, normal.gradient
@@ -136,6 +146,7 @@ def _first(window: Window, count: int) -> Window:
         rays=window.rays[:, :count],
         rays_px=window.rays_px[:, :, :count],
         levels=window.levels[:count],
+        real=window.real[:count],
         used=window.used[:count],
         shadow=window.shadow[:count],
     )
@@ -149,7 +160,7 @@ def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " 
 def _minimum(
     y: Unknowns, window: Window, scale: Float[Array, " N"], instants: Int[Array, ""], steps: int
 ) -> tuple[Unknowns, Array]:
-    def cost(y: Unknowns, args: Any) -> tuple[Array, NormalEquations]:
+    def cost(y: Any, args: Any) -> tuple[Any, Any]:
         del args
         residual, J, _ = _model(y, window, instants)
         loss, weight = _loss(residual / scale, window.used)
@@ -159,8 +170,8 @@ def _minimum(
             weighted @ J.T + prior_J.T @ prior_J, -weighted @ residual + prior_J.T @ prior
         )
 
-    solver = _PatternLM(rtol=1e-6, atol=1e-2, initial_damping=1e-3)
-    solution = optx.least_squares(cost, solver, y, has_aux=True, max_steps=steps, throw=False)
+    solver = _PatternLM()
+    solution: Any = optx.least_squares(cost, solver, y, has_aux=True, max_steps=steps, throw=False)
     return solution.value, solution.state.done
 
 
@@ -252,17 +263,22 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) 
     contrast = y.light[3] * window.contrast
     basis = _basis(y, window, image)
     marker = (y.light[:6] * window.contrast) @ basis[:6]
+    light = y.light * window.contrast
+    bright = _basis(y, window, image._replace(dark=jnp.zeros_like(image.dark)))
+    inky = _basis(y, window, image._replace(dark=jnp.ones_like(image.dark)))
+    white = light @ bright
+    darkens = white - light @ inky
     plain = _plain(basis[:3], window, scale)
     without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
     return PatternFit(
         y.M, y.motion_px, y.lens_px2, covariance[:8, :8], noise, contrast, weight, residual, marker,
-        ratio, 1 - with_marker / without, (without - with_marker) / 2, done,
+        white, darkens, scale, ratio, 1 - with_marker / without, (without - with_marker) / 2, done,
     )  # fmt: skip
 
 
 def _plain(basis: Float[Array, "3 N"], window: Window, scale: Array) -> Float[Array, " N"]:
     """Residual (N,) of a ground without a marker: a level and its gradient."""
-    weight = window.used / scale**2
+    weight = window.real / scale**2
     level = jnp.zeros(3, basis.dtype)
     for _ in range(3):
         weighted = basis * weight[None]
@@ -271,7 +287,7 @@ def _plain(basis: Float[Array, "3 N"], window: Window, scale: Array) -> Float[Ar
             gram + 1e-6 * jnp.trace(gram) * jnp.eye(3), (weighted @ window.levels)[:, None]
         )[:, 0]
         residual = window.levels - level @ basis
-        weight = _loss(residual / scale, window.used)[1] / scale**2
+        weight = _loss(residual / scale, window.real)[1] / scale**2
     return residual
 
 

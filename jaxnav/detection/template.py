@@ -74,8 +74,8 @@ def _draw(
     low = np.floor(paper.min(axis=0)).astype(int) - margin
     size = np.ceil(paper.max(axis=0)).astype(int) + margin + 1 - low
     side = pattern.shape[0]
-    texels = np.float32([[0, 0], [side, 0], [side, side], [0, side]]) - 0.5
-    finer = np.float32((paper - low + 0.5) * _FINER - 0.5)
+    texels = _box(0, side) - 0.5
+    finer = ((paper - low + 0.5) * _FINER - 0.5).astype(np.float32)
     H = cv2.getPerspectiveTransform(texels, finer)
     shape = (int(size[0]) * _FINER, int(size[1]) * _FINER)
     drawn = cv2.warpPerspective(
@@ -93,10 +93,14 @@ def _draw(
 def _paper(pattern: np.ndarray, quad: np.ndarray) -> np.ndarray:
     """Corners (4, 2) of the white zone around the marker with these corners."""
     cells = pattern.shape[0] // _TEXELS
-    square = np.float32([[1, 1], [cells - 1, 1], [cells - 1, cells - 1], [1, cells - 1]])
-    H = cv2.getPerspectiveTransform(square, np.float32(quad))
-    ends = np.float32([[[0, 0], [cells, 0], [cells, cells], [0, cells]]])
+    square = _box(1, cells - 1)
+    H = cv2.getPerspectiveTransform(square, quad.astype(np.float32))
+    ends = _box(0, cells)[None]
     return np.asarray(cv2.perspectiveTransform(ends, H)[0], float)
+
+
+def _box(low: float, high: float) -> np.ndarray:
+    return np.array([[low, low], [high, low], [high, high], [low, high]], np.float32)
 
 
 def _smeared(drawn: np.ndarray, streak: tuple[float, float]) -> np.ndarray:

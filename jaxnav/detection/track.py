@@ -10,19 +10,24 @@ and no other code of the family comes near.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxnav.detection.codes import code_advantage
-from jaxnav.detection.disturbance import clear_pixels, find_shadow, noise_correlation
+from jaxnav.detection.disturbance import (
+    blank_pixels,
+    clear_pixels,
+    find_shadow,
+    noise_correlation,
+)
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import SQUARE, generators, homography, on_paper
-from jaxnav.detection.pattern_fit import PatternFit, Window, fit_patterns
+from jaxnav.detection.pattern_fit import Window, fit_patterns
 from jaxnav.detection.refine import corners_of, mean_side_px, pixels_around
 from jaxnav.detection.template import best_match
 from jaxnav.models.camera import Camera
@@ -42,6 +47,7 @@ _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
 # Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.
 _DISAGREE, _WEIGHT = 1.3, 0.78
+_PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _MOST_NOISE = 0.15  # of the contrast
 _BOUND = 9.0  # of a pixel's loss, noise variances
 _HALVES, _HALF = 8, 0.1  # of the marker, a little more than half
@@ -113,6 +119,20 @@ def track(
     return [_track(image, lens, target) for target in targets]
 
 
+def warm_up_tracks(camera: Camera | None) -> None:
+    """Compile what `track` calls, so that the first marker takes no longer than others."""
+    lens = Lens(camera)
+    image = np.full((64, 64), 128, np.uint8)
+    for side in (12.0, 24.0):
+        quad_px = 20 + side * (SQUARE + 1) / 2
+        target = Target("tag36h11", 0, quad_px[None], 0.0)
+        placed = _place(image, lens, target, quad_px, np.zeros(2))
+        if placed is not None:
+            M0, pixels, window = placed
+            _best_fitted(M0, pixels, [window])
+            _best_fitted(M0, pixels, [window] * _HALVES)
+
+
 def _track(image: np.ndarray, lens: Lens, target: Target) -> Track | None:
     sides_px = [mean_side_px(quad) for quad in target.quads_px if np.all(np.isfinite(quad))]
     if not sides_px or max(sides_px) < _LEAST_SIDE_PX:
@@ -132,17 +152,25 @@ def _track(image: np.ndarray, lens: Lens, target: Target) -> Track | None:
     if found is None or not np.all(np.isfinite(found.fit.M)):
         return None
     if _is_disturbed(found):
+        if found.fit.explained < _PROMISING:
+            return None
         found = _undisturbed(found) or found
     return _judge(target, lens, found, start.quad_px)
 
 
+_window: Any = Window  # here it holds NumPy's arrays
+
+
 class _Fitted(NamedTuple):
-    """A fit, its first homography, its pixels (N, 2) and its window."""
+    """A fit, its first homography, its pixels (N, 2) and its window.
+
+    Window and fit hold NumPy's arrays.
+    """
 
     M0: np.ndarray
     pixels: np.ndarray
-    window: Window
-    fit: PatternFit
+    window: Any  # `Window`
+    fit: Any  # `PatternFit`
 
 
 def _fit(
@@ -152,12 +180,12 @@ def _fit(
     return None if placed is None else _fitted(*placed)
 
 
-def _fitted(M0: np.ndarray, pixels: np.ndarray, window: Window) -> _Fitted:
+def _fitted(M0: np.ndarray, pixels: np.ndarray, window: Any) -> _Fitted:
     """The fit of one window."""
     return _best_fitted(M0, pixels, [window])
 
 
-def _best_fitted(M0: np.ndarray, pixels: np.ndarray, windows: Sequence[Window]) -> _Fitted:
+def _best_fitted(M0: np.ndarray, pixels: np.ndarray, windows: Sequence[Any]) -> _Fitted:
     """The fit of the window that explains most of all pixels."""
     streak_px = float(np.hypot(*windows[0].motion_px))
     instants = min(max(math.ceil(streak_px / _INSTANT_PX), 1), _MOST_INSTANTS)
@@ -203,7 +231,7 @@ def _undisturbed(found: _Fitted) -> _Fitted | None:
     return found
 
 
-def _model_sigma_px(fit: PatternFit, side_px: float) -> float:
+def _model_sigma_px(fit: Any, side_px: float) -> float:
     """What residuals don't show: a streak as long as the marker mixes the ground into all of it."""
     streak_px = float(np.hypot(*fit.motion_px))
     return _MODEL_SIGMA_PX + _STREAK_SIGMA_PX * min(streak_px / side_px, 2.0) ** 4
@@ -211,7 +239,7 @@ def _model_sigma_px(fit: PatternFit, side_px: float) -> float:
 
 def _place(
     image: np.ndarray, lens: Lens, target: Target, quad_px: np.ndarray, streak_px: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, Window] | None:
+) -> tuple[np.ndarray, np.ndarray, Any] | None:
     """The first homography, the pixels (N, 2) and the window of a fit that starts there."""
     cells = marker_cells(target.family, target.marker_id)
     M0 = homography(lens.rays(quad_px)[0].T)
@@ -233,10 +261,11 @@ def _place(
     return (
         M0,
         pixels,
-        Window(
+        _window(
             np.asarray((M0 @ rays)[:, lanes], np.float32),
             np.asarray((M0 @ rays_px)[:, :, lanes], np.float32),
             levels[lanes],
+            np.arange(len(lanes)) < count,
             np.arange(len(lanes)) < count,
             np.asarray(step_corners(cells), np.float32),
             np.ones(len(lanes), np.float32),
@@ -262,7 +291,10 @@ def _judge(target: Target, lens: Lens, found: _Fitted, start_px: np.ndarray) -> 
     explained, ratio = float(fit.explained), float(fit.log_likelihood_ratio)
     if not explained >= _LEAST_EXPLAINED:
         return None
-    advantage = code_advantage(target.family, target.marker_id, fit, window, count)
+    cell_px = mean_side_px(corners_px) / len(window.K)
+    clear = window.used[:count]
+    shown = ~blank_pixels(pixels, clear, cell_px)
+    advantage = code_advantage(target.family, target.marker_id, fit, window, shown)
     if not advantage >= _LEAST_ADVANTAGE:
         return None
     _, paper_px = on_paper(M, *lens.rays(corners_px))
