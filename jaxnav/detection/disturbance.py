@@ -117,15 +117,17 @@ def noise_correlation(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> float:
     keep it so: the sum of a residual's correlations with its eight neighbours and itself.
     """
     count = len(pixels)
-    weight = np.asarray(fit.weight, float)[:count]
-    residual = np.where(weight > 0.5, np.asarray(fit.residual, float)[:count], 0.0)
-    grid, at = _on_grid(pixels, residual)
-    pairs = _neighbours(_on_grid(pixels, weight > 0.5)[0])[at] @ (weight > 0.5)
-    products = float(_neighbours(grid)[at] @ residual)
-    variance = float(residual @ residual) / max(int(np.sum(weight > 0.5)), 1)
+    fits = np.asarray(fit.weight, float)[:count] > 0.5
+    deviation = np.asarray(fit.deviation, float)[:count]
+    # Where the ground beyond the paper shows, residuals are alike, and count little in the fit.
+    share = fits * float(fit.noise) / deviation
+    residual = share * np.asarray(fit.residual, float)[:count] / deviation
+    (grid, at), (shares, _) = _on_grid(pixels, residual), _on_grid(pixels, share)
+    variance = float(residual @ residual) / max(float(share @ share), 1e-9)
+    pairs = float(_neighbours(shares)[at] @ share)
     if not (pairs > 0 and variance > 0):
         return 1.0
-    return max(1.0, 1 + 8 * products / pairs / variance)
+    return max(1.0, 1 + 8 * float(_neighbours(grid)[at] @ residual) / pairs / variance)
 
 
 def _spacing(pixels: np.ndarray) -> float:

@@ -8,13 +8,13 @@ together with the light. The loss of a pixel is bounded, so that what hides a pa
 does not move the rest. optimistix runs the Levenberg-Marquardt steps, first with a loss as wide as
 the contrast and then with one as wide as the noise.
 
-Source: Geman, McClure (1987), the loss; Madsen, Nielsen, Tingleff (2004), the damping.
+Source: Geman, McClure (1987), the loss; Madsen, Nielsen, Tingleff (2004), the damping; MacKinnon,
+White (1985), the covariance (HC3).
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
@@ -28,10 +28,9 @@ from jaxnav.numerics.small_matrices import eliminate
 _LIGHTS = 9
 UNKNOWNS = 8 + 2 + 1 + _LIGHTS
 _WIDTH = 3.0  # of the loss, standard deviations
-# What Gaussian noise makes of the estimate's variance under this loss, E[psi^2] / E[psi']^2, over
-# E[w r^2] / E[w]^2.
-_LOSS_VARIANCE = 1.27
-_SCORE_VARIANCE = 0.537  # E[psi^2] / E[w] / that variance
+# Of Gaussian noise under this loss: mean slope of the score over the mean weight, E[psi'] / E[w],
+# and E[psi^2] / E[w] over E[w r^2] / E[w].
+_SLOPE, _SCORE = 0.734, 0.682
 _NOTICED = 1.3  # a smaller factor may come from so many cells by chance
 _GROUND = 0.15  # standard deviation of the ground beyond the paper, of the contrast
 _LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
@@ -42,8 +41,8 @@ _LENS_PX2, _LENS_SIGMA_PX2 = 0.4, 0.5
 _MOST_LENS_PX2 = 9.0
 _MOST_STEP = 0.15  # of D: half sides
 # Standard deviations of the light's coefficients, over the contrast: gradients over half a side,
-# shade, ground beyond the paper, curve of the levels.
-_LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 2.0, 0.1)
+# shade, ground beyond the paper, curve of the levels (sRGB has up to 0.95).
+_LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 2.0, 0.6)
 
 
 class Window(NamedTuple):
@@ -122,8 +121,13 @@ class _PatternLM(NielsenLM):
         )
 
 
+@kept
 def fit_pattern(window: Window, instants: Int[Array, ""]) -> PatternFit:
-    """Fit a window from M = I and the expected motion; see the module."""
+    """Fit a window from M = I and the expected motion, in float32 in any process.
+
+    Args:
+        instants: number of images that are averaged, see `expose`.
+    """
     start = Unknowns(
         jnp.eye(3, dtype=window.levels.dtype),
         window.motion_px,
@@ -250,16 +254,22 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) 
     noise = jnp.maximum(noise, _LEAST_NOISE)
     scale = _deviation(noise, image, window)
     _, weight = _loss(residual / scale, window.used)
-    freedom = jnp.maximum(jnp.sum(weight) - UNKNOWNS, 1)
-    variance = _LOSS_VARIANCE * jnp.sum(weight * (residual / scale) ** 2) / freedom
     _, prior_J = _prior(y, window)
-    information = (J * (weight / scale**2)[None]) @ J.T / variance + prior_J.T @ prior_J
+    prior = prior_J.T @ prior_J
+    weighted = J * (weight / scale**2)[None]
+    information = weighted @ J.T
     units = jnp.eye(UNKNOWNS, dtype=J.dtype)
+    bread = eliminate(ridged(_SLOPE * information + prior), units)
+    # The noise is what each pixel shows: a sensor's grows with the light. A pixel that decides
+    # much draws the fit to itself: what it shows is too little by its leverage.
+    leverage = _SLOPE * jnp.sum(weighted * (bread @ J), axis=0)
+    scores = weighted * (residual / jnp.maximum(1 - leverage, 0.3))[None]
+    covariance = bread @ (scores @ scores.T + prior) @ bread
     xy, _ = on_paper(y.M, window.rays, window.rays_px)
-    scores = J * (weight * residual / scale**2 / jnp.sqrt(variance * _SCORE_VARIANCE))[None]
-    ratio = cell_disagreement(xy, scores, information, window.K.shape[0] - 1)
-    factor = jnp.where(ratio > _NOTICED, ratio, 1)
-    covariance = eliminate(ridged(information), units) * factor
+    variance = jnp.sum(weight * (residual / scale) ** 2) / jnp.maximum(jnp.sum(weight), 1)
+    score = weighted * residual[None] / jnp.sqrt(_SCORE * variance)
+    ratio = cell_disagreement(xy, score, information, window.K.shape[0] - 1)
+    covariance = covariance * jnp.where(ratio > _NOTICED, ratio, 1)
     contrast = y.light[3] * window.contrast
     basis = _basis(y, window, image)
     marker = (y.light[:6] * window.contrast) @ basis[:6]
@@ -289,9 +299,3 @@ def _plain(basis: Float[Array, "3 N"], window: Window, scale: Array) -> Float[Ar
         residual = window.levels - level @ basis
         weight = _loss(residual / scale, window.real)[1] / scale**2
     return residual
-
-
-@kept
-def fit_patterns(windows: Window, instants: Int[Array, ""]) -> PatternFit:
-    """`fit_pattern` of B windows, leading axis B, each the mean of so many images."""
-    return jax.vmap(lambda window: fit_pattern(window, instants))(windows)

@@ -27,7 +27,7 @@ from jaxnav.detection.families import marker_cells
 from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import SQUARE, generators, homography, on_paper
-from jaxnav.detection.pattern_fit import Window, fit_patterns
+from jaxnav.detection.pattern_fit import Window, fit_pattern
 from jaxnav.detection.refine import corners_of, mean_side_px, pixels_around
 from jaxnav.detection.template import best_match
 from jaxnav.models.camera import Camera
@@ -36,7 +36,7 @@ _LANES = (256, 512)  # pixels of a fit, padded to the next
 _LEAST_PIXELS = 60
 _INSTANT_PX = 2.5  # of the streak, for each image that is averaged
 _MOST_INSTANTS = 16
-_LEAST_SIDE_PX = 8.0
+_SIDES_PX = (8.0, 120.0)  # of a marker that is followed; a larger one takes too long
 _LEAST_STREAK_PX = 0.5  # of a start: where there is no motion the image has no slope by it
 _LEAST_CONTRAST = 10.0  # grey levels
 # What decides, see `benchmarks/README-blur.md`: of the loss without a marker the part that it
@@ -47,6 +47,7 @@ _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
 # Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.
 _DISAGREE, _WEIGHT = 1.3, 0.78
+_MOST_ROUGH = 0.045  # of the contrast, the noise where something still disturbs it
 _PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _MOST_NOISE = 0.15  # of the contrast
 _BOUND = 9.0  # of a pixel's loss, noise variances
@@ -128,14 +129,12 @@ def warm_up_tracks(camera: Camera | None) -> None:
         target = Target("tag36h11", 0, quad_px[None], 0.0)
         placed = _place(image, lens, target, quad_px, np.zeros(2))
         if placed is not None:
-            M0, pixels, window = placed
-            _best_fitted(M0, pixels, [window])
-            _best_fitted(M0, pixels, [window] * _HALVES)
+            _fitted(*placed)
 
 
 def _track(image: np.ndarray, lens: Lens, target: Target) -> Track | None:
     sides_px = [mean_side_px(quad) for quad in target.quads_px if np.all(np.isfinite(quad))]
-    if not sides_px or max(sides_px) < _LEAST_SIDE_PX:
+    if not sides_px or not _SIDES_PX[0] <= max(sides_px) <= _SIDES_PX[1]:
         return None
     start = best_match(
         image,
@@ -155,6 +154,8 @@ def _track(image: np.ndarray, lens: Lens, target: Target) -> Track | None:
         if found.fit.explained < _PROMISING:
             return None
         found = _undisturbed(found) or found
+        if _is_disturbed(found) and found.fit.noise > _MOST_ROUGH * found.fit.contrast:
+            return None
     return _judge(target, lens, found, start.quad_px)
 
 
@@ -181,22 +182,19 @@ def _fit(
 
 
 def _fitted(M0: np.ndarray, pixels: np.ndarray, window: Any) -> _Fitted:
-    """The fit of one window."""
-    return _best_fitted(M0, pixels, [window])
-
-
-def _best_fitted(M0: np.ndarray, pixels: np.ndarray, windows: Sequence[Any]) -> _Fitted:
-    """The fit of the window that explains most of all pixels."""
-    streak_px = float(np.hypot(*windows[0].motion_px))
+    streak_px = float(np.hypot(*window.motion_px))
     instants = min(max(math.ceil(streak_px / _INSTANT_PX), 1), _MOST_INSTANTS)
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *windows)
-    fits = jax.device_get(fit_patterns(batch, np.int32(instants)))
-    scale = max(float(np.nanmin(fits.noise)), 1.0)
-    off = fits.residual[:, : len(pixels)] ** 2 / scale**2
+    return _Fitted(M0, pixels, window, jax.device_get(fit_pattern(window, np.int32(instants))))
+
+
+def _best(fits: Sequence[_Fitted]) -> _Fitted:
+    """The fit that explains most of all pixels."""
+    count = len(fits[0].pixels)
+    residual = np.stack([one.fit.residual[:count] for one in fits])
+    scale = max(float(np.nanmin([one.fit.noise for one in fits])), 1.0)
+    off = residual**2 / scale**2
     losses = np.sum(off / (1 + off / _BOUND), axis=1)
-    best = int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))
-    fit = jax.tree.map(lambda leaf: leaf[best], fits)
-    return _Fitted(M0, pixels, windows[best], fit)
+    return fits[int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))]
 
 
 def _is_disturbed(found: _Fitted) -> bool:
@@ -219,7 +217,7 @@ def _undisturbed(found: _Fitted) -> _Fitted | None:
         angles = np.arange(_HALVES) * 2 * np.pi / _HALVES
         sides = [np.cos(a) * xy[0] + np.sin(a) * xy[1] < _HALF for a in angles]
         halves = [window._replace(used=window.used & side) for side in sides]
-        found = _best_fitted(M0, pixels, halves)
+        found = _best([_fitted(M0, pixels, half) for half in halves])
     for _ in range(_ROUNDS):
         clear = np.zeros_like(window.used)
         clear[:count] = clear_pixels(pixels, found.fit)

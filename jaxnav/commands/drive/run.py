@@ -70,9 +70,8 @@ def run(args: Run, signals: Signals) -> int:
         if guarding is not None:
             closing.callback(guarding.end)
             guarding.prepare(signals.check)  # its errors are reported before anything is compiled
-        searches = searches_for(
-            args.corner_backend, setup.rig, setup.markers, args.detector == "follow"
-        )
+        follow = args.detector == "follow"
+        searches = searches_for(args.corner_backend, setup.rig, setup.markers, follow)
         onlookers = open_onlookers(args, setup, closing)
         for onlooker in onlookers:
             signals.before_leaving(onlooker.close)
