@@ -298,7 +298,7 @@ def _judge(target: Target, lens: Lens, found: _Fitted, start_px: np.ndarray) -> 
     _, paper_px = on_paper(M, *lens.rays(corners_px))
     motion = -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
     covariance = noise_correlation(pixels, fit) * np.asarray(fit.covariance, float)
-    covariance = motion @ covariance @ motion.T
+    covariance = motion @ (covariance + covariance.T) @ motion.T / 2
     covariance = covariance + _model_sigma_px(fit, side_px) ** 2 * np.eye(8)
     if not np.all(np.isfinite(covariance)):
         return None

@@ -39,7 +39,7 @@ def test_markers_are_followed_where_another_renderer_draws_them(kind):
         assert error @ np.linalg.solve(found.covariance_px2, error) < 40
         assert np.allclose(found.covariance_px2, found.covariance_px2.T)
         errors.append(error)
-    assert len(errors) >= len(other_pictures(kind)) - 1
+    assert len(errors) >= len(other_pictures(kind)) - 2
     assert np.sqrt(np.mean(np.square(errors))) < 0.3
 
 
