@@ -179,6 +179,12 @@ Detector = Annotated[
     CornerBackend,
     tyro.conf.arg(help="Marker detector. apriltag needs the extra of that name."),
 ]
+Following = Annotated[
+    Literal["follow", "decode-only"],
+    tyro.conf.arg(
+        help="follow: also follow expected markers that are too blurred, shaded or hidden to read."
+    ),
+]
 Float64 = Annotated[Switch, tyro.conf.arg(help="Estimate in double precision.")]
 ResultsFolder = Annotated[Path, tyro.conf.arg(metavar="DIR", help="Folder for the results.")]
 

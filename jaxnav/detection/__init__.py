@@ -4,14 +4,19 @@
     detections = detector.detect(image, camera)
     observed = observe([detections, ...], markers)  # corners_px, visible, sigma_px
 
+    tracks = track(image, camera, [Target("tag36h11", 7, quads_px, radius_px=12.0)])
+
 A decoder (OpenCV's, or AprilTag's own) finds each marker's id and its place to a pixel; `refine`
-then fits the corners, in the same way for both.
+then fits the corners, in the same way for both. Where a marker is expected, `track` follows it
+through blur, shade and what hides a part of it, with nothing decoded.
 """
 
 from jaxnav.detection.apriltag import AprilTagDetector
 from jaxnav.detection.aruco import ArucoDetector
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.observe import CornerLanes, observe
+from jaxnav.detection.track import Target, Track, track
+from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
@@ -22,10 +27,14 @@ __all__ = [
     "CornerLanes",
     "Detections",
     "Detector",
+    "Target",
+    "Track",
+    "Tracker",
     "make_detector",
     "make_detectors",
     "marker_cells",
     "observe",
+    "track",
 ]
 
 BACKENDS = {"aruco": ArucoDetector, "apriltag": AprilTagDetector}

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxnav.detection.families import all_cells
-from jaxnav.detection.read import codes_of
+from jaxnav.detection.families import all_cells, codes_of
 from jaxnav.detection.types import at_scale
 
 # A room with markers has a dozen quadrilaterals in 820 x 410 pixels, a robot field over a hundred.

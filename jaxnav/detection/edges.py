@@ -13,14 +13,13 @@ the fit is honest, and tells an edge from the cells one or two pixels behind it.
 (x, y) are paper coordinates, K the corners of the cells at (x_l, y_k) (second differences of the
 pattern), Phi2 the integral of the blur on the paper. The blur's covariance is G (S + I/12) G' with
 G = d(x, y)/du, S that of lens and motion (px^2, fitted), 1/12 that of a square pixel, whose flat
-top is kept (see `_dark`). far is 1 beyond the white zone, one cell wide, around every marker. With
+top is kept (see `ink`). far is 1 beyond the white zone, one cell wide, around every marker. With
 c4 the levels are no linear measure of the light, as in pictures for screens (sRGB): what is half
 dark is then too light. The light (white, contrast, c) enters linearly and is eliminated.
 
 Source: Golub and Pereyra (1973), variable projection; Kaufman (1975) for its Jacobian.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -30,17 +29,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.compiling.executables import kept
+from jaxnav.detection.image_model import (
+    PIXEL_VARIANCE_PX2,
+    beyond_paper,
+    box_split,
+    cell_disagreement,
+    ink,
+    ridged,
+)
 from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
 from jaxnav.numerics.small_matrices import eliminate
 
 PIXELS = 1024  # of one fit; unused ones are masked
 _STEPS = 20
-PIXEL_VARIANCE_PX2 = 1 / 12  # of a square
 _START_BLUR_PX2 = 0.8**2
 _BLUR_LIMITS_PX2 = (0.0, 5.0**2)
 _HUBER = 2.5  # standard deviations
-_MEHLER_ORDERS = 3
-_MAX_RHO = 0.95
 # Prior of the far ground for views without it, and of the curve of the levels: within about a
 # hundred grey levels.
 _PRIOR = 1e-3
@@ -85,11 +89,6 @@ class _State(NamedTuple):
     steps: Array
     converged: Array
     step: Array
-
-
-def step_corners(cells: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n+1 n+1"]:
-    """The matrix K (n + 1, n + 1) of a pattern of cells (n, n), 1 white, 0 black."""
-    return np.diff(np.diff(np.pad(1 - cells, 1), axis=0), axis=1)
 
 
 @kept
@@ -149,8 +148,11 @@ def fit_edges(
     freedom = jnp.maximum(jnp.sum(weight) - 16, 1)
     noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
     units = jnp.eye(s.hessian.shape[0], dtype=one.dtype)
-    factor = _disagreement(s, patch, weight, noise)
-    covariance = eliminate(_ridged(s.hessian), units)[:8, :8] * noise**2 * factor
+    xy, _ = on_paper(s.M, patch.rays, patch.rays_px)
+    scores = s.J * (weight * s.residual / noise)[None]
+    ratio = cell_disagreement(xy, scores, s.hessian, patch.K.shape[0] - 1)
+    factor = jnp.where(ratio > _NOTICED, ratio, 1)
+    covariance = eliminate(ridged(s.hessian), units)[:8, :8] * noise**2 * factor
     return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, s.residual, s.converged, s.step)
 
 
@@ -162,10 +164,8 @@ def _linearise(M: Array, blur: Array, patch: _Patch, weight: Array) -> tuple[Arr
     xy, xy_px = on_paper(M, patch.rays, patch.rays_px)
     pixel = PIXEL_VARIANCE_PX2 * jnp.array([1, 0, 1], blur.dtype)
     variance = blur_on_paper(xy_px, blur + pixel)
-    # Two Gaussians with the fourth cumulant of a box, -1/120 px^4 along u and v: -2 split^4.
-    split = (jnp.sum(xy_px**4, axis=0) / 240) ** 0.25
-    dark, slope = _dark(xy, variance, split, patch.K)
-    far = _far(xy, variance, patch.K.shape[0] - 1)
+    dark, slope = ink(xy, variance, box_split(xy_px), patch.K)
+    far = beyond_paper(xy, variance, patch.K.shape[0] - 1)
     # Derivatives by D through x and y at fixed blur; by S through the blur on the paper.
     motion = generators(xy)
     by_D = slope[:1] * motion[0] + slope[1:2] * motion[1]
@@ -205,100 +205,6 @@ def _lit(light: Array, weight: Array, levels: Array) -> tuple[Array, Callable[[A
 def _normal_equations(residual: Array, J: Array, weight: Array) -> tuple[Array, Array]:
     weighted = J * weight[None]
     return weighted @ J.T, weighted @ residual
-
-
-def _disagreement(s: _State, patch: _Patch, weight: Array, noise: Array) -> Array:
-    """The factor of the variances by which the cells disagree; 1 if it may be chance.
-
-    Where pixels, steps of a print or other ink are wrong alike for some pixels, as they are along
-    an edge of a picture that is sharper than its pixels, each cell of the pattern pulls its own
-    way. Of independent noise the factor is 1.
-
-    Source: Liang, Zeger (1986), as in `calibration/parts.py`.
-    """
-    xy, _ = on_paper(s.M, patch.rays, patch.rays_px)
-    cells = patch.K.shape[0] - 1
-    column, row = jnp.clip(jnp.floor((xy + 1) * cells / 2) + 1, 0, cells + 1).astype(int)
-    scores = jax.ops.segment_sum(
-        (s.J * (weight * s.residual / noise)[None]).T, row * (cells + 2) + column, (cells + 2) ** 2
-    )
-    ratio = jnp.sum(scores.T * eliminate(_ridged(s.hessian), scores.T)) / len(s.hessian)
-    return jnp.where(ratio > _NOTICED, ratio, 1)
-
-
-def _ridged(hessian: Array) -> Array:
-    """The normal equations with a ridge, so that they have a solution whatever is seen."""
-    return hessian + jnp.diag(1e-6 * jnp.maximum(jnp.diagonal(hessian), 1e-6 * jnp.max(hessian)))
-
-
-def _dark(xy: Array, variance: Array, split: Array, K: Array) -> tuple[Array, Array]:
-    """Blurred ink (N,), and its derivatives (5, N) by x, y and the blur's xx, yy, xy.
-
-    Along each axis the blur is the mean of two Gaussians, offset by `split` (2, N) to either side.
-    With U_0(x) = mean Phi and U_m its m-th derivative, up to sign, the corner of a cell blurs into
-    Phi2(x, y) = sum_m xy^m / m! U_m(x) U_m(y)  (Mehler). Blurred images obey the heat equation:
-    d/d xx is half of d^2/dx^2, d/d xy is d^2/dx dy.
-    """
-    knots = jnp.linspace(-1, 1, K.shape[0], dtype=xy.dtype)[:, None]
-    sigma = jnp.sqrt(variance[:2] - split**2)
-    limit = _MAX_RHO * sigma[0] * sigma[1]
-    covariance = jnp.clip(variance[2], -limit, limit)
-    columns, rows = (
-        _hermite_terms(xy[i : i + 1] - knots, sigma[i : i + 1], split[i : i + 1]) for i in (0, 1)
-    )
-    # XLA computes a matrix product once, but the rest again for each of the two dozen sums below.
-    rows = [K.T @ term for term in rows]
-    columns = [jnp.eye(K.shape[0], dtype=K.dtype) @ term for term in columns]
-
-    def derivative(i: int, j: int) -> Array:
-        value, factor = jnp.zeros_like(covariance), jnp.ones_like(covariance)
-        for m in range(_MEHLER_ORDERS + 1):
-            # U_0' = U_1, U_m' = -U_(m+1).
-            flips = (i if m else max(i - 1, 0)) + (j if m else max(j - 1, 0))
-            product = jnp.sum(columns[m + i] * rows[m + j], axis=0)
-            value = value + (-1) ** flips * factor * product
-            factor = factor * covariance / (m + 1)
-        return value
-
-    by_blur = [derivative(2, 0) / 2, derivative(0, 2) / 2, derivative(1, 1)]
-    return derivative(0, 0), jnp.stack([derivative(1, 0), derivative(0, 1), *by_blur])
-
-
-def _hermite_terms(distance: Array, sigma: Array, split: Array) -> list[Array]:
-    """U_0 = mean Phi(z), U_m = mean He_(m-1) phi(z) / sigma^m, z = (distance +- split) / sigma."""
-    sides = []
-    for z in ((distance + split) / sigma, (distance - split) / sigma):
-        step, bump = _gauss(z)
-        terms, before, he = [step], jnp.ones_like(z), z
-        scaled = bump / sigma
-        terms.append(scaled)
-        for m in range(1, _MEHLER_ORDERS + 2):
-            scaled = scaled / sigma
-            terms.append(he * scaled)
-            before, he = he, z * he - m * before
-        sides.append(terms)
-    return [(a + b) / 2 for a, b in zip(*sides, strict=True)]
-
-
-def _far(xy: Array, variance: Array, n: int) -> Array:
-    zone = 1 + 2 / n
-    sigma = jnp.sqrt(variance[:2])
-    inside = _gauss((xy + zone) / sigma)[0] - _gauss((xy - zone) / sigma)[0]
-    return 1 - inside[0] * inside[1]
-
-
-def _gauss(z: Array) -> tuple[Array, Array]:
-    """Integral and density of the standard normal distribution.
-
-    Source: Abramowitz and Stegun (1964), 7.1.26; error below 1.5e-7.
-    """
-    exponential = jnp.exp(-0.5 * z * z)
-    t = 1 / (1 + 0.3275911 / math.sqrt(2) * jnp.abs(z))
-    tail = jnp.zeros_like(z)
-    for a in (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592):
-        tail = t * (tail + a)
-    upper = 0.5 * tail * exponential
-    return jnp.where(z < 0, upper, 1 - upper), exponential * (1 / math.sqrt(2 * math.pi))
 
 
 def _moved(M: Array, blur: Array, step: Array) -> tuple[Array, Array]:

@@ -42,3 +42,12 @@ def all_cells(family: str) -> Float[np.ndarray, "ids n n"]:
 def marker_cells(family: str, marker_id: int) -> Float[np.ndarray, "n n"]:
     """Cells of a marker with its black frame, (n, n) float: 1 white, 0 black, top row first."""
     return all_cells(family)[marker_id]
+
+
+@cache
+def codes_of(family: str) -> Float[np.ndarray, "codes cells"]:
+    """Ink inside the frame, (4 * ids, cells): each marker after 0..3 quarter turns."""
+    inner = 1 - all_cells(family)[:, 1:-1, 1:-1]
+    # After k clockwise turns, the marker's own top-left corner is corner k of the image.
+    turned = [np.rot90(inner, -k, axes=(1, 2)) for k in range(4)]
+    return np.stack(turned, axis=1).reshape(4 * len(inner), -1)

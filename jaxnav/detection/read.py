@@ -5,14 +5,12 @@ turns, is compared with the pixels through the blur found at the frame. The most
 accepted if no other comes near it and if the whole marker then explains the image.
 """
 
-from functools import cache
-
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxnav.detection.edges import PIXEL_VARIANCE_PX2
-from jaxnav.detection.families import all_cells
+from jaxnav.detection.families import all_cells, codes_of
+from jaxnav.detection.image_model import PIXEL_VARIANCE_PX2
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import blur_on_paper, on_paper
 from jaxnav.detection.refine import (
@@ -64,15 +62,6 @@ def read_marker(
     if _worst_cell(refined.fitted, n, lens) > _MAX_CELL_ERROR:
         return None
     return marker_id, refined
-
-
-@cache
-def codes_of(family: str) -> Float[np.ndarray, "codes cells"]:
-    """Ink inside the frame, (4 * ids, cells): each marker after 0..3 quarter turns."""
-    inner = 1 - all_cells(family)[:, 1:-1, 1:-1]
-    # After k clockwise turns, the marker's own top-left corner is corner k of the image.
-    turned = [np.rot90(inner, -k, axes=(1, 2)) for k in range(4)]
-    return np.stack(turned, axis=1).reshape(4 * len(inner), -1)
 
 
 def _most_likely(

@@ -7,7 +7,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges, step_corners
+from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges
+from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import SQUARE, generators, homography, on_paper, rays_of
 
@@ -111,11 +112,11 @@ def fit_marker(
     side_px = mean_side_px(corners_px)
     whole = whole or side_px <= _WHOLE_UP_TO_PX
     around = image.shape, M, lens, side_px / len(cells)
-    pixels = _pixels_around(*around, None if whole else _NO_EDGES)
+    pixels = pixels_around(*around, None if whole else _NO_EDGES)
     known = bool(np.all((cells == 0) | (cells == 1)))
     curved = known and side_px <= _CURVED_UP_TO_PX and _has_greys(image, pixels)
     if curved and not whole:
-        pixels = _pixels_around(*around, _inner_edges(cells))
+        pixels = pixels_around(*around, _inner_edges(cells))
     count = len(pixels)
     if count < _MIN_PIXELS:
         return None
@@ -168,9 +169,13 @@ def _inner_edges(cells: np.ndarray) -> np.ndarray:
     return np.stack([x, y], axis=-1)
 
 
-def _pixels_around(
-    shape: tuple[int, ...], M: np.ndarray, lens: Lens, cell_px: float, edges: np.ndarray | None
-) -> np.ndarray:
+def pixels_around(
+    shape: tuple[int, ...],
+    M: Float[np.ndarray, "3 3"],
+    lens: Lens,
+    cell_px: float,
+    edges: Float[np.ndarray, "E 2 2"] | None = None,
+) -> Int[np.ndarray, "N 2"]:
     """The pixels (N, 2) to fit: along the outline and along edges (E, 2, 2) inside it; with None
     all inside it."""
     t = np.linspace(0, 1, _POINTS_PER_EDGE, endpoint=False)[:, None]

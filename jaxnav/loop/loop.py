@@ -11,7 +11,7 @@ that of a paused simulation does, the command is no speed.
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import jax
@@ -35,10 +35,12 @@ from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.loop.priority import before_siblings
 from jaxnav.loop.seeing import Eyes, Region, group_frames
 from jaxnav.loop.standing_clock import StandingClock
+from jaxnav.navigator import Output
 
 _THREAD = "the loop"
 _STAYS_S = 0.5  # the drive ends this long after the last waypoint is reached
 # Markers are searched for at the reported hypothesis: regions are not narrower than this.
+_APART_NS, _TOO_FAR_NS = 15_000_000, 200_000_000  # of two poses that tell a velocity
 _MIN_COVARIANCE = np.diag([0.01**2, 0.01**2, np.deg2rad(0.5) ** 2])
 
 
@@ -117,8 +119,8 @@ class Loop:
         self._odometry_ns: int | None = None
         # Frames without markers, kept for the next tick.
         self._blank: tuple[FrameDetections, ...] = ()
-        self._belief: tuple[np.ndarray, np.ndarray] | None = None
-        self._expectation: tuple[tuple[np.ndarray, np.ndarray], Expected] | None = None  # of it
+        self._belief: _Belief | None = None
+        self._expectation: tuple[_Belief, Expected, np.ndarray | None] | None = None  # of it
         dtype = np.asarray(pilot.navigator.corner_sigma_px).dtype
         self._min_covariance = _MIN_COVARIANCE.astype(dtype)
         # Compiled now: the threads that look for markers are watched.
@@ -223,14 +225,7 @@ class Loop:
         self._outcome = outcome
         output = outcome.output
         # One assignment: the threads that look for markers read it at any time.
-        self._belief = (
-            (
-                np.asarray(output.T_world_vehicle.wxyz_xyz),
-                np.asarray(output.pose_covariance + self._min_covariance),
-            )
-            if output.decided
-            else None
-        )
+        self._belief = self._believed(output, given.now_ns) if output.decided else None
         for observer in self._observers:
             observer.on_outcome(given, outcome)
 
@@ -240,6 +235,17 @@ class Loop:
             faults |= observer.faults
         return faults
 
+    def _believed(self, output: Output, now_ns: int) -> "_Belief":
+        before = self._belief
+        if before is not None and before.before is not None and now_ns - before.now_ns < _APART_NS:
+            before = before.before
+        return _Belief(
+            np.asarray(output.T_world_vehicle.wxyz_xyz),
+            np.asarray(output.pose_covariance + self._min_covariance),
+            now_ns,
+            None if before is None else replace(before, before=None),
+        )
+
     def _region(self, camera: int) -> Region | None:
         """The region where a camera should see markers. Called by the threads that search."""
         belief = self._belief
@@ -247,11 +253,35 @@ class Loop:
             return None
         known = self._expectation
         if known is None or known[0] is not belief:  # the same for all cameras of a set
-            known = self._expectation = belief, self._expected(*belief)
+            expected = self._expected(belief.wxyz_xyz, belief.covariance)
+            known = self._expectation = belief, expected, self._flow_px_s(belief, expected)
         quads_px, visible, radius_px = (np.asarray(part)[camera] for part in known[1])
-        return Region(quads_px[visible], radius_px[visible])
+        markers = self.pilot.navigator.markers
+        keys = tuple(zip(markers.families, map(int, markers.ids), strict=True))
+        flow_px_s = None if known[2] is None else known[2][camera][visible]
+        seen = tuple(key for key, sees in zip(keys, visible, strict=True) if sees)
+        return Region(quads_px[visible], radius_px[visible], seen, flow_px_s)
+
+    def _flow_px_s(self, belief: "_Belief", expected: Expected) -> np.ndarray | None:
+        """Velocities (C, M, 2) of the markers' centres in the images, from two poses in a row."""
+        before = belief.before
+        if before is None or not _APART_NS <= belief.now_ns - before.now_ns <= _TOO_FAR_NS:
+            return None
+        earlier = self._expected(before.wxyz_xyz, before.covariance)
+        moved_px = np.mean(expected.quads_px - earlier.quads_px, axis=-2)
+        return np.asarray(moved_px / ((belief.now_ns - before.now_ns) / 1e9))
 
     def _expected(self, wxyz_xyz: np.ndarray, covariance: np.ndarray) -> Expected:
         navigator = self.pilot.navigator
         corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, covariance)
         return Expected(*jax.device_get(corners))
+
+
+@dataclass(frozen=True)
+class _Belief:
+    """A pose (7,), its covariance (3, 3), when it holds, and the pose a little earlier."""
+
+    wxyz_xyz: np.ndarray
+    covariance: np.ndarray
+    now_ns: int
+    before: "_Belief | None"

@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnav.detection.families import marker_cells
+from jaxnav.detection.track import warm_up_tracks
+from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector, RegionDetector
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FROZEN_AFTER, FrameDetections
@@ -43,10 +45,19 @@ class SearchedFrame:
 
 @dataclass(frozen=True)
 class Region:
-    """The expected places of K markers in an image: corners (K, 4, 2) and search radii (K,)."""
+    """The expected places of K markers in an image.
+
+    Attributes:
+        quads_px: (K, 4, 2), corners, TL TR BR BL.
+        radius_px: (K,), search radii.
+        keys: family and id of each marker; left out, none of them is followed.
+        flow_px_s: (K, 2), velocities of their centres in the image; None if nobody knows them.
+    """
 
     quads_px: Float[np.ndarray, "K 4 2"]
     radius_px: Float[np.ndarray, " K"]
+    keys: tuple[tuple[str, int], ...] = ()
+    flow_px_s: Float[np.ndarray, "K 2"] | None = None
 
 
 class Search:
@@ -58,13 +69,15 @@ class Search:
         size_px: tuple[int, int],
         model: CameraModel,
         detectors: Sequence[Detector],
+        tracker: Tracker | None = None,
     ):
         """Args:
         camera: its index in the rig.
         size_px: width and height of its images.
+        tracker: follows the expected markers that the detectors do not read; None: nothing does.
         """
         self._camera, self._size_px, self._model = camera, size_px, model
-        self._detectors = list(detectors)
+        self._detectors, self.tracker = list(detectors), tracker
         self._since_whole = camera  # so that cameras take turns
         self._picture, self._pictures = b"", 0  # the last picture, and how often it repeated
 
@@ -82,6 +95,8 @@ class Search:
         region = Region((8 + side * corner)[None], np.array([4.0]))
         self._near(image, region)
         self._everywhere(image, region)
+        if self.tracker is not None:
+            warm_up_tracks(self._model)
 
     def look(self, frame: Frame, region: Region | None) -> FrameDetections:
         """Search a frame for markers.
@@ -101,10 +116,12 @@ class Search:
         if region is not None and self._since_whole < WHOLE_EVERY:
             if not len(region.quads_px):
                 return FrameDetections(self._camera, frame.stamp_ns, _NONE)
-            detections = self._near(frame.image, region)
+            detections = self._followed(frame.image, region, self._near(frame.image, region))
         if not len(detections):
             self._since_whole = 0
             detections = self._everywhere(frame.image, region)
+            if region is not None:
+                detections = self._followed(frame.image, region, detections)
         return FrameDetections(self._camera, frame.stamp_ns, detections)
 
     def _repeats(self, image: np.ndarray) -> bool:
@@ -122,6 +139,21 @@ class Search:
             if isinstance(detector, RegionDetector)
         ]
         return Detections.concatenate(parts)
+
+    def _followed(self, image: np.ndarray, region: Region, detections: Detections) -> Detections:
+        """The detections, and the expected markers that were followed without being decoded."""
+        if self.tracker is None or not region.keys:
+            return detections
+        followed = self.tracker.follow(
+            image,
+            self._model,
+            region.keys,
+            region.quads_px,
+            region.radius_px,
+            region.flow_px_s,
+            detections,
+        )
+        return Detections.concatenate([detections, followed])
 
     def _everywhere(self, image: np.ndarray, region: Region | None) -> Detections:
         quads_px = None if region is None else region.quads_px

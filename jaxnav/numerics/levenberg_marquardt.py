@@ -188,10 +188,10 @@ def _for_leaf(accept: Array, leaf: Array) -> Array:
 
 
 class NormalEquations(eqx.Module):
-    """J'J and J'r of N problems with n unknowns each."""
+    """J'J and J'r of N problems, or of a single one, with n unknowns each."""
 
-    information: Float[Array, "n n N"]  # J'J
-    gradient: Float[Array, "n N"]  # J'r
+    information: Float[Array, "n n ..."]  # J'J
+    gradient: Float[Array, "n ..."]  # J'r
 
 
 class NormalEquationsLM(NielsenLM):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from jaxnav.detection import edges
+from jaxnav.detection import image_model
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import blur_on_paper, generators, on_paper
@@ -148,14 +148,14 @@ def test_result_is_the_same_in_both_precisions():
 
 
 def test_blurred_ink_equals_the_integral_and_its_slopes_the_differences():
-    K = jnp.asarray(edges.step_corners(marker_cells(FAMILY, 7)))
+    K = jnp.asarray(image_model.step_corners(marker_cells(FAMILY, 7)))
     knots = np.linspace(-1, 1, 9)
     xy = np.array([[0.31, -0.92, 0.98, 0.1], [-0.47, 0.88, -1.01, 0.74]])
     variance = np.array(
         [[0.02, 0.03, 0.01, 0.05], [0.03, 0.02, 0.015, 0.04], [0.01, -0.012, 0, 0.02]]
     )
     split = np.array([[0.05, 0.0, 0.03, 0.1], [0.0, 0.06, 0.02, 0.05]])
-    dark, slope = edges._dark(*map(jnp.asarray, (xy, variance, split)), K)
+    dark, slope = image_model.ink(*map(jnp.asarray, (xy, variance, split)), K)
     sides = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
     for i in range(xy.shape[1]):
         xx, yy, both = variance[:, i]
@@ -179,7 +179,7 @@ def test_blurred_ink_equals_the_integral_and_its_slopes_the_differences():
             moved = known.copy()
             moved[index] += sign * small
             arguments = (moved, variance, split) if row < 2 else (xy, moved, split)
-            values.append(np.asarray(edges._dark(*map(jnp.asarray, arguments), K)[0]))
+            values.append(np.asarray(image_model.ink(*map(jnp.asarray, arguments), K)[0]))
         difference = (values[0] - values[1]) / (2 * small)
         # By the blur the series is cut off one order apart; a blur that is off costs nothing else.
         tolerance = 1e-3 if row < 2 else 0.1 * np.max(np.abs(difference))

@@ -27,7 +27,7 @@ from jaxnav.calibration.boards.saddles import EDGE_WIDTH_SIGMAS, Places, Saddles
 from jaxnav.calibration.boards.tags import as_printed, read_tags
 from jaxnav.calibration.lenses.views import BoardView
 from jaxnav.detection import make_detector
-from jaxnav.detection.edges import PIXEL_VARIANCE_PX2
+from jaxnav.detection.image_model import PIXEL_VARIANCE_PX2
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.refine import refine_corners
 from jaxnav.detection.types import at_scale, grey

@@ -14,6 +14,7 @@ from jaxnav.commands.kinds import (
     CornerBackend,
     Detector,
     Float64,
+    Following,
     Headless,
     KeyValues,
     OptionalFile,
@@ -78,6 +79,7 @@ class Run(Checked):
     """Tuned parameters of filter and controller."""
     selector: Believed = "multi-hypothesis"
     corner_backend: Detector = "aruco"
+    detector: Following = "follow"
     relocate: bool = True
     """Drive on, slowly at first, where the corners say that the car is where its wheels can't have
     brought it: somebody carried it there, or shows it a copy of the marker. Without: stop."""
@@ -131,6 +133,7 @@ class Ros(Checked):
     rate: Annotated[float, POSITIVE] = 1.0
     """How fast the bag is played, times real time; inf is as fast as it goes."""
     corner_backend: Detector = "aruco"
+    detector: Following = "follow"
     period_s: float = 0.02
     """Between two readings of the odometer, s."""
     timeout_s: float = 0.2

@@ -88,7 +88,9 @@ class PreparedDrive:
             float64=args.float64,
             headless=True,
         )
-        self._searches = searches_for(args.corner_backend, setup.rig, setup.markers)
+        self._searches = searches_for(
+            args.corner_backend, setup.rig, setup.markers, args.detector == "follow"
+        )
         timed(say, lambda: compiled_pilot(self._run, setup, self._searches))
         odom: OdomFrame | None = None
         self._listening: list[Any] = []

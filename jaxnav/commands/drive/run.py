@@ -22,7 +22,7 @@ from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder
-from jaxnav.detection import make_detectors
+from jaxnav.detection import Tracker, make_detectors
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.loop import plugins
@@ -70,7 +70,8 @@ def run(args: Run, signals: Signals) -> int:
         if guarding is not None:
             closing.callback(guarding.end)
             guarding.prepare(signals.check)  # its errors are reported before anything is compiled
-        searches = searches_for(args.corner_backend, setup.rig, setup.markers)
+        follow = args.detector == "follow"
+        searches = searches_for(args.corner_backend, setup.rig, setup.markers, follow)
         onlookers = open_onlookers(args, setup, closing)
         for onlooker in onlookers:
             signals.before_leaving(onlooker.close)
@@ -125,11 +126,20 @@ def guarding_process(args: Run) -> GuardProcess | None:
         raise BadInput(f"--car {args.car}", problem) from None
 
 
-def searches_for(corner_backend: str, rig: CameraRig, markers: MarkerMap) -> list[Search]:
-    """A search for markers for each camera."""
+def searches_for(
+    corner_backend: str, rig: CameraRig, markers: MarkerMap, follow: bool = False
+) -> list[Search]:
+    """A search for markers for each camera.
+
+    Args:
+        follow: also follow expected markers that can't be decoded.
+    """
     detectors = make_detectors(markers, corner_backend)
     rig = jax.device_get(rig)  # NumPy indexes its cameras without compiling anything
-    return [Search(c, rig.image_sizes_px[c], rig.camera(c), detectors) for c in range(len(rig))]
+    return [
+        Search(c, rig.image_sizes_px[c], rig.camera(c), detectors, Tracker() if follow else None)
+        for c in range(len(rig))
+    ]
 
 
 def compiled_pilot(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot:

@@ -10,6 +10,7 @@ from jaxnav.commands.kinds import (
     Base,
     Count,
     Detector,
+    Following,
     Headless,
     Imu,
     NotNegative,
@@ -66,6 +67,7 @@ class Demo(Headless):
     rolling_shutter: bool = True
     """Expose the rows of an image one after the other."""
     corner_backend: Detector = "aruco"
+    detector: Following = "follow"
     duration_s: Positive = 30.0
     """Give up when the car has not arrived after this simulated time, s."""
 

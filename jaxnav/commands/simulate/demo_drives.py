@@ -13,7 +13,7 @@ from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWor
 from jaxnav.commands.simulate.runner_up import SELECTOR, opencv_detectors
 from jaxnav.compiling.step import compiled_step
 from jaxnav.configuration import step_folder
-from jaxnav.detection import Detector, make_detectors
+from jaxnav.detection import Detector, Tracker, make_detectors
 from jaxnav.models.geometry import wrap_angle_np
 from jaxnav.models.origin import planar_in_world
 from jaxnav.simulation.drive import DriveFrame, DriveSettings, Methods, drive
@@ -136,7 +136,9 @@ def _drive(
         duration_s=args.duration_s,
         floor_m=world.floor_m(),
     )
-    cameras = RenderedCameras(world, method.detectors, rng, args.corner_noise_px)
+    follows = args.detector == "follow" and method.name == OURS
+    trackers = [Tracker() for _ in world.cameras] if follows else []
+    cameras = RenderedCameras(world, method.detectors, rng, args.corner_noise_px, trackers=trackers)
     record = Record(method.name, [])
     with progress_bar(
         total=round(args.duration_s, 1),

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxnav.commands.simulate.arguments import Demo
-from jaxnav.detection import Detections, Detector, observe
+from jaxnav.detection import Detections, Detector, Tracker, observe
 from jaxnav.errors import BadInput
 from jaxnav.files import (
     Params,
@@ -95,6 +95,9 @@ class RenderedWorld:
         return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
+_FOLLOW_WITHIN_PX = 15.0  # of its expected place
+
+
 @dataclass
 class RenderedCameras:
     """Cameras whose rendered images are searched around the driver's belief and everywhere else."""
@@ -103,13 +106,18 @@ class RenderedCameras:
     detectors: Sequence[Detector]
     rng: np.random.Generator
     corner_noise_px: float = 0.0  # on top of the detection's errors
+    # One a camera; none: markers that the detectors do not read are not followed.
+    trackers: Sequence[Tracker] = ()
     # The latest, one a camera.
     images: list[UInt8[np.ndarray, "rows columns"]] = field(default_factory=list)
+    _stamp_s: float = 0.0
+    _before: tuple[float, np.ndarray] | None = None  # the last stamp and prediction
 
     def look(
         self, T_world_vehicle_at: PoseAt, stamp_s: float, believed: Output | None
     ) -> tuple[Float[np.ndarray, "C M 4 2"], Bool[np.ndarray, "C M"], Float[np.ndarray, "C M 4"]]:
         """Corners (C, M, 4, 2), visibility (C, M) and sigmas (C, M, 4) at one instant."""
+        self._stamp_s = stamp_s
         self.images = self.world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)
         return self.search(self.images, believed)
 
@@ -127,10 +135,41 @@ class RenderedCameras:
             )
             for c, image in enumerate(images)
         ]
+        detections = self._followed(images, detections, predicted_px, expected)
         observed = observe(detections, self.world.setup.markers)
         noise_px = self.corner_noise_px * self.rng.standard_normal(observed.corners_px.shape)
         sigma_px = np.hypot(observed.sigma_px, self.corner_noise_px)
         return observed.corners_px + noise_px, observed.visible, sigma_px
+
+    def _followed(
+        self,
+        images: Sequence[np.ndarray],
+        detections: Sequence[Detections],
+        predicted_px: np.ndarray,
+        expected: np.ndarray,
+    ) -> list[Detections]:
+        """The detections of each camera, with the expected markers that were followed."""
+        markers, followed = self.world.setup.markers, list(detections)
+        keys = list(zip(markers.families, map(int, markers.ids), strict=True))
+        flow_px_s, now = None, (self._stamp_s, predicted_px)
+        if self._before is not None and self._before[0] < self._stamp_s:
+            moved_px = np.mean(predicted_px - self._before[1], axis=-2)
+            flow_px_s = moved_px / (self._stamp_s - self._before[0])
+        self._before = now if expected.any() else None
+        for c, tracker in enumerate(self.trackers):
+            if not expected[c].any():
+                continue
+            more = tracker.follow(
+                images[c],
+                self.world.cameras[c],
+                [key for key, sees in zip(keys, expected[c], strict=True) if sees],
+                predicted_px[c][expected[c]],
+                np.full(int(expected[c].sum()), _FOLLOW_WITHIN_PX),
+                None if flow_px_s is None else flow_px_s[c][expected[c]],
+                detections[c],
+            )
+            followed[c] = Detections.concatenate([detections[c], more])
+        return followed
 
     def _predicted(self, believed: Output | None) -> tuple[np.ndarray, np.ndarray]:
         rig, markers = self.world.setup.rig, self.world.setup.markers

@@ -1,0 +1,152 @@
+"""What disturbs the picture of a marker: the edge of a shadow across it, and what hides a part."""
+
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxnav.detection.pattern_fit import PatternFit
+
+_ANGLES, _OFFSETS = 16, 9
+_SOFT = (0.03, 0.12, 0.3)  # widths of a penumbra, half sides
+_REFINED = 3  # halvings of the steps of angle and offset
+_GAINS = (0.15, 0.9)  # of a shadow's light, over that beside it
+_BETTER = 0.75  # a shadow must lower the loss to this part
+_WIDTH = 3.0  # of the loss, standard deviations
+_PIXELS = 256  # that are compared
+_HIDDEN = 3.5  # standard deviations
+_CELLS = 0.75  # half of the least width of what hides a marker, beside that of its own edge
+
+
+def find_shadow(
+    xy: Float[np.ndarray, "2 N"], levels: Float[np.ndarray, " N"], fit: PatternFit
+) -> Float[np.ndarray, " N"] | None:
+    """Where the light is, 1, and where a shadow, 0; None if no straight edge explains the pixels.
+
+    Lines of all directions are tried, each with the two lights that suit its sides, then the best
+    one is turned, shifted and softened.
+
+    Args:
+        xy: places of the pixels on the paper.
+        levels: grey levels of the pixels.
+        fit: a fit of the marker without a shadow, whose arrays may be longer than the pixels.
+    """
+    within = np.flatnonzero(np.all(np.abs(xy) < 1.1, axis=0))[:_PIXELS]
+    marker, levels, at = np.asarray(fit.marker, float)[within], levels[within], xy[:, within]
+    scale = float(fit.noise) + 0.02 * float(fit.contrast)
+
+    def losses(lines: np.ndarray) -> np.ndarray:
+        """Loss (L,) of each line (angle, offset, softness), (L, 3)."""
+        lit = marker * _lit(at, lines)
+        dim = marker - lit
+        weight = np.ones_like(lit)
+        for _ in range(3):
+            a, b, c = (np.sum(weight * x * y, axis=1) for x, y in
+                       ((lit, lit), (lit, dim), (dim, dim)))  # fmt: skip
+            p, q = (np.sum(weight * x * levels, axis=1) for x in (lit, dim))
+            determinant = np.maximum(a * c - b * b, 1e-9 * (a + c) ** 2)
+            light, shade = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+            residual = (levels - light[:, None] * lit - shade[:, None] * dim) / scale
+            weight = 1 / (1 + (residual / _WIDTH) ** 2) ** 2
+        total = np.sum(residual**2 / (1 + (residual / _WIDTH) ** 2), axis=1)
+        gain = shade / np.maximum(light, 1e-6)
+        return np.where((gain > _GAINS[0]) & (gain < _GAINS[1]), total, np.inf)
+
+    plain = np.asarray(fit.residual, float)[within] / scale
+    without = float(np.sum(plain**2 / (1 + (plain / _WIDTH) ** 2)))
+    angles = np.arange(_ANGLES) * 2 * math.pi / _ANGLES
+    offsets = np.linspace(-0.8, 0.8, _OFFSETS)
+    lines = np.stack(np.meshgrid(angles, offsets, _SOFT[:1]), axis=-1).reshape(-1, 3)
+    turn, shift = math.pi / _ANGLES, 0.1
+    least = math.inf
+    for _ in range(_REFINED + 1):
+        trials = losses(lines)
+        if np.min(trials) < least:
+            least, best = float(np.min(trials)), lines[np.argmin(trials)]
+        if not least < math.inf:
+            return None
+        steps = np.array([[turn, 0, 0], [-turn, 0, 0], [0, shift, 0], [0, -shift, 0]])
+        others = [[best[0], best[1], soft] for soft in _SOFT]
+        lines = np.concatenate([best + steps, others])
+        turn, shift = turn / 2, shift / 2
+    return _lit(xy, best[None])[0] if least < _BETTER * without else None
+
+
+def _lit(xy: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """The light (L, N), 0 to 1, beside lines of (angle, offset, softness), (L, 3)."""
+    angle, offset, soft = lines.T[:, :, None]
+    beside = np.cos(angle) * xy[0] + np.sin(angle) * xy[1] - offset
+    return np.asarray(1 / (1 + np.exp(-np.clip(beside / soft, -30, 30))))
+
+
+def clear_pixels(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> Bool[np.ndarray, " N"]:
+    """Which pixels show the marker: those that fit, and have no neighbour that does not.
+
+    At the edge of what hides a marker pixels are mixed and may fit by chance. A pixel that does not
+    fit, and has no neighbour that does not either, is noise and hides nothing.
+    """
+    residual = np.asarray(fit.residual, float)[: len(pixels)]
+    grid, at = _on_grid(pixels, np.abs(residual) > _HIDDEN * float(fit.noise), _spacing(pixels))
+    lumps = grid * ((_neighbours(grid) > 0) | (grid > 1))
+    return np.asarray((lumps + _neighbours(lumps))[at] == 0)
+
+
+def blank_pixels(
+    pixels: Int[np.ndarray, "N 2"], clear: Bool[np.ndarray, " N"], cell_px: float
+) -> Bool[np.ndarray, " N"]:
+    """Which pixels that are not clear lie within something larger than cells of another code.
+
+    Args:
+        cell_px: side of the marker's cells.
+    """
+    spacing = _spacing(pixels)
+    grid, at = _on_grid(pixels, ~clear, spacing)
+    covered, _ = _on_grid(pixels, np.ones(len(pixels)), spacing)
+    hidden = ((grid > 0) | (covered == 0)).astype(np.uint8)
+    radius = math.ceil((1 + _CELLS * cell_px) / spacing)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    inner = cv2.erode(hidden, disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    return np.asarray(inner[at] > 0) & ~clear
+
+
+def noise_correlation(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> float:
+    """The factor of the variances by which the noise of neighbouring pixels is alike, at least 1.
+
+    Sensors have white noise, but what makes colours of a raw picture or compresses it does not
+    keep it so: the sum of a residual's correlations with its eight neighbours and itself.
+    """
+    count = len(pixels)
+    fits = np.asarray(fit.weight, float)[:count] > 0.5
+    deviation = np.asarray(fit.deviation, float)[:count]
+    # Where the ground beyond the paper shows, residuals are alike, and count little in the fit.
+    share = fits * float(fit.noise) / deviation
+    residual = share * np.asarray(fit.residual, float)[:count] / deviation
+    (grid, at), (shares, _) = _on_grid(pixels, residual), _on_grid(pixels, share)
+    variance = float(residual @ residual) / max(float(share @ share), 1e-9)
+    pairs = float(_neighbours(shares)[at] @ share)
+    if not (pairs > 0 and variance > 0):
+        return 1.0
+    return max(1.0, 1 + 8 * float(_neighbours(grid)[at] @ residual) / pairs / variance)
+
+
+def _spacing(pixels: np.ndarray) -> float:
+    """Mean distance between neighbouring pixels, some of which may have been left out, px."""
+    width, height = cv2.minAreaRect(pixels.astype(np.float32))[1]
+    return max(1.0, math.sqrt((width + 1) * (height + 1) / len(pixels)))
+
+
+def _on_grid(
+    pixels: np.ndarray, values: np.ndarray, spacing: float = 1.0
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Values (N,) of pixels on a grid with an empty border, and their places on it."""
+    column, row = (np.floor((pixels - pixels.min(axis=0)) / spacing).astype(int) + 1).T
+    grid = np.zeros((column.max() + 2, row.max() + 2))
+    np.add.at(grid, (column, row), values)
+    return grid, (column, row)
+
+
+def _neighbours(grid: np.ndarray) -> np.ndarray:
+    """The sum of the eight neighbours of each place of a grid with an empty border."""
+    rows = grid + np.roll(grid, 1, axis=0) + np.roll(grid, -1, axis=0)
+    return np.asarray(rows + np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1) - grid)

@@ -1,0 +1,301 @@
+"""Fit of a whole marker of known pattern to the raw pixels around its predicted place.
+
+    I(u) = (1, x, y) white - (1, x, y) contrast dark + shade (shadow - 1) (white - contrast dark)
+           + ground far + bend dark (1 - dark)
+
+dark is the image of the ink, see `image_model`: homography, motion and the lens's blur are fitted
+together with the light. The loss of a pixel is bounded, so that what hides a part of the marker
+does not move the rest. optimistix runs the Levenberg-Marquardt steps, first with a loss as wide as
+the contrast and then with one as wide as the noise.
+
+Source: Geman, McClure (1987), the loss; Madsen, Nielsen, Tingleff (2004), the damping; MacKinnon,
+White (1985), the covariance (HC3).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.compiling.executables import kept
+from jaxnav.detection.image_model import Exposure, cell_disagreement, expose, ridged
+from jaxnav.detection.paper import on_paper
+from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
+from jaxnav.numerics.small_matrices import eliminate
+
+_LIGHTS = 9
+UNKNOWNS = 8 + 2 + 1 + _LIGHTS
+_WIDTH = 3.0  # of the loss, standard deviations
+# Of Gaussian noise under this loss: mean slope of the score over the mean weight, E[psi'] / E[w],
+# and E[psi^2] / E[w] over E[w r^2] / E[w].
+_SLOPE, _SCORE = 0.734, 0.682
+_NOTICED = 1.3  # a smaller factor may come from so many cells by chance
+_GROUND = 0.15  # standard deviation of the ground beyond the paper, of the contrast
+_LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
+_STEPS = 8
+_COARSE_STEPS = 6
+_COARSER = 4  # at first one of so many pixels
+_LENS_PX2, _LENS_SIGMA_PX2 = 0.4, 0.5
+_MOST_LENS_PX2 = 9.0
+_MOST_STEP = 0.15  # of D: half sides
+# Standard deviations of the light's coefficients, over the contrast: gradients over half a side,
+# shade, ground beyond the paper, curve of the levels (sRGB has up to 0.95).
+_LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 2.0, 0.6)
+
+
+class Window(NamedTuple):
+    """The pixels around one marker's predicted place, and what is expected there.
+
+    M is the first guess in a basis in which it is near the identity; rays are in that basis.
+    """
+
+    rays: Float[Array, "3 N"]
+    rays_px: Float[Array, "2 3 N"]
+    levels: Float[Array, " N"]
+    real: Bool[Array, " N"]  # which pixels are no padding
+    used: Bool[Array, " N"]  # which of them count in the fit
+    K: Float[Array, "k k"]
+    shadow: Float[Array, " N"]  # 1 in the light, 0 in the shadow
+    motion_px: Float[Array, " 2"]  # the expected streak
+    motion_sigma_px: Float[Array, ""]
+    contrast: Float[Array, ""]  # about that of the marker, grey levels
+    most_noise: Float[Array, ""]  # standard deviation of pixels that fit, at most
+
+
+class Unknowns(NamedTuple):
+    M: Float[Array, "3 3"]
+    motion_px: Float[Array, " 2"]
+    lens_px2: Float[Array, ""]
+    light: Float[Array, " L"]  # over the contrast
+
+
+class PatternFit(NamedTuple):
+    """The result of a fit, in paper coordinates."""
+
+    M: Float[Array, "3 3"]
+    motion_px: Float[Array, " 2"]
+    lens_px2: Float[Array, ""]
+    covariance: Float[Array, "8 8"]  # of D in (I + D) M, by rows without the last entry
+    noise: Float[Array, ""]  # standard deviation of the pixels that fit, grey levels
+    contrast: Float[Array, ""]  # white minus black, grey levels
+    weight: Float[Array, " N"]  # of each pixel in the loss, 0 to 1; 0 for padding
+    residual: Float[Array, " N"]  # grey levels
+    marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
+    white: Float[Array, " N"]  # levels as they would be without ink
+    darkens: Float[Array, " N"]  # by how many levels ink darkens a pixel
+    deviation: Float[Array, " N"]  # standard deviation of a pixel, grey levels
+    disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
+    explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
+    log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
+    converged: Bool[Array, ""]
+
+
+class _PatternLM(NielsenLM):
+    """Steps of D, motion, lens and light, damped in proportion to what is known of each."""
+
+    rtol: float = 1e-6
+    atol: float = 1e-2
+    initial_damping: float = 1e-3
+    norm: Callable[[Any], Float[Array, ""]] = optx.max_norm
+
+    def solved(self, normal: NormalEquations, damping: Float[Array, ""]) -> Move:
+        information, gradient = normal.information, normal.gradient
+        damping = jnp.where(damping > 0, jnp.maximum(damping, 1e-7), self.initial_damping)
+        diagonal = jnp.maximum(jnp.diagonal(information), 1e-6)
+        move = -eliminate(information + jnp.diag(damping * diagonal), gradient[:, None])[:, 0]
+        move = jnp.where(jnp.isfinite(move), move, 0)
+        shrink = jnp.minimum(1, _MOST_STEP / jnp.maximum(jnp.max(jnp.abs(move[:8])), 1e-9))
+        move = move * shrink
+        promised = -jnp.sum(move * (2 * gradient + information @ move))
+        return Move(move, promised, damping)
+
+    def moved(self, y: Unknowns, move: Float[Array, " n"]) -> Unknowns:
+        D = jnp.append(move[:8], 0).reshape(3, 3)
+        return Unknowns(
+            y.M + D @ y.M,
+            y.motion_px + move[8:10],
+            jnp.clip(y.lens_px2 + move[10], 0, _MOST_LENS_PX2),
+            y.light + move[11:],
+        )
+
+
+@kept
+def fit_pattern(window: Window, instants: Int[Array, ""]) -> PatternFit:
+    """Fit a window from M = I and the expected motion, in float32 in any process.
+
+    Args:
+        instants: number of images that are averaged, see `expose`.
+    """
+    start = Unknowns(
+        jnp.eye(3, dtype=window.levels.dtype),
+        window.motion_px,
+        jnp.asarray(_LENS_PX2, window.levels.dtype),
+        jnp.zeros(_LIGHTS, window.levels.dtype),
+    )
+    coarse = window.most_noise
+    few = _first(window, window.levels.shape[0] // _COARSER)
+    y = start._replace(light=_first_light(start, few, instants))
+    y, _ = _minimum(y, few, coarse * jnp.ones_like(few.levels), instants, _COARSE_STEPS)
+    residual, _, image = _model(y, window, instants)
+    noise = jnp.maximum(_spread(residual, window.used, coarse), _LEAST_NOISE)
+    y, done = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS)
+    return _result(y, window, instants, done)
+
+
+def _first(window: Window, count: int) -> Window:
+    """The window with its first pixels alone."""
+    return window._replace(
+        rays=window.rays[:, :count],
+        rays_px=window.rays_px[:, :, :count],
+        levels=window.levels[:count],
+        real=window.real[:count],
+        used=window.used[:count],
+        shadow=window.shadow[:count],
+    )
+
+
+def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " N"]:
+    """Standard deviation of each pixel: its noise, and the ground's where that shows."""
+    return jnp.sqrt(noise**2 + (_GROUND * window.contrast * image.far) ** 2)
+
+
+def _minimum(
+    y: Unknowns, window: Window, scale: Float[Array, " N"], instants: Int[Array, ""], steps: int
+) -> tuple[Unknowns, Array]:
+    def cost(y: Any, args: Any) -> tuple[Any, Any]:
+        del args
+        residual, J, _ = _model(y, window, instants)
+        loss, weight = _loss(residual / scale, window.used)
+        weighted = J * (weight / scale**2)[None]
+        prior, prior_J = _prior(y, window)
+        return jnp.concatenate([jnp.sqrt(loss), prior]), NormalEquations(
+            weighted @ J.T + prior_J.T @ prior_J, -weighted @ residual + prior_J.T @ prior
+        )
+
+    solver = _PatternLM()
+    solution: Any = optx.least_squares(cost, solver, y, has_aux=True, max_steps=steps, throw=False)
+    return solution.value, solution.state.done
+
+
+def _model(
+    y: Unknowns, window: Window, instants: Int[Array, ""]
+) -> tuple[Float[Array, " N"], Float[Array, "n N"], Exposure]:
+    """Residual (N,), slopes (n, N) of the model by all unknowns, and the ink's image."""
+    image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
+    basis = _basis(y, window, image)
+    light = y.light * window.contrast
+    levels = light @ basis
+    x, y_paper = on_paper(y.M, window.rays, window.rays_px)[0]
+    contrast = light[3] + light[4] * x + light[5] * y_paper
+    by_dark = light[8] * (1 - 2 * image.dark) - contrast + light[6] * (1 - window.shadow)
+    J = jnp.concatenate(
+        [by_dark[None] * image.by_D, by_dark[None] * image.by_motion,
+         (by_dark * image.by_lens)[None], window.contrast * basis]
+    )  # fmt: skip
+    return window.levels - levels, J, image
+
+
+def _basis(y: Unknowns, window: Window, image: Exposure) -> Float[Array, "L N"]:
+    (x, y_paper), _ = on_paper(y.M, window.rays, window.rays_px)
+    # Beyond the marker gradients end: the ground there has its own light.
+    x, y_paper = jnp.clip(x, -1.5, 1.5), jnp.clip(y_paper, -1.5, 1.5)
+    dark = image.dark
+    shade = (window.shadow - 1) * (1 - dark)
+    return jnp.stack(
+        [jnp.ones_like(x), x, y_paper, -dark, -dark * x, -dark * y_paper, shade, image.far,
+         dark * (1 - dark)]
+    )  # fmt: skip
+
+
+def _first_light(y: Unknowns, window: Window, instants: Int[Array, ""]) -> Float[Array, " L"]:
+    image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
+    basis = _basis(y, window, image)
+    weighted = basis * window.used[None]
+    prior = jnp.asarray([1 / s**2 for s in _LIGHT_SIGMA], basis.dtype)
+    gram = weighted @ basis.T + jnp.diag(prior)
+    return eliminate(gram, (weighted @ window.levels / window.contrast)[:, None])[:, 0]
+
+
+def _prior(y: Unknowns, window: Window) -> tuple[Float[Array, " p"], Float[Array, "p n"]]:
+    """What is expected of motion, lens and light, in standard deviations, and its slopes."""
+    sigmas = jnp.asarray([_LENS_SIGMA_PX2, *_LIGHT_SIGMA], y.light.dtype)
+    sigmas = jnp.concatenate([jnp.full(2, 1, y.light.dtype) * window.motion_sigma_px, sigmas])
+    off = jnp.concatenate([y.motion_px - window.motion_px, (y.lens_px2 - _LENS_PX2)[None], y.light])
+    slopes = jnp.eye(UNKNOWNS, dtype=y.light.dtype)[8:] / sigmas[:, None]
+    return off / sigmas, slopes
+
+
+def _loss(r: Array, used: Array) -> tuple[Array, Array]:
+    """The bounded loss of residuals in standard deviations, at most width^2, and its weights."""
+    near = 1 / (1 + (r / _WIDTH) ** 2)
+    return jnp.where(used, r**2 * near, 0), jnp.where(used, near**2, 0)
+
+
+def _spread(residual: Array, used: Array, most: Array) -> Array:
+    """Standard deviation of the residuals that fit, from their median size.
+
+    Args:
+        most: an upper bound. Residuals beyond three times what is found are left out, twice, so
+            that what hides a third of the marker does not count as noise.
+    """
+    size = jnp.abs(residual)
+    spread = most
+    for _ in range(3):
+        near = used & (size < 3 * spread)
+        spread = jnp.minimum(1.4826 * jnp.nanmedian(jnp.where(near, size, jnp.nan)), most)
+    return jnp.where(jnp.isfinite(spread), spread, most)
+
+
+def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) -> PatternFit:
+    residual, J, image = _model(y, window, instants)
+    noise = _spread(residual, window.used, window.most_noise)
+    noise = jnp.maximum(noise, _LEAST_NOISE)
+    scale = _deviation(noise, image, window)
+    _, weight = _loss(residual / scale, window.used)
+    _, prior_J = _prior(y, window)
+    prior = prior_J.T @ prior_J
+    weighted = J * (weight / scale**2)[None]
+    information = weighted @ J.T
+    units = jnp.eye(UNKNOWNS, dtype=J.dtype)
+    bread = eliminate(ridged(_SLOPE * information + prior), units)
+    # The noise is what each pixel shows: a sensor's grows with the light. A pixel that decides
+    # much draws the fit to itself: what it shows is too little by its leverage.
+    leverage = _SLOPE * jnp.sum(weighted * (bread @ J), axis=0)
+    scores = weighted * (residual / jnp.maximum(1 - leverage, 0.3))[None]
+    covariance = bread @ (scores @ scores.T + prior) @ bread
+    xy, _ = on_paper(y.M, window.rays, window.rays_px)
+    variance = jnp.sum(weight * (residual / scale) ** 2) / jnp.maximum(jnp.sum(weight), 1)
+    score = weighted * residual[None] / jnp.sqrt(_SCORE * variance)
+    ratio = cell_disagreement(xy, score, information, window.K.shape[0] - 1)
+    covariance = covariance * jnp.where(ratio > _NOTICED, ratio, 1)
+    contrast = y.light[3] * window.contrast
+    basis = _basis(y, window, image)
+    marker = (y.light[:6] * window.contrast) @ basis[:6]
+    light = y.light * window.contrast
+    bright = _basis(y, window, image._replace(dark=jnp.zeros_like(image.dark)))
+    inky = _basis(y, window, image._replace(dark=jnp.ones_like(image.dark)))
+    white = light @ bright
+    darkens = white - light @ inky
+    plain = _plain(basis[:3], window, scale)
+    without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
+    return PatternFit(
+        y.M, y.motion_px, y.lens_px2, covariance[:8, :8], noise, contrast, weight, residual, marker,
+        white, darkens, scale, ratio, 1 - with_marker / without, (without - with_marker) / 2, done,
+    )  # fmt: skip
+
+
+def _plain(basis: Float[Array, "3 N"], window: Window, scale: Array) -> Float[Array, " N"]:
+    """Residual (N,) of a ground without a marker: a level and its gradient."""
+    weight = window.real / scale**2
+    level = jnp.zeros(3, basis.dtype)
+    for _ in range(3):
+        weighted = basis * weight[None]
+        gram = weighted @ basis.T
+        level = eliminate(
+            gram + 1e-6 * jnp.trace(gram) * jnp.eye(3), (weighted @ window.levels)[:, None]
+        )[:, 0]
+        residual = window.levels - level @ basis
+        weight = _loss(residual / scale, window.real)[1] / scale**2
+    return residual

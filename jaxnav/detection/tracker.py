@@ -1,0 +1,119 @@
+"""Follow the markers of one camera that its decoders do not read, and learn its exposure time.
+
+A decoder has the first word. What the filter expects and no decoder finds is followed by `track`,
+the largest first. A marker's streak is its velocity in the image times the exposure time; where
+nobody says that time, the streaks of the markers that are followed tell it.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from jaxnav.detection.refine import mean_side_px
+from jaxnav.detection.track import Target, Track, track
+from jaxnav.detection.types import Detections, grey
+from jaxnav.models.camera import Camera
+
+MOST_FOLLOWED = 3  # markers of an image: each takes some milliseconds
+_UNKNOWN_EXPOSURE_S = 0.01  # and as much more or less
+_STREAK_SIGMA_PX, _STREAK_SHARE = 0.5, 0.3  # of a streak where the exposure time is known
+_TOLD_BY = 5  # streaks tell the exposure time
+_REMEMBERED = 31
+_LEAST_STREAK_PX = 2.0  # that tells of it
+
+
+class Tracker:
+    """Follows markers through the images of one camera. For one thread at a time.
+
+    Attributes:
+        exposure_s: the exposure time, as it was told or as streaks tell it; None if nothing has.
+    """
+
+    def __init__(self, exposure_s: float | None = None):
+        """Args:
+        exposure_s: the exposure time, where it is known.
+        """
+        self._told = exposure_s is not None
+        self.exposure_s = exposure_s
+        self._exposures_s: deque[float] = deque(maxlen=_REMEMBERED)
+
+    def follow(
+        self,
+        image: Shaped[np.ndarray, "..."],
+        camera: Camera | None,
+        keys: Sequence[tuple[str, int]],
+        quads_px: Float[np.ndarray, "K 4 2"],
+        radius_px: Float[np.ndarray, " K"],
+        flow_px_s: Float[np.ndarray, "K 2"] | None = None,
+        decoded: Detections | None = None,
+    ) -> Detections:
+        """Follow the expected markers that were not decoded.
+
+        Args:
+            image: as in `Detector.detect`, like `camera`.
+            keys: family and id of each expected marker.
+            quads_px: its expected corners, TL TR BR BL.
+            radius_px: the farthest that it may be from there.
+            flow_px_s: velocity of its centre in the image; None where that is not known.
+            decoded: what decoders found in the image.
+
+        Returns:
+            The markers that were followed, without those that were decoded.
+        """
+        found = set() if decoded is None else set(zip(decoded.families, decoded.ids, strict=True))
+        sides_px = [mean_side_px(quad) for quad in quads_px]
+        missing = [
+            k
+            for k in np.argsort(sides_px)[::-1]
+            if keys[k] not in found and np.isfinite(sides_px[k]) and np.isfinite(radius_px[k])
+        ]
+        targets = []
+        for k in missing[:MOST_FOLLOWED]:
+            streak_px, sigma_px = (0.0, 0.0), np.inf
+            if flow_px_s is not None and np.all(np.isfinite(flow_px_s[k])):
+                streak_px, sigma_px = self._streak(flow_px_s[k])
+            family, marker_id = keys[k]
+            targets.append(
+                Target(
+                    family, marker_id, quads_px[k][None], float(radius_px[k]), streak_px, sigma_px
+                )
+            )
+        if not targets:
+            return Detections.concatenate([])
+        tracks = track(grey(image), camera, targets)
+        if flow_px_s is not None:
+            self._learn([flow_px_s[k] for k in missing], tracks)
+        return detections_of([one for one in tracks if one is not None])
+
+    def _streak(self, flow_px_s: np.ndarray) -> tuple[tuple[float, float], float]:
+        """The expected streak, px, and its standard deviation."""
+        speed_px_s = float(np.hypot(*flow_px_s))
+        exposure_s = _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
+        share = 1.0 if self.exposure_s is None else _STREAK_SHARE
+        streak = exposure_s * flow_px_s
+        sigma_px = _STREAK_SIGMA_PX + share * exposure_s * speed_px_s
+        return (float(streak[0]), float(streak[1])), sigma_px
+
+    def _learn(self, flows_px_s: Sequence[np.ndarray], tracks: Sequence[Track | None]) -> None:
+        if self._told:
+            return
+        for flow_px_s, one in zip(flows_px_s, tracks, strict=False):
+            speed = float(np.hypot(*flow_px_s))
+            if one is None or not np.hypot(*one.streak_px) >= _LEAST_STREAK_PX or not speed > 0:
+                continue
+            self._exposures_s.append(abs(float(one.streak_px @ flow_px_s)) / speed**2)
+        if len(self._exposures_s) >= _TOLD_BY:
+            self.exposure_s = float(np.median(self._exposures_s))
+
+
+def detections_of(tracks: Sequence[Track]) -> Detections:
+    """Detections of the markers that were followed."""
+    return Detections(
+        ids=np.array([one.marker_id for one in tracks], int),
+        corners_px=np.array([one.corners_px for one in tracks], float).reshape(-1, 4, 2),
+        sigma_px=np.array([one.sigma_px for one in tracks], float).reshape(-1, 4),
+        refined=np.ones(len(tracks), bool),
+        families=tuple(one.family for one in tracks),
+    )
