@@ -8,6 +8,7 @@ Every method sees the same pictures. Those with a prediction get the true corner
 """
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -21,9 +22,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import jaxnav
-from benchmarks.bench_detection import apriltag, opencv, row
+from benchmarks.bench_detection import DATA, apriltag, opencv, row
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.detection.track import Target, Track, track
+from jaxnav.files.images import read_image
 from jaxnav.models.camera import Camera
 from tests.helpers import marker_images
 from tests.helpers.marker_images import Scene, rotation
@@ -124,6 +126,55 @@ def predicted(picture: Picture, seed: int) -> Target:
     return Target(
         FAMILY, picture.marker_id, quad_px[None], off_px + 1.5, tuple(map(float, streak_px)), 0.7
     )
+
+
+def false_fixes(count: int) -> tuple[int, int]:
+    """How many pictures without the sought marker show it, of how many.
+
+    By turns: another marker of the family, blurred by up to 8 px; a part of a real photograph, of
+    rooms with markers of the family and of boards; a wall of rough noise.
+    """
+    photographs = [
+        (read_image(file, cv2.IMREAD_GRAYSCALE), file.parent.name)
+        for pattern in ("apriltag_photos/*.jpg", "boards/*/*.jpg", "boards/*/*.png")
+        for file in sorted(DATA.glob(pattern))[::3]
+    ]
+    shown = {
+        index: set(make_detector("aruco", FAMILY).detect(image).ids.tolist())
+        for index, (image, folder) in enumerate(photographs)
+        if folder == "apriltag_photos"
+    }
+    marker_images.SUBPIXELS, wrong = 4, 0
+    for seed in range(count):
+        rng = np.random.default_rng([seed, 270])
+        side_px, blur_px, sought = rng.uniform(14, 40), rng.uniform(0, 8), int(rng.integers(587))
+        ids = {sought}
+        if seed % 3 == 0:
+            other_id = int((sought + rng.integers(1, 587)) % 587)
+            scene = _scene(rng, side_px, blur_px, other_id)
+            image, quad_px, ids = scene.render(rng), scene.corners_px(), {other_id}
+        elif seed % 3 == 1:
+            index = int(rng.integers(len(photographs)))
+            image, ids = photographs[index][0], shown.get(index, set())
+            center = rng.uniform(side_px, np.array(image.shape[::-1]) - side_px)
+            quad_px = center + side_px / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        else:
+            rough = rng.normal(110, rng.uniform(5, 60), (24, 24))
+            image = cv2.resize(rough, (96, 96), interpolation=int(rng.integers(3)))
+            image = np.clip(image + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8)
+            quad_px = 48 + side_px / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        if seed % 3 != 2 and sought in ids:
+            continue
+        angle = rng.uniform(0, 2 * np.pi)
+        streak_px = (blur_px * math.cos(angle), blur_px * math.sin(angle))
+        target = Target(FAMILY, sought, quad_px[None], 8.0, streak_px, 1.0)
+        found = track(image, None, [target])[0]
+        if found is not None:
+            wrong += 1
+            print(
+                f"  seed {seed}: advantage {found.advantage:.0f}, explained {found.explained:.2f}"
+            )
+    return wrong, count
 
 
 Find = Callable[[Picture, Target], np.ndarray | Track | None]
@@ -228,7 +279,12 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--other", type=Path, help="pictures by benchmarks/other_renderer.py")
     parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--false", type=int, help="count false fixes in so many pictures instead")
     given = parser.parse_args()
     cv2.setNumThreads(1)
     jaxnav.configure()
-    write_table(given.other, given.count)
+    if given.false:
+        wrong, count = false_fixes(given.false)
+        print(f"{wrong} of {count} pictures show a marker that is not there")
+    else:
+        write_table(given.other, given.count)

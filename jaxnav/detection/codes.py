@@ -42,11 +42,16 @@ def code_advantage(
         np.asarray(window.levels, float)[:count] - np.asarray(fit.white, float)[:count]
     ) / noise
     darkens = np.asarray(fit.darkens, float)[:count] / noise
-    # To draw all codes would take some milliseconds: those that correlate best suffice.
-    alike = codes @ (cells @ (darkens * np.clip(light + darkens * frame, -_MOST, _MOST)))
+    # To draw all codes would take some milliseconds: those that correlate best suffice, with what
+    # remains where all cells are grey.
+    half = frame + cells.sum(axis=0) / 2
+    bend = float(fit.bend) * shown / noise
+    grey = light + darkens * half - bend * half * (1 - half)
+    alike = codes @ (cells @ (darkens * np.clip(grey, -_MOST, _MOST)))
     near = np.argpartition(alike, min(_NEAR, len(alike) - 1))[:_NEAR]
     near = np.append(near[near != own], own)
-    residual = light + darkens * (frame + codes[near] @ cells)
+    drawn = frame + codes[near] @ cells
+    residual = light + darkens * drawn - bend * drawn * (1 - drawn)
     losses = np.sum(residual**2 / (1 + residual**2 / _BOUND), axis=1)
     return float(np.min(losses[:-1]) - losses[-1])
 

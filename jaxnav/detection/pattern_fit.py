@@ -85,6 +85,7 @@ class PatternFit(NamedTuple):
     marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
     white: Float[Array, " N"]  # levels as they would be without ink
     darkens: Float[Array, " N"]  # by how many levels ink darkens a pixel
+    bend: Float[Array, ""]  # of levels that are half dark, grey levels
     deviation: Float[Array, " N"]  # standard deviation of a pixel, grey levels
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
@@ -282,7 +283,8 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) 
     without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
     return PatternFit(
         y.M, y.motion_px, y.lens_px2, covariance[:8, :8], noise, contrast, weight, residual, marker,
-        white, darkens, scale, ratio, 1 - with_marker / without, (without - with_marker) / 2, done,
+        white, darkens, light[8], scale, ratio, 1 - with_marker / without,
+        (without - with_marker) / 2, done,
     )  # fmt: skip
 
 

@@ -43,10 +43,11 @@ _LEAST_CONTRAST = 10.0  # grey levels
 # explains, and by how many noise variances every other code is worse.
 _LEAST_EXPLAINED = 0.5
 _LEAST_ADVANTAGE = 60.0
+_LEAST_IN_ALL = -40.0  # the same over all pixels: what hides the marker is no other code
 _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
 # Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.
-_DISAGREE, _WEIGHT = 1.3, 0.78
+_DISAGREE, _WEIGHT = 1.6, 0.78
 _MOST_ROUGH = 0.045  # of the contrast, the noise where something still disturbs it
 _PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _MOST_NOISE = 0.15  # of the contrast
@@ -293,7 +294,9 @@ def _judge(target: Target, lens: Lens, found: _Fitted, start_px: np.ndarray) -> 
     clear = window.used[:count]
     shown = ~blank_pixels(pixels, clear, cell_px)
     advantage = code_advantage(target.family, target.marker_id, fit, window, shown)
-    if not advantage >= _LEAST_ADVANTAGE:
+    everywhere = np.ones(count, bool)
+    in_all = code_advantage(target.family, target.marker_id, fit, window, everywhere)
+    if not (advantage >= _LEAST_ADVANTAGE and in_all >= _LEAST_IN_ALL):
         return None
     _, paper_px = on_paper(M, *lens.rays(corners_px))
     motion = -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
