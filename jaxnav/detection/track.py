@@ -48,7 +48,8 @@ _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
 # Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.
 _DISAGREE, _WEIGHT = 1.6, 0.78
-_MOST_ROUGH = 0.045  # of the contrast, the noise where something still disturbs it
+# What still shows more noise, of the contrast, and is so much alike among neighbours, is disturbed.
+_MOST_ROUGH, _MOST_ALIKE = 0.04, 3.0
 _PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _MOST_NOISE = 0.15  # of the contrast
 _BOUND = 9.0  # of a pixel's loss, noise variances
@@ -155,7 +156,8 @@ def _track(image: np.ndarray, lens: Lens, target: Target) -> Track | None:
         if found.fit.explained < _PROMISING:
             return None
         found = _undisturbed(found) or found
-        if _is_disturbed(found) and found.fit.noise > _MOST_ROUGH * found.fit.contrast:
+        rough = found.fit.noise > _MOST_ROUGH * found.fit.contrast
+        if rough and noise_correlation(found.pixels, found.fit) > _MOST_ALIKE:
             return None
     return _judge(target, lens, found, start.quad_px)
 
