@@ -19,6 +19,7 @@ from jaxnav.models.camera import Camera
 MOST_FOLLOWED = 3  # markers of an image: each takes some milliseconds
 _UNKNOWN_EXPOSURE_S = 0.01  # and as much more or less
 _STREAK_SIGMA_PX, _STREAK_SHARE = 0.5, 0.3  # of a streak where the exposure time is known
+_FAR_AHEAD_S, _AHEAD_SHARE = 0.1, 0.1  # a flow is trusted so long, and is off by so much
 _TOLD_BY = 5  # streaks tell the exposure time
 _REMEMBERED = 31
 _LEAST_STREAK_PX = 2.0  # that tells of it
@@ -47,6 +48,7 @@ class Tracker:
         quads_px: Float[np.ndarray, "K 4 2"],
         radius_px: Float[np.ndarray, " K"],
         flow_px_s: Float[np.ndarray, "K 2"] | None = None,
+        ahead_s: float = 0.0,
         decoded: Detections | None = None,
     ) -> Detections:
         """Follow the expected markers that were not decoded.
@@ -57,6 +59,7 @@ class Tracker:
             quads_px: its expected corners, TL TR BR BL.
             radius_px: the farthest that it may be from there.
             flow_px_s: velocity of its centre in the image; None where that is not known.
+            ahead_s: from the time of the expectation to that of the image.
             decoded: what decoders found in the image.
 
         Returns:
@@ -72,14 +75,14 @@ class Tracker:
         targets = []
         for k in missing[:MOST_FOLLOWED]:
             streak_px, sigma_px = (0.0, 0.0), np.inf
+            quad_px, within_px = quads_px[k], float(radius_px[k])
             if flow_px_s is not None and np.all(np.isfinite(flow_px_s[k])):
                 streak_px, sigma_px = self._streak(flow_px_s[k])
+                ahead_px = flow_px_s[k] * min(max(ahead_s, -_FAR_AHEAD_S), _FAR_AHEAD_S)
+                quad_px = quad_px + ahead_px
+                within_px += _AHEAD_SHARE * float(np.hypot(*ahead_px))
             family, marker_id = keys[k]
-            targets.append(
-                Target(
-                    family, marker_id, quads_px[k][None], float(radius_px[k]), streak_px, sigma_px
-                )
-            )
+            targets.append(Target(family, marker_id, quad_px[None], within_px, streak_px, sigma_px))
         if not targets:
             return Detections.concatenate([])
         tracks = track(grey(image), camera, targets)

@@ -260,7 +260,7 @@ class Loop:
         keys = tuple(zip(markers.families, map(int, markers.ids), strict=True))
         flow_px_s = None if known[2] is None else known[2][camera][visible]
         seen = tuple(key for key, sees in zip(keys, visible, strict=True) if sees)
-        return Region(quads_px[visible], radius_px[visible], seen, flow_px_s)
+        return Region(quads_px[visible], radius_px[visible], seen, flow_px_s, belief.now_ns)
 
     def _flow_px_s(self, belief: "_Belief", expected: Expected) -> np.ndarray | None:
         """Velocities (C, M, 2) of the markers' centres in the images, from two poses in a row."""

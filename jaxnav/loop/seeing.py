@@ -52,12 +52,14 @@ class Region:
         radius_px: (K,), search radii.
         keys: family and id of each marker; left out, none of them is followed.
         flow_px_s: (K, 2), velocities of their centres in the image; None if nobody knows them.
+        stamp_ns: the time at which they are expected there; None: that of the image.
     """
 
     quads_px: Float[np.ndarray, "K 4 2"]
     radius_px: Float[np.ndarray, " K"]
     keys: tuple[tuple[str, int], ...] = ()
     flow_px_s: Float[np.ndarray, "K 2"] | None = None
+    stamp_ns: int | None = None
 
 
 class Search:
@@ -116,12 +118,12 @@ class Search:
         if region is not None and self._since_whole < WHOLE_EVERY:
             if not len(region.quads_px):
                 return FrameDetections(self._camera, frame.stamp_ns, _NONE)
-            detections = self._followed(frame.image, region, self._near(frame.image, region))
+            detections = self._followed(frame, region, self._near(frame.image, region))
         if not len(detections):
             self._since_whole = 0
             detections = self._everywhere(frame.image, region)
             if region is not None:
-                detections = self._followed(frame.image, region, detections)
+                detections = self._followed(frame, region, detections)
         return FrameDetections(self._camera, frame.stamp_ns, detections)
 
     def _repeats(self, image: np.ndarray) -> bool:
@@ -140,17 +142,19 @@ class Search:
         ]
         return Detections.concatenate(parts)
 
-    def _followed(self, image: np.ndarray, region: Region, detections: Detections) -> Detections:
+    def _followed(self, frame: Frame, region: Region, detections: Detections) -> Detections:
         """The detections, and the expected markers that were followed without being decoded."""
-        if self.tracker is None or not region.keys:
+        if self.tracker is None or not region.keys or frame.image is None:
             return detections
+        ahead_ns = 0 if region.stamp_ns is None else frame.stamp_ns - region.stamp_ns
         followed = self.tracker.follow(
-            image,
+            frame.image,
             self._model,
             region.keys,
             region.quads_px,
             region.radius_px,
             region.flow_px_s,
+            ahead_ns / 1e9,
             detections,
         )
         return Detections.concatenate([detections, followed])

@@ -174,7 +174,7 @@ def test_a_tracker_learns_the_exposure_time_from_streaks_and_leaves_decoded_mark
         found = tracker.follow(*given, np.array([4.5]), flow_px_s[None])
         if len(found):
             assert found.ids.tolist() == [truth.id]
-            assert len(tracker.follow(*given, np.array([4.5]), flow_px_s[None], found)) == 0
+            assert len(tracker.follow(*given, np.array([4.5]), flow_px_s[None], decoded=found)) == 0
     assert tracker.exposure_s == pytest.approx(exposure_s, rel=0.1)
     assert Tracker(0.004).exposure_s == 0.004
 

@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 
+from jaxnav.detection import Tracker, make_detector
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -19,6 +20,7 @@ from jaxnav.loop.seeing import Eyes, Region, Search, SearchedFrame, group_frames
 from jaxnav.loop.standing_clock import STANDS_S, StandingClock
 from jaxnav.navigator import Navigator
 from tests import worlds
+from tests.helpers.other_pictures import other_pictures
 
 SLACK_S = 0.3  # of a machine that does something else
 NONE = Detections.concatenate([])
@@ -375,3 +377,28 @@ def test_a_gyro_is_asked_at_every_reading_and_may_fail_now_and_then(standing):
     last = next(given for given in reversed(ticks) if given.gyro)
     assert last.gyro[-1].turn_radps == 0.1 * (2 * MOST_TURNS - 1)
     assert not any(given.faults & Fault.VEHICLE_FAILED for given in ticks)
+
+
+def test_a_marker_that_no_decoder_reads_is_followed_where_it_is_expected():
+    for image, truth in other_pictures("blur4"):
+        size_px = image.shape[::-1]
+        detectors = [make_detector("aruco", truth.family)]
+        # Expected 10 ms ago, when it was elsewhere by as much as it moves in that time.
+        ago_px = truth.corners_px - truth.streak_px
+        region = Region(
+            ago_px[None],
+            np.array([4.0]),
+            ((truth.family, truth.id),),
+            truth.streak_px[None] / truth.exposure_s,
+            stamp_ns=10_000_000,
+        )
+        frame = Frame(20_000_000, image)
+        decoded = Search(0, size_px, truth.camera, detectors).look(frame, region)
+        if len(decoded.detections):
+            continue  # this one can be read
+        search = Search(0, size_px, truth.camera, detectors, Tracker())
+        followed = search.look(frame, region)
+        assert followed.detections.ids.tolist() == [truth.id]
+        assert np.max(np.abs(followed.detections.corners_px[0] - truth.corners_px)) < 0.5
+        return
+    raise AssertionError("every picture can be read")

@@ -151,10 +151,12 @@ class RenderedCameras:
         """The detections of each camera, with the expected markers that were followed."""
         markers, followed = self.world.setup.markers, list(detections)
         keys = list(zip(markers.families, map(int, markers.ids), strict=True))
-        flow_px_s, now = None, (self._stamp_s, predicted_px)
+        flow_px_s, ahead_s, now = None, 0.0, (self._stamp_s, predicted_px)
         if self._before is not None and self._before[0] < self._stamp_s:
             moved_px = np.mean(predicted_px - self._before[1], axis=-2)
-            flow_px_s = moved_px / (self._stamp_s - self._before[0])
+            # What is believed is of the frame before.
+            ahead_s = self._stamp_s - self._before[0]
+            flow_px_s = moved_px / ahead_s
         self._before = now if expected.any() else None
         for c, tracker in enumerate(self.trackers):
             if not expected[c].any():
@@ -166,6 +168,7 @@ class RenderedCameras:
                 predicted_px[c][expected[c]],
                 np.full(int(expected[c].sum()), _FOLLOW_WITHIN_PX),
                 None if flow_px_s is None else flow_px_s[c][expected[c]],
+                ahead_s,
                 detections[c],
             )
             followed[c] = Detections.concatenate([detections[c], more])
