@@ -109,9 +109,9 @@ def _disturbed(
     return np.clip(image * (1 - behind) + behind * object_levels, 0, 255).astype(np.uint8)
 
 
-def other(kind: str, folder: Path) -> Iterable[Picture]:
+def other(kind: str, folder: Path, count: int) -> Iterable[Picture]:
     """Pictures by the other renderer."""
-    for image, truth in other_pictures(kind, folder):
+    for image, truth in other_pictures(kind, folder)[:count]:
         assert truth.id is not None
         yield Picture(image, truth.camera, truth.id, truth.corners_px, truth.streak_px)
 
@@ -268,7 +268,7 @@ def write_table(folder: Path | None, count: int) -> None:
     if folder is not None:
         lines += ["", "By Mitsuba, `benchmarks/other_renderer.py`:", *head]
         for kind, what in KINDS.items():
-            lines.append(row(what, *measure(other(kind, folder)).values()))
+            lines.append(row(what, *measure(other(kind, folder, count)).values()))
             print(lines[-1], flush=True)
     lines += ["", row("followed", "CPU time, ms"), row("---", "---"), *times(15)]
     text = TABLE.read_text() if TABLE.exists() else "# Markers that no decoder reads\n\n<!-- rows"

@@ -33,7 +33,7 @@ from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Shutter
 
 TABLE = Path(__file__).with_name("README-blur.md")
-PERIOD_S, EXPOSURE_S = 1 / 30, 0.01
+PERIOD_S, EXPOSURE_S, READOUT_S = 1 / 30, 0.01, 0.008
 PLACE_M = (0.3, 0.0)
 FASTEST_RADPS = 10.0
 NOISE = 0.02
@@ -61,13 +61,17 @@ def poses_at(times_s: np.ndarray) -> np.ndarray:
     return np.column_stack([np.cos(half), zero, zero, np.sin(half), x_m, y_m, zero])
 
 
-def spin(follow: bool) -> dict[str, float]:
-    """One spin: how often the marker was found while it was fast, and how far off the pose was."""
+def spin(follow: bool, told: bool) -> dict[str, float]:
+    """One spin: how often the marker was found while it was fast, and how far off the pose was.
+
+    Args:
+        told: whether exposure and row time are known.
+    """
     rig = load_rig(calib_dir() / "qcar/rig.yaml")
     markers = load_markers(calib_dir() / "qcar/markers.yaml")
     rows = max(height for _, height in rig.image_sizes_px)
     renderer = Renderer(
-        Scene.create(markers, seed=0), rig, Shutter(EXPOSURE_S, 0.008 / rows), SENSOR
+        Scene.create(markers, seed=0), rig, Shutter(EXPOSURE_S, READOUT_S / rows), SENSOR
     )
     cameras = [rig.camera(c) for c in range(len(rig))]
     # What the cameras ask of their world.
@@ -75,7 +79,8 @@ def spin(follow: bool) -> dict[str, float]:
         setup=SimpleNamespace(rig=rig, markers=markers), cameras=cameras, renderer=renderer
     )
     rng = np.random.default_rng(0)
-    trackers = [Tracker() for _ in cameras] if follow else []
+    timing = (EXPOSURE_S, READOUT_S / rows) if told else (None, None)
+    trackers = [Tracker(*timing) for _ in cameras] if follow else []
     eyes = RenderedCameras(world, make_detectors(markers), rng, trackers=trackers)
     navigator = Navigator(rig, markers, vehicle=TwistBase.create(1.0, 12.0, 0.15))
     step, state = jax.jit(navigator.step), navigator.init()
@@ -131,8 +136,12 @@ def write_table() -> None:
         ),
         row(*["---"] * 5),
     ]
-    for follow, name in ((False, "decode-only"), (True, "follow")):
-        got = spin(follow)
+    for follow, told, name in (
+        (False, False, "decode-only"),
+        (True, True, "follow, timing told"),
+        (True, False, "follow, timing not told"),
+    ):
+        got = spin(follow, told)
         lines.append(
             row(
                 name,

@@ -3,10 +3,14 @@
 A decoder has the first word. What the filter expects and no decoder finds is followed by `track`,
 the largest first. A marker's streak is its velocity in the image times the exposure time; where
 nobody says that time, the streaks of the markers that are followed tell it.
+
+A rolling shutter sees each row at its own time: corners of a marker that moves are taken back to
+the time of the middle row, or are less certain by as much where nobody says how fast it rolls.
 """
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -20,6 +24,7 @@ MOST_FOLLOWED = 3  # markers of an image: each takes some milliseconds
 _UNKNOWN_EXPOSURE_S = 0.01  # and as much more or less
 _STREAK_SIGMA_PX, _STREAK_SHARE = 0.5, 0.3  # of a streak where the exposure time is known
 _FAR_AHEAD_S, _AHEAD_SHARE = 0.1, 0.1  # a flow is trusted so long, and is off by so much
+_UNKNOWN_ROW_TIME_S = 2e-5  # of common sensors 5 to 30 us
 _TOLD_BY = 5  # streaks tell the exposure time
 _REMEMBERED = 31
 _LEAST_STREAK_PX = 2.0  # that tells of it
@@ -30,15 +35,26 @@ class Tracker:
 
     Attributes:
         exposure_s: the exposure time, as it was told or as streaks tell it; None if nothing has.
+        row_time_s: from the exposure of one row to that of the next; None if nobody has told.
     """
 
-    def __init__(self, exposure_s: float | None = None):
+    def __init__(self, exposure_s: float | None = None, row_time_s: float | None = None):
         """Args:
         exposure_s: the exposure time, where it is known.
+        row_time_s: from the exposure of one row to that of the next, where it is known.
         """
-        self._told = exposure_s is not None
-        self.exposure_s = exposure_s
+        self._told = False
+        self.exposure_s: float | None = None
+        self.row_time_s: float | None = None
+        self.tell(exposure_s, row_time_s)
         self._exposures_s: deque[float] = deque(maxlen=_REMEMBERED)
+
+    def tell(self, exposure_s: float | None, row_time_s: float | None) -> None:
+        """Tell the camera's timing; what is None stays as it was."""
+        if exposure_s is not None:
+            self.exposure_s, self._told = exposure_s, True
+        if row_time_s is not None:
+            self.row_time_s = row_time_s
 
     def follow(
         self,
@@ -63,14 +79,15 @@ class Tracker:
             decoded: what decoders found in the image.
 
         Returns:
-            The markers that were followed, without those that were decoded.
+            The markers that were followed, without those that were decoded, at the time of the
+            image's middle row.
         """
-        found = set() if decoded is None else set(zip(decoded.families, decoded.ids, strict=True))
+        read = set() if decoded is None else set(zip(decoded.families, decoded.ids, strict=True))
         sides_px = [mean_side_px(quad) for quad in quads_px]
         missing = [
             k
             for k in np.argsort(sides_px)[::-1]
-            if keys[k] not in found and np.isfinite(sides_px[k]) and np.isfinite(radius_px[k])
+            if keys[k] not in read and np.isfinite(sides_px[k]) and np.isfinite(radius_px[k])
         ]
         targets = []
         for k in missing[:MOST_FOLLOWED]:
@@ -85,10 +102,17 @@ class Tracker:
             targets.append(Target(family, marker_id, quad_px[None], within_px, streak_px, sigma_px))
         if not targets:
             return Detections.concatenate([])
-        tracks = track(grey(image), camera, targets)
-        if flow_px_s is not None:
-            self._learn([flow_px_s[k] for k in missing], tracks)
-        return detections_of([one for one in tracks if one is not None])
+        image = grey(image)
+        tracks = track(image, camera, targets)
+        found = detections_of([one for one in tracks if one is not None])
+        if flow_px_s is None:
+            return found
+        flows_px_s = [flow_px_s[k] for k, _ in zip(missing, targets, strict=False)]
+        self._learn(flows_px_s, tracks)
+        seen = [f for f, one in zip(flows_px_s, tracks, strict=True) if one is not None]
+        return self._of_one_time(
+            found, np.nan_to_num(np.reshape(seen, (-1, 2))), (len(image) - 1) / 2
+        )
 
     def _streak(self, flow_px_s: np.ndarray) -> tuple[tuple[float, float], float]:
         """The expected streak, px, and its standard deviation."""
@@ -98,6 +122,18 @@ class Tracker:
         streak = exposure_s * flow_px_s
         sigma_px = _STREAK_SIGMA_PX + share * exposure_s * speed_px_s
         return (float(streak[0]), float(streak[1])), sigma_px
+
+    def _of_one_time(
+        self, found: Detections, flows_px_s: np.ndarray, middle_px: float
+    ) -> Detections:
+        """The corners at the time of the middle row."""
+        after_px = found.corners_px[..., 1] - middle_px  # rows after it
+        if self.row_time_s is not None:
+            late_s = (self.row_time_s * after_px)[..., None]
+            return replace(found, corners_px=found.corners_px - late_s * flows_px_s[:, None])
+        speeds_px_s = np.linalg.norm(flows_px_s, axis=1)[:, None]
+        unknown_px = _UNKNOWN_ROW_TIME_S * speeds_px_s * np.abs(after_px)
+        return replace(found, sigma_px=np.hypot(found.sigma_px, unknown_px))
 
     def _learn(self, flows_px_s: Sequence[np.ndarray], tracks: Sequence[Track | None]) -> None:
         if self._told:

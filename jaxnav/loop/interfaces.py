@@ -129,11 +129,16 @@ class Frame:
         stamp_ns: middle of the exposure, `time.monotonic_ns()` of this machine.
         image: (H, W) or (H, W, 3) in BGR order, uint8.
         detections: from a camera that detects markers itself; its image is only shown and recorded.
+        exposure_s: how long each row was exposed; None: the driver does not know.
+        row_time_s: from the exposure of one row to that of the next, 0 for a global shutter; None:
+            the driver does not know.
     """
 
     stamp_ns: int
     image: UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"] | None = None
     detections: Detections | None = None
+    exposure_s: float | None = None
+    row_time_s: float | None = None
 
 
 @runtime_checkable

@@ -146,6 +146,7 @@ class Search:
         """The detections, and the expected markers that were followed without being decoded."""
         if self.tracker is None or not region.keys or frame.image is None:
             return detections
+        self.tracker.tell(frame.exposure_s, frame.row_time_s)
         ahead_ns = 0 if region.stamp_ns is None else frame.stamp_ns - region.stamp_ns
         followed = self.tracker.follow(
             frame.image,

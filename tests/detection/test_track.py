@@ -179,6 +179,21 @@ def test_a_tracker_learns_the_exposure_time_from_streaks_and_leaves_decoded_mark
     assert Tracker(0.004).exposure_s == 0.004
 
 
+def test_corners_of_a_rolling_shutter_are_of_the_middle_row():
+    image, truth = other_pictures("blur8")[0]
+    flow_px_s = truth.streak_px / truth.exposure_s
+    given = (image, truth.camera, [(FAMILY, truth.id)], target(truth, 0).quads_px)
+    at_once, rolling, unknown = (
+        Tracker(truth.exposure_s, row_time_s).follow(*given, np.array([4.5]), flow_px_s[None])
+        for row_time_s in (0.0, 3e-5, None)
+    )
+    rows_after = at_once.corners_px[..., 1:] - (len(image) - 1) / 2
+    late_px = 3e-5 * rows_after * flow_px_s
+    assert np.allclose(rolling.corners_px, at_once.corners_px - late_px, atol=1e-6)
+    assert np.all(unknown.sigma_px > at_once.sigma_px)
+    assert np.allclose(unknown.corners_px, at_once.corners_px)
+
+
 def test_what_a_decoder_reads_is_followed_to_the_same_corners():
     rng = np.random.default_rng(5)
     scene = random_scene(rng, 32, marker_cells(FAMILY, 5), optics_px=0.5)

@@ -137,7 +137,8 @@ def _drive(
         floor_m=world.floor_m(),
     )
     follows = args.detector == "follow" and method.name == OURS
-    trackers = [Tracker() for _ in world.cameras] if follows else []
+    shutter = world.renderer.shutter
+    trackers = [Tracker(shutter.exposure_s, shutter.row_time_s) for _ in world.cameras if follows]
     cameras = RenderedCameras(world, method.detectors, rng, args.corner_noise_px, trackers=trackers)
     record = Record(method.name, [])
     with progress_bar(
