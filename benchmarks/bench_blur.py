@@ -271,8 +271,10 @@ def write_table(folder: Path | None, count: int) -> None:
             lines.append(row(what, *measure(other(kind, folder, count)).values()))
             print(lines[-1], flush=True)
     lines += ["", row("followed", "CPU time, ms"), row("---", "---"), *times(15)]
-    text = TABLE.read_text() if TABLE.exists() else "# Markers that no decoder reads\n\n<!-- rows"
-    TABLE.write_text(text[: text.index("<!-- rows")] + "\n".join(lines) + "\n")
+    text = TABLE.read_text()
+    turning = text[text.index("<!-- rows by bench_turning.py -->") :]
+    before = text[: text.index("<!-- rows by bench_blur.py -->")]
+    TABLE.write_text(before + "\n".join(lines) + "\n\n" + turning)
 
 
 if __name__ == "__main__":
