@@ -48,7 +48,7 @@ _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
 # Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.
 _DISAGREE, _WEIGHT = 1.6, 0.78
-# What still shows more noise, of the contrast, and is so much alike among neighbours, is disturbed.
+# What still shows more noise, of the contrast, and so much alike among neighbours, is disturbed.
 _MOST_ROUGH, _MOST_ALIKE = 0.04, 3.0
 _PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _MOST_NOISE = 0.15  # of the contrast
@@ -157,7 +157,8 @@ def _track(image: np.ndarray, lens: Lens, target: Target) -> Track | None:
             return None
         found = _undisturbed(found) or found
         rough = found.fit.noise > _MOST_ROUGH * found.fit.contrast
-        if rough and noise_correlation(found.pixels, found.fit) > _MOST_ALIKE:
+        alike = noise_correlation(found.pixels, found.fit) > _MOST_ALIKE
+        if rough and (alike or _is_disturbed(found)):
             return None
     return _judge(target, lens, found, start.quad_px)
 
