@@ -6,17 +6,15 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxnav.detection.pattern_fit import PatternFit
+from jaxnav.detection.pattern_fit import PatternFit, bounded_loss
 
 _ANGLES, _OFFSETS = 16, 9
 _SOFT = (0.03, 0.12, 0.3)  # widths of a penumbra, half sides
 _REFINED = 3  # halvings of the steps of angle and offset
 _GAINS = (0.15, 0.9)  # of a shadow's light, over that beside it
 _BETTER = 0.75  # a shadow must lower the loss to this part
-_WIDTH = 3.0  # of the loss, standard deviations
 _PIXELS = 256  # that are compared
 _HIDDEN = 3.5  # standard deviations
-_CELLS = 0.75  # half of the least width of what hides a marker, beside that of its own edge
 
 
 def find_shadow(
@@ -48,13 +46,11 @@ def find_shadow(
             determinant = np.maximum(a * c - b * b, 1e-9 * (a + c) ** 2)
             light, shade = (c * p - b * q) / determinant, (a * q - b * p) / determinant
             residual = (levels - light[:, None] * lit - shade[:, None] * dim) / scale
-            weight = 1 / (1 + (residual / _WIDTH) ** 2) ** 2
-        total = np.sum(residual**2 / (1 + (residual / _WIDTH) ** 2), axis=1)
+            loss, weight = bounded_loss(residual)
         gain = shade / np.maximum(light, 1e-6)
-        return np.where((gain > _GAINS[0]) & (gain < _GAINS[1]), total, np.inf)
+        return np.where((gain > _GAINS[0]) & (gain < _GAINS[1]), np.sum(loss, axis=1), np.inf)
 
-    plain = np.asarray(fit.residual, float)[within] / scale
-    without = float(np.sum(plain**2 / (1 + (plain / _WIDTH) ** 2)))
+    without = float(np.sum(bounded_loss(np.asarray(fit.residual, float)[within] / scale)[0]))
     angles = np.arange(_ANGLES) * 2 * math.pi / _ANGLES
     offsets = np.linspace(-0.8, 0.8, _OFFSETS)
     lines = np.stack(np.meshgrid(angles, offsets, _SOFT[:1]), axis=-1).reshape(-1, 3)
@@ -90,24 +86,6 @@ def clear_pixels(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> Bool[np.nda
     grid, at = _on_grid(pixels, np.abs(residual) > _HIDDEN * float(fit.noise), _spacing(pixels))
     lumps = grid * ((_neighbours(grid) > 0) | (grid > 1))
     return np.asarray((lumps + _neighbours(lumps))[at] == 0)
-
-
-def blank_pixels(
-    pixels: Int[np.ndarray, "N 2"], clear: Bool[np.ndarray, " N"], cell_px: float
-) -> Bool[np.ndarray, " N"]:
-    """Which pixels that are not clear lie within something larger than cells of another code.
-
-    Args:
-        cell_px: side of the marker's cells.
-    """
-    spacing = _spacing(pixels)
-    grid, at = _on_grid(pixels, ~clear, spacing)
-    covered, _ = _on_grid(pixels, np.ones(len(pixels)), spacing)
-    hidden = ((grid > 0) | (covered == 0)).astype(np.uint8)
-    radius = math.ceil((1 + _CELLS * cell_px) / spacing)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    inner = cv2.erode(hidden, disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    return np.asarray(inner[at] > 0) & ~clear
 
 
 def noise_correlation(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> float:

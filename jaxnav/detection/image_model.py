@@ -171,6 +171,29 @@ def beyond_paper(
     return 1 - inside[0] * inside[1]
 
 
+def cell_shares(
+    M: Float[np.ndarray, "3 3"],
+    rays: Float[np.ndarray, "3 N"],
+    rays_px: Float[np.ndarray, "2 3 N"],
+    blur_px2: Float[np.ndarray, " 3"],
+    cells: int,
+) -> Float[np.ndarray, "cells N"]:
+    """The share of each pixel's light that comes from each cell, (cells * cells, N), in NumPy.
+
+    Args:
+        blur_px2: xx, xy, yy of the lens's and the motion's blur.
+        cells: along a side.
+    """
+    xy, xy_px = on_paper(M, rays, rays_px)
+    pixel_px2 = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])
+    variance = blur_on_paper(xy_px, blur_px2 + pixel_px2)[:2]
+    knots = np.linspace(-1, 1, cells + 1)[:, None]
+    # A logistic curve is within 0.01 of the Gaussian integral: enough to read cells.
+    z = np.clip((xy[:, None] - knots) / np.sqrt(variance)[:, None], -20, 20)
+    columns, rows = -np.diff(1 / (1 + np.exp(-1.702 * z)), axis=1)
+    return np.asarray((rows[:, None] * columns[None]).reshape(cells * cells, -1))
+
+
 def gauss(z: Array) -> tuple[Array, Array]:
     """Integral and density of the standard normal distribution.
 

@@ -31,6 +31,11 @@ class CornerLanes(NamedTuple):
     duplicates: int
 
 
+def marker_keys(markers: MarkerMap) -> tuple[tuple[str, int], ...]:
+    """Family and id of each marker of a map, in its order."""
+    return tuple(zip(markers.families, map(int, markers.ids), strict=True))
+
+
 def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes:
     """The observation of one instant from one `Detections` a camera, in the rig's order.
 

@@ -26,7 +26,7 @@ from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
 from jaxnav.numerics.small_matrices import eliminate
 
 _LIGHTS = 9
-UNKNOWNS = 8 + 2 + 1 + _LIGHTS
+_UNKNOWNS = 8 + 2 + 1 + _LIGHTS
 _WIDTH = 3.0  # of the loss, standard deviations
 # Of Gaussian noise under this loss: mean slope of the score over the mean weight, E[psi'] / E[w],
 # and E[psi^2] / E[w] over E[w r^2] / E[w].
@@ -90,7 +90,6 @@ class PatternFit(NamedTuple):
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
     log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
-    converged: Bool[Array, ""]
 
 
 class _PatternLM(NielsenLM):
@@ -138,11 +137,11 @@ def fit_pattern(window: Window, instants: Int[Array, ""]) -> PatternFit:
     coarse = window.most_noise
     few = _first(window, window.levels.shape[0] // _COARSER)
     y = start._replace(light=_first_light(start, few, instants))
-    y, _ = _minimum(y, few, coarse * jnp.ones_like(few.levels), instants, _COARSE_STEPS)
+    y = _minimum(y, few, coarse * jnp.ones_like(few.levels), instants, _COARSE_STEPS)
     residual, _, image = _model(y, window, instants)
     noise = jnp.maximum(_spread(residual, window.used, coarse), _LEAST_NOISE)
-    y, done = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS)
-    return _result(y, window, instants, done)
+    y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS)
+    return _result(y, window, instants)
 
 
 def _first(window: Window, count: int) -> Window:
@@ -164,7 +163,7 @@ def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " 
 
 def _minimum(
     y: Unknowns, window: Window, scale: Float[Array, " N"], instants: Int[Array, ""], steps: int
-) -> tuple[Unknowns, Array]:
+) -> Unknowns:
     def cost(y: Any, args: Any) -> tuple[Any, Any]:
         del args
         residual, J, _ = _model(y, window, instants)
@@ -177,7 +176,8 @@ def _minimum(
 
     solver = _PatternLM()
     solution: Any = optx.least_squares(cost, solver, y, has_aux=True, max_steps=steps, throw=False)
-    return solution.value, solution.state.done
+    minimum: Unknowns = solution.value
+    return minimum
 
 
 def _model(
@@ -224,14 +224,22 @@ def _prior(y: Unknowns, window: Window) -> tuple[Float[Array, " p"], Float[Array
     sigmas = jnp.asarray([_LENS_SIGMA_PX2, *_LIGHT_SIGMA], y.light.dtype)
     sigmas = jnp.concatenate([jnp.full(2, 1, y.light.dtype) * window.motion_sigma_px, sigmas])
     off = jnp.concatenate([y.motion_px - window.motion_px, (y.lens_px2 - _LENS_PX2)[None], y.light])
-    slopes = jnp.eye(UNKNOWNS, dtype=y.light.dtype)[8:] / sigmas[:, None]
+    slopes = jnp.eye(_UNKNOWNS, dtype=y.light.dtype)[8:] / sigmas[:, None]
     return off / sigmas, slopes
 
 
-def _loss(r: Array, used: Array) -> tuple[Array, Array]:
-    """The bounded loss of residuals in standard deviations, at most width^2, and its weights."""
+def bounded_loss(r: Any) -> tuple[Any, Any]:
+    """The bounded loss of residuals in standard deviations, at most width^2, and its weights.
+
+    Takes NumPy's and JAX's arrays.
+    """
     near = 1 / (1 + (r / _WIDTH) ** 2)
-    return jnp.where(used, r**2 * near, 0), jnp.where(used, near**2, 0)
+    return r**2 * near, near**2
+
+
+def _loss(r: Array, used: Array) -> tuple[Array, Array]:
+    loss, weight = bounded_loss(r)
+    return jnp.where(used, loss, 0), jnp.where(used, weight, 0)
 
 
 def _spread(residual: Array, used: Array, most: Array) -> Array:
@@ -249,7 +257,7 @@ def _spread(residual: Array, used: Array, most: Array) -> Array:
     return jnp.where(jnp.isfinite(spread), spread, most)
 
 
-def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) -> PatternFit:
+def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit:
     residual, J, image = _model(y, window, instants)
     noise = _spread(residual, window.used, window.most_noise)
     noise = jnp.maximum(noise, _LEAST_NOISE)
@@ -259,7 +267,7 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) 
     prior = prior_J.T @ prior_J
     weighted = J * (weight / scale**2)[None]
     information = weighted @ J.T
-    units = jnp.eye(UNKNOWNS, dtype=J.dtype)
+    units = jnp.eye(_UNKNOWNS, dtype=J.dtype)
     bread = eliminate(ridged(_SLOPE * information + prior), units)
     # The noise is what each pixel shows: a sensor's grows with the light. A pixel that decides
     # much draws the fit to itself: what it shows is too little by its leverage.
@@ -271,10 +279,7 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) 
     score = weighted * residual[None] / jnp.sqrt(_SCORE * variance)
     ratio = cell_disagreement(xy, score, information, window.K.shape[0] - 1)
     covariance = covariance * jnp.where(ratio > _NOTICED, ratio, 1)
-    contrast = y.light[3] * window.contrast
-    basis = _basis(y, window, image)
-    marker = (y.light[:6] * window.contrast) @ basis[:6]
-    light = y.light * window.contrast
+    basis, light = _basis(y, window, image), y.light * window.contrast
     bright = _basis(y, window, image._replace(dark=jnp.zeros_like(image.dark)))
     inky = _basis(y, window, image._replace(dark=jnp.ones_like(image.dark)))
     white = light @ bright
@@ -282,9 +287,9 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""], done: Array) 
     plain = _plain(basis[:3], window, scale)
     without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
     return PatternFit(
-        y.M, y.motion_px, y.lens_px2, covariance[:8, :8], noise, contrast, weight, residual, marker,
-        white, darkens, light[8], scale, ratio, 1 - with_marker / without,
-        (without - with_marker) / 2, done,
+        y.M, y.motion_px, y.lens_px2, covariance[:8, :8], noise, light[3], weight, residual,
+        light[:6] @ basis[:6], white, darkens, light[8], scale, ratio, 1 - with_marker / without,
+        (without - with_marker) / 2,
     )  # fmt: skip
 
 

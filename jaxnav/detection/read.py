@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxnav.detection.families import all_cells, codes_of
-from jaxnav.detection.image_model import PIXEL_VARIANCE_PX2
+from jaxnav.detection.image_model import cell_shares
 from jaxnav.detection.lens import Lens
-from jaxnav.detection.paper import blur_on_paper, on_paper
 from jaxnav.detection.refine import (
     MarkerFit,
     RefinedMarker,
@@ -100,14 +99,8 @@ def _worst_cell(fitted: MarkerFit, n: int, lens: Lens) -> float:
 
 def _cells_in_image(fitted: MarkerFit, n: int, lens: Lens) -> np.ndarray:
     """The share of each pixel's light that comes from each cell, (n * n, N)."""
-    xy, xy_px = on_paper(fitted.M, *lens.rays(fitted.pixels))
-    pixel_px2 = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])
-    variance = blur_on_paper(xy_px, np.asarray(fitted.edges.blur_px2) + pixel_px2)[:2]
-    knots = np.linspace(-1, 1, n + 1)[:, None]
-    # A logistic curve is within 0.01 of the Gaussian integral: enough to read cells.
-    z = np.clip((xy[:, None] - knots) / np.sqrt(variance)[:, None], -20, 20)
-    columns, rows = -np.diff(1 / (1 + np.exp(-1.702 * z)), axis=1)
-    return (rows[:, None] * columns[None]).reshape(n * n, -1)
+    blur_px2 = np.asarray(fitted.edges.blur_px2)
+    return cell_shares(fitted.M, *lens.rays(fitted.pixels), blur_px2, n)
 
 
 def frames_first(

@@ -92,9 +92,7 @@ def refine_corners(
     )
     if not good:
         return failed
-    # A corner's pixel moves so that its ray stays on the corner while the paper moves.
-    _, paper_px = on_paper(fitted.M, *lens.rays(fitted_px))
-    motion = -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
+    motion = corner_motion(fitted.M, lens, fitted_px)
     variance_px2 = np.einsum("ij,jk,ik->i", motion, np.asarray(fit.covariance, float), motion)
     sigma_px = np.sqrt(variance_px2.reshape(4, 2).mean(axis=1) + _MODEL_SIGMA_PX**2)
     return RefinedMarker(fitted_px, sigma_px, float(fit.noise / fit.contrast), True, fitted)
@@ -134,6 +132,17 @@ def fit_marker(
 def mean_side_px(corners_px: Float[np.ndarray, "4 2"]) -> float:
     """Mean length of the four sides of a quadrilateral (4, 2), px."""
     return float(np.mean(np.linalg.norm(corners_px - np.roll(corners_px, 1, 0), axis=1)))
+
+
+def corner_motion(
+    M: Float[np.ndarray, "3 3"], lens: Lens, corners_px: Float[np.ndarray, "4 2"]
+) -> Float[np.ndarray, "8 8"]:
+    """Derivatives of the corners' pixels, u and v of each in turn, by D, when M becomes (I + D) M.
+
+    A corner's pixel moves so that its ray stays on the corner while the paper moves.
+    """
+    _, paper_px = on_paper(M, *lens.rays(corners_px))
+    return -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
 
 
 def corners_of(M: Float[np.ndarray, "3 3"], lens: Lens) -> Float[np.ndarray, "4 2"]:
@@ -204,7 +213,11 @@ def pixels_around(
     rows, columns = np.nonzero(mask)
     pixels = np.column_stack([columns, rows]) + low
     if len(pixels) > PIXELS:
-        # The choice is fixed but scattered, so that it thins out all rows and directions alike.
-        order = (pixels @ np.array([12.9898, 78.233]) * 43758.5453) % 1.0
-        pixels = pixels[np.argsort(order, kind="stable")[:PIXELS]]
+        pixels = scattered(pixels)[:PIXELS]
     return pixels
+
+
+def scattered(pixels: Int[np.ndarray, "N 2"]) -> Int[np.ndarray, "N 2"]:
+    """The pixels in a fixed but scattered order, whose first ones thin out all rows alike."""
+    order = (pixels @ np.array([12.9898, 78.233]) * 43758.5453) % 1.0
+    return pixels[np.argsort(order, kind="stable")]

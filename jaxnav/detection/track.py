@@ -17,18 +17,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxnav.detection.codes import code_advantage
-from jaxnav.detection.disturbance import (
-    blank_pixels,
-    clear_pixels,
-    find_shadow,
-    noise_correlation,
-)
+from jaxnav.detection.disturbance import clear_pixels, find_shadow, noise_correlation
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.lens import Lens
-from jaxnav.detection.paper import SQUARE, generators, homography, on_paper
-from jaxnav.detection.pattern_fit import Window, fit_pattern
-from jaxnav.detection.refine import corners_of, mean_side_px, pixels_around
+from jaxnav.detection.paper import SQUARE, homography, on_paper
+from jaxnav.detection.pattern_fit import Window, bounded_loss, fit_pattern
+from jaxnav.detection.refine import (
+    corner_motion,
+    corners_of,
+    mean_side_px,
+    pixels_around,
+    scattered,
+)
 from jaxnav.detection.template import best_match
 from jaxnav.models.camera import Camera
 
@@ -43,7 +44,6 @@ _LEAST_CONTRAST = 10.0  # grey levels
 # explains, and by how many noise variances every other code is worse.
 _LEAST_EXPLAINED = 0.5
 _LEAST_ADVANTAGE = 60.0
-_LEAST_IN_ALL = -40.0  # the same over all pixels: what hides the marker is no other code
 _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
 # Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.
@@ -52,7 +52,6 @@ _DISAGREE, _WEIGHT = 1.6, 0.78
 _MOST_ROUGH, _MOST_ALIKE = 0.04, 3.0
 _PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _MOST_NOISE = 0.15  # of the contrast
-_BOUND = 9.0  # of a pixel's loss, noise variances
 _HALVES, _HALF = 8, 0.1  # of the marker, a little more than half
 _SAME = 0.01  # of the pixels
 _ROUNDS = 4  # of leaving out pixels that do not fit
@@ -149,8 +148,11 @@ def _track(image: np.ndarray, lens: Lens, target: Target) -> Track | None:
     )
     if start is None:
         return None
-    found = _fit(image, lens, target, start.quad_px, np.asarray(start.streak_px))
-    if found is None or not np.all(np.isfinite(found.fit.M)):
+    placed = _place(image, lens, target, start.quad_px, np.asarray(start.streak_px))
+    if placed is None:
+        return None
+    found = _fitted(*placed)
+    if not np.all(np.isfinite(found.fit.M)):
         return None
     if _is_disturbed(found):
         if found.fit.explained < _PROMISING:
@@ -178,13 +180,6 @@ class _Fitted(NamedTuple):
     fit: Any  # `PatternFit`
 
 
-def _fit(
-    image: np.ndarray, lens: Lens, target: Target, quad_px: np.ndarray, streak_px: np.ndarray
-) -> _Fitted | None:
-    placed = _place(image, lens, target, quad_px, streak_px)
-    return None if placed is None else _fitted(*placed)
-
-
 def _fitted(M0: np.ndarray, pixels: np.ndarray, window: Any) -> _Fitted:
     streak_px = float(np.hypot(*window.motion_px))
     instants = min(max(math.ceil(streak_px / _INSTANT_PX), 1), _MOST_INSTANTS)
@@ -196,8 +191,7 @@ def _best(fits: Sequence[_Fitted]) -> _Fitted:
     count = len(fits[0].pixels)
     residual = np.stack([one.fit.residual[:count] for one in fits])
     scale = max(float(np.nanmin([one.fit.noise for one in fits])), 1.0)
-    off = residual**2 / scale**2
-    losses = np.sum(off / (1 + off / _BOUND), axis=1)
+    losses = np.sum(bounded_loss(residual / scale)[0], axis=1)
     return fits[int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))]
 
 
@@ -246,12 +240,9 @@ def _place(
     cells = marker_cells(target.family, target.marker_id)
     M0 = homography(lens.rays(quad_px)[0].T)
     pixels = pixels_around(image.shape, M0, lens, mean_side_px(quad_px) / len(cells))
-    count = len(pixels)
-    if count < _LEAST_PIXELS:
+    if len(pixels) < _LEAST_PIXELS:
         return None
-    # Scattered, so that the first quarter of them shows the whole marker too.
-    order = np.argsort((pixels @ np.array([12.9898, 78.233]) * 43758.5453) % 1.0, kind="stable")
-    pixels = pixels[order][: _LANES[-1]]
+    pixels = scattered(pixels)[: _LANES[-1]]
     count = len(pixels)
     lanes = np.minimum(np.arange(next(n for n in _LANES if n >= count)), count - 1)
     rays, rays_px = lens.rays(pixels)
@@ -289,20 +280,12 @@ def _judge(target: Target, lens: Lens, found: _Fitted, start_px: np.ndarray) -> 
     side_px = mean_side_px(start_px)
     if not np.all(np.linalg.norm(corners_px - start_px, axis=1) < max(3.0, 0.5 * side_px)):
         return None
-    count = len(pixels)
-    explained, ratio = float(fit.explained), float(fit.log_likelihood_ratio)
-    if not explained >= _LEAST_EXPLAINED:
+    if not fit.explained >= _LEAST_EXPLAINED:
         return None
-    cell_px = mean_side_px(corners_px) / len(window.K)
-    clear = window.used[:count]
-    shown = ~blank_pixels(pixels, clear, cell_px)
-    advantage = code_advantage(target.family, target.marker_id, fit, window, shown)
-    everywhere = np.ones(count, bool)
-    in_all = code_advantage(target.family, target.marker_id, fit, window, everywhere)
-    if not (advantage >= _LEAST_ADVANTAGE and in_all >= _LEAST_IN_ALL):
+    advantage = code_advantage(target.family, target.marker_id, fit, window, len(pixels))
+    if not advantage >= _LEAST_ADVANTAGE:
         return None
-    _, paper_px = on_paper(M, *lens.rays(corners_px))
-    motion = -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
+    motion = corner_motion(M, lens, corners_px)
     covariance = noise_correlation(pixels, fit) * np.asarray(fit.covariance, float)
     covariance = motion @ (covariance + covariance.T) @ motion.T / 2
     covariance = covariance + _model_sigma_px(fit, side_px) ** 2 * np.eye(8)
@@ -312,6 +295,6 @@ def _judge(target: Target, lens: Lens, found: _Fitted, start_px: np.ndarray) -> 
     if streak_px @ np.asarray(target.streak_px) < 0:
         streak_px = -streak_px
     return Track(
-        target.family, target.marker_id, corners_px, covariance, streak_px, explained, advantage,
-        ratio,
+        target.family, target.marker_id, corners_px, covariance, streak_px,
+        float(fit.explained), advantage, float(fit.log_likelihood_ratio),
     )  # fmt: skip

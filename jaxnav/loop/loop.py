@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxnav.detection.observe import marker_keys
 from jaxnav.loop.expect import Expected, expect_corners
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -123,6 +124,7 @@ class Loop:
         self._expectation: tuple[_Belief, Expected, np.ndarray | None] | None = None  # of it
         dtype = np.asarray(pilot.navigator.corner_sigma_px).dtype
         self._min_covariance = _MIN_COVARIANCE.astype(dtype)
+        self._keys = marker_keys(pilot.navigator.markers)
         # Compiled now: the threads that look for markers are watched.
         self._expected(np.array([1, 0, 0, 0, 0, 0, 0], dtype), self._min_covariance)
 
@@ -256,10 +258,8 @@ class Loop:
             expected = self._expected(belief.wxyz_xyz, belief.covariance)
             known = self._expectation = belief, expected, self._flow_px_s(belief, expected)
         quads_px, visible, radius_px = (np.asarray(part)[camera] for part in known[1])
-        markers = self.pilot.navigator.markers
-        keys = tuple(zip(markers.families, map(int, markers.ids), strict=True))
         flow_px_s = None if known[2] is None else known[2][camera][visible]
-        seen = tuple(key for key, sees in zip(keys, visible, strict=True) if sees)
+        seen = tuple(key for key, sees in zip(self._keys, visible, strict=True) if sees)
         return Region(quads_px[visible], radius_px[visible], seen, flow_px_s, belief.now_ns)
 
     def _flow_px_s(self, belief: "_Belief", expected: Expected) -> np.ndarray | None:

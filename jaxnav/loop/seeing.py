@@ -115,14 +115,15 @@ class Search:
             return FrameDetections(self._camera, frame.stamp_ns, None, Fault.FRAME_FROZEN)
         self._since_whole += 1
         detections = _NONE
-        if region is not None and self._since_whole < WHOLE_EVERY:
+        near = region is not None and self._since_whole < WHOLE_EVERY
+        if region is not None and near:
             if not len(region.quads_px):
                 return FrameDetections(self._camera, frame.stamp_ns, _NONE)
             detections = self._followed(frame, region, self._near(frame.image, region))
         if not len(detections):
             self._since_whole = 0
             detections = self._everywhere(frame.image, region)
-            if region is not None:
+            if region is not None and not near:  # else none of them could be followed just now
                 detections = self._followed(frame, region, detections)
         return FrameDetections(self._camera, frame.stamp_ns, detections)
 

@@ -1,7 +1,7 @@
 """Checks of vehicle and route: do they fit each other, and are markers seen along the route?"""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -65,13 +65,8 @@ def vehicle_file(vehicle: Vehicle | TwistBase) -> Iterator[Finding]:
             "drive a circle at full lock: calib/README.md says how its radius gives the limit",
         ),
     ]
-    for wrong, what, do in problems:
-        if wrong:
-            yield warning(what, do)
-    if not any(wrong for wrong, _, _ in problems):
-        yield ok(
-            f"{top_mps:.2g} m/s at full throttle, turns within {turning_radius_m(vehicle):.2f} m"
-        )
+    good = f"{top_mps:.2g} m/s at full throttle, turns within {turning_radius_m(vehicle):.2f} m"
+    yield from _judged(problems, good)
 
 
 def _base_file(base: TwistBase) -> Iterator[Finding]:
@@ -95,11 +90,17 @@ def _base_file(base: TwistBase) -> Iterator[Finding]:
             "it is the time in s until 63 % of a commanded speed is reached",
         ),
     ]
+    good = f"{top_mps:.2g} m/s and {math.degrees(turn_radps):.0f} deg/s at most"
+    yield from _judged(problems, good)
+
+
+def _judged(problems: Sequence[tuple[bool, str, str]], good: str) -> Iterator[Finding]:
+    """A warning for each figure that is wrong, with what to do; else what is good."""
     for wrong, what, do in problems:
         if wrong:
             yield warning(what, do)
     if not any(wrong for wrong, _, _ in problems):
-        yield ok(f"{top_mps:.2g} m/s and {math.degrees(turn_radps):.0f} deg/s at most")
+        yield ok(good)
 
 
 def route_file(route: Route, vehicle: Vehicle | TwistBase, markers: MarkerMap) -> Iterator[Finding]:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.detection import Detections, Detector, Tracker, observe
+from jaxnav.detection.observe import marker_keys
 from jaxnav.errors import BadInput
 from jaxnav.files import (
     Params,
@@ -149,8 +150,10 @@ class RenderedCameras:
         expected: np.ndarray,
     ) -> list[Detections]:
         """The detections of each camera, with the expected markers that were followed."""
-        markers, followed = self.world.setup.markers, list(detections)
-        keys = list(zip(markers.families, map(int, markers.ids), strict=True))
+        followed = list(detections)
+        if not self.trackers:
+            return followed
+        keys = marker_keys(self.world.setup.markers)
         flow_px_s, ahead_s, now = None, 0.0, (self._stamp_s, predicted_px)
         if self._before is not None and self._before[0] < self._stamp_s:
             moved_px = np.mean(predicted_px - self._before[1], axis=-2)
