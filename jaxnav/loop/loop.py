@@ -118,6 +118,7 @@ class Loop:
         self._now_ns, self._clock = now_ns, StandingClock()
         self._outcome: Outcome | None = None
         self._odometry_ns: int | None = None
+        self._due_ns = 0  # when the odometer is read next
         # Frames without markers, kept for the next tick.
         self._blank: tuple[FrameDetections, ...] = ()
         self._belief: _Belief | None = None
@@ -144,8 +145,7 @@ class Loop:
 
     def _driven(self, duration_s: float, until_arrival: bool) -> str:
         ending = self._vehicle if isinstance(self._vehicle, Ending) else None
-        begin_ns = self._now_ns()
-        due_ns = begin_ns
+        begin_ns = self._due_ns = self._now_ns()
         arrived_ns: int | None = None
         self.guard.arm()
         self.guard.beat(_THREAD)
@@ -153,13 +153,10 @@ class Loop:
             now_ns = self._now_ns()
             if self._clock.stands(now_ns):
                 self._hold()
-            if now_ns >= due_ns:
-                late = now_ns - due_ns > self._period_ns
-                self._tick(Fault.DEADLINE_MISSED if late else Fault(0))
-                self.statistics.deadlines_missed += late
-                due_ns = max(due_ns + self._period_ns, now_ns)
+            self._tick_if_due()
             for group in self._sighted():
                 self._handle(Input(self._now_ns(), frames=group, faults=self._failures()))
+                self._tick_if_due()  # frames that have waited must not keep the odometer waiting
             self.guard.beat(_THREAD)
             if (now_ns - begin_ns) / 1e9 > duration_s:
                 return "time is over"
@@ -169,7 +166,7 @@ class Loop:
                 arrived_ns = arrived_ns or now_ns
                 if now_ns - arrived_ns > _STAYS_S * 1e9:
                     return "arrived"
-            self._eyes.wait((due_ns - self._now_ns()) / 1e9)
+            self._eyes.wait((self._due_ns - self._now_ns()) / 1e9)
         self.stopped = True
         return self.guard.reason or "stopped"
 
@@ -177,6 +174,15 @@ class Loop:
         """Command no speed while the clock stands: no input comes, and the guard waits for none."""
         limits, outcome = self.pilot.limits, self._outcome
         self.guard.write(*limits.standing(limits.zero if outcome is None else outcome.command))
+
+    def _tick_if_due(self) -> None:
+        now_ns = self._now_ns()
+        if now_ns < self._due_ns:
+            return
+        late = now_ns - self._due_ns > self._period_ns
+        self._tick(Fault.DEADLINE_MISSED if late else Fault(0))
+        self.statistics.deadlines_missed += late
+        self._due_ns = max(self._due_ns + self._period_ns, now_ns)
 
     def _tick(self, faults: Fault) -> None:
         frames, self._blank = self._blank, ()

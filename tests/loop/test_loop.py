@@ -269,6 +269,37 @@ def test_a_drive_that_the_guard_ends_was_stopped(standing):
         assert drive.loop.stopped
 
 
+class Backlog:
+    """Eyes that bring five images at once, each of another instant."""
+
+    def start(self):
+        self.seen = [seen(0, 1 + index, 1) for index in range(5)]
+
+    def take(self):
+        now, self.seen = self.seen, []
+        return now
+
+    def wait(self, timeout_s):
+        pass
+
+
+def test_images_that_have_waited_do_not_keep_the_odometer_waiting(standing):
+    """Each takes the pilot 30 ms, and the odometer is read every 20."""
+    now_ns = [10**9]
+    car = Recorded()
+    loop = Loop(standing, Guard(car, standing.limits), car, Backlog(), now_ns=lambda: now_ns[0])
+
+    def handle_for_a_while():
+        now_ns[0] += 30_000_000
+
+    standing.act, car.over = handle_for_a_while, "the recording is over"
+    standing.handled.clear()
+    assert loop.run(10.0) == "the recording is over"
+    loop.guard.close()
+    kinds = ["frame" if given.frames else "odometer" for given in standing.handled]
+    assert kinds == ["odometer", *["frame", "odometer"] * 5]
+
+
 def found(count, shift=0.0):
     corners = np.tile([[0.0, 0], [9, 0], [9, 9], [0, 9]], (count, 1, 1)) + shift
     return Detections(
