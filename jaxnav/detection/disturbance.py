@@ -1,12 +1,15 @@
 """What disturbs the picture of a marker: the edge of a shadow across it, and what hides a part."""
 
 import math
+from typing import Any
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.detection.pattern_fit import PatternFit, bounded_loss
+from jaxnav.detection.paper import library
+from jaxnav.detection.pattern_fit import bounded_loss
 
 _ANGLES, _OFFSETS = 16, 9
 _SOFT = (0.03, 0.12, 0.3)  # widths of a penumbra, half sides
@@ -15,10 +18,15 @@ _GAINS = (0.15, 0.9)  # of a shadow's light, over that beside it
 _BETTER = 0.75  # a shadow must lower the loss to this part
 _PIXELS = 256  # that are compared
 _HIDDEN = 3.5  # standard deviations
+_GRID = 192  # pixels along a side: of a marker of 120 px, turned
 
 
 def find_shadow(
-    xy: Float[np.ndarray, "2 N"], levels: Float[np.ndarray, " N"], fit: PatternFit
+    xy: Float[np.ndarray, "2 N"],
+    levels: Float[np.ndarray, " N"],
+    marker: Float[np.ndarray, " N"],
+    residual: Float[np.ndarray, " N"],
+    scale: float,
 ) -> Float[np.ndarray, " N"] | None:
     """Where the light is, 1, and where a shadow, 0; None if no straight edge explains the pixels.
 
@@ -28,11 +36,12 @@ def find_shadow(
     Args:
         xy: places of the pixels on the paper.
         levels: grey levels of the pixels.
-        fit: a fit of the marker without a shadow, whose arrays may be longer than the pixels.
+        marker: the levels of a fit of the marker without a shadow.
+        residual: of that fit.
+        scale: its noise, grey levels.
     """
     within = np.flatnonzero(np.all(np.abs(xy) < 1.1, axis=0))[:_PIXELS]
-    marker, levels, at = np.asarray(fit.marker, float)[within], levels[within], xy[:, within]
-    scale = float(fit.noise) + 0.02 * float(fit.contrast)
+    marker, levels, at = marker[within], levels[within], xy[:, within]
 
     def losses(lines: np.ndarray) -> np.ndarray:
         """Loss (L,) of each line (angle, offset, softness), (L, 3)."""
@@ -50,7 +59,7 @@ def find_shadow(
         gain = shade / np.maximum(light, 1e-6)
         return np.where((gain > _GAINS[0]) & (gain < _GAINS[1]), np.sum(loss, axis=1), np.inf)
 
-    without = float(np.sum(bounded_loss(np.asarray(fit.residual, float)[within] / scale)[0]))
+    without = float(np.sum(bounded_loss(residual[within] / scale)[0]))
     angles = np.arange(_ANGLES) * 2 * math.pi / _ANGLES
     offsets = np.linspace(-0.8, 0.8, _OFFSETS)
     lines = np.stack(np.meshgrid(angles, offsets, _SOFT[:1]), axis=-1).reshape(-1, 3)
@@ -76,36 +85,46 @@ def _lit(xy: np.ndarray, lines: np.ndarray) -> np.ndarray:
     return np.asarray(1 / (1 + np.exp(-np.clip(beside / soft, -30, 30))))
 
 
-def clear_pixels(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> Bool[np.ndarray, " N"]:
+def clear_pixels(
+    pixels: Int[np.ndarray, "N 2"], residual: Float[np.ndarray, " N"]
+) -> Bool[np.ndarray, " N"]:
     """Which pixels show the marker: those that fit, and have no neighbour that does not.
 
     At the edge of what hides a marker pixels are mixed and may fit by chance. A pixel that does not
     fit, and has no neighbour that does not either, is noise and hides nothing.
+
+    Args:
+        residual: of each pixel, over the noise.
     """
-    residual = np.asarray(fit.residual, float)[: len(pixels)]
-    grid, at = _on_grid(pixels, np.abs(residual) > _HIDDEN * float(fit.noise), _spacing(pixels))
+    grid, at = _on_grid(pixels, np.abs(residual) > _HIDDEN, _spacing(pixels))
     lumps = grid * ((_neighbours(grid) > 0) | (grid > 1))
     return np.asarray((lumps + _neighbours(lumps))[at] == 0)
 
 
-def noise_correlation(pixels: Int[np.ndarray, "N 2"], fit: PatternFit) -> float:
+def noise_correlation(
+    pixels: Float[Array, "N 2"],
+    residual: Float[Array, " N"],
+    share: Float[Array, " N"],
+) -> Float[Array, ""]:
     """The factor of the variances by which the noise of neighbouring pixels is alike, at least 1.
 
     Sensors have white noise, but what makes colours of a raw picture or compresses it does not
     keep it so: the sum of a residual's correlations with its eight neighbours and itself.
+
+    Args:
+        residual: of each pixel, in its standard deviations.
+        share: by how much a pixel counts, 0 to 1.
     """
-    count = len(pixels)
-    fits = np.asarray(fit.weight, float)[:count] > 0.5
-    deviation = np.asarray(fit.deviation, float)[:count]
-    # Where the ground beyond the paper shows, residuals are alike, and count little in the fit.
-    share = fits * float(fit.noise) / deviation
-    residual = share * np.asarray(fit.residual, float)[:count] / deviation
-    (grid, at), (shares, _) = _on_grid(pixels, residual), _on_grid(pixels, share)
-    variance = float(residual @ residual) / max(float(share @ share), 1e-9)
-    pairs = float(_neighbours(shares)[at] @ share)
-    if not (pairs > 0 and variance > 0):
-        return 1.0
-    return max(1.0, 1 + 8 * float(_neighbours(grid)[at] @ residual) / pairs / variance)
+    column, row = jnp.rint(pixels - jnp.min(pixels, axis=0)[None]).astype(int).T + 1
+    grids = jnp.zeros((_GRID, _GRID, 2), residual.dtype)
+    grids = grids.at[column, row].add(jnp.stack([share * residual, share], axis=1), mode="drop")
+    beside, shares = _neighbours(grids)[column, row].T
+    pairs = jnp.sum(shares * share)
+    product, square = (jnp.sum(share * residual * other) for other in (beside, share * residual))
+    found = (pairs > 0) & (square > 0)
+    variance = square / jnp.maximum(jnp.sum(share**2), 1e-9)
+    factor = 1 + 8 * product / jnp.where(found, pairs * variance, 1)
+    return jnp.where(found, jnp.maximum(factor, 1), 1)
 
 
 def _spacing(pixels: np.ndarray) -> float:
@@ -124,7 +143,9 @@ def _on_grid(
     return grid, (column, row)
 
 
-def _neighbours(grid: np.ndarray) -> np.ndarray:
-    """The sum of the eight neighbours of each place of a grid with an empty border."""
-    rows = grid + np.roll(grid, 1, axis=0) + np.roll(grid, -1, axis=0)
-    return np.asarray(rows + np.roll(rows, 1, axis=1) + np.roll(rows, -1, axis=1) - grid)
+def _neighbours(grid: Any) -> Any:
+    """The sum of the eight neighbours of each place of a grid (NumPy's or JAX's) with an empty
+    border."""
+    roll = library(grid).roll
+    rows = grid + roll(grid, 1, axis=0) + roll(grid, -1, axis=0)
+    return rows + roll(rows, 1, axis=1) + roll(rows, -1, axis=1) - grid

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnav.detection.paper import blur_on_paper, generators, on_paper
+from jaxnav.detection.paper import Numbers, blur_on_paper, generators, library, on_paper
 from jaxnav.numerics.small_matrices import eliminate
 
 PIXEL_VARIANCE_PX2 = 1 / 12  # of a square
@@ -172,26 +172,25 @@ def beyond_paper(
 
 
 def cell_shares(
-    M: Float[np.ndarray, "3 3"],
-    rays: Float[np.ndarray, "3 N"],
-    rays_px: Float[np.ndarray, "2 3 N"],
-    blur_px2: Float[np.ndarray, " 3"],
-    cells: int,
-) -> Float[np.ndarray, "cells N"]:
-    """The share of each pixel's light that comes from each cell, (cells * cells, N), in NumPy.
+    M: Numbers, rays: Numbers, rays_px: Numbers, blur_px2: Numbers, cells: int
+) -> Numbers:
+    """The share of each pixel's light that comes from each cell, (cells * cells, N).
+
+    Accepts NumPy and JAX arrays, see `on_paper`.
 
     Args:
-        blur_px2: xx, xy, yy of the lens's and the motion's blur.
+        blur_px2: (3,), xx, xy, yy of the lens's and the motion's blur.
         cells: along a side.
     """
+    numbers = library(rays)
     xy, xy_px = on_paper(M, rays, rays_px)
-    pixel_px2 = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])
+    pixel_px2 = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2], xy.dtype)
     variance = blur_on_paper(xy_px, blur_px2 + pixel_px2)[:2]
-    knots = np.linspace(-1, 1, cells + 1)[:, None]
+    knots = np.linspace(-1, 1, cells + 1, dtype=xy.dtype)[None, :, None]
     # A logistic curve is within 0.01 of the Gaussian integral: enough to read cells.
-    z = np.clip((xy[:, None] - knots) / np.sqrt(variance)[:, None], -20, 20)
-    columns, rows = -np.diff(1 / (1 + np.exp(-1.702 * z)), axis=1)
-    return np.asarray((rows[:, None] * columns[None]).reshape(cells * cells, -1))
+    z = numbers.clip((xy[:, None] - knots) / numbers.sqrt(variance)[:, None], -20, 20)
+    columns, rows = -numbers.diff(1 / (1 + numbers.exp(-1.702 * z)), axis=1)
+    return (rows[:, None] * columns[None]).reshape(cells * cells, -1)
 
 
 def gauss(z: Array) -> tuple[Array, Array]:

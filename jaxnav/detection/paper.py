@@ -37,7 +37,7 @@ def generators(xy: Numbers) -> Numbers:
 
     D is taken by rows, without its last entry.
     """
-    numbers = _library(xy)
+    numbers = library(xy)
     x, y = xy
     zero, one = numbers.zeros_like(x), numbers.ones_like(x)
     along_x = [x, y, one, zero, zero, zero, -x * x, -x * y]
@@ -56,25 +56,54 @@ def blur_on_paper(xy_px: Numbers, S: Numbers) -> Numbers:
     xx = a * a * S[0] + 2 * a * b * S[1] + b * b * S[2]
     yy = c * c * S[0] + 2 * c * d * S[1] + d * d * S[2]
     xy = a * c * S[0] + (a * d + b * c) * S[1] + b * d * S[2]
-    return _library(xy_px).stack([xx, yy, xy])
+    return library(xy_px).stack([xx, yy, xy])
 
 
-def homography(rays: Float[np.ndarray, "4 3"]) -> Float[np.ndarray, "3 3"]:
+def homography(rays: Numbers) -> Numbers:
     """The homography M (3, 3) that takes the corner rays (4, 3), TL TR BR BL, to the paper."""
-    M = _basis(np.column_stack([SQUARE, np.ones(4)])) @ np.linalg.inv(_basis(rays))
+    corners = np.column_stack([SQUARE, np.ones(4)]).astype(rays.dtype)
+    M = _basis(library(rays).asarray(corners)) @ _inverse(_basis(rays))
     return M / (M @ rays.mean(axis=0))[2]
 
 
-def rays_of(M: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+def rays_of(M: Numbers, xy: Float[np.ndarray, "N 2"]) -> Numbers:
     """Rays (N, 3) through points (N, 2) on the paper."""
-    return np.linalg.solve(M, np.vstack([xy.T, np.ones(len(xy))])).T
+    return (_inverse(M) @ np.vstack([xy.T, np.ones(len(xy))]).astype(M.dtype)).T
 
 
-def _basis(points: np.ndarray) -> np.ndarray:
+def corner_motion(M: Numbers, rays: Numbers, rays_px: Numbers) -> Numbers:
+    """Derivatives (8, 8) of the corners' pixels, u and v of each in turn, by D, when M becomes
+    (I + D) M.
+
+    A corner's pixel moves so that its ray stays on the corner while the paper moves.
+
+    Args:
+        rays: (3, 4), of the corners, TL TR BR BL.
+        rays_px: (2, 3, 4), their derivatives by pixel.
+    """
+    numbers = library(M)
+    (a, c), (b, d) = on_paper(M, rays, rays_px)[1][..., None, :]
+    by_x, by_y = generators(numbers.asarray(SQUARE.T.astype(M.dtype)))
+    det = a * d - b * c
+    by_D = numbers.stack([(d * by_x - b * by_y) / det, (a * by_y - c * by_x) / det])
+    return -by_D.transpose(2, 0, 1).reshape(8, 8)
+
+
+def _basis(points: Numbers) -> Numbers:
     # Takes the unit vectors and (1, 1, 1) to the four points, up to scale.
     first = points[:3].T
-    return first * np.linalg.solve(first, points[3])
+    return first * (_inverse(first) @ points[3])[None]
 
 
-def _library(array: Numbers) -> Any:
+def _inverse(A: Numbers) -> Numbers:
+    """The inverse of a matrix (3, 3), not finite where it has none."""
+    if isinstance(A, np.ndarray):
+        return np.linalg.inv(A)
+    a, b, c = A.T
+    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
+    return rows / (rows[0] @ a)
+
+
+def library(array: Numbers) -> Any:
+    """`jax.numpy` for a JAX array, `numpy` for another."""
     return jnp if isinstance(array, jax.Array) else np

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.compiling.executables import kept
 from jaxnav.detection.image_model import Exposure, cell_disagreement, expose, ridged
 from jaxnav.detection.paper import on_paper
 from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
@@ -74,9 +73,8 @@ class Unknowns(NamedTuple):
 class PatternFit(NamedTuple):
     """The result of a fit, in paper coordinates."""
 
-    M: Float[Array, "3 3"]
-    motion_px: Float[Array, " 2"]
-    lens_px2: Float[Array, ""]
+    y: Unknowns
+    xy: Float[Array, "2 N"]  # places of the pixels on the paper
     covariance: Float[Array, "8 8"]  # of D in (I + D) M, by rows without the last entry
     noise: Float[Array, ""]  # standard deviation of the pixels that fit, grey levels
     contrast: Float[Array, ""]  # white minus black, grey levels
@@ -96,7 +94,7 @@ class _PatternLM(NielsenLM):
     """Steps of D, motion, lens and light, damped in proportion to what is known of each."""
 
     rtol: float = 1e-6
-    atol: float = 1e-2
+    atol: float = 0.1  # of the sum of squares: a tenth of a standard deviation and less each
     initial_damping: float = 1e-3
     norm: Callable[[Any], Float[Array, ""]] = optx.max_norm
 
@@ -121,26 +119,39 @@ class _PatternLM(NielsenLM):
         )
 
 
-@kept
-def fit_pattern(window: Window, instants: Int[Array, ""]) -> PatternFit:
-    """Fit a window from M = I and the expected motion, in float32 in any process.
+def first_guess(window: Window) -> Unknowns:
+    """M = I, the expected motion, and no light yet."""
+    dtype = window.levels.dtype
+    return Unknowns(
+        jnp.eye(3, dtype=dtype),
+        window.motion_px,
+        jnp.asarray(_LENS_PX2, dtype),
+        jnp.zeros(_LIGHTS, dtype),
+    )
+
+
+def fit_pattern(
+    window: Window, start: Unknowns, is_far: bool, instants: Int[Array, ""]
+) -> PatternFit:
+    """Fit a window.
 
     Args:
+        start: where the steps begin.
+        is_far: whether the start may be a pixel off and knows no light: a wide loss comes first.
         instants: number of images that are averaged, see `expose`.
     """
-    start = Unknowns(
-        jnp.eye(3, dtype=window.levels.dtype),
-        window.motion_px,
-        jnp.asarray(_LENS_PX2, window.levels.dtype),
-        jnp.zeros(_LIGHTS, window.levels.dtype),
-    )
     coarse = window.most_noise
     few = _first(window, window.levels.shape[0] // _COARSER)
-    y = start._replace(light=_first_light(start, few, instants))
-    y = _minimum(y, few, coarse * jnp.ones_like(few.levels), instants, _COARSE_STEPS)
+
+    def nearer() -> Unknowns:
+        half = (instants + 1) // 2
+        y = start._replace(light=_first_light(start, few, half))
+        return _minimum(y, few, coarse * jnp.ones_like(few.levels), half, _COARSE_STEPS)
+
+    y = nearer() if is_far else start
     residual, _, image = _model(y, window, instants)
     noise = jnp.maximum(_spread(residual, window.used, coarse), _LEAST_NOISE)
-    y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS)
+    y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS, _SLOPE)
     return _result(y, window, instants)
 
 
@@ -162,8 +173,20 @@ def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " 
 
 
 def _minimum(
-    y: Unknowns, window: Window, scale: Float[Array, " N"], instants: Int[Array, ""], steps: int
+    y: Unknowns,
+    window: Window,
+    scale: Float[Array, " N"],
+    instants: Int[Array, ""],
+    steps: int,
+    slope: float = 1.0,
 ) -> Unknowns:
+    """The unknowns at the least loss.
+
+    Args:
+        slope: mean slope of the score over the mean weight. With it steps are Newton's; with the
+            weights alone each is a part of the way, 0.73 of it.
+    """
+
     def cost(y: Any, args: Any) -> tuple[Any, Any]:
         del args
         residual, J, _ = _model(y, window, instants)
@@ -171,7 +194,7 @@ def _minimum(
         weighted = J * (weight / scale**2)[None]
         prior, prior_J = _prior(y, window)
         return jnp.concatenate([jnp.sqrt(loss), prior]), NormalEquations(
-            weighted @ J.T + prior_J.T @ prior_J, -weighted @ residual + prior_J.T @ prior
+            slope * (weighted @ J.T) + prior_J.T @ prior_J, -weighted @ residual + prior_J.T @ prior
         )
 
     solver = _PatternLM()
@@ -249,11 +272,12 @@ def _spread(residual: Array, used: Array, most: Array) -> Array:
         most: an upper bound. Residuals beyond three times what is found are left out, twice, so
             that what hides a third of the marker does not count as noise.
     """
-    size = jnp.abs(residual)
+    size = jnp.sort(jnp.where(used, jnp.abs(residual), jnp.inf))
     spread = most
     for _ in range(3):
-        near = used & (size < 3 * spread)
-        spread = jnp.minimum(1.4826 * jnp.nanmedian(jnp.where(near, size, jnp.nan)), most)
+        near = jnp.sum(size < 3 * spread)
+        middle = (size[(near - 1) // 2] + size[near // 2]) / 2
+        spread = jnp.minimum(1.4826 * middle, most)
     return jnp.where(jnp.isfinite(spread), spread, most)
 
 
@@ -287,9 +311,8 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit
     plain = _plain(basis[:3], window, scale)
     without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
     return PatternFit(
-        y.M, y.motion_px, y.lens_px2, covariance[:8, :8], noise, light[3], weight, residual,
-        light[:6] @ basis[:6], white, darkens, light[8], scale, ratio, 1 - with_marker / without,
-        (without - with_marker) / 2,
+        y, xy, covariance[:8, :8], noise, light[3], weight, residual, light[:6] @ basis[:6], white,
+        darkens, light[8], scale, ratio, 1 - with_marker / without, (without - with_marker) / 2,
     )  # fmt: skip
 
 

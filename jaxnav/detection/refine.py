@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges
 from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.lens import Lens
-from jaxnav.detection.paper import SQUARE, generators, homography, on_paper, rays_of
+from jaxnav.detection.paper import SQUARE, corner_motion, homography, rays_of
 
 # Markers up to this side are fitted whole, of larger ones the outline. Where levels may be coded,
 # the edges of all cells go with it: a curve of the levels and an outline's size look alike.
@@ -92,7 +92,7 @@ def refine_corners(
     )
     if not good:
         return failed
-    motion = corner_motion(fitted.M, lens, fitted_px)
+    motion = corner_motion(fitted.M, *lens.rays(fitted_px))
     variance_px2 = np.einsum("ij,jk,ik->i", motion, np.asarray(fit.covariance, float), motion)
     sigma_px = np.sqrt(variance_px2.reshape(4, 2).mean(axis=1) + _MODEL_SIGMA_PX**2)
     return RefinedMarker(fitted_px, sigma_px, float(fit.noise / fit.contrast), True, fitted)
@@ -132,17 +132,6 @@ def fit_marker(
 def mean_side_px(corners_px: Float[np.ndarray, "4 2"]) -> float:
     """Mean length of the four sides of a quadrilateral (4, 2), px."""
     return float(np.mean(np.linalg.norm(corners_px - np.roll(corners_px, 1, 0), axis=1)))
-
-
-def corner_motion(
-    M: Float[np.ndarray, "3 3"], lens: Lens, corners_px: Float[np.ndarray, "4 2"]
-) -> Float[np.ndarray, "8 8"]:
-    """Derivatives of the corners' pixels, u and v of each in turn, by D, when M becomes (I + D) M.
-
-    A corner's pixel moves so that its ray stays on the corner while the paper moves.
-    """
-    _, paper_px = on_paper(M, *lens.rays(corners_px))
-    return -np.linalg.solve(paper_px.T, generators(SQUARE.T).transpose(2, 0, 1)).reshape(8, 8)
 
 
 def corners_of(M: Float[np.ndarray, "3 3"], lens: Lens) -> Float[np.ndarray, "4 2"]:

@@ -1,6 +1,7 @@
 """First place of a known marker near where it is expected: correlation with its blurred picture."""
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -60,6 +61,7 @@ def best_match(
     return best if best is not None and best.correlation > _LEAST_MATCH else None
 
 
+@cache
 def _printed(family: str, marker_id: int) -> np.ndarray:
     cells = np.pad(marker_cells(family, marker_id), 1, constant_values=1.0)
     return np.kron(cells, np.ones((_TEXELS, _TEXELS))).astype(np.float32)

@@ -98,7 +98,7 @@ class Search:
         self._near(image, region)
         self._everywhere(image, region)
         if self.tracker is not None:
-            warm_up_tracks(self._model)
+            warm_up_tracks(self._model, sorted({one.family for one in self._detectors}))
 
     def look(self, frame: Frame, region: Region | None) -> FrameDetections:
         """Search a frame for markers.

@@ -132,15 +132,6 @@ def test_an_exposure_is_the_mean_of_still_images():
     assert np.max(np.abs(np.mean(still, axis=0) - image(quad_px, motion_px, 12))) < 0.005
 
 
-class Fit:
-    """What is asked of a fit by those who look for disturbances."""
-
-    def __init__(self, levels, residual, noise, contrast):
-        self.marker, self.residual = levels, residual
-        self.noise, self.contrast = np.array(noise), np.array(contrast)
-        self.weight, self.deviation = np.ones(len(residual)), np.full(len(residual), noise)
-
-
 def test_the_edge_of_a_shadow_is_found_and_none_where_there_is_none():
     rng = np.random.default_rng(3)
     xy = rng.uniform(-1, 1, (2, 400))
@@ -148,10 +139,10 @@ def test_the_edge_of_a_shadow_is_found_and_none_where_there_is_none():
     beside = np.cos(0.7) * xy[0] + np.sin(0.7) * xy[1] - 0.15
     noise = rng.normal(0, 3, 400)
     shaded = levels * np.where(beside > 0, 1.0, 0.45) + noise
-    lit = find_shadow(xy, shaded, Fit(levels, shaded - levels, 3.0, 140.0))
+    lit = find_shadow(xy, shaded, levels, shaded - levels, 5.8)
     assert lit is not None
     assert np.mean((lit > 0.5) == (beside > 0)) > 0.97
-    assert find_shadow(xy, levels + noise, Fit(levels, noise, 3.0, 140.0)) is None
+    assert find_shadow(xy, levels + noise, levels, noise, 5.8) is None
 
 
 def test_noise_that_neighbours_share_counts_more_than_once():
@@ -162,7 +153,8 @@ def test_noise_that_neighbours_share_counts_more_than_once():
     smooth = white + np.roll(white, 1, 0) + np.roll(white, 1, 1) + np.roll(white, (1, 1), (0, 1))
     for noise, low, high in ((white, 1.0, 1.5), (smooth, 2.5, 4.5)):
         residual = noise[:20, :20].ravel()
-        factor = noise_correlation(pixels, Fit(residual, residual, np.std(residual), 100.0))
+        parts = pixels.astype(float), residual / np.std(residual), np.ones(len(residual))
+        factor = float(noise_correlation(*(jnp.asarray(part) for part in parts)))
         assert low <= factor < high
 
 

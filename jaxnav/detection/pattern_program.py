@@ -1,0 +1,136 @@
+"""The compiled program that follows one marker: from raw pixels to corners and what decides.
+
+One call for everything, from the rays through the pixels to the comparison with other codes: each
+array that crosses between NumPy and JAX, and each call, takes tens of microseconds.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.compiling.executables import kept
+from jaxnav.detection.codes import code_advantage
+from jaxnav.detection.disturbance import noise_correlation
+from jaxnav.detection.paper import SQUARE, corner_motion, homography, on_paper, rays_of
+from jaxnav.detection.pattern_fit import Unknowns, Window, first_guess, fit_pattern
+from jaxnav.models.camera import Camera
+
+_ZONE = 1.1  # cells around the marker that count: its white zone is one wide
+
+
+class Patch(NamedTuple):
+    """The pixels around one marker's predicted place, padded to N, and what is expected there."""
+
+    pixels: Float[Array, "N 2"]
+    levels: Float[Array, " N"]
+    real: Bool[Array, " N"]  # which pixels are no padding
+    used: Bool[Array, " N"]  # which of them count in the fit
+    shadow: Float[Array, " N"]  # 1 in the light, 0 in the shadow
+    quad_px: Float[Array, "4 2"]  # about where the corners are
+    K: Float[Array, "k k"]  # `step_corners` of the marker
+    own: Int[Array, ""]  # which of the family's codes it is
+    motion_px: Float[Array, " 2"]  # the expected streak
+    motion_sigma_px: Float[Array, ""]
+    contrast: Float[Array, ""]  # about that of the marker, grey levels
+    most_noise: Float[Array, ""]  # standard deviation of pixels that fit, at most
+    instants: Int[Array, ""]  # see `expose`
+
+
+class Summary(NamedTuple):
+    """What a fit tells of its marker."""
+
+    corners_px: Float[Array, "4 2"]
+    covariance_px2: Float[Array, "8 8"]  # of the corners, u and v of each in turn
+    streak_px: Float[Array, " 2"]
+    noise: Float[Array, ""]  # standard deviation of the pixels that fit, grey levels
+    contrast: Float[Array, ""]  # white minus black, grey levels
+    weight: Float[Array, ""]  # mean weight of the pixels that count, 0 to 1
+    disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
+    explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
+    log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
+    advantage: Float[Array, ""]  # noise variances by which the nearest other code is worse
+    alike: Float[Array, ""]  # factor of the variances by which neighbours' noise is alike
+
+
+class PixelFit(NamedTuple):
+    """What a fit tells of each pixel."""
+
+    xy: Float[Array, "2 N"]  # places on the paper
+    residual: Float[Array, " N"]  # grey levels
+    marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
+    weight: Float[Array, " N"]
+
+
+class Followed(NamedTuple):
+    """A fit: what decides, each pixel's part, and where another fit of the marker may start."""
+
+    summary: Summary
+    pixels: PixelFit
+    unknowns: Unknowns
+
+
+@kept
+def follow_pattern(
+    camera: Camera | None,
+    patch: Patch,
+    codes: Float[Array, "codes cells"],
+    start: Unknowns | None = None,
+) -> Followed:
+    """Fit a patch in float32 in any process.
+
+    Args:
+        camera: makes edges straight in the world; without it, straight in the image.
+        codes: of the family, see `codes_of`.
+        start: the unknowns of an earlier fit of the same patch; None: the patch's quadrilateral.
+    """
+    rays, rays_px = _rays(camera, patch.pixels)
+    M0 = homography(_rays(camera, patch.quad_px)[0].T)
+    f32 = jnp.float32
+    rays, rays_px = (M0 @ rays).astype(f32), (M0[None] @ rays_px).astype(f32)
+    zone = 1 + 2 * _ZONE / (patch.K.shape[0] - 1)
+    near = jnp.all(jnp.abs(on_paper(jnp.eye(3, dtype=f32), rays, rays_px)[0]) < zone, axis=0)
+    window = Window(
+        rays, rays_px, patch.levels, patch.real & near, patch.used & near, patch.K, patch.shadow,
+        patch.motion_px, patch.motion_sigma_px, patch.contrast, patch.most_noise,
+    )  # fmt: skip
+    begin = first_guess(window) if start is None else start
+    fit = fit_pattern(window, begin, start is None, patch.instants)
+    M = fit.y.M.astype(M0.dtype) @ M0
+    rays_of_corners = rays_of(M, SQUARE)
+    corners_px = _pixels(camera, rays_of_corners)
+    motion = corner_motion(M, *_rays(camera, corners_px)).astype(f32)
+    share = jnp.where(fit.weight > 0.5, fit.noise / fit.deviation, 0)
+    alike = noise_correlation(patch.pixels, fit.residual / fit.deviation, share)
+    covariance = motion @ (alike * (fit.covariance + fit.covariance.T) / 2) @ motion.T
+    summary = Summary(
+        corners_px.astype(f32),
+        covariance,
+        fit.y.motion_px,
+        fit.noise,
+        fit.contrast,
+        jnp.sum(fit.weight) / jnp.maximum(jnp.sum(window.used), 1),
+        fit.disagreement,
+        fit.explained,
+        fit.log_likelihood_ratio,
+        code_advantage(fit, window, codes, patch.own, patch.instants),
+        alike,
+    )
+    return Followed(summary, PixelFit(fit.xy, fit.residual, fit.marker, fit.weight), fit.y)
+
+
+def _rays(
+    camera: Camera | None, pixels: Float[Array, "N 2"]
+) -> tuple[Float[Array, "3 N"], Float[Array, "2 3 N"]]:
+    """Rays (3, N) through pixels, and their derivatives (2, 3, N), per px."""
+    if camera is None:
+        rays = jnp.concatenate([pixels.T, jnp.ones((1, len(pixels)), pixels.dtype)])
+        by_px = jnp.eye(3, dtype=pixels.dtype)[:2, :, None]
+        return rays, jnp.broadcast_to(by_px, (2, 3, len(pixels)))
+    pixels = pixels.astype(camera.focal_px.dtype)
+    return camera.unproject(pixels).T, jax.vmap(jax.jacfwd(camera.unproject))(pixels).T
+
+
+def _pixels(camera: Camera | None, rays: Float[Array, "N 3"]) -> Float[Array, "N 2"]:
+    return rays[:, :2] / rays[:, 2:] if camera is None else camera.project(rays)
