@@ -82,16 +82,15 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
     obs = worlds.observe(
         off_rig(), worlds.paper_markers(), worlds.planar(*VIEW), jnp.asarray(noise_px)
     )
-    snapshot = Snapshot.create(off_rig(), worlds.paper_markers(), obs, 1.0)
+    snapshot = jax.jit(Snapshot.create)(off_rig(), worlds.paper_markers(), obs, 1.0)
     assert int(jnp.sum(snapshot.seen.visible)) == 2
     bank = bank_at(navigator, rng)
-    prior = navigator.motion.poses(bank)
+    prior = eqx.filter_jit(navigator.motion.poses)(bank)
     fit = jax.jit(fit_poses, static_argnums=6)(
         prior.T_world_vehicle, prior.covariance, prior.errors, prior, snapshot, jnp.zeros(6), 60
     )
 
-    moves = camera_slopes(snapshot.rig, snapshot.markers, snapshot.seen)
-    rows = reprojection_rows(snapshot.rig, snapshot.seen)
+    moves = jax.jit(camera_slopes)(snapshot.rig, snapshot.markers, snapshot.seen)
     corners = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
     T_prior = jaxlie.SE3(prior.T_world_vehicle.wxyz_xyz[0])
     e = prior.errors.mean.shape[1]
@@ -108,17 +107,22 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
     for group, camera in enumerate(np.asarray(moves.camera)):
         turns[EACH * camera : EACH * (camera + 1)] += np.asarray(moves.turns[:, :, group])
     places = np.asarray(moves.places).transpose(2, 0, 1).reshape(-1, turns.shape[1])
+
     # The vehicle's nuisance, as the estimator linearises it: at the prediction.
-    tilt = jax.jacobian(
-        lambda t: rows(moved(T_prior @ cayley(prior.nuisance @ t), corners))[0].reshape(-1)
-    )(jnp.zeros(prior.nuisance.shape[1]))
-    base = jax.jit(lambda xi: rows(moved(T_prior @ cayley(PLANAR @ xi), corners))[0].reshape(-1))
+    @jax.jit
+    def at(xi):
+        rows = reprojection_rows(snapshot.rig, snapshot.seen)
+        return rows(moved(T_prior @ cayley(xi), corners))[0].reshape(-1)
+
+    tilt = jax.jit(jax.jacobian(lambda t: at(prior.nuisance @ t)))(
+        jnp.zeros(prior.nuisance.shape[1])
+    )
 
     def residuals(x):
         y, b, t = np.split(x, [3 + e, 3 + e + len(places)])
         xi, q = np.split(root @ y, [3])
         q = q + np.asarray(prior.errors.mean[0])
-        r = np.asarray(base(jnp.asarray(xi))) + q @ turns + b @ places + np.asarray(tilt) @ t
+        r = np.asarray(at(ON_GROUND @ xi)) + q @ turns + b @ places + np.asarray(tilt) @ t
         return np.concatenate([r, x])
 
     found = least_squares(residuals, np.zeros(3 + e + len(places) + 3), method="lm", xtol=1e-14)
@@ -134,7 +138,9 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
 
     # The rest of the state, by the joint Gaussian of all of it.
     posterior = jax.tree.map(lambda leaf: leaf[0], fit.posterior)
-    offer = navigator.motion.follow(jax.tree.map(lambda leaf: leaf[0], bank), posterior, obs)
+    offer = eqx.filter_jit(navigator.motion.follow)(
+        jax.tree.map(lambda leaf: leaf[0], bank), posterior, obs
+    )
     mean, covariance = map(np.asarray, offer.posterior)
     np.testing.assert_allclose(mean[SENSORS_END:] - bank.mean[0, SENSORS_END:], y[3:], atol=1e-4)
     np.testing.assert_allclose(covariance[SENSORS_END:, SENSORS_END:], C[3:, 3:], atol=2e-3)
@@ -162,6 +168,9 @@ def test_a_start_far_from_its_guess_keeps_a_covariance(navigator, body):
     sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     least = np.linalg.eigvalsh(P / sigma[:, :, None] / sigma[:, None])[:, 0]
     assert np.all(least > 0)
+
+
+follow = jax.jit(follow_pose, static_argnums=4)
 
 
 def moved(T_world_vehicle: jaxlie.SE3, corners):
@@ -201,7 +210,7 @@ def test_the_rest_follows_pose_and_errors_as_a_gaussian_does(hidden):
         jnp.asarray(True),
         ErrorsPosterior(*map(jnp.asarray, (y[d:], slope, given, rows))),
     )
-    correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, PLANAR, n - e)
+    correction, after = follow(jnp.asarray(P), T_prior, corrected, PLANAR, n - e)
     np.testing.assert_allclose(correction[:d], y[:d], atol=1e-8)
     np.testing.assert_allclose(correction, expected, atol=2e-5)
     np.testing.assert_allclose(after, P_expected, atol=3e-6)
@@ -243,9 +252,7 @@ def test_a_pose_that_is_inflated_keeps_errors_that_are_considered_in_proportion(
         jnp.zeros(()),
         jnp.asarray(True),
     )
-    _, after = follow_pose(
-        jnp.asarray(P), worlds.planar(0.3, -0.2, 0.7), corrected, freedom, states
-    )
+    _, after = follow(jnp.asarray(P), worlds.planar(0.3, -0.2, 0.7), corrected, freedom, states)
     np.testing.assert_allclose(after[:d, :d], inflation * C, rtol=1e-7, atol=1e-12)
     posterior = jnp.zeros_like(x), after
     _, considered = motion.considered(jnp.asarray(False), (x, jnp.asarray(P)), posterior)
@@ -270,8 +277,8 @@ def test_nothing_is_learnt_while_the_heading_is_open_or_from_odometry(navigator)
     obs = dataclasses.replace(
         obs, speed_mps=jnp.asarray(0.5), steering_rad=jnp.asarray(0.3), dt_s=jnp.asarray(0.1)
     )
-    once = motion.predict(bank, obs)
-    later = motion.predict(once, obs)
+    predict = eqx.filter_jit(motion.predict)
+    later = predict(predict(bank, obs), obs)
     np.testing.assert_array_equal(later.mean[:, SIX:], 0)
     errors = bank.covariance[:, SIX:, SIX:]
     np.testing.assert_allclose(later.covariance[:, SIX:, SIX:], errors, rtol=1e-12)
@@ -287,7 +294,8 @@ def test_a_slip_fades_with_the_way_and_another_comes(navigator):
     )
     way_m = 0.1 * float(jnp.linalg.norm(bank.mean[0, 3:5]))
     f = np.exp(-way_m / motion.slip_length_m)
-    later = motion.predict(bank, obs)
+    predict = eqx.filter_jit(motion.predict)
+    later = predict(bank, obs)
     n = bank.mean.shape[1]
     F = np.eye(n)
     F[SLIP, SLIP] = f
@@ -298,7 +306,7 @@ def test_a_slip_fades_with_the_way_and_another_comes(navigator):
     assert float(later.mean[0, SLIP]) == pytest.approx(f * float(bank.mean[0, SLIP]))
     still = motion.init(1)  # at its prior it stays there, whatever the way
     moving = eqx.tree_at(lambda b: b.mean, still, still.mean.at[:, 3].set(0.5))
-    variance = motion.predict(moving, obs).covariance[0, SLIP, SLIP]
+    variance = predict(moving, obs).covariance[0, SLIP, SLIP]
     assert float(variance) == pytest.approx(SLIP_SIGMA**2)
 
 

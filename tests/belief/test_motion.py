@@ -564,14 +564,19 @@ def test_a_state_on_the_ground_and_its_covariance(kind):
         mean = jnp.append(tilted.wxyz_xyz, jnp.asarray([0.3, -0.1, 0.2, 0.4, -0.2, 0.5]))
     size = motion.init().covariance.shape[-1]
     root = 1e-3 * rng.standard_normal((size, size))
-    told = motion.planar(mean, jnp.asarray(root @ root.T))
+    told = eqx.filter_jit(motion.planar)(mean, jnp.asarray(root @ root.T))
     dt_s = 1e-6
     bank = eqx.tree_at(lambda b: b.mean, motion.init(), mean[None])
-    later = motion.predict(bank, reading(dt_s=dt_s)) if kind == "free" else None
-    moved = mean[:3] + dt_s * mean[3:] if later is None else motion.on_ground(later.mean[0])[0]
+    if kind == "free":
+        later = eqx.filter_jit(motion.predict)(bank, reading(dt_s=dt_s))
+        moved = eqx.filter_jit(motion.on_ground)(later.mean[0])[0]
+    else:
+        moved = mean[:3] + dt_s * mean[3:]
     np.testing.assert_allclose((moved - told.pose) / dt_s, told.velocity, atol=1e-5)
     errors = jnp.asarray(rng.standard_normal((20_000, size)) @ root.T)
-    poses, velocities = jax.vmap(lambda error: motion.on_ground(motion.moved(mean, error)))(errors)
+    poses, velocities = jax.jit(
+        jax.vmap(lambda error: motion.on_ground(motion.moved(mean, error)))
+    )(errors)
     for samples, covariance in (
         (poses, told.pose_covariance),
         (velocities, told.velocity_covariance),

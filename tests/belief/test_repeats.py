@@ -28,7 +28,11 @@ CORRELATION = 0.975  # of repeated errors, from frame to frame
 
 def snapshot(shift_px=0.0, visible=True) -> Snapshot:
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()
-    obs = worlds.observe(rig, markers, pose())
+    return shoot(rig, markers, worlds.observe(rig, markers, pose()), shift_px, visible)
+
+
+@jax.jit
+def shoot(rig, markers, obs, shift_px, visible) -> Snapshot:
     obs = dataclasses.replace(
         obs,
         corners_px=obs.corners_px + jnp.asarray([shift_px, 0.0]).reshape(1, 1, 1, 2),
@@ -79,7 +83,8 @@ def test_what_surprises_counts_anew():
     """By n / surprise^2: at four times the bound a repeated sighting is new but for a sixteenth."""
     _, repeats = weigh(nothing(), snapshot())
     one, four = (
-        MODEL.weighed(repeats, snapshot(), surprise).seen.sigma_px[0, 0] for surprise in (1.0, 4.0)
+        jax.jit(MODEL.weighed)(repeats, snapshot(), surprise).seen.sigma_px[0, 0]
+        for surprise in (1.0, 4.0)
     )
     n = 1 / 16
     growth = (1 - SHARE + (n + 1) * SHARE) * (1 - SHARE + n * SHARE) / (1 - SHARE)
@@ -87,6 +92,7 @@ def test_what_surprises_counts_anew():
     assert float(one) > 1.2 * float(four)
 
 
+@jax.jit
 def predicted(off, sigma, alive=True) -> PoseBelief:
     """Two hypotheses, the second one off by (m, m, rad) with sigmas of its own."""
     freedom = jnp.asarray(ON_GROUND, float)
@@ -108,7 +114,7 @@ def surprise(belief, free_cost=0.0, valid=True):
     candidates = dataclasses.replace(
         candidates, cost=jnp.asarray([free_cost, 0.0]), valid=jnp.asarray([valid, False])
     )
-    return float(surprise_of(belief, jnp.asarray(1), candidates, snapshot()))
+    return float(jax.jit(surprise_of)(belief, jnp.asarray(1), candidates, snapshot()))
 
 
 def test_the_surprise_is_the_nis_of_the_prediction_over_its_bound():
@@ -118,6 +124,7 @@ def test_the_surprise_is_the_nis_of_the_prediction_over_its_bound():
     T = jaxlie.SE3(belief.T_world_vehicle.wxyz_xyz[1])
     shown = np.asarray(shot.seen.visible)
 
+    @jax.jit
     def residual(xi):
         corners_px = shot.rig.project((T @ cayley(xi)).inverse(), shot.markers.corners_world_m)
         at = corners_px[shot.seen.camera_index, shot.seen.marker_index]
@@ -125,7 +132,7 @@ def test_the_surprise_is_the_nis_of_the_prediction_over_its_bound():
         return r[shown].reshape(-1)
 
     r = np.asarray(residual(jnp.zeros(6)))
-    J = np.asarray(jax.jacfwd(residual)(jnp.zeros(6)))
+    J = np.asarray(jax.jit(jax.jacfwd(residual))(jnp.zeros(6)))
     spread = np.hstack([np.asarray(ON_GROUND) * sigma, np.asarray(belief.nuisance)])
     S = np.eye(r.size) + J @ spread @ spread.T @ J.T
     nis, bound = r @ np.linalg.solve(S, r), 6 + 3 * np.sqrt(12)
@@ -153,8 +160,8 @@ def test_a_pause_changes_nothing():
 def test_white_errors_are_told_by_a_share_of_nothing():
     repeats, white = nothing(), RepeatedErrors(0.0, 0.0)
     for _ in range(5):
-        seen = white.weighed(repeats, snapshot()).seen
-        repeats = white.after(repeats, snapshot(), pose(), YES)
+        seen = jax.jit(white.weighed)(repeats, snapshot()).seen
+        repeats = jax.jit(white.after)(repeats, snapshot(), pose(), YES)
         np.testing.assert_allclose(seen.sigma_px, snapshot().seen.sigma_px, rtol=1e-12)
 
 
@@ -215,9 +222,10 @@ def test_what_no_pose_explains_is_what_least_squares_leave():
     noisy = seen.corners_px + rng.normal(size=seen.corners_px.shape)
     shot = dataclasses.replace(shot, seen=dataclasses.replace(seen, corners_px=noisy))
     T = pose().inverse()
-    got = np.asarray(unexplained(T, shot))
+    got = np.asarray(jax.jit(unexplained)(T, shot))
     for i in np.flatnonzero(np.asarray(seen.visible)):
 
+        @jax.jit
         def residual(xi, i=i):
             T_camera_vehicle = jaxlie.SE3(shot.rig.Ts_camera_vehicle.wxyz_xyz[seen.camera_index[i]])
             corners = shot.markers.corners_world_m[seen.marker_index[i]]
@@ -227,10 +235,10 @@ def test_what_no_pose_explains_is_what_least_squares_leave():
             return ((pixels - noisy[i]) / seen.sigma_px[i][:, None]).reshape(-1)
 
         r = np.asarray(residual(jnp.zeros(6)))
-        J = np.asarray(jax.jacfwd(residual)(jnp.zeros(6)))
+        J = np.asarray(jax.jit(jax.jacfwd(residual))(jnp.zeros(6)))
         left = r - J @ np.linalg.lstsq(J, r, rcond=None)[0]
         np.testing.assert_allclose(np.sum(got[i] ** 2), np.sum(left**2), rtol=1e-9)
-    near = np.asarray(unexplained(T @ jaxlie.SE3.exp(jnp.full(6, 0.01)), shot))
+    near = np.asarray(jax.jit(unexplained)(T @ jaxlie.SE3.exp(jnp.full(6, 0.01)), shot))
     np.testing.assert_allclose(near, got, atol=0.1 * np.abs(got).max())
     hidden = ~np.asarray(seen.visible)
     assert hidden.any()
@@ -274,10 +282,12 @@ def test_derivatives_are_finite_where_nothing_moves():
     def sigma(shift_px, share):
         model = RepeatedErrors(share, share)
         repeats = model.after(start, shot, pose(), YES)
-        return jnp.sum(model.weighed(repeats, snapshot(shift_px)).seen.sigma_px)
+        moved = shoot(shot.rig, shot.markers, shot.obs, shift_px, True)
+        return jnp.sum(model.weighed(repeats, moved).seen.sigma_px)
 
+    slopes_of = jax.jit(jax.grad(sigma, argnums=(0, 1)))
     for at in ((0.0, 0.1), (3.0, 0.5)):
-        slopes = jax.grad(sigma, argnums=(0, 1))(*map(jnp.asarray, at))
+        slopes = slopes_of(*map(jnp.asarray, at))
         assert np.all(np.isfinite(slopes))
     assert float(slopes[1]) > 0
 
@@ -286,7 +296,7 @@ def test_derivatives_are_finite_where_nothing_moves():
         found = dataclasses.replace(none, valid=none.valid.at[0].set(True))
         return surprise_of(belief, jnp.asarray(1), found, shot)
 
-    still, moved = (jax.grad(of_surprise)(jnp.asarray(off)) for off in (0.0, 0.05))
+    still, moved = (jax.jit(jax.grad(of_surprise))(jnp.asarray(off)) for off in (0.0, 0.05))
     assert float(still) == 0
     assert np.isfinite(moved)
     assert float(moved) > 0
@@ -295,6 +305,6 @@ def test_derivatives_are_finite_where_nothing_moves():
 @in_float32
 def test_it_works_in_float32(precision):
     shot = snapshot()
-    after = MODEL.after(nothing(), shot, pose(), YES)
+    after = jax.jit(MODEL.after)(nothing(), shot, pose(), YES)
     assert {leaf.dtype for leaf in jax.tree.leaves(after)} == {np.dtype(precision)}
-    assert MODEL.weighed(after, shot).seen.sigma_px.dtype == precision
+    assert jax.jit(MODEL.weighed)(after, shot).seen.sigma_px.dtype == precision

@@ -22,6 +22,8 @@ SIGMA = np.repeat([0.005, np.deg2rad(0.5)], 3)
 SIGMA_PX = 0.3
 
 refine = jax.jit(refine_pose, static_argnames="max_steps")
+matrices_of = jax.jit(jaxlie.SE3.as_matrix)
+poses_of = jax.jit(jax.vmap(jaxlie.SE3.from_matrix))
 
 
 def uncertain(rig: CameraRig, sigma=SIGMA) -> CameraRig:
@@ -32,14 +34,15 @@ def uncertain(rig: CameraRig, sigma=SIGMA) -> CameraRig:
 def moved(rig: CameraRig, errors: np.ndarray) -> CameraRig:
     """Cameras shifted along and turned about the vehicle's axes, each at its own place, (C, 6)."""
     matrices = []
-    for T_camera_vehicle, error in zip(rig.Ts_camera_vehicle.as_matrix(), errors, strict=True):
+    for T_camera_vehicle, error in zip(
+        np.asarray(matrices_of(rig.Ts_camera_vehicle)), errors, strict=True
+    ):
         T_vehicle_camera = np.linalg.inv(T_camera_vehicle)
         T_vehicle_camera[:3, 3] += error[:3]
         turn = Rotation.from_rotvec(error[3:]).as_matrix()
         T_vehicle_camera[:3, :3] = turn @ T_vehicle_camera[:3, :3]
         matrices.append(np.linalg.inv(T_vehicle_camera))
-    Ts = jax.vmap(jaxlie.SE3.from_matrix)(jnp.asarray(np.stack(matrices)))
-    return dataclasses.replace(rig, Ts_camera_vehicle=Ts)
+    return dataclasses.replace(rig, Ts_camera_vehicle=poses_of(np.stack(matrices)))
 
 
 # --- the elimination ------------------------------------------------------------------
@@ -142,8 +145,10 @@ def test_the_slopes_are_differences_of_projections(slots):
         visible[tuple(np.transpose(kept))] = True
     sigmas = SIGMA * np.linspace(0.5, 2.0, 24).reshape(4, 6)  # all different
     known = dataclasses.replace(rig, extrinsics_sigma=jnp.asarray(sigmas))
-    seen = sightings(rig, markers, obs.corners_px, jnp.asarray(visible), SIGMA_PX, slots)
-    nuisance = camera_errors(known, markers, seen)
+    seen = jax.jit(sightings, static_argnums=5)(
+        rig, markers, obs.corners_px, jnp.asarray(visible), SIGMA_PX, slots
+    )
+    nuisance = jax.jit(camera_errors)(known, markers, seen)
     assert nuisance is not None
     count = min(slots, 4)
     assert nuisance.slopes.shape == (6, 8 * slots, count, 1)
@@ -152,7 +157,7 @@ def test_the_slopes_are_differences_of_projections(slots):
     assert len(np.unique(cameras[cameras >= 0])) >= 2
 
     dense = np.zeros((2, 4 * slots, 4, 6))  # of the residuals (u, v), by camera and its error
-    h, Ts = 1e-3, np.asarray(rig.Ts_camera_vehicle.as_matrix())
+    h, Ts = 1e-3, np.asarray(matrices_of(rig.Ts_camera_vehicle))
     for slot, index in enumerate(cameras):
         if index < 0:
             continue
@@ -164,7 +169,7 @@ def test_the_slopes_are_differences_of_projections(slots):
             for sign in (1, -1):
                 errors = np.zeros((4, 6))
                 errors[index, axis] = sign * h
-                T = np.asarray(moved(rig, errors).Ts_camera_vehicle.as_matrix())[index]
+                T = np.asarray(matrices_of(moved(rig, errors).Ts_camera_vehicle))[index]
                 ends.append(pixels_of(T, points, camera))
             slope = (ends[0] - ends[1]) / (2 * h) * sigmas[index, axis] / SIGMA_PX
             dense[:, 4 * slot : 4 * slot + 4, index, axis] = slope.T

@@ -32,6 +32,7 @@ GAINS = [
     )
 ]  # fmt: skip
 SPREAD = Spread()
+DRIVES = 6  # the same number in several tests, which then share a program
 keys = jax.vmap(jax.random.key)
 
 
@@ -98,7 +99,7 @@ def tame() -> ClosedLoop:
 
 def test_derivatives_are_those_of_the_soft_drive(tame):
     """Against central differences of every drive, each gain by itself."""
-    space, seeds = space_of(tame), keys(jnp.arange(4))
+    space, seeds = space_of(tame), keys(jnp.arange(DRIVES))
     _, slopes = tame.value_and_grad(space.start, space, seeds)
     step = 1e-5
     for name in GAINS:
@@ -136,7 +137,7 @@ def test_derivatives_are_those_of_the_hard_drives_on_average(tame):
 
 
 def test_a_narrow_switch_is_the_hard_one(tame):
-    space, seeds = space_of(tame), keys(jnp.arange(6))
+    space, seeds = space_of(tame), keys(jnp.arange(DRIVES))
     hard, costs, trace = tame.value(space.values(space.start), seeds)
     assert np.all(trace.done[:, -1])
     far = []
@@ -157,7 +158,7 @@ def test_a_gain_that_does_nothing_is_found(tame):
     """The throttle never gets so far as to feel the bound of its integral."""
     space = space_of(tame)
     start = moved(space, "controller.integral_limit_ms", 1000.0)
-    _, slopes = tame.value_and_grad(start, space, keys(jnp.arange(2)))
+    _, slopes = tame.value_and_grad(start, space, keys(jnp.arange(DRIVES)))
     assert without_gradient(slopes, space.labels) == ["controller.integral_limit_ms"]
 
 

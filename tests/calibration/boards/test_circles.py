@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 
 import cv2
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from jaxnav.simulation.sensor import Sensor
 from tests.worlds import qcar_rig
 
 CAMERA, SIZE_PX, MODULE_M = qcar_rig().camera(0), (820, 410), 0.0005
+project = eqx.filter_jit(CAMERA.project)
 BOARDS = {
     "circles": Board("circles", 7, 5, 0.03, marker_m=0.018),
     "asymmetric_circles": Board("asymmetric_circles", 4, 7, 0.02, marker_m=0.018),
@@ -47,7 +49,7 @@ def renderer(kind: str) -> BoardRenderer:
 def off_px(board: Board, found_px: np.ndarray, T_camera_board: np.ndarray) -> np.ndarray:
     """Errors (P, 2) of the points, the board turned by half a turn where that is nearer."""
     points_camera_m = board.points_board_m @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
-    truth_px = np.asarray(CAMERA.project(jnp.asarray(points_camera_m)))
+    truth_px = np.asarray(project(jnp.asarray(points_camera_m)))
     both = [found_px - truth_px, found_px - truth_px[::-1]]
     return min(both, key=lambda error: float(np.abs(error).max()))
 

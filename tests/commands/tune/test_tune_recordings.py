@@ -93,7 +93,8 @@ def long_enough(recording: Recording, begin: int, end: int, shortest: int) -> se
 
 @pytest.mark.parametrize("part", [*HALVES, (0.25, 0.7)])
 def test_every_detection_is_in_one_appearance_of_its_marker(test_7, part):
-    recorded, place_of = sequences_of_recording(test_7, True, part), places(test_7)
+    recorded = jax.device_get(sequences_of_recording(test_7, True, part))
+    place_of = places(test_7)
     begin, end = (round(share * len(test_7)) for share in part)
     assert recorded.obs.visible.shape[2:] == (4, 1)
     assert recorded.used.shape[1] <= 64
@@ -175,7 +176,7 @@ def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
     assert start.chosen.mean() >= 0.95
     first = jnp.argmax(estimate_sequences(navigator, recorded).decided, axis=1)
     truth = recorded.T_world_vehicle_true[np.arange(len(rows)), first]
-    off_rad = jax.vmap(lambda a, b: rotation_error_rad(jaxlie.SE3(a), jaxlie.SE3(b)))(
+    off_rad = jax.jit(jax.vmap(lambda a, b: rotation_error_rad(jaxlie.SE3(a), jaxlie.SE3(b))))(
         start.bank.mean[:, 0, :7], truth
     )
     assert np.mean(np.rad2deg(off_rad)[np.asarray(start.chosen)] < 10) >= 0.95
@@ -187,8 +188,10 @@ def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_
         sequences_of_recording(test_7, True, HALVES[0], 20),
         sequences_of_recording(test_7, True, HALVES[1], 32),
     ]
-    both = join_sequences(
-        [NamedSequences(f"part {k}", navigator, part) for k, part in enumerate(parts)]
+    both = jax.device_get(
+        join_sequences(
+            [NamedSequences(f"part {k}", navigator, part) for k, part in enumerate(parts)]
+        )
     )
     assert both.used.shape == (sum(map(len, parts)), 32)
     assert int(both.used.sum()) == sum(int(part.used.sum()) for part in parts)
@@ -257,8 +260,8 @@ def test_events_of_a_drive_are_what_the_pilot_fused(setup, drive):
 def test_a_drive_is_its_events_one_by_one(setup, drive):
     log, _ = drive
     events = believed_events(log.inputs, setup)
-    recorded = sequences_of_drive(log, setup, (0, 1), length=30)
-    used, obs = np.asarray(recorded.used), recorded.obs
+    recorded = jax.device_get(sequences_of_drive(log, setup, (0, 1), length=30))
+    used, obs = recorded.used, recorded.obs
     assert used.shape[1] <= 30
     assert int(used.sum()) == len(events)
     assert not recorded.judged.any()
