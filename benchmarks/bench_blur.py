@@ -284,7 +284,7 @@ if __name__ == "__main__":
     parser.add_argument("--false", type=int, help="count false fixes in so many pictures instead")
     given = parser.parse_args()
     cv2.setNumThreads(1)
-    jaxnav.configure()
+    jaxnav.configure(threads=1)  # as the commands that drive
     if given.false:
         wrong, count = false_fixes(given.false)
         print(f"{wrong} of {count} pictures show a marker that is not there")
