@@ -1,11 +1,13 @@
-"""Calibrate lenses from real pictures of boards, against OpenCV on the same corners.
+"""Calibrate lenses from real pictures of boards, against OpenCV and mrcal on the same corners.
 
     python benchmarks/bench_real_boards.py
 
 The sets are the folders of `JAXNAV_DATA`/boards, or of ../shared/data/boards, with a `board.yaml`
 in them or in `BOARDS`. Halves: each half of the views is calibrated by itself (even and odd views,
 then the first and the last), in sigmas of the difference; each lens then has to explain the views
-of the other half, where only the poses are free.
+of the other half, where only the poses are free. mrcal runs with its defaults: it leaves out
+corners that fit badly, finds by how much the board is bent, and holds the coefficients down a
+little. Without it (`apt install mrcal`) its tables are left out.
 """
 
 import os
@@ -18,15 +20,22 @@ from jaxnav.configuration import configure
 configure(float64=True)  # before the first array, as the commands do
 
 import numpy as np  # noqa: E402
+from mrcal_lens import MISSING, installed, mrcal_lens  # noqa: E402
 
 from jaxnav.calibration.boards.board import Board  # noqa: E402
 from jaxnav.calibration.boards.images import collect_views  # noqa: E402
 from jaxnav.calibration.lenses import bundle as lens_bundle  # noqa: E402
 from jaxnav.calibration.lenses.intrinsics import LensCalibration, calibrate_lens  # noqa: E402
+from jaxnav.calibration.lenses.maps import (  # noqa: E402
+    grid_px,
+    projection_difference,
+    projection_sigma,
+)
 from jaxnav.calibration.lenses.start import board_poses, opencv_calibration  # noqa: E402
 from jaxnav.calibration.lenses.views import BoardViews  # noqa: E402
 from jaxnav.commands.calibrate.board import read_board  # noqa: E402
 from jaxnav.errors import BadInput  # noqa: E402
+from jaxnav.models.camera import Camera  # noqa: E402
 
 DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/data")) / "boards"
 BOARDS = {
@@ -83,8 +92,65 @@ def _half(views: BoardViews) -> LensCalibration | None:
         return None
 
 
+def beside_mrcal(found: LensCalibration, views: BoardViews, board: Board) -> tuple[str, str, str]:
+    """Rows of three tables: the focal length, its errors of unseen views, and two maps."""
+    fit, pixels = found.fit, grid_px(views.image_size_px).reshape(-1, 2)
+    of_opencv = opencv_parameters(views)
+    # As the cameras differ: jaxnav leaves views out, and the others get the same ones then.
+    kept = tuple(v for v in views.views if v.name not in found.left_out)
+    lenses = {
+        model: mrcal_lens(views, board, of_opencv[0], pixels, model)
+        for model in ("OPENCV4", "OPENCV5", "OPENCV8")
+    }
+    theirs, few = lenses["OPENCV5"], replace(views, views=kept)
+    alike = mrcal_lens(few, board, of_opencv[0], pixels)
+    focal = [str(round(fit.parameters[0], 1)) + f" +- {fit.sigma[0]:.1f}", f"{of_opencv[0]:.1f}"]
+    focal += [
+        "-" if lens is None else f"{lens.parameters[0]:.1f} +- {lens.focal_sigma_px[0]:.1f}"
+        for lens in lenses.values()
+    ]
+    if theirs is None or alike is None:
+        return (_row(focal), "", "")
+    for pair in ((of_opencv, theirs), (opencv_parameters(few), alike)):
+        mean = (pair[0][0] + pair[1].parameters[0]) / 2
+        off = fit.parameters[0] - mean
+        focal.append(f"{mean:.1f}: {100 * off / mean:+.2f} %, {off / fit.sigma[0]:+.1f}")
+    unseen = []
+    for trained, other in [each for pair in halves(views) for each in (pair, pair[::-1])]:
+        half = mrcal_lens(trained, board, of_opencv[0], pixels)
+        errors = (np.nan, np.nan)
+        if half is not None:
+            errors = unseen_px("radtan", half.parameters, other)
+        unseen.append(f"{errors[0]:.3f} {errors[1]:.3f}")
+    ours_px = np.sqrt(np.mean(projection_sigma(fit).shift_px.reshape(-1, 2) ** 2, axis=1))
+    middle, rim = _middle(pixels, views.image_size_px)
+    maps = [
+        f"{np.median(sigma[part]):.2f}"
+        for sigma in (ours_px, theirs.sigma_px)
+        for part in (middle, rim)
+    ]
+    ours = fit.camera
+    for parameters in (of_opencv, theirs.parameters, alike.parameters):
+        camera = Camera.create(parameters[:2], parameters[2:4], "radtan", parameters[4:])
+        length_px = projection_difference(ours, camera, views.image_size_px).length_px.reshape(-1)
+        maps.append(f"{np.nanmedian(length_px[middle]):.2f} {np.nanmedian(length_px[rim]):.2f}")
+    return _row(focal), _row(unseen), _row(maps)
+
+
+def _middle(pixels: np.ndarray, image_size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Masks of the pixels in the middle half of the image, both ways, and of the others."""
+    from_middle = np.abs(pixels / (np.array(image_size_px) - 1) - 0.5)
+    inside = np.all(from_middle < 0.25, axis=1)
+    return inside, ~inside
+
+
+def _row(cells: list[str]) -> str:
+    return " | ".join(cells)
+
+
 def main() -> None:
-    """Print a row for each set."""
+    """Print a row for each set, then the tables with mrcal."""
+    rows: dict[str, tuple[str, str, str]] = {}
     print(
         "| set | views | lens | fx, fy | sigma % | centre | RMS | cv2: fx, fy | RMS "
         "| halves, sigmas | unseen px, RMS median: jaxnav / cv2 | s |"
@@ -115,6 +181,22 @@ def main() -> None:
             f"| {'; '.join(errors)} | {took_s:.0f} |",
             flush=True,
         )
+        if installed():
+            rows[folder.name] = beside_mrcal(found, collected.views, board)
+    if not installed():
+        print(MISSING)
+        return
+    titles = (
+        "fx +- sigma: jaxnav | cv2 | mrcal OPENCV4 | OPENCV5 | OPENCV8 "
+        "| jaxnav from the mean of cv2 and OPENCV5, in sigmas | the same on the views jaxnav kept",
+        "unseen px, RMS median, of mrcal OPENCV5: even | odd | first | last",
+        "sigma, px: jaxnav, middle | border | mrcal, middle | border "
+        "| apart, px, middle border: jaxnav and cv2 | and mrcal | and mrcal on the views kept",
+    )
+    for number, title in enumerate(titles):
+        print(f"\n| set | {title} |\n|" + "---|" * (title.count("|") + 2))
+        for name, cells in rows.items():
+            print(f"| {name} | {cells[number]} |")
 
 
 if __name__ == "__main__":

@@ -116,7 +116,7 @@ def _pixels_within(
         focal_px: tells by how much edges of the marker may be bent.
     """
     side_px = mean_side_px(quad_px)
-    bend_px = side_px**2 / (8 * focal_px)
+    bend_px = min(side_px**2 / (8 * focal_px), side_px / 4)
     reach = round(min(_OUTLINE_PX, max(1.0, side_px / cells))) + round(bend_px)
     low = np.maximum(np.floor(quad_px.min(0)).astype(int) - reach - 1, 0)
     high = np.minimum(np.ceil(quad_px.max(0)).astype(int) + reach + 2, shape[1::-1])
