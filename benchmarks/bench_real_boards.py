@@ -92,11 +92,12 @@ def _half(views: BoardViews) -> LensCalibration | None:
         return None
 
 
-def beside_mrcal(found: LensCalibration, views: BoardViews, board: Board) -> tuple[str, str, str]:
+def beside_mrcal(
+    found: LensCalibration, of_opencv: np.ndarray, views: BoardViews, board: Board
+) -> tuple[str, str, str]:
     """Rows of three tables: the focal length, its errors of unseen views, and two maps."""
     fit, pixels = found.fit, grid_px(views.image_size_px).reshape(-1, 2)
-    of_opencv = opencv_parameters(views)
-    # As the cameras differ: jaxnav leaves views out, and the others get the same ones then.
+    # jaxnav leaves views out: the others get the same ones as well.
     kept = tuple(v for v in views.views if v.name not in found.left_out)
     lenses = {
         model: mrcal_lens(views, board, of_opencv[0], pixels, model)
@@ -104,13 +105,13 @@ def beside_mrcal(found: LensCalibration, views: BoardViews, board: Board) -> tup
     }
     theirs, few = lenses["OPENCV5"], replace(views, views=kept)
     alike = mrcal_lens(few, board, of_opencv[0], pixels)
-    focal = [str(round(fit.parameters[0], 1)) + f" +- {fit.sigma[0]:.1f}", f"{of_opencv[0]:.1f}"]
+    focal = [f"{fit.parameters[0]:.1f} +- {fit.sigma[0]:.1f}", f"{of_opencv[0]:.1f}"]
     focal += [
         "-" if lens is None else f"{lens.parameters[0]:.1f} +- {lens.focal_sigma_px[0]:.1f}"
         for lens in lenses.values()
     ]
     if theirs is None or alike is None:
-        return (_row(focal), "", "")
+        return (" | ".join(focal), "", "")
     for pair in ((of_opencv, theirs), (opencv_parameters(few), alike)):
         mean = (pair[0][0] + pair[1].parameters[0]) / 2
         off = fit.parameters[0] - mean
@@ -134,7 +135,7 @@ def beside_mrcal(found: LensCalibration, views: BoardViews, board: Board) -> tup
         camera = Camera.create(parameters[:2], parameters[2:4], "radtan", parameters[4:])
         length_px = projection_difference(ours, camera, views.image_size_px).length_px.reshape(-1)
         maps.append(f"{np.nanmedian(length_px[middle]):.2f} {np.nanmedian(length_px[rim]):.2f}")
-    return _row(focal), _row(unseen), _row(maps)
+    return " | ".join(focal), " | ".join(unseen), " | ".join(maps)
 
 
 def _middle(pixels: np.ndarray, image_size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -142,10 +143,6 @@ def _middle(pixels: np.ndarray, image_size_px: tuple[int, int]) -> tuple[np.ndar
     from_middle = np.abs(pixels / (np.array(image_size_px) - 1) - 0.5)
     inside = np.all(from_middle < 0.25, axis=1)
     return inside, ~inside
-
-
-def _row(cells: list[str]) -> str:
-    return " | ".join(cells)
 
 
 def main() -> None:
@@ -182,7 +179,7 @@ def main() -> None:
             flush=True,
         )
         if installed():
-            rows[folder.name] = beside_mrcal(found, collected.views, board)
+            rows[folder.name] = beside_mrcal(found, theirs, collected.views, board)
     if not installed():
         print(MISSING)
         return

@@ -31,8 +31,6 @@ json.dump(
     {
         "parameters": model.intrinsics()[1].tolist(),
         "focal_sigma_px": (noise_px * np.sqrt(np.sum(spread**2, axis=0))).tolist(),
-        "rms_px": float(np.sqrt(np.mean(np.sum(residuals_px**2, axis=1)))),
-        "corners": len(residuals_px),
         "sigma_px": mrcal.projection_uncertainty(
             rays, model, atinfinity=True, what="rms-stdev"
         ).tolist(),

@@ -27,15 +27,11 @@ class MrcalLens:
     Attributes:
         parameters: fx fy cx cy and the coefficients in OpenCV's order.
         focal_sigma_px: (2,) standard deviations of fx and fy.
-        rms_px: RMS distance of the corners that it kept from their predictions.
-        corners: how many it kept.
         sigma_px: (N,) how unsure it is of the projection at the pixels asked for.
     """
 
     parameters: np.ndarray
     focal_sigma_px: np.ndarray
-    rms_px: float
-    corners: int
     sigma_px: np.ndarray
 
 
@@ -50,7 +46,6 @@ def mrcal_lens(
     focal_px: float,
     pixels: np.ndarray,
     model: str = "OPENCV5",
-    flat: bool = False,
 ) -> MrcalLens | None:
     """Calibrate by `mrcal-calibrate-cameras`; None where it finds nothing.
 
@@ -59,7 +54,6 @@ def mrcal_lens(
         focal_px: mrcal asks for a first guess.
         pixels: (N, 2), where its uncertainty is asked for.
         model: OPENCV4 (k1 k2 p1 p2), OPENCV5 (and k3: jaxnav's radtan), OPENCV8 (and k4 k5 k6).
-        flat: take the board for flat; mrcal's default is to find by how much it is bent.
     """
     command = shutil.which(_COMMAND)
     assert command is not None, MISSING
@@ -75,7 +69,6 @@ def mrcal_lens(
             *("--imagersize", *size, "--outdir", name, "--corners-cache", "corners.vnl"),
             *("--object-spacing", f"{board.size_m}"),
             *("--object-width-n", f"{columns}", "--object-height-n", f"{rows}"),
-            *(("--skip-calobject-warp-solve",) if flat else ()),
             "view*.png",
         ]
         done = subprocess.run(calibrate, cwd=folder, capture_output=True, text=True)
@@ -96,8 +89,6 @@ def mrcal_lens(
     return MrcalLens(
         np.array(values["parameters"]),
         np.array(values["focal_sigma_px"]),
-        values["rms_px"],
-        values["corners"],
         np.array(values["sigma_px"]),
     )
 

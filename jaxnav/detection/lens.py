@@ -6,22 +6,33 @@ Shapes are fixed and cameras are arguments, so each kind of lens compiles once.
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Array, Float, Num
 
 from jaxnav.compiling.executables import kept
 from jaxnav.detection.edges import PIXELS
 from jaxnav.models.camera import Camera
 
 
-@kept
-def _rays_and_jacobians(camera: Camera, pixels: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return camera.unproject(pixels), jax.vmap(jax.jacfwd(camera.unproject))(pixels)
+def rays_through(
+    camera: Camera | None, pixels: Float[Array, "N 2"]
+) -> tuple[Float[Array, "3 N"], Float[Array, "2 3 N"]]:
+    """Rays (3, N) through pixels (N, 2), and their derivatives (2, 3, N), per px, inside jit."""
+    if camera is None:
+        rays = jnp.concatenate([pixels.T, jnp.ones((1, len(pixels)), pixels.dtype)])
+        by_px = jnp.eye(3, dtype=pixels.dtype)[:2, :, None]
+        return rays, jnp.broadcast_to(by_px, (2, 3, len(pixels)))
+    pixels = pixels.astype(camera.focal_px.dtype)
+    return camera.unproject(pixels).T, jax.vmap(jax.jacfwd(camera.unproject))(pixels).T
 
 
-@kept
-def _project(camera: Camera, points_camera: jax.Array) -> jax.Array:
-    return camera.project(points_camera)
+def pixels_of(camera: Camera | None, rays: Float[Array, "N 3"]) -> Float[Array, "N 2"]:
+    """Project rays (N, 3) to pixels (N, 2), inside jit."""
+    return rays[:, :2] / rays[:, 2:] if camera is None else camera.project(rays)
+
+
+_rays_through, _pixels_of = kept(rays_through), kept(pixels_of)
 
 
 @dataclass(frozen=True)
@@ -46,13 +57,11 @@ class Lens:
             return rays, np.broadcast_to(np.eye(3)[:2, :, None], (2, 3, n))
         padded = np.zeros((PIXELS, 2), np.asarray(self.camera.focal_px).dtype)
         padded[:n] = pixels
-        rays, jacobian = (
-            np.asarray(a, float)[:n] for a in _rays_and_jacobians(self.camera, padded)
-        )
-        return rays.T, jacobian.T
+        rays, rays_px = _rays_through(self.camera, padded)
+        return np.asarray(rays, float)[:, :n], np.asarray(rays_px, float)[:, :, :n]
 
     def pixels(self, rays: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
         """Project rays (N, 3) to pixels (N, 2). Compiles once for each N."""
         if self.camera is None:
             return rays[:, :2] / rays[:, 2:]
-        return np.asarray(_project(self.camera, rays), float)
+        return np.asarray(_pixels_of(self.camera, rays), float)

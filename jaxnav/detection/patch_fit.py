@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import cv2
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,12 +14,11 @@ from jaxnav.detection.families import marker_cells
 from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.pattern_fit import Unknowns
 from jaxnav.detection.pattern_program import Patch, PixelFit, follow_pattern
-from jaxnav.detection.refine import mean_side_px, scattered
+from jaxnav.detection.refine import mean_side_px, pixels_along, scattered
 from jaxnav.models.camera import Camera
 
 _LANES = 512  # pixels of a fit
 LEAST_PIXELS = 60
-_OUTLINE_PX = 3.0  # around the marker
 _INSTANT_PX = 2.5  # of the streak, for each image that is averaged
 _MOST_INSTANTS = 16
 _LEAST_STREAK_PX = 0.5  # of a start: where there is no motion the image has no slope by it
@@ -68,7 +66,11 @@ class PatchFit:
             streak_px, streak_sigma_px: as in `Target`.
         """
         focal_px = math.inf if camera is None else float(np.min(np.asarray(camera.focal_px)))
-        pixels = _pixels_within(image.shape, quad_px, len(_printed_corners(*key)) - 1, focal_px)
+        side_px = mean_side_px(quad_px)
+        cell_px = side_px / (len(_printed_corners(*key)) - 1)
+        bend_px = round(min(side_px**2 / (8 * focal_px), side_px / 4))  # of an edge, at most
+        pixels = pixels_along(image.shape, quad_px, cell_px, wider_px=bend_px)
+        pixels = scattered(pixels)[:_LANES]
         if len(pixels) < LEAST_PIXELS:
             return None
         patch = _patch_of(image, key, pixels, quad_px, streak_px, streak_sigma_px)
@@ -104,30 +106,6 @@ class PatchFit:
 @cache
 def _printed_corners(family: str, marker_id: int) -> np.ndarray:
     return step_corners(marker_cells(family, marker_id)).astype(np.float32)
-
-
-def _pixels_within(
-    shape: tuple[int, ...], quad_px: np.ndarray, cells: int, focal_px: float
-) -> np.ndarray:
-    """The pixels (N, 2) of a marker and around it, scattered, at most as many as fit.
-
-    Args:
-        cells: along a side.
-        focal_px: tells by how much edges of the marker may be bent.
-    """
-    side_px = mean_side_px(quad_px)
-    bend_px = min(side_px**2 / (8 * focal_px), side_px / 4)
-    reach = round(min(_OUTLINE_PX, max(1.0, side_px / cells))) + round(bend_px)
-    low = np.maximum(np.floor(quad_px.min(0)).astype(int) - reach - 1, 0)
-    high = np.minimum(np.ceil(quad_px.max(0)).astype(int) + reach + 2, shape[1::-1])
-    if np.any(high <= low):
-        return np.zeros((0, 2), int)
-    mask = np.zeros((high - low)[::-1], np.uint8)
-    polygon = np.round((quad_px - low) * 16).astype(np.int32)
-    cv2.polylines(mask, [polygon], True, 1, 2 * reach, shift=4)
-    cv2.fillPoly(mask, [polygon], 1, shift=4)
-    rows, columns = np.nonzero(mask)
-    return scattered(np.column_stack([columns, rows]) + low)[:_LANES]
 
 
 def _patch_of(

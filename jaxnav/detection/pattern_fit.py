@@ -119,40 +119,37 @@ class _PatternLM(NielsenLM):
         )
 
 
-def first_guess(window: Window) -> Unknowns:
-    """M = I, the expected motion, and no light yet."""
+def fit_pattern(
+    window: Window, instants: Int[Array, ""], start: Unknowns | None = None
+) -> PatternFit:
+    """Fit a window.
+
+    Args:
+        instants: number of images that are averaged, see `expose`.
+        start: where the steps begin, near the end; None: at M = I and the expected motion, which
+            may be a pixel off, so that a wide loss comes first.
+    """
+    coarse = window.most_noise
+    y = _nearer(window, (instants + 1) // 2) if start is None else start
+    residual, _, image = _model(y, window, instants)
+    noise = jnp.maximum(_spread(residual, window.used, coarse), _LEAST_NOISE)
+    y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS, _SLOPE)
+    return _result(y, window, instants)
+
+
+def _nearer(window: Window, instants: Int[Array, ""]) -> Unknowns:
+    """The least of a loss as wide as the contrast, over a part of the pixels."""
     dtype = window.levels.dtype
-    return Unknowns(
+    few = _first(window, window.levels.shape[0] // _COARSER)
+    y = Unknowns(
         jnp.eye(3, dtype=dtype),
         window.motion_px,
         jnp.asarray(_LENS_PX2, dtype),
         jnp.zeros(_LIGHTS, dtype),
     )
-
-
-def fit_pattern(
-    window: Window, start: Unknowns, is_far: bool, instants: Int[Array, ""]
-) -> PatternFit:
-    """Fit a window.
-
-    Args:
-        start: where the steps begin.
-        is_far: whether the start may be a pixel off and knows no light: a wide loss comes first.
-        instants: number of images that are averaged, see `expose`.
-    """
-    coarse = window.most_noise
-    few = _first(window, window.levels.shape[0] // _COARSER)
-
-    def nearer() -> Unknowns:
-        half = (instants + 1) // 2
-        y = start._replace(light=_first_light(start, few, half))
-        return _minimum(y, few, coarse * jnp.ones_like(few.levels), half, _COARSE_STEPS)
-
-    y = nearer() if is_far else start
-    residual, _, image = _model(y, window, instants)
-    noise = jnp.maximum(_spread(residual, window.used, coarse), _LEAST_NOISE)
-    y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS, _SLOPE)
-    return _result(y, window, instants)
+    y = y._replace(light=_first_light(y, few, instants))
+    scale = window.most_noise * jnp.ones_like(few.levels)
+    return _minimum(y, few, scale, instants, _COARSE_STEPS)
 
 
 def _first(window: Window, count: int) -> Window:

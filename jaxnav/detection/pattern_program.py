@@ -6,15 +6,15 @@ array that crosses between NumPy and JAX, and each call, takes tens of microseco
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.compiling.executables import kept
 from jaxnav.detection.codes import code_advantage
 from jaxnav.detection.disturbance import noise_correlation
+from jaxnav.detection.lens import pixels_of, rays_through
 from jaxnav.detection.paper import SQUARE, corner_motion, homography, on_paper, rays_of
-from jaxnav.detection.pattern_fit import Unknowns, Window, first_guess, fit_pattern
+from jaxnav.detection.pattern_fit import Unknowns, Window, fit_pattern
 from jaxnav.models.camera import Camera
 
 _ZONE = 1.1  # cells around the marker that count: its white zone is one wide
@@ -60,7 +60,6 @@ class PixelFit(NamedTuple):
     xy: Float[Array, "2 N"]  # places on the paper
     residual: Float[Array, " N"]  # grey levels
     marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
-    weight: Float[Array, " N"]
 
 
 class Followed(NamedTuple):
@@ -85,8 +84,8 @@ def follow_pattern(
         codes: of the family, see `codes_of`.
         start: the unknowns of an earlier fit of the same patch; None: the patch's quadrilateral.
     """
-    rays, rays_px = _rays(camera, patch.pixels)
-    M0 = homography(_rays(camera, patch.quad_px)[0].T)
+    rays, rays_px = rays_through(camera, patch.pixels)
+    M0 = homography(rays_through(camera, patch.quad_px)[0].T)
     f32 = jnp.float32
     rays, rays_px = (M0 @ rays).astype(f32), (M0[None] @ rays_px).astype(f32)
     zone = 1 + 2 * _ZONE / (patch.K.shape[0] - 1)
@@ -95,12 +94,11 @@ def follow_pattern(
         rays, rays_px, patch.levels, patch.real & near, patch.used & near, patch.K, patch.shadow,
         patch.motion_px, patch.motion_sigma_px, patch.contrast, patch.most_noise,
     )  # fmt: skip
-    begin = first_guess(window) if start is None else start
-    fit = fit_pattern(window, begin, start is None, patch.instants)
+    fit = fit_pattern(window, patch.instants, start)
     M = fit.y.M.astype(M0.dtype) @ M0
-    rays_of_corners = rays_of(M, SQUARE)
-    corners_px = _pixels(camera, rays_of_corners)
-    motion = corner_motion(M, *_rays(camera, corners_px)).astype(f32)
+    corners_px = pixels_of(camera, rays_of(M, SQUARE))
+    motion = corner_motion(M, *rays_through(camera, corners_px)).astype(f32)
+    # Where the ground beyond the paper shows, residuals are alike, and count little in the fit.
     share = jnp.where(fit.weight > 0.5, fit.noise / fit.deviation, 0)
     alike = noise_correlation(patch.pixels, fit.residual / fit.deviation, share)
     covariance = motion @ (alike * (fit.covariance + fit.covariance.T) / 2) @ motion.T
@@ -117,20 +115,4 @@ def follow_pattern(
         code_advantage(fit, window, codes, patch.own, patch.instants),
         alike,
     )
-    return Followed(summary, PixelFit(fit.xy, fit.residual, fit.marker, fit.weight), fit.y)
-
-
-def _rays(
-    camera: Camera | None, pixels: Float[Array, "N 2"]
-) -> tuple[Float[Array, "3 N"], Float[Array, "2 3 N"]]:
-    """Rays (3, N) through pixels, and their derivatives (2, 3, N), per px."""
-    if camera is None:
-        rays = jnp.concatenate([pixels.T, jnp.ones((1, len(pixels)), pixels.dtype)])
-        by_px = jnp.eye(3, dtype=pixels.dtype)[:2, :, None]
-        return rays, jnp.broadcast_to(by_px, (2, 3, len(pixels)))
-    pixels = pixels.astype(camera.focal_px.dtype)
-    return camera.unproject(pixels).T, jax.vmap(jax.jacfwd(camera.unproject))(pixels).T
-
-
-def _pixels(camera: Camera | None, rays: Float[Array, "N 3"]) -> Float[Array, "N 2"]:
-    return rays[:, :2] / rays[:, 2:] if camera is None else camera.project(rays)
+    return Followed(summary, PixelFit(fit.xy, fit.residual, fit.marker), fit.y)

@@ -182,8 +182,32 @@ def pixels_around(
     outline_px = lens.pixels(rays_of(M, outline))
     if not (np.abs(outline_px) < _NOWHERE_PX).all():  # no marker has this outline
         return np.zeros((0, 2), int)
-    # Pixels stay within the white zone around the marker, one cell wide.
-    reach = round(min(_OUTLINE_PX, max(1.0, cell_px)))
+    segments_px: Float[np.ndarray, "E 2 2"] | None = None
+    if edges is not None:
+        segments_px = edges
+        if len(edges):
+            segments_px = lens.pixels(rays_of(M, edges.reshape(-1, 2))).reshape(-1, 2, 2)
+        if not (np.abs(segments_px) < _NOWHERE_PX).all():
+            return np.zeros((0, 2), int)
+    pixels = pixels_along(shape, outline_px, cell_px, segments_px)
+    if len(pixels) > PIXELS:
+        pixels = scattered(pixels)[:PIXELS]
+    return pixels
+
+
+def pixels_along(
+    shape: tuple[int, ...],
+    outline_px: Float[np.ndarray, "P 2"],
+    cell_px: float,
+    segments_px: Float[np.ndarray, "E 2 2"] | None = None,
+    wider_px: int = 0,
+) -> Int[np.ndarray, "N 2"]:
+    """The pixels (N, 2) beside a marker's outline (P, 2) and beside segments; with None all inside.
+
+    Args:
+        wider_px: added to how far they lie beside: within the white zone, one cell wide.
+    """
+    reach = round(min(_OUTLINE_PX, max(1.0, cell_px))) + wider_px
     low = np.maximum(np.floor(outline_px.min(0)).astype(int) - reach - 1, 0)
     high = np.minimum(np.ceil(outline_px.max(0)).astype(int) + reach + 2, shape[::-1])
     if np.any(high <= low):
@@ -191,19 +215,13 @@ def pixels_around(
     mask = np.zeros((high - low)[::-1], np.uint8)
     polyline = np.round((outline_px - low) * 16).astype(np.int32)
     cv2.polylines(mask, [polyline], True, 1, 2 * reach, shift=4)
-    if edges is None:
+    if segments_px is None:
         cv2.fillPoly(mask, [polyline], 1, shift=4)
-    elif len(edges):
-        ends_px = lens.pixels(rays_of(M, edges.reshape(-1, 2))).reshape(-1, 2, 2)
-        if not (np.abs(ends_px) < _NOWHERE_PX).all():
-            return np.zeros((0, 2), int)
-        segments = np.round((ends_px - low) * 16).astype(np.int32)
+    elif len(segments_px):
+        segments = np.round((segments_px - low) * 16).astype(np.int32)
         cv2.polylines(mask, list(segments), False, 1, 2 * reach, shift=4)
     rows, columns = np.nonzero(mask)
-    pixels = np.column_stack([columns, rows]) + low
-    if len(pixels) > PIXELS:
-        pixels = scattered(pixels)[:PIXELS]
-    return pixels
+    return np.column_stack([columns, rows]) + low
 
 
 def scattered(pixels: Int[np.ndarray, "N 2"]) -> Int[np.ndarray, "N 2"]:

@@ -102,7 +102,7 @@ def track(
     return [_track(image, camera, target) for target in targets]
 
 
-def warm_up_tracks(camera: Camera | None, families: Sequence[str] = ("tag36h11",)) -> None:
+def warm_up_tracks(camera: Camera | None, families: Sequence[str]) -> None:
     """Compile what `track` calls, so that the first marker takes no longer than others."""
     image = np.full((64, 64), 128, np.uint8)
     for family in families:
