@@ -37,7 +37,9 @@ _WHICH_BOARD = (
     "is it the board of the file, with as many squares in its rows and columns, and is the lens of "
     "this kind?"
 )
-_SIGNIFICANT = 3.0  # sigmas of the corners' noise: a coefficient as large is known
+# Sigmas of the corners' noise from which on a coefficient makes unseen views better, not worse.
+# Source: Akaike (1974), "A new look at the statistical model identification".
+_WORTH = 2**0.5
 _FEW_WORSE = 1.5  # times another lens's residuals: of few views radtan is not taken
 _GROWN = 1.01  # times the error of unseen views: more says that it was needed
 _LAST_FIRST = {
@@ -190,7 +192,7 @@ def _best_of_few(fits: Mapping[str, LensFit], drawn: Sequence[str]) -> str:
 def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
     """Refit the lens with coefficients at zero that the corners don't tell from it.
 
-    Such a coefficient is not significant, unseen views do without it, and the image's border is
+    Such a coefficient is not worth its noise, unseen views do without it, and the image's border is
     not known with it. The sigmas are those of the lens with all of them: none is known better for
     another being held.
     """
@@ -208,10 +210,10 @@ def within_reach(fit: LensFit, tell: Callable[[str], None]) -> LensFit:
 
 
 def _without(fit: LensFit, told: LensFit, name: str, tell: Callable[[str], None]) -> LensFit | None:
-    """The fit with a coefficient held at zero; None where it is significant or needed."""
+    """The fit with a coefficient held at zero; None where it is worth it or needed."""
     at = told.names.index(name)
     noise = told.sigma[at] / np.sqrt(told.inflation)  # what views disagree in, they need
-    if abs(told.parameters[at]) > _SIGNIFICANT * noise:
+    if abs(told.parameters[at]) > _WORTH * noise:
         return None
     tell(f"hold {name}")
     held = fit_lens(fit.views, fit.lens, (*fit.fixed, name), fit.parameters)
