@@ -2,10 +2,12 @@
 
 First corners count less the further off they are (Cauchy), so that outliers are found without
 leading the fit astray. Then outliers are left out and plain least squares fits the rest, so that
-its covariance is honest; this is repeated until nothing changes.
+its covariance is honest; this is repeated until nothing changes. Views that are worse than the
+others count less only where that changes the lens by more than chance would: which views are right
+is a guess where few disagree, and a lens that is led by it explains unseen views no better.
 
 Source: Rousseeuw and Leroy (1987), "Robust regression and outlier detection", chapter 5.2
-(reweighted least squares).
+(reweighted least squares). Hausman (1978), "Specification tests in econometrics".
 """
 
 from dataclasses import dataclass
@@ -34,6 +36,7 @@ _FAR = 5.0  # in sigmas: Gaussian noise takes one corner in 270 000 there
 _WEAK, _WRONG = 1.5, 4.0  # a view whose corners are this many times as far off counts less, or not
 _CHANCE = 1e-6  # probability that a good view is taken for a worse one
 _ROBUST_ROUNDS, _ROUNDS = 3, 10
+_BY_CHANCE = 0.05  # probability that weights of good views change the lens by as much
 _NOTICED_SIGMAS = 2.0  # views that disagree by less may do so by chance
 _LEAST_SIGMA_PX = 1e-6
 
@@ -50,7 +53,8 @@ class LensFit:
         Ts_camera_board: (V, 7) wxyz_xyz.
         residual_px: (V, P, 2) predicted - seen; 0 for points not seen.
         used: (V, P) true for corners in the fit.
-        view_weights: (V,) 1; less for a view that is worse than the others, 0 if it is left out.
+        view_weights: (V,) 1; 0 if the view is left out; less than 1 if it is worse than the others
+            and the lens would be another one by it.
         view_sigma_px: (V,) standard deviation of a corner's x and of its y; inf without a pose.
         sigma_px: the same for a view of weight 1, over the whole fit.
         converged: true if the search ended before its limit of steps.
@@ -144,11 +148,21 @@ def fit_lens(
             break
     used, view_weights = before  # those of the last fit
     inflation = problem.inflation(bundle.unknowns, weights, sigma_px)
+    covariance = inflation * problem.covariance(bundle, sigma_px)
+    if np.any((view_weights > 0) & (view_weights < 1)):
+        equal = (view_weights > 0).astype(float)
+        plain = problem.solved(bundle.unknowns, used * equal[:, None], sigma_px, NO_CUT)
+        if problem.same_lens(bundle, plain, covariance):
+            bundle, view_weights, weights = plain, equal, used * equal[:, None]
+            residual_px = np.asarray(bundle.residual_px)
+            sigma_px = problem.sigma_px(residual_px, weights)
+            inflation = problem.inflation(bundle.unknowns, weights, sigma_px)
+            covariance = inflation * problem.covariance(bundle, sigma_px)
     return LensFit(
         lens=lens,
         views=views,
         parameters=np.asarray(bundle.unknowns.lens),
-        covariance=inflation * problem.covariance(bundle, sigma_px),
+        covariance=covariance,
         inflation=inflation,
         fixed=fixed,
         Ts_camera_board=np.asarray(bundle.unknowns.Ts_camera_board)[:count],
@@ -215,6 +229,17 @@ class _Problem:
         # Fewer than four corners don't determine a pose.
         few = used.sum(axis=1) < 4
         return used & ~few[:, None], np.where(few, 0.0, weights)
+
+    def same_lens(self, weighted: Bundle, plain: Bundle, covariance: np.ndarray) -> bool:
+        """True if two lenses differ by no more than the covariance of one lets expect."""
+        moved = np.asarray(plain.unknowns.lens - weighted.unknowns.lens)[self.free]
+        inside = covariance[np.ix_(self.free, self.free)]
+        if not np.all(np.isfinite(inside)):
+            return False
+        sigma = np.sqrt(np.diag(inside))
+        correlation = inside / np.outer(sigma, sigma)
+        squared = float(moved / sigma @ np.linalg.solve(correlation, moved / sigma))
+        return squared < stats.chi2.isf(_BY_CHANCE, self.free.sum())
 
     def inflation(self, y: LensUnknowns, weights: np.ndarray, sigma_px: float) -> float:
         """The factor of the variances by which the views disagree; 1 where there are too few."""

@@ -238,7 +238,8 @@ def _require_sound(fit: LensFit, where: str) -> None:
             f"the board is parallel to itself in all views, within {spread_deg:.1f} deg, so focal "
             "length and distance can't be told apart: tilt it by 30 to 45 deg, to all sides",
         )
-    if not float(np.max(fit.focal_sigma)) < _NO_FOCAL:
+    # Of the corners' noise alone: a lens of the wrong kind is said to be one later.
+    if not float(np.max(fit.focal_sigma)) < _NO_FOCAL * np.sqrt(fit.inflation):
         raise BadInput(
             where,
             "the views don't tell the focal length at all: tilt the board by 30 to 45 deg, to all "

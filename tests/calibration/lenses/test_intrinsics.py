@@ -192,6 +192,24 @@ def test_a_coefficient_worth_its_noise_is_not_held() -> None:
     assert 1.5 < abs(found.fit.parameters[8]) / found.fit.sigma[8] < 3
 
 
+def test_a_view_a_little_worse_counts_less_only_where_the_lens_is_another_by_it() -> None:
+    views, poses = views_of("radtan", 20)
+    truth, row = TRUTHS["radtan"], views.views[3]
+    noise_px = np.random.default_rng(20).normal(scale=3.2 * SIGMA_PX, size=row.corners_px.shape)
+    noisy = with_views(views, v3=replace(row, corners_px=row.corners_px + noise_px))
+    fit = fit_lens(noisy, "radtan")
+    matrix, _ = lens_start.opencv_calibration(noisy, noisy.views, "radtan")
+    assert np.all(fit.view_weights == 1)
+    np.testing.assert_allclose(fit.parameters[:2], [matrix[0, 0], matrix[1, 1]], rtol=1e-6)
+
+    camera = Camera.create(truth[:2], truth[2:4], "radtan", truth[4:])
+    longer, inside = seen_from(camera, SIZE_PX, POINTS_M * [1.012, 1, 1], poses[3])
+    ids = np.flatnonzero(inside)
+    fit = fit_lens(with_views(views, v3=replace(row, ids=ids, corners_px=longer[ids])), "radtan")
+    assert 0 < fit.view_weights[3] < 0.5
+    assert np.all(np.abs(fit.parameters[:2] - truth[:2]) < 3 * fit.sigma[:2])
+
+
 def test_a_lens_that_most_programs_read_is_taken_where_it_does() -> None:
     truth = (900.0, 900.0, 411.0, 212.0, 0.01, -5e-3, 2e-3, -4e-4)
     camera = Camera.create(truth[:2], truth[2:4], "equidistant", truth[4:])
