@@ -34,10 +34,11 @@ os.environ.setdefault(
     + (" --xla_cpu_max_isa=SSE4_2" if platform.machine() == "x86_64" else ""),
 )
 # The workers share the programs that they compile, and the next run finds them: what a program is
-# called by is its text, the compiler and its flags.
+# called by is its text, the compiler and its flags. The thousands that are a single operation are
+# kept too.
 kept = os.environ.get("JAXNAV_TEST_CACHE") or Path(__file__).parents[1] / ".pytest_cache/compiled"
 jax.config.update("jax_compilation_cache_dir", str(kept))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # Nor does anybody look where in the sources an operation is from, children neither.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 jax.config.update("jax_traceback_in_locations_limit", 0)
