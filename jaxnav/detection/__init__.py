@@ -8,9 +8,11 @@
 
 A decoder (OpenCV's, or AprilTag's own) finds each marker's id and its place to a pixel; `refine`
 then fits the corners, in the same way for both. Where a marker is expected, `track` follows it
-through blur, shade and what hides a part of it, with nothing decoded.
+through blur, shade and what hides a part of it, with nothing decoded. Where none is expected,
+`Acquirer` finds those of known ids in an image that is restored from its blur.
 """
 
+from jaxnav.detection.acquire import Acquirer
 from jaxnav.detection.apriltag import AprilTagDetector
 from jaxnav.detection.aruco import ArucoDetector
 from jaxnav.detection.families import marker_cells
@@ -22,6 +24,7 @@ from jaxnav.errors import BadInput
 from jaxnav.models.markers import MarkerMap
 
 __all__ = [
+    "Acquirer",
     "AprilTagDetector",
     "ArucoDetector",
     "CornerLanes",

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jaxnav.files import poses
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.models.lenses import LENSES
-from jaxnav.models.rig import PLACED_BY_HAND, CameraRig
+from jaxnav.models.rig import PLACED_BY_HAND, UNKNOWN_TIMING, CameraRig, Timing
 
 Lens = Literal[
     "none",
@@ -48,6 +48,7 @@ class CameraFigures:
             None where the file does not say.
         lens_sigma_px: (4,) of fx, fy, cx, cy; None where the file does not say. Read only: no file
             is given it.
+        timing: of its sensor.
     """
 
     name: str
@@ -59,6 +60,7 @@ class CameraFigures:
     T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None
     sigma: Float[np.ndarray, " 6"] | None = None
     lens_sigma_px: Float[np.ndarray, " 4"] | None = None
+    timing: Timing = UNKNOWN_TIMING
 
     @staticmethod
     def create(
@@ -70,6 +72,7 @@ class CameraFigures:
         T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None,
         sigma: Float[np.ndarray, " 6"] | None = None,
         lens_sigma_px: Float[np.ndarray, " 4"] | None = None,
+        timing: Timing = UNKNOWN_TIMING,
     ) -> "CameraFigures":
         """A camera from fx fy cx cy and coefficients; missing last coefficients are zero."""
         fx, fy, cx, cy = (float(value) for value in pinhole_px)
@@ -84,6 +87,7 @@ class CameraFigures:
             T_camera_vehicle=T_camera_vehicle,
             sigma=sigma,
             lens_sigma_px=lens_sigma_px,
+            timing=timing,
         )
 
     def camera(self) -> Camera:
@@ -122,6 +126,7 @@ def rig_from_figures(cameras: Sequence[CameraFigures]) -> CameraRig:
     A place without standard deviations has those of one measured by hand.
     """
     Ts_camera_vehicle = []
+    timings = [camera.timing for camera in cameras]
     for camera in cameras:
         assert camera.T_camera_vehicle is not None
         Ts_camera_vehicle.append(to_se3(poses.pose_as_read(camera.T_camera_vehicle)))
@@ -131,6 +136,7 @@ def rig_from_figures(cameras: Sequence[CameraFigures]) -> CameraRig:
         [camera.name for camera in cameras],
         [camera.image_size_px for camera in cameras],
         _sigmas(cameras),
+        timings if any(timing != UNKNOWN_TIMING for timing in timings) else None,
     )
 
 
@@ -158,6 +164,7 @@ def figures_of_rig(rig: CameraRig) -> list[CameraFigures]:
                 rig.image_sizes_px[index],
                 np.asarray(rig.Ts_camera_vehicle.wxyz_xyz[index], float),
                 sigma,
+                timing=rig.timing(index),
             )
         )
     return figures

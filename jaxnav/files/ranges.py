@@ -81,6 +81,8 @@ RANGES: dict[str, Range] = {
     "gain": Range(0.1, 10.0, "", "scale of speed and steering readings"),
     "offset_rad": Range(-0.5, 0.5, "rad", "offset of the steering"),
     "delay_s": Range(-0.5, 0.5, "s", "delay of the cameras behind the odometer"),
+    "exposure_s": Range(1e-7, 0.1, "s", "exposure of a camera's rows"),
+    "row_time_s": Range(0.0, 1e-3, "s", "time from a row's exposure to the next one's"),
     "imu_noise": Range(0.0, 100.0, "SI", "noise, random walk and bias of an IMU"),
     "imu_range": Range(0.1, 1e6, "rad/s, m/s^2", "largest reading of an IMU"),
     # Noise and tuning.

@@ -11,6 +11,10 @@
         position_m: [0.193, 0.0, 0.0953] # in the vehicle frame, with yaw_deg (0 forward, 90 left),
         yaw_deg: 0.0                     # elevation_deg (up) and roll_deg (clockwise from behind)
 
+A camera may have the times of its sensor, by which blurred markers are followed: `exposure_s`, and
+`row_time_s` from the exposure of one row to that of the next (0 for a global shutter). What a
+driver says of a frame goes before them, and where neither does, the exposure is learnt.
+
 The place of a camera may also be `T_vehicle_camera` or its inverse `T_camera_vehicle`, each
 either 4x4 or `{wxyz: [...], xyz_m: [...]}`. A camera may have standard deviations (`sigma`): those
 of its place (`position_m`, `rotation_deg`) are what the estimator allows for: where the file does
@@ -39,7 +43,7 @@ from jaxnav.files.figures import (
     rig_from_figures,
 )
 from jaxnav.files.provenance import Calibrated
-from jaxnav.files.ranges import pinhole_problem
+from jaxnav.files.ranges import pinhole_problem, within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import (
     NAME_PATTERN,
@@ -52,6 +56,7 @@ from jaxnav.files.validation import (
     Name,
     Number,
     Pair,
+    Positive,
     PositivePair,
     QuaternionPose,
     at,
@@ -59,7 +64,7 @@ from jaxnav.files.validation import (
 )
 from jaxnav.files.writing import atomic_write, yaml_text
 from jaxnav.models.camera import LENS_COEFFICIENTS
-from jaxnav.models.rig import CameraRig
+from jaxnav.models.rig import CameraRig, Timing
 from jaxnav.parameters import TUNABLES
 
 # One that is larger says that nobody knows where the camera is, or was written in another unit.
@@ -109,6 +114,8 @@ class CameraEntry(Entry):
     center_px: Pair
     distortion: list[Coefficient] = Field(default_factory=list)
     image_size_px: ImageSize
+    exposure_s: Annotated[Positive, within("exposure_s")] | None = None
+    row_time_s: Annotated[Number, within("row_time_s")] | None = None
     T_vehicle_camera: MountPose | None = None
     T_camera_vehicle: MountPose | None = None
     position_m: Mount | None = None
@@ -174,6 +181,7 @@ class CameraEntry(Entry):
             T_camera_vehicle,
             sigma.of_place(),
             sigma.of_lens(),
+            Timing(self.exposure_s, self.row_time_s),
         )
 
 
@@ -279,6 +287,7 @@ def camera_data(cameras: Sequence[CameraFigures]) -> dict[str, Any]:
                 "T_camera_vehicle": plain_pose(camera.T_camera_vehicle),
             }
         )
+        entries[-1] |= {k: v for k, v in camera.timing._asdict().items() if v is not None}
         if camera.sigma is not None:
             turn_deg = np.minimum(np.rad2deg(camera.sigma[3:]), _MOST_SIGMA_DEG)  # once rounded
             place = {"position_m": camera.sigma[:3], "rotation_deg": turn_deg}

@@ -2,10 +2,12 @@
 
 A camera's thread hands over its latest frame; older ones are dropped. The searching threads take
 frames camera by camera. They search first where the filter expects the markers, and the whole
-image now and then, and whenever nothing was found where it should be.
+image now and then, and whenever nothing was found where it should be. While nobody knows where they
+should be and nothing is read, some images are restored from their blur.
 """
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from jaxnav.detection.acquire import Acquirer
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.track import warm_up_tracks
 from jaxnav.detection.tracker import Tracker
@@ -30,6 +33,7 @@ _MIN_SPREAD = 2.0  # grey levels: an image with less spread shows nothing at all
 _SAMPLE = 16  # step between the rows and columns whose spread is taken
 
 WHOLE_EVERY = 10  # frames of a camera
+_RESTING = 3.0  # times what a restored image took, until the next
 
 _NONE = Detections.concatenate([])
 
@@ -72,14 +76,18 @@ class Search:
         model: CameraModel,
         detectors: Sequence[Detector],
         tracker: Tracker | None = None,
+        acquirer: Acquirer | None = None,
     ):
         """Args:
         camera: its index in the rig.
         size_px: width and height of its images.
         tracker: follows the expected markers that the detectors do not read; None: nothing does.
+        acquirer: finds markers in blurred images while nobody knows where they should be; None:
+            nothing does. It has a quarter of the time.
         """
         self._camera, self._size_px, self._model = camera, size_px, model
         self._detectors, self.tracker = list(detectors), tracker
+        self._acquirer, self._rests_until_s = acquirer, 0.0
         self._since_whole = camera  # so that cameras take turns
         self._picture, self._pictures = b"", 0  # the last picture, and how often it repeated
 
@@ -125,6 +133,8 @@ class Search:
             detections = self._everywhere(frame.image, region)
             if region is not None and not near:  # else none of them could be followed just now
                 detections = self._followed(frame, region, detections)
+        if region is None and not len(detections):
+            detections = self._acquired(frame.image)
         return FrameDetections(self._camera, frame.stamp_ns, detections)
 
     def _repeats(self, image: np.ndarray) -> bool:
@@ -160,6 +170,16 @@ class Search:
             detections,
         )
         return Detections.concatenate([detections, followed])
+
+    def _acquired(self, image: np.ndarray) -> Detections:
+        """The markers of a blurred image that no detector reads."""
+        begin_s = time.monotonic()
+        if self._acquirer is None or begin_s < self._rests_until_s:
+            return _NONE
+        detections = self._acquirer.detect(image, self._model)
+        end_s = time.monotonic()
+        self._rests_until_s = end_s + _RESTING * (end_s - begin_s)
+        return detections
 
     def _everywhere(self, image: np.ndarray, region: Region | None) -> Detections:
         quads_px = None if region is None else region.quads_px

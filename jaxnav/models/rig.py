@@ -4,6 +4,7 @@ Source: Liu, Schofield, Shan (2023), Eq. 2.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,6 +22,21 @@ PLACED_BY_HAND = np.repeat([0.005, np.deg2rad(0.5)], 3)
 PLACED_BY_CALIBRATION = np.repeat([0.002, np.deg2rad(0.2)], 3)
 
 
+class Timing(NamedTuple):
+    """When a camera's sensor sees: None where nobody says.
+
+    Attributes:
+        exposure_s: how long each row is exposed.
+        row_time_s: from the exposure of one row to that of the next; 0 for a global shutter.
+    """
+
+    exposure_s: float | None = None
+    row_time_s: float | None = None
+
+
+UNKNOWN_TIMING = Timing()
+
+
 class CameraRig(eqx.Module):
     """C cameras fixed to one vehicle. The order of the rig is the order of every C axis."""
 
@@ -31,6 +47,7 @@ class CameraRig(eqx.Module):
     # Standard deviations of each camera's place along the vehicle's axes, m, and of its direction
     # about them, rad; None: the cameras are exactly where `Ts_camera_vehicle` says.
     extrinsics_sigma: Float[Array, "C 6"] | None = None
+    timings: tuple[Timing, ...] | None = eqx.field(static=True, default=None)  # None: all unknown
 
     @staticmethod
     def create(
@@ -39,6 +56,7 @@ class CameraRig(eqx.Module):
         names: Sequence[str],
         image_sizes_px: Sequence[tuple[int, int]],
         extrinsics_sigma: Float[Array | np.ndarray, "C 6"] | None = None,
+        timings: Sequence[Timing] | None = None,
     ) -> "CameraRig":
         """A rig from its cameras, one entry each in every sequence."""
         return CameraRig(
@@ -49,6 +67,7 @@ class CameraRig(eqx.Module):
             extrinsics_sigma=None
             if extrinsics_sigma is None
             else jnp.asarray(extrinsics_sigma, float),
+            timings=None if timings is None else tuple(timings),
         )
 
     def __len__(self) -> int:
@@ -58,12 +77,17 @@ class CameraRig(eqx.Module):
         """One camera of the rig."""
         return jax.tree.map(lambda leaf: leaf[index], self.cameras)
 
+    def timing(self, index: int) -> Timing:
+        """What is known of when one camera's sensor sees."""
+        return UNKNOWN_TIMING if self.timings is None else self.timings[index]
+
     def first(self, count: int) -> "CameraRig":
         """The rig with its first cameras alone."""
         arrays = self.cameras, self.Ts_camera_vehicle, self.extrinsics_sigma
         cameras, Ts_camera_vehicle, sigma = jax.tree.map(lambda leaf: leaf[:count], arrays)
         names, sizes_px = self.names[:count], self.image_sizes_px[:count]
-        return CameraRig(cameras, Ts_camera_vehicle, names, sizes_px, sigma)
+        timings = None if self.timings is None else self.timings[:count]
+        return CameraRig(cameras, Ts_camera_vehicle, names, sizes_px, sigma, timings)
 
     def with_focal_px(self, mean_px: Float[Array, ""] | float) -> "CameraRig":
         """The rig with all focal lengths scaled to this mean."""

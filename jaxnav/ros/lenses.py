@@ -66,6 +66,7 @@ def with_lenses(rig: CameraRig, lenses: Mapping[str, CameraFigures]) -> CameraRi
             for size_px, one in zip(rig.image_sizes_px, told, strict=True)
         ],
         rig.extrinsics_sigma,
+        rig.timings,
     )
 
 

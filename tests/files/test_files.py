@@ -112,6 +112,7 @@ def test_a_saved_rig_reads_back_bit_for_bit(precision, tmp_path):
     odd = {"position_m": [0.1, 0.2, 0.3], "yaw_deg": 33.3, "elevation_deg": -7.1, "roll_deg": 1.7}
     text["cameras"][1] |= odd | {"lens": "radtan", "distortion": [0.1, -0.02, 1e-3, 2e-4]}
     text["cameras"][2] |= {"lens": "none", "distortion": []}
+    text["cameras"][3] |= {"exposure_s": 0.0123, "row_time_s": 0}
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(text))
     rig = files.load_rig(tmp_path / "rig.yaml")
     assert rig.cameras.focal_px.dtype == precision
@@ -119,6 +120,8 @@ def test_a_saved_rig_reads_back_bit_for_bit(precision, tmp_path):
     again = files.load_rig(tmp_path / "again.yaml")
     assert leaves_equal(rig, again)
     assert (again.names, again.image_sizes_px) == (rig.names, rig.image_sizes_px)
+    assert rig.timing(3) == again.timing(3) == (0.0123, 0.0)
+    assert rig.timing(0) == again.timing(0) == rig.first(1).timing(0) == (None, None)
 
 
 def test_sigmas_of_places_read_back_bit_for_bit(precision, tmp_path):

@@ -36,6 +36,8 @@ FIELDS: list[tuple[str, tuple[Any, ...], list[float]]] = [
     ("rig", ("cameras", 0, "distortion", 0), [1e9, -1e300]),
     ("rig", ("cameras", 0, "position_m", 2), [1e9, -1e5]),
     ("rig", ("cameras", 0, "yaw_deg"), [1e9]),
+    ("saved rig", ("cameras", 0, "exposure_s"), [1.0, 1e-9]),
+    ("saved rig", ("cameras", 0, "row_time_s"), [0.1, -1e-6]),
     ("saved rig", ("cameras", 0, "T_camera_vehicle", "xyz_m", 0), [1e9, 1e5]),
     ("saved markers", ("markers", 0, "size_m"), ODD),
     ("saved markers", ("markers", 0, "T_world_marker", "xyz_m", 1), [1e9, -1e300]),

@@ -26,6 +26,7 @@ from jaxnav.files.poses import pose_as_read
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.ros import load_ros
 from jaxnav.files.wpilib import layout_figures, layout_left_out
+from jaxnav.models.rig import CameraRig, Timing
 from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
 from jaxnav.recording.drive_log import read_drive
@@ -310,9 +311,16 @@ T_vehicle_odometry: {wxyz: [0, 0, 0, 1], xyz_m: [0.1, 0, -0.2]}
 odometry_delay_s: -0.05
 odometry_sigma: {scale: 0.05, turn_deg: 2.0}
 """
+
+
+def _timed_rig() -> CameraRig:
+    rig = qcar_rig()
+    return dataclasses.replace(rig, timings=(Timing(0.008, 1.5e-5),) * len(rig))
+
+
 STRUCTURED = {
     "rig": Loader(_written("rig.yaml", (QCAR / "rig.yaml").read_bytes()), files.load_rig),
-    "saved rig": Loader(_saved("rig.yaml", files.save_rig, qcar_rig), files.load_rig),
+    "saved rig": Loader(_saved("rig.yaml", files.save_rig, _timed_rig), files.load_rig),
     "markers": Loader(
         _written("markers.yaml", (QCAR / "markers.yaml").read_bytes()), files.load_markers
     ),

@@ -17,6 +17,7 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import place, rig_text
 from jaxnav.files.validation import validate
 from jaxnav.files.writing import atomic_write_all, refuse_overwriting
+from jaxnav.models.rig import UNKNOWN_TIMING
 
 _MANY: dict[str, Callable[[Sequence[CameraFigures]], str]] = {
     "jaxnav": rig_text,
@@ -114,6 +115,9 @@ def _write_cameras(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, 
         raise BadInput(args.source, "holds cameras, and a WPILib layout holds markers")
     cameras = _chosen(args, source)
     left_out = list(source.left_out)
+    timed = [camera.name for camera in cameras if camera.timing != UNKNOWN_TIMING]
+    if timed and args.to != "jaxnav":
+        left_out.append(f"when the sensors of {', '.join(timed)} see (exposure_s, row_time_s)")
     if args.to in _MANY:
         _require_suffix(args.to, args.out)
         contents = {args.out: _MANY[args.to](cameras)}

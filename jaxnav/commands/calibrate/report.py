@@ -47,6 +47,7 @@ def calibrated_rig(data: RigData, calibration: RigCalibration) -> CameraRig:
         data.rig.names,
         data.rig.image_sizes_px,
         data.rig.extrinsics_sigma,
+        data.rig.timings,
     )
 
 

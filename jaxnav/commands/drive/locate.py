@@ -17,6 +17,7 @@ from jaxnav.commands.drive.locate_notes import notes, without_doubles
 from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.detection import ArucoDetector, Detections, Detector, make_detector
+from jaxnav.detection.acquire import acquire_in_photograph
 from jaxnav.errors import BadInput
 from jaxnav.files.cameras import load_figures
 from jaxnav.files.images import read_photograph
@@ -52,6 +53,9 @@ def run(args: Locate) -> int:
     # What the pattern does not fit is a ghost, or was found better by the first.
     more = [found.only(found.refined) for found in more]
     detections = without_doubles(Detections.concatenate([first, *more]))
+    blurred = not len(detections)
+    if blurred:
+        detections = acquire_in_photograph(image, camera, args.family)
     rigs = [
         CameraRig.create([one], [jaxlie.SE3.identity()], ["camera"], [size_px])
         for one in _cameras(camera, lens_sigma_px)
@@ -67,7 +71,7 @@ def run(args: Locate) -> int:
         "family": args.family,
         "marker_size_m": args.marker_size_m,
         "markers": markers,
-        "notes": notes(args, markers, image, orientation, lens_sigma_px is not None),
+        "notes": notes(args, markers, image, orientation, lens_sigma_px is not None, blurred),
     }
     if args.out is not None:
         view = _view(image, camera, args.marker_size_m, detections, located)

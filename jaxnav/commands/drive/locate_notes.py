@@ -23,6 +23,7 @@ def notes(
     image: UInt8[np.ndarray, "rows columns *channels"],
     orientation: int,
     knows_lens: bool,
+    blurred: bool = False,
 ) -> list[str]:
     """Sentences on a photograph and the markers found in it.
 
@@ -30,6 +31,7 @@ def notes(
         markers: as in the report.
         orientation: of the photograph, 1 to 8, as EXIF counts.
         knows_lens: whether the camera's file has sigmas of its lens.
+        blurred: whether no marker could be read without restoring the photograph.
     """
     said = _of_the_size(args.marker_size_m)
     if orientation != 1:
@@ -42,6 +44,11 @@ def notes(
         )
     if not markers:
         said += _other_family(args, image)
+    elif blurred:
+        said.append(
+            "the photograph is blurred by a motion: ids were read in a restored one, and corners "
+            "fitted to the photograph as it is"
+        )
     said += [
         f"marker {marker['id']}: no pose explains its corners"
         for marker in markers

@@ -22,7 +22,8 @@ from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder
-from jaxnav.detection import Tracker, make_detectors
+from jaxnav.detection import Acquirer, Tracker, make_detectors
+from jaxnav.detection.observe import marker_keys
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.loop import plugins
@@ -132,12 +133,19 @@ def searches_for(
     """A search for markers for each camera.
 
     Args:
-        follow: also follow expected markers that can't be decoded.
+        follow: also follow expected markers that can't be decoded, and find them in blurred images.
     """
     detectors = make_detectors(markers, corner_backend)
     rig = jax.device_get(rig)  # NumPy indexes its cameras without compiling anything
     return [
-        Search(c, rig.image_sizes_px[c], rig.camera(c), detectors, Tracker() if follow else None)
+        Search(
+            c,
+            rig.image_sizes_px[c],
+            rig.camera(c),
+            detectors,
+            Tracker(*rig.timing(c)) if follow else None,
+            Acquirer(marker_keys(markers)) if follow else None,
+        )
         for c in range(len(rig))
     ]
 

@@ -89,6 +89,21 @@ def test_no_marker_in_view_is_a_result(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["markers"] == []
 
 
+def test_a_blurred_photograph_is_restored_to_be_read(rendered, tmp_path, capsys):
+    path, T_camera_marker = rendered
+    blurred = cv2.blur(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (9, 1))
+    cv2.imwrite(str(tmp_path / "blurred.png"), blurred)
+    assert not len(make_detector("aruco").detect(blurred))
+    assert locate(tmp_path / "blurred.png", *CAMERA, "--as-json") == 0
+    report = json.loads(capsys.readouterr().out)
+    (marker,) = report["markers"]
+    assert marker["id"] == 0
+    assert any("is blurred by a motion" in note for note in report["notes"])
+    position_m = np.array(marker["poses"][0]["T_camera_marker"])[:3, 3]
+    truth_m = np.asarray(T_camera_marker.translation())
+    np.testing.assert_allclose(position_m, truth_m, atol=0.02)
+
+
 def test_every_tag_that_either_detector_finds_is_found_once(data_dir, tmp_path, capsys):
     photo = data_dir / "apriltag_photos" / "34085369442_304b6bafd9_c.jpg"
     (tmp_path / "camera.yaml").write_text(
