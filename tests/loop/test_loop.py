@@ -451,4 +451,5 @@ def test_a_blurred_marker_is_acquired_while_nobody_knows_where_it_should_be():
     found = search.look(Frame(2, image), None)
     assert found.detections.ids.tolist() == [truth.id]
     # Then it rests, so that decoding has most of the time.
+    image[0, 0] ^= 1  # a sensor has noise
     assert not len(search.look(Frame(3, image), None).detections)
