@@ -48,6 +48,21 @@ class Detections:
             tuple(self.families[row] for row in rows),
         )
 
+    def once_each(self) -> "Detections":
+        """The detections less the less sharp of two of the same marker in the same place."""
+        keys = list(zip(self.families, self.ids.tolist(), strict=True))
+        if len(set(keys)) == len(keys):
+            return self
+        centres_px = self.corners_px.mean(axis=1)
+        sides_px = np.linalg.norm(np.diff(self.corners_px, axis=1), axis=2).mean(axis=1)
+        kept: list[int] = []
+        for row in map(int, np.argsort(self.sigma_px.mean(axis=1), kind="stable")):
+            same = [other for other in kept if keys[other] == keys[row]]
+            apart_px = np.linalg.norm(centres_px[same] - centres_px[row], axis=1)
+            if not np.any(apart_px < sides_px[row] / 2):
+                kept.append(row)
+        return self.only(np.array(sorted(kept), int))
+
     @staticmethod
     def concatenate(parts: Sequence["Detections"]) -> "Detections":
         """Concatenate one image's detections by several detectors, say of different families."""
@@ -139,7 +154,10 @@ def refine_detections(
     family: str,
     camera: Camera | None,
 ) -> Detections:
-    """Refine the corners of markers that a decoder found, given as (id, (4, 2) corners) each."""
+    """Refine the corners of markers that a decoder found, given as (id, (4, 2) corners) each.
+
+    A marker whose outline it found twice, inside and outside, is there once.
+    """
     lens = Lens(camera)
     fits = [refine_corners(image, corners, marker_cells(family, i), lens) for i, corners in markers]
     return Detections(
@@ -148,4 +166,4 @@ def refine_detections(
         sigma_px=np.array([fit.sigma_px for fit in fits], float).reshape(-1, 4),
         refined=np.array([fit.good for fit in fits], bool),
         families=(family,) * len(markers),
-    )
+    ).once_each()

@@ -70,6 +70,31 @@ def test_photographs(detector, data_dir):
     assert np.max(errors_px) < 2.5  # the same corner first, in all of them
 
 
+def test_one_sighting_is_not_two():
+    corners_px = np.array([[10.0, 10], [50, 10], [50, 50], [10, 50]])
+    places_px = [corners_px, corners_px + 2, corners_px + 200, corners_px + 1, corners_px]
+    seen = Detections(
+        ids=np.array([3, 3, 3, 5, 3]),
+        corners_px=np.stack(places_px),
+        sigma_px=np.repeat([[0.2], [0.01], [0.3], [0.1], [0.4]], 4, axis=1),
+        refined=np.array([True, True, True, False, True]),
+        families=("tag36h11",) * 4 + ("4x4_50",),
+    )
+    kept = seen.once_each()
+    assert kept.sigma_px[:, 0].tolist() == [0.01, 0.3, 0.1, 0.4]
+    assert kept.ids.tolist() == [3, 3, 5, 3]
+    assert len(Detections.concatenate([]).once_each()) == 0
+
+
+def test_photographs_have_no_marker_twice(detector, data_dir):
+    """OpenCV's decoder gives the outline of some from both sides of their edge."""
+    for photograph in sorted((data_dir / "apriltag_photos").glob("*.jpg")):
+        detections = detector.detect(cv2.imread(str(photograph)))
+        centers = detections.corners_px.mean(axis=1)
+        apart_px = np.linalg.norm(centers[:, None] - centers, axis=2)
+        assert np.min(apart_px + 1e3 * np.eye(len(centers))) > 8
+
+
 def small_scene(rng, side_px, blur_px):
     """The paper's marker from afar: upright, 39 degrees off its normal, before a patterned wall."""
     direction = rng.uniform(0, 2 * np.pi)

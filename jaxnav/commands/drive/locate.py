@@ -13,7 +13,7 @@ import numpy as np
 from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.commands.drive.arguments import Locate
-from jaxnav.commands.drive.locate_notes import notes, without_doubles
+from jaxnav.commands.drive.locate_notes import notes
 from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.detection import ArucoDetector, Detections, Detector, make_detector
@@ -52,7 +52,7 @@ def run(args: Locate) -> int:
     first, *more = (detector.detect(image, camera) for detector in detectors)
     # What the pattern does not fit is a ghost, or was found better by the first.
     more = [found.only(found.refined) for found in more]
-    detections = without_doubles(Detections.concatenate([first, *more]))
+    detections = Detections.concatenate([first, *more]).once_each()
     blurred = not len(detections)
     if blurred:
         detections = acquire_in_photograph(image, camera, args.family)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxnav.commands.drive.arguments import Locate
-from jaxnav.detection import Detections, make_detector
+from jaxnav.detection import make_detector
 from jaxnav.detection.families import LARGEST_FAMILIES
 from jaxnav.files.images import MIRRORED
 
@@ -66,20 +66,6 @@ def notes(
             "its focal length and centre are wrong: `jaxnav calibrate intrinsics` writes them"
         )
     return said
-
-
-def without_doubles(detections: Detections) -> Detections:
-    """The detections with the sharper one of two that show the same marker in the same place."""
-    order = np.argsort(detections.sigma_px.mean(axis=1), kind="stable")
-    centres_px = detections.corners_px.mean(axis=1)
-    sides_px = np.linalg.norm(np.diff(detections.corners_px, axis=1), axis=2).mean(axis=1)
-    kept: list[int] = []
-    for index in order:
-        apart_px = np.linalg.norm(centres_px[kept] - centres_px[index], axis=1)
-        same = (detections.ids[kept] == detections.ids[index]) & (apart_px < sides_px[index] / 2)
-        if not np.any(same):
-            kept.append(int(index))
-    return detections.only(np.array(sorted(kept), int))
 
 
 def _of_the_size(size_m: float) -> list[str]:

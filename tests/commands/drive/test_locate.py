@@ -11,8 +11,7 @@ import yaml
 from PIL import Image
 
 from jaxnav.cli import main
-from jaxnav.commands.drive.locate_notes import without_doubles
-from jaxnav.detection import Detections, make_detector, marker_cells
+from jaxnav.detection import make_detector, marker_cells
 from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
@@ -242,21 +241,6 @@ def test_corners_that_no_pose_explains_count_as_unsure(tmp_path, capsys):
     face, tele = found
     assert face["sigma_factor"] < 2 < 5 < tele["sigma_factor"]
     assert np.min(tele["corner_sigma_px"]) > 2 * np.max(face["corner_sigma_px"])
-
-
-def test_one_sighting_is_not_two():
-    corners_px = np.array([[10.0, 10], [50, 10], [50, 50], [10, 50]])
-    seen = Detections(
-        ids=np.array([3, 3, 3, 5]),
-        corners_px=np.stack([corners_px, corners_px + 2, corners_px + 200, corners_px + 1]),
-        sigma_px=np.array([[0.2] * 4, [0.01] * 4, [0.3] * 4, [0.1] * 4]),
-        refined=np.array([True, True, True, False]),
-        families=("a", "b", "c", "d"),
-    )
-    kept = without_doubles(seen)
-    assert kept.ids.tolist() == [3, 3, 5]
-    assert kept.families == ("b", "c", "d")
-    assert len(without_doubles(Detections.concatenate([]))) == 0
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
