@@ -21,7 +21,6 @@ _POINTS_PER_EDGE = 16
 _MIN_PIXELS = 60
 _MAX_NOISE = 0.25  # of the contrast
 _FEW_GREYS = 0.06  # of the pixels around the outline
-_CURVED_UP_TO_PX = 300.0  # of larger markers a third of a pixel is a thousandth
 _NO_EDGES = np.zeros((0, 2, 2))
 _SETTLED_PX = 0.1  # a corner that moves by less in a step
 _MAX_MOVE = 0.2  # of the side
@@ -112,7 +111,7 @@ def fit_marker(
     around = image.shape, M, lens, side_px / len(cells)
     pixels = pixels_around(*around, None if whole else _NO_EDGES)
     known = bool(np.all((cells == 0) | (cells == 1)))
-    curved = known and side_px <= _CURVED_UP_TO_PX and _has_greys(image, pixels)
+    curved = known and _has_greys(image, pixels)
     if curved and not whole:
         pixels = pixels_around(*around, _inner_edges(cells))
     count = len(pixels)

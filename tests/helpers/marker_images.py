@@ -49,7 +49,8 @@ class Scene:
         rays = self._rays(u, v).astype(np.float32)
         # Ray and plane: the marker's own coordinates of the hit.
         R, t = self.R_camera_marker.astype(np.float32), self.t_camera_marker.astype(np.float32)
-        depth = (R[:, 2] @ t) / (rays @ R[:, 2])
+        along = rays @ R[:, 2]
+        depth = (R[:, 2] @ t) / np.where(along == 0, 1e-9, along)  # a ray along the paper
         hit = (rays * depth[..., None] - t) @ R
         n = len(self.cells)
         column = np.floor((hit[..., 0] / self.size_m + 0.5) * n).astype(int)
