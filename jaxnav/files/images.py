@@ -28,6 +28,7 @@ _TIFF = (b"II*\0", b"MM\0*")  # which OpenCV turns as viewers do, whatever flag 
 _TURNS_BACK = {3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}  # by so many quarters, anticlockwise
 _EXIF_WITHIN = 2**20  # bytes from the start of a file
 _BROKEN = (OSError, ValueError, SyntaxError, KeyError, TypeError, EOFError, RuntimeError)
+_NO_IMAGE = "is not an image that OpenCV can read"
 _HEIC = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif")
 
 
@@ -125,7 +126,8 @@ def read_photograph(
     with libraries_silenced():
         image = decode_image(raw, flags)
     if image is None:
-        raise BadInput(path, image_problem(raw) or "is not an image that OpenCV can read")
+        broken = "is a damaged HEIC picture, or no picture" if is_heic(raw) else _NO_IMAGE
+        raise BadInput(path, image_problem(raw) or broken)
     return image, exif_orientation(raw)
 
 
@@ -140,7 +142,7 @@ def image_problem(raw: bytes | UInt8[np.ndarray, " N"]) -> str | None:
         return "is a HEIC picture: pip install 'jaxnav[heic]' reads it, or save it as JPEG"
     size_px = image_size_px(stored)
     if size_px is None:
-        return "is not an image that OpenCV can read"
+        return _NO_IMAGE
     width, height = size_px
     if width * height > limits.IMAGE_PIXELS:
         most = limits.IMAGE_PIXELS // 10**6

@@ -132,6 +132,13 @@ def test_without_its_reader_a_heic_picture_gets_a_hint(tmp_path: Path, monkeypat
         read_image(file)
 
 
+def test_a_damaged_heic_picture_is_called_so(tmp_path: Path) -> None:
+    pytest.importorskip("pillow_heif", reason="pillow-heif is not installed")
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(64))
+    with pytest.raises(BadInput, match="damaged HEIC picture"):
+        read_image(tmp_path / "IMG_1.HEIC")
+
+
 def test_what_is_no_picture_is_said_to_be_none(tmp_path: Path) -> None:
     for name, raw in {
         "a.heic": b"\0\0\0\x18ftypheic" + bytes(64),

@@ -141,7 +141,7 @@ def calibrate_lens(
         name, sigma_px = good.views[row].name, fit.view_sigma_px[row]
         left_out[name] = (
             f"its corners are {sigma_px:.2g} px off, {sigma_px / fit.sigma_px:.0f} times as far as "
-            "the others'"
+            "the others': did the board bend, or move?"
             if np.isfinite(sigma_px)
             else "no pose of the board explains it"
         )

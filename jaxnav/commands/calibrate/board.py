@@ -54,12 +54,23 @@ def run(args: CalibrateBoard) -> int:
     print(f"{words}, on {paper_mm[0]:g} x {paper_mm[1]:g} mm")
     print(f"{folder / 'board.pdf'}, {folder / 'board.png'}, {folder / 'board.yaml'}")
     print("\n".join(_ADVICE))
-    if board.kind != "marker":
+    if board.kind == "marker":
+        print(
+            f"Photograph it with a calibrated camera: {_locate(board)}, the side as measured where "
+            "a ruler is off"
+        )
+    else:
         print(
             "Photograph it 20 times, tilted, into the corners of the image: "
             f"jaxnav calibrate intrinsics FOLDER --board {folder / 'board.yaml'}"
         )
     return 0
+
+
+def _locate(marker: Board) -> str:
+    """The command that finds the marker in a photograph."""
+    family = "" if marker.family == "tag36h11" else f" --family {marker.family}"
+    return f"jaxnav locate PHOTO --camera camera.yaml --marker-size-m {marker.size_m:g}{family}"
 
 
 def _paper_mm(args: CalibrateBoard) -> tuple[float, float]:

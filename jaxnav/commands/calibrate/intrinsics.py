@@ -36,6 +36,8 @@ from jaxnav.plots.lens import lens_report
 # The yaw of a camera with such a name, until its place is measured.
 _YAWS_DEG = {"front": 0.0, "left": 90.0, "rear": 180.0, "back": 180.0, "right": -90.0}
 
+_NAMED = 5  # views without the board that are named one by one
+
 
 def run(args: CalibrateIntrinsics) -> int:
     """Find the board in the images, fit the lenses, write camera.yaml and a report."""
@@ -188,6 +190,15 @@ def _notes(calibration: LensCalibration, collected: CollectedViews) -> tuple[str
     return (other, *calibration.findings)
 
 
+def _without_board(views: tuple[str, ...]) -> list[str]:
+    """A line for each view in which the board is not seen; one for many, as of a video."""
+    if not views:
+        return []
+    if len(views) > _NAMED:
+        return [f"  left out: {len(views)} views, {views[0]} first: the board is not seen"]
+    return [f"  left out: {view}: the board is not seen: is it blurred?" for view in views]
+
+
 def _text(name: str, calibration: LensCalibration, collected: CollectedViews) -> str:
     fit = calibration.fit
     used = int(np.sum(fit.view_weights > 0))
@@ -202,6 +213,7 @@ def _text(name: str, calibration: LensCalibration, collected: CollectedViews) ->
         lines.append(f"  {parameter:>5} {value:12.6g} {sure}")
     lines += [f"  left out: {view}: {why}" for view, why in calibration.left_out.items()]
     lines += [f"  left out: {view}: {why}" for view, why in collected.unreadable]
+    lines += _without_board(collected.without_board)
     lines += [f"  left out: {view}: repeats {twin}" for view, twin in collected.duplicates]
     lines += [f"  counts {weight:.2g}: {view}" for view, weight in calibration.downweighted.items()]
     lines += [f"  note: {sentence}" for sentence in _notes(calibration, collected)]
