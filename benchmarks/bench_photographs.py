@@ -1,0 +1,175 @@
+"""Compare detectors on real photographs: what each finds, what it misses and what it makes up.
+
+    python benchmarks/bench_photographs.py FAMILY=FOLDER ... --out DIR
+
+Of each photograph the markers of all detectors are laid over each other: one marker is the same id
+at the same place. Nobody says what is there: what only one detector sees is drawn into --out, for
+the eye to judge. Prints a table.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from bench_detection import Find, row
+
+from jaxnav.calibration.boards.images import source_files
+from jaxnav.commands.drive.locate import _detectors as locate_detectors
+from jaxnav.detection import Detections, make_detector
+from jaxnav.detection.families import dictionary
+from jaxnav.files.images import read_image
+
+APRILTAG = ("tag16h5", "tag25h9", "tag36h11")
+
+
+def opencv(family: str, refinement: int) -> Find:
+    """OpenCV's detector; with the refinement of AprilTag it looks for quads as AprilTag does."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = refinement
+    decoder = cv2.aruco.ArucoDetector(dictionary(family), parameters)
+
+    def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        quads, ids, _ = decoder.detectMarkers(image)
+        return np.ravel([] if ids is None else ids), np.reshape(quads, (-1, 4, 2))
+
+    return find
+
+
+def pyapriltags(family: str) -> Find:
+    """AprilTag's own detector at full resolution."""
+    from pyapriltags import Detector
+
+    decoder = Detector(families=family, nthreads=1, quad_decimate=1.0)
+
+    def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        tags = decoder.detect(image)
+        corners_px = [tag.corners[[1, 0, 3, 2]] - 0.5 for tag in tags]
+        return np.array([tag.tag_id for tag in tags], int), np.reshape(corners_px, (-1, 4, 2))
+
+    return find
+
+
+def ours(family: str, backend: str) -> Find:
+    """The detector of this package."""
+    detector = make_detector(backend, family)
+
+    def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        detections = detector.detect(image)
+        return detections.ids, detections.corners_px
+
+    return find
+
+
+def locate(family: str) -> Find:
+    """What `jaxnav locate` does: both, and a closer look at every quadrilateral."""
+    detectors = locate_detectors("aruco", family)
+
+    def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        first, *more = (detector.detect(image) for detector in detectors)
+        more = [found.only(found.refined) for found in more]
+        found = Detections.concatenate([first, *more]).once_each()
+        return found.ids, found.corners_px
+
+    return find
+
+
+def finders(family: str) -> dict[str, Find]:
+    """Those that can read the family."""
+    found = {
+        "OpenCV": opencv(family, cv2.aruco.CORNER_REFINE_NONE),
+        "OpenCV, AprilTag's quads": opencv(family, cv2.aruco.CORNER_REFINE_APRILTAG),
+        "ours, aruco": ours(family, "aruco"),
+        "jaxnav locate": locate(family),
+    }
+    if family in APRILTAG:
+        found["pyapriltags"] = pyapriltags(family)
+        found["ours, apriltag"] = ours(family, "apriltag")
+    return found
+
+
+class Marker:
+    """One marker of a photograph: its id, corners (4, 2) and who found it, how often."""
+
+    def __init__(self, marker_id: int, corners_px: np.ndarray):
+        self.marker_id, self.corners_px = marker_id, corners_px
+        self.by: dict[str, int] = {}
+
+    def is_at(self, corners_px: np.ndarray) -> bool:
+        """True where the centres are less than a third of the smaller side apart."""
+        away = np.linalg.norm(corners_px.mean(axis=0) - self.corners_px.mean(axis=0))
+        return bool(away < min(side_px(corners_px), side_px(self.corners_px)) / 3)
+
+
+def side_px(corners_px: np.ndarray) -> float:
+    """Mean side of a quadrilateral (4, 2)."""
+    sides = np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=0), axis=1)
+    return float(np.mean(sides))
+
+
+def laid_over(image: np.ndarray, found: dict[str, Find]) -> list[Marker]:
+    """The markers of all detectors."""
+    markers: list[Marker] = []
+    for name, find in found.items():
+        for marker_id, corners_px in zip(*find(image), strict=True):
+            same = [m for m in markers if m.marker_id == marker_id and m.is_at(corners_px)]
+            if not same:
+                same = [Marker(int(marker_id), corners_px)]
+                markers += same
+            same[0].by[name] = same[0].by.get(name, 0) + 1
+    return markers
+
+
+def draw(image: np.ndarray, markers: list[Marker], names: list[str], file: Path) -> None:
+    """Markers that all see are green, others red with who sees them."""
+    scale = 1600 / max(image.shape)
+    picture = cv2.resize(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), None, fx=scale, fy=scale)
+    for marker in markers:
+        everyone = len(marker.by) == len(names)
+        colour = (0, 200, 0) if everyone else (0, 0, 255)
+        corners = np.int32(np.round((marker.corners_px + 0.5) * scale))
+        cv2.polylines(picture, [corners], True, colour, 1)
+        who = "" if everyone else "".join(str(names.index(name)) for name in marker.by)
+        place = tuple(corners.min(axis=0).tolist())
+        cv2.putText(picture, f"{marker.marker_id} {who}", place, 0, 0.5, colour, 1)
+    cv2.imwrite(str(file), picture)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sources", nargs="+", help="FAMILY=FOLDER")
+    parser.add_argument("--out", type=Path, help="folder for pictures of what was found")
+    arguments = parser.parse_args()
+    for source in arguments.sources:
+        family, _, folder = source.partition("=")
+        found = finders(family)
+        names, every = list(found), []
+        for file in source_files([Path(folder)]):
+            image = read_image(file, cv2.IMREAD_GRAYSCALE)
+            markers = laid_over(image, found)
+            every += [(file.name, marker) for marker in markers]
+            if arguments.out:
+                arguments.out.mkdir(parents=True, exist_ok=True)
+                draw(image, markers, names, arguments.out / f"{family}-{file.stem}.png")
+        print(f"\n{family}, {len(source_files([Path(folder)]))} photographs\n")
+        print(row("", "found", "of all", "alone", "twice"))
+        print(row(*["---"] * 5))
+        for name in names:
+            by = [marker.by for _, marker in every if name in marker.by]
+            twice = sum(count[name] > 1 for count in by)
+            print(row(name, len(by), len(every), sum(len(b) == 1 for b in by), twice))
+        for file_name, marker in every:
+            if len(marker.by) < len(names):
+                center = marker.corners_px.mean(axis=0).round().astype(int).tolist()
+                print(f"{file_name} {marker.marker_id} at {center},"
+                      f" {side_px(marker.corners_px):.0f} px: {', '.join(marker.by)}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
