@@ -15,7 +15,7 @@ from jaxtyping import Shaped, UInt8
 from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import all_cells, dictionary
 from jaxnav.detection.restore import BlurredImage, likely_motions
-from jaxnav.detection.track import Target, Track, track
+from jaxnav.detection.track import Target, track
 from jaxnav.detection.tracker import detections_of
 from jaxnav.detection.types import Detections, at_scale, grey
 from jaxnav.models.camera import Camera
@@ -55,15 +55,13 @@ class Acquirer:
         blurred = BlurredImage(image)
         for motion in likely_motions(image)[: self._motions]:
             restored, in_image = at_scale(blurred.restored(motion), _ENLARGE)
-            found: dict[tuple[str, int], Track] = {}
-            for key, quad_px in self._proposed(restored):
-                quads_px = in_image(quad_px)[None]
-                target = Target(*key, quads_px, _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
-                [seen] = track(image, camera, [target])
-                if seen is not None and key not in found:
-                    found[key] = seen
+            targets = [
+                Target(*key, in_image(quad_px)[None], _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
+                for key, quad_px in self._proposed(restored)
+            ]
+            found = [seen for seen in track(image, camera, targets) if seen is not None]
             if found:
-                return detections_of([found[key] for key in sorted(found)])
+                return detections_of(found).once_each()
         return Detections.concatenate([])
 
     def _proposed(self, image: np.ndarray) -> list[tuple[tuple[str, int], np.ndarray]]:
