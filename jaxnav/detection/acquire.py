@@ -5,7 +5,9 @@ ids alone reads it with many errors allowed. What it reads is only proposed: `tr
 whole pattern to the raw pixels, and decides.
 """
 
-from collections.abc import Sequence
+import math
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -26,42 +28,76 @@ _FRAME_ERRORS = 0.4  # of the frame's cells
 _PERIMETER_RATE = 0.03
 _OFF_PX = 4.0  # a corner in a restored image, at most
 _STREAK_SIGMA_PX = 1.5
-_PHOTOGRAPH_PIXELS = 1e6  # a larger one is halved
 _MOST_PROPOSED = 4  # a motion: each takes some milliseconds
 
 
 class Acquirer:
     """Finds markers of known ids in blurred images. Not safe for several threads."""
 
-    def __init__(self, keys: Sequence[tuple[str, int]], motions: int = 4):
+    def __init__(
+        self,
+        keys: Sequence[tuple[str, int]],
+        motions: int = 4,
+        most_s: float = math.inf,
+        most_pixels: float = 1e6,
+    ):
         """Args:
         keys: family and id of each marker.
         motions: for how many motions an image is restored, at most.
+        most_s: no motion is begun after this time; the next image goes on with the next likely one.
+        most_pixels: a larger image is halved, and again.
         """
-        self._motions = motions
+        self._motions, self._most_s, self._most_pixels = motions, most_s, most_pixels
+        self._next = 0  # the rank of the motion to begin with
         self._ids = {
             family: sorted({i for name, i in keys if name == family})
             for family in sorted({name for name, _ in keys})
         }
         self._decoders = {family: _decoder(family, ids) for family, ids in self._ids.items()}
 
-    def detect(self, image: Shaped[np.ndarray, "..."], camera: Camera | None = None) -> Detections:
+    def detect(
+        self,
+        image: Shaped[np.ndarray, "..."],
+        camera: Camera | None = None,
+        alive: Callable[[], object] = lambda: None,
+    ) -> Detections:
         """The markers that the first restored image with any of them shows.
 
         Args:
             image: as in `Detector.detect`, like `camera`.
+            alive: called before every part of the work, some 10 ms each.
         """
-        image = grey(image)
-        blurred = BlurredImage(image)
-        for motion in likely_motions(image)[: self._motions]:
+        image, scale = grey(image), 1.0
+        while scale**2 * image.size > self._most_pixels:
+            scale /= 2
+        if scale < 1 and camera is not None:
+            center_px = scale * (camera.center_px + 0.5) - 0.5
+            camera = replace(camera, focal_px=scale * camera.focal_px, center_px=center_px)
+        small, in_image = at_scale(image, scale)
+        found = self._found(small, camera, alive).once_each()
+        corners_px = in_image(found.corners_px)
+        return replace(found, corners_px=corners_px, sigma_px=found.sigma_px / scale)
+
+    def _found(
+        self, image: np.ndarray, camera: Camera | None, alive: Callable[[], object]
+    ) -> Detections:
+        until_s = time.monotonic() + self._most_s
+        blurred, likely = BlurredImage(image), likely_motions(image)
+        for _ in range(self._motions):
+            alive()
+            motion = likely[self._next]
             restored, in_image = at_scale(blurred.restored(motion), _ENLARGE)
-            targets = [
-                Target(*key, in_image(quad_px)[None], _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
-                for key, quad_px in self._proposed(restored)
-            ]
-            found = [seen for seen in track(image, camera, targets) if seen is not None]
-            if found:
-                return detections_of(found).once_each()
+            tracks = []
+            for key, quad_px in self._proposed(restored):
+                alive()
+                quads_px = in_image(quad_px)[None]
+                target = Target(*key, quads_px, _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
+                tracks += [one for one in track(image, camera, [target]) if one is not None]
+            if tracks:
+                return detections_of(tracks)
+            self._next = (self._next + 1) % self._motions
+            if time.monotonic() > until_s:
+                break
         return Detections.concatenate([])
 
     def _proposed(self, image: np.ndarray) -> list[tuple[tuple[str, int], np.ndarray]]:
@@ -80,25 +116,9 @@ class Acquirer:
 def acquire_in_photograph(
     image: UInt8[np.ndarray, "rows columns *channels"], camera: Camera, family: str
 ) -> Detections:
-    """Any markers of a family in a blurred photograph.
-
-    Args:
-        image: a large one is halved, and again: it may be blurred by more pixels.
-    """
-    image, scale = grey(image), 1.0
-    while scale**2 * image.size > _PHOTOGRAPH_PIXELS:
-        scale /= 2
-    small, in_photograph = at_scale(image, scale)
-    lens = replace(
-        camera,
-        focal_px=scale * camera.focal_px,
-        center_px=scale * (camera.center_px + 0.5) - 0.5,
-    )
+    """Any markers of a family in a blurred photograph."""
     keys = [(family, marker_id) for marker_id in range(len(all_cells(family)))]
-    found = Acquirer(keys).detect(small, lens)
-    return replace(
-        found, corners_px=in_photograph(found.corners_px), sigma_px=found.sigma_px / scale
-    )
+    return Acquirer(keys).detect(image, camera)
 
 
 def _decoder(family: str, ids: Sequence[int]) -> cv2.aruco.ArucoDetector:

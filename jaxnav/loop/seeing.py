@@ -88,6 +88,7 @@ class Search:
         self._camera, self._size_px, self._model = camera, size_px, model
         self._detectors, self.tracker = list(detectors), tracker
         self._acquirer, self._rests_until_s = acquirer, 0.0
+        self.alive: Callable[[], object] = lambda: None  # told during a long search
         self._since_whole = camera  # so that cameras take turns
         self._picture, self._pictures = b"", 0  # the last picture, and how often it repeated
 
@@ -176,7 +177,7 @@ class Search:
         begin_s = time.monotonic()
         if self._acquirer is None or begin_s < self._rests_until_s:
             return _NONE
-        detections = self._acquirer.detect(image, self._model)
+        detections = self._acquirer.detect(image, self._model, self.alive)
         end_s = time.monotonic()
         self._rests_until_s = end_s + _RESTING * (end_s - begin_s)
         return detections
@@ -216,6 +217,8 @@ class Eyes:
         workers: number of threads that search for markers.
         """
         self._cameras, self._searches, self._guard = list(cameras), list(searches), guard
+        for search in searches:
+            search.alive = lambda: guard.beat(threading.current_thread().name)
         self._woken = threading.Condition()
         self._frames: list[Frame | None] = [None] * len(cameras)
         self._busy = [False] * len(cameras)

@@ -42,6 +42,8 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import DriveSetup
 
 EXIT_STOPPED = 1  # by the watchdog, not by a person
+# Of an image that is restored: one motion, two on a fast machine, in 25 ms each at that size.
+_LOOK_S, _LOOK_PIXELS = 0.02, 4e5
 
 
 @before_others()
@@ -144,7 +146,9 @@ def searches_for(
             rig.camera(c),
             detectors,
             Tracker(*rig.timing(c)) if follow else None,
-            Acquirer(marker_keys(markers)) if follow else None,
+            Acquirer(marker_keys(markers), most_s=_LOOK_S, most_pixels=_LOOK_PIXELS)
+            if follow
+            else None,
         )
         for c in range(len(rig))
     ]
