@@ -2,8 +2,8 @@
 
 The spectrum of an image blurred by a straight motion is the sharp one's times that of the motion,
 sinc(l f), which is weak in stripes across the motion. The mean spectrum of the image's tiles is
-compared with those stripes, without what depends on the spatial frequency's size alone: the lens
-and the scene change that, a motion does not.
+compared with those stripes, without what a scene has by itself: a power that depends on the spatial
+frequency's size, and in each direction, across walls and floors, falls off in its own way.
 
 Source: Wiener (1949); Welch (1967), the mean spectrum; Gennery (1973), the stripes.
 """
@@ -20,7 +20,7 @@ _LENGTHS_PX = (3.0, 4.0, 5.5, 7.5, 10.0)
 _TURN_PX = 2.0  # between the ends of neighbouring motions
 _TILE = 64
 _FREQUENCIES = (0.04, 0.45)  # 1/px: what is slower is the scene's, what is faster noise
-_RINGS = 40  # per 1/px
+_RINGS, _SECTORS = 40, 16  # per 1/px, and of half a turn
 _FLOOR = 0.01  # of the stripes' power: noise fills them
 _LENS_PX2 = 0.45  # variance of lens and pixel
 _NOISE_PER_PX = 1e-3  # noise over the scene's power, for each pixel of the motion
@@ -62,9 +62,9 @@ def likely_motions(image: UInt8[np.ndarray, "rows columns"]) -> list[Motion]:
         image: (H, W) grey levels, blurred by about the same motion everywhere.
     """
     size = min(_TILE, *image.shape)
-    rings, stripes = _stripes(size)
+    used, stripes = _stripes(size)
     power = _mean_power(image, size)
-    seen = _without_rings(np.log(power + 1e-3 * power.mean() + 1e-9)[rings >= 0], rings)
+    seen = np.log(power + 1e-3 * power.mean() + 1e-9)[used]
     order = np.argsort(-(stripes @ seen), kind="stable")
     return [motions()[k] for k in order]
 
@@ -111,19 +111,22 @@ def _begins(side: int, size: int) -> np.ndarray:
 
 @cache
 def _stripes(size: int) -> tuple[np.ndarray, Float[np.ndarray, "motions frequencies"]]:
-    """The ring of each frequency of a tile, -1 for one that is left out; each motion's stripes."""
+    """Which frequencies of a tile count, and each motion's stripes without what a scene has."""
     fy, fx = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None]
     radius = np.hypot(fx, fy)
     used = (radius > _FREQUENCIES[0]) & (radius < _FREQUENCIES[1])
-    rings = np.where(used, (radius * _RINGS).astype(int), -1)
-    stripes = [
-        _without_rings(np.log(one.transfer(fx, fy)[used] ** 2 + _FLOOR), rings) for one in motions()
-    ]
-    return rings, np.stack([one / np.linalg.norm(one) for one in stripes])
+    scene = _of_scenes(radius[used], np.arctan2(fy, fx)[used])
+    logs = np.stack([np.log(one.transfer(fx, fy)[used] ** 2 + _FLOOR) for one in motions()])
+    stripes = logs - (logs @ scene) @ scene.T
+    return used, stripes / np.linalg.norm(stripes, axis=1, keepdims=True)
 
 
-def _without_rings(values: np.ndarray, rings: np.ndarray) -> np.ndarray:
-    """Values (frequencies,) less the mean of their ring."""
-    ring = rings[rings >= 0]
-    mean = np.bincount(ring, values) / np.maximum(np.bincount(ring), 1)
-    return np.asarray(values - mean[ring])
+def _of_scenes(radius: np.ndarray, angle_rad: np.ndarray) -> Float[np.ndarray, "frequencies n"]:
+    """An orthonormal basis of log spectra: any function of the frequency's size, and in each sector
+    a power of it."""
+    ring = (radius * _RINGS).astype(int)
+    sector = ((angle_rad / math.pi + 0.5) * _SECTORS).astype(int).clip(0, _SECTORS - 1)
+    one_ring, one_sector = (np.eye(k.max() + 1)[k] for k in (ring, sector))
+    columns = np.concatenate([one_ring, one_sector, one_sector * np.log(radius)[:, None]], axis=1)
+    basis, weights, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(basis[:, weights > 1e-9 * weights[0]])

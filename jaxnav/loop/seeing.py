@@ -177,6 +177,7 @@ class Search:
         begin_s = time.monotonic()
         if self._acquirer is None or begin_s < self._rests_until_s:
             return _NONE
+        self.alive()
         detections = self._acquirer.detect(image, self._model, self.alive)
         end_s = time.monotonic()
         self._rests_until_s = end_s + _RESTING * (end_s - begin_s)
