@@ -23,6 +23,7 @@ from jaxnav.detection.types import Detections, at_scale, grey
 from jaxnav.models.camera import Camera
 
 _ENLARGE = 2
+_STRIP_PX, _OVERLAP_PX = 320, 120  # of what is decoded at once; a marker's side at most
 _ERRORS = 6  # one bit of so many may be wrong
 _FRAME_ERRORS = 0.4  # of the frame's cells
 _PERIMETER_RATE = 0.03
@@ -86,12 +87,10 @@ class Acquirer:
         for _ in range(self._motions):
             alive()
             motion = likely[self._next]
-            restored, in_image = at_scale(blurred.restored(motion), _ENLARGE)
             tracks = []
-            for key, quad_px in self._proposed(restored):
+            for key, quad_px in self._proposed(blurred.restored(motion), alive):
                 alive()
-                quads_px = in_image(quad_px)[None]
-                target = Target(*key, quads_px, _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
+                target = Target(*key, quad_px[None], _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
                 tracks += [one for one in track(image, camera, [target]) if one is not None]
             if tracks:
                 return detections_of(tracks)
@@ -100,16 +99,21 @@ class Acquirer:
                 break
         return Detections.concatenate([])
 
-    def _proposed(self, image: np.ndarray) -> list[tuple[tuple[str, int], np.ndarray]]:
-        """Family, id and corners of what may be a marker."""
+    def _proposed(
+        self, image: np.ndarray, alive: Callable[[], object]
+    ) -> list[tuple[tuple[str, int], np.ndarray]]:
+        """Family, id and corners of what may be a marker, strip by strip."""
         proposed = []
-        for family, ids in self._ids.items():
-            left = thin_crowd(image, family, _PERIMETER_RATE * max(image.shape))
-            quads, places, _ = self._decoders[family].detectMarkers(left)
-            if places is not None:
-                corners_px = np.reshape(quads, (-1, 4, 2)).astype(float)
-                keys = [(family, ids[int(k)]) for k in places.ravel()]
-                proposed += list(zip(keys, corners_px, strict=True))
+        for begin_px in range(0, max(image.shape[1] - _OVERLAP_PX, 1), _STRIP_PX - _OVERLAP_PX):
+            strip, in_strip = at_scale(image[:, begin_px : begin_px + _STRIP_PX], _ENLARGE)
+            for family, ids in self._ids.items():
+                alive()
+                left = thin_crowd(strip, family, _PERIMETER_RATE * max(strip.shape))
+                quads, places, _ = self._decoders[family].detectMarkers(left)
+                if places is not None:
+                    corners_px = in_strip(np.reshape(quads, (-1, 4, 2)).astype(float))
+                    keys = [(family, ids[int(k)]) for k in places.ravel()]
+                    proposed += list(zip(keys, corners_px + np.array([begin_px, 0]), strict=True))
         return proposed[:_MOST_PROPOSED]
 
 

@@ -22,8 +22,7 @@ from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder
-from jaxnav.detection import Acquirer, Tracker, make_detectors
-from jaxnav.detection.observe import marker_keys
+from jaxnav.detection import Tracker, make_detectors
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.loop import plugins
@@ -42,8 +41,6 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import DriveSetup
 
 EXIT_STOPPED = 1  # by the watchdog, not by a person
-# Of an image that is restored: one motion, two on a fast machine, in 25 ms each at that size.
-_LOOK_S, _LOOK_PIXELS = 0.02, 4e5
 
 
 @before_others()
@@ -135,7 +132,7 @@ def searches_for(
     """A search for markers for each camera.
 
     Args:
-        follow: also follow expected markers that can't be decoded, and find them in blurred images.
+        follow: also follow expected markers that can't be decoded.
     """
     detectors = make_detectors(markers, corner_backend)
     rig = jax.device_get(rig)  # NumPy indexes its cameras without compiling anything
@@ -146,9 +143,6 @@ def searches_for(
             rig.camera(c),
             detectors,
             Tracker(*rig.timing(c)) if follow else None,
-            Acquirer(marker_keys(markers), most_s=_LOOK_S, most_pixels=_LOOK_PIXELS)
-            if follow
-            else None,
         )
         for c in range(len(rig))
     ]
