@@ -3,7 +3,7 @@
 A camera's thread hands over its latest frame; older ones are dropped. The searching threads take
 frames camera by camera. They search first where the filter expects the markers, and the whole
 image now and then, and whenever nothing was found where it should be. While nobody knows where they
-should be and nothing is read, some images are restored from their blur.
+should be and nothing is read, an acquirer restores some images from their blur.
 """
 
 import threading
