@@ -5,9 +5,7 @@ ids alone reads it with many errors allowed. What it reads is only proposed: `tr
 whole pattern to the raw pixels, and decides.
 """
 
-import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -23,7 +21,7 @@ from jaxnav.detection.types import Detections, at_scale, grey
 from jaxnav.models.camera import Camera
 
 _ENLARGE = 2
-_STRIP_PX, _OVERLAP_PX = 320, 120  # of what is decoded at once; a marker's side at most
+_MOST_PIXELS = 1e6
 _ERRORS = 6  # one bit of so many may be wrong
 _FRAME_ERRORS = 0.4  # of the frame's cells
 _PERIMETER_RATE = 0.03
@@ -35,85 +33,58 @@ _MOST_PROPOSED = 4  # a motion: each takes some milliseconds
 class Acquirer:
     """Finds markers of known ids in blurred images. Not safe for several threads."""
 
-    def __init__(
-        self,
-        keys: Sequence[tuple[str, int]],
-        motions: int = 4,
-        most_s: float = math.inf,
-        most_pixels: float = 1e6,
-    ):
+    def __init__(self, keys: Sequence[tuple[str, int]], motions: int = 4):
         """Args:
         keys: family and id of each marker.
         motions: for how many motions an image is restored, at most.
-        most_s: no motion is begun after this time; the next image goes on with the next likely one.
-        most_pixels: a larger image is halved, and again.
         """
-        self._motions, self._most_s, self._most_pixels = motions, most_s, most_pixels
-        self._next = 0  # the rank of the motion to begin with
+        self._motions = motions
         self._ids = {
             family: sorted({i for name, i in keys if name == family})
             for family in sorted({name for name, _ in keys})
         }
         self._decoders = {family: _decoder(family, ids) for family, ids in self._ids.items()}
 
-    def detect(
-        self,
-        image: Shaped[np.ndarray, "..."],
-        camera: Camera | None = None,
-        alive: Callable[[], object] = lambda: None,
-    ) -> Detections:
+    def detect(self, image: Shaped[np.ndarray, "..."], camera: Camera | None = None) -> Detections:
         """The markers that the first restored image with any of them shows.
 
         Args:
-            image: as in `Detector.detect`, like `camera`.
-            alive: called before every part of the work, some 10 ms each.
+            image: as in `Detector.detect`, like `camera`; a large one is halved, and again.
         """
         image, scale = grey(image), 1.0
-        while scale**2 * image.size > self._most_pixels:
+        while scale**2 * image.size > _MOST_PIXELS:
             scale /= 2
         if scale < 1 and camera is not None:
             center_px = scale * (camera.center_px + 0.5) - 0.5
             camera = replace(camera, focal_px=scale * camera.focal_px, center_px=center_px)
         small, in_image = at_scale(image, scale)
-        found = self._found(small, camera, alive).once_each()
+        found = self._found(small, camera).once_each()
         corners_px = in_image(found.corners_px)
         return replace(found, corners_px=corners_px, sigma_px=found.sigma_px / scale)
 
-    def _found(
-        self, image: np.ndarray, camera: Camera | None, alive: Callable[[], object]
-    ) -> Detections:
-        until_s = time.monotonic() + self._most_s
-        blurred, likely = BlurredImage(image), likely_motions(image)
-        for _ in range(self._motions):
-            alive()
-            motion = likely[self._next]
-            tracks = []
-            for key, quad_px in self._proposed(blurred.restored(motion), alive):
-                alive()
-                target = Target(*key, quad_px[None], _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
-                tracks += [one for one in track(image, camera, [target]) if one is not None]
-            if tracks:
-                return detections_of(tracks)
-            self._next = (self._next + 1) % self._motions
-            if time.monotonic() > until_s:
-                break
+    def _found(self, image: np.ndarray, camera: Camera | None) -> Detections:
+        blurred = BlurredImage(image)
+        for motion in likely_motions(image)[: self._motions]:
+            restored, in_image = at_scale(blurred.restored(motion), _ENLARGE)
+            targets = [
+                Target(*key, in_image(quad_px)[None], _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
+                for key, quad_px in self._proposed(restored)
+            ]
+            found = [seen for seen in track(image, camera, targets) if seen is not None]
+            if found:
+                return detections_of(found)
         return Detections.concatenate([])
 
-    def _proposed(
-        self, image: np.ndarray, alive: Callable[[], object]
-    ) -> list[tuple[tuple[str, int], np.ndarray]]:
-        """Family, id and corners of what may be a marker, strip by strip."""
+    def _proposed(self, image: np.ndarray) -> list[tuple[tuple[str, int], np.ndarray]]:
+        """Family, id and corners of what may be a marker."""
         proposed = []
-        for begin_px in range(0, max(image.shape[1] - _OVERLAP_PX, 1), _STRIP_PX - _OVERLAP_PX):
-            strip, in_strip = at_scale(image[:, begin_px : begin_px + _STRIP_PX], _ENLARGE)
-            for family, ids in self._ids.items():
-                alive()
-                left = thin_crowd(strip, family, _PERIMETER_RATE * max(strip.shape))
-                quads, places, _ = self._decoders[family].detectMarkers(left)
-                if places is not None:
-                    corners_px = in_strip(np.reshape(quads, (-1, 4, 2)).astype(float))
-                    keys = [(family, ids[int(k)]) for k in places.ravel()]
-                    proposed += list(zip(keys, corners_px + np.array([begin_px, 0]), strict=True))
+        for family, ids in self._ids.items():
+            left = thin_crowd(image, family, _PERIMETER_RATE * max(image.shape))
+            quads, places, _ = self._decoders[family].detectMarkers(left)
+            if places is not None:
+                corners_px = np.reshape(quads, (-1, 4, 2)).astype(float)
+                keys = [(family, ids[int(k)]) for k in places.ravel()]
+                proposed += list(zip(keys, corners_px, strict=True))
         return proposed[:_MOST_PROPOSED]
 
 

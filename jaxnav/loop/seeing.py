@@ -2,12 +2,10 @@
 
 A camera's thread hands over its latest frame; older ones are dropped. The searching threads take
 frames camera by camera. They search first where the filter expects the markers, and the whole
-image now and then, and whenever nothing was found where it should be. While nobody knows where they
-should be and nothing is read, an acquirer restores some images from their blur.
+image now and then, and whenever nothing was found where it should be.
 """
 
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +14,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.detection.acquire import Acquirer
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.track import warm_up_tracks
 from jaxnav.detection.tracker import Tracker
@@ -33,7 +30,6 @@ _MIN_SPREAD = 2.0  # grey levels: an image with less spread shows nothing at all
 _SAMPLE = 16  # step between the rows and columns whose spread is taken
 
 WHOLE_EVERY = 10  # frames of a camera
-_RESTING = 3.0  # times what a restored image took, until the next
 
 _NONE = Detections.concatenate([])
 
@@ -76,19 +72,14 @@ class Search:
         model: CameraModel,
         detectors: Sequence[Detector],
         tracker: Tracker | None = None,
-        acquirer: Acquirer | None = None,
     ):
         """Args:
         camera: its index in the rig.
         size_px: width and height of its images.
         tracker: follows the expected markers that the detectors do not read; None: nothing does.
-        acquirer: finds markers in blurred images while nobody knows where they should be; None:
-            nothing does. It has a quarter of the time.
         """
         self._camera, self._size_px, self._model = camera, size_px, model
         self._detectors, self.tracker = list(detectors), tracker
-        self._acquirer, self._rests_until_s = acquirer, 0.0
-        self.alive: Callable[[], object] = lambda: None  # told during a long search
         self._since_whole = camera  # so that cameras take turns
         self._picture, self._pictures = b"", 0  # the last picture, and how often it repeated
 
@@ -134,8 +125,6 @@ class Search:
             detections = self._everywhere(frame.image, region)
             if region is not None and not near:  # else none of them could be followed just now
                 detections = self._followed(frame, region, detections)
-        if region is None and not len(detections):
-            detections = self._acquired(frame.image)
         return FrameDetections(self._camera, frame.stamp_ns, detections)
 
     def _repeats(self, image: np.ndarray) -> bool:
@@ -172,17 +161,6 @@ class Search:
         )
         return Detections.concatenate([detections, followed])
 
-    def _acquired(self, image: np.ndarray) -> Detections:
-        """The markers of a blurred image that no detector reads."""
-        begin_s = time.monotonic()
-        if self._acquirer is None or begin_s < self._rests_until_s:
-            return _NONE
-        self.alive()
-        detections = self._acquirer.detect(image, self._model, self.alive)
-        end_s = time.monotonic()
-        self._rests_until_s = end_s + _RESTING * (end_s - begin_s)
-        return detections
-
     def _everywhere(self, image: np.ndarray, region: Region | None) -> Detections:
         quads_px = None if region is None else region.quads_px
         return Detections.concatenate(
@@ -218,8 +196,6 @@ class Eyes:
         workers: number of threads that search for markers.
         """
         self._cameras, self._searches, self._guard = list(cameras), list(searches), guard
-        for search in searches:
-            search.alive = lambda: guard.beat(threading.current_thread().name)
         self._woken = threading.Condition()
         self._frames: list[Frame | None] = [None] * len(cameras)
         self._busy = [False] * len(cameras)

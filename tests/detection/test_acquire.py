@@ -1,7 +1,6 @@
 """Markers that no decoder reads are found without a prediction, and nothing else is."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -66,21 +65,6 @@ def test_a_restored_image_is_nearer_to_the_sharp_one():
         return np.mean((image.astype(float) - sharp)[inside] ** 2)
 
     assert off(restored) < 0.5 * off(blurred)
-
-
-def test_a_look_of_little_time_goes_on_with_the_next_motion():
-    """Every part of the work is told of, and what the fourth motion finds is found in the end."""
-    found = {"patient": 0, "hurried": 0}
-    for image, truth in other_pictures("blur4"):
-        parts: list[int] = []
-        keys = [(FAMILY, truth.id)]
-        found["patient"] += len(Acquirer(keys).detect(image, truth.camera))
-        hurried = Acquirer(keys, most_s=0.0)
-        alive = partial(parts.append, 0)
-        looks = [hurried.detect(image, truth.camera, alive) for _ in range(4)]
-        assert len(parts) >= 4
-        found["hurried"] += any(map(len, looks))
-    assert found["hurried"] == found["patient"] >= 3
 
 
 def test_a_large_photograph_is_halved():

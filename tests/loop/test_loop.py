@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from jaxnav.detection import Acquirer, Tracker, make_detector
+from jaxnav.detection import Tracker, make_detector
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -433,23 +433,3 @@ def test_a_marker_that_no_decoder_reads_is_followed_where_it_is_expected():
         assert np.max(np.abs(followed.detections.corners_px[0] - truth.corners_px)) < 0.5
         return
     raise AssertionError("every picture can be read")
-
-
-def test_a_blurred_marker_is_acquired_while_nobody_knows_where_it_should_be():
-    detectors = [make_detector("aruco")]
-    image, truth = next(
-        (image, truth)
-        for image, truth in other_pictures("blur8")
-        if not len(detectors[0].detect(image, truth.camera))
-        and len(Acquirer([(truth.family, truth.id)]).detect(image, truth.camera))
-    )
-    camera = 0, image.shape[::-1], truth.camera, detectors
-    assert not len(Search(*camera).look(Frame(1, image), None).detections)
-    search = Search(*camera, acquirer=Acquirer([(truth.family, truth.id)]))
-    nowhere = Region(np.zeros((0, 4, 2)), np.zeros(0))  # a pose is known
-    assert not len(search.look(Frame(1, image), nowhere).detections)
-    found = search.look(Frame(2, image), None)
-    assert found.detections.ids.tolist() == [truth.id]
-    # Then it rests, so that decoding has most of the time.
-    image[0, 0] ^= 1  # a sensor has noise
-    assert not len(search.look(Frame(3, image), None).detections)
