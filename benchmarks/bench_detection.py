@@ -29,10 +29,10 @@ DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/da
 Find = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # image -> ids, corners_px
 
 
-def opencv(refinement: int) -> Find:
+def opencv(refinement: int, family: str = FAMILY) -> Find:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = refinement
-    decoder = cv2.aruco.ArucoDetector(dictionary(FAMILY), parameters)
+    decoder = cv2.aruco.ArucoDetector(dictionary(family), parameters)
 
     def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         quads, ids, _ = decoder.detectMarkers(image)
@@ -41,19 +41,19 @@ def opencv(refinement: int) -> Find:
     return find
 
 
-def apriltag() -> Find:
-    decoder = pyapriltags.Detector(families=FAMILY, nthreads=1, quad_decimate=1.0)
+def apriltag(family: str = FAMILY) -> Find:
+    decoder = pyapriltags.Detector(families=family, nthreads=1, quad_decimate=1.0)
 
     def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         tags = decoder.detect(image)
         corners_px = [tag.corners[[1, 0, 3, 2]] - 0.5 for tag in tags]
-        return np.array([tag.tag_id for tag in tags]), np.reshape(corners_px, (-1, 4, 2))
+        return np.array([tag.tag_id for tag in tags], int), np.reshape(corners_px, (-1, 4, 2))
 
     return find
 
 
-def ours(backend: str) -> Find:
-    detector = make_detector(backend, FAMILY)
+def ours(backend: str, family: str = FAMILY) -> Find:
+    detector = make_detector(backend, family)
 
     def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         detections = detector.detect(image)

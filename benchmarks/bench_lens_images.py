@@ -7,9 +7,13 @@ narrow one. Beside it stands OpenCV on the same corners; for the narrow lens mrc
 installed: it has no equidistant one.
 """
 
+import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from jaxnav.configuration import configure
 
@@ -19,17 +23,13 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from mrcal_lens import MISSING, installed, mrcal_lens  # noqa: E402
 from scipy.ndimage import gaussian_filter  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
 
 from jaxnav.calibration.boards.board import Board  # noqa: E402
-from jaxnav.calibration.boards.sheets import sheet_of  # noqa: E402
 from jaxnav.calibration.lenses.images import calibrate_images  # noqa: E402
-from jaxnav.calibration.lenses.simulated_views import simulated_views  # noqa: E402
 from jaxnav.calibration.lenses.start import opencv_calibration  # noqa: E402
 from jaxnav.files import calib_dir, load_rig  # noqa: E402
 from jaxnav.models.camera import Camera  # noqa: E402
-from jaxnav.simulation.boards import BoardRenderer  # noqa: E402
-from jaxnav.simulation.sensor import Sensor  # noqa: E402
+from tests.helpers.board_pictures import board_pictures  # noqa: E402
 
 RIG = load_rig(calib_dir() / "qcar" / "rig.yaml")
 SIZE_PX = RIG.image_sizes_px[0]
@@ -51,20 +51,13 @@ ROWS = (
 
 def draw(folder: Path, board: Board, camera: Camera, count: int, spoilt: bool) -> None:
     """Pictures of the board from all sides."""
-    sheet = sheet_of(board)
-    renderer = BoardRenderer(camera, SIZE_PX, sheet.ink, sheet.module_m, Sensor(psf_sigma_px=0.5))
     rng = np.random.default_rng(7)
-    how = {"distances_m": (0.2, 0.45), "reach": 0.9}
+    how: dict[str, Any] = {"distances_m": (0.2, 0.45), "reach": 0.9}
     if board.kind == "marker":
         how = {"distances_m": (0.15, 0.4), "reach": 0.9, "fewest": 4}
     if camera is NARROW:
         how = {"distances_m": (0.35, 0.9), "reach": 0.9}
-    _, poses = simulated_views(camera, SIZE_PX, board.points_board_m, count, rng, **how)
-    for number, pose in enumerate(poses):
-        T_camera_board = np.eye(4)
-        T_camera_board[:3, :3] = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
-        T_camera_board[:3, 3] = pose[4:]
-        image = renderer.render(T_camera_board, rng)
+    for number, image in enumerate(board_pictures(board, camera, SIZE_PX, count, rng, **how)):
         if spoilt and number == 11:
             image = gaussian_filter(image, 4.0)
         cv2.imwrite(str(folder / f"{number}.png"), image)

@@ -17,63 +17,21 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from bench_detection import Find, row
+from bench_detection import Find, apriltag, opencv, ours, row
 
 from jaxnav.calibration.boards.images import source_files
-from jaxnav.commands.drive.locate import _detectors as locate_detectors
-from jaxnav.detection import Detections, make_detector
-from jaxnav.detection.families import dictionary
+from jaxnav.commands.drive.locate import detect, detectors_for
 from jaxnav.files.images import read_image
 
 APRILTAG = ("tag16h5", "tag25h9", "tag36h11")
 
 
-def opencv(family: str, refinement: int) -> Find:
-    """OpenCV's detector; with the refinement of AprilTag it looks for quads as AprilTag does."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = refinement
-    decoder = cv2.aruco.ArucoDetector(dictionary(family), parameters)
-
-    def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        quads, ids, _ = decoder.detectMarkers(image)
-        return np.ravel([] if ids is None else ids), np.reshape(quads, (-1, 4, 2))
-
-    return find
-
-
-def pyapriltags(family: str) -> Find:
-    """AprilTag's own detector at full resolution."""
-    from pyapriltags import Detector
-
-    decoder = Detector(families=family, nthreads=1, quad_decimate=1.0)
-
-    def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        tags = decoder.detect(image)
-        corners_px = [tag.corners[[1, 0, 3, 2]] - 0.5 for tag in tags]
-        return np.array([tag.tag_id for tag in tags], int), np.reshape(corners_px, (-1, 4, 2))
-
-    return find
-
-
-def ours(family: str, backend: str) -> Find:
-    """The detector of this package."""
-    detector = make_detector(backend, family)
-
-    def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        detections = detector.detect(image)
-        return detections.ids, detections.corners_px
-
-    return find
-
-
 def locate(family: str) -> Find:
     """What `jaxnav locate` does: both, and a closer look at every quadrilateral."""
-    detectors = locate_detectors("aruco", family)
+    detectors = detectors_for("aruco", family)
 
     def find(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        first, *more = (detector.detect(image) for detector in detectors)
-        more = [found.only(found.refined) for found in more]
-        found = Detections.concatenate([first, *more]).once_each()
+        found = detect(detectors, image)
         return found.ids, found.corners_px
 
     return find
@@ -82,14 +40,14 @@ def locate(family: str) -> Find:
 def finders(family: str) -> dict[str, Find]:
     """Those that can read the family."""
     found = {
-        "OpenCV": opencv(family, cv2.aruco.CORNER_REFINE_NONE),
-        "OpenCV, AprilTag's quads": opencv(family, cv2.aruco.CORNER_REFINE_APRILTAG),
-        "ours, aruco": ours(family, "aruco"),
+        "OpenCV": opencv(cv2.aruco.CORNER_REFINE_NONE, family),
+        "OpenCV, AprilTag's quads": opencv(cv2.aruco.CORNER_REFINE_APRILTAG, family),
+        "ours, aruco": ours("aruco", family),
         "jaxnav locate": locate(family),
     }
     if family in APRILTAG:
-        found["pyapriltags"] = pyapriltags(family)
-        found["ours, apriltag"] = ours(family, "apriltag")
+        found["pyapriltags"] = apriltag(family)
+        found["ours, apriltag"] = ours("apriltag", family)
     return found
 
 

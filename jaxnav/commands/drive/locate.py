@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -38,7 +39,7 @@ def run(args: Locate) -> int:
     if args.out is not None and args.out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise BadInput("--out", f"must end in .png or .jpg, got {args.out}")
     configure_jax(float64=True)
-    detectors = _detectors(args.corner_backend, args.family)
+    detectors = detectors_for(args.corner_backend, args.family)
     figures = load_figures(args.camera, args.camera_name)
     camera, size_px, lens_sigma_px = figures.camera(), figures.image_size_px, figures.lens_sigma_px
     image, orientation = read_photograph(args.image)
@@ -49,10 +50,7 @@ def run(args: Locate) -> int:
             f"is {width} x {height} pixels, but --camera {args.camera} was calibrated at "
             f"{size_px[0]} x {size_px[1]}",
         )
-    first, *more = (detector.detect(image, camera) for detector in detectors)
-    # What the pattern does not fit is a ghost, or was found better by the first.
-    more = [found.only(found.refined) for found in more]
-    detections = Detections.concatenate([first, *more]).once_each()
+    detections = detect(detectors, image, camera)
     blurred = not len(detections)
     if blurred:
         detections = acquire_in_photograph(image, camera, args.family)
@@ -80,7 +78,17 @@ def run(args: Locate) -> int:
     return 0
 
 
-def _detectors(backend: str, family: str) -> list[Detector]:
+def detect(
+    detectors: Sequence[Detector], image: np.ndarray, camera: Camera | None = None
+) -> Detections:
+    """The markers that any of the detectors finds, each once."""
+    first, *more = (detector.detect(image, camera) for detector in detectors)
+    # What the pattern does not fit is a ghost, or was found better by the first.
+    more = [found.only(found.refined) for found in more]
+    return Detections.concatenate([first, *more]).once_each()
+
+
+def detectors_for(backend: str, family: str) -> list[Detector]:
     """The detector that is asked for; AprilTag's beside OpenCV's where it is there.
 
     A photograph has the time for a closer look at every quadrilateral.

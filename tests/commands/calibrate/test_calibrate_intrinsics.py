@@ -8,14 +8,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from jaxnav import cli
 from jaxnav.calibration.boards.board import Board
-from jaxnav.calibration.boards.sheets import sheet_of
 from jaxnav.calibration.lenses import comparison as lens_comparison
 from jaxnav.calibration.lenses.images import calibrate_images
-from jaxnav.calibration.lenses.simulated_views import simulated_views
 from jaxnav.commands.calibrate import intrinsics as calibrate_intrinsics
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import write_board
@@ -23,8 +20,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.reading import read_mapping
 from jaxnav.models.camera import Camera
-from jaxnav.simulation.boards import BoardRenderer
-from jaxnav.simulation.sensor import Sensor
+from tests.helpers.board_pictures import board_pictures
 
 VIEWS = 7  # as few as leave the comparison of lenses out, which compiles long
 QCAR = calib_dir() / "qcar" / "rig.yaml"
@@ -39,16 +35,9 @@ def rendered(folder, board, count, seed, camera=None, **how):
     folder.mkdir()
     rig = load_rig(QCAR)
     camera, size_px = camera or rig.camera(0), rig.image_sizes_px[0]
-    sheet = sheet_of(board)
-    renderer = BoardRenderer(camera, size_px, sheet.ink, sheet.module_m, Sensor(psf_sigma_px=0.5))
-    rng = np.random.default_rng(seed)
     how = {"distances_m": (0.2, 0.4), "reach": 0.8} | how
-    _, poses = simulated_views(camera, size_px, board.points_board_m, count, rng, **how)
-    for number, pose in enumerate(poses):
-        T_camera_board = np.eye(4)
-        T_camera_board[:3, :3] = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
-        T_camera_board[:3, 3] = pose[4:]
-        image = renderer.render(T_camera_board, rng)
+    rng = np.random.default_rng(seed)
+    for number, image in enumerate(board_pictures(board, camera, size_px, count, rng, **how)):
         cv2.imwrite(str(folder / f"{number}.png"), image)
 
 
