@@ -1,8 +1,10 @@
 """Read the cameras, one thread each, and search their frames for markers in further threads.
 
-A camera's thread hands over its latest frame; older ones are dropped. The searching threads take
-frames camera by camera. They search first where the filter expects the markers, and the whole
-image now and then, and whenever nothing was found where it should be.
+A camera's thread hands over its latest frame; older ones are dropped, and so are searched frames
+that the loop has not taken when the camera's next one is searched: a loop that is too slow handles
+fewer frames, not later ones. The searching threads take frames camera by camera. They search first
+where the filter expects the markers, and the whole image now and then, and whenever nothing was
+found where it should be.
 """
 
 import threading
@@ -201,9 +203,9 @@ class Eyes:
         self._busy = [False] * len(cameras)
         self._turn = 0
         self._waiting = threading.Condition()
-        self._seen: list[SearchedFrame] = []
+        self._seen: dict[int, SearchedFrame] = {}  # by camera
         self._over = threading.Event()
-        self.dropped = 0  # frames replaced by newer ones before a search
+        self.dropped = 0  # frames replaced by newer ones, before a search or after it
         self.errors = [0] * len(cameras)  # failed reads
         self.expected: Callable[[int], Region | None] = lambda camera: None
         turns: list[tuple[str, Callable[[], None]]] = [
@@ -222,10 +224,10 @@ class Eyes:
             thread.start()
 
     def take(self) -> list[SearchedFrame]:
-        """The frames searched since the last call, in the order of their stamps."""
+        """The last searched frame of each camera since the last call, in the order of stamps."""
         with self._woken:
-            seen, self._seen = self._seen, []
-        return sorted(seen, key=lambda one: one.sighted.stamp_ns)
+            seen, self._seen = self._seen, {}
+        return sorted(seen.values(), key=lambda one: one.sighted.stamp_ns)
 
     def wait(self, timeout_s: float) -> None:
         """Wait until a frame was searched, or the time is over."""
@@ -284,7 +286,8 @@ class Eyes:
             self._busy[index] = False
         seen = SearchedFrame(sighted, frame, self._cameras[index].name)
         with self._woken:
-            self._seen.append(seen)
+            self.dropped += index in self._seen
+            self._seen[index] = seen
             self._woken.notify()
 
     def _next(self) -> tuple[int, Frame] | None:

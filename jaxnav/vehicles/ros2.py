@@ -47,6 +47,9 @@ if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
     from jaxnav.models.bicycle import Vehicle as VehicleModel
     from jaxnav.models.twist_base import TwistBase
 
+# Until somebody listens to the commands: what is sent before is lost, and a vehicle that hears
+# nothing is taken for one that is held fast.
+_HEARD_WITHIN_S, _LOOK_S = 5.0, 0.01
 _LOCK_PATIENCE_S = 0.03  # a `stop` waits this long for a message that another thread publishes
 _SHORT = {"odometry": ODOMETRY_TYPES[0], "ackermann": ACKERMANN}  # names of earlier releases
 _COMMANDS = {"ackermann": ACKERMANN, "twist": "geometry_msgs/msg/Twist"}
@@ -70,7 +73,7 @@ class RosVehicle:
     timeout_s = math.inf  # a subscriber may stop by itself, but does not say so
 
     def __init__(self, vehicle: VehicleModel | TwistBase, options: Mapping[str, str]):
-        """Subscribe to the odometry.
+        """Subscribe to the odometry, and wait until somebody listens to the commands, up to 5 s.
 
         Args:
             options: see the module.
@@ -111,6 +114,11 @@ class RosVehicle:
             self._gyro_clock = self._connection.source_clock()
             self._connection.listen(IMU, options["imu_topic"], self._take_turn)
         self._connection.run()
+        end_s = time.monotonic() + _HEARD_WITHIN_S
+        while self._publisher is not None and time.monotonic() < end_s:
+            if self._publisher.get_subscription_count():
+                break
+            time.sleep(_LOOK_S)
 
     def read(self) -> Any:
         """The latest message, with its own stamp.

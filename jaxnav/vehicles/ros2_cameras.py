@@ -12,7 +12,6 @@ Options, `--option KEY=VALUE`:
 """
 
 import threading
-from collections import deque
 from functools import partial
 from typing import Any, get_args
 
@@ -26,11 +25,10 @@ from jaxnav.ros.source_clock import SourceClock
 from jaxnav.vehicles.options import choice, number
 
 _PREFIX = "camera."
-_WAITING = 8  # frames that a camera keeps for its reader
 
 
 class RosCamera:
-    """A camera behind a topic. Implements `Camera`."""
+    """A camera behind a topic. Implements `Camera`: a slow reader gets the newest frame."""
 
     def __init__(self, name: str, leave: Any):
         """Args:
@@ -38,22 +36,23 @@ class RosCamera:
         """
         self.name = name
         self._leave = leave
-        self._frames: deque[Frame] = deque(maxlen=_WAITING)
+        self._frame: Frame | None = None
         self._came = threading.Condition()
         self._closed = False
 
     def add(self, frame: Frame) -> None:
         """Take a frame from the topic."""
         with self._came:
-            self._frames.append(frame)
+            self._frame = frame
             self._came.notify()
 
     def read(self, timeout_s: float) -> Frame | None:
         """See `Camera`."""
         with self._came:
-            if not self._frames and not self._closed:
+            if self._frame is None and not self._closed:
                 self._came.wait(timeout_s)
-            return self._frames.popleft() if self._frames else None
+            frame, self._frame = self._frame, None
+            return frame
 
     def close(self) -> None:
         """See `Camera`."""

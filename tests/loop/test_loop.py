@@ -14,6 +14,7 @@ from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import TIMEOUT_S, Guard
 from jaxnav.loop.interfaces import MOST_TURNS, Frame, GyroReading, Odometry
+from jaxnav.loop.limits import limits_of
 from jaxnav.loop.loop import Loop
 from jaxnav.loop.pilot import Input, Pilot
 from jaxnav.loop.seeing import Eyes, Region, Search, SearchedFrame, group_frames, image_fault
@@ -317,6 +318,39 @@ def test_sightings_of_one_instant_go_together_and_the_empty_ones_apart():
     assert [[s.camera for s in group] for group in shows] == [[0, 1], [0]]
     assert [s.camera for s in blank] == [2]
     assert group_frames([]) == ([], ())
+
+
+class Strip(Eye):
+    """A camera whose next frame comes when its last one is searched."""
+
+    def __init__(self, name, *stamps_ns):
+        super().__init__(name)
+        self.stamps_ns, self.searched = list(stamps_ns), threading.Semaphore()
+
+    def read(self, timeout_s):
+        if not self.stamps_ns or not self.searched.acquire(timeout=timeout_s):
+            self.closed.wait(timeout_s)
+            return None
+        return Frame(self.stamps_ns.pop(0), None, found(1))
+
+
+def test_a_loop_that_is_too_slow_gets_the_newest_frame_of_each_camera():
+    strips = Strip("left", 6, 7, 8, 9, 10), Strip("right", 1, 2, 3, 4, 5)
+    looks = Look(), Look()
+    for strip, look in zip(strips, looks, strict=True):
+        look.act = strip.searched.release
+    guard = Guard(Car(), limits_of(worlds.qcar()))
+    eyes = Eyes(strips, looks, guard)
+    eyes.start()
+    try:
+        deadline_s = time.monotonic() + 20
+        while eyes.dropped < 8 and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        assert [one.sighted.stamp_ns for one in eyes.take()] == [5, 10]
+        assert eyes.take() == []
+    finally:
+        eyes.close()
+        guard.close()
 
 
 @pytest.mark.parametrize(

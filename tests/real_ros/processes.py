@@ -52,15 +52,21 @@ class Program:
         return self.process.wait(timeout_s)
 
 
-def until(happens, timeout_s: float, program: Program | None = None) -> None:
-    """Wait until something happens; once the program has ended, not for much longer."""
+def until(happens, timeout_s: float, program: Program | None = None, tells=lambda: "") -> None:
+    """Wait until something happens; once the program has ended, not for much longer.
+
+    Args:
+        tells: what else to say where it does not happen.
+    """
     end_s = time.monotonic() + timeout_s
     ended = False
     while not happens():
         what = "" if program is None else program.said
         if program is not None and not ended and program.process.poll() is not None:
             ended, end_s = True, min(end_s, time.monotonic() + ENDED_S)
-        assert time.monotonic() < end_s, f"waited in vain, for at most {timeout_s} s; {what}"
+        assert time.monotonic() < end_s, (
+            f"waited in vain, for at most {timeout_s} s; {what} {tells()}"
+        )
         time.sleep(0.02)
 
 

@@ -36,13 +36,19 @@ def relay(folder, number: int) -> Program:
 def test_publishers_that_repeat_jump_and_die(tmp_path):
     topics = ", ".join(f"{name}: /relayed/{name}/detections" for name in CAMERAS)
     file = write_file(tmp_path, cameras=f"{{{topics}}}", odometry="/relayed/odom")
-    recording, listener = tmp_path / "drive.mcap", Listener()
+    # The node begins when somebody hears its commands: that must be the car.
+    recording, listener = tmp_path / "drive.mcap", Listener("/drive")
     faults = listener.connection.publisher(TEXT, "/fault")
     happened: dict[str, tuple[int, int]] = {}
 
     def is_well() -> bool:
         bank = listener.last("/jaxnav/bank")
         return bool(bank and bank.health == "OK" and bank.decided)
+
+    def states() -> str:
+        """What the node said last: a health and its flags for each second or so."""
+        banks = listener.heard["/jaxnav/bank"][::-30][:20]
+        return "; ".join(f"{one.health} {'+'.join(one.faults)} {one.decided}" for one in banks)
 
     def is_on_its_way() -> bool:
         """A car that has hardly begun to move may be taken for one that can't."""
@@ -58,17 +64,17 @@ def test_publishers_that_repeat_jump_and_die(tmp_path):
         words = (*PATIENT, "--record", str(recording))
         with sim_car(tmp_path), node(tmp_path, str(file), *words) as program:
             with relay(tmp_path, 1) as dies:
-                until(lambda: is_well() and is_on_its_way(), 240.0, program)
+                until(lambda: is_well() and is_on_its_way(), 240.0, program, states)
                 for name in FAULTS:
                     tell(listener, faults, name)
                     lasts(name)
                     tell(listener, faults, f"{name.split()[0]} passes")
                     time.sleep(0.3)
-                    until(is_well, 30.0, program)
+                    until(is_well, 30.0, program, states)
                 dies.tell(signal.SIGKILL)
                 lasts("killed")
             with relay(tmp_path, 2):
-                until(is_well, 30.0, program)
+                until(is_well, 30.0, program, states)
                 program.tell(signal.SIGTERM)
                 assert program.ends() == 128 + signal.SIGTERM, program.said
     finally:

@@ -23,7 +23,10 @@ GOAL = 0.50, 0.65
 class Listener:
     """What others hear on the topics of the node and of the car."""
 
-    def __init__(self) -> None:
+    def __init__(self, *others: str) -> None:
+        """Args:
+        others: topics that it does not listen to.
+        """
         self.connection = Connection("listener")
         self.heard: dict[str, list] = {}
         for kind, topic in (
@@ -37,8 +40,9 @@ class Listener:
             (NAV_ODOMETRY, "/odom"),
             (ACKERMANN, "/drive"),
         ):
-            self.heard[topic] = []
-            self.connection.listen(kind, topic, self.heard[topic].append)
+            if topic not in others:
+                self.heard[topic] = []
+                self.connection.listen(kind, topic, self.heard[topic].append)
         self.connection.run()
 
     def last(self, topic: str):
