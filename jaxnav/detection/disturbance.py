@@ -52,7 +52,7 @@ def find_shadow(
             a, b, c = (np.sum(weight * x * y, axis=1) for x, y in
                        ((lit, lit), (lit, dim), (dim, dim)))  # fmt: skip
             p, q = (np.sum(weight * x * levels, axis=1) for x in (lit, dim))
-            determinant = np.maximum(a * c - b * b, 1e-9 * (a + c) ** 2)
+            determinant = np.maximum(a * c - b * b, 1e-9 * (a + c) ** 2 + 1e-30)
             light, shade = (c * p - b * q) / determinant, (a * q - b * p) / determinant
             residual = (levels - light[:, None] * lit - shade[:, None] * dim) / scale
             loss, weight = bounded_loss(residual)

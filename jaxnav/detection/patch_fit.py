@@ -21,6 +21,7 @@ _LANES = 512  # pixels of a fit
 LEAST_PIXELS = 60
 _INSTANT_PX = 2.5  # of the streak, for each image that is averaged
 _MOST_INSTANTS = 16
+MOST_STREAK_PX = _INSTANT_PX * _MOST_INSTANTS
 _LEAST_STREAK_PX = 0.5  # of a start: where there is no motion the image has no slope by it
 _MOST_NOISE = 0.15  # of the contrast
 # Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.

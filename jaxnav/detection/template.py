@@ -9,11 +9,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxnav.detection.families import marker_cells
+from jaxnav.detection.refine import mean_side_px
 
 _TEXELS = 8  # of a cell, along a side
 _FINER = 2  # sub-pixels of the drawn marker, along a side
 _LENS_PX = 0.7
 _MOST_RADIUS_PX = 48
+_SIDE_PX = 32.0  # of a marker that is searched for: a larger one is shrunk, or takes 100 ms
+_MOST_PAPER = 2.5  # extent of the white zone against the marker's: beyond is almost the horizon
 _LEAST_MATCH = 0.35  # correlation, -1 to 1
 _STREAKS_PX = (4.0, 8.0)  # tried in four directions where the motion is not known
 _SURE_PX = 2.0  # of the streak: what is known better is not searched for
@@ -37,7 +40,8 @@ def best_match(
     streak_px: tuple[float, float],
     streak_sigma_px: float,
 ) -> Match | None:
-    """The shift of one of the quadrilaterals, to a pixel, at which the marker's picture fits best.
+    """The shift of one of the quadrilaterals at which the marker's picture fits best, to a pixel or
+    to a 32nd of the marker's side, whichever is more.
 
     Args:
         radius_px: the farthest shift along an axis.
@@ -49,16 +53,32 @@ def best_match(
         angles = np.arange(4) * math.pi / 4
         streaks += [(s * math.cos(a), s * math.sin(a)) for s in _STREAKS_PX for a in angles]
     pattern = _printed(family, marker_id)
+    quads_px = quads_px[np.all(np.isfinite(quads_px), axis=(1, 2))]
+    shrink = max(int(max(map(mean_side_px, quads_px), default=0.0) / _SIDE_PX), 1)
+    image = _shrunk(image, shrink)
     best: Match | None = None
-    for quad in quads_px:
-        if not np.all(np.isfinite(quad)):
+    for quad_px in quads_px:
+        quad = (quad_px + 0.5) / shrink - 0.5
+        paper = _paper(pattern, quad)
+        if not np.ptp(paper, axis=0).max() < _MOST_PAPER * np.ptp(quad, axis=0).max():
             continue
-        drawn, mask, origin = _draw(pattern, quad, max(math.hypot(*s) for s in streaks))
+        longest = max(math.hypot(*streak) for streak in streaks) / shrink
+        drawn, mask, origin = _draw(pattern, paper, longest)
         for streak in streaks:
-            match = _shift(image, _smeared(drawn, streak), mask, origin, quad, streak, radius_px)
-            if match is not None and (best is None or match.correlation > best.correlation):
-                best = match
+            smeared = _smeared(drawn, (streak[0] / shrink, streak[1] / shrink))
+            found = _shift(image, smeared, mask, origin, radius_px / shrink)
+            if found is not None and (best is None or found[1] > best.correlation):
+                best = Match(quad_px + shrink * found[0], streak, found[1])
     return best if best is not None and best.correlation > _LEAST_MATCH else None
+
+
+def _shrunk(image: np.ndarray, shrink: int) -> np.ndarray:
+    """The means of blocks of pixels; what is left at the right and below is cut off."""
+    if shrink == 1:
+        return image
+    columns, rows = image.shape[1] // shrink, image.shape[0] // shrink
+    whole = image[: rows * shrink, : columns * shrink]
+    return cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
 
 
 @cache
@@ -68,10 +88,9 @@ def _printed(family: str, marker_id: int) -> np.ndarray:
 
 
 def _draw(
-    pattern: np.ndarray, quad: np.ndarray, reach_px: float
+    pattern: np.ndarray, paper: np.ndarray, reach_px: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The marker's picture, where its paper is (both sub-sampled), and the pixel of its corner."""
-    paper = _paper(pattern, quad)
     margin = math.ceil(reach_px / 2) + 1
     low = np.floor(paper.min(axis=0)).astype(int) - margin
     size = np.ceil(paper.max(axis=0)).astype(int) + margin + 1 - low
@@ -125,10 +144,9 @@ def _shift(
     drawn: np.ndarray,
     mask: np.ndarray,
     origin: np.ndarray,
-    quad: np.ndarray,
-    streak: tuple[float, float],
     radius_px: float,
-) -> Match | None:
+) -> tuple[np.ndarray, float] | None:
+    """The shift (2,) at which what was drawn correlates best, and how well."""
     radius = min(math.ceil(radius_px), _MOST_RADIUS_PX)
     rows, columns = drawn.shape
     low = origin - radius
@@ -148,5 +166,4 @@ def _shift(
     scores = cv2.matchTemplate(window, drawn, cv2.TM_CCOEFF_NORMED, mask=mask)
     scores[~np.isfinite(scores)] = -1
     _, highest, _, at = cv2.minMaxLoc(scores)
-    shift = np.array(at) - radius
-    return Match(quad + shift, streak, float(highest))
+    return np.array(at) - radius, float(highest)

@@ -10,14 +10,13 @@ and no other code of the family comes near.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxnav.detection.disturbance import clear_pixels, find_shadow
 from jaxnav.detection.paper import SQUARE
-from jaxnav.detection.patch_fit import LEAST_PIXELS, PatchFit
+from jaxnav.detection.patch_fit import LEAST_PIXELS, MOST_STREAK_PX, PatchFit
 from jaxnav.detection.pattern_fit import bounded_loss
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.detection.template import best_match
@@ -49,7 +48,8 @@ class Target:
         marker_id: its id.
         quads_px: (H, 4, 2), where its corners may be, TL TR BR BL: a place for each hypothesis.
         radius_px: the farthest that it may be from them.
-        streak_px: (2,), the expected streak of its centre during the exposure.
+        streak_px: (2,), the expected streak of its centre during the exposure; one of more than
+            `MOST_STREAK_PX` counts as not known.
         streak_sigma_px: standard deviation of that; infinite where the motion is not known.
     """
 
@@ -91,15 +91,27 @@ class Track:
 
 
 def track(
-    image: UInt8[np.ndarray, "rows columns"], camera: Camera | None, targets: Sequence[Target]
+    image: UInt8[np.ndarray, "rows columns"],
+    camera: Camera | None,
+    targets: Sequence[Target],
+    most_disturbed: float = math.inf,
 ) -> list[Track | None]:
     """Follow markers into an image, each on its own; None for one that is not seen.
 
     Args:
         image: (H, W) grey levels.
         camera: makes edges straight in the world; without it, straight in the image.
+        most_disturbed: of so many markers, in the order of the targets, a shadow or what hides a
+            part is looked for: that takes ten times as long as a marker that is in plain view.
     """
-    return [_track(image, camera, target) for target in targets]
+    tracks: list[Track | None] = []
+    for target in targets:
+        fit = _first_fit(image, camera, target)
+        if fit is not None and fit.is_disturbed:
+            most_disturbed -= 1
+            fit = _disturbed_fit(fit) if most_disturbed >= 0 else None
+        tracks.append(None if fit is None else _judge(target, fit))
+    return tracks
 
 
 def warm_up_tracks(camera: Camera | None, families: Sequence[str]) -> None:
@@ -111,35 +123,32 @@ def warm_up_tracks(camera: Camera | None, families: Sequence[str]) -> None:
             fit.again()
 
 
-def _track(image: np.ndarray, camera: Camera | None, target: Target) -> Track | None:
+def _first_fit(image: np.ndarray, camera: Camera | None, target: Target) -> PatchFit | None:
+    """The fit that starts where the marker's picture matches best; None where none does."""
     sides_px = [mean_side_px(quad) for quad in target.quads_px if np.all(np.isfinite(quad))]
     if not sides_px or not _SIDES_PX[0] <= max(sides_px) <= _SIDES_PX[1]:
         return None
+    streak_px, streak_sigma_px = target.streak_px, target.streak_sigma_px
+    if not math.hypot(*streak_px) <= MOST_STREAK_PX:
+        streak_px, streak_sigma_px = (0.0, 0.0), math.inf
+    key = target.family, target.marker_id
     start = best_match(
-        image,
-        target.family,
-        target.marker_id,
-        target.quads_px,
-        target.radius_px,
-        target.streak_px,
-        target.streak_sigma_px,
-    )
+        image, *key, target.quads_px, target.radius_px, streak_px, streak_sigma_px
+    )  # fmt: skip
     if start is None:
         return None
-    fit = PatchFit.begin(
-        image, camera, (target.family, target.marker_id), start.quad_px,
-        np.asarray(start.streak_px), target.streak_sigma_px,
-    )  # fmt: skip
-    if fit is None or not np.all(np.isfinite(fit.summary.corners_px)):
+    streak = np.asarray(start.streak_px)
+    fit = PatchFit.begin(image, camera, key, start.quad_px, streak, streak_sigma_px)
+    return None if fit is None or not np.all(np.isfinite(fit.summary.corners_px)) else fit
+
+
+def _disturbed_fit(fit: PatchFit) -> PatchFit | None:
+    """The fit of a marker with something on it or in its light; None where that explains little."""
+    if fit.summary.explained < _PROMISING:
         return None
-    if fit.is_disturbed:
-        if fit.summary.explained < _PROMISING:
-            return None
-        fit = _undisturbed(fit) or fit
-        rough = fit.summary.noise > _MOST_ROUGH * fit.summary.contrast
-        if rough and (fit.summary.alike > _MOST_ALIKE or fit.is_disturbed):
-            return None
-    return _judge(target, fit.summary, start.quad_px)
+    fit = _undisturbed(fit) or fit
+    rough = fit.summary.noise > _MOST_ROUGH * fit.summary.contrast
+    return None if rough and (fit.summary.alike > _MOST_ALIKE or fit.is_disturbed) else fit
 
 
 def _best(fits: Sequence[PatchFit]) -> PatchFit:
@@ -178,8 +187,9 @@ def _among(used: np.ndarray, some: np.ndarray) -> np.ndarray:
     return used & np.append(some, np.zeros(len(used) - len(some), bool))
 
 
-def _judge(target: Target, fit: Any, start_px: np.ndarray) -> Track | None:
-    """The track if the fit (`Summary`) is the marker's, else None."""
+def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
+    """The track if the fit is the marker's, else None."""
+    fit, start_px = patch_fit.summary, np.asarray(patch_fit.patch.quad_px, float)
     if not fit.contrast >= max(_LEAST_CONTRAST, 2 * fit.noise):
         return None
     corners_px = np.asarray(fit.corners_px, float)

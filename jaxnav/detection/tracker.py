@@ -15,12 +15,14 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from jaxnav.detection.patch_fit import MOST_STREAK_PX
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.detection.track import Target, Track, track
 from jaxnav.detection.types import Detections, grey
 from jaxnav.models.camera import Camera
 
 MOST_FOLLOWED = 3  # markers of an image: each takes some milliseconds
+_MOST_DISTURBED = 1  # of them: it takes 50 ms
 _UNKNOWN_EXPOSURE_S = 0.01  # and as much more or less
 _STREAK_SIGMA_PX, _STREAK_SHARE = 0.5, 0.3  # of a streak where the exposure time is known
 _FAR_AHEAD_S, _AHEAD_SHARE = 0.1, 0.1  # a flow is trusted so long, and is off by so much
@@ -82,6 +84,8 @@ class Tracker:
             The markers that were followed, without those that were decoded, at the time of the
             image's middle row.
         """
+        if flow_px_s is not None:
+            flow_px_s = self._credible(flow_px_s)
         read = set() if decoded is None else set(zip(decoded.families, decoded.ids, strict=True))
         sides_px = [mean_side_px(quad) for quad in quads_px]
         missing = [
@@ -103,7 +107,7 @@ class Tracker:
         if not targets:
             return Detections.concatenate([])
         image = grey(image)
-        tracks = track(image, camera, targets)
+        tracks = track(image, camera, targets, _MOST_DISTURBED)
         found = detections_of([one for one in tracks if one is not None])
         if flow_px_s is None:
             return found
@@ -113,6 +117,13 @@ class Tracker:
         return self._of_one_time(
             found, np.nan_to_num(np.reshape(seen, (-1, 2))), (len(image) - 1) / 2
         )
+
+    def _credible(self, flow_px_s: np.ndarray) -> np.ndarray:
+        """The velocities, NaN where they are those of a belief that jumped: of a marker that is so
+        fast nothing can be seen."""
+        exposure_s = _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
+        streaks_px = exposure_s * np.linalg.norm(flow_px_s, axis=1, keepdims=True)
+        return np.where(streaks_px <= MOST_STREAK_PX, flow_px_s, np.nan)
 
     def _streak(self, flow_px_s: np.ndarray) -> tuple[tuple[float, float], float]:
         """The expected streak, px, and its standard deviation."""

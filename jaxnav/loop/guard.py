@@ -17,10 +17,12 @@ as this one.
 
 import atexit
 import math
+import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.interfaces import AnyVehicle
@@ -64,6 +66,7 @@ class Guard:
         self._tripped = threading.Event()
         self._closed = threading.Event()
         self._beats: dict[str, int] = {}  # time of each watched thread's last sign of life
+        self._idents: dict[str, int] = {}  # of these threads
         self._command, self._written_ns = limits.zero, now_ns()
         self._deadline_ns = self._written_ns
         self.unheard: str | None = None
@@ -91,7 +94,8 @@ class Guard:
             self._armed = not self.tripped
 
     def beat(self, name: str) -> None:
-        """Note a sign of life of a thread; the first one begins its watch."""
+        """Note a sign of life of the calling thread; the first one begins its watch."""
+        self._idents[name] = threading.get_ident()
         self._beats[name] = self._now_ns()
 
     def leave(self, name: str) -> None:
@@ -193,7 +197,8 @@ class Guard:
             self.trip(f"no fresh command for {(now_ns - self._written_ns) / 1e9:.2f} s")
         for name, beat_ns in list(self._beats.items()):
             if now_ns - beat_ns > self._timeout_ns:
-                self.trip(f"{name} hangs for {(now_ns - beat_ns) / 1e9:.2f} s")
+                where = _where(self._idents[name])
+                self.trip(f"{name} hangs for {(now_ns - beat_ns) / 1e9:.2f} s{where}")
 
     def _stop(self) -> None:
         """Tell the vehicle to stop once; `_look` and `close` repeat it until it is heard."""
@@ -206,3 +211,16 @@ class Guard:
 
     def _at_exit(self) -> None:
         self.trip("the program ends")
+
+
+def _where(ident: int) -> str:
+    """The two innermost calls of a thread, of different files, to follow "it hangs"."""
+    frame = sys._current_frames().get(ident)
+    places: list[str] = []
+    while frame is not None and len(places) < 2:
+        path = Path(frame.f_code.co_filename)
+        place = f"{path.parent.name}/{path.name}:{frame.f_lineno}"
+        if not places or place.split(":")[0] != places[-1].split(":")[0]:
+            places.append(place)
+        frame = frame.f_back
+    return f" at {', called from '.join(places)}" if places else ""

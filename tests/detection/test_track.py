@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -80,6 +81,65 @@ def test_impossible_places_show_nothing(quad_px):
     rng = np.random.default_rng(1)
     for image in (np.full((60, 80), 90, np.uint8), rng.integers(0, 255, (60, 80), np.uint8)):
         assert track(image, None, [Target(FAMILY, 0, quad_px[None], 5.0)]) == [None]
+
+
+def test_no_belief_makes_a_search_draw_large_pictures(monkeypatch):
+    """A belief that jumps tells any velocity; a marker seen along its plane reaches to the horizon.
+    The largest picture decides how long a search takes, and a drive ends where one takes long."""
+    drawn, smeared = cv2.warpPerspective, cv2.filter2D
+    sides_px = []
+
+    def measured(image, H, shape, **options):
+        sides_px.append(max(shape))
+        return drawn(image, H, shape, **options)
+
+    def measured_too(image, depth, kernel, **options):
+        sides_px.append(max(kernel.shape))
+        return smeared(image, depth, kernel, **options)
+
+    monkeypatch.setattr(cv2, "warpPerspective", measured)
+    monkeypatch.setattr(cv2, "filter2D", measured_too)
+    image, truth = other_pictures("blur4")[0]
+    rng = np.random.default_rng(0)
+    for number in range(200):
+        size_px, narrow = rng.uniform(10, 118), rng.uniform(0.01, 0.3)
+        ends = [(-1, -1), (1, -narrow), (1, narrow), (-1, 1)]
+        turn = np.exp(1j * rng.uniform(0, 2 * np.pi)) * (np.array(ends) @ [1, 1j]) * size_px / 2
+        quad_px = rng.uniform(0, 150, 2) + np.column_stack([turn.real, turn.imag])
+        streak_px = tuple(rng.normal(0, 10 ** rng.uniform(0, 4), 2))
+        sigma_px = math.inf if number % 2 else 1.0
+        there = Target(FAMILY, truth.id, quad_px[None], 1e4, streak_px, sigma_px)
+        track(image, truth.camera, [there], most_disturbed=0)
+    assert 40 < max(sides_px) < 400
+
+
+def test_a_marker_whose_velocity_is_not_credible_is_followed_as_one_of_unknown_velocity():
+    image, truth = other_pictures("blur4")[0]
+    where = truth.camera, [(FAMILY, truth.id)], truth.corners_px[None], np.array([4.0])
+    (expected_px,) = Tracker().follow(image, *where).corners_px
+    followed = Tracker().follow(image, *where, np.array([[1e5, 0.0]]), ahead_s=0.05)
+    np.testing.assert_array_equal(followed.corners_px[0], expected_px)
+
+
+@pytest.mark.parametrize("side_px", [70, 110])
+def test_large_markers_are_followed_from_where_a_shrunk_picture_has_them(side_px):
+    rng = np.random.default_rng(2)
+    scene = random_scene(rng, side_px, marker_cells(FAMILY, 17), optics_px=0.4)
+    image, quad_px = scene.render(rng), scene.corners_px()
+    (found,) = track(image, scene.camera, [Target(FAMILY, 17, quad_px[None] + 5.0, 8.0)])
+    error = (found.corners_px - quad_px).ravel()
+    assert error @ np.linalg.solve(found.covariance_px2, error) < 40
+
+
+def test_no_more_markers_with_something_on_them_are_looked_at_than_asked():
+    image, truth = other_pictures("hidden")[0]
+    there = [target(truth, 0)] * 2
+    first, second = track(image, truth.camera, there)
+    assert first is not None
+    assert second is not None
+    first, second = track(image, truth.camera, there, most_disturbed=1)
+    assert first is not None
+    assert second is None
 
 
 def test_slopes_of_an_exposure_are_its_derivatives():

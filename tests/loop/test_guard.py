@@ -130,6 +130,7 @@ def test_a_watched_thread_that_hangs_stops_it(car, guard):
     drive(guard, 0.5, detector=True)
     assert guard.tripped
     assert "camera hangs" in guard.reason
+    assert "loop/test_guard.py:" in guard.reason  # where it is just now
     assert stopped_after(car, since) < TIMEOUT_S + SLACK_S
 
 
