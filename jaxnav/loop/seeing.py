@@ -102,11 +102,14 @@ class Search:
         if self.tracker is not None:
             warm_up_tracks(self._model, sorted({one.family for one in self._detectors}))
 
-    def look(self, frame: Frame, region: Region | None) -> FrameDetections:
+    def look(
+        self, frame: Frame, region: Region | None, alive: Callable[[], None] = lambda: None
+    ) -> FrameDetections:
         """Search a frame for markers.
 
         Args:
             region: where markers should be, possibly nowhere; None where that is not known.
+            alive: called now and then.
         """
         if frame.detections is not None:
             return FrameDetections(self._camera, frame.stamp_ns, frame.detections)
@@ -121,12 +124,12 @@ class Search:
         if region is not None and near:
             if not len(region.quads_px):
                 return FrameDetections(self._camera, frame.stamp_ns, _NONE)
-            detections = self._followed(frame, region, self._near(frame.image, region))
+            detections = self._followed(frame, region, self._near(frame.image, region), alive)
         if not len(detections):
             self._since_whole = 0
             detections = self._everywhere(frame.image, region)
             if region is not None and not near:  # else none of them could be followed just now
-                detections = self._followed(frame, region, detections)
+                detections = self._followed(frame, region, detections, alive)
         return FrameDetections(self._camera, frame.stamp_ns, detections)
 
     def _repeats(self, image: np.ndarray) -> bool:
@@ -145,11 +148,14 @@ class Search:
         ]
         return Detections.concatenate(parts)
 
-    def _followed(self, frame: Frame, region: Region, detections: Detections) -> Detections:
+    def _followed(
+        self, frame: Frame, region: Region, detections: Detections, alive: Callable[[], None]
+    ) -> Detections:
         """The detections, and the expected markers that were followed without being decoded."""
         if self.tracker is None or not region.keys or frame.image is None:
             return detections
         self.tracker.tell(frame.exposure_s, frame.row_time_s)
+        alive()
         ahead_ns = 0 if region.stamp_ns is None else frame.stamp_ns - region.stamp_ns
         followed = self.tracker.follow(
             frame.image,
@@ -160,6 +166,7 @@ class Search:
             region.flow_px_s,
             ahead_ns / 1e9,
             detections,
+            alive,
         )
         return Detections.concatenate([detections, followed])
 
@@ -211,7 +218,8 @@ class Eyes:
         turns: list[tuple[str, Callable[[], None]]] = [
             (f"camera {camera.name}", partial(self._read, c)) for c, camera in enumerate(cameras)
         ]
-        turns += [(f"detector {number}", self._look) for number in range(workers)]
+        for name in (f"detector {number}" for number in range(workers)):
+            turns.append((name, partial(self._look, partial(guard.beat, name))))
         self._threads = [
             threading.Thread(target=self._repeat, args=(turn, name), name=name, daemon=True)
             for name, turn in turns
@@ -273,7 +281,7 @@ class Eyes:
                 self._frames[index] = frame
                 self._waiting.notify()
 
-    def _look(self) -> None:
+    def _look(self, alive: Callable[[], None]) -> None:
         task = self._next()
         if task is None:
             return
@@ -281,7 +289,7 @@ class Eyes:
         try:
             # A camera that detects markers itself needs no region.
             region = self.expected(index) if frame.detections is None else None
-            sighted = self._searches[index].look(frame, region)
+            sighted = self._searches[index].look(frame, region, alive)
         finally:
             self._busy[index] = False
         seen = SearchedFrame(sighted, frame, self._cameras[index].name)

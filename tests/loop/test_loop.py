@@ -77,7 +77,7 @@ class Look:
     def warm_up(self):
         pass
 
-    def look(self, frame, region):
+    def look(self, frame, region, alive):
         self.act()
         return FrameDetections(0, frame.stamp_ns, frame.detections)
 
