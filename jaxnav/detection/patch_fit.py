@@ -15,6 +15,7 @@ from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.pattern_fit import Unknowns
 from jaxnav.detection.pattern_program import Patch, PixelFit, follow_pattern
 from jaxnav.detection.refine import mean_side_px, pixels_along, scattered
+from jaxnav.detection.signs_of_life import sign
 from jaxnav.models.camera import Camera
 
 _LANES = 512  # pixels of a fit
@@ -81,6 +82,7 @@ class PatchFit:
     def _of(
         cls, camera: Camera | None, codes: jax.Array, patch: Any, count: int, start: Any
     ) -> "PatchFit":
+        sign()
         summary, pixels, end = follow_pattern(camera, patch, codes, start)
         return cls(camera, codes, patch, count, jax.device_get(summary), (pixels, end))
 

@@ -11,6 +11,7 @@ from jaxnav.detection.edges import PIXELS, EdgeFit, fit_edges
 from jaxnav.detection.image_model import step_corners
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import SQUARE, corner_motion, homography, rays_of
+from jaxnav.detection.signs_of_life import sign
 
 # Markers up to this side are fitted whole, of larger ones the outline. Where levels may be coded,
 # the edges of all cells go with it: a curve of the levels and an outline's size look alike.
@@ -105,6 +106,7 @@ def fit_marker(
     whole: bool,
 ) -> MarkerFit | None:
     """Fit the marker and return the fit, good or not; None if the image shows too little of it."""
+    sign()
     M = homography(lens.rays(corners_px)[0].T)
     side_px = mean_side_px(corners_px)
     whole = whole or side_px <= _WHOLE_UP_TO_PX

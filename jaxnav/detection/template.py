@@ -76,7 +76,7 @@ def _shrunk(image: np.ndarray, shrink: int) -> np.ndarray:
     """The means of blocks of pixels; what is left at the right and below is cut off."""
     if shrink == 1:
         return image
-    columns, rows = image.shape[1] // shrink, image.shape[0] // shrink
+    columns, rows = max(image.shape[1] // shrink, 1), max(image.shape[0] // shrink, 1)
     whole = image[: rows * shrink, : columns * shrink]
     return cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
 

@@ -8,7 +8,7 @@ and no other code of the family comes near.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,7 +95,6 @@ def track(
     camera: Camera | None,
     targets: Sequence[Target],
     most_disturbed: float = math.inf,
-    alive: Callable[[], None] = lambda: None,
 ) -> list[Track | None]:
     """Follow markers into an image, each on its own; None for one that is not seen.
 
@@ -104,15 +103,13 @@ def track(
         camera: makes edges straight in the world; without it, straight in the image.
         most_disturbed: of so many markers, in the order of the targets, a shadow or what hides a
             part is looked for: that takes ten times as long as a marker that is in plain view.
-        alive: called before each fit, of which each takes some milliseconds.
     """
     tracks: list[Track | None] = []
     for target in targets:
-        alive()
         fit = _first_fit(image, camera, target)
         if fit is not None and fit.is_disturbed:
             most_disturbed -= 1
-            fit = _disturbed_fit(fit, alive) if most_disturbed >= 0 else None
+            fit = _disturbed_fit(fit) if most_disturbed >= 0 else None
         tracks.append(None if fit is None else _judge(target, fit))
     return tracks
 
@@ -145,11 +142,11 @@ def _first_fit(image: np.ndarray, camera: Camera | None, target: Target) -> Patc
     return None if fit is None or not np.all(np.isfinite(fit.summary.corners_px)) else fit
 
 
-def _disturbed_fit(fit: PatchFit, alive: Callable[[], None]) -> PatchFit | None:
+def _disturbed_fit(fit: PatchFit) -> PatchFit | None:
     """The fit of a marker with something on it or in its light; None where that explains little."""
     if fit.summary.explained < _PROMISING:
         return None
-    fit = _undisturbed(fit, alive) or fit
+    fit = _undisturbed(fit) or fit
     rough = fit.summary.noise > _MOST_ROUGH * fit.summary.contrast
     return None if rough and (fit.summary.alike > _MOST_ALIKE or fit.is_disturbed) else fit
 
@@ -162,7 +159,7 @@ def _best(fits: Sequence[PatchFit]) -> PatchFit:
     return fits[int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))]
 
 
-def _undisturbed(fit: PatchFit, alive: Callable[[], None]) -> PatchFit | None:
+def _undisturbed(fit: PatchFit) -> PatchFit | None:
     """The fit with a shadow's edge, and without the pixels of what hides the marker."""
     count, used, seen = fit.count, fit.patch.used, fit.pixels
     scale = float(fit.summary.noise + 0.02 * fit.summary.contrast)
@@ -173,13 +170,8 @@ def _undisturbed(fit: PatchFit, alive: Callable[[], None]) -> PatchFit | None:
         # Whatever hides a part leaves one of the halves.
         angles = np.arange(_HALVES) * 2 * np.pi / _HALVES
         sides = [np.cos(a) * seen.xy[0] + np.sin(a) * seen.xy[1] < _HALF for a in angles]
-        halves = []
-        for side in sides:
-            alive()
-            halves.append(fit.anew(used=_among(used, side)))
-        fit = _best(halves)
+        fit = _best([fit.anew(used=_among(used, side)) for side in sides])
     for _ in range(_ROUNDS):
-        alive()
         pixels_px = fit.patch.pixels[:count].astype(int)
         clear = clear_pixels(pixels_px, fit.pixels.residual / float(fit.summary.noise))
         if np.sum(clear) < max(_LEAST_VISIBLE * count, LEAST_PIXELS):

@@ -9,7 +9,7 @@ the time of the middle row, or are less certain by as much where nobody says how
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -68,7 +68,6 @@ class Tracker:
         flow_px_s: Float[np.ndarray, "K 2"] | None = None,
         ahead_s: float = 0.0,
         decoded: Detections | None = None,
-        alive: Callable[[], None] = lambda: None,
     ) -> Detections:
         """Follow the expected markers that were not decoded.
 
@@ -80,7 +79,6 @@ class Tracker:
             flow_px_s: velocity of its centre in the image; None where that is not known.
             ahead_s: from the time of the expectation to that of the image.
             decoded: what decoders found in the image.
-            alive: see `track`.
 
         Returns:
             The markers that were followed, without those that were decoded, at the time of the
@@ -109,7 +107,7 @@ class Tracker:
         if not targets:
             return Detections.concatenate([])
         image = grey(image)
-        tracks = track(image, camera, targets, _MOST_DISTURBED, alive)
+        tracks = track(image, camera, targets, _MOST_DISTURBED)
         found = detections_of([one for one in tracks if one is not None])
         if flow_px_s is None:
             return found

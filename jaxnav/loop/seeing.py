@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnav.detection.families import marker_cells
+from jaxnav.detection.signs_of_life import sign, telling
 from jaxnav.detection.track import warm_up_tracks
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector, RegionDetector
@@ -102,14 +103,11 @@ class Search:
         if self.tracker is not None:
             warm_up_tracks(self._model, sorted({one.family for one in self._detectors}))
 
-    def look(
-        self, frame: Frame, region: Region | None, alive: Callable[[], None] = lambda: None
-    ) -> FrameDetections:
+    def look(self, frame: Frame, region: Region | None) -> FrameDetections:
         """Search a frame for markers.
 
         Args:
             region: where markers should be, possibly nowhere; None where that is not known.
-            alive: called now and then.
         """
         if frame.detections is not None:
             return FrameDetections(self._camera, frame.stamp_ns, frame.detections)
@@ -124,12 +122,12 @@ class Search:
         if region is not None and near:
             if not len(region.quads_px):
                 return FrameDetections(self._camera, frame.stamp_ns, _NONE)
-            detections = self._followed(frame, region, self._near(frame.image, region), alive)
+            detections = self._followed(frame, region, self._near(frame.image, region))
         if not len(detections):
             self._since_whole = 0
             detections = self._everywhere(frame.image, region)
             if region is not None and not near:  # else none of them could be followed just now
-                detections = self._followed(frame, region, detections, alive)
+                detections = self._followed(frame, region, detections)
         return FrameDetections(self._camera, frame.stamp_ns, detections)
 
     def _repeats(self, image: np.ndarray) -> bool:
@@ -148,14 +146,11 @@ class Search:
         ]
         return Detections.concatenate(parts)
 
-    def _followed(
-        self, frame: Frame, region: Region, detections: Detections, alive: Callable[[], None]
-    ) -> Detections:
+    def _followed(self, frame: Frame, region: Region, detections: Detections) -> Detections:
         """The detections, and the expected markers that were followed without being decoded."""
         if self.tracker is None or not region.keys or frame.image is None:
             return detections
         self.tracker.tell(frame.exposure_s, frame.row_time_s)
-        alive()
         ahead_ns = 0 if region.stamp_ns is None else frame.stamp_ns - region.stamp_ns
         followed = self.tracker.follow(
             frame.image,
@@ -166,7 +161,6 @@ class Search:
             region.flow_px_s,
             ahead_ns / 1e9,
             detections,
-            alive,
         )
         return Detections.concatenate([detections, followed])
 
@@ -218,8 +212,7 @@ class Eyes:
         turns: list[tuple[str, Callable[[], None]]] = [
             (f"camera {camera.name}", partial(self._read, c)) for c, camera in enumerate(cameras)
         ]
-        for name in (f"detector {number}" for number in range(workers)):
-            turns.append((name, partial(self._look, partial(guard.beat, name))))
+        turns += [(f"detector {number}", self._look) for number in range(workers)]
         self._threads = [
             threading.Thread(target=self._repeat, args=(turn, name), name=name, daemon=True)
             for name, turn in turns
@@ -260,9 +253,10 @@ class Eyes:
     def _repeat(self, turn: Callable[[], None], name: str) -> None:
         """Take turns until the end, watched by the guard. Runs in a thread."""
         try:
-            while not self._over.is_set():
-                self._guard.beat(name)
-                turn()
+            with telling(partial(self._guard.beat, name)):
+                while not self._over.is_set():
+                    sign()
+                    turn()
         except Exception as error:  # its meaning is unknown: the vehicle stops
             self._guard.trip(f"{name}: {type(error).__name__}: {error}")
         finally:
@@ -281,7 +275,7 @@ class Eyes:
                 self._frames[index] = frame
                 self._waiting.notify()
 
-    def _look(self, alive: Callable[[], None]) -> None:
+    def _look(self) -> None:
         task = self._next()
         if task is None:
             return
@@ -289,14 +283,13 @@ class Eyes:
         try:
             # A camera that detects markers itself needs no region.
             region = self.expected(index) if frame.detections is None else None
-            sighted = self._searches[index].look(frame, region, alive)
+            sighted = self._searches[index].look(frame, region)
+            with self._woken:
+                self.dropped += index in self._seen
+                self._seen[index] = SearchedFrame(sighted, frame, self._cameras[index].name)
+                self._woken.notify()
         finally:
             self._busy[index] = False
-        seen = SearchedFrame(sighted, frame, self._cameras[index].name)
-        with self._woken:
-            self.dropped += index in self._seen
-            self._seen[index] = seen
-            self._woken.notify()
 
     def _next(self) -> tuple[int, Frame] | None:
         """The camera whose turn it is, and its frame; None: none came in time."""

@@ -12,6 +12,7 @@ from jaxnav.detection import Target, Tracker, make_detector, marker_cells, track
 from jaxnav.detection.disturbance import find_shadow, noise_correlation
 from jaxnav.detection.image_model import expose, step_corners
 from jaxnav.detection.paper import homography
+from jaxnav.detection.signs_of_life import telling
 from jaxnav.models.camera import Camera
 from tests.helpers.marker_images import random_scene
 from tests.helpers.other_pictures import other_pictures
@@ -137,11 +138,24 @@ def test_no_more_markers_with_something_on_them_are_looked_at_than_asked():
     first, second = track(image, truth.camera, there)
     assert first is not None
     assert second is not None
-    signs = []
-    first, second = track(image, truth.camera, there, 1, lambda: signs.append(1))
+    first, second = track(image, truth.camera, there, most_disturbed=1)
     assert first is not None
     assert second is None
-    assert len(signs) > 10  # a sign of life before each fit: half of a marker takes 50 ms
+
+
+def test_a_search_gives_a_sign_of_life_before_each_fit():
+    """A fit takes 5 to 20 ms; all that there is to see in an image may take half a second."""
+    image, truth = other_pictures("hidden")[0]
+    many, signs = np.tile(other_pictures("clean")[0][0], (3, 4)), []
+    with telling(lambda: signs.append(1)):
+        track(image, truth.camera, [target(truth, 0)])
+        assert len(signs) > 10
+        signs.clear()
+        found = make_detector("aruco", FAMILY).detect(many)
+    assert len(found) == 12
+    assert len(signs) >= 12
+    make_detector("aruco", FAMILY).detect(image)  # outside of the block nobody is told
+    assert len(signs) < 40
 
 
 def test_slopes_of_an_exposure_are_its_derivatives():

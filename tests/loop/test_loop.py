@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxnav.detection import Tracker, make_detector
+from jaxnav.detection.signs_of_life import sign
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
@@ -77,7 +78,7 @@ class Look:
     def warm_up(self):
         pass
 
-    def look(self, frame, region, alive):
+    def look(self, frame, region):
         self.act()
         return FrameDetections(0, frame.stamp_ns, frame.detections)
 
@@ -217,6 +218,21 @@ def test_whoever_hangs_or_fails_the_vehicle_stands_in_time(standing, who, act):
             assert "RuntimeError: somewhere" in said
         if act is hang:
             assert "hangs" in said or "no fresh command" in said
+
+
+def test_a_search_that_takes_long_and_gives_signs_of_life_does_not_end_the_drive(standing):
+    def search_for_long():
+        for _ in range(20):
+            time.sleep(0.03)
+            sign()
+
+    with Drive(standing) as drive:
+        drive.looks[0].act = search_for_long
+        time.sleep(1.0)
+        assert not drive.guard.tripped, drive.guard.reason
+        drive.looks[0].act = lambda: time.sleep(1.5)
+        assert drive.guard.wait(3.0)
+        assert "hangs" in drive.guard.reason
 
 
 def test_a_camera_or_a_vehicle_that_can_not_be_read_now_is_no_reason_to_stop(standing):

@@ -1,0 +1,30 @@
+"""Signs of life of a thread that searches an image: one before each fit of some milliseconds.
+
+A search takes as long as there is much to see, so its length does not tell whether it hangs.
+
+    with telling(partial(guard.beat, name)):
+        detector.detect(image)
+"""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+_thread = threading.local()
+
+
+@contextmanager
+def telling(alive: Callable[[], None]) -> Iterator[None]:
+    """Have `sign` call this, inside the block and in this thread."""
+    before, _thread.alive = getattr(_thread, "alive", None), alive
+    try:
+        yield
+    finally:
+        _thread.alive = before
+
+
+def sign() -> None:
+    """Give a sign of life to whoever watches this thread."""
+    alive = getattr(_thread, "alive", None)
+    if alive is not None:
+        alive()
