@@ -1,6 +1,7 @@
 """AprilTag's own detector through pyapriltags, with corners fitted by `refine`."""
 
 import importlib
+from collections.abc import Collection
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -23,7 +24,7 @@ _MIN_DECISION_MARGIN = 10.0  # grey levels; tags decoded from noise stay below
 class AprilTagDetector:
     """Detects markers of one AprilTag family. Slower than OpenCV, but finds small ones at once."""
 
-    def __init__(self, family: str = "tag36h11"):
+    def __init__(self, family: str = "tag36h11", ids: Collection[int] | None = None):
         """See `make_detector`."""
         dictionary(family)
         if family not in APRILTAG_FAMILIES:
@@ -35,7 +36,7 @@ class AprilTagDetector:
             raise BadInput(
                 "detector", "'apriltag' needs pyapriltags: pip install 'jaxnav[apriltag]'"
             ) from error
-        self.family = family
+        self.family, self._ids = family, ids
         self._decoder = pyapriltags.Detector(families=family, nthreads=1, quad_decimate=1.0)
 
     def detect(
@@ -55,4 +56,4 @@ class AprilTagDetector:
             for tag in self._decoder.detect(np.ascontiguousarray(image))
             if tag.decision_margin > _MIN_DECISION_MARGIN
         ]
-        return refine_detections(image, markers, self.family, camera)
+        return refine_detections(image, markers, self.family, camera, self._ids)

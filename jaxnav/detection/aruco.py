@@ -1,5 +1,7 @@
 """OpenCV's aruco decoder, with a closer look at quadrilaterals that it can't read."""
 
+from collections.abc import Collection
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -31,15 +33,20 @@ class ArucoDetector:
     finds but can't read, also those in a threefold enlargement around the predictions.
     """
 
-    def __init__(self, family: str = "tag36h11", closer_looks: int = 12):
+    def __init__(
+        self,
+        family: str = "tag36h11",
+        ids: Collection[int] | None = None,
+        closer_looks: int = 12,
+    ):
         """See `make_detector`.
 
         Args:
-            family: one of `jaxnav.models.markers.FAMILY_SIZES`.
+            family, ids: as there.
             closer_looks: most quadrilaterals of an image to look at again, some ms each.
         """
         self.family = family
-        self._closer_looks = closer_looks
+        self._ids, self._closer_looks = ids, closer_looks
         self._decoders: dict[float, cv2.aruco.ArucoDetector] = {}
         self._decoder(0.0)
 
@@ -61,6 +68,8 @@ class ArucoDetector:
                         f for f in markers_there if not any(_overlap(f[1], c) for _, c in markers)
                     ]
                     unread = [quad, *unread_there, *unread]
+        if self._ids is not None and set(self._ids) <= {marker_id for marker_id, _ in markers}:
+            unread = []  # all that matter are read
         looked_at = [corners for _, corners in markers]
         for quad in frames_first(image, _worth_a_look(unread))[: self._closer_looks]:
             if any(_overlap(quad, other) for other in looked_at):
@@ -69,7 +78,7 @@ class ArucoDetector:
             if read is not None:
                 markers.append((read[0], read[1].corners_px))
                 looked_at.append(read[1].corners_px)
-        return refine_detections(image, markers, self.family, camera)
+        return refine_detections(image, markers, self.family, camera, self._ids)
 
     def detect_near(
         self,
@@ -95,7 +104,7 @@ class ArucoDetector:
                 if code is not None:
                     markers.append((code[0], code[1].corners_px))
                     break
-        return refine_detections(image, markers, self.family, camera)
+        return refine_detections(image, markers, self.family, camera, self._ids)
 
     def _decoder(self, perimeter_rate: float) -> cv2.aruco.ArucoDetector:
         """The decoder whose least perimeter is this part of the image's longer side."""

@@ -32,6 +32,8 @@ def pixels_of(camera: Camera | None, rays: Float[Array, "N 3"]) -> Float[Array, 
     return rays[:, :2] / rays[:, 2:] if camera is None else camera.project(rays)
 
 
+_RAYS = 128  # that are projected at once
+
 _rays_through, _pixels_of = kept(rays_through), kept(pixels_of)
 
 
@@ -61,7 +63,10 @@ class Lens:
         return np.asarray(rays, float)[:, :n], np.asarray(rays_px, float)[:, :, :n]
 
     def pixels(self, rays: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
-        """Project rays (N, 3) to pixels (N, 2). Compiles once for each N."""
+        """Project rays (N, 3) to pixels (N, 2)."""
         if self.camera is None:
             return rays[:, :2] / rays[:, 2:]
-        return np.asarray(_pixels_of(self.camera, rays), float)
+        padded = np.tile(np.array([0.0, 0.0, 1.0], rays.dtype), (-(-len(rays) // _RAYS), _RAYS, 1))
+        padded.reshape(-1, 3)[: len(rays)] = rays
+        pixels = [np.asarray(_pixels_of(self.camera, part), float) for part in padded]
+        return np.concatenate(pixels)[: len(rays)]

@@ -75,8 +75,7 @@ def refine_corners(
     """
     corners_px = np.asarray(corners_px, float)
     side_px = mean_side_px(corners_px)
-    # A decoder's corners lie within a pixel, or 3 % of the side, of the truth.
-    failed = RefinedMarker(corners_px, np.full(4, max(1.0, 0.03 * side_px)), np.inf, False, None)
+    failed = as_decoded(corners_px)
     fitted = fit_marker(image, corners_px, cells, lens, whole)
     if fitted is None:
         return failed
@@ -96,6 +95,12 @@ def refine_corners(
     variance_px2 = np.einsum("ij,jk,ik->i", motion, np.asarray(fit.covariance, float), motion)
     sigma_px = np.sqrt(variance_px2.reshape(4, 2).mean(axis=1) + _MODEL_SIGMA_PX**2)
     return RefinedMarker(fitted_px, sigma_px, float(fit.noise / fit.contrast), True, fitted)
+
+
+def as_decoded(corners_px: Float[np.ndarray, "4 2"]) -> RefinedMarker:
+    """A decoder's corners, which lie within a pixel, or 3 % of the side, of the truth."""
+    sigma_px = np.full(4, max(1.0, 0.03 * mean_side_px(corners_px)))
+    return RefinedMarker(np.asarray(corners_px, float), sigma_px, np.inf, False, None)
 
 
 def fit_marker(

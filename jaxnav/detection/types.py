@@ -1,6 +1,6 @@
 """The protocols of detectors, and the detections that they return."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.lens import Lens
-from jaxnav.detection.refine import refine_corners
+from jaxnav.detection.refine import as_decoded, refine_corners
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
 
@@ -153,13 +153,22 @@ def refine_detections(
     markers: Sequence[tuple[int, Float[np.ndarray, "4 2"]]],
     family: str,
     camera: Camera | None,
+    ids: Collection[int] | None = None,
 ) -> Detections:
     """Refine the corners of markers that a decoder found, given as (id, (4, 2) corners) each.
 
     A marker whose outline it found twice, inside and outside, is there once.
+
+    Args:
+        ids: see `make_detector`.
     """
     lens = Lens(camera)
-    fits = [refine_corners(image, corners, marker_cells(family, i), lens) for i, corners in markers]
+    fits = [
+        refine_corners(image, corners, marker_cells(family, i), lens)
+        if ids is None or i in ids
+        else as_decoded(corners)
+        for i, corners in markers
+    ]
     return Detections(
         ids=np.array([marker_id for marker_id, _ in markers], int),
         corners_px=np.array([fit.corners_px for fit in fits], float).reshape(-1, 4, 2),

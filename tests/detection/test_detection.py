@@ -216,6 +216,22 @@ def test_colour_and_grey_are_the_same(detector):
     assert np.array_equal(grey.corners_px, colour.corners_px)
 
 
+def test_corners_of_markers_that_do_not_matter_stay_as_they_are_decoded(backend, detector):
+    rng = np.random.default_rng(6)
+    parts = [random_scene(rng, 40, marker_cells("tag36h11", n), optics_px=0.4) for n in (5, 9)]
+    image = np.concatenate([part.render(rng) for part in parts], axis=1)
+    all_of_them = detector.detect(image)
+    assert all_of_them.refined.all()
+    few = make_detector(backend, "tag36h11", {9}).detect(image)
+    assert sorted(few.ids) == [5, 9]
+    assert (few.ids[few.refined] == 9).all()
+    assert few.refined.sum() == 1
+    nine = np.flatnonzero(all_of_them.ids == 9)
+    np.testing.assert_array_equal(few.corners_px[few.refined], all_of_them.corners_px[nine])
+    (off_px,) = few.corners_px[~few.refined] - all_of_them.corners_px[all_of_them.ids == 5]
+    assert np.all(np.abs(off_px) < 3 * few.sigma_px[~few.refined].max())
+
+
 @pytest.mark.parametrize(
     "image", [np.zeros((4, 5)), np.zeros((4, 5, 2), np.uint8), np.zeros((0, 5), np.uint8)]
 )
