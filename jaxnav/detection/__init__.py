@@ -18,7 +18,7 @@ from jaxnav.detection.acquire import Acquirer
 from jaxnav.detection.apriltag import AprilTagDetector
 from jaxnav.detection.aruco import ArucoDetector
 from jaxnav.detection.families import marker_cells
-from jaxnav.detection.observe import CornerLanes, observe
+from jaxnav.detection.observe import CornerLanes, marker_keys, observe
 from jaxnav.detection.track import Target, Track, track
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector
@@ -66,7 +66,8 @@ def make_detector(
 
 def make_detectors(markers: MarkerMap, backend: str = "aruco") -> list[Detector]:
     """Make a detector for each family of a map, of the map's ids: see `make_detector`."""
-    ids: dict[str, set[int]] = {}
-    for family, marker_id in zip(markers.families, markers.ids, strict=True):
-        ids.setdefault(family, set()).add(int(marker_id))
-    return [make_detector(backend, family, ids[family]) for family in sorted(ids)]
+    keys = marker_keys(markers)
+    return [
+        make_detector(backend, family, {marker_id for of, marker_id in keys if of == family})
+        for family in sorted(set(markers.families))
+    ]

@@ -46,7 +46,8 @@ class ArucoDetector:
             closer_looks: most quadrilaterals of an image to look at again, some ms each.
         """
         self.family = family
-        self._ids, self._closer_looks = ids, closer_looks
+        self._ids = None if ids is None else frozenset(ids)
+        self._closer_looks = closer_looks
         self._decoders: dict[float, cv2.aruco.ArucoDetector] = {}
         self._decoder(0.0)
 
@@ -68,7 +69,7 @@ class ArucoDetector:
                         f for f in markers_there if not any(_overlap(f[1], c) for _, c in markers)
                     ]
                     unread = [quad, *unread_there, *unread]
-        if self._ids is not None and set(self._ids) <= {marker_id for marker_id, _ in markers}:
+        if self._ids is not None and self._ids <= {marker_id for marker_id, _ in markers}:
             unread = []  # all that matter are read
         looked_at = [corners for _, corners in markers]
         for quad in frames_first(image, _worth_a_look(unread))[: self._closer_looks]:

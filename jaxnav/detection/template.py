@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.refine import mean_side_px
+from jaxnav.detection.types import at_scale
 
 _TEXELS = 8  # of a cell, along a side
 _FINER = 2  # sub-pixels of the drawn marker, along a side
@@ -54,8 +55,9 @@ def best_match(
         streaks += [(s * math.cos(a), s * math.sin(a)) for s in _STREAKS_PX for a in angles]
     pattern = _printed(family, marker_id)
     quads_px = quads_px[np.all(np.isfinite(quads_px), axis=(1, 2))]
-    shrink = max(int(max(map(mean_side_px, quads_px), default=0.0) / _SIDE_PX), 1)
-    image = _shrunk(image, shrink)
+    side_px = max(map(mean_side_px, quads_px), default=0.0)
+    shrink = min(max(int(side_px / _SIDE_PX), 1), *image.shape)
+    image, _ = at_scale(image, 1 / shrink)
     best: Match | None = None
     for quad_px in quads_px:
         quad = (quad_px + 0.5) / shrink - 0.5
@@ -70,15 +72,6 @@ def best_match(
             if found is not None and (best is None or found[1] > best.correlation):
                 best = Match(quad_px + shrink * found[0], streak, found[1])
     return best if best is not None and best.correlation > _LEAST_MATCH else None
-
-
-def _shrunk(image: np.ndarray, shrink: int) -> np.ndarray:
-    """The means of blocks of pixels; what is left at the right and below is cut off."""
-    if shrink == 1:
-        return image
-    columns, rows = max(image.shape[1] // shrink, 1), max(image.shape[0] // shrink, 1)
-    whole = image[: rows * shrink, : columns * shrink]
-    return cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
 
 
 @cache

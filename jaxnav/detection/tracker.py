@@ -118,17 +118,20 @@ class Tracker:
             found, np.nan_to_num(np.reshape(seen, (-1, 2))), (len(image) - 1) / 2
         )
 
+    @property
+    def _likely_exposure_s(self) -> float:
+        return _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
+
     def _credible(self, flow_px_s: np.ndarray) -> np.ndarray:
         """The velocities, NaN where they are those of a belief that jumped: of a marker that is so
         fast nothing can be seen."""
-        exposure_s = _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
-        streaks_px = exposure_s * np.linalg.norm(flow_px_s, axis=1, keepdims=True)
+        streaks_px = self._likely_exposure_s * np.linalg.norm(flow_px_s, axis=1, keepdims=True)
         return np.where(streaks_px <= MOST_STREAK_PX, flow_px_s, np.nan)
 
     def _streak(self, flow_px_s: np.ndarray) -> tuple[tuple[float, float], float]:
         """The expected streak, px, and its standard deviation."""
         speed_px_s = float(np.hypot(*flow_px_s))
-        exposure_s = _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
+        exposure_s = self._likely_exposure_s
         share = 1.0 if self.exposure_s is None else _STREAK_SHARE
         streak = exposure_s * flow_px_s
         sigma_px = _STREAK_SIGMA_PX + share * exposure_s * speed_px_s

@@ -65,8 +65,8 @@ class Guard:
         self.reason: str | None = None
         self._tripped = threading.Event()
         self._closed = threading.Event()
-        self._beats: dict[str, int] = {}  # time of each watched thread's last sign of life
-        self._idents: dict[str, int] = {}  # of these threads
+        # Time of each watched thread's last sign of life, and the thread's identifier.
+        self._beats: dict[str, tuple[int, int]] = {}
         self._command, self._written_ns = limits.zero, now_ns()
         self._deadline_ns = self._written_ns
         self.unheard: str | None = None
@@ -90,13 +90,12 @@ class Guard:
             now_ns = self._now_ns()
             self._written_ns = now_ns
             self._deadline_ns = now_ns + self._timeout_ns
-            self._beats = dict.fromkeys(self._beats, now_ns)
+            self._beats = {name: (now_ns, ident) for name, (_, ident) in list(self._beats.items())}
             self._armed = not self.tripped
 
     def beat(self, name: str) -> None:
         """Note a sign of life of the calling thread; the first one begins its watch."""
-        self._idents[name] = threading.get_ident()
-        self._beats[name] = self._now_ns()
+        self._beats[name] = self._now_ns(), threading.get_ident()
 
     def leave(self, name: str) -> None:
         """Stop watching a thread that ends normally."""
@@ -195,10 +194,9 @@ class Guard:
         now_ns = self._now_ns()
         if now_ns > self._deadline_ns:
             self.trip(f"no fresh command for {(now_ns - self._written_ns) / 1e9:.2f} s")
-        for name, beat_ns in list(self._beats.items()):
+        for name, (beat_ns, ident) in list(self._beats.items()):
             if now_ns - beat_ns > self._timeout_ns:
-                where = _where(self._idents[name])
-                self.trip(f"{name} hangs for {(now_ns - beat_ns) / 1e9:.2f} s{where}")
+                self.trip(f"{name} hangs for {(now_ns - beat_ns) / 1e9:.2f} s{_where(ident)}")
 
     def _stop(self) -> None:
         """Tell the vehicle to stop once; `_look` and `close` repeat it until it is heard."""

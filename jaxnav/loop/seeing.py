@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnav.detection.families import marker_cells
-from jaxnav.detection.signs_of_life import sign, telling
+from jaxnav.detection.signs_of_life import telling
 from jaxnav.detection.track import warm_up_tracks
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector, RegionDetector
@@ -252,10 +252,11 @@ class Eyes:
 
     def _repeat(self, turn: Callable[[], None], name: str) -> None:
         """Take turns until the end, watched by the guard. Runs in a thread."""
+        beat = partial(self._guard.beat, name)
         try:
-            with telling(partial(self._guard.beat, name)):
+            with telling(beat):
                 while not self._over.is_set():
-                    sign()
+                    beat()
                     turn()
         except Exception as error:  # its meaning is unknown: the vehicle stops
             self._guard.trip(f"{name}: {type(error).__name__}: {error}")

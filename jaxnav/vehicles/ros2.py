@@ -115,9 +115,7 @@ class RosVehicle:
             self._connection.listen(IMU, options["imu_topic"], self._take_turn)
         self._connection.run()
         end_s = time.monotonic() + _HEARD_WITHIN_S
-        while self._publisher is not None and time.monotonic() < end_s:
-            if self._publisher.get_subscription_count():
-                break
+        while not self._is_heard and time.monotonic() < end_s:
             time.sleep(_LOOK_S)
 
     def read(self) -> Any:
@@ -183,6 +181,11 @@ class RosVehicle:
         finally:
             self._closed = True
             self._connection.close()
+
+    @property
+    def _is_heard(self) -> bool:
+        """Whether somebody listens to the commands, or there are none."""
+        return self._publisher is None or self._publisher.get_subscription_count() > 0
 
     def _command(self, command: Command) -> None:
         if self._command_type is None:
