@@ -16,15 +16,15 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.belief.ambiguity import Selector, Ungated
-from jaxnav.belief.bank import Bank, heaviest, renumber_if_empty, restart_broken
+from jaxnav.belief.bank import Bank, heaviest, renumber_if_empty
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.estimate import Belief, Estimate, Evidence
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.lag import Lagged, Window
 from jaxnav.belief.motion import Motion
-from jaxnav.belief.repeats import RepeatedErrors, surprise_of
-from jaxnav.control import Controller, ControlLog, ControlState, Follower
+from jaxnav.belief.repeats import RepeatedErrors, learn_repeats, weigh_repeats
+from jaxnav.control import ControlLog, ControlState, Follower
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -32,7 +32,7 @@ from jaxnav.models.twist_base import TwistBase
 from jaxnav.pose.candidates import Candidates, find_candidates
 from jaxnav.pose.consistency import ConsistentSnapshot, remove_outliers
 from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
-from jaxnav.twist_control import TwistController
+from jaxnav.twist_control import follower_along
 
 
 class State(eqx.Module):
@@ -60,9 +60,8 @@ class Navigator(eqx.Module):
 
     With a vehicle and waypoints it commands the vehicle, a car by steering and throttle, a
     `TwistBase` by a twist; the gains of the throttle are a car's. Without them it only localises,
-    with the motion model of the body, `ConstantVelocity()` by default.
-
-    Coordinates count from `markers.origin_m` (see docs/design.md, Far origins).
+    with the motion model of the body, `ConstantVelocity()` by default. Coordinates count from
+    `markers.origin_m` (see docs/design.md, Far origins).
     """
 
     rig: CameraRig
@@ -113,54 +112,32 @@ class Navigator(eqx.Module):
         """
         if not 0 <= lag_s < float("inf") or lag_observations < 1:
             raise ValueError(f"no lag: {lag_s} s in {lag_observations} observations")
-        self.rig = rig
-        self.markers = markers
+        self.rig, self.markers = rig, markers
         self.selector = selector or MultiHypothesis()
         self.motion = motion or (BicycleKalman(vehicle) if vehicle else ConstantVelocity())
-        if isinstance(selector, Ungated):
-            self.selector = selector.rule
+        if isinstance(self.selector, Ungated):
+            self.selector = self.selector.rule
             self.motion = eqx.tree_at(lambda m: m.gate_nis, self.motion, float("inf"))
         self.motion = self.motion.for_rig(rig, self.selector.hypotheses)
-        self.controller = None
-        if len(waypoints_m) > 0 and isinstance(vehicle, TwistBase):
-            self.controller = TwistController.along(
-                waypoints_m, vehicle, waypoint_radius_m=waypoint_radius_m
-            )
-        elif len(waypoints_m) > 0:
-            self.controller = Controller.along(
-                waypoints_m, vehicle, waypoint_radius_m=waypoint_radius_m,
-                proportional_per_m=proportional_per_m, integral_per_ms=integral_per_ms,
-                integral_limit_ms=integral_limit_ms,
-            )  # fmt: skip
+        self.controller = follower_along(
+            waypoints_m, vehicle, waypoint_radius_m, proportional_per_m=proportional_per_m,
+            integral_per_ms=integral_per_ms, integral_limit_ms=integral_limit_ms,
+        )  # fmt: skip
         self.corner_sigma_px = jnp.asarray(corner_sigma_px, float)
         self.model_sigma_px = jnp.asarray(model_sigma_px, float)
-        self.repeated_errors = repeated_errors
-        if repeated_errors is None and self.selector.hypotheses > 1:
-            self.repeated_errors = RepeatedErrors()
+        self.repeated_errors = repeated_errors or RepeatedErrors.of(self.selector.hypotheses)
         self.max_sightings = max_sightings
         self.max_candidates = max_candidates
         self.max_lm_steps = max_lm_steps
         self.ground_plane = ground_plane
-        self.lag_s = lag_s
-        self.lag_observations = lag_observations
-
-    @classmethod
-    def like(cls, navigator: "Navigator") -> "Navigator":
-        """An instance of this class, which may override methods, with the fields of another."""
-        other = object.__new__(cls)
-        for name, part in vars(navigator).items():
-            object.__setattr__(other, name, part)
-        return other
+        self.lag_s, self.lag_observations = lag_s, lag_observations
 
     def init(self) -> State:
         """The state before the first observation, at the first waypoint."""
-        belief = self.believe(self.motion.init(self.selector.hypotheses))
+        bank = self.motion.init(self.selector.hypotheses)
         control = None if self.controller is None else self.controller.init()
-        if not self.lag_s:
-            return State(belief, control)
-        hypotheses = self.selector.hypotheses
-        window = Window.begin(self.motion, hypotheses, self.lag_s, self.lag_observations)
-        return State(belief, control, window)
+        window = Window.begin(bank, self.lag_s, self.lag_observations) if self.lag_s else None
+        return State(self.believe(bank), control, window)
 
     def believe(self, bank: Bank) -> Belief:
         """The belief in these hypotheses before the first observation."""
@@ -177,11 +154,10 @@ class Navigator(eqx.Module):
         """
         belief, estimate = self.sense(state.belief, obs)
         control, output = self.act(state.control, estimate, obs)
-        if state.window is None:
-            return State(belief, control), output
-        before = state.belief.bank
-        window = state.window.after(self.motion, before, belief.bank, obs.usable())
-        output = replace(output, lagged=window.look_back(self.motion, belief))
+        window = state.window
+        if window is not None:
+            window = window.after(self.motion, state.belief.bank, belief.bank, obs.usable())
+            output = replace(output, lagged=window.look_back(self.motion, belief))
         return State(belief, control, window), output
 
     def sense(self, belief: Belief, obs: Observation) -> tuple[Belief, Estimate]:
@@ -204,35 +180,27 @@ class Navigator(eqx.Module):
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
         """The belief `obs.dt_s` later (Eq. 9), with the odometry fused where there is any."""
-        return belief.with_prediction(self._sound(self.motion.predict(belief.bank, obs)))
+        return belief.with_prediction(self.motion.sound(self.motion.predict(belief.bank, obs)))
 
     def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
         motion, snapshot = self.motion, seen.snapshot
         prior = renumber_if_empty(belief.bank)
         predicted = motion.poses(prior)
-        repeated, repeats = self.repeated_errors, belief.repeats
-        if repeated is not None and repeats is not None:
-            surprise = surprise_of(predicted, heaviest(prior), seen.candidates, snapshot)
-            snapshot = repeated.weighed(repeats, snapshot, surprise)
-        selection = self.selector(predicted, seen.candidates, snapshot)
+        repeats = self.repeated_errors, belief.repeats
+        weighed = weigh_repeats(*repeats, predicted, heaviest(prior), seen.candidates, snapshot)
+        selection = self.selector(predicted, seen.candidates, weighed)
         updated = motion.update(prior, selection, snapshot.obs)
-        updated = updated._replace(bank=self._sound(updated.bank))
+        updated = updated._replace(bank=motion.sound(updated.bank))
         belief = belief.after(updated.bank, selection.decided, selection.flip_probability)
         evidence = Evidence.of(seen, prior, selection, updated, predicted.gate_nis)
-        if repeated is not None and repeats is not None:
-            best = motion.T_world_vehicle(belief.bank.mean[heaviest(belief.bank)])
-            known = belief.decided & evidence.agrees
-            repeats = repeated.after(repeats, seen.snapshot, best, known)
-            belief = replace(belief, repeats=repeats)
-        return belief, evidence
+        best = motion.T_world_vehicle(belief.bank.mean[heaviest(belief.bank)])
+        known = belief.decided & evidence.agrees
+        return replace(belief, repeats=learn_repeats(*repeats, snapshot, best, known)), evidence
 
     def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
         """The predicted belief as the next one, where no marker is in view."""
-        located = jnp.any(belief.bank.initialised)
-        flip_probability = jnp.where(located, belief.flip_probability, 0)
-        belief = belief.after(belief.bank, belief.decided & located, flip_probability)
-        return belief, self.no_evidence(belief)
+        return belief.coasted(), self.no_evidence(belief)
 
     def act(
         self, control: ControlState | None, estimate: Estimate, obs: Observation
@@ -244,14 +212,10 @@ class Navigator(eqx.Module):
         """
         command, done, log = None, jnp.asarray(False), None
         if self.controller is not None and control is not None:
-            obs, pose = obs.usable(), estimate.pose
-            measured_mps = jnp.where(obs.has_odometry, obs.speed_mps, jnp.nan)
-            odometry = obs.steering_rad, obs.dt_s, measured_mps
-            steering_rad, dt_s, speed_mps = (jnp.asarray(x, pose.dtype) for x in odometry)
-            nearest_m = self.markers.nearest_m(estimate.T_world_vehicle)
+            speed_mps, steering_rad, dt_s = obs.usable().driven(estimate.pose.dtype)
             control, command, done, log = self.controller(
-                control, pose, estimate.located, steering_rad, dt_s, estimate.decided,
-                nearest_m, speed_mps,
+                control, estimate.pose, estimate.located, steering_rad, dt_s, estimate.decided,
+                self.markers.nearest_m(estimate.T_world_vehicle), speed_mps,
             )  # fmt: skip
         return control, Output(**vars(estimate), command=command, done=done, control_log=log)
 
@@ -262,8 +226,8 @@ class Navigator(eqx.Module):
 
     def find_candidates(self, snapshot: Snapshot, own: jaxlie.SE3 | None = None) -> Candidates:
         """Both poses of every sighting, refined; see `jaxnav.pose.candidates.find_candidates`."""
-        limits = self.max_candidates, self.max_lm_steps
-        return find_candidates(snapshot, *limits, self.ground_plane, own)
+        limits = self.max_candidates, self.max_lm_steps, self.ground_plane
+        return find_candidates(snapshot, *limits, own)
 
     def no_candidates(self) -> Candidates:
         """Candidates as many as `find_candidates` returns, none of them valid."""
@@ -271,14 +235,10 @@ class Navigator(eqx.Module):
         return Candidates.none(count, self.rig.cameras.focal_px.dtype)
 
     def no_evidence(self, belief: Belief) -> Evidence:
-        """The evidence of an observation without a marker."""
+        """The evidence of an observation without a marker in view."""
         return Evidence.none(self.no_candidates(), len(self.markers.ids), belief.bank.mean.dtype)
 
-    def _sound(self, bank: Bank) -> Bank:
-        return restart_broken(bank, self.motion.init(bank.initialised.shape[0]))
-
-    # Bound methods hash their owner: by identity, so that `jax.jit(navigator.step)` works.
-    __hash__ = object.__hash__
+    __hash__ = object.__hash__  # by identity: `jax.jit(navigator.step)` hashes its owner
 
 
 Step = Callable[[State, Observation], tuple[State, Output]]

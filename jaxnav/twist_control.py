@@ -3,14 +3,37 @@
 Source: Coulter (1992), "Implementation of the pure pursuit path tracking algorithm".
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.control import ControlLog, ControlState, Exploration, Follower
+from jaxnav.control import Controller, ControlLog, ControlState, Exploration, Follower
+from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
 from jaxnav.models.twist_base import TwistBase
+
+
+def follower_along(
+    waypoints_m: Sequence[Sequence[float]] | Float[Array, "W 2"],
+    vehicle: Vehicle | TwistBase | None,
+    waypoint_radius_m: float,
+    **throttle_gains: float,
+) -> Follower | None:
+    """The controller of a car or of another base, which has no throttle; None without waypoints.
+
+    Raises:
+        ValueError: no vehicle, or waypoints of the wrong shape.
+    """
+    if len(waypoints_m) == 0:
+        return None
+    if isinstance(vehicle, TwistBase):
+        return TwistController.along(waypoints_m, vehicle, waypoint_radius_m=waypoint_radius_m)
+    return Controller.along(
+        waypoints_m, vehicle, waypoint_radius_m=waypoint_radius_m, **throttle_gains
+    )
 
 
 class TwistCommand(eqx.Module):

@@ -36,6 +36,12 @@ class Belief(eqx.Module):
         given_up = jnp.any(self.bank.initialised) & ~jnp.any(bank.initialised)
         return replace(self, bank=bank, restarts=self.restarts + given_up)
 
+    def coasted(self) -> "Belief":
+        """The belief after an observation without a marker in view, once it is predicted."""
+        located = jnp.any(self.bank.initialised)
+        flip_probability = jnp.where(located, self.flip_probability, 0)
+        return self.after(self.bank, self.decided & located, flip_probability)
+
     def after(
         self, bank: Bank, decided: Bool[Array, ""], flip_probability: Float[Array, ""]
     ) -> "Belief":

@@ -50,9 +50,8 @@ class Window(eqx.Module):
     lag_s: Float[Array, ""]
 
     @staticmethod
-    def begin(motion: Motion, hypotheses: int, lag_s: float, observations: int) -> "Window":
-        """A window that has seen nothing."""
-        bank = motion.init(hypotheses)
+    def begin(bank: Bank, lag_s: float, observations: int) -> "Window":
+        """A window that has seen nothing, before a bank's first observation."""
         kept = jax.tree.map(lambda leaf: leaf[:_KEPT], bank)
         P = jnp.zeros_like(kept.covariance)
         none = -jnp.ones_like(bank.parent)

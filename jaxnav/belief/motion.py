@@ -22,7 +22,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
-from jaxnav.belief.bank import Bank, branched
+from jaxnav.belief.bank import Bank, branched, restart_broken
 from jaxnav.belief.camera_errors import EACH
 from jaxnav.belief.gate import Moments, Offer, apply_gate
 from jaxnav.belief.merging import merge_heirs
@@ -70,6 +70,10 @@ class Motion(eqx.Module):
 
         What moves the hypothesis, as odometry that tells the motion does, belongs to it.
         """
+
+    def sound(self, bank: Bank) -> Bank:
+        """The bank whose hypotheses that are not finite begin anew."""
+        return restart_broken(bank, self.init(bank.initialised.shape[0]))
 
     @abc.abstractmethod
     def lost(self, bank: Bank) -> Bool[Array, " K"]:

@@ -79,6 +79,11 @@ class RepeatedErrors(eqx.Module):
     # By which corners have moved when 1 / e of their errors is the same.
     renewal_px: Float[Array, ""] | float = 40.0
 
+    @staticmethod
+    def of(hypotheses: int) -> "RepeatedErrors | None":
+        """The default; None for a single hypothesis, which doubts nothing."""
+        return RepeatedErrors() if hypotheses > 1 else None
+
     def begin(self, rig: CameraRig, markers: MarkerMap) -> Repeats:
         """Nothing was seen yet."""
         lanes, dtype = (len(rig), len(markers.ids)), rig.cameras.focal_px.dtype
@@ -148,6 +153,33 @@ class RepeatedErrors(eqx.Module):
         moved = seen.corners_px[:, ::2] - repeats.diagonal_px[_lanes(seen)]
         moved_px = safe_norm(moved.reshape(-1, 4) / np.sqrt(2))
         return jnp.exp(-moved_px / self.renewal_px).astype(repeats.count.dtype)
+
+
+def weigh_repeats(
+    model: RepeatedErrors | None,
+    repeats: Repeats | None,
+    predicted: PoseBelief,
+    index: Int[Array, ""],
+    candidates: Candidates,
+    snapshot: Snapshot,
+) -> Snapshot:
+    """The snapshot weighed by the surprise of one prediction; as it is without a model."""
+    if model is None or repeats is None:
+        return snapshot
+    return model.weighed(repeats, snapshot, surprise_of(predicted, index, candidates, snapshot))
+
+
+def learn_repeats(
+    model: RepeatedErrors | None,
+    repeats: Repeats | None,
+    snapshot: Snapshot,
+    T_world_vehicle: jaxlie.SE3,
+    known: Bool[Array, ""],
+) -> Repeats | None:
+    """`model.after` a snapshot; None without a model."""
+    if model is None or repeats is None:
+        return None
+    return model.after(repeats, snapshot, T_world_vehicle, known)
 
 
 def surprise_of(

@@ -1,4 +1,4 @@
-"""`where` for trees of arrays."""
+"""`where` for trees of arrays, and a module under another class."""
 
 from typing import Any, TypeVar
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 _Tree = TypeVar("_Tree")
+_Module = TypeVar("_Module")
 
 
 def where(condition: Bool[Array, "*rows"], yes: _Tree, no: _Tree) -> _Tree:
@@ -18,3 +19,11 @@ def where(condition: Bool[Array, "*rows"], yes: _Tree, no: _Tree) -> _Tree:
 
     chosen: _Tree = jax.tree.map(choose, yes, no)
     return chosen
+
+
+def as_class(cls: type[_Module], module: Any) -> _Module:
+    """An instance of a class, which may override methods, with the fields of another module."""
+    other = object.__new__(cls)
+    for name, part in vars(module).items():
+        object.__setattr__(other, name, part)
+    return other

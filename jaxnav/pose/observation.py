@@ -1,11 +1,13 @@
 """`Observation`, one reading of all sensors, and `Snapshot`, its compact form for the solvers."""
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.models.camera import Camera
@@ -71,6 +73,12 @@ class Observation(eqx.Module):
             dt_s=jnp.where(usable_dt, dt_s, 0.0),
             has_odometry=has_odometry,
         )
+
+    def driven(self, dtype: DTypeLike) -> tuple[Array, Array, Array]:
+        """`speed_mps`, NaN without odometry, `steering_rad` and `dt_s`: what a controller reads."""
+        speed_mps = jnp.where(self.has_odometry, self.speed_mps, jnp.nan)
+        asarray = partial(jnp.asarray, dtype=dtype)
+        return asarray(speed_mps), asarray(self.steering_rad), asarray(self.dt_s)
 
 
 class Sightings(eqx.Module):

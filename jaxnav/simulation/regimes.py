@@ -21,6 +21,7 @@ from jaxnav.belief.bank import (
 from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.navigator import Navigator, Step
+from jaxnav.numerics.trees import as_class
 from jaxnav.pose.consistency import ConsistentSnapshot, Inliers, find_inliers
 from jaxnav.pose.observation import Observation
 
@@ -33,7 +34,7 @@ def step_by_regime(navigator: Navigator) -> Step:
     """`navigator.step` without the empty slots; a subclass's own `step` is returned unchanged."""
     if type(navigator) is not Navigator:
         return navigator.step
-    return _ByRegime.like(navigator).step
+    return as_class(_ByRegime, navigator).step
 
 
 class _ByRegime(Navigator):

@@ -21,6 +21,7 @@ from jaxnav.belief.kalman import log_likelihood
 from jaxnav.belief.motion import Motion
 from jaxnav.navigator import Navigator
 from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND
+from jaxnav.numerics.trees import as_class
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.consistency import ConsistentSnapshot
 from jaxnav.pose.observation import Observation, Snapshot
@@ -51,8 +52,8 @@ def trust_corners(navigator: Navigator) -> Navigator:
         navigator = eqx.tree_at(
             lambda n: (n.selector.max_inflation, n.selector.max_misfit), navigator, (1.0, 1.0)
         )
-        return _GoesOn.like(navigator)
-    return _Trusts.like(navigator)
+        return as_class(_GoesOn, navigator)
+    return as_class(_Trusts, navigator)
 
 
 def follow(navigator: Navigator, start: Bank, recorded: FrameSequences) -> FilterScores:
