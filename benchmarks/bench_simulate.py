@@ -1,11 +1,14 @@
 """Time closed-loop simulation: steps a second over all lanes, whole drives.
 
     python benchmarks/bench_simulate.py [--seeds N]
+    python benchmarks/bench_simulate.py --accelerator
     pytest benchmarks/bench_simulate.py --benchmark-enable --benchmark-only
 
 The paper's scenario at corner noise of 1 px. A step counts if its drive is still under way. Few
 drives run under `vmap` (as all did once), many through `over_lanes`; both in one process, in turns.
 CPU time is that of all threads: on a shared machine it is more reliable than the clock.
+
+With `--accelerator` the drives run under `vmap` on JAX's default device, many lanes at once.
 """
 
 import platform
@@ -28,6 +31,7 @@ from jaxnav.simulation.scenarios import scenarios
 
 SELECTORS = ("paper-cost", "lowest-reprojection", "multi-hypothesis")
 FEW, MANY, ROUNDS = 256, 4096, 3
+ACCELERATOR_LANES = (1024, 8192, 32768)
 
 
 def rollout(selector: str, **options: Any) -> Rollout:
@@ -66,10 +70,27 @@ def start(drives: Rollout, chunks: int = 1) -> float:
     return drives.many_lanes * drives.chunk_frames * chunks / (time.perf_counter() - begin)
 
 
+def on_accelerator() -> None:
+    """Print a table of steps a second under `vmap`, by the number of lanes."""
+    device = jax.devices()[0]
+    print(f"jax {jax.__version__}, {device.device_kind}, float32, as many drives as lanes\n")
+    print("| selector | lanes | steps/s | s to compile |\n|---|---|---|---|", flush=True)
+    for selector in SELECTORS:
+        for lanes in ACCELERATOR_LANES:
+            drives = rollout(selector, many=sys.maxsize, lanes=lanes)
+            first = timed(drives, lanes)[0]
+            clock, _, steps = np.transpose([timed(drives, lanes) for _ in range(ROUNDS)])
+            compiling = first - np.median(clock)
+            rate = np.median(steps / clock)
+            print(f"| {selector} | {lanes} | {rate:,.0f} | {compiling:.0f} |", flush=True)
+
+
 def main() -> None:
     """Print the table."""
     configure(float64=False)
     jax.config.update("jax_enable_compilation_cache", False)
+    if "--accelerator" in sys.argv:
+        return on_accelerator()
     many = int(sys.argv[sys.argv.index("--seeds") + 1]) if "--seeds" in sys.argv else MANY
     print(
         f"jax {jax.__version__}, {platform.processor() or platform.machine()}, "

@@ -23,16 +23,6 @@ hypothesis.settings.register_profile("shared", deadline=None)
 hypothesis.settings.load_profile("shared")
 # As a terminal has it: a suite under `nohup` would have tests whose programs ignore it too.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
-# Most of a run is compilation. LLVM's costly passes and wide registers win nothing on inputs as
-# small as these, nor does a second thread beside a second worker. XLA reads this when the
-# first array is made.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
-    "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"
-    + (" --xla_cpu_max_isa=SSE4_2" if platform.machine() == "x86_64" else ""),
-)
 # The workers share the programs that they compile, and the next run finds them: what a program is
 # called by is its text, the compiler and its flags. The thousands that are a single operation are
 # kept too.
@@ -67,6 +57,21 @@ AROUND = [
     )
 ]  # fmt: skip
 install_import_hook(AROUND, "tests.helpers.shapes.check_arrays")
+
+# Most of a run is compilation. LLVM's costly passes and wide registers win nothing on inputs as
+# small as these, nor does a second thread beside a second worker. XLA reads this when the
+# first array is made, and aborts on a flag that its version lacks.
+if "XLA_FLAGS" not in os.environ:
+    from jaxnav.configuration import FLAGS, known_flags
+
+    quick = {
+        "xla_backend_optimization_level": "0",
+        "xla_llvm_disable_expensive_passes": "true",
+        "xla_cpu_parallel_codegen_split_count": "1",
+    }
+    narrow = {"xla_cpu_max_isa": "SSE4_2"} if platform.machine() == "x86_64" else {}
+    flags = known_flags(quick | FLAGS | narrow)
+    os.environ["XLA_FLAGS"] = " ".join(f"--{name}={value}" for name, value in flags.items())
 
 
 # A file is one worker's: what takes minutes must not come last.
