@@ -18,7 +18,7 @@ import pytest
 from jax import lax
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, over_lanes
+from jaxnav.lanes.over_lanes import compiler_options, over_lanes
 from jaxnav.lanes.rules import RULES
 
 LANES, ROUNDS = 4096, 40
@@ -58,7 +58,7 @@ FREE = {"stop_gradient", "nondifferentiable_backward", "nonbatchable", "unvmap_a
 def lowered(name: str) -> jax.stages.Lowered:
     """The row's function for all lanes, under the rules of the moment."""
     A, k = jax.ShapeDtypeStruct((6, 6, LANES), "float32"), jax.ShapeDtypeStruct((LANES,), "int32")
-    return jax.jit(over_lanes(ROWS[name]), compiler_options=COMPILER_OPTIONS).lower(A, k)
+    return jax.jit(over_lanes(ROWS[name]), compiler_options=compiler_options()).lower(A, k)
 
 
 def both_ways(name: str) -> tuple[jax.stages.Lowered, jax.stages.Lowered]:

@@ -72,6 +72,7 @@ def start(drives: Rollout, chunks: int = 1) -> float:
 
 def on_accelerator() -> None:
     """Print a table of steps a second under `vmap`, by the number of lanes."""
+    configure(float64=False)
     device = jax.devices()[0]
     print(f"jax {jax.__version__}, {device.device_kind}, float32, as many drives as lanes\n")
     print("| selector | lanes | steps/s | s to compile |\n|---|---|---|---|", flush=True)
@@ -89,8 +90,6 @@ def main() -> None:
     """Print the table."""
     configure(float64=False)
     jax.config.update("jax_enable_compilation_cache", False)
-    if "--accelerator" in sys.argv:
-        return on_accelerator()
     many = int(sys.argv[sys.argv.index("--seeds") + 1]) if "--seeds" in sys.argv else MANY
     print(
         f"jax {jax.__version__}, {platform.processor() or platform.machine()}, "
@@ -126,4 +125,4 @@ def test_whole_drives(benchmark: Any, selector: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    on_accelerator() if "--accelerator" in sys.argv else main()

@@ -332,13 +332,11 @@ def test_the_users_own_flags_for_xla_are_kept(tmp_path) -> None:
         "import os; from jaxnav.commands.process import configure_jax\n"
         "configure_jax(float64=False); print(os.environ['XLA_FLAGS'])"
     )
-    flag, own = "--xla_cpu_use_fusion_emitters", "--xla_cpu_multi_thread_eigen=false"
-    other = "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"
-    for given, kept in (
-        ("", f"{flag}=false {other}"),
-        (own, f"{own} {flag}=false {other}"),
-        (f"{flag}=true {other}",) * 2,
-    ):
+    known = configuration.known_flags(configuration.FLAGS)
+    ours = " ".join(f"--{flag}={value}" for flag, value in known.items())
+    own = "--xla_cpu_multi_thread_eigen=false"
+    reverse = " ".join(reversed(ours.split()))
+    for given, kept in (("", ours), (own, f"{own} {ours}"), (reverse, reverse)):
         run = subprocess.run(
             [sys.executable, "-c", script],
             env=os.environ | {"XLA_FLAGS": given, "XDG_CACHE_HOME": str(tmp_path)},

@@ -117,7 +117,7 @@ class _Evaluation(NamedTuple):
         if name == "while":
             return self._while(args, params)
         if name == "scan":
-            return self._scan(args, params)
+            return self._scan(eqn, args)
         if name in ELEMENTWISE and name not in RULES:
             return [elementwise(eqn.primitive, args, params, self.lanes)]
         if name not in VIEWS:  # a sum reads every term once
@@ -165,8 +165,15 @@ class _Evaluation(NamedTuple):
         start = [rows_of(arg, self.lanes) for arg in args[n_cond + n_body :]]
         return [Lane(out) for out in lax.while_loop(any_goes, step, start)]
 
-    def _scan(self, args: list[Value], params: Params) -> list[Value]:
-        n_consts, n_carry = params["num_consts"], params["num_carry"]
+    def _scan(self, eqn: core.JaxprEqn, args: list[Value]) -> list[Value]:
+        params, inner = eqn.params, eqn.params["jaxpr"].jaxpr
+
+        def stacked(outer: Sequence[Any], inner: Sequence[Any]) -> int:
+            """How many have the loop's axis, which every version of JAX names differently."""
+            return sum(a.aval.ndim != b.aval.ndim for a, b in zip(outer, inner, strict=True))
+
+        n_carry = len(eqn.outvars) - stacked(eqn.outvars, inner.outvars)
+        n_consts = len(args) - n_carry - stacked(eqn.invars, inner.invars)
         consts = args[:n_consts]
         carry = [rows_of(arg, self.lanes) for arg in args[n_consts : n_consts + n_carry]]
         xs = [rows_of(arg, self.lanes) for arg in args[n_consts + n_carry :]]

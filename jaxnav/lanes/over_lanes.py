@@ -15,18 +15,19 @@ not fit, `vmap` itself is taken, with one warning.
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import PyTree
 
+# LLVM's costly passes double the compile time and buy nothing.
+_OPTIONS: dict[str, str | int] = {"xla_backend_optimization_level": 1}
 # Without barriers XLA for the CPU computes anew, at every use, the values that `over_lanes` writes
-# to memory once. Its costly passes double the compile time and buy nothing.
-COMPILER_OPTIONS = {
-    "xla_disable_hlo_passes": "cse_barrier_expander",
-    "xla_backend_optimization_level": 1,
-}
+# to memory once. From jaxlib 0.12 on it can't compile them in a loop that it has hoisted.
+_KEEP_BARRIERS = "cse_barrier_expander", "cse_barrier_expander,small-while-loop-hoisting"
 # What an internal that is missing, or has other parameters, makes the evaluation raise.
 _DOES_NOT_FIT = ImportError, AttributeError, LookupError, TypeError, ValueError, NotImplementedError
 
@@ -79,6 +80,21 @@ def _warn(reason: str) -> None:
     """Warn once for each reason."""
     problem = f"jaxnav.lanes does not fit jax {jax.__version__} ({reason})"
     warnings.warn(f"{problem}: vmap takes its place, several times as slow", stacklevel=3)
+
+
+@cache
+def compiler_options() -> dict[str, str | int]:
+    """Options for the `jit` around a function of `over_lanes`, by what this XLA can compile."""
+
+    def loop(rows: jax.Array) -> jax.Array:
+        return lax.fori_loop(0, 3, lambda _, rows: lax.optimization_barrier(jnp.sin(rows)), rows)
+
+    for passes in _KEEP_BARRIERS:
+        options = _OPTIONS | {"xla_disable_hlo_passes": passes}
+        with suppress(jax.errors.JaxRuntimeError):
+            jax.jit(loop, compiler_options=options).lower(jnp.zeros(8)).compile()
+            return options
+    return _OPTIONS
 
 
 def lanes_last(tree: PyTree) -> PyTree:

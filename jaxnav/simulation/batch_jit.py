@@ -1,11 +1,14 @@
 """Compile a batch of drives or recordings, which takes longer than to run it."""
 
+import functools
 import os
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import equinox as eqx
 from jaxtyping import PyTree
+
+from jaxnav.lanes.over_lanes import compiler_options
 
 Function = TypeVar("Function", bound=Callable[..., PyTree])
 
@@ -22,3 +25,17 @@ def batch_jit(function: Function) -> Function:
     without them (`benchmarks/README-simulate.md`).
     """
     return cast(Function, jit_with(function, compiler_options=_OPTIONS))
+
+
+def lanes_jit(function: Function) -> Function:
+    """`equinox.filter_jit` of a function of `over_lanes`; its first call asks for the options."""
+
+    @functools.cache
+    def compiled() -> Function:
+        return cast(Function, jit_with(function, compiler_options=compiler_options()))
+
+    @functools.wraps(function)
+    def call(*args: PyTree) -> PyTree:
+        return compiled()(*args)
+
+    return cast(Function, call)

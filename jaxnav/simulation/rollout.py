@@ -14,14 +14,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from jaxnav.belief.kalman import nis
-from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
+from jaxnav.lanes.over_lanes import lanes_first, lanes_last, over_lanes
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import T_world_vehicle_from_planar, safe_norm, wrap_angle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.observation import Observation
-from jaxnav.simulation.batch_jit import jit_with
+from jaxnav.simulation.batch_jit import lanes_jit
 from jaxnav.simulation.corners import drifted, see
 from jaxnav.simulation.drive import PASSED_M
 from jaxnav.simulation.gyro import read_gyro, switched_on
@@ -143,7 +143,7 @@ class Rollout(eqx.Module):
         )(worlds)
         return advanced
 
-    @jit_with(compiler_options=COMPILER_OPTIONS)
+    @lanes_jit
     def _advance_many(
         self, worlds: DriveState, keep: Keep
     ) -> tuple[DriveState, tuple[Trace, PyTree]]:

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
+from jaxnav.lanes.over_lanes import lanes_first, lanes_last, over_lanes
 from jaxnav.navigator import Step
 from jaxnav.parameters import with_parameters
-from jaxnav.simulation.batch_jit import jit_with
+from jaxnav.simulation.batch_jit import lanes_jit
 from jaxnav.simulation.queue import run_lanes
 from jaxnav.simulation.regimes import step_by_regime
 from jaxnav.simulation.rollout import Rollout, Trace
@@ -178,7 +178,7 @@ class ClosedLoop(eqx.Module):
         )
         return drives, _sums(drives)
 
-    @jit_with(compiler_options=COMPILER_OPTIONS)
+    @lanes_jit
     def _advance_many(self, x: Array, space: Space, drives: DriveSlopes) -> tuple[DriveSlopes, Any]:
         """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
 

@@ -11,7 +11,7 @@ from jax import lax
 
 from jaxnav.lanes import over_lanes as door
 from jaxnav.lanes import rules
-from jaxnav.lanes.over_lanes import COMPILER_OPTIONS, lanes_first, lanes_last, over_lanes
+from jaxnav.lanes.over_lanes import compiler_options, lanes_first, lanes_last, over_lanes
 from jaxnav.numerics.small_matrices import cho_solve, cholesky, sandwich
 
 LANES = 37
@@ -24,7 +24,7 @@ def drawn(*shape, seed=0):
 def same(fn, *args, rtol=1e-12, block=8):
     """Both evaluations agree, in the process's precision; the lane-wise one is returned."""
     args = jax.tree.map(jnp.asarray, args)
-    mapped = jax.jit(over_lanes(fn, block), compiler_options=COMPILER_OPTIONS)(*args)
+    mapped = jax.jit(over_lanes(fn, block), compiler_options=compiler_options())(*args)
     expected = jax.jit(jax.vmap(fn, in_axes=-1, out_axes=-1))(*args)
     assert jax.tree.structure(mapped) == jax.tree.structure(expected)
     for a, b in zip(jax.tree.leaves(mapped), jax.tree.leaves(expected), strict=True):
@@ -122,7 +122,7 @@ def test_loops_run_in_strips(lanes):
         return lax.while_loop(lambda c: c[0] > 1, step, (jnp.abs(x), 0 * x, 0))
 
     x, floor = 100 * jnp.asarray(np.resize(drawn(), lanes)), jnp.asarray(np.resize(drawn(), lanes))
-    mapped = jax.jit(over_lanes(looping), compiler_options=COMPILER_OPTIONS)
+    mapped = jax.jit(over_lanes(looping), compiler_options=compiler_options())
     assert "xla_cpu_small_call" in mapped.lower(x, floor).as_text()
     straight = mapped(x, floor)
     for a, b in zip(
@@ -209,7 +209,7 @@ def test_random_numbers():
 def test_a_lane_does_not_depend_on_the_others():
     """Bit for bit, wherever it stands."""
     which, A = np.resize([0, 1, 2, 1], 64), jnp.asarray(np.resize(drawn(4, 4), (4, 4, 64)))
-    fn = jax.jit(over_lanes(branching, 16), compiler_options=COMPILER_OPTIONS)
+    fn = jax.jit(over_lanes(branching, 16), compiler_options=compiler_options())
     straight, order = fn(which, A), np.random.default_rng(4).permutation(64)
     shuffled = fn(which[order], A[..., order])
     for a, b in zip(straight, shuffled, strict=True):
