@@ -75,7 +75,7 @@ def configure(
         _choose_cache(cache if isinstance(cache, Path) else None)
     wanted["XLA_FLAGS"] = _with_flags(os.environ.get("XLA_FLAGS", ""))
     changes = {name: value for name, value in wanted.items() if os.environ.get(name, "") != value}
-    if changes and _jax_runs():
+    if changes and jax_runs():
         warnings.warn(
             f"{' and '.join(changes)} come too late: JAX runs already. Call jaxnav.configure() "
             "before the first array is made",
@@ -154,7 +154,7 @@ def _survives(flags: dict[str, str]) -> bool:
     return run.returncode == 0
 
 
-def _jax_runs() -> bool:
+def jax_runs() -> bool:
     """Whether JAX has started a backend, which is when XLA reads its flags."""
     # No public API tells it, so this may vanish one day: then there is no warning.
     with suppress(ImportError, AttributeError):

@@ -327,6 +327,26 @@ def test_cache_folders_that_could_be_somebody_elses_are_refused(tmp_path, capsys
     assert configuration.cache_refused() in lines[-1]
 
 
+@pytest.mark.parametrize(
+    ("threads", "asked", "platforms"),
+    [(1, "", "cpu"), (1, "cpu,cuda", "cpu,cuda"), (None, "", "")],
+)
+def test_a_single_car_is_computed_on_the_processor(tmp_path, threads, asked, platforms) -> None:
+    """Unless the user says where; studies take what JAX takes."""
+    script = (
+        "import jax; from jaxnav.commands.process import configure_jax\n"
+        f"configure_jax(float64=False, threads={threads}); print(jax.config.jax_platforms)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"JAX_PLATFORMS": asked, "XDG_CACHE_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stdout.strip() == platforms
+
+
 def test_the_users_own_flags_for_xla_are_kept(tmp_path) -> None:
     script = (
         "import os; from jaxnav.commands.process import configure_jax\n"

@@ -1,9 +1,12 @@
 """JAX's settings in a command's own process."""
 
 import gc
+import os
 import warnings
 
-from jaxnav.configuration import configure
+import jax
+
+from jaxnav.configuration import configure, jax_runs
 
 
 def configure_jax(float64: bool, threads: int | None = None) -> None:
@@ -13,8 +16,11 @@ def configure_jax(float64: bool, threads: int | None = None) -> None:
     as it is, without a warning.
 
     Args:
-        threads: of XLA; by default one a core.
+        threads: of XLA; by default one a core. One: a single car, whose step takes ten times as
+            long on an accelerator, and goes to the processor unless $JAX_PLATFORMS says where.
     """
+    if threads == 1 and not os.environ.get("JAX_PLATFORMS") and not jax_runs():
+        jax.config.update("jax_platforms", "cpu")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         configure(float64=float64, threads=threads)

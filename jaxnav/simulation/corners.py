@@ -31,7 +31,8 @@ def see(
     towards = Ts_world_camera.translation()[:, None] - markers.Ts_world_marker.translation()[None]
     faces = jnp.einsum("cmi,mi->cm", towards, normals) > 0
     diagonals = corners_px[:, :, :2] - corners_px[:, :, 2:]
-    area_px2 = jnp.abs(jnp.cross(diagonals[:, :, 0], diagonals[:, :, 1])) / 2
+    (ax, ay), (bx, by) = jnp.moveaxis(diagonals, (2, 3), (0, 1))
+    area_px2 = jnp.abs(ax * by - ay * bx) / 2
     return corners_px, inside & faces & (area_px2 > MIN_SIDE_PX**2)
 
 

@@ -41,6 +41,7 @@ from jaxnav.simulation.world import DriveState, Spread, nominal
 from jaxnav.twist_control import TwistCommand
 
 _SUBSTEPS = 4  # for each of the two parts of a frame period
+_ACCELERATOR_LANES = 2048
 
 
 class Trace(eqx.Module):
@@ -72,7 +73,7 @@ class Rollout(eqx.Module):
 
     A lane whose drive has ended takes the next seed, so that long drives leave no lane idle. Many
     drives run through `over_lanes`, one thread per core or device: ten times as fast as `vmap`.
-    Few drives run under `vmap`, which compiles ten times as fast.
+    Few drives run under `vmap`, which compiles ten times as fast; so do all on an accelerator.
     """
 
     navigator: Navigator
@@ -108,8 +109,10 @@ class Rollout(eqx.Module):
         progress: Callable[[int], object] = lambda ended: None,
     ) -> tuple[Trace, PyTree]:
         """`run`, and `keep`'s record of every frame; after a drive's end its last is repeated."""
-        if len(keys) < self.many:
-            lanes = self.lanes if self.all_lanes else min(self.lanes, len(keys))
+        on_cpu = jax.default_backend() == "cpu"
+        if len(keys) < self.many or not on_cpu:
+            most = self.lanes if on_cpu else max(self.lanes, _ACCELERATOR_LANES)
+            lanes = most if self.all_lanes else min(most, len(keys))
             threads, advance = 1, self._advance
         else:
             lanes, threads, advance = self.many_lanes, self.threads, self._advance_many

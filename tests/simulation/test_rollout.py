@@ -132,7 +132,7 @@ def test_a_lane_takes_the_next_seed_where_its_drive_has_ended():
         )
 
 
-def test_many_drives_are_those_of_few():
+def test_many_drives_are_those_of_few(monkeypatch):
     """Lanes along the last axis, in two threads, in blocks that some leave early."""
     scenario = short(
         "paper", start_pose=(1.9, 0.0, 0.0), start_spread=(0.6, 0.1, 0.0), duration_s=1.2
@@ -151,6 +151,12 @@ def test_many_drives_are_those_of_few():
     again = dataclasses.replace(many, threads=1).run(keys(seeds[::-1]))
     for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b[::-1])
+    # An accelerator takes all of them under `vmap`.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(Rollout, "_advance_many", None)
+    elsewhere = dataclasses.replace(few, many=40).run(keys(seeds))
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(elsewhere), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_the_navigator_s_errors_are_measured(real):
