@@ -4,8 +4,9 @@ Source: Liu, Schofield, Shan (2023), Eqs. 16-19.
 """
 
 import abc
+import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -43,15 +44,12 @@ class ControlState(eqx.Module):
     explored_s: Float[Array, ""]  # duration of the exploration since the pose was last decided
     side: Float[Array, ""]  # of the line of sight, where it explores: 1 left, -1 right, 0 none
 
-    def exploring(
-        self, decided: Bool[Array, ""] | bool, dt_s: Float[Array, ""], side: Float[Array, ""]
-    ) -> "ControlState":
+    def exploring(self, given: "ControlInput", side: Float[Array, ""]) -> "ControlState":
         """The state after exploring to a side for `dt_s`; a decided pose ends the exploration."""
-        return ControlState(
-            self.waypoint_index,
-            self.integral_ms,
-            jnp.where(decided, 0, self.explored_s + dt_s),
-            jnp.where(decided, 0, side),
+        return dataclasses.replace(
+            self,
+            explored_s=jnp.where(given.decided, 0, self.explored_s + given.elapsed_s()),
+            side=jnp.where(given.decided, 0, side),
         )
 
 
@@ -71,6 +69,34 @@ class Exploration(eqx.Module):
     reach_m: float = 0.4  # distance of the point on that course at which it steers
     min_range_m: float = 0.7
     duration_s: float = 12.0
+
+
+class ControlInput(eqx.Module):
+    """What a command follows from."""
+
+    pose: Float[Array, " 3"]  # (x_m, y_m, psi_rad) of the vehicle in the world
+    located: Bool[Array, ""]  # whether a pose has been estimated yet
+    steering_rad: Float[Array, ""]  # measured, for the sideslip; a NaN is taken as 0
+    dt_s: Float[Array, ""]  # since the previous command; 0 where it is not positive and finite
+    decided: Bool[Array, ""] | bool = True  # whether the pose may be acted upon
+    # Position of the nearest marker in vehicle axes, the same under all poses that are still
+    # possible. Needed where `decided` may be False.
+    to_marker_m: Float[Array, " 2"] | None = None
+    # Measured speed, which exploration controls; NaN: it drives open-loop.
+    speed_mps: Float[Array, ""] | float = np.nan
+
+    def elapsed_s(self) -> Float[Array, ""]:
+        """`dt_s` where it is a time, else 0."""
+        return jnp.where(jnp.isfinite(self.dt_s) & (self.dt_s > 0), self.dt_s, 0)
+
+
+class Way(NamedTuple):
+    """The way to the waypoint of a state."""
+
+    distance_m: Float[Array, ""]
+    alpha_rad: Float[Array, ""]  # from the course to the waypoint
+    done: Bool[Array, ""]  # the last waypoint is reached
+    drives: Bool[Array, ""]  # there is a waypoint, and a pose from which to drive there
 
 
 class Follower(eqx.Module):
@@ -120,14 +146,7 @@ class Follower(eqx.Module):
 
         Args:
             state: after the previous command.
-            pose: (x_m, y_m, psi_rad) of the vehicle in the world.
-            located: whether a pose has been estimated yet.
-            steering_rad: measured steering angle, for the sideslip; a NaN is taken as 0.
-            dt_s: time since the previous call; taken as 0 where it is not positive and finite.
-            decided: whether the pose may be acted upon.
-            to_marker_m: (2,) position of the nearest marker in vehicle axes, which is the same
-                under all poses that are still possible. Needed where `decided` may be False.
-            speed_mps: measured speed, which exploration controls; NaN: it drives open-loop.
+            pose: this and all others as in `ControlInput`.
 
         Returns:
             The next state, the command, whether the last waypoint is reached, and the log.
@@ -138,23 +157,27 @@ class Follower(eqx.Module):
         index = jnp.minimum(index + (arrived & (index < count)), count)
         integral_ms = jnp.where(arrived, 0, state.integral_ms)
         state = ControlState(index, integral_ms, state.explored_s, state.side)
-        return self.towards(
-            state, pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps
-        )
+        sensed = pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps
+        return self.towards(state, ControlInput(*sensed))
 
     @abc.abstractmethod
     def towards(
-        self,
-        state: ControlState,
-        pose: Float[Array, " 3"],
-        located: Bool[Array, ""],
-        steering_rad: Float[Array, ""],
-        dt_s: Float[Array, ""],
-        decided: Bool[Array, ""] | bool = True,
-        to_marker_m: Float[Array, " 2"] | None = None,
-        speed_mps: Float[Array, ""] | float = np.nan,
+        self, state: ControlState, given: ControlInput
     ) -> tuple[ControlState, Any, Bool[Array, ""], ControlLog]:
         """One command towards the waypoint of the state, whether it is reached or not."""
+
+    def way(
+        self, state: ControlState, given: ControlInput, sideslip_rad: Float[Array, ""] | float = 0.0
+    ) -> Way:
+        """The way to the waypoint of the state, for a course turned from the heading."""
+        count, index = self.waypoints_m.shape[0], state.waypoint_index
+        done = index >= count
+        to_waypoint = self.waypoints_m[jnp.minimum(index, count - 1)] - given.pose[:2]
+        distance_m = safe_norm(to_waypoint)
+        bearing_rad = safe_atan2(to_waypoint[1], to_waypoint[0])
+        alpha_rad = wrap_angle(bearing_rad - given.pose[2] - sideslip_rad)
+        finite = jnp.isfinite(distance_m) & jnp.isfinite(alpha_rad)
+        return Way(distance_m, alpha_rad, done, given.located & ~done & finite)
 
     def short_of(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
         """Distance to the circle inside which a waypoint counts as reached, m; negative inside."""
@@ -197,39 +220,25 @@ class Controller(Follower):
     exploration: Exploration = Exploration()
 
     def towards(
-        self,
-        state: ControlState,
-        pose: Float[Array, " 3"],
-        located: Bool[Array, ""],
-        steering_rad: Float[Array, ""],
-        dt_s: Float[Array, ""],
-        decided: Bool[Array, ""] | bool = True,
-        to_marker_m: Float[Array, " 2"] | None = None,
-        speed_mps: Float[Array, ""] | float = np.nan,
+        self, state: ControlState, given: ControlInput
     ) -> tuple[ControlState, Command, Bool[Array, ""], ControlLog]:
         """One command towards the waypoint of the state, whether it is reached or not."""
-        count, index = self.waypoints_m.shape[0], state.waypoint_index
-        done = index >= count
-        to_waypoint = self.waypoints_m[jnp.minimum(index, count - 1)] - pose[:2]
-        distance_m = safe_norm(to_waypoint)
-        steering_limit = self.vehicle.steering_limit_rad
-        steering_rad = jnp.where(jnp.isfinite(steering_rad), steering_rad, 0)
+        steering_limit, decided = self.vehicle.steering_limit_rad, given.decided
+        steering_rad = jnp.where(jnp.isfinite(given.steering_rad), given.steering_rad, 0)
         beta_rad = sideslip_rad(jnp.clip(steering_rad, -steering_limit, steering_limit))
-        alpha_rad = wrap_angle(safe_atan2(to_waypoint[1], to_waypoint[0]) - pose[2] - beta_rad)
-        drives = located & ~done & jnp.isfinite(distance_m) & jnp.isfinite(alpha_rad)
-        dt_s = jnp.where(jnp.isfinite(dt_s) & (dt_s > 0), dt_s, 0)
+        distance_m, alpha_rad, done, drives = self.way(state, given, beta_rad)
 
         ahead_m = distance_m / (1 + distance_m / self.lookahead_m)
         steering = self._steering(alpha_rad, ahead_m, beta_rad)
         steering = jnp.where(self._orbited(alpha_rad, distance_m), 0, steering)
-        integral_ms = state.integral_ms + jnp.where(drives & decided, distance_m * dt_s, 0)
-        integral_ms = jnp.clip(integral_ms, 0, self.integral_limit_ms)
+        grown_ms = jnp.where(drives & decided, distance_m * given.elapsed_s(), 0)
+        integral_ms = jnp.clip(state.integral_ms + grown_ms, 0, self.integral_limit_ms)
         throttle = self.proportional_per_m * distance_m + self.integral_per_ms * integral_ms
         # Clipped, or a heading of 1e270 rad would leave inf / inf.
         off_course = jnp.clip(alpha_rad, -jnp.pi, jnp.pi) / self.slows_at_rad
         throttle = throttle / (1 + off_course**2)
         limit = self.vehicle.throttle_limit
-        state, explore = self._explore(state, decided, to_marker_m, beta_rad, speed_mps, dt_s)
+        state, explore = self._explore(state, given, beta_rad)
         steering = jnp.where(decided, steering, explore.steering_rad)
         throttle = jnp.where(decided, jnp.clip(throttle, -limit, limit), explore.throttle)
         command = Command(
@@ -237,20 +246,14 @@ class Controller(Follower):
             throttle=jnp.where(drives, throttle, 0),
         )
         log = ControlLog(distance_m, alpha_rad, beta_rad, integral_ms)
-        state = ControlState(index, integral_ms, state.explored_s, state.side)
+        state = dataclasses.replace(state, integral_ms=integral_ms)
         return state, command, done, log
 
     def _explore(
-        self,
-        state: ControlState,
-        decided: Bool[Array, ""] | bool,
-        to_marker_m: Float[Array, " 2"] | None,
-        beta_rad: Float[Array, ""],
-        speed_mps: Float[Array, ""] | float,
-        dt_s: Float[Array, ""],
+        self, state: ControlState, given: ControlInput, beta_rad: Float[Array, ""]
     ) -> tuple[ControlState, Command]:
         """The command while the pose is undecided; see `Exploration`."""
-        zero = jnp.zeros_like(beta_rad)
+        zero, to_marker_m = jnp.zeros_like(beta_rad), given.to_marker_m
         if to_marker_m is None:
             return state, Command(zero, zero)
         explore, limit = self.exploration, self.vehicle.steering_limit_rad
@@ -262,12 +265,12 @@ class Controller(Follower):
         steering = self._steering(alpha_rad, jnp.asarray(explore.reach_m, limit.dtype), beta_rad)
         goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
         lead = jnp.maximum(self.vehicle.speed_time_constant_s / explore.settle_s - 1, 0)
-        short_mps = explore.speed_mps - speed_mps
+        short_mps = explore.speed_mps - given.speed_mps
         short_mps = jnp.where(jnp.isfinite(short_mps), short_mps, 0)
         throttle = (explore.speed_mps + lead * short_mps) / self.vehicle.speed_per_throttle_mps
         throttle = jnp.clip(throttle, 0, self.vehicle.throttle_limit)
         command = Command(steering, jnp.where(goes, throttle, 0))
-        return state.exploring(decided, dt_s, side), command
+        return state.exploring(given, side), command
 
     def _orbited(
         self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""]

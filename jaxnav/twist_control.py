@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.control import Controller, ControlLog, ControlState, Exploration, Follower
+from jaxnav.control import ControlInput, Controller, ControlLog, ControlState, Exploration, Follower
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
 from jaxnav.models.twist_base import TwistBase
@@ -74,32 +74,17 @@ class TwistController(Follower):
     exploration: Exploration = Exploration()
 
     def towards(
-        self,
-        state: ControlState,
-        pose: Float[Array, " 3"],
-        located: Bool[Array, ""],
-        steering_rad: Float[Array, ""],
-        dt_s: Float[Array, ""],
-        decided: Bool[Array, ""] | bool = True,
-        to_marker_m: Float[Array, " 2"] | None = None,
-        speed_mps: Float[Array, ""] | float = np.nan,
+        self, state: ControlState, given: ControlInput
     ) -> tuple[ControlState, TwistCommand, Bool[Array, ""], ControlLog]:
         """One command towards the waypoint of the state; what wheels measured is not looked at."""
-        count, index = self.waypoints_m.shape[0], state.waypoint_index
-        done = index >= count
-        to_waypoint = self.waypoints_m[jnp.minimum(index, count - 1)] - pose[:2]
-        distance_m = safe_norm(to_waypoint)
-        alpha_rad = wrap_angle(safe_atan2(to_waypoint[1], to_waypoint[0]) - pose[2])
-        drives = located & ~done & jnp.isfinite(distance_m) & jnp.isfinite(alpha_rad)
-        dt_s = jnp.where(jnp.isfinite(dt_s) & (dt_s > 0), dt_s, 0)
-
+        distance_m, alpha_rad, done, drives = self.way(state, given)
         follow = self._twist(
             jnp.where(drives, alpha_rad, 0),
             jnp.where(drives, distance_m, 1),
             jnp.minimum(self.speed_mps, self.slows_per_s * distance_m),
         )
-        state, explore = self._explore(state, decided, to_marker_m, dt_s)
-        twist = self._limited(jnp.where(decided, follow, explore))
+        state, explore = self._explore(state, given)
+        twist = self._limited(jnp.where(given.decided, follow, explore))
         command = TwistCommand(*jnp.where(drives, twist, 0))
         zero = jnp.zeros_like(distance_m)
         return state, command, done, ControlLog(distance_m, alpha_rad, zero, zero)
@@ -118,14 +103,10 @@ class TwistController(Follower):
         return jnp.where(self.vehicle.left_limit_mps > 0, sideways, differential)
 
     def _explore(
-        self,
-        state: ControlState,
-        decided: Bool[Array, ""] | bool,
-        to_marker_m: Float[Array, " 2"] | None,
-        dt_s: Float[Array, ""],
+        self, state: ControlState, given: ControlInput
     ) -> tuple[ControlState, Float[Array, " 3"]]:
         """The twist while the pose is undecided; see `Exploration`."""
-        zero = jnp.zeros_like(state.explored_s)
+        zero, to_marker_m = jnp.zeros_like(state.explored_s), given.to_marker_m
         if to_marker_m is None:
             return state, jnp.stack([zero] * 3)
         explore = self.exploration
@@ -142,7 +123,7 @@ class TwistController(Follower):
         twist = self._twist(alpha_rad, reach_m, speed)
         twist = twist.at[0].multiply(jnp.where(backs, -1, 1))
         goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
-        return state.exploring(decided, dt_s, side), jnp.where(goes, twist, 0)
+        return state.exploring(given, side), jnp.where(goes, twist, 0)
 
     def _limited(self, twist: Float[Array, " 3"]) -> Float[Array, " 3"]:
         """The twist, scaled down until it is inside the limits."""

@@ -49,9 +49,11 @@ def test_one_call_sets_what_the_commands_set(tmp_path) -> None:
     assert (flags.split(), threads, float64) == (TAKEN, "1", True)
     assert Path(folder).parent == tmp_path / "jaxnav"
     assert said == ""
-    (kept,) = (Path(folder) / "steps").glob("flags-*.json")
-    assert json.loads(kept.read_text()) == sorted(KNOWN)
-    kept.write_text("[]")
+    asked = list((Path(folder) / "steps").glob("flags-*.json"))
+    assert sorted(KNOWN) in [json.loads(kept.read_text()) for kept in asked]
+    assert len(asked) == 1 + (KNOWN != configuration.FLAGS)  # the second call asks for the others
+    for kept in asked:
+        kept.write_text("[]")
     (flags, *_), said = shown("import jaxnav as jn; jn.configure()", tmp_path)
     assert (flags, said) == (None, "")  # as it was told before
 

@@ -8,7 +8,7 @@ import pytest
 from jaxnav.belief.ambiguity import LowestReprojection, PaperCost, Ungated
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
-from jaxnav.control import ControlState
+from jaxnav.control import ControlInput, ControlState
 from jaxnav.models.bicycle import sideslip_rad
 from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
 from jaxnav.models.odometry_errors import OdometryErrors, sigma_as_told
@@ -130,7 +130,8 @@ def test_what_the_paper_does_not_have_changes_no_bit():
         integral_ms = jnp.asarray(rng.uniform(0, 4))
         state = ControlState(jnp.asarray(0), integral_ms, zero, zero)
         pose, yes, no_time = jnp.stack([x_m, y_m, psi_rad]), jnp.asarray(True), zero
-        _, command, _, _ = control.towards(state, pose, yes, steering_rad, no_time)
+        given = ControlInput(pose, yes, steering_rad, no_time)
+        _, command, _, _ = control.towards(state, given)
 
         to_waypoint = control.waypoints_m[0] - pose[:2]
         distance_m = safe_norm(to_waypoint)
@@ -145,6 +146,6 @@ def test_what_the_paper_does_not_have_changes_no_bit():
     nearer = with_parameters(
         DRIVER,
         {"controller.lookahead_m": jnp.asarray(0.5), "controller.slows_at_rad": jnp.asarray(0.3)},
-    ).controller.towards(state, pose, yes, steering_rad, no_time)[1]
+    ).controller.towards(state, given)[1]
     assert nearer.steering_rad != command.steering_rad
     assert nearer.throttle < command.throttle

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxnav.control import ControlInput
 from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.plant import BaseState, move_base
@@ -166,7 +167,7 @@ def test_derivatives(base, pose):
 
     def twist(pose):
         true, zero = jnp.asarray(True), jnp.zeros(())
-        return control.towards(control.init(), pose, true, zero, zero)[1]
+        return control.towards(control.init(), ControlInput(pose, true, zero, zero))[1]
 
     if pose == (0.1, 0.3, 0.4):
         check_derivatives(twist, jnp.asarray(pose))

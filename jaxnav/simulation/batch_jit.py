@@ -38,4 +38,5 @@ def lanes_jit(function: Function) -> Function:
     def call(*args: PyTree) -> PyTree:
         return compiled()(*args)
 
+    call.compiled = compiled  # type: ignore[attr-defined]
     return cast(Function, call)

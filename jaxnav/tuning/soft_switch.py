@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.control import Command, Controller, ControlLog, ControlState
+from jaxnav.control import Command, ControlInput, Controller, ControlLog, ControlState
 from jaxnav.navigator import Navigator
 
 DONE = 0.999  # with this share past the last waypoint the drive is over
@@ -69,11 +69,11 @@ class SoftController(eqx.Module):
         nothing = jnp.zeros(1, moved.dtype)
         shares = state.shares - jnp.append(moved, nothing) + jnp.append(nothing, moved)
 
+        given = ControlInput(pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps)
+
         def towards(index: Array, integral_ms: Array) -> tuple[ControlState, Command, ControlLog]:
             hard = ControlState(index, integral_ms, state.explored_s, state.side)
-            after, command, _, log = control.towards(
-                hard, pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps
-            )
+            after, command, _, log = control.towards(hard, given)
             return after, command, log
 
         after, commands, logs = jax.vmap(towards)(waypoints, state.integrals_ms)

@@ -213,9 +213,9 @@ def test_many_drives_are_those_of_few(tame):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
     # The hard losses of fewer drives, by the program that differentiates so many.
     hard, _, _ = few.value(space.values(space.start), seeds[:5])
-    programs = ClosedLoop._advance_many._cached._cache_size()
+    programs = ClosedLoop._advance_many.compiled()._cached._cache_size()
     by_the_same = many.hard_losses(space.start, space, seeds[:5], beside=20)
-    assert ClosedLoop._advance_many._cached._cache_size() == programs
+    assert ClosedLoop._advance_many.compiled()._cached._cache_size() == programs
     np.testing.assert_allclose(by_the_same, hard, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(few.hard_losses(space.start, space, seeds[:5], beside=20), hard)
 
