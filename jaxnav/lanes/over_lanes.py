@@ -86,13 +86,13 @@ def _warn(reason: str) -> None:
 def compiler_options() -> dict[str, str | int]:
     """Options for the `jit` around a function of `over_lanes`, by what this XLA can compile."""
 
-    def loop(rows: jax.Array) -> jax.Array:
+    def loop(rows: jax.Array) -> jax.Array:  # of so many that jaxlib 0.10 does not hoist it
         return lax.fori_loop(0, 3, lambda _, rows: lax.optimization_barrier(jnp.sin(rows)), rows)
 
     for passes in _KEEP_BARRIERS:
         options = _OPTIONS | {"xla_disable_hlo_passes": passes}
         with suppress(jax.errors.JaxRuntimeError):
-            jax.jit(loop, compiler_options=options).lower(jnp.zeros(8)).compile()
+            jax.jit(loop, compiler_options=options).lower(jnp.zeros(4096)).compile()
             return options
     return _OPTIONS
 
