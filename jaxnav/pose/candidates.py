@@ -172,13 +172,9 @@ def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
     rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
 
     def one(
-        camera: Camera,
-        T_camera_vehicle: jaxlie.SE3,
-        T_world_marker: jaxlie.SE3,
-        size_m: Array,
-        corners_px: Array,
+        T_camera_vehicle: jaxlie.SE3, T_world_marker: jaxlie.SE3, size_m: Array, rays: Array
     ) -> jaxlie.SE3:
-        Ts_camera_marker = ippe_from_rays(camera.unproject(corners_px), size_m)
+        Ts_camera_marker = ippe_from_rays(rays, size_m)
         return jax.vmap(
             lambda T_camera_marker: (
                 T_camera_vehicle.inverse() @ T_camera_marker @ T_world_marker.inverse()
@@ -186,10 +182,10 @@ def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
         )(Ts_camera_marker)
 
     return jax.vmap(one)(
-        *cameras_of(rig, seen),
+        cameras_of(rig, seen)[1],
         jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[seen.marker_index]),
         markers.size_m[seen.marker_index],
-        seen.corners_px,
+        seen.rays,
     )
 
 

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.models.camera import Camera
 from jaxnav.models.geometry import safe_norm, skew, transform_points
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
@@ -115,14 +114,13 @@ def camera_slopes(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> Camera
 def _points_as_seen(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> Float[Array, "3 P 1"]:
     """Corners in the vehicle frame, m, on their rays, as far as the longest side tells."""
 
-    def one(camera: Camera, T_camera_vehicle: jaxlie.SE3, px: Array, size_m: Array) -> Array:
-        rays = camera.unproject(px)
+    def one(T_camera_vehicle: jaxlie.SE3, rays: Array, size_m: Array) -> Array:
         sides = safe_norm(rays - jnp.roll(rays, 1, axis=0))
         range_m = size_m / jnp.maximum(jnp.max(sides), 1e-3)
         return transform_points(T_camera_vehicle.inverse(), rays * range_m)
 
     sizes_m = markers.size_m[seen.marker_index]
-    points = jax.vmap(one)(*cameras_of(rig, seen), seen.corners_px, sizes_m)
+    points = jax.vmap(one)(cameras_of(rig, seen)[1], seen.rays, sizes_m)
     return points.reshape(-1, 3).T[..., None]
 
 

@@ -87,6 +87,7 @@ class Sightings(eqx.Module):
     camera_index: Int[Array, " D"]
     marker_index: Int[Array, " D"]
     corners_px: Float[Array, "D 4 2"]
+    rays: Float[Array, "D 4 3"]  # unit vectors through the corners, in the camera's frame
     sigma_px: Float[Array, "D 4"]
     visible: Bool[Array, " D"]
 
@@ -141,10 +142,13 @@ def sightings(
         slots = in_order(area, kept) if few else jax.lax.top_k(area, kept)[1]
     else:
         slots = jnp.arange(count)
+    camera_index, corners = camera_index[slots], corners[slots]
+    cameras = jax.tree.map(lambda leaf: leaf[camera_index], rig.cameras)
     return Sightings(
-        camera_index=camera_index[slots],
+        camera_index=camera_index,
         marker_index=jnp.tile(jnp.arange(lanes[1]), lanes[0])[slots],
-        corners_px=corners[slots],
+        corners_px=corners,
+        rays=jax.vmap(lambda camera, px: camera.unproject(px))(cameras, corners),
         sigma_px=sigma[slots],
         visible=seen[slots],
     )

@@ -38,10 +38,12 @@ def rig_of(lenses: list[str]) -> CameraRig:
 def sightings_of(rig: CameraRig, rng: np.random.Generator) -> Sightings:
     """Every camera sees a marker, but the last of several."""
     count = len(rig)
+    corners_px = jnp.asarray(rng.uniform(0, 400, (count, 4, 2)))
     return Sightings(
         camera_index=jnp.arange(count),
         marker_index=jnp.zeros(count, int),
-        corners_px=jnp.asarray(rng.uniform(0, 400, (count, 4, 2))),
+        corners_px=corners_px,
+        rays=jax.vmap(lambda camera, px: camera.unproject(px))(rig.cameras, corners_px),
         sigma_px=jnp.asarray(rng.uniform(0.5, 2, (count, 4))),
         visible=jnp.arange(count) < max(count - 1, 1),
     )
