@@ -337,14 +337,7 @@ def test_a_single_car_is_computed_on_the_processor(tmp_path, threads, asked, pla
         "import jax; from jaxnav.commands.process import configure_jax\n"
         f"configure_jax(float64=False, threads={threads}); print(jax.config.jax_platforms)"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", script],
-        env=os.environ | {"JAX_PLATFORMS": asked, "XDG_CACHE_HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert run.stdout.strip() == platforms
+    assert _printed(script, JAX_PLATFORMS=asked, XDG_CACHE_HOME=str(tmp_path)) == platforms
 
 
 def test_the_users_own_flags_for_xla_are_kept(tmp_path) -> None:
@@ -357,11 +350,16 @@ def test_the_users_own_flags_for_xla_are_kept(tmp_path) -> None:
     own = "--xla_cpu_multi_thread_eigen=false"
     reverse = " ".join(reversed(ours.split()))
     for given, kept in (("", ours), (own, f"{own} {ours}"), (reverse, reverse)):
-        run = subprocess.run(
-            [sys.executable, "-c", script],
-            env=os.environ | {"XLA_FLAGS": given, "XDG_CACHE_HOME": str(tmp_path)},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert run.stdout.strip() == kept
+        assert _printed(script, XLA_FLAGS=given, XDG_CACHE_HOME=str(tmp_path)) == kept
+
+
+def _printed(script: str, **environment: str) -> str:
+    """What a script prints in a process of its own."""
+    run = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return run.stdout.strip()

@@ -163,6 +163,13 @@ def planar_covariance(
     return sandwich(jacobian, covariance)
 
 
+def quad_area(corners: Float[Array, "*batch 4 2"]) -> Float[Array, "*batch"]:
+    """Area of quads whose corners go round: half the cross product of their diagonals."""
+    diagonals = corners[..., :2, :] - corners[..., 2:, :]
+    (ax, ay), (bx, by) = jnp.moveaxis(diagonals, (-2, -1), (0, 1))
+    return jnp.abs(ax * by - ay * bx) / 2
+
+
 def safe_norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     """Euclidean length along the last axis, with a zero gradient at the origin."""
     squared = jnp.sum(vector**2, axis=-1)

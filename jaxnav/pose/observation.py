@@ -11,6 +11,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.models.camera import Camera
+from jaxnav.models.geometry import quad_area
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.preintegration import Preintegrated
 from jaxnav.models.rig import CameraRig
@@ -133,11 +134,7 @@ def sightings(
     centers = rig.cameras.center_px[camera_index]
     corners = jnp.where(seen[:, None, None], corners, centers[:, None] + dummy[None])
     if kept < count:
-        diagonals = corners[:, :2] - corners[:, 2:]
-        area = jnp.abs(
-            diagonals[:, 0, 0] * diagonals[:, 1, 1] - diagonals[:, 0, 1] * diagonals[:, 1, 0]
-        )
-        area = jnp.where(seen, area, -1)
+        area = jnp.where(seen, quad_area(corners), -1)
         few = count <= _FEW_LANES
         slots = in_order(area, kept) if few else jax.lax.top_k(area, kept)[1]
     else:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxnav.models.geometry import rotation_matrix
+from jaxnav.models.geometry import quad_area, rotation_matrix
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
@@ -30,10 +30,7 @@ def see(
     Ts_world_camera = jax.vmap(lambda T: T_world_vehicle @ T.inverse())(rig.Ts_camera_vehicle)
     towards = Ts_world_camera.translation()[:, None] - markers.Ts_world_marker.translation()[None]
     faces = jnp.einsum("cmi,mi->cm", towards, normals) > 0
-    diagonals = corners_px[:, :, :2] - corners_px[:, :, 2:]
-    (ax, ay), (bx, by) = jnp.moveaxis(diagonals, (2, 3), (0, 1))
-    area_px2 = jnp.abs(ax * by - ay * bx) / 2
-    return corners_px, inside & faces & (area_px2 > MIN_SIDE_PX**2)
+    return corners_px, inside & faces & (quad_area(corners_px) > MIN_SIDE_PX**2)
 
 
 def drifted(
