@@ -79,8 +79,10 @@ def guard(base):
     guard.close()
 
 
-def last(tmp_path) -> tuple[float, float, float]:
-    return words(tmp_path / "log")[-1].twist
+def last(tmp_path) -> tuple[float, float, float] | None:
+    """What the base was told last, None before its first word."""
+    told = words(tmp_path / "log")
+    return told[-1].twist if told else None
 
 
 def test_what_is_beyond_the_limits_is_cut(tmp_path, guard):
