@@ -25,9 +25,12 @@ from jaxtyping import PyTree
 
 # LLVM's costly passes double the compile time and buy nothing.
 _OPTIONS: dict[str, str | int] = {"xla_backend_optimization_level": 1}
-# Without barriers XLA for the CPU computes anew, at every use, the values that `over_lanes` writes
-# to memory once. From jaxlib 0.12 on it can't compile them in a loop that it has hoisted.
-_KEEP_BARRIERS = "cse_barrier_expander", "cse_barrier_expander,small-while-loop-hoisting"
+# The first two only take time: each moves or simplifies by one operation a round, so that XLA goes
+# through a large program 25 times, then gives up, not 4. Without barriers XLA for the CPU computes
+# anew, at every use, the values that `over_lanes` writes to memory once; from jaxlib 0.12 on it
+# can't compile them in a loop that it has hoisted.
+_DISABLED = "reshape-mover,simplify-while-loops,cse_barrier_expander"
+_PASSES = _DISABLED, f"{_DISABLED},small-while-loop-hoisting"
 # What an internal that is missing, or has other parameters, makes the evaluation raise.
 _DOES_NOT_FIT = ImportError, AttributeError, LookupError, TypeError, ValueError, NotImplementedError
 
@@ -89,7 +92,7 @@ def compiler_options() -> dict[str, str | int]:
     def loop(rows: jax.Array) -> jax.Array:  # of so many that jaxlib 0.10 does not hoist it
         return lax.fori_loop(0, 3, lambda _, rows: lax.optimization_barrier(jnp.sin(rows)), rows)
 
-    for passes in _KEEP_BARRIERS:
+    for passes in _PASSES:
         options = _OPTIONS | {"xla_disable_hlo_passes": passes}
         with suppress(jax.errors.JaxRuntimeError):
             jax.jit(loop, compiler_options=options).lower(jnp.zeros(4096)).compile()

@@ -60,7 +60,7 @@ class ClosedLoop(eqx.Module):
         converter=lambda m: jnp.asarray(m, float), default=0.03
     )
     many: int = eqx.field(static=True, default=256)  # least number of drives for `over_lanes`
-    many_lanes: int = eqx.field(static=True, default=256)  # per thread
+    many_lanes: int = eqx.field(static=True, default=128)  # per thread
 
     def value(
         self,
