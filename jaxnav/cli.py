@@ -51,8 +51,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the arguments after the program's name, by default those of the process.
     """
     args = list(sys.argv[1:] if argv is None else argv)
+    # Libraries ask for these once, when they are imported, which the arguments' ranges do.
     if args[:1] not in (["run"], ["ros"]):
+        # XLA advises to file a bug where it compiles for two minutes. Its failures are exceptions.
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
         return _main(args, _dispatch)
+    # NumPy's own threads: those that look for markers have matrices so small that sharing one out
+    # takes longer than it does, and the cores are theirs.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # A car may move: from here on no signal is lost, and no terminal holds anything up.
     fill_descriptors()
     signals = Signals()
@@ -116,10 +122,6 @@ def _dispatch(args: list[str], *signals: Signals) -> int:
     if command is None:
         return 0
     check_outputs(command)
-    if signals:
-        # NumPy's own threads, which it asks for once: those that look for markers have matrices so
-        # small that sharing one out takes longer than it does, and the cores are theirs.
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         module = importlib.import_module(f"jaxnav.commands.{registered(command).module}")
         with nothing_hidden():

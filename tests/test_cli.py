@@ -232,6 +232,37 @@ def test_a_name_that_is_too_long_is_one_line(command: str, tmp_path: Path) -> No
     assert f"jaxnav {command.split()[0]}: xxx" in last
 
 
+@pytest.mark.parametrize(
+    ("module", "args", "name", "value"),
+    [
+        ("tune.controller", ["tune", "controller"], "TF_CPP_MIN_LOG_LEVEL", "3"),
+        ("drive.run", ["run"], "OPENBLAS_NUM_THREADS", "1"),
+    ],
+)
+def test_libraries_find_what_they_ask_for_when_they_are_imported(module, args, name, value) -> None:
+    """XLA prints no advice to file a bug, NumPy starts no threads beside a drive's; who sets either
+    is obeyed."""
+    script = (
+        "import os, sys; from types import SimpleNamespace; from jaxnav import cli\n"
+        "def found(event, args):\n"
+        "    if event == 'import' and args[0] == 'numpy' and not values:\n"
+        "        values.append(os.environ[sys.argv[2]])\n"
+        "values = []; sys.addaudithook(found)\n"
+        "module = SimpleNamespace(run=lambda *args: 0)\n"
+        "sys.modules['jaxnav.commands.' + sys.argv[1]] = module\n"
+        "code = cli.main(sys.argv[3:]); import numpy; print(*values, code)"
+    )
+    inherited = {k: v for k, v in os.environ.items() if k != name}
+    for own, set_to in (({}, value), ({name: "2"}, "2")):
+        run = subprocess.run(
+            [sys.executable, "-c", script, module, name, *args],
+            env=inherited | own,
+            capture_output=True,
+            text=True,
+        )
+        assert (run.stdout.split(), run.stderr) == ([set_to, "0"], "")
+
+
 def test_a_closed_pipe_is_no_traceback() -> None:
     reader, writer = os.pipe()
     os.close(reader)
