@@ -103,6 +103,17 @@ def test_every_lane_s_loop_ends_when_it_would_alone():
     assert len(np.unique(steps)) > 2
 
 
+def test_a_small_loop_of_one_round_compiles():
+    """XLA can't compile barriers in a small loop that stays one: this one has to be removed."""
+
+    def once(x):
+        return lax.scan(
+            lambda c, _: (jnp.sin(c) * jnp.exp(-c) + jnp.sqrt(1 + c * c), None), x, length=1
+        )[0]
+
+    same(once, np.linspace(-1, 1, 8))
+
+
 def test_loops_of_a_batch_inside_a_lane():
     """Each ends by itself, also in a lane whose others go on."""
     same(jax.vmap(newton), 100 * drawn(3))
