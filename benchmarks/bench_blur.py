@@ -129,7 +129,7 @@ def predicted(picture: Picture, seed: int) -> Target:
     )
 
 
-def false_fixes(count: int) -> tuple[int, int, int]:
+def false_fixes(first: int, count: int) -> tuple[int, int, int]:
     """In how many pictures without the sought marker it is followed, acquired, of how many.
 
     By turns: another marker of the family, blurred by up to 8 px; a part of a real photograph, of
@@ -146,7 +146,7 @@ def false_fixes(count: int) -> tuple[int, int, int]:
         if folder == "apriltag_photos"
     }
     marker_images.SUBPIXELS, wrong, ghosts = 4, 0, 0
-    for seed in range(count):
+    for seed in range(first, first + count):
         rng = np.random.default_rng([seed, 270])
         side_px, blur_px, sought = rng.uniform(14, 40), rng.uniform(0, 8), int(rng.integers(587))
         ids = {sought}
@@ -295,11 +295,12 @@ if __name__ == "__main__":
     parser.add_argument("--other", type=Path, help="pictures by benchmarks/other_renderer.py")
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--false", type=int, help="count false fixes in so many pictures instead")
+    parser.add_argument("--first", type=int, default=0, help="the first of them")
     given = parser.parse_args()
     cv2.setNumThreads(1)
     jaxnav.configure(threads=1)  # as the commands that drive
     if given.false:
-        wrong, ghosts, count = false_fixes(given.false)
+        wrong, ghosts, count = false_fixes(given.first, given.false)
         print(
             f"of {count} pictures without it a marker is followed in {wrong}, acquired in {ghosts}"
         )

@@ -22,6 +22,7 @@ from jaxnav.lanes.values import (
     Params,
     Value,
     known,
+    loop_over,
     rows_of,
     scan_rows,
     write_out,
@@ -163,7 +164,8 @@ class _Evaluation(NamedTuple):
             ]
 
         start = [rows_of(arg, self.lanes) for arg in args[n_cond + n_body :]]
-        return [Lane(out) for out in lax.while_loop(any_goes, step, start)]
+        with loop_over(start):
+            return [Lane(out) for out in lax.while_loop(any_goes, step, start)]
 
     def _scan(self, eqn: core.JaxprEqn, args: list[Value]) -> list[Value]:
         params, inner = eqn.params, eqn.params["jaxpr"].jaxpr
@@ -190,14 +192,15 @@ class _Evaluation(NamedTuple):
             rows = [rows_of(out, self.lanes) for out in outs]
             return rows[:n_carry], rows[n_carry:]
 
-        carry, ys = lax.scan(
-            body,
-            carry,
-            xs,
-            length=params["length"],
-            reverse=params["reverse"],
-            unroll=params["unroll"],
-        )
+        with loop_over(carry):
+            carry, ys = lax.scan(
+                body,
+                carry,
+                xs,
+                length=params["length"],
+                reverse=params["reverse"],
+                unroll=params["unroll"],
+            )
         return [Lane(out) for out in [*carry, *ys]]
 
     def _cond(self, args: list[Value], params: Params) -> list[Value]:
@@ -275,7 +278,8 @@ def _sorted_switch(
                 for b, out in zip(buffers, outs, strict=True)
             ]
 
-        buffers = lax.fori_loop(0, blocks[number], body, buffers)
+        with loop_over(buffers):
+            buffers = lax.fori_loop(0, blocks[number], body, buffers)
     return [b.at[..., slot].get(mode="promise_in_bounds") for b in buffers]
 
 

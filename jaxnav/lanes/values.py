@@ -1,8 +1,8 @@
 """Represent the values of `over_lanes`: those that differ between lanes, and those that don't."""
 
 import contextvars
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import jax
@@ -17,26 +17,40 @@ UNROLLED = 32  # the most terms of a sum, or rows of a table, that are written o
 CHEAP, DEAR = 2, 24
 
 
+# XLA makes one kernel of a loop that touches fewer bytes, and can't compile barriers in it.
+_SMALL_LOOP_BYTES = 1024
 _in_kernel = contextvars.ContextVar("in_kernel", default=False)
+_in_small_loop = contextvars.ContextVar("in_small_loop", default=False)
 
 
 @contextmanager
-def one_kernel() -> Iterator[None]:
-    """Trace the block as part of one kernel: see `strips.py`."""
-    token = _in_kernel.set(True)
+def _within(flag: contextvars.ContextVar[bool]) -> Iterator[None]:
+    token = flag.set(True)
     try:
         yield
     finally:
-        _in_kernel.reset(token)
+        flag.reset(token)
+
+
+def one_kernel() -> AbstractContextManager[None]:
+    """Trace the block as part of one kernel: see `strips.py`."""
+    return _within(_in_kernel)
+
+
+def loop_over(carry: Sequence[Shaped[jax.Array, "..."]]) -> AbstractContextManager[None]:
+    """Trace the block as a loop with this carry: without barriers where it may be small."""
+    small = sum(rows.size * rows.dtype.itemsize for rows in carry) < _SMALL_LOOP_BYTES
+    return _within(_in_small_loop) if small else nullcontext()
 
 
 def barrier(rows: Shaped[jax.Array, "*shape"]) -> Shaped[jax.Array, "*shape"]:
     """The same rows, computed once and not anew at every use.
 
     Inside a kernel XLA knows no barriers; a call, which LLVM makes a copy, serves as one there.
+    In a small loop the rows stay as they are.
     """
     if not _in_kernel.get():
-        return lax.optimization_barrier(rows)
+        return rows if _in_small_loop.get() else lax.optimization_barrier(rows)
     with set_xla_metadata(inlineable="false"):
         return jax.jit(_same)(rows)
 

@@ -64,6 +64,16 @@ class Trace(eqx.Module):
 Keep = Callable[[DriveState, DriveState], PyTree]
 
 
+def by_lanes(drives: int, many: int) -> bool:
+    """Whether so many drives run through `over_lanes`: `many` or more, on the processor."""
+    return drives >= many and jax.default_backend() == "cpu"
+
+
+def vmap_lanes(on_cpu: int) -> int:
+    """The most lanes that run under `vmap` at once: `on_cpu`, or those of an accelerator."""
+    return on_cpu if jax.default_backend() == "cpu" else max(on_cpu, _ACCELERATOR_LANES)
+
+
 def nothing(before: DriveState, after: DriveState) -> None:
     """Keep no record of a frame."""
 
@@ -109,13 +119,12 @@ class Rollout(eqx.Module):
         progress: Callable[[int], object] = lambda ended: None,
     ) -> tuple[Trace, PyTree]:
         """`run`, and `keep`'s record of every frame; after a drive's end its last is repeated."""
-        on_cpu = jax.default_backend() == "cpu"
-        if len(keys) < self.many or not on_cpu:
-            most = self.lanes if on_cpu else max(self.lanes, _ACCELERATOR_LANES)
+        if by_lanes(len(keys), self.many):
+            lanes, threads, advance = self.many_lanes, self.threads, self._advance_many
+        else:
+            most = vmap_lanes(self.lanes)
             lanes = most if self.all_lanes else min(most, len(keys))
             threads, advance = 1, self._advance
-        else:
-            lanes, threads, advance = self.many_lanes, self.threads, self._advance_many
         kept = run_lanes(
             keys,
             self.start,

@@ -29,7 +29,7 @@ from jaxnav.parameters import with_parameters
 from jaxnav.simulation.batch_jit import lanes_jit
 from jaxnav.simulation.queue import run_lanes
 from jaxnav.simulation.regimes import step_by_regime
-from jaxnav.simulation.rollout import Rollout, Trace
+from jaxnav.simulation.rollout import Rollout, Trace, by_lanes, vmap_lanes
 from jaxnav.simulation.traces import DriveTraces
 from jaxnav.simulation.world import DriveState
 from jaxnav.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss, no_costs
@@ -97,8 +97,8 @@ class ClosedLoop(eqx.Module):
             compiled_for: the number of drives whose program runs them; by default that of `keys`.
         """
         count = len(keys) if compiled_for is None else compiled_for
-        lanes, threads, advance = min(self.rollout.lanes, count), 1, self._advance
-        if count >= self.many:
+        lanes, threads, advance = min(vmap_lanes(self.rollout.lanes), count), 1, self._advance
+        if by_lanes(count, self.many):
             lanes, threads, advance = self.many_lanes, self.rollout.threads, self._advance_many
         kept = run_lanes(
             keys,

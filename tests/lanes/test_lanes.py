@@ -103,15 +103,28 @@ def test_every_lane_s_loop_ends_when_it_would_alone():
     assert len(np.unique(steps)) > 2
 
 
-def test_a_small_loop_of_one_round_compiles():
-    """XLA can't compile barriers in a small loop that stays one: this one has to be removed."""
+def wave(x):
+    return jnp.sin(x) * jnp.exp(-x) + jnp.sqrt(1 + x * x)
 
-    def once(x):
-        return lax.scan(
-            lambda c, _: (jnp.sin(c) * jnp.exp(-c) + jnp.sqrt(1 + c * c), None), x, length=1
-        )[0]
 
-    same(once, np.linspace(-1, 1, 8))
+SMALL_LOOPS = {
+    "once": lambda x: lax.scan(lambda c, _: (wave(c), None), x, length=1)[0],
+    "thrice": lambda x: lax.scan(lambda c, _: (wave(c), c), x, length=3),
+    "while": lambda x: lax.while_loop(
+        lambda s: s[0] < 5, lambda s: (s[0] + abs(wave(s[1])), wave(s[1])), (x, x)
+    ),
+    "cond": lambda x: lax.cond(x > 0, wave, lambda c: 2 * wave(c + 1), x),
+    "both": lambda x: lax.fori_loop(
+        0, 3, lambda _, c: lax.cond(c > 1, wave, lambda d: 2 * wave(d + 1), c), x
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SMALL_LOOPS)
+@pytest.mark.parametrize("lanes", [1, 8, 32, 64])
+def test_a_small_loop_compiles(name, lanes):
+    """XLA makes one kernel of it, in which it can't compile a barrier."""
+    same(SMALL_LOOPS[name], np.linspace(-1, 1, lanes))
 
 
 def test_loops_of_a_batch_inside_a_lane():

@@ -201,7 +201,7 @@ def test_through_the_whole_navigator():
     assert np.all(np.isfinite(closed.value_and_grad(space.start, space, seeds)[1]))
 
 
-def test_many_drives_are_those_of_few(tame):
+def test_many_drives_are_those_of_few(tame, monkeypatch):
     """Lanes along the last axis, in two threads; more drives than lanes."""
     short = dataclasses.replace(tame.rollout, scenario=scenario(duration_s=1.0), chunk_frames=5)
     few = dataclasses.replace(tame, rollout=short)
@@ -218,6 +218,12 @@ def test_many_drives_are_those_of_few(tame):
     assert ClosedLoop._advance_many.compiled()._cached._cache_size() == programs
     np.testing.assert_allclose(by_the_same, hard, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(few.hard_losses(space.start, space, seeds[:5], beside=20), hard)
+    # An accelerator takes all of them under `vmap`.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(ClosedLoop, "_advance_many", None)
+    elsewhere = dataclasses.replace(few, many=10).value_and_grad(space.start, space, seeds)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(elsewhere), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_a_drive_without_arrival_pays_for_all_its_time():
