@@ -7,6 +7,7 @@ The QCar sees the paper's marker from 3.2 m, in its front camera, at corner nois
 run one at a time as on the car, and take turns with their peers in `step_numpy.py`.
 """
 
+import dataclasses
 import functools
 import os
 import subprocess
@@ -45,27 +46,37 @@ from jaxnav.simulation.corners import see  # noqa: E402
 from jaxnav.simulation.plant import CarState, move_through  # noqa: E402
 
 STEPS, PERIOD_S, SPEED_MPS = 20, 1 / 15, 0.3
+DRIVES = 5
 ROUNDS = 110  # times STEPS: 2 200 steps of each
 START = (0.5, -1.7, np.pi / 2)
 ROLLOUT_STEPS = 100
 SELECTORS: dict[str, Selector] = {"paper-cost": PaperCost(), "multi-hypothesis": MultiHypothesis()}
 
 
-def navigator_with(selector: Selector) -> Navigator:
-    """The paper's car on the paper's route."""
+def navigator_with(selector: Selector, exact: bool = False) -> Navigator:
+    """The paper's car on the paper's route; exact: cameras, sensors and corners without errors that
+    repeat, which the peers do not know."""
     qcar = calib_dir() / "qcar"
-    return Navigator(
-        load_rig(qcar / "rig.yaml"),
+    rig, vehicle = load_rig(qcar / "rig.yaml"), load_vehicle(qcar / "vehicle.yaml")
+    if exact:
+        rig = dataclasses.replace(rig, extrinsics_sigma=None)
+        vehicle = dataclasses.replace(vehicle, sensor_sigma=None)
+    navigator = Navigator(
+        rig,
         load_markers(qcar / "markers.yaml"),
-        load_vehicle(qcar / "vehicle.yaml"),
+        vehicle,
         waypoints_m=[(1.30, 0.0), (0.50, 0.65)],
         selector=selector,
     )
+    if not exact:
+        return navigator
+    unknown = lambda leaf: leaf is None  # noqa: E731
+    return eqx.tree_at(lambda n: n.repeated_errors, navigator, None, is_leaf=unknown)
 
 
-def observations(navigator: Navigator, count: int) -> list[Observation]:
+def observations(navigator: Navigator, count: int, seed: int) -> list[Observation]:
     """Readings along a straight line."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     seen = jax.jit(lambda pose: see(navigator.rig, navigator.markers,
                                     T_world_vehicle_from_planar(pose)))  # fmt: skip
     readings = []
@@ -98,9 +109,9 @@ def as_reading(obs: Observation) -> peer.Reading:
 class Drive:
     """A drive by jaxnav and by its peer, from the state after the first sight."""
 
-    def __init__(self, selector: Selector):
-        self.navigator = navigator_with(selector)
-        self.readings = observations(self.navigator, STEPS + 1)
+    def __init__(self, selector: Selector, exact: bool = True, seed: int = 0):
+        self.navigator = navigator_with(selector, exact)
+        self.readings = observations(self.navigator, STEPS + 1, seed)
         navigator = self.navigator
         self.step = jax.jit(lambda state, obs: navigator.step(state, obs))
         self.unstarted = navigator.init()
@@ -142,30 +153,33 @@ class Drive:
 
 
 @jax.enable_x64(True)
-def same_step(selector: Selector) -> tuple[float, float, float]:
-    """Over a drive, how far both are apart: pose (m, rad; largest), and the share of steps in which
-    both select the same candidate and both decide alike. In float64, as the peer: in float32 two
-    hypotheses of a wide belief become one in this frame or in the next."""
-    drive = Drive(selector)
-    state, memory = drive.started, drive.peer_started
+def same_step(selector: Selector) -> tuple[float, float, float, float]:
+    """Over `DRIVES` drives, how far both are apart (median, m and rad), and the share of steps in
+    which both are within 1 cm and 0.01 rad, select the same candidate, and decide alike.
+
+    In float64, as the peer. Two hypotheses of a wide belief become one in this frame or in the
+    next, which rounding may tell: then the heaviest of those that are left differ.
+    """
     apart, selected, decided = [], [], []
-    for obs, reading in zip(drive.readings[1:], drive.peer_readings[1:], strict=True):
-        state, out = drive.step(state, obs)
-        memory, result = drive.peer(memory, reading)
-        apart.append(np.max(np.abs(np.asarray(out.pose) - result.pose)))
-        selected.append(int(out.selected) == result.selected)
-        decided.append(bool(out.decided) == result.decided)
-    return float(np.max(apart)), float(np.mean(selected)), float(np.mean(decided))
+    for seed in range(DRIVES):
+        drive = Drive(selector, seed=seed)
+        state, memory = drive.started, drive.peer_started
+        for obs, reading in zip(drive.readings[1:], drive.peer_readings[1:], strict=True):
+            state, out = drive.step(state, obs)
+            memory, result = drive.peer(memory, reading)
+            apart.append(np.max(np.abs(np.asarray(out.pose) - result.pose)))
+            selected.append(int(out.selected) == result.selected)
+            decided.append(bool(out.decided) == result.decided)
+    shares = np.mean([np.array(apart) < 0.01, selected, decided], axis=1)
+    return float(np.median(apart)), *shares.tolist()
 
 
 @pytest.mark.parametrize("name", SELECTORS)
 def test_the_peer_takes_the_same_step(name: str) -> None:
-    """Within a centimetre over the drive (they minimise in pixels and in normalised coordinates),
-    and the same choices but for a tie or two."""
-    apart, selected, decided = same_step(SELECTORS[name])
-    assert apart < 0.015
-    assert selected >= 0.9
-    assert decided >= 0.9
+    """They minimise in pixels and in normalised coordinates."""
+    apart, *shares = same_step(SELECTORS[name])
+    assert apart < 0.005
+    assert min(shares) >= 0.9
 
 
 @pytest.mark.parametrize("name", SELECTORS)
@@ -232,9 +246,10 @@ def print_steps() -> None:
     """Median and 99 % of the step, ours and theirs."""
     cv2.setNumThreads(1)
     drives = {name: Drive(selector) for name, selector in SELECTORS.items()}
+    drives["default"] = Drive(MultiHypothesis(), exact=False)
     rows = [(name, who) for name in drives for who in ("ours", "theirs", "first", "second")]
-    rows.remove(("paper-cost", "first"))
-    rows.remove(("paper-cost", "second"))
+    for left_out in ("paper-cost", "first"), ("paper-cost", "second"), ("default", "theirs"):
+        rows.remove(left_out)
     seconds: dict[tuple[str, str], list[float]] = {row: [] for row in rows}
     for _ in range(ROUNDS):
         for name, who in rows:
@@ -247,11 +262,11 @@ def print_steps() -> None:
     for (name, who), times in seconds.items():
         median, high = np.quantile(times, [0.5, 0.99]) * 1e6
         print(f"| {labels[who].format(name)} | {median:.0f} | {high:.0f} | {len(times)} |")
-    print("\n| the same step? | poses apart at most (m, rad) | same candidate | same decided |")
-    print("|---|---|---|---|")
+    print("\n| the same step? | poses apart, median (m, rad) | within 0.01 | same candidate "
+          "| same decided |\n|---|---|---|---|---|")  # fmt: skip
     for name, selector in SELECTORS.items():
-        apart, selected, decided = same_step(selector)
-        print(f"| {name} | {apart:.4f} | {selected:.0%} | {decided:.0%} |")
+        apart, *shares = same_step(selector)
+        print(f"| {name} | {apart:.4f} | {' | '.join(f'{share:.1%}' for share in shares)} |")
 
 
 def print_compilation() -> None:
@@ -282,7 +297,7 @@ def print_compilation() -> None:
 def load_once(name: str) -> None:
     """Seconds until the first step is done, by way of `compiled_step`."""
     navigator = navigator_with(SELECTORS[name])
-    state, obs = navigator.init(), observations(navigator, 1)[0]
+    state, obs = navigator.init(), observations(navigator, 1, seed=0)[0]
     begin = time.perf_counter()
     jax.block_until_ready(compiled_step(navigator, step_folder())(state, obs))
     print(time.perf_counter() - begin)
@@ -291,7 +306,7 @@ def load_once(name: str) -> None:
 def compile_once(name: str) -> None:
     """Seconds to trace, lower and compile one step."""
     navigator = navigator_with(SELECTORS[name])
-    state, obs = navigator.init(), observations(navigator, 1)[0]
+    state, obs = navigator.init(), observations(navigator, 1, seed=0)[0]
     stamps = [time.perf_counter()]
     traced = jax.jit(lambda state, obs: navigator.step(state, obs)).trace(state, obs)
     stamps.append(time.perf_counter())

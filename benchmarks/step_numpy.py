@@ -192,6 +192,9 @@ class NumpyStep:
         H[:, :, 3:] = np.eye(3)
         H[:, 0, 2], H[:, 1, 2] = vy, -vx
         innovation = np.stack([vx, vy, np.full_like(vx, rate)], 1) - mean[:, 3:]
+        # Speed and steering have changed at an unknown instant.
+        moments = np.array([[dt**2 / 3, dt / 2], [dt / 2, 1.0]])
+        P = P + np.stack([np.kron(moments, np.outer(d, d)) for d in innovation])
         return _updated(mean, P, innovation, H, self.odometry_R)
 
     def _paper(self, state: Memory, candidates: list[Any], obs: Reading) -> tuple[Memory, Result]:
@@ -318,6 +321,7 @@ class NumpyStep:
         after[:, :2] += (_turns(mean[:, 2]) @ shift[..., None])[..., 0]
         after[:, 2] = psi
         after[:, 3:] += (gain[:, 3:] @ xi[..., None])[..., 0]
+        nis = np.maximum(nis, cost - free_cost)
         passes = nis <= self.motion.gate_nis * inflation
         mean = np.where(passes[:, None], after, mean)
         P = np.where(passes[:, None, None], P_after, P)

@@ -16,7 +16,15 @@ from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heav
 from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.gate import Moments, Offer
-from jaxnav.belief.inertial import Turn, bias_at_rest, slip_of, turn_of, turned
+from jaxnav.belief.inertial import (
+    GYRO,
+    Turn,
+    bias_at_rest,
+    gyro_variance,
+    slip_of,
+    turn_of,
+    turned,
+)
 from jaxnav.belief.motion import Motion, Planar, camera_states
 from jaxnav.belief.sensor_errors import (
     SENSORS_END,
@@ -211,7 +219,7 @@ class BicycleKalman(Motion):
             measured,
             freedom,
             self.states,
-            0 if self.vehicle.gyro is None else 1,
+            0 if self.vehicle.gyro is None else GYRO,
         )
         P = kalman.replace_first(
             P, jnp.eye(3, P.shape[0], dtype=P.dtype).at[:, :3].set(planar_rotation(pose[2]))
@@ -302,7 +310,7 @@ class BicycleKalman(Motion):
         variance = jnp.concatenate([slip, of_sensors, jnp.ones(self.camera_states, dtype)])
         if gyro is None:
             return variance
-        return jnp.append(variance, jnp.asarray(gyro.bias_sigma_radps, dtype) ** 2)
+        return jnp.append(variance, gyro_variance(gyro, dtype))
 
     def _slip_sigma(self) -> Array:
         """Standard deviation of the slip; 0 where the sensors are exact."""

@@ -1,6 +1,8 @@
-"""A gyro in the planar filter: it tells the turn of an interval, and its bias is the last state.
+"""A gyro in the planar filter: it tells the turn of an interval, and its errors are states.
 
-    psi += dt r + delay (r - psi_dot),    psi_dot = r,    r = z - b
+    psi += dt r + (delay + d) (r - psi_dot),    psi_dot = r,    r = (1 - e) z - b
+
+The errors of its scale e, of its delay d and its bias b stand at the end of the state.
 
 The wheels read the velocity at the end of an interval, and a turn rate that slips with them; the
 gyro reads the whole turn. So where it has told, the wheels' turn rate moves nothing. The two are
@@ -8,9 +10,6 @@ compared twice, which teaches every hypothesis, since it holds whichever pose is
 while the wheels stand, z is the bias; while they turn, they show what they get wrong. Corners teach
 the bias as they do the errors of the other sensors, once the heading is known: a mirrored pose
 would learn the bias that fits it.
-
-What the delay is off by moves the heading where the rate changes; an error of the scale grows with
-the turn, and as a random walk is right at 1 rad.
 
 Source: Titterton, Weston (2004), "Strapdown Inertial Navigation Technology", chapters 12 and 13
 (errors as states; zero-velocity updates); Schmidt (1966) for errors that are only considered.
@@ -34,6 +33,16 @@ _TURNS_RADPS, _MOST_SLIP = 0.05, 0.5  # slower turns say nothing of a slip; a sh
 _STEADY_RADPS = 0.005  # a rate that changes by less, and its noise, does not
 
 
+GYRO = 3  # states of a gyro, the last of all
+_SCALE, _DELAY, _BIAS = -3, -2, -1
+
+
+def gyro_variance(gyro: Gyro, dtype: jnp.dtype) -> Float[Array, " 3"]:
+    """Variances of the errors of scale, delay (s^2) and bias, (rad/s)^2, that nothing has told."""
+    sigmas = gyro.scale_sigma, gyro.delay_sigma_s, gyro.bias_sigma_radps
+    return jnp.stack([jnp.asarray(sigma, dtype) ** 2 for sigma in sigmas])
+
+
 class Turn(NamedTuple):
     """What a gyro says of an interval: the turn in it, and the turn rate at its end."""
 
@@ -54,20 +63,23 @@ def turn_of(
     """The turn that a gyro tells.
 
     Args:
-        mean: of the state before, the gyro's bias last.
+        mean: of the state before, the gyro's errors last.
         acceleration_density: of the turn, (rad/s^2)^2/Hz: a rate at the end is not its mean.
     """
     dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
     read = jnp.asarray(jnp.nan if obs.gyro_radps is None else obs.gyro_radps[2], dtype)
     told = (jnp.abs(read) < gyro.saturation_radps) & (dt_s > 0)
     dt_s = jnp.where(told, dt_s, 1)
-    delay_s, white = jnp.asarray(gyro.delay_s, dtype), jnp.asarray(gyro.noise_density, dtype) ** 2
-    rate = jnp.where(told, read, 0) - mean[-1]
+    white = jnp.asarray(gyro.noise_density, dtype) ** 2
+    delay_s = jnp.asarray(gyro.delay_s, dtype) + mean[_DELAY]
+    read = jnp.where(told, read, 0)
+    rate = (1 - mean[_SCALE]) * read - mean[_BIAS]
     changed = rate - mean[5]
+    by_rate = jnp.stack([dt_s + delay_s, jnp.ones_like(dt_s)])  # of heading and rate
     slopes = jnp.zeros((2, mean.shape[0]), dtype).at[0, 2].set(1).at[0, 5].set(-delay_s)
-    slopes = slopes.at[0, -1].set(-dt_s - delay_s).at[1, -1].set(-1)
-    angle_rad = jnp.abs(rate) * dt_s
-    of_angle = white * dt_s + (gyro.delay_sigma_s * changed) ** 2 + gyro.scale_sigma**2 * angle_rad
+    slopes = slopes.at[:, _SCALE].set(-read * by_rate).at[:, _BIAS].set(-by_rate)
+    slopes = slopes.at[0, _DELAY].set(changed)
+    of_angle = white * dt_s
     of_rate = white / dt_s + acceleration_density * dt_s / 3 + changed**2 / 4
     noise = jnp.stack([jnp.stack([of_angle, white]), jnp.stack([white, of_rate])])
     turn_rad = dt_s * rate + delay_s * changed
@@ -179,9 +191,9 @@ def bias_at_rest(
     white = jnp.asarray(gyro.noise_density, mean.dtype) ** 2 / jnp.where(turn.told, dt_s, 1)
     steady = jnp.abs(turn.changed_radps) < _STEADY_RADPS + 4 * jnp.sqrt(white)
     stands = (turn.told & slow & steady).astype(mean.dtype)
-    H = jnp.zeros((1, mean.shape[0]), mean.dtype).at[0, -1].set(1)
+    H = jnp.zeros((1, mean.shape[0]), mean.dtype).at[0, _BIAS].set(1)
     R = (wheels_sigma_radps**2 + white)[None, None]
     seen = kalman.hide_rows((turn.rate_radps - read.velocity[2])[None], H, R, stands[None])
     correction, after, _ = kalman.update(P, *seen)
-    kept = slice(SIX, -1)
+    kept = slice(SIX, _BIAS)
     return mean + correction.at[kept].set(0), after.at[kept, kept].set(P[kept, kept])

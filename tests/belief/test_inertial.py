@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.belief import inertial
 from jaxnav.belief.ambiguity import PoseMeasurement, Selection
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.inertial import slip_of, turn_of
@@ -119,8 +120,9 @@ def test_a_gyro_that_is_silent_or_saturated_changes_nothing(gyro_radps):
     for twist in ((0.3, 0.1, 1.0), (0.4, 0.0, -1.0), (0.0, 0.0, 0.0)):
         bank = predicted(with_gyro, bank, reading(twist, gyro_radps))
         expected = predicted(without, expected, reading(twist))
-    np.testing.assert_allclose(bank.mean[:, :-1], expected.mean, atol=1e-13)
-    np.testing.assert_allclose(bank.covariance[:, :-1, :-1], expected.covariance, atol=1e-13)
+    kept = slice(0, -inertial.GYRO)
+    np.testing.assert_allclose(bank.mean[:, kept], expected.mean, atol=1e-13)
+    np.testing.assert_allclose(bank.covariance[:, kept, kept], expected.covariance, atol=1e-13)
     np.testing.assert_allclose(bank.covariance[0, -1, -1], BIAS_SIGMA**2, rtol=1e-9)
 
 
@@ -138,6 +140,32 @@ def test_the_heading_is_the_gyros_whatever_the_wheels_say():
     np.testing.assert_allclose(bank.covariance[0, 2, 2], expected, rtol=0.05)
     np.testing.assert_allclose(bank.covariance[0, 2, -1], -(BIAS_SIGMA**2) * time_s, rtol=0.05)
     assert np.all(np.linalg.eigvalsh(bank.covariance[0]) > -1e-12)
+
+
+def test_errors_of_scale_and_delay_grow_with_the_turn_and_with_the_rate():
+    """Three turns to one side and back leave none of the former; a rate leaves d times itself."""
+    off = dataclasses.replace(GYRO, scale_sigma=0.02, delay_sigma_s=0.01, bias_sigma_radps=0.0)
+    motion = BicycleKalman(base(off, TWIST_AS_TOLD))
+    bank, sigmas = begun(motion, [0.0, 0.0, 0.0], sigma=1e-4), []
+    for rate in np.repeat([4.0, -4.0, 0.0], 100):
+        bank = predicted(motion, bank, reading((0.0, 0.0, rate), rate))
+        sigmas.append(np.sqrt(bank.covariance[0, 2, 2]))
+    turned_rad = 4.0 * 100 * DT_S
+    assert sigmas[99] == pytest.approx(np.hypot(0.02 * turned_rad, 0.01 * 4), rel=0.02)
+    assert sigmas[199] == pytest.approx(0.01 * 4, rel=0.1)
+    assert sigmas[299] < 0.01
+
+
+def test_a_turn_s_slopes_are_its_derivatives():
+    off = dataclasses.replace(GYRO, scale_sigma=0.02, delay_s=0.01, delay_sigma_s=0.01)
+    mean = jnp.asarray(np.random.default_rng(3).normal(size=SENSORS_END + inertial.GYRO) / 30)
+
+    def of(mean):
+        turn = turn_of(off, reading(gyro_radps=1.3), mean, jnp.asarray(0.0))
+        return jnp.stack([mean[2] + turn.turn_rad, turn.rate_radps])
+
+    slopes = turn_of(off, reading(gyro_radps=1.3), mean, jnp.asarray(0.0)).slopes
+    np.testing.assert_allclose(slopes, jax.jacfwd(of)(mean), atol=1e-12)
 
 
 def test_a_late_gyro_is_brought_forward():
@@ -182,8 +210,9 @@ def test_a_gyro_teaches_wheels_their_errors_and_their_slip(rate_radps):
     """The rows of a dense Kalman gain that belong to s, k, g, o, where the mismatch is as likely as
     not; beyond, with a slip as wide as it takes."""
     rng = np.random.default_rng(4)
-    n = SENSORS_END + 1
-    scale = np.concatenate([np.full(SIX, 0.02), [0.05], TWIST_AS_TOLD, [BIAS_SIGMA]])
+    n = SENSORS_END + inertial.GYRO
+    of_gyro = [0.01, 0.005, BIAS_SIGMA]
+    scale = np.concatenate([np.full(SIX, 0.02), [0.05], TWIST_AS_TOLD, of_gyro])
     A = rng.normal(size=(n, 2 * n)) / np.sqrt(2 * n)
     P, mean = scale[:, None] * (A @ A.T) * scale, np.zeros(n)
     mean[5] = 0.8
@@ -269,7 +298,7 @@ def test_a_rule_that_takes_one_pose_has_the_papers_states():
     motion = BicycleKalman(base(GYROS["consumer"], TWIST_AS_TOLD))
     assert motion.for_rig(worlds.qcar_rig_by_hand(), 1).init(1).mean.shape == (1, SIX)
     many = motion.for_rig(worlds.qcar_rig_by_hand(), 2).init(2)
-    assert many.mean.shape == (2, SENSORS_END + 12 + 1)
+    assert many.mean.shape == (2, SENSORS_END + 12 + inertial.GYRO)
 
 
 def test_gradients_are_finite_where_it_stands():
