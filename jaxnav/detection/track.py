@@ -25,9 +25,11 @@ from jaxnav.models.camera import Camera
 _SIDES_PX = (8.0, 120.0)  # of a marker that is followed; a larger one takes too long
 _LEAST_CONTRAST = 10.0  # grey levels
 # What decides, see `benchmarks/README-blur.md`: of the loss without a marker the part that it
-# explains, and by how many noise variances every other code is worse.
+# explains, by how many noise variances every other code is worse, and how far, of a side, the fit
+# moved a corner from where the picture matched best.
 _LEAST_EXPLAINED = 0.5
-_LEAST_ADVANTAGE = 60.0
+_LEAST_ADVANTAGE = 70.0  # of white noise
+_MOST_MOVED = 0.25
 _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
 # What still shows more noise, of the contrast, and so much alike among neighbours, is disturbed.
@@ -194,9 +196,12 @@ def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
         return None
     corners_px = np.asarray(fit.corners_px, float)
     side_px = mean_side_px(start_px)
-    if not np.all(np.linalg.norm(corners_px - start_px, axis=1) < max(3.0, 0.5 * side_px)):
+    moved_px = np.linalg.norm(corners_px - start_px, axis=1)
+    if not np.all(moved_px < max(3.0, _MOST_MOVED * side_px)):
         return None
-    if not (fit.explained >= _LEAST_EXPLAINED and fit.advantage >= _LEAST_ADVANTAGE):
+    # A sum of squares deviates by the root of the factor by which neighbours' noise is alike.
+    advantage = fit.advantage / np.sqrt(fit.alike)
+    if not (fit.explained >= _LEAST_EXPLAINED and advantage >= _LEAST_ADVANTAGE):
         return None
     streak_px = np.asarray(fit.streak_px, float)
     sigma_px = _model_sigma_px(float(np.hypot(*streak_px)), side_px)

@@ -25,11 +25,19 @@ from jaxtyping import PyTree
 
 # LLVM's costly passes double the compile time and buy nothing.
 _OPTIONS: dict[str, str | int] = {"xla_backend_optimization_level": 1}
-# `reshape-mover` moves reshapes by one operation a round: for it XLA goes through a large program
-# 25 times, then gives up, not 11. Without barriers XLA for the CPU computes anew, at every use, the
-# values that `over_lanes` writes to memory once; from jaxlib 0.12 on it can't compile them in a
-# loop that it has hoisted.
-_DISABLED = "reshape-mover,cse_barrier_expander"
+# The first four move what they find by one operation a round: for them XLA goes through a large
+# program 25 times, then gives up, not 4. Without barriers XLA for the CPU computes anew, at every
+# use, the values that `over_lanes` writes to memory once; from jaxlib 0.12 on it can't compile them
+# in a loop that it has hoisted.
+_DISABLED = ",".join(
+    (
+        "reshape-mover",
+        "simplify-while-loops",
+        "while-loop-invariant-code-motion",
+        "while-loop-constant-sinking",
+        "cse_barrier_expander",
+    )
+)
 _PASSES = _DISABLED, f"{_DISABLED},small-while-loop-hoisting"
 # What an internal that is missing, or has other parameters, makes the evaluation raise.
 _DOES_NOT_FIT = ImportError, AttributeError, LookupError, TypeError, ValueError, NotImplementedError
