@@ -31,7 +31,8 @@ def errors_of(
     """The errors that the heaviest hypothesis of a vehicle keeps, and their sigmas.
 
     (k, g, o, tau) of `sensor_errors`, then three turns a camera in units of their prior's sigma,
-    then the bias of a gyro, rad/s, where there is one. Empty where the bank keeps none.
+    then the errors of a gyro's scale, delay and bias, where there is one. Empty where the bank
+    keeps none.
 
     Args:
         bank: of NumPy, with its leading axis (K,).
@@ -53,16 +54,16 @@ def error_sigmas(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, " e"
 
 
 def as_filed(
-    errors: Float[np.ndarray, " e"],
+    errors: Float[np.ndarray, " e"], rig: CameraRig | None
 ) -> tuple[Float[np.ndarray, " sensors"], Float[np.ndarray, " turns"]]:
     """The errors against the files: those of the sensors, and three turns a camera.
 
-    The filter keeps the turn that takes a camera back to where its file has it. A gyro's bias is
-    left out.
+    The filter keeps the turn that takes a camera back to where its file has it. A gyro's errors are
+    left out, and without a rig, or with exact cameras, there are no turns.
     """
     of_sensors = SENSORS_END - LEARNT
-    of_cameras = (len(errors) - of_sensors) // EACH * EACH
-    return errors[:of_sensors], -errors[of_sensors : of_sensors + of_cameras]
+    turned = 0 if rig is None or rig.extrinsics_sigma is None else EACH * len(rig)
+    return errors[:of_sensors], -errors[of_sensors : of_sensors + turned]
 
 
 def sensor_errors(vehicle: Vehicle | TwistBase) -> tuple[str, ...]:
@@ -104,7 +105,7 @@ class Learnt:
         if not errors.size:
             return None
         cameras = len(rig)
-        sensors, turned = as_filed(errors)
+        sensors, turned = as_filed(errors, rig)
         sensors_sigma = sigma[: len(sensors)]
         turned_sigma = sigma[len(sensors) : len(sensors) + len(turned)]
         exact = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma)

@@ -56,7 +56,7 @@ class RerunScene:
         stream: its `RecordingStream`.
         """
         self._rerun, self._stream = rerun, stream
-        self._names = () if rig is None else rig.names
+        self._rig, self._names = rig, () if rig is None else rig.names
         self._from_world = opposite(ZERO if markers is None else markers.origin_m)
         self._begin_ns: int | None = None
         self._is_base = False  # until an outcome commands a twist
@@ -219,7 +219,7 @@ class RerunScene:
         if not self._is_base and not np.isnan(outcomes.twist[index]).all():
             self._is_base = True
             self._still("plots/sensor_errors", self._rerun.SeriesLines(names=list(TWIST_ERRORS)))
-        errors = as_filed(outcomes.errors[index])
+        errors = as_filed(outcomes.errors[index], self._rig)
         for entity, values in zip(("sensor_errors", "camera_errors"), errors, strict=True):
             if values.size and np.isfinite(values).all():
                 self._say(f"plots/{entity}", self._rerun.Scalars(values))

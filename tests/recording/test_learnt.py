@@ -8,10 +8,12 @@ import jaxlie
 import numpy as np
 import pytest
 
+from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.models.bicycle import SENSORS_AS_TOLD, Vehicle
+from jaxnav.models.gyro import GYROS
 from jaxnav.models.rig import CameraRig
 from jaxnav.navigator import Navigator
-from jaxnav.recording.learnt import Learnt, errors_of
+from jaxnav.recording.learnt import Learnt, as_filed, errors_of
 from tests import worlds
 from tests.reference import paper
 
@@ -130,3 +132,19 @@ def test_an_error_beyond_what_its_file_allows_for_is_named_so():
     camera, wheels = told
     assert camera.endswith("3.5 times the sigma of its file")
     assert wheels.endswith("6.7 times the sigma of its file")
+
+
+def test_a_gyro_s_errors_are_those_of_no_camera():
+    """They stand behind the cameras', as many as a camera has."""
+    rig, vehicle = told_rig(), dataclasses.replace(sensors_as_told(), gyro=GYROS["consumer"])
+    bank = jax.device_get(BicycleKalman(vehicle).for_rig(rig, 2).init(2))
+    errors, sigma = errors_of(bank)
+    assert len(errors) == len(sigma) == 4 + 3 * len(rig) + 3
+    marked = np.arange(len(errors), dtype=float)
+    sensors, turns = as_filed(marked, rig)
+    np.testing.assert_array_equal(sensors, marked[:4])
+    np.testing.assert_array_equal(turns, -marked[4:-3])
+    exact = dataclasses.replace(rig, extrinsics_sigma=None)
+    assert as_filed(marked, exact)[1].size == as_filed(marked, None)[1].size == 0
+    learnt = Learnt.of(errors, sigma, rig, vehicle)
+    np.testing.assert_allclose(learnt.turns_sigma_rad, learnt.turns_prior_rad)
