@@ -2,7 +2,9 @@
 
     psi += dt r + (delay + d) (r - psi_dot),    psi_dot = r,    r = (1 - e) z - b
 
-The errors of its scale e, of its delay d and its bias b stand at the end of the state.
+The errors of its scale e, of its delay d and its bias b stand at the end of the state. What of
+scale and delay is not the same in every interval (a scale that depends on the rate, a bus that is
+busy) is as large again, as noise: a random walk of the angle that is right at 1 rad, and a delay.
 
 The wheels read the velocity at the end of an interval, and a turn rate that slips with them; the
 gyro reads the whole turn. So where it has told, the wheels' turn rate moves nothing. The two are
@@ -79,7 +81,8 @@ def turn_of(
     slopes = jnp.zeros((2, mean.shape[0]), dtype).at[0, 2].set(1).at[0, 5].set(-delay_s)
     slopes = slopes.at[:, _SCALE].set(-read * by_rate).at[:, _BIAS].set(-by_rate)
     slopes = slopes.at[0, _DELAY].set(changed)
-    of_angle = white * dt_s
+    angle_rad = jnp.abs(rate) * dt_s
+    of_angle = white * dt_s + (gyro.delay_sigma_s * changed) ** 2 + gyro.scale_sigma**2 * angle_rad
     of_rate = white / dt_s + acceleration_density * dt_s / 3 + changed**2 / 4
     noise = jnp.stack([jnp.stack([of_angle, white]), jnp.stack([white, of_rate])])
     turn_rad = dt_s * rate + delay_s * changed

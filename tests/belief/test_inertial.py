@@ -143,7 +143,8 @@ def test_the_heading_is_the_gyros_whatever_the_wheels_say():
 
 
 def test_errors_of_scale_and_delay_grow_with_the_turn_and_with_the_rate():
-    """Three turns to one side and back leave none of the former; a rate leaves d times itself."""
+    """Three turns to one side and back leave none of the part that stays, but for d times a rate;
+    the part that comes and goes is a walk of the angle, and a delay of each change."""
     off = dataclasses.replace(GYRO, scale_sigma=0.02, delay_sigma_s=0.01, bias_sigma_radps=0.0)
     motion = BicycleKalman(base(off, TWIST_AS_TOLD))
     bank, sigmas = begun(motion, [0.0, 0.0, 0.0], sigma=1e-4), []
@@ -151,9 +152,14 @@ def test_errors_of_scale_and_delay_grow_with_the_turn_and_with_the_rate():
         bank = predicted(motion, bank, reading((0.0, 0.0, rate), rate))
         sigmas.append(np.sqrt(bank.covariance[0, 2, 2]))
     turned_rad = 4.0 * 100 * DT_S
-    assert sigmas[99] == pytest.approx(np.hypot(0.02 * turned_rad, 0.01 * 4), rel=0.02)
-    assert sigmas[199] == pytest.approx(0.01 * 4, rel=0.1)
-    assert sigmas[299] < 0.01
+    for index, angle_rad, rate, changes, ways in (
+        (99, turned_rad, 4, 4**2, 1),
+        (199, 0.0, -4, 4**2 + 8**2, 2),
+        (299, 0.0, 0, 2 * 4**2 + 8**2, 2),
+    ):
+        stays = (0.02 * angle_rad) ** 2 + (0.01 * rate) ** 2
+        comes = 0.02**2 * ways * turned_rad + 0.01**2 * changes
+        assert sigmas[index] == pytest.approx(np.sqrt(stays + comes), rel=0.02)
 
 
 def test_a_turn_s_slopes_are_its_derivatives():
