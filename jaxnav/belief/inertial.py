@@ -33,8 +33,6 @@ from jaxnav.pose.observation import Observation
 _STANDS_MPS, _STANDS_RADPS = 0.03, 0.05
 _TURNS_RADPS, _MOST_SLIP = 0.05, 0.5  # slower turns say nothing of a slip; a share of the speed
 _STEADY_RADPS = 0.005  # a rate that changes by less, and its noise, does not
-
-
 GYRO = 3  # states of a gyro, the last of all
 _SCALE, _DELAY, _BIAS = -3, -2, -1
 
