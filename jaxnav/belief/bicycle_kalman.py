@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.belief import kalman
 from jaxnav.belief.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
 from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heaviest, known_to
-from jaxnav.belief.camera_errors import CameraErrors, ErrorsPosterior
+from jaxnav.belief.camera_errors import CameraErrors
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.gate import Moments, Offer
 from jaxnav.belief.inertial import (
@@ -164,9 +164,11 @@ class BicycleKalman(Motion):
         nuisance = jnp.asarray(OFF_GROUND, dtype) * jnp.asarray(tilt, dtype)[None]
 
         def in_body(P: Array, seen: Array, slope: Array) -> tuple[Array, Array]:
-            H = product(freedom, product(planar_rotation(-seen[2]), slope))
-            of_pose = product(H, P)
-            return kalman.symmetrise(product(of_pose, H.T)), of_pose[:, self._cameras]
+            H = product(planar_rotation(-seen[2]), slope)
+            h = H.shape[1]
+            of_pose = product(H, P[:h])
+            covariance = kalman.symmetrise(product(of_pose[:, :h], H.T))
+            return sandwich(freedom, covariance), product(freedom, of_pose[:, self._cameras])
 
         covariance, cross = jax.vmap(in_body)(bank.covariance, seen, slopes)
         errors = None
@@ -201,7 +203,6 @@ class BicycleKalman(Motion):
             kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
-            first=self._first(pose, R, bank.velocity_lead, obs, None),
             posterior=(self.moved(bank.mean, correction), posterior),
         )
 
@@ -221,17 +222,13 @@ class BicycleKalman(Motion):
             self.states,
             0 if self.vehicle.gyro is None else GYRO,
         )
-        P = kalman.replace_first(
-            P, jnp.eye(3, P.shape[0], dtype=P.dtype).at[:, :3].set(planar_rotation(pose[2]))
-        )
+        P = kalman.replace_first(P, planar_rotation(pose[2]))
         posterior = _at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P, lead)
-        started = planar_covariance(T, measured.covariance)
         return Offer(
             measured.innovation,
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
-            first=self._first(pose, started, lead, obs, measured.errors),
             posterior=posterior,
         )
 
@@ -275,15 +272,15 @@ class BicycleKalman(Motion):
         """Pose and velocity as they stand in the state, which is planar."""
         return Planar(mean[:3], covariance[:3, :3], mean[3:SIX], covariance[3:SIX, 3:SIX])
 
-    def _first(
-        self,
-        pose: Array,
-        covariance: Array,
-        lead: Array,
-        obs: Observation,
-        errors: ErrorsPosterior | None,
+    def start(
+        self, bank: Bank, measured: PoseMeasurement | PosePosterior, obs: Observation
     ) -> Moments:
-        """A hypothesis that starts at a pose, moving as measured, with errors as likely as not."""
+        """One hypothesis that begins at a measured pose, moving as read, its errors unknown."""
+        pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
+        covariance = planar_covariance(measured.T_world_vehicle, measured.covariance)
+        errors = measured.errors if isinstance(measured, PosePosterior) else None
+        if isinstance(measured, PoseMeasurement):
+            covariance = covariance + kalman.as_covariance(self.vision_floor)
         velocity = jnp.asarray(self.initial_velocity_sigma, pose.dtype) ** 2
         variance = jnp.concatenate([jnp.zeros(3, pose.dtype), velocity, self._error_variance()])
         P = jnp.diag(variance).at[:3, :3].set(covariance)
@@ -293,7 +290,7 @@ class BicycleKalman(Motion):
             cross = product(covariance, product(slope.T, errors.rows))
             P = P.at[:3, self._cameras].set(cross).at[self._cameras, :3].set(cross.T)
         start = jnp.append(pose, jnp.zeros_like(variance[3:]))
-        return _at_stamp(*self._with_odometry(start, P, obs), lead)
+        return _at_stamp(*self._with_odometry(start, P, obs), bank.velocity_lead)
 
     @property
     def _cameras(self) -> slice:
@@ -320,7 +317,7 @@ class BicycleKalman(Motion):
     def _later(self, mean: Array, P: Array, obs: Observation, turn: Turn | None = None) -> Moments:
         """The state `dt_s` later (Eq. 9), turned as a gyro has told."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
-        A = jnp.eye(3, mean.shape[0], dtype=dtype).at[:, 3:SIX].set(dt_s * jnp.eye(3, dtype=dtype))
+        A = jnp.eye(3, SIX, dtype=dtype).at[:, 3:].set(dt_s * jnp.eye(3, dtype=dtype))
         density = sandwich(planar_rotation(mean[2]), kalman.as_matrix(self.acceleration_density))
         Q = kalman.white_acceleration(density, dt_s).astype(dtype)
         pose = mean[:3] + dt_s * mean[3:SIX]
@@ -384,13 +381,8 @@ class BicycleKalman(Motion):
         """The state whose velocity the odometry has measured."""
         dtype = mean.dtype
         read = read_velocity(self.vehicle, obs, mean)
-        H = jnp.eye(3, mean.shape[0], k=3, dtype=dtype)
-        H = (
-            H.at[:, 2]
-            .set(-read.by_heading)
-            .at[:, SIX : SIX + read.by_errors.shape[1]]
-            .set(-read.by_errors)
-        )
+        H = jnp.eye(3, SIX, k=3, dtype=dtype).at[:, 2].set(-read.by_heading)
+        H = jnp.concatenate([H, -read.by_errors], axis=1)
         R = sandwich(planar_rotation(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(
             dtype
         )

@@ -9,13 +9,13 @@ from jaxnav.belief.ambiguity import PosePosterior
 from jaxnav.belief.camera_errors import ridge
 from jaxnav.models.geometry import inverse_cayley, inverse_cayley_jacobian
 from jaxnav.numerics.small_matrices import (
-    cho_solve,
     cholesky,
     gram,
     matvec,
     product,
     sandwich,
     solve_lower,
+    solve_upper,
 )
 
 
@@ -73,16 +73,15 @@ def follow_pose(
         P_yy = P_yy + jnp.diag(jnp.append(jnp.zeros(d, P.dtype), hidden + ridge(P.dtype)))
         given_pose = errors.covariance
     factor = cholesky(P_yy)
-    gain = cho_solve(factor, P_y[:, d:]).T  # of the rest on y, (n - d, len(y))
-    # Block by block: as P plus a correction the pose would keep the rounding of its prediction,
-    # which may be thousands of times as wide.
-    explained = gram(solve_lower(factor, P_y[:, d:]).T)
-    moves = product(gain, M)
-    cross = product(moves, C)
-    rest = P[d:, d:] - explained + product(cross, moves.T)
+    whitened = solve_lower(factor, P_y[:, d:])
+    gain = solve_upper(factor, whitened).T  # of the rest on y, (n - d, len(y))
+    rest = P[d:, d:] - gram(whitened.T)
     if given_pose is not None:
         rest = rest + sandwich(gain[:, d:], given_pose)
-    after = kalman.symmetrise(jnp.block([[C, cross.T], [cross, rest]]))
-    wider = jnp.concatenate([jnp.eye(d, dtype=C.dtype), moves[: states - d]])
-    after = after.at[:states, :states].add((posterior.inflation - 1) * sandwich(wider, C))
+    # Not as P plus a correction: the pose would keep the rounding of its prediction, which may be
+    # thousands of times as wide.
+    by_pose = sandwich(jnp.concatenate([jnp.eye(d, dtype=C.dtype), product(gain, M)]), C)
+    after = kalman.symmetrise(by_pose.at[d:, d:].add(rest))
+    wider = (posterior.inflation - 1) * by_pose[:states, :states]
+    after = after.at[:states, :states].add(wider)
     return jnp.append(xi, matvec(gain, y)), kalman.add_floor(after, P)

@@ -15,7 +15,6 @@ from jaxnav.belief.bank import Bank, contradicted, empty_bank, forget_lost, heav
 from jaxnav.belief.camera_errors import (
     EACH,
     CameraErrors,
-    ErrorsPosterior,
     common_turn,
     not_told,
 )
@@ -104,7 +103,6 @@ class FreeBody(Motion):
     def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
         """The offer to one hypothesis whose selector has chosen a candidate, in 6 dof."""
         mean, P = bank.mean, bank.covariance
-        wxyz_xyz = measured.T_world_vehicle.wxyz_xyz
         log_volume = log_det(cholesky(measured.covariance)) / 2
         R = measured.covariance + kalman.as_covariance(self.vision_floor)
         innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
@@ -115,7 +113,6 @@ class FreeBody(Motion):
             kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
-            first=self._first(wxyz_xyz, R, None),
             posterior=(self.moved(mean, correction), posterior),
         )
 
@@ -138,7 +135,6 @@ class FreeBody(Motion):
             gate_nis=self.gate_nis,
             log_likelihood=measured.log_likelihood,
             inflation=measured.inflation,
-            first=self._first(T.wxyz_xyz, measured.covariance, measured.errors),
             posterior=(jnp.append(T.wxyz_xyz, bank.mean[7:] + correction[6:]), P),
         )
 
@@ -181,9 +177,16 @@ class FreeBody(Motion):
         variance = jnp.trace(bank.covariance[:, 3:6, 3:6], axis1=1, axis2=2)
         return known_to(bank, apart, variance) < self.learn_sigma_rad**2
 
-    def _first(self, wxyz_xyz: Array, covariance: Array, errors: ErrorsPosterior | None) -> Moments:
-        """A hypothesis that starts at a pose."""
-        dtype = wxyz_xyz.dtype
+    def start(
+        self, bank: Bank, measured: PoseMeasurement | PosePosterior, obs: Observation
+    ) -> Moments:
+        """One hypothesis that begins at a measured pose, moving as little as is known."""
+        wxyz_xyz, dtype = measured.T_world_vehicle.wxyz_xyz, bank.mean.dtype
+        covariance, errors = measured.covariance, None
+        if isinstance(measured, PosePosterior):
+            errors = measured.errors
+        else:
+            covariance = covariance + kalman.as_covariance(self.vision_floor)
         mean, of_rest = (x.astype(dtype) for x in self.at_first())
         behind = 6 + mean.shape[0]
         cameras = jnp.ones(self.camera_states, dtype)

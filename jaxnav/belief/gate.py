@@ -15,12 +15,10 @@ Moments = tuple[Float[Array, " n"], Float[Array, "d d"]]  # mean and covariance
 
 
 class Offer(NamedTuple):
-    """One hypothesis as a measured pose would start or correct it; `apply_gate` chooses."""
+    """One hypothesis as a measured pose would correct it; `apply_gate` chooses."""
 
     innovation: Float[Array, " m"]  # of the pose, whitened
-    # Mean and covariance where the pose starts the hypothesis, and where the hypothesis takes it.
-    first: Moments
-    posterior: Moments
+    posterior: Moments  # where the hypothesis takes the pose
     gate_nis: Float[Array, ""] | float  # a larger NIS is a contradiction, and counted
     log_likelihood: Float[Array, ""]  # of what was measured given the prediction
     inflation: Float[Array, ""] | float = 1.0  # a NIS above inflation * gate_nis is not fused
@@ -29,6 +27,7 @@ class Offer(NamedTuple):
 def apply_gate(
     bank: Bank,
     offer: Offer,
+    first: Moments,
     valid: Bool[Array, ""],
 ) -> tuple[Bank, Float[Array, ""], Bool[Array, ""]]:
     """One hypothesis after the gate, the NIS of its pose, and whether the pose was accepted.
@@ -40,6 +39,7 @@ def apply_gate(
     Args:
         bank: a bank without its leading axis.
         offer: what the pose makes of it.
+        first: what the pose starts.
         valid: whether there is a pose at all.
     """
     nis = jnp.sum(offer.innovation**2)
@@ -47,7 +47,7 @@ def apply_gate(
     starts, agrees = valid & ~bank.initialised, offered & (nis <= offer.gate_nis)
     accepted = offered & (nis <= offer.gate_nis * offer.inflation)
     predicted = (bank.mean, bank.covariance)
-    mean, covariance = where(accepted, offer.posterior, where(starts, offer.first, predicted))
+    mean, covariance = where(accepted, offer.posterior, where(starts, first, predicted))
     return (
         Bank(
             mean,

@@ -91,7 +91,7 @@ def turned(
     turn: Turn,
     mean: Float[Array, " n"],
     later: Float[Array, " 6"],
-    A: Float[Array, "3 n"],
+    A: Float[Array, "3 6"],
     Q: Float[Array, "6 6"],
     dt_s: Float[Array, ""],
 ) -> tuple[Float[Array, " 6"], Float[Array, "6 n"], Float[Array, "6 6"]]:
@@ -103,7 +103,7 @@ def turned(
     Args:
         mean: of the state before.
         later: pose and velocity after it without a gyro.
-        A: the rows of the pose without a gyro.
+        A: the rows of the pose without a gyro, by pose and velocity.
         Q: the noise of pose and velocity without it.
     """
     eye = jnp.eye(SIX, mean.shape[0], dtype=mean.dtype)
@@ -126,7 +126,7 @@ def turned(
     parts = (mean[:2] + way_m, psi_rad[None], velocity, turn.rate_radps[None])
     return (
         jnp.where(turn.told, jnp.concatenate(parts), later),
-        jnp.where(turn.told, rows, eye.at[:3].set(A)),
+        jnp.where(turn.told, rows, eye.at[:3, :SIX].set(A)),
         jnp.where(turn.told, noise, Q),
     )
 
@@ -161,10 +161,11 @@ def slip_of(
     slips = jnp.where(compared & steep, jnp.minimum(slips, _MOST_SLIP**2), 0)
     P, S = P.at[SLIP, SLIP].add(slips), S + slips * by_slip**2
     wheels = jnp.zeros_like(mean).at[SIX : SENSORS_END - 1].set(1)  # all but the cameras' delay
-    gain = jnp.where(compared, wheels * matvec(P, H) / S, 0)
-    left = jnp.eye(mean.shape[0], dtype=mean.dtype) - gain[:, None] * H[None]
-    noise = wheels_sigma_radps**2 * gain[:, None] * gain[None]
-    return mean + gain * change, kalman.symmetrise(sandwich(left, P) + noise)
+    PH = matvec(P, H)
+    gain = jnp.where(compared, wheels * PH / S, 0)
+    left = P - gain[:, None] * PH[None]  # (I - K H) P
+    back = matvec(left, H) - wheels_sigma_radps**2 * gain
+    return mean + gain * change, kalman.symmetrise(left - back[:, None] * gain[None])
 
 
 def bias_at_rest(

@@ -31,12 +31,15 @@ def predict_covariance(
 def update(
     P: Float[Array, "n n"],
     innovation: Float[Array, " m"],
-    H: Float[Array, "m n"],
+    H: Float[Array, "m h"],
     R: Float[Array, "m m"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, "m m"]]:
     """One update of a linear Kalman filter, in Joseph's form.
 
         S = H P H' + R,  K = P H' S^-1,  P = (I - K H) P (I - K H)' + K R K'
+
+    Args:
+        H: by the first h states; the others are not measured.
 
     Returns:
         Correction K @ innovation (n,) of the mean, posterior covariance (n, n), and S (m, m).
@@ -46,27 +49,30 @@ def update(
 
     Source: Liu, Schofield, Shan (2023), Eqs. 10 and 11; Bucy, Joseph (1968).
     """
-    HP = product(H, P)
-    S = symmetrise(product(HP, H.T) + R)
+    h = H.shape[1]
+    HP = product(H, P[:h])
+    S = symmetrise(product(HP[:, :h], H.T) + R)
     K = cho_solve(cholesky(S), HP).T
     left = P - product(K, HP)  # (I - K H) P
-    posterior = symmetrise(left - product(product(left, H.T), K.T) + sandwich(K, R))
+    rounding = product(left[:, :h], H.T) - product(K, R)  # 0, were K exact
+    posterior = symmetrise(left - product(rounding, K.T))
     return matvec(K, innovation), add_floor(posterior, P), S
 
 
-def replace_first(P: Float[Array, "n n"], H: Float[Array, "k n"]) -> Float[Array, "n n"]:
-    """The covariance of a state whose first k entries x are replaced by H x of the whole state."""
-    k = H.shape[0]
-    top = product(H, P)
-    return P.at[:k].set(top).at[:, :k].set(top.T).at[:k, :k].set(symmetrise(product(top, H.T)))
+def replace_first(P: Float[Array, "n n"], H: Float[Array, "k h"]) -> Float[Array, "n n"]:
+    """The covariance of a state whose first k entries are replaced by H x of its first h, x."""
+    k, h = H.shape
+    top = product(H, P[:h])
+    corner = symmetrise(product(top[:, :h], H.T))
+    return P.at[:k].set(top).at[:, :k].set(top.T).at[:k, :k].set(corner)
 
 
 def hide_rows(
     innovation: Float[Array, " m"],
-    H: Float[Array, "m n"],
+    H: Float[Array, "m h"],
     R: Float[Array, "m m"],
     present: Float[Array, " m"],
-) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, "m m"]]:
+) -> tuple[Float[Array, " m"], Float[Array, "m h"], Float[Array, "m m"]]:
     """(innovation, H, R) with the rows where `present` is 0 made ineffective; 1 keeps a row."""
     kept = present[:, None] * present[None, :]
     return present * innovation, present[:, None] * H, kept * R + jnp.diag(1 - present)

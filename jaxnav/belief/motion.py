@@ -92,6 +92,12 @@ class Motion(eqx.Module):
         """The offer to one hypothesis whose selector has corrected its pose."""
 
     @abc.abstractmethod
+    def start(
+        self, bank: Bank, measured: PoseMeasurement | PosePosterior, obs: Observation
+    ) -> Moments:
+        """One hypothesis that begins at a measured pose."""
+
+    @abc.abstractmethod
     def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
         """The error state that leads from one mean to another."""
 
@@ -167,16 +173,22 @@ class Motion(eqx.Module):
         offer = self.follow if isinstance(measured, PosePosterior) else self.measure
         learns = self.learns(bank)
 
-        def one(before: Bank, measured: Any) -> BankUpdate:
+        def one(before: Bank, measured: Any, first: Moments) -> BankUpdate:
             offered = offer(before, measured, obs)
             predicted = before.mean, before.covariance
             posterior = self.considered(learns, predicted, offered.posterior)
             offered = offered._replace(posterior=posterior)
-            after, nis, accepted = apply_gate(before, offered, measured.valid)
+            after, nis, accepted = apply_gate(before, offered, first, measured.valid)
             compared = measured.valid & before.initialised
             return BankUpdate(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
 
-        updated: BankUpdate = jax.vmap(one)(bank, measured)
+        # In few frames a hypothesis starts.
+        first = jax.lax.cond(
+            jnp.any(measured.valid & ~bank.initialised),
+            lambda: jax.vmap(lambda b, pose: self.start(b, pose, obs))(bank, measured),
+            lambda: (bank.mean, bank.covariance),
+        )
+        updated: BankUpdate = jax.vmap(one)(bank, measured, first)
         bank = merge_heirs(updated.bank, selection.heir, self.difference, self.moved)
         return updated._replace(bank=bank)
 

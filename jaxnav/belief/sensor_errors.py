@@ -181,8 +181,8 @@ def lead_after(
 
 def seen_pose(
     mean: Float[Array, " n"], lead: Float[Array, " 3"]
-) -> tuple[Float[Array, " 3"], Float[Array, "3 n"]]:
-    """Where the corners show the vehicle, and its derivative by the state.
+) -> tuple[Float[Array, " 3"], Float[Array, "3 h"]]:
+    """Where the corners show the vehicle, and its derivative by the states before the cameras'.
 
     The derivative leaves out that the lead turns with the heading.
     """
@@ -192,8 +192,11 @@ def seen_pose(
 
 def from_seen(
     mean: Float[Array, " n"], lead: Float[Array, " 3"]
-) -> tuple[Float[Array, " n"], Float[Array, "3 n"]]:
-    """The state of one whose first three entries are the seen pose, and their derivative by it."""
+) -> tuple[Float[Array, " n"], Float[Array, "3 h"]]:
+    """The state of one whose first three entries are the seen pose, and their derivative by it.
+
+    Of the derivative, the columns of the cameras' errors are left out: they are 0.
+    """
     if mean.shape[0] == SIX:
         return mean, _sheared(mean, lead, 1)
     return mean.at[:3].add(_way_since(mean, lead)), _sheared(mean, lead, 1)
@@ -208,7 +211,7 @@ def _way_since(mean: Array, lead: Array) -> Array:
 
 def _sheared(mean: Array, lead: Array, sign: int) -> Array:
     """Derivative of pose + sign tau (v - c l)."""
-    slope = jnp.eye(3, mean.shape[0], dtype=mean.dtype)
+    slope = jnp.eye(3, min(mean.shape[0], SENSORS_END), dtype=mean.dtype)
     if mean.shape[0] == SIX:
         return slope
     tau = mean[_DELAY]

@@ -39,6 +39,18 @@ def test_update_is_the_textbook_s(seed):
         np.testing.assert_allclose(result, expected, atol=1e-9)
 
 
+def test_states_behind_the_measured_ones_are_corrected_along():
+    """Rows of the first states alone are rows whose other columns are 0."""
+    P, innovation, H, R = random_problem(7)
+    padded = np.pad(H[:, :4], ((0, 0), (0, 2)))
+    results = update(*map(jnp.asarray, (P, innovation, H[:, :4], R)))
+    for result, expected in zip(results, textbook(P, innovation, padded, R), strict=True):
+        np.testing.assert_allclose(result, expected, atol=1e-9)
+    F = np.vstack([padded[:2], np.eye(6)[2:]])
+    replaced = jax.jit(kalman.replace_first)(jnp.asarray(P), jnp.asarray(H[:2, :4]))
+    np.testing.assert_allclose(replaced, F @ P @ F.T, atol=1e-9)
+
+
 def test_hidden_rows_are_rows_left_out():
     P, innovation, H, R = random_problem(9)
     for present in ([1, 0, 1, 1, 0], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1], [0, 0, 0, 0, 1]):

@@ -542,10 +542,8 @@ def test_what_the_gate_accepts_is_told(nis, inflation, taken):
     bank = jax.tree.map(lambda leaf: leaf[0], BicycleKalman(worlds.qcar()).init())
     bank = eqx.tree_at(lambda b: b.initialised, bank, jnp.asarray(True))
     posterior = bank.mean + 1, bank.covariance
-    offer = Offer(
-        jnp.asarray([np.sqrt(nis), 0, 0]), posterior, posterior, 21.1, jnp.zeros(()), inflation
-    )
-    after, own, accepted = apply_gate(bank, offer, jnp.asarray(True))
+    offer = Offer(jnp.asarray([np.sqrt(nis), 0, 0]), posterior, 21.1, jnp.zeros(()), inflation)
+    after, own, accepted = apply_gate(bank, offer, posterior, jnp.asarray(True))
     assert (float(own), bool(accepted)) == (pytest.approx(nis), taken)
     assert bool(jnp.all(after.mean == bank.mean + taken))
     assert int(after.rejections.count) == (nis > 21.1)

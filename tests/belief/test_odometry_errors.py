@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxnav.belief import kalman
+from jaxnav.belief.ambiguity import PoseMeasurement
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.merging import merge_heirs
 from jaxnav.belief.smoothing import smoothed
@@ -219,8 +220,10 @@ def test_a_bank_keeps_what_it_has_learnt_where_it_merges_and_begins_anew_at_the_
     np.testing.assert_array_equal(kept[13:], errors[0])
     np.testing.assert_array_equal(P[12:, 12:], bank.covariance[0, 12:, 12:])
     np.testing.assert_array_equal(MOTION.considered(jnp.asarray(True), before, after)[0], after[0])
-    wxyz_xyz = jaxlie.SE3.identity().wxyz_xyz
-    mean, P = MOTION._first(wxyz_xyz, 1e-4 * jnp.eye(6), None)
+    seen = PoseMeasurement(
+        jaxlie.SE3.identity(), 1e-4 * jnp.eye(6), jnp.zeros(()), jnp.asarray(True)
+    )
+    mean, P = MOTION.start(jax.tree.map(lambda leaf: leaf[0], bank), seen, reading(jnp.zeros(6)))
     np.testing.assert_array_equal(mean[13:], 0)
     np.testing.assert_array_equal(P[6:, 6:], P_rest)
 
