@@ -35,6 +35,7 @@ def sandwich(A: Float[Array, "n k"], P: Float[Array, "k k"]) -> Float[Array, "n 
     return product(product(A, P), A.T)
 
 
+@jax.custom_jvp
 def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The lower L of A = L L'. NaN where A is not positive definite.
 
@@ -57,6 +58,24 @@ def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.stack([jnp.stack(row) for row in L])
 
 
+@cholesky.defjvp
+def _cholesky_slope(at: tuple[Array], moves: tuple[Array]) -> tuple[Array, Array]:
+    """L' = L F(L^-1 A' L^-T), where F takes the lower half, and half of the diagonal."""
+    ((A,), (A_dot,)) = at, moves
+    L = cholesky(A)
+    both = solve_lower(L, solve_lower(L, A_dot).T)
+    return L, product(L, _lower(both) - jnp.diag(jnp.diagonal(both)) / 2)
+
+
+def _lower(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return jnp.where(jnp.arange(A.shape[0])[:, None] >= jnp.arange(A.shape[0])[None], A, 0)
+
+
+def _times(A: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    return matvec(A, b) if b.ndim == 1 else product(A, b)
+
+
+@jax.custom_jvp
 def solve_lower(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """L^-1 b, for a lower triangular L; b is (n,) or (n, m)."""
     inverse = 1 / jnp.diagonal(L)
@@ -69,6 +88,14 @@ def solve_lower(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array
     return jnp.stack(x)
 
 
+@solve_lower.defjvp
+def _lower_slope(at: tuple[Array, Array], moves: tuple[Array, Array]) -> tuple[Array, Array]:
+    (L, b), (L_dot, b_dot) = at, moves
+    x = solve_lower(L, b)
+    return x, solve_lower(L, b_dot - _times(_lower(L_dot), x))
+
+
+@jax.custom_jvp
 def solve_upper(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """L'^-1 b, for a lower triangular L; b is (n,) or (n, m)."""
     n = L.shape[0]
@@ -80,6 +107,13 @@ def solve_upper(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array
             rest = rest - L[k, i] * x[k]
         x[i] = rest * inverse[i]
     return jnp.stack(x)
+
+
+@solve_upper.defjvp
+def _upper_slope(at: tuple[Array, Array], moves: tuple[Array, Array]) -> tuple[Array, Array]:
+    (L, b), (L_dot, b_dot) = at, moves
+    x = solve_upper(L, b)
+    return x, solve_upper(L, b_dot - _times(_lower(L_dot).T, x))
 
 
 def cho_solve(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
@@ -97,10 +131,25 @@ def solve_positive(
 ) -> Float[Array, "n ..."]:
     """(A + ridge I)^-1 b for all lanes along the trailing axes; NaN if not positive definite.
 
+    Its derivative x' solves A x' = b' - A' x, so that none of the factor's entries is derived.
+
+    Source: Golub, Van Loan (2013), algorithm 4.2.1; Giles (2008), "An extended collection of matrix
+    derivative results", section 2.2.
+    """
+    lanes = max(A.ndim - 2, b.ndim - 1)
+    A = A.reshape(*A.shape[:2], *(1,) * (lanes - A.ndim + 2), *A.shape[2:])
+    b = b.reshape(b.shape[0], *(1,) * (lanes - b.ndim + 1), *b.shape[1:])
+    return _solve_positive(A, b, jnp.asarray(ridge, A.dtype))
+
+
+@jax.custom_jvp
+def _solve_positive(
+    A: Float[Array, "n n ..."], b: Float[Array, "n ..."], ridge: Float[Array, "..."]
+) -> Float[Array, "n ..."]:
+    """As `solve_positive`, of as many trailing axes.
+
     Every entry is an array of its own: in matrices XLA would compute each column of the factor anew
     for every entry that uses it.
-
-    Source: Golub, Van Loan (2013), algorithm 4.2.1.
     """
     n = A.shape[0]
     L: list[list[Array]] = [[] for _ in range(n)]  # the factor, its diagonal inverted
@@ -124,6 +173,16 @@ def solve_positive(
             rest = rest - L[k][i] * x[k]
         x[i] = rest * L[i][i]
     return jnp.stack(x)
+
+
+@_solve_positive.defjvp
+def _positive_slope(
+    at: tuple[Array, Array, Array], moves: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    (A, b, ridge), (A_dot, b_dot, ridge_dot) = at, moves
+    x = _solve_positive(A, b, ridge)
+    moved = jnp.sum(A_dot * x[None], axis=1) + (ridge_dot[None] if ridge.ndim else ridge_dot) * x
+    return x, _solve_positive(A, b_dot - moved, ridge)
 
 
 def eliminate(A: Float[Array, "n n"], B: Float[Array, "n m"]) -> Float[Array, "n m"]:

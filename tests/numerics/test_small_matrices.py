@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxnav.numerics import small_matrices as small
+from tests.derivatives import check_derivatives
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -55,9 +56,34 @@ def test_gradients_are_those_of_lapack():
     A, b = jnp.asarray(root @ root.T), jnp.asarray(rng.normal(size=3))
     ours = jax.grad(lambda A: b @ small.cho_solve(small.cholesky(A), b))(A)
     x = np.linalg.solve(A, b)
-    # The lower triangle alone is read.
+    # Of A and its transpose together: of a symmetric matrix no more is defined.
     expected = -np.outer(x, x)
     np.testing.assert_allclose(ours + ours.T, expected + expected.T, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_derivatives_are_those_of_differences(n):
+    """Of each of the four, with one right side, with several, and of lanes that share a matrix."""
+    rng = np.random.default_rng(n)
+    root, many = rng.normal(size=(n, n + 2)), jnp.asarray(rng.normal(size=(n, 4)))
+    A = jnp.asarray(root @ root.T + np.eye(n))
+
+    def all_of(A, b, ridge):
+        A = (A + A.T) / 2
+        L = small.cholesky(A)
+        lanes = jnp.stack([A, 2 * A], axis=-1)
+        return (
+            L,
+            small.solve_lower(L, b),
+            small.solve_upper(L, b),
+            small.solve_lower(L, b[:, 0]),
+            small.solve_upper(L, b[:, 0]),
+            small.solve_positive(A, b, ridge),
+            small.solve_positive(A, b[:, 0]),
+            small.solve_positive(lanes[:, :, None], b[:, :, None], ridge),
+        )
+
+    check_derivatives(all_of, A, many, jnp.asarray(0.3))
 
 
 @pytest.mark.parametrize("n", [1, 3, 6])
