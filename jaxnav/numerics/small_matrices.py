@@ -60,7 +60,10 @@ def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @cholesky.defjvp
 def _cholesky_slope(at: tuple[Array], moves: tuple[Array]) -> tuple[Array, Array]:
-    """L' = L F(L^-1 A' L^-T), where F takes the lower half, and half of the diagonal."""
+    """L' = L F(L^-1 A' L^-T), A' symmetric; F takes the lower half, and half of the diagonal.
+
+    Source: Murray (2016), "Differentiation of the Cholesky decomposition", Eq. 8.
+    """
     ((A,), (A_dot,)) = at, moves
     L = cholesky(A)
     both = solve_lower(L, solve_lower(L, A_dot).T)
