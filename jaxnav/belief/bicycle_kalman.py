@@ -278,8 +278,10 @@ class BicycleKalman(Motion):
         """One hypothesis that begins at a measured pose, moving as read, its errors unknown."""
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         covariance = planar_covariance(measured.T_world_vehicle, measured.covariance)
-        errors = measured.errors if isinstance(measured, PosePosterior) else None
-        if isinstance(measured, PoseMeasurement):
+        errors = None
+        if isinstance(measured, PosePosterior):
+            errors = measured.errors
+        else:
             covariance = covariance + kalman.as_covariance(self.vision_floor)
         velocity = jnp.asarray(self.initial_velocity_sigma, pose.dtype) ** 2
         variance = jnp.concatenate([jnp.zeros(3, pose.dtype), velocity, self._error_variance()])

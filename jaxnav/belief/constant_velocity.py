@@ -113,7 +113,7 @@ class ConstantVelocity(FreeBody):
             led = errors.corrected(twist, known + change)
             return jnp.append(inverse_cayley(back @ jaxlie.SE3.exp(led * dt_s)), led)
 
-        F = jnp.zeros((12, P.shape[0]), dtype).at[:6, :6].set(back.adjoint())
+        F = jnp.zeros((12, _ERRORS.stop), dtype).at[:6, :6].set(back.adjoint())
         F = F.at[:, _ERRORS].set(jax.jacfwd(off)(jnp.zeros(ERRORS, dtype)))
         T_world_vehicle = (jaxlie.SE3(mean[:7]) @ back.inverse()).normalize()
         P = kalman.replace_first(P, F).at[:12, :12].add(self._drift(u, dt_s))

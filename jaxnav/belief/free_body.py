@@ -106,9 +106,7 @@ class FreeBody(Motion):
         log_volume = log_det(cholesky(measured.covariance)) / 2
         R = measured.covariance + kalman.as_covariance(self.vision_floor)
         innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
-        correction, posterior, S = kalman.update(
-            P, innovation, jnp.eye(6, P.shape[0], dtype=P.dtype), R
-        )
+        correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, dtype=P.dtype), R)
         return Offer(
             kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
@@ -213,7 +211,7 @@ def moved_by_twist(
     dtype = mean.dtype
     motion = jaxlie.SE3.exp(twist * dt_s)
     T_world_vehicle = (jaxlie.SE3(mean[:7]) @ motion).normalize()
-    F = jnp.zeros((6, P.shape[0]), dtype).at[:, :6].set(motion.inverse().adjoint())
-    F = F.at[:, 6:12].set(jnp.where(own, dt_s, 0) * jnp.eye(6, dtype=dtype))
+    by_twist = jnp.where(own, dt_s, 0) * jnp.eye(6, dtype=dtype)
+    F = jnp.concatenate([motion.inverse().adjoint(), by_twist], axis=1)
     mean = jnp.concatenate([T_world_vehicle.wxyz_xyz, twist, mean[13:]])
     return mean, kalman.replace_first(P, F)

@@ -149,8 +149,7 @@ class InertialMotion(FreeBody):
             )
 
         slopes = jax.jacfwd(off)(jnp.zeros(states + 15, dtype))[:states]
-        F = jnp.zeros((states, P.shape[0]), dtype).at[:, :states].set(slopes[:, :states])
-        P = kalman.replace_first(P, F)
+        P = kalman.replace_first(P, slopes[:, :states])
         Q = sandwich(slopes[:, states:], imu.covariance)
         # The rate is the mean of the interval; at its end a white acceleration has changed it.
         A = kalman.as_matrix(self.acceleration_density).astype(dtype)[3:, 3:]
@@ -176,8 +175,8 @@ class InertialMotion(FreeBody):
 
     def _rested(self, bank: Bank, still: Bool[Array, ""]) -> Bank:
         """The bank corrected by zero velocity and turn rate where the body is at rest."""
-        dtype, d = bank.mean.dtype, bank.covariance.shape[-1]
-        H = jnp.eye(d, dtype=dtype)[6:12]
+        dtype = bank.mean.dtype
+        H = jnp.eye(6, 12, k=6, dtype=dtype)
         R = jnp.diag(jnp.asarray(self.still_sigma, dtype) ** 2)
 
         def one(mean: Array, P: Array) -> tuple[Array, Array, Array, Array]:

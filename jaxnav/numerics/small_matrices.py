@@ -67,11 +67,7 @@ def _cholesky_slope(at: tuple[Array], moves: tuple[Array]) -> tuple[Array, Array
     ((A,), (A_dot,)) = at, moves
     L = cholesky(A)
     both = solve_lower(L, solve_lower(L, A_dot).T)
-    return L, product(L, _lower(both) - jnp.diag(jnp.diagonal(both)) / 2)
-
-
-def _lower(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    return jnp.where(jnp.arange(A.shape[0])[:, None] >= jnp.arange(A.shape[0])[None], A, 0)
+    return L, product(L, jnp.tril(both) - jnp.diag(jnp.diagonal(both)) / 2)
 
 
 def _times(A: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
@@ -95,7 +91,7 @@ def solve_lower(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array
 def _lower_slope(at: tuple[Array, Array], moves: tuple[Array, Array]) -> tuple[Array, Array]:
     (L, b), (L_dot, b_dot) = at, moves
     x = solve_lower(L, b)
-    return x, solve_lower(L, b_dot - _times(_lower(L_dot), x))
+    return x, solve_lower(L, b_dot - _times(jnp.tril(L_dot), x))
 
 
 @jax.custom_jvp
@@ -116,7 +112,7 @@ def solve_upper(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array
 def _upper_slope(at: tuple[Array, Array], moves: tuple[Array, Array]) -> tuple[Array, Array]:
     (L, b), (L_dot, b_dot) = at, moves
     x = solve_upper(L, b)
-    return x, solve_upper(L, b_dot - _times(_lower(L_dot).T, x))
+    return x, solve_upper(L, b_dot - _times(jnp.tril(L_dot).T, x))
 
 
 def cho_solve(L: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
