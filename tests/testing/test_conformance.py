@@ -112,11 +112,21 @@ class RaisesValueError(GoodVehicle):
 
 
 class StopWaits(GoodVehicle):
-    """Until who writes is done."""
+    """Until who writes is done, who then lets it go first: locks know no order of their own."""
+
+    stops = False
 
     def write(self, steering_rad, throttle):
+        while self.stops:
+            time.sleep(0.001)
         with self._lock:
             time.sleep(0.3)
+        super().write(steering_rad, throttle)
+
+    def stop(self):
+        self.stops = True
+        super().stop()
+        self.stops = False
 
 
 class StopHangs(GoodVehicle):
