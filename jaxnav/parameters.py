@@ -103,6 +103,17 @@ TUNABLES: dict[str, Tunable] = {
         0.02,
         most=(0.5, 0.5, 0.35, 0.5),
     ),
+    "motion.vehicle.gyro.noise_density": Tunable(
+        "R: of a gyro's turn rate", "rad/s/sqrt(Hz)", 2.5e-4, most=(1.0,)
+    ),
+    "motion.vehicle.gyro.bias_sigma_radps": Tunable(
+        "P0: bias of a gyro", "rad/s", 0.02, most=(10.0,)
+    ),
+    "motion.vehicle.gyro.bias_walk": Tunable(
+        "Q: random walk of that bias", "rad/s/sqrt(s)", 2e-5, most=(1.0,)
+    ),
+    "motion.vehicle.gyro.scale_sigma": Tunable("P0: scale of a gyro", "1", 0.01, most=(0.5,)),
+    "motion.vehicle.gyro.delay_sigma_s": Tunable("P0: delay of a gyro", "s", 5e-3, most=(0.5,)),
     "rig.extrinsics_sigma": Tunable(
         "P0: place and direction of each camera, in the vehicle's axes",
         "m, rad",

@@ -11,6 +11,7 @@ from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.control import ControlInput, ControlState
 from jaxnav.models.bicycle import sideslip_rad
 from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
+from jaxnav.models.gyro import GYROS
 from jaxnav.models.odometry_errors import OdometryErrors, sigma_as_told
 from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
@@ -48,7 +49,8 @@ def test_a_name_is_the_path_of_its_number():
 
 
 def test_every_tunable_is_some_navigator_s():
-    base = Navigator(RIG, MARKERS, TwistBase.create(1.0, 3.0, 0.1), worlds.WAYPOINTS_M)
+    turns = TwistBase.create(1.0, 3.0, 0.1, gyro=GYROS["consumer"])
+    base = Navigator(RIG, MARKERS, turns, worlds.WAYPOINTS_M)
     led = ConstantVelocity(odometry_errors=OdometryErrors.create(sigma_as_told(), np.zeros(3)))
     carried = Navigator(RIG, MARKERS, motion=led)
     navigators = DRIVER, HANDHELD, base, carried

@@ -171,7 +171,6 @@ KeyValues = Annotated[
 QCarRig = Annotated[Path | None, optional(*_QCAR, "Cameras: a rig file or a Kalibr camchain.")]
 QCarMarkers = Annotated[Path | None, optional(*_QCAR, "Marker map.")]
 QCarVehicle = Annotated[Path | None, optional(*_QCAR, "Vehicle parameters and limits.")]
-QCarBicycle = Annotated[Path | None, optional(*_QCAR, "Bicycle parameters and limits.")]
 Believed = Annotated[
     Selector, tyro.conf.arg(help="Which of the two poses of a marker is believed.")
 ]
@@ -195,3 +194,21 @@ class Headless(Checked):
 
     headless: Switch = False
     """No progress bar."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioCarFiles(Headless):
+    """What every command is told that drives through scenarios: its car, in files or by name."""
+
+    base: Base = "ackermann"
+    """What drives: the vehicle, or a base of the QCar's size that is commanded by a twist."""
+    imu: Imu = "none"
+    """The vehicle's gyro: as its file says, or one of that class, with errors drawn anew for each
+    drive."""
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle: QCarVehicle = None
+
+    def _check(self) -> None:
+        named = self.base == "ackermann" or self.vehicle is None
+        require(named, "--base", f"{self.base} takes the place of --vehicle: give one of them")

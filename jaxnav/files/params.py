@@ -15,6 +15,7 @@ as they are: so a number that is infinite in a navigator is left out. Only `moti
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from pathlib import Path
 from textwrap import indent
 from typing import Annotated, Any
@@ -79,7 +80,9 @@ class Params:
         for name, value in values.items():
             where = params.where(name)
             if name not in TUNABLES:
-                raise BadInput(where, f"unknown: expected one of {', '.join(TUNABLES)}")
+                nearest = ", ".join(get_close_matches(name, TUNABLES, cutoff=0))
+                problem = f"unknown: of {len(TUNABLES)} names the nearest are {nearest}"
+                raise BadInput(where, problem)
             params.values[name] = param_array(value, where, TUNABLES[name])
         return params
 

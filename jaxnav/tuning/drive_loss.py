@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.control import Command
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import safe_norm, safe_sqrt
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.simulation.scenarios import Scenario
 from jaxnav.simulation.world import DriveState
 from jaxnav.tuning.soft_switch import SoftState
@@ -34,7 +35,8 @@ class DriveLoss:
             true car has not passed every waypoint, is charged the longest duration.
         cross_track: weight of the RMS distance of the true car from the leg, 1/m: the line from
             the start or the waypoint before to the waypoint ahead.
-        effort: weight of throttle^2 + steering^2, as fractions of their limits, over time, 1/s.
+        effort: weight of throttle^2 + steering^2, of another base of its squared twist, as
+            fractions of their limits, over time, 1/s.
         smoothness: weight of the summed squared differences of those fractions between frames.
     """
 
@@ -111,12 +113,8 @@ class _Course(eqx.Module):
 
 def _course(before: DriveState, after: DriveState, count: int) -> _Course:
     was, now, car = before.state.control, after.state.control, after.truth.vehicle
-    commands = before.command, after.command
-    if not isinstance(car, Vehicle):
-        raise ValueError("only the drives of a car have a loss")
-    limits = jnp.stack([car.throttle_limit, car.steering_limit_rad])[:, None]
     if isinstance(was, SoftState) and isinstance(now, SoftState):
-        old, new = (state.commands / limits for state in (was, now))
+        old, new = (_fractions(car, state.commands) for state in (was, now))
         came = now.moved[:-1]
         stayed = now.shares[:-1] - jnp.append(jnp.zeros_like(came[:1]), came)
         effort = jnp.sum(new**2, axis=0)
@@ -130,13 +128,24 @@ def _course(before: DriveState, after: DriveState, count: int) -> _Course:
     if now is None:
         raise ValueError("a navigator without waypoints has no drive to be tuned")
     old, new = (
-        jnp.stack([command.throttle, command.steering_rad])[:, None] / limits
-        for command in commands
-        if isinstance(command, Command)
+        _fractions(car, jnp.stack(jax.tree.leaves(command))[:, None])
+        for command in (before.command, after.command)
     )
     shares = (jnp.arange(count + 1) == now.waypoint_index).astype(new.dtype)
     effort, change = jnp.sum(new**2, axis=0), jnp.sum((new - old) ** 2, axis=0)
     return _Course(shares, 1 - shares[-1:], effort, change)
+
+
+def _fractions(
+    vehicle: Vehicle | TwistBase, commands: Float[Array, "parts n"]
+) -> Float[Array, "parts n"]:
+    """The parts of n commands, in the order of their fields, as fractions of their limits."""
+    if isinstance(vehicle, TwistBase):
+        limits = vehicle.limits
+    else:
+        limits = jnp.stack([vehicle.steering_limit_rad, vehicle.throttle_limit])
+    # What can't move to its left is never told to.
+    return commands / jnp.where(limits > 0, limits, 1)[:, None]
 
 
 def _off_line_m2(

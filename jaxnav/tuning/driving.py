@@ -236,7 +236,7 @@ def _moving(world: DriveState) -> tuple[DriveState, DriveState]:
         spec,
         **{
             part: jax.tree.map(eqx.is_inexact_array, getattr(world, part))
-            for part in ("car", "acting", "command", "state")
+            for part in ("car", "acting", "command", "gyro", "state")
         },
     )
     moving, still = eqx.partition(world, spec)

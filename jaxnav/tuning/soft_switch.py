@@ -6,16 +6,17 @@ once, each with a share; the nearer the waypoint, the larger the part of its sha
 the softness goes to 0 this becomes the controller itself.
 """
 
-from typing import cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.control import Command, ControlInput, Controller, ControlLog, ControlState
+from jaxnav.control import Command, ControlInput, ControlLog, ControlState, Follower
 from jaxnav.navigator import Navigator
+from jaxnav.simulation.plant import standing
+from jaxnav.twist_control import TwistCommand
 
 DONE = 0.999  # with this share past the last waypoint the drive is over
 
@@ -26,17 +27,17 @@ class SoftState(ControlState):
     shares: Float[Array, " W1"]  # heading for each waypoint; the last: done
     moved: Float[Array, " W"]  # the share that each waypoint has just passed on
     integrals_ms: Float[Array, " W"]  # one for each waypoint
-    commands: Float[Array, "2 W"]  # throttle and steering towards each
+    commands: Float[Array, "parts W"]  # towards each, its parts in the order of their fields
 
 
 class SoftController(eqx.Module):
-    """A replacement for a navigator's `Controller` that applies its law to every waypoint.
+    """A replacement for a navigator's controller that applies its law to every waypoint.
 
     In each frame the part sigmoid((radius - distance) / softness) of a share moves on. The shares
     weight the commands towards the waypoints, which are summed, and the integrals' increments.
     """
 
-    controller: Controller
+    controller: Follower
     softness_m: Float[Array, ""]  # 0: hard
 
     def init(self) -> SoftState:
@@ -46,32 +47,27 @@ class SoftController(eqx.Module):
         zero = jnp.zeros_like(hard.integral_ms)
         shares = jnp.zeros(count + 1, zero.dtype).at[0].set(1)
         zeros = jnp.zeros(count, zero.dtype)
-        commands = jnp.stack([zeros, zeros])
+        parts = jax.tree.leaves(standing(self.controller.vehicle, zero.dtype))
+        commands = jnp.stack([zeros] * len(parts))
         return SoftState(hard.waypoint_index, zero, zero, zero, shares, zeros, zeros, commands)
 
     def __call__(
-        self,
-        state: SoftState,
-        pose: Float[Array, " 3"],
-        located: Bool[Array, ""],
-        steering_rad: Float[Array, ""],
-        dt_s: Float[Array, ""],
-        decided: Bool[Array, ""] | bool = True,
-        to_marker_m: Float[Array, " 2"] | None = None,
-        speed_mps: Float[Array, ""] | float = np.nan,
-    ) -> tuple[SoftState, Command, Bool[Array, ""], ControlLog]:
-        """Control as `Controller` does; the log is that of the waypoint with the largest share."""
-        control = self.controller
+        self, state: SoftState, *sensed: Any
+    ) -> tuple[SoftState, Command | TwistCommand, Bool[Array, ""], ControlLog]:
+        """Control as the controller does; the log is that of the waypoint with the largest share.
+
+        Args:
+            sensed: the fields of a `ControlInput`.
+        """
+        control, given = self.controller, ControlInput(*sensed)
         waypoints = jnp.arange(control.waypoints_m.shape[0])
-        short_m = jax.vmap(lambda index: control.short_of(index, pose))(waypoints)
-        leaves = jnp.where(located & decided, _beyond(-short_m, self.softness_m), 0)
+        short_m = jax.vmap(lambda index: control.short_of(index, given.pose))(waypoints)
+        leaves = jnp.where(given.located & given.decided, _beyond(-short_m, self.softness_m), 0)
         moved = state.shares[:-1] * leaves
         nothing = jnp.zeros(1, moved.dtype)
         shares = state.shares - jnp.append(moved, nothing) + jnp.append(nothing, moved)
 
-        given = ControlInput(pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps)
-
-        def towards(index: Array, integral_ms: Array) -> tuple[ControlState, Command, ControlLog]:
+        def towards(index: Array, integral_ms: Array) -> tuple[ControlState, Any, ControlLog]:
             hard = ControlState(index, integral_ms, state.explored_s, state.side)
             after, command, _, log = control.towards(hard, given)
             return after, command, log
@@ -89,7 +85,7 @@ class SoftController(eqx.Module):
             shares=shares,
             moved=moved,
             integrals_ms=integrals_ms,
-            commands=jnp.stack([commands.throttle, commands.steering_rad]),
+            commands=jnp.stack(jax.tree.leaves(commands)),
         )
         return state, command, done, jax.tree.map(lambda leaf: leaf[most], logs)
 
@@ -98,12 +94,10 @@ def soften_switch(navigator: Navigator, softness_m: float | Float[Array, ""]) ->
     """The navigator, with a soft switch from waypoint to waypoint.
 
     Raises:
-        ValueError: it has no route, or drives no car.
+        ValueError: it has no route.
     """
     if navigator.controller is None:
         raise ValueError("a navigator without waypoints has no drive to be tuned")
-    if not isinstance(navigator.controller, Controller):
-        raise ValueError("only the gains of a car's controller can be tuned")
     soft = SoftController(
         navigator.controller,
         jnp.asarray(softness_m, navigator.controller.waypoint_radius_m.dtype),

@@ -21,7 +21,7 @@ from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.camera import Camera
 from jaxnav.models.lenses import LENSES
 from jaxnav.models.rig import CameraRig
-from jaxnav.parameters import parameters_of
+from jaxnav.parameters import TUNABLES, parameters_of
 from jaxnav.recording.drive_format import decode, encode
 from jaxnav.recording.drive_setup import (
     PILOT_SELECTORS,
@@ -231,7 +231,7 @@ def _without(header: dict, key: str) -> dict:
         (lambda h: h | {"parameters": [1]}, "parameters: must be a mapping, got [1]"),
         (
             lambda h: h | {"parameters": {"motion.speed": 1}},
-            "parameters.motion.speed: unknown: expected one of motion.acceleration_density, ",
+            f"parameters.motion.speed: unknown: of {len(TUNABLES)} names the nearest are motion.",
         ),
         (
             lambda h: h | {"parameters": {"motion.odometry_sigma": [1, -1, 1]}},

@@ -16,9 +16,11 @@ from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.map_fit import fit_poses
 from jaxnav.models.bicycle import advance
 from jaxnav.models.geometry import cayley, planar_from_T_world_vehicle
+from jaxnav.models.gyro import Gyro
+from jaxnav.models.twist_base import TWIST_AS_TOLD, TwistBase
 from jaxnav.navigator import Navigator
-from jaxnav.parameters import with_parameters
-from jaxnav.pose.observation import Snapshot
+from jaxnav.parameters import parameters_of, with_parameters
+from jaxnav.pose.observation import Observation, Snapshot
 from jaxnav.simulation.rollout import Rollout
 from jaxnav.simulation.scenarios import scenarios
 from jaxnav.tuning import branches
@@ -263,6 +265,45 @@ def test_gradients_are_central_differences(loss):
     np.testing.assert_allclose(found, numeric, rtol=1e-4, atol=1e-5 * np.abs(numeric).max())
     named = [np.abs(found[np.array(SPACE.labels) == name]).max() for name in SPACE.free]
     assert np.min(named) > 1e-5  # the floors are a tenth of a millimetre
+
+
+def test_a_gyro_s_numbers_are_learned_by_their_gradients():
+    """Of a base that drives, slips and stands: against central differences of what is predicted."""
+    gyro = Gyro(2e-3, 0.02, 0.02, 30.0, 0.02, delay_sigma_s=0.02)
+    base = TwistBase.create(1.0, 4.0, 0.15, sensor_sigma=TWIST_AS_TOLD, gyro=gyro)
+    navigator = Navigator(RIG, MARKERS, base)
+    names = [name for name in parameters_of(navigator) if ".gyro." in name]
+    assert len(names) == 5
+    space = Space.of(navigator, dict.fromkeys(names, True))
+    turns = jnp.asarray([[0.3, 1.0, 1.03], [0.3, 1.4, 0.9], [0.0, 0.0, 0.02], [0.0, 0.0, 0.02]])
+    weights = jnp.asarray(
+        np.random.default_rng(0).normal(size=(navigator.motion.init().mean.size,))
+    )
+
+    @jax.jit
+    @jax.value_and_grad
+    def value(step):
+        motion = with_parameters(navigator, space.values(space.start + step)).motion
+        bank = eqx.tree_at(lambda b: b.initialised, motion.init(), jnp.ones(1, bool))
+
+        def interval(bank, told):
+            ahead_mps, wheels, read = told
+            zero = jnp.zeros(())
+            obs = Observation(
+                jnp.zeros((1, 1, 4, 2)), jnp.zeros((1, 1), bool), dt_s=0.2,
+                twist=jnp.stack([ahead_mps, zero, zero, zero, zero, wheels]),
+                gyro_radps=jnp.stack([zero, zero, read]),
+            )  # fmt: skip
+            return motion.predict(bank, obs), None
+
+        bank = jax.lax.scan(interval, bank, turns)[0]
+        return jnp.sum(weights * bank.mean[0]) + weights @ bank.covariance[0] @ weights
+
+    step = 1e-4 * jnp.eye(space.start.size)
+    found = value(0 * space.start)[1]
+    numeric = [(value(d)[0] - value(-d)[0]) / 2e-4 for d in step]
+    np.testing.assert_allclose(found, numeric, rtol=1e-5, atol=1e-9)
+    assert np.abs(found).min() > 1e-6
 
 
 def test_frames_that_are_not_used_say_nothing():

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 
@@ -12,6 +13,8 @@ from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.control import Command, ControlState
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.geometry import planar_from_T_world_vehicle
+from jaxnav.models.gyro import Gyro
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator, State
 from jaxnav.parameters import with_parameters
 from jaxnav.simulation.plant import CarState, OdometryNoise
@@ -22,9 +25,11 @@ from jaxnav.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss
 from jaxnav.tuning.driving import ClosedLoop, without_gradient
 from jaxnav.tuning.soft_switch import SoftController, SoftState, soften_switch
 from jaxnav.tuning.unconstrained import Space
+from jaxnav.twist_control import TwistCommand, follower_along
 from tests import worlds
 
 RIG, MARKERS, CAR = worlds.qcar_rig().first(1), worlds.paper_markers(), worlds.qcar()
+BASE = TwistBase.create(0.8, 4.0, 0.15)
 GAINS = [
     f"controller.{name}"
     for name in (
@@ -112,6 +117,44 @@ def test_derivatives_are_those_of_the_soft_drive(tame):
         )
     assert np.abs(of(space, slopes, "controller.proportional_per_m")).min() > 1e-3
     assert without_gradient(slopes, space.labels) == []
+
+
+class TurnsByGyro(Knows):
+    """Steers by a heading that is off by what the gyro reads, as a filter's is."""
+
+    def step(self, state, obs):
+        true, (_, _, rate) = obs.T_world_vehicle_true, obs.gyro_radps
+        turn = jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(0.05 * jnp.nan_to_num(rate)))
+        still = jnp.zeros_like(rate)
+        obs = dataclasses.replace(
+            obs, T_world_vehicle_true=true @ turn, speed_mps=still, steering_rad=still
+        )
+        return super().step(state, obs)
+
+
+@pytest.mark.parametrize("left_limit_mps", [0.0, 0.6], ids=["differential", "omni"])
+def test_derivatives_of_a_base_s_drive(left_limit_mps):
+    """Against central differences, with a gyro that reads what the gains have made it turn."""
+    gyro = Gyro(2e-3, 0.02, 1e-4, 30.0, 0.01, delay_s=0.03)
+    base = TwistBase.create(0.8, 4.0, 0.15, left_limit_mps, gyro=gyro)
+    names = [f"controller.{name}" for name in ("speed_mps", "slows_per_s", "turns_per_s")]
+    steers = TurnsByGyro(RIG, MARKERS, base, worlds.WAYPOINTS_M, selector=LowestReprojection())
+    rollout = Rollout(steers, base, MARKERS, scenario(), 1.0, spread=SPREAD, chunk_frames=45)
+    closed = ClosedLoop(rollout, DriveLoss(), 0.03)
+    space, seeds = Space.of(steers, dict.fromkeys(names, True)), keys(jnp.arange(3))
+    _, slopes = closed.value_and_grad(space.start, space, seeds)
+    step = 1e-5
+    for name in names:
+        ahead, behind = (
+            closed.value_and_grad(moved(space, name, d), space, seeds)[0] for d in (step, -step)
+        )
+        numeric = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(
+            of(space, slopes, name), numeric, rtol=1e-4, atol=1e-6, err_msg=name
+        )
+    # What moves to its left never turns on the spot.
+    idle = names[2:] if left_limit_mps else []
+    assert without_gradient(slopes, space.labels) == idle
 
 
 def test_derivatives_are_those_of_the_hard_drives_on_average(tame):
@@ -243,25 +286,27 @@ def test_a_drive_without_arrival_pays_for_all_its_time():
 
 
 def frame_costs(
-    state, car=(0.0, 0.0, 0.0), old=(0.0, 0.0), new=(0.0, 0.0), was=None, **others
+    state, car=(0.0, 0.0, 0.0), old=(0.0, 0.0), new=(0.0, 0.0), was=None, of=Command, **others
 ) -> Costs:
-    """Of one frame of a route from (0, 0) to (2, 0) and on to (2, 2)."""
+    """Of one frame of a route from (0, 0) to (2, 0) and on to (2, 2), with the commands `of`."""
     route = scenario(waypoints_m=((2.0, 0.0), (2.0, 2.0)))
     zero = jnp.zeros(())
     common = {
-        "truth": nominal(CAR, route, jax.random.key(0), jnp.zeros(()).dtype),
+        "truth": nominal(
+            CAR if of is Command else BASE, route, jax.random.key(0), jnp.zeros(()).dtype
+        ),
         "start_pose": jnp.zeros(3),
         "passed": 2,
         "on_floor": jnp.asarray(True),
     }
     before = SimpleNamespace(
-        command=Command(*map(jnp.asarray, old)),
+        command=of(*map(jnp.asarray, old)),
         ended=jnp.asarray(False),
         frame=jnp.asarray(9),
         state=SimpleNamespace(control=was),
     )
     after = SimpleNamespace(
-        command=Command(*map(jnp.asarray, new)),
+        command=of(*map(jnp.asarray, new)),
         car=CarState(jnp.asarray(car), zero, zero),
         state=SimpleNamespace(control=state),
         **common | {"ended": jnp.asarray(False)} | others,
@@ -284,10 +329,10 @@ def test_what_a_frame_costs():
     np.testing.assert_allclose(second.off_line_m2s, 1.5**2 * period_s)
     # A quarter done, the rest half and half.
     # A quarter done; of the rest a third has just come from the first waypoint to the second.
-    zero, commands = jnp.zeros(()), jnp.asarray([[0.15, -0.15], [0.0, 0.0]])
+    zero, commands = jnp.zeros(()), jnp.asarray([[0.0, 0.0], [0.15, -0.15]])
     shares, moved = jnp.asarray([0.375, 0.375, 0.25]), jnp.asarray([0.25, 0.0])
     old = SoftState(jnp.asarray(0), zero, zero, zero, shares, moved, jnp.zeros(2), commands)
-    new = dataclasses.replace(old, commands=jnp.asarray([[0.15, -0.15], [0.25, 0.0]]))
+    new = dataclasses.replace(old, commands=jnp.asarray([[0.25, 0.0], [0.15, -0.15]]))
     soft = frame_costs(new, (0.5, -0.3, 1.0), was=old)
     np.testing.assert_allclose(soft.time_s, 0.75 * period_s)
     np.testing.assert_allclose(soft.off_line_m2s, 0.375 * (0.09 + 2.25) * period_s)
@@ -297,6 +342,14 @@ def test_what_a_frame_costs():
     assert all(leaf == 0 for leaf in jax.tree.leaves(done))
     lost = frame_costs(heading_for(2), ended=jnp.asarray(True), passed=1)
     np.testing.assert_allclose(lost.time_s, (180 - 9) * period_s)
+
+
+def test_what_a_frame_of_a_base_costs():
+    """Its twist as fractions of its limits; to its left it can't be told to move."""
+    twists = (0.2, 0.0, 1.0), (0.4, 0.0, -2.0)  # of 0.8 m/s, 0, 4 rad/s
+    costs = frame_costs(heading_for(0), old=twists[0], new=twists[1], of=TwistCommand)
+    np.testing.assert_allclose(costs.effort_s, (0.25 + 0.25) / 15)
+    np.testing.assert_allclose(costs.change, 0.25**2 + 0.75**2)
 
 
 def test_each_part_is_weighed_by_itself():
@@ -310,9 +363,11 @@ def test_each_part_is_weighed_by_itself():
     assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(slopes))
 
 
-def test_the_soft_switch_has_finite_derivatives_wherever_the_car_is(precision):
+@pytest.mark.parametrize("vehicle", [CAR, BASE], ids=["car", "base"])
+def test_the_soft_switch_has_finite_derivatives_wherever_the_car_is(precision, vehicle):
     """On a waypoint, standing still, far away."""
-    controller = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision), driver().controller)
+    hard = driver().controller if vehicle is CAR else follower_along(worlds.WAYPOINTS_M, BASE, 0.15)
+    controller = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision), hard)
 
     @jax.jit
     @jax.grad
@@ -322,7 +377,7 @@ def test_the_soft_switch_has_finite_derivatives_wherever_the_car_is(precision):
         state, total = soft.init(), jnp.zeros((), precision)
         for _ in range(3):
             state, command, _, log = soft(state, pose, jnp.asarray(True), steering_rad, dt_s)
-            total = total + command.throttle + command.steering_rad + log.alpha_rad
+            total = total + sum(jax.tree.leaves(command)) + log.alpha_rad
         return total + jnp.sum(state.integrals_ms) + state.shares[-1]
 
     for pose in ((1.3, 0.0, 0.0), (0.5, 0.65, 1.0), (1.3, 0.15, 0.0), (1e3, -1e3, 9.0)):

@@ -7,22 +7,20 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
-    Base,
     Count,
     Detector,
     Following,
     Headless,
-    Imu,
     NotNegative,
     NotNegativeCount,
     OptionalFile,
     Positive,
-    QCarBicycle,
     QCarFile,
     QCarMarkers,
     QCarRig,
     QCarVehicle,
     Scenario,
+    ScenarioCarFiles,
     Seed,
     Selector,
     SimulatedSelector,
@@ -73,7 +71,7 @@ class Demo(Headless):
 
 
 @dataclass(frozen=True)
-class Simulate(Headless):
+class Simulate(ScenarioCarFiles):
     """Drive many seeds at corner level, without images, and count what became of them.
 
     Prints a table, one row for each selector and noise level. A drive succeeds when the true car
@@ -86,11 +84,6 @@ class Simulate(Headless):
 
     scenario: Scenario = "paper"
     """What happens: the paper's drive, or one with trouble in it."""
-    base: Base = "ackermann"
-    """What drives: the vehicle, or a base of the QCar's size that is commanded by a twist."""
-    imu: Imu = "none"
-    """The vehicle's gyro: as its file says, or one of that class, with errors drawn anew for each
-    drive."""
     laps: NotNegativeCount = 0
     """Drive this many laps before the marker, 6 m and 18 s each, instead of the scenario's
     own route, for errors that repeat: `paper` is then the clean drive to compare with."""
@@ -106,9 +99,6 @@ class Simulate(Headless):
     """How many drives."""
     seed: Seed = 0
     """The first seed."""
-    rig: QCarRig = None
-    markers: QCarMarkers = None
-    vehicle: QCarBicycle = None
     params: OptionalFile = None
     """Tuned parameters, before what the scenario tells; --told-noise-px goes before both."""
     json: OptionalFile = None
@@ -117,8 +107,7 @@ class Simulate(Headless):
     """Keep the rows that --json holds already."""
 
     def _check(self) -> None:
-        named = self.base == "ackermann" or self.vehicle is None
-        require(named, "--base", f"{self.base} takes the place of --vehicle: give one of them")
+        super()._check()
         require(self.laps <= 100, "--laps", f"must be at most 100, got {self.laps}")
         require(bool(self.selector), "--selector", "names no selector")
         require(bool(self.corner_noise_px), "--corner-noise-px", "holds no number")

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 from jaxnav.belief.ambiguity import Selector
 from jaxnav.belief.bicycle_kalman import BicycleKalman
-from jaxnav.commands.simulate.arguments import Simulate
-from jaxnav.commands.tune.arguments import TuneController, TuneFilter
+from jaxnav.commands.kinds import ScenarioCarFiles
 from jaxnav.files import Params, apply_params, calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
@@ -26,22 +25,18 @@ class ScenarioCar:
     params: Params | None
 
     @staticmethod
-    def load(
-        files: Simulate | TuneFilter | TuneController, params: Params | None = None
-    ) -> "ScenarioCar":
+    def load(files: ScenarioCarFiles, params: Params | None = None) -> "ScenarioCar":
         """Load a car from its files.
 
         Raises:
             BadInput: a file that is not valid.
         """
         qcar = calib_dir() / "qcar"
-        vehicle: Vehicle | TwistBase = load_vehicle(files.vehicle or qcar / "vehicle.yaml")
-        if isinstance(files, Simulate):
-            vehicle = equipped(vehicle, files.base, files.imu)
+        vehicle = load_vehicle(files.vehicle or qcar / "vehicle.yaml")
         return ScenarioCar(
             rig=load_rig(files.rig or qcar / "rig.yaml"),
             markers=load_markers(files.markers or qcar / "markers.yaml"),
-            vehicle=vehicle,
+            vehicle=equipped(vehicle, files.base, files.imu),
             params=params,
         )
 

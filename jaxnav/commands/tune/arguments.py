@@ -10,15 +10,12 @@ from jaxnav.commands.kinds import (
     Believed,
     CornerSigma,
     Count,
-    Headless,
     NotNegative,
     OptionalFile,
     Positive,
-    QCarBicycle,
-    QCarMarkers,
-    QCarRig,
     ResultsFolder,
     Scenario,
+    ScenarioCarFiles,
     Seed,
     optional,
     require,
@@ -28,7 +25,7 @@ _Names = Annotated[tuple[str, ...], optional("NAME", "")]
 
 
 @dataclass(frozen=True)
-class TuneFilter(Headless):
+class TuneFilter(ScenarioCarFiles):
     """Learn the filter's noise, Q and R, from recordings or from simulated drives.
 
     By default it asks no truth: it makes the corners of every frame as likely as can be, given all
@@ -66,8 +63,8 @@ class TuneFilter(Headless):
     """Likelihood of the corners, which asks no truth; density of the true pose under what is
     believed; or squared position error."""
     train: _Names = ()
-    """Parameters to learn, e.g. motion.odometry_sigma corner_sigma_px; by default of a car Q and
-    all of R that this selector looks at, of a rig Q."""
+    """Parameters to learn, e.g. motion.odometry_sigma corner_sigma_px; by default of a vehicle Q
+    and all of R that this selector looks at, of a rig Q."""
     full: _Names = ()
     """Those that are to be whole matrices."""
     params: OptionalFile = None
@@ -75,12 +72,13 @@ class TuneFilter(Headless):
     selector: Believed = "multi-hypothesis"
     steps: Count = 150
     """At most so many evaluations."""
-    rig: QCarRig = None
-    markers: QCarMarkers = None
-    vehicle: QCarBicycle = None
     out: ResultsFolder = Path("tuned")
 
     def _check(self) -> None:
+        super()._check()
+        for flag, plain in (("--base", self.base == "ackermann"), ("--imu", self.imu == "none")):
+            alone = plain or not self.recordings
+            require(alone, flag, "is of simulated drives: recordings tell what drove")
         require(0 <= self.seed < 10**6, "--seed", f"must be from 0 to 999999, got {self.seed}")
         most = 10**6 - self.seed - self.seeds
         require(self.held_out_seeds <= most, "--seeds", "test drives count from a million on")
@@ -90,7 +88,7 @@ class TuneFilter(Headless):
 
 
 @dataclass(frozen=True)
-class TuneController(Headless):
+class TuneController(ScenarioCarFiles):
     """Learn the controller's gains from simulated drives.
 
     The loss of a drive is a weighed sum of the time to the last waypoint, the distance from the
@@ -127,7 +125,8 @@ class TuneController(Headless):
     smoothness: NotNegative = 0.045
     """Weight of the squared changes of the commands from frame to frame."""
     train: _Names = ()
-    """Parameters to learn; by default p1, p2, its bound, look-ahead and slowing down in turns."""
+    """Parameters to learn; by default of a car p1, p2, its bound, look-ahead and slowing down in
+    turns, of another base its speed, how it slows down, and how fast it turns on the spot."""
     params: OptionalFile = None
     """Where to start: a file of parameters."""
     selector: Believed = "multi-hypothesis"
@@ -135,12 +134,10 @@ class TuneController(Headless):
     """At most so many."""
     learning_rate: Positive = 0.25
     """Of Adam, at the first step; a tenth of it at the last."""
-    rig: QCarRig = None
-    markers: QCarMarkers = None
-    vehicle: QCarBicycle = None
     out: ResultsFolder = Path("tuned")
 
     def _check(self) -> None:
+        super()._check()
         require(bool(self.test_scenario), "--test-scenario", "names no scenario")
         total = self.time + self.cross_track + self.effort + self.smoothness
         require(total > 0, "--time", "is 0 as all other weights are: there is nothing to lower")

@@ -33,13 +33,15 @@ from jaxnav.tuning.fit import Problem, TuningFit
 from jaxnav.tuning.objective import Batch, NotFinite
 from jaxnav.tuning.unconstrained import Space
 
-GAINS = (
+_CAR = (
     "controller.proportional_per_m",
     "controller.integral_per_ms",
     "controller.integral_limit_ms",
     "controller.lookahead_m",
     "controller.slows_at_rad",
 )
+_BASE = ("controller.speed_mps", "controller.slows_per_s")
+_ON_THE_SPOT = ("controller.turns_per_s",)
 # The spread between the cars; most odometers report too much where wheels slip.
 _CARS = Spread(odometer_scale=(0.95, 1.2))
 _SOFTNESS_M = (0.06, 0.01)  # of the switch between waypoints, at the first step and at the last
@@ -82,8 +84,6 @@ def closed_loop(args: Arguments, name: str, params: Params | None = None) -> Clo
     if not scenario.drives:
         raise BadInput("--scenario", f"nothing drives in {name}")
     car = ScenarioCar.load(args, params)
-    if isinstance(car.vehicle, TwistBase):
-        raise BadInput("--vehicle", "is no Ackermann car: only the gains of a car can be learned")
     navigator = car.navigator(scenario, make_selector(args.selector))
     noise_px = jnp.asarray(args.corner_noise_px)
     rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px, spread=_CARS)
@@ -101,7 +101,15 @@ def gains_of(args: Arguments, navigator: Navigator) -> Space:
         if name not in known:
             expected = ", ".join(known)
             raise BadInput("--train", f"there is no {name} to learn: expected one of {expected}")
-    return Space.of(navigator, dict.fromkeys(args.train or GAINS, True))
+    return Space.of(navigator, dict.fromkeys(args.train or _by_default(navigator), True))
+
+
+def _by_default(navigator: Navigator) -> tuple[str, ...]:
+    """The default names: all on which the drives of a vehicle depend."""
+    vehicle = None if navigator.controller is None else navigator.controller.vehicle
+    if not isinstance(vehicle, TwistBase):
+        return _CAR
+    return _BASE if vehicle.left_limit_mps > 0 else (*_BASE, *_ON_THE_SPOT)
 
 
 class Gains:

@@ -143,7 +143,6 @@ def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> NamedS
     if path.suffix == _DRIVE:
         log = read_shown(path, args.headless)
         setup = DriveSetup.of_header(log.header, path)
-        setup.car(path)
         return NamedSequences(str(path), setup.navigator(), sequences_of_drive(log, setup, part))
     recording = read_recording(
         path,

@@ -1,11 +1,12 @@
 """Recorded drives as sequences of equal length to tune a filter on.
 
 Inputs of a recorded drive are treated as the pilot treats them: the same stamps, frames and
-readings are believed. But they are in the order of their stamps, as if nothing had ever come late.
+readings are believed, corrected as the vehicle's file says. But they are in the order of their
+stamps, as if nothing had ever come late.
 """
 
-import math
 from collections.abc import Collection, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,11 +16,16 @@ from jaxtyping import Bool, Float
 
 from jaxnav.commands.tune.sequences import IDENTITY, bounds, cut, maps, observations, side_by_side
 from jaxnav.errors import BadInput
+from jaxnav.loop.chassis import chassis_of
+from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.flags import Reject
 from jaxnav.loop.frames import FrameIntake
+from jaxnav.loop.gyro_track import GyroTrack
 from jaxnav.loop.history import EventData
 from jaxnav.loop.pilot import Input
-from jaxnav.loop.stamps import Stamps
+from jaxnav.loop.stamps import OLD_NS, Stamps
+from jaxnav.models.gyro import Gyro
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_replay import check_inputs
 from jaxnav.recording.drive_setup import DriveSetup
@@ -38,9 +44,10 @@ class Event(NamedTuple):
 def sequences_of_drive(
     log: DriveLog, setup: DriveSetup, part: tuple[float, float], length: int = 400
 ) -> FrameSequences:
-    """Sequences of a drive. The car's true pose is unknown, so that no frame is judged.
+    """Sequences of a drive. The vehicle's true pose is unknown, so that no frame is judged.
 
-    Odometry that the pilot refused on the way is left out.
+    Odometry that the pilot refused on the way is left out. Where the vehicle has a gyro, every
+    event has its mean rate since the event before.
 
     Args:
         setup: its `navigator()` goes with the sequences.
@@ -79,19 +86,22 @@ def sequences_of_inputs(
     if not any(event.data.corners_px is not None for event in events[begin:end]):
         problem = f"{end - begin} of its {len(events)} events, and none shows a marker of the map"
         raise BadInput(where, problem)
-    rows = _Rows.of(events, len(setup.rig), len(setup.markers.ids))
+    rows = _Rows.of(events, setup)
     indices, used = side_by_side(cut(np.arange(begin, end), length))
     stamps_us = rows.stamps_us[indices]
     dt_s = np.diff(stamps_us, axis=1, prepend=stamps_us[:, :1]) * 1e-6
     lanes = np.tile(np.arange(len(setup.markers.ids)), (len(indices), 1))
+    told = rows.wheels()
+    if setup.vehicle.gyro is not None:
+        told["gyro_radps"] = np.zeros((len(events), 3))
+        told["gyro_radps"][:, 2] = _mean_rates(inputs, events, setup.vehicle.gyro)
     obs = observations(
         corners_px=jnp.asarray(rows.corners_px[indices], float),
         visible=jnp.asarray(rows.visible[indices] & used[..., None, None]),
         corner_sigma_px=jnp.asarray(rows.sigma_px[indices], float),
-        speed_mps=jnp.asarray(rows.odometry[indices, 0], float),
-        steering_rad=jnp.asarray(rows.odometry[indices, 1], float),
         has_odometry=jnp.asarray(rows.has_odometry[indices] & used),
         dt_s=jnp.asarray(dt_s, float),
+        **{name: jnp.asarray(values[indices], float) for name, values in told.items()},
     )
     return FrameSequences(
         markers=maps(setup.markers, lanes),
@@ -124,19 +134,37 @@ def _read_events(
 ) -> Iterator[Event]:
     """Events of the inputs that `Pilot.handle` would believe, without an estimate."""
     frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
-    stamps = Stamps()
+    stamps, chassis = Stamps(), chassis_of(setup.vehicle)
+    corrections = Corrections.of(setup.vehicle)
     for given in inputs:
-        data, data_ns, _ = frames.check(given.frames, given.now_ns)
+        seen = [corrections.correct_frame(frame) for frame in given.frames]
+        data, data_ns, _ = frames.check(seen, given.now_ns)
         if data is not None:
             yield Event(data_ns, data)
-        reading = given.odometry
-        if reading is None:
+        if given.odometry is None:
             continue
+        reading = corrections.correct_reading(given.odometry)
         stamp_ns = stamps.take(reading.stamp_ns, given.now_ns)
-        odometry = reading.values
-        believed = reading.valid and all(map(math.isfinite, odometry))
+        believed = reading.valid and chassis.reads(reading)
         if stamp_ns is not None and believed and given.now_ns not in refused_ns:
-            yield Event(stamp_ns, EventData(odometry=odometry))
+            yield Event(stamp_ns, EventData(odometry=reading.values))
+
+
+def _mean_rates(
+    inputs: Sequence[Input], events: Sequence[Event], gyro: Gyro
+) -> Float[np.ndarray, " N"]:
+    """What a gyro tells of the interval before each event, rad/s; NaN where it tells nothing."""
+    track = GyroTrack(float(gyro.saturation_radps))
+    told = iter(given for given in inputs if given.gyro)
+    given = next(told, None)
+    rates = np.full(len(events), np.nan)
+    for index, (before, event) in enumerate(pairwise(events), 1):
+        # Readings are late by less than this, and the track is longer.
+        while given is not None and given.now_ns <= event.stamp_ns + OLD_NS:
+            track.take(given.gyro, given.now_ns)
+            given = next(told, None)
+        rates[index] = track.mean_radps(before.stamp_ns, event.stamp_ns)
+    return rates
 
 
 def _order(event: Event) -> tuple[int, bool]:
@@ -168,25 +196,26 @@ class _Rows(NamedTuple):
     """N events as arrays."""
 
     stamps_us: np.ndarray
-    odometry: Float[np.ndarray, "N 2"]  # speed_mps, steering_rad: the last known
+    odometry: Float[np.ndarray, "N values"]  # of the last reading, see `interfaces`
     has_odometry: Bool[np.ndarray, " N"]
     corners_px: Float[np.ndarray, "N C M 4 2"]
     visible: Bool[np.ndarray, "N C M"]
     sigma_px: Float[np.ndarray, "N C M 4"]
 
     @staticmethod
-    def of(events: Sequence[Event], cameras: int, markers: int) -> "_Rows":
+    def of(events: Sequence[Event], setup: DriveSetup) -> "_Rows":
         """Arrays of the events, with stamps in whole microseconds as the pilot counts them."""
-        lanes = (len(events), cameras, markers)
+        values = 3 if isinstance(setup.vehicle, TwistBase) else 2
+        lanes = (len(events), len(setup.rig), len(setup.markers.ids))
         rows = _Rows(
             stamps_us=np.array([event.stamp_ns // _NS_PER_US for event in events], np.int64),
-            odometry=np.zeros((len(events), 2)),
+            odometry=np.zeros((len(events), values)),
             has_odometry=np.array([event.data.odometry is not None for event in events], bool),
             corners_px=np.zeros((*lanes, 4, 2)),
             visible=np.zeros(lanes, bool),
             sigma_px=np.ones((*lanes, 4)),
         )
-        odometry: tuple[float, ...] = (0.0, 0.0)
+        odometry: tuple[float, ...] = (0.0,) * values
         for index, (_, data) in enumerate(events):
             odometry = data.odometry or odometry
             rows.odometry[index] = odometry
@@ -195,3 +224,11 @@ class _Rows(NamedTuple):
                 rows.visible[index] = data.visible
                 rows.sigma_px[index] = data.sigma_px
         return rows
+
+    def wheels(self) -> dict[str, np.ndarray]:
+        """The fields of an `Observation` that the odometry fills, (N, ...) each."""
+        if self.odometry.shape[1] == 2:
+            return {"speed_mps": self.odometry[:, 0], "steering_rad": self.odometry[:, 1]}
+        twist = np.zeros((len(self.odometry), 6))
+        twist[:, [0, 1, 5]] = self.odometry
+        return {"twist": twist}

@@ -80,16 +80,18 @@ def space_of(args: Arguments, navigator: Navigator, learned: FrameSequences) -> 
 
 
 def _by_default(navigator: Navigator, learned: FrameSequences) -> tuple[str, ...]:
-    """The default names: Q and all of R that the estimator uses for a car; Q alone for a free body,
-    whose recordings tell by themselves how far its corners scatter."""
+    """The default names: Q and all of R that the estimator uses for a vehicle; Q alone for a free
+    body, whose recordings tell by themselves how far its corners scatter."""
     names = ("motion.acceleration_density",)
     if not isinstance(navigator.motion, BicycleKalman):
         return names
+    has_gyro = navigator.motion.vehicle.gyro is not None
+    gyro = ("motion.vehicle.gyro.noise_density",) if has_gyro else ()
     is_bank = isinstance(navigator.selector, MultiHypothesis)
     floors = ("selector.floor_m", "selector.floor_rad") if is_bank else ("motion.vision_floor",)
     brings_sigma = learned.obs.corner_sigma_px is not None
     corners = "model_sigma_px" if brings_sigma else "corner_sigma_px"
-    return (*names, "motion.odometry_sigma", *floors, corners)
+    return (*names, "motion.odometry_sigma", *gyro, *floors, corners)
 
 
 def _problem(args: Arguments, cost: FilterCost, objective: Objective, data: TuningData) -> Problem:

@@ -39,6 +39,8 @@ FEW = ("--seeds", "2", "--held-out-seeds", "1", "--test-seeds", "2")
         (("filter", "--part", "0.5", "0.5"), "--part: must be two parts"),
         (("filter", "--corner-noise-px", "nan"), "--corner-noise-px: must be positive"),
         (("filter", "nowhere.mcap"), "nowhere.mcap: "),
+        (("filter", "drive.mcap", "--imu", "consumer"), "--imu: is of simulated drives"),
+        (("controller", "--base", "omni", "--vehicle", "v.yaml"), "--base: omni takes the place"),
         (("filter", "--params", "nowhere.yaml"), "nowhere.yaml: "),
         (("controller", "--steps", "0"), "--steps: must be at least 1"),
         (("controller", "--effort", "-1"), "--effort: must not be negative"),
