@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.belief.bank import Bank, heaviest
-from jaxnav.belief.estimate import Belief
+from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.smoothing import Trail, doubt
 from jaxnav.models.geometry import rotation_error_rad
-from jaxnav.navigator import Navigator, Output
+from jaxnav.navigator import Navigator
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Observation
 
@@ -27,10 +27,10 @@ class Kept(eqx.Module):
     candidates: Candidates
 
     @staticmethod
-    def of(belief: Belief, output: Output) -> "Kept":
+    def of(belief: Belief, estimate: Estimate) -> "Kept":
         """What is kept of one frame."""
         bare = eqx.tree_at(lambda b: b.repeats, belief, None, is_leaf=lambda leaf: leaf is None)
-        return Kept(bare, output.candidates)
+        return Kept(bare, estimate.candidates)
 
 
 class Packed(NamedTuple):
@@ -101,10 +101,10 @@ class Localised(eqx.Module):
     selected: Int[Array, "..."]  # of the candidates; -1: none
 
     @staticmethod
-    def of(output: Output) -> "Localised":
+    def of(estimate: Estimate) -> "Localised":
         """What a filter has said of one frame."""
-        same = {f.name: getattr(output, f.name) for f in dataclasses.fields(Localised)}
-        same["covariance"] = output.covariance[:6, :6]
+        same = {f.name: getattr(estimate, f.name) for f in dataclasses.fields(Localised)}
+        same["covariance"] = estimate.covariance[:6, :6]
         return Localised(**same)
 
 

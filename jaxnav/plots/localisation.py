@@ -48,6 +48,7 @@ def localisation_report(
     markers_m: Float[np.ndarray, "M 4 3"],
     title: str = "",
     connected: bool = True,
+    names: tuple[str, str] = ("estimate", "reference"),
 ) -> Figure:
     """Draw a localised recording: the track from above and from the side, and errors over time.
 
@@ -59,6 +60,7 @@ def localisation_report(
         markers_m: (M, 4, 3) corners in the world.
         title: above everything.
         connected: whether successive positions belong to one track; points otherwise.
+        names: of the two tracks.
     """
     style: dict[str, Any] = (
         {"ls": "--", "lw": 1} if connected else {"ls": "", "marker": ".", "ms": 1.5}
@@ -68,12 +70,10 @@ def localisation_report(
     grid = figure.add_gridspec(1 + len(errors), 2, height_ratios=(2.6, *[1] * len(errors)))
     for column, (first, second) in enumerate(((0, 1), (0, 2))):
         axes = figure.add_subplot(grid[0, column])
-        axes.plot(
-            estimate_m[:, first], estimate_m[:, second], color=BLUE, label="estimate", **style
-        )
+        axes.plot(estimate_m[:, first], estimate_m[:, second], color=BLUE, label=names[0], **style)
         if reference_m is not None:
             axes.plot(
-                reference_m[:, first], reference_m[:, second], color=BLACK, lw=1, label="reference"
+                reference_m[:, first], reference_m[:, second], color=BLACK, lw=1, label=names[1]
             )
             _fit_view(axes, np.vstack([reference_m, markers_m.reshape(-1, 3)])[:, [first, second]])
         for corners in markers_m:

@@ -214,8 +214,8 @@ class ReplayRecording(Headless):
     without_odometry: Switch = False
     """Localise a rig by its cameras alone, also where an IMU or odometry is recorded."""
     smooth: Switch = False
-    """Of a rig: tell each pose what was seen after it as well as before, both branches weighed over
-    all of it; the trajectory goes on where no marker is seen."""
+    """Tell each pose what was seen after it as well as before, both branches weighed over all of
+    it; the trajectory goes on where no marker is seen. Of a drive it is smoothed.tum."""
     limit: Annotated[int | None, optional("N", "(default: all)", int), AT_LEAST_1] = None
     """Stop after N frames, of a drive after N inputs."""
     out: ResultsFolder = Path("out")

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
+from jaxnav.commands.drive import replay_smoothed
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import flag_of
 from jaxnav.commands.pictures import corners_in_world, save_figure
@@ -32,6 +33,7 @@ from jaxnav.files import (
 from jaxnav.loop.flags import Fault, Health, Reject, names
 from jaxnav.loop.pilot import Input, Outcome
 from jaxnav.plots.localisation import localisation_report
+from jaxnav.recording.drive_events import DriveEvents, refused_odometry
 from jaxnav.recording.drive_format import PROFILE
 from jaxnav.recording.drive_log import DriveLog
 from jaxnav.recording.drive_replay import (
@@ -50,7 +52,7 @@ from jaxnav.recording.recorder import Recorder
 
 EXIT_DIFFERS = 1
 _FILES = ("rig", "markers", "vehicle", "route")
-_FOR_RIGS = ("one_at_a_time", "without_odometry", "smooth")
+_FOR_RIGS = ("one_at_a_time", "without_odometry")
 _FOR_DRIVES = ("vehicle", "route", "images", "record_anew")
 _OVERRIDES = (
     *("rig", "markers", "vehicle", "route", "params"),
@@ -127,14 +129,9 @@ class Track:
         """Root mean square differences from the recorded track."""
         shift_m, turn_rad = self.distances_to(recorded)
         return {
-            "rms_position_difference_m": _rms(shift_m),
-            "rms_heading_difference_deg": np.rad2deg(_rms(turn_rad)),
+            "rms_position_difference_m": replay_smoothed.rms(shift_m),
+            "rms_heading_difference_deg": np.rad2deg(replay_smoothed.rms(turn_rad)),
         }
-
-
-def _rms(values: np.ndarray) -> float:
-    values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
 def is_for(args: Arguments) -> bool:
@@ -199,10 +196,16 @@ def run(args: Arguments) -> int:
         }
     else:
         save_figure(_picture(setup, track, recorded, _text(summary)), out / "report.png")
+    smoothing = ""
+    if args.smooth:
+        refused_ns = set() if log is None else refused_odometry(log)
+        events = DriveEvents.of(inputs, setup, args.recording, refused_ns)
+        summary["smoothing"] = replay_smoothed.run(args, events, setup)
+        smoothing = f"\n{replay_smoothed.text(summary['smoothing'])}"
     write_json(out / "summary.json", summary)
     located = track.located
     write_tum(out / "trajectory.tum", track.now_ns[located] / 1e9, track.Ts_world_vehicle[located])
-    print(_text(summary))
+    print(f"{_text(summary)}{smoothing}")
     print(f"summary in {visible(out)}")
     return EXIT_DIFFERS if comparison is not None and comparison.first else 0
 

@@ -89,7 +89,6 @@ def test_its_recording_replays(folder, drive):
     [
         ["calibrate", "odometry", "drive.mcap", "--out", "out"],
         ["calibrate", "adopt", "drive.mcap", "--out", "out"],
-        ["tune", "filter", "drive.mcap", "--out", "out"],
     ],
     ids=lambda arguments: " ".join(arguments[:2]),
 )
