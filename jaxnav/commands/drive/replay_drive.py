@@ -171,6 +171,10 @@ def run(args: Arguments) -> int:
     if not inputs:
         raise BadInput(args.recording, "holds no input")
     check_inputs(inputs, setup, args.recording)
+    events = None
+    if args.smooth:
+        refused_ns = set() if log is None else refused_odometry(log)
+        events = DriveEvents.of(inputs, setup, args.recording, refused_ns)
     changed = [name for name in _OVERRIDES if getattr(args, name)]
     comparison = Comparison(log) if log is not None and not changed else None
     out = output_folder(args.out)
@@ -197,9 +201,7 @@ def run(args: Arguments) -> int:
     else:
         save_figure(_picture(setup, track, recorded, _text(summary)), out / "report.png")
     smoothing = ""
-    if args.smooth:
-        refused_ns = set() if log is None else refused_odometry(log)
-        events = DriveEvents.of(inputs, setup, args.recording, refused_ns)
+    if events is not None:
         summary["smoothing"] = replay_smoothed.run(args, events, setup)
         smoothing = f"\n{replay_smoothed.text(summary['smoothing'])}"
     write_json(out / "summary.json", summary)

@@ -1,13 +1,16 @@
 """`jaxnav tune`: from the command line to its files, and the errors for bad input."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from jaxnav.belief.ambiguity import LowestReprojection
 from jaxnav.cli import main
-from jaxnav.commands.tune.arguments import TuneController
+from jaxnav.commands.tune.arguments import TuneController, TuneFilter
+from jaxnav.commands.tune.controller import closed_loop, gains_of
+from jaxnav.commands.tune.filter import space_of
 from jaxnav.files import load_params
 from jaxnav.tuning.drive_loss import DriveLoss
 
@@ -61,6 +64,21 @@ def test_bad_input_gets_one_line(capsys, arguments, says):
 def test_the_command_weighs_as_the_loss_does_by_default():
     args = TuneController()
     assert DriveLoss(args.time, args.cross_track, args.effort, args.smoothness) == DriveLoss()
+
+
+def test_a_base_has_gains_and_noise_of_its_own():
+    """What is learned by default: all on which its drives depend, and nothing else."""
+    common = {"controller.speed_mps", "controller.slows_per_s"}
+    spot = {"controller.turns_per_s"}
+    for base, imu, gains in (("differential", "consumer", common | spot), ("omni", "none", common)):
+        args = TuneController(base=base, imu=imu)
+        navigator = closed_loop(args, "paper").rollout.navigator
+        assert set(gains_of(args, navigator).free) == gains
+        told = SimpleNamespace(obs=SimpleNamespace(corner_sigma_px=None))
+        learned = set(space_of(TuneFilter(base=base, imu=imu), navigator, told).free)
+        gyro = {"motion.vehicle.gyro.noise_density"} if imu == "consumer" else set()
+        assert {name for name in learned if "gyro" in name} == gyro
+        assert {"motion.acceleration_density", "motion.odometry_sigma"} < learned
 
 
 def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch):
