@@ -6,6 +6,8 @@ prior of one hypothesis, so wide that it only says which local minimum is the tr
 the filter is smooth in its noise parameters.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -128,7 +130,8 @@ def _carried_back(
 
     def one(obs: Observation, pose: Array, frame: Array) -> Array:
         def back(pose: Array, now: tuple[Observation, Array]) -> tuple[Array, None]:
-            obs, index = now[0].usable(), now[1]
+            # Events without odometry, such as frames, hold the last reading.
+            obs, index = dataclasses.replace(now[0], has_odometry=True).usable(), now[1]
             speed_mps, steering_rad, dt_s = (
                 jnp.asarray(x, pose.dtype) for x in (obs.speed_mps, obs.steering_rad, obs.dt_s)
             )

@@ -230,15 +230,16 @@ def test_the_mirror_image_is_less_likely():
 
 
 def test_a_pose_is_carried_back_along_its_arcs():
-    """Exact odometry: back to where the drive began, from whatever frame, and no further."""
+    """Exact odometry: back to where the drive began, from whatever frame, and no further. Frames
+    between two readings hold the last one."""
     rng, count = np.random.default_rng(0), 3
     drives = recorded()
     shape = drives.used.shape
     speeds, steerings = rng.uniform(-0.5, 0.5, shape), rng.uniform(-0.5, 0.5, shape)
     obs = eqx.tree_at(
-        lambda o: (o.speed_mps, o.steering_rad),
+        lambda o: (o.speed_mps, o.steering_rad, o.has_odometry),
         drives.obs,
-        (jnp.asarray(speeds), jnp.asarray(steerings)),
+        (jnp.asarray(speeds), jnp.asarray(steerings), jnp.asarray(rng.uniform(size=shape) < 0.5)),
     )
     frames, begins, ends = np.array([0, 4, 11]), rng.uniform(-2, 2, (count, 3)), []
     for row in range(count):
