@@ -134,12 +134,9 @@ def test_it_drives_to_the_goal_and_tells_everybody_where_it_is(tmp_path, listene
 
 def check_poses(listener: Listener) -> None:
     """Poses are near the truth, and as near as they say."""
-    errors_m, nees, told = [], [], listener.heard["/jaxnav/pose"]
-    for message in told:
-        truth = nearest(listener.heard["/truth"], stamp_s(message))
-        if abs(stamp_s(truth) - stamp_s(message)) > 0.02:
-            continue  # the truth of then has not been heard yet
-        true = pose_of(truth.pose)
+    errors_m, nees = [], []
+    for message in listener.heard["/jaxnav/pose"]:
+        true = pose_of(nearest(listener.heard["/truth"], stamp_s(message)).pose)
         error = pose_of(message.pose.pose)[4:6] - true[4:6]
         covariance = np.reshape(message.pose.covariance, (6, 6))
         assert np.all(np.linalg.eigvalsh(covariance) > 0)
@@ -149,10 +146,8 @@ def check_poses(listener: Listener) -> None:
     # seen from one side only, by cameras that are placed by hand.
     assert np.median(errors_m[len(errors_m) // 2 :]) < 0.02
     assert np.median(errors_m) < 0.04
-    # A first pose of 1 px is off by more now and then, and says so: 16 is passed by 3 of 10 000.
-    assert np.all((np.array(errors_m) < 0.15) | (np.array(nees) < 16))
+    assert np.max(errors_m) < 0.15
     assert np.median(nees) < 5
-    assert len(errors_m) > 0.9 * len(told)
 
 
 def check_tf(listener: Listener) -> None:
@@ -237,8 +232,8 @@ def test_it_drives_by_the_time_of_a_simulation_and_by_lenses_that_topics_tell(tm
         until(lambda: len(listener.heard["/jaxnav/pose"]) > 200, 300.0, program)
         assert 100 < stamp_s(listener.last("/jaxnav/pose")) < 1000  # the simulation's seconds
         until(listener.drives, 60.0, program)
-        check_poses(listener)
         check_pause(listener, car, program)
+        check_poses(listener)
         check_tf(listener)
 
 
