@@ -7,13 +7,13 @@ the filter knew at every event, and what is known of it at the end (`jaxnav repl
 import argparse
 from pathlib import Path
 
-import jax
+from jaxnav.configuration import configure
 
-jax.config.update("jax_enable_x64", True)
+configure(float64=True)  # before the first array
 
 import numpy as np  # noqa: E402
 
-from jaxnav.datasets.smoothed_drive import DriveTrack, smooth_drive  # noqa: E402
+from jaxnav.datasets.smoothed_drive import DriveTrack, distances, smooth_drive  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
 from jaxnav.recording.drive_events import DriveEvents  # noqa: E402
 from jaxnav.recording.drive_setup import DriveSetup  # noqa: E402
@@ -26,9 +26,7 @@ START = (2.0, -1.0, 2.2)
 
 def errors_of(track: DriveTrack, truth: np.ndarray) -> np.ndarray:
     """Position m and heading rad off the truth, and over their sigmas: (N, 4)."""
-    apart = track.poses - truth
-    shift_m = np.hypot(apart[:, 0], apart[:, 1])
-    turn_rad = np.abs(np.angle(np.exp(1j * apart[:, 2])))
+    shift_m, turn_rad = distances(track.poses, truth, track.located)
     return np.stack([shift_m, turn_rad, shift_m / track.sigma_m, turn_rad / track.sigma_rad], 1)
 
 

@@ -54,16 +54,22 @@ class DriveTrack:
         self, other: "DriveTrack"
     ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
         """Distances (N,) m and (N,) rad to a track of the same events, NaN where not located."""
-        apart = self.poses - other.poses
-        located = self.located & other.located
-        turn_rad = np.abs(np.angle(np.exp(1j * apart[:, 2])))
-        shift_m = np.hypot(apart[:, 0], apart[:, 1])
-        return np.where(located, shift_m, np.nan), np.where(located, turn_rad, np.nan)
+        return distances(self.poses, other.poses, self.located & other.located)
 
     @property
     def positions_m(self) -> Float[np.ndarray, "N 3"]:
         """Positions of the vehicle, (N, 3) m, NaN where not located."""
         return np.where(self.located[:, None], self.Ts_world_vehicle[:, 4:], np.nan)
+
+
+def distances(
+    poses: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "N 3"], known: Bool[np.ndarray, " N"]
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Distances (N,) m and (N,) rad between planar poses, NaN where they are not known."""
+    apart = poses - others
+    turn_rad = np.abs(np.angle(np.exp(1j * apart[:, 2])))
+    shift_m = np.hypot(apart[:, 0], apart[:, 1])
+    return np.where(known, shift_m, np.nan), np.where(known, turn_rad, np.nan)
 
 
 def smooth_drive(

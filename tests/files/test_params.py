@@ -220,7 +220,8 @@ GATE = "parameters.motion.gate_nis"
         ("[1]", "parameters: must be a mapping, got [1]"),
         (
             "{speed: 1}",
-            f"parameters.speed: unknown: {NEAREST} controller.speed_mps, ",
+            f"parameters.speed: unknown: {NEAREST} controller.speed_mps, selector.floor_rad, "
+            "selector.floor_m",
         ),
         ("{motion: {vision_floor: 1}}", f"parameters.motion: unknown: {NEAREST} motion."),
         ("{corner_sigma_px: big}", "parameters.corner_sigma_px: must be a number, got the text"),

@@ -96,6 +96,20 @@ def of(space: Space, slopes, name: str):
     return np.asarray(slopes)[:, space.labels.index(name)]
 
 
+def slopes_as_differences(closed: ClosedLoop, space: Space, seeds, step=1e-5, rtol=1e-4):
+    """The slopes of every drive, which are central differences of its loss."""
+    losses, slopes = closed.value_and_grad(space.start, space, seeds)
+    assert np.all(np.isfinite(losses))
+    for name in space.labels:
+        ahead, behind = (
+            closed.value_and_grad(moved(space, name, d), space, seeds)[0] for d in (step, -step)
+        )
+        np.testing.assert_allclose(
+            of(space, slopes, name), (ahead - behind) / (2 * step), rtol, 1e-6, err_msg=name
+        )
+    return slopes
+
+
 @pytest.fixture(scope="module")
 def tame() -> ClosedLoop:
     """One compilation for all that drive with the true pose."""
@@ -105,16 +119,7 @@ def tame() -> ClosedLoop:
 def test_derivatives_are_those_of_the_soft_drive(tame):
     """Against central differences of every drive, each gain by itself."""
     space, seeds = space_of(tame), keys(jnp.arange(DRIVES))
-    _, slopes = tame.value_and_grad(space.start, space, seeds)
-    step = 1e-5
-    for name in GAINS:
-        ahead, behind = (
-            tame.value_and_grad(moved(space, name, d), space, seeds)[0] for d in (step, -step)
-        )
-        numeric = (ahead - behind) / (2 * step)
-        np.testing.assert_allclose(
-            of(space, slopes, name), numeric, rtol=1e-4, atol=1e-6, err_msg=name
-        )
+    slopes = slopes_as_differences(tame, space, seeds)
     assert np.abs(of(space, slopes, "controller.proportional_per_m")).min() > 1e-3
     assert without_gradient(slopes, space.labels) == []
 
@@ -142,16 +147,7 @@ def test_derivatives_of_a_base_s_drive(left_limit_mps):
     rollout = Rollout(steers, base, MARKERS, scenario(), 1.0, spread=SPREAD, chunk_frames=45)
     closed = ClosedLoop(rollout, DriveLoss(), 0.03)
     space, seeds = Space.of(steers, dict.fromkeys(names, True)), keys(jnp.arange(3))
-    _, slopes = closed.value_and_grad(space.start, space, seeds)
-    step = 1e-5
-    for name in names:
-        ahead, behind = (
-            closed.value_and_grad(moved(space, name, d), space, seeds)[0] for d in (step, -step)
-        )
-        numeric = (ahead - behind) / (2 * step)
-        np.testing.assert_allclose(
-            of(space, slopes, name), numeric, rtol=1e-4, atol=1e-6, err_msg=name
-        )
+    slopes = slopes_as_differences(closed, space, seeds)
     # What moves to its left never turns on the spot.
     idle = names[2:] if left_limit_mps else []
     assert without_gradient(slopes, space.labels) == idle
@@ -229,16 +225,7 @@ def test_through_the_whole_navigator():
     rollout = Rollout(navigator, CAR, MARKERS, route, 1.0, spread=SPREAD, chunk_frames=18)
     closed = ClosedLoop(rollout)
     space, seeds = Space.of(navigator, {GAINS[0]: True, GAINS[3]: True}), keys(jnp.arange(2))
-    losses, slopes = closed.value_and_grad(space.start, space, seeds)
-    assert np.all(np.isfinite(losses))
-    step = 1e-4
-    for name in space.labels:
-        slope = of(space, slopes, name)
-        ahead, behind = (
-            closed.value_and_grad(moved(space, name, d), space, seeds)[0] for d in (step, -step)
-        )
-        numeric = (ahead - behind) / (2 * step)
-        np.testing.assert_allclose(slope, numeric, rtol=1e-3, atol=1e-6, err_msg=name)
+    slopes_as_differences(closed, space, seeds, step=1e-4, rtol=1e-3)
     silent = dataclasses.replace(rollout, corner_noise_px=0.0 * rollout.corner_noise_px)
     closed = dataclasses.replace(closed, rollout=silent)
     assert np.all(np.isfinite(closed.value_and_grad(space.start, space, seeds)[1]))

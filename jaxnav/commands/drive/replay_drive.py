@@ -20,6 +20,7 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
 from jaxnav.configuration import step_folder
 from jaxnav.datasets.ros_drives import read_ros_drive
+from jaxnav.datasets.smoothed_drive import distances
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     Params,
@@ -120,10 +121,7 @@ class Track:
         if not len(recorded.now_ns):
             return np.full(len(index), np.nan), np.full(len(index), np.nan)
         known &= (recorded.now_ns[index] == self.now_ns) & recorded.located[index] & self.located
-        difference = self.poses - recorded.pose[index]
-        turn = np.abs(np.angle(np.exp(1j * difference[:, 2])))
-        shift_m = np.hypot(difference[:, 0], difference[:, 1])
-        return np.where(known, shift_m, np.nan), np.where(known, turn, np.nan)
+        return distances(self.poses, recorded.pose[index], known)
 
     def rms_differences(self, recorded: Outcomes) -> dict[str, Any]:
         """Root mean square differences from the recorded track."""
