@@ -4,7 +4,7 @@ It publishes /odom (with a pose that drifts), /NAME/detections of each camera of
 true pose on /truth; it obeys /drive, and stops by itself 0.5 s after the last command.
 
     --clock    sends /clock, and its stamps are of that: seconds since it began, and 100. SIGUSR1
-               pauses it, and lets it go on.
+               pauses it and its world, and lets them go on.
     --tf       sends /twist too, and the pose of /odom on /tf: odom -> base_footprint, with a fixed
                base_footprint -> base_link on /tf_static
     --images   sends rendered pictures on /NAME/image_raw instead of detections
@@ -28,7 +28,7 @@ from jaxnav.ros.camera_messages import APRILTAG_ROS, IMAGE, detections_message
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.lenses import CAMERA_INFO
 from jaxnav.ros.odometry_messages import ACKERMANN, IMU, NAV_ODOMETRY, TWIST_WITH_COVARIANCE
-from jaxnav.vehicles.sim import open_cameras, open_vehicle
+from jaxnav.vehicles import sim
 
 TF, POSE = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/Pose"
 TOPICS = {APRILTAG_ROS: "detections", IMAGE: "image_raw"}
@@ -36,6 +36,33 @@ COLORED = ("front", "rear")
 WHEELBASE_M = 0.256
 ODOMETRY_S = 0.02
 SILENT_S = 0.5
+
+
+class SimTime:
+    """The time of the simulated world, in place of the module `time`: it can be paused."""
+
+    def __init__(self):
+        self._now = 0, time.monotonic_ns(), False  # what it showed, when, and whether it stands
+
+    @property
+    def stands(self) -> bool:
+        """Whether it is paused."""
+        return self._now[2]
+
+    def pause(self) -> None:
+        """Stand still, or go on."""
+        self._now = self.monotonic_ns(), time.monotonic_ns(), not self.stands
+
+    def monotonic_ns(self) -> int:
+        """Since it began, without its pauses."""
+        shown_ns, at_ns, stands = self._now
+        return shown_ns + (0 if stands else time.monotonic_ns() - at_ns)
+
+    def sleep(self, wait_s: float) -> None:
+        """Sleep for so long of this time."""
+        until_ns = self.monotonic_ns() + int(wait_s * 1e9)
+        while (left_ns := until_ns - self.monotonic_ns()) > 0:
+            time.sleep(0.005 if self.stands else left_ns / 1e9)
 
 
 def tell_lenses(ros, rig, over):
@@ -55,7 +82,10 @@ def tell_lenses(ros, rig, over):
 
 def main(words):
     """Simulate until a signal comes."""
-    clocked = "--clock" in words
+    clocked, sim_time = "--clock" in words, SimTime()
+    if clocked:
+        sim.time = sim_time
+        signal.signal(signal.SIGUSR1, lambda *_: sim_time.pause())
     over = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: over.set())
@@ -70,31 +100,23 @@ def main(words):
         shown = {"images": "true", "rate_hz": "8"}
     markers = load_markers(qcar / "markers.yaml")
     setup = Setup(rig, markers, vehicle_model, route.start_pose, options=shown)
-    vehicle = open_vehicle(setup)
-    cameras = open_cameras(setup, vehicle)
+    vehicle = sim.open_vehicle(setup)
+    cameras = sim.open_cameras(setup, vehicle)
     ros = Connection("sim_car")
     heard_s = [time.monotonic()]
-    began_ns, time_of = time.monotonic_ns(), message_type("builtin_interfaces/msg/Time")
-
-    pauses = [0, 0]  # ns in all of those that are over, and when this one began
-
-    def pause(*_):
-        now_ns = time.monotonic_ns()
-        pauses[:] = [pauses[0] + now_ns - pauses[1], 0] if pauses[1] else [pauses[0], now_ns]
-
-    signal.signal(signal.SIGUSR1, pause)
+    time_of = message_type("builtin_interfaces/msg/Time")
 
     def stamp_of(now_ns):
         if not clocked:
             return ros.stamp(now_ns)
-        since_ns = min(now_ns, pauses[1] or now_ns) - pauses[0] - began_ns + 100 * 10**9
-        return time_of(sec=since_ns // 10**9, nanosec=since_ns % 10**9)
+        seconds, ns = divmod(now_ns, 10**9)
+        return time_of(sec=100 + seconds, nanosec=ns)
 
     def tick():
         clock = message_type("rosgraph_msgs/msg/Clock")
         publisher = ros.publisher("rosgraph_msgs/msg/Clock", "/clock")
         while not over.wait(0.005):
-            ros.publish(publisher, clock(clock=stamp_of(time.monotonic_ns())))
+            ros.publish(publisher, clock(clock=stamp_of(sim.time.monotonic_ns())))
 
     def obey(message):
         heard_s[0] = time.monotonic()
@@ -107,7 +129,7 @@ def main(words):
     def look(camera, publisher):
         while not over.is_set():
             frame = camera.read(0.1)
-            if frame is not None and not pauses[1]:
+            if frame is not None:
                 stamp = stamp_of(frame.stamp_ns)
                 ros.publish(publisher, message_of(kind, camera.name, frame, stamp))
 
@@ -126,13 +148,13 @@ def main(words):
         twist, tf = ros.publisher(TWIST_WITH_COVARIANCE, "/twist"), ros.publisher(TF, "/tf")
         fixed, nowhere = ros.publisher(TF, "/tf_static", True), message_type(POSE)()
         place(nowhere, 0.0, 0.0, 0.0)
-        told = transform("base_footprint", "base_link", nowhere, stamp_of(began_ns))
+        told = transform("base_footprint", "base_link", nowhere, stamp_of(sim.time.monotonic_ns()))
         ros.publish(fixed, message_type(TF)(transforms=[told]))
     x_m = y_m = psi_rad = 0.0
     while not over.wait(ODOMETRY_S):
         if time.monotonic() - heard_s[0] > SILENT_S:
             vehicle.stop()
-        if pauses[1]:
+        if sim_time.stands:
             continue
         reading = vehicle.read()
         forward_mps, left_mps, rate_radps = motion_of(reading)
@@ -160,7 +182,7 @@ def main(words):
             told = transform("odom", "base_footprint", message.pose.pose, message.header.stamp)
             ros.publish(tf, message_type(TF)(transforms=[told]))
         true = message_type("geometry_msgs/msg/PoseStamped")()
-        now_ns = time.monotonic_ns()
+        now_ns = sim.time.monotonic_ns()
         true.header.stamp = stamp_of(now_ns)
         place(true.pose, *map(float, vehicle.world.state(now_ns)[:3]))
         ros.publish(truth, true)
