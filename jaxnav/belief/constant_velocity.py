@@ -1,7 +1,7 @@
 """A filter for bodies that move freely: pose on SE(3) and twist."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -93,7 +93,9 @@ class ConstantVelocity(FreeBody):
             P = P.at[6:12].multiply(1 - told).at[:, 6:12].multiply(1 - told)
         return mean, P.at[:12, :12].add(jnp.where(told, self._drift(twist, dt_s), Q))
 
-    def _told(self, obs: Observation, dtype: Any) -> tuple[Bool[Array, ""], Float[Array, " 6"]]:
+    def _told(
+        self, obs: Observation, dtype: jnp.dtype
+    ) -> tuple[Bool[Array, ""], Float[Array, " 6"]]:
         """Whether the odometry tells the motion, and its twist; 0 where it does not."""
         if obs.twist is None:
             return jnp.asarray(False), jnp.zeros(6, dtype)

@@ -1,6 +1,6 @@
 """A filter for bodies that move freely and carry an inertial measurement unit (IMU)."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -119,7 +119,9 @@ class InertialMotion(FreeBody):
         coasted = self._coasted(mean, P, jnp.asarray(obs.dt_s, mean.dtype))
         return coasted if imu is None else where(told, self._carried(mean, P, imu), coasted)
 
-    def _told(self, obs: Observation, dtype: Any) -> tuple[Bool[Array, ""], Preintegrated | None]:
+    def _told(
+        self, obs: Observation, dtype: jnp.dtype
+    ) -> tuple[Bool[Array, ""], Preintegrated | None]:
         """Whether the IMU tells the motion, and what it tells."""
         if obs.imu is None:
             return jnp.asarray(False), None

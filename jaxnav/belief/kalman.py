@@ -13,19 +13,11 @@ from jaxnav.numerics.small_matrices import (
     log_det,
     matvec,
     product,
-    sandwich,
     solve_lower,
 )
 
 # A variance never falls below this fraction of the largest one.
 _RELATIVE_FLOOR = 1e-12
-
-
-def predict_covariance(
-    P: Float[Array, "n n"], F: Float[Array, "n n"], Q: Float[Array, "n n"]
-) -> Float[Array, "n n"]:
-    """F P F' + Q (Eq. 9), symmetric."""
-    return symmetrise(sandwich(F, P) + Q)
 
 
 def update(

@@ -14,17 +14,17 @@ visual-inertial odometry", Eqs. 31-44 and appendix A; the biases' random walk as
 CombinedImuFactor of GTSAM.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, DTypeLike, Float
 
 from jaxnav.models.geometry import rotation_matrix, safe_norm, safe_sinc, skew
 from jaxnav.models.imu_classes import IMU_CLASSES
 from jaxnav.numerics.small_matrices import matvec, product, sandwich
+
+_Sums = tuple[Array, Array, Array, Array, Array]
 
 
 class ImuNoise(eqx.Module):
@@ -105,7 +105,7 @@ class Preintegrated(eqx.Module):
     still: Bool[Array, "*F"]
 
     @staticmethod
-    def none(dtype: Any = float) -> "Preintegrated":
+    def none(dtype: DTypeLike = float) -> "Preintegrated":
         """No reading."""
         zero = jnp.zeros(3, dtype)
         return Preintegrated(
@@ -120,7 +120,7 @@ class Preintegrated(eqx.Module):
             jnp.asarray(False),
         )
 
-    def usable(self, dtype: Any = float) -> "Preintegrated":
+    def usable(self, dtype: DTypeLike = float) -> "Preintegrated":
         """The same, or `none` where a number is not finite or the duration is not positive."""
         told = [leaf for leaf in jax.tree.leaves(self) if leaf.dtype != bool]
         good = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in told])))
@@ -169,7 +169,7 @@ def preintegrate(
     bridged_s = jnp.sum(jnp.where(readings.bridged, readings.dt_s, 0))
     per_bridged = noise.bridged_variances().astype(dtype) * bridged_s
 
-    def step(carry: Any, row: Any) -> tuple[Any, None]:
+    def step(carry: _Sums, row: tuple[Array, Array, Array, Array]) -> tuple[_Sums, None]:
         wxyz, v, p, P, chain = carry
         gyro, accel, dt, bridged = row
         dR = jaxlie.SO3(wxyz)

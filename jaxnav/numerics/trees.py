@@ -1,10 +1,10 @@
 """`where` for trees of arrays, and a module under another class."""
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, ArrayLike, Bool
 
 _Tree = TypeVar("_Tree")
 _Module = TypeVar("_Module")
@@ -13,7 +13,7 @@ _Module = TypeVar("_Module")
 def where(condition: Bool[Array, "*rows"], yes: _Tree, no: _Tree) -> _Tree:
     """`jnp.where` of every leaf; the condition's axes are the leaves' leading ones."""
 
-    def choose(a: Any, b: Any) -> Array:
+    def choose(a: ArrayLike, b: ArrayLike) -> Array:
         shape = condition.shape + (1,) * (jnp.ndim(a) - condition.ndim)
         return jnp.where(condition.reshape(shape), a, b)
 
@@ -21,7 +21,7 @@ def where(condition: Bool[Array, "*rows"], yes: _Tree, no: _Tree) -> _Tree:
     return chosen
 
 
-def as_class(cls: type[_Module], module: Any) -> _Module:
+def as_class(cls: type[_Module], module: object) -> _Module:
     """An instance of a class, which may override methods, with the fields of another module."""
     other = object.__new__(cls)
     for name, part in vars(module).items():

@@ -8,8 +8,6 @@ Position and turn are sums of sines about a stand from which the vehicle's x axi
 velocity, acceleration and turn rate are their derivatives, of the IMU's place too.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxnav.models.geometry import rotation_from_matrix, rotation_matrix, safe_norm
 from jaxnav.models.imu_samples import ImuSamples
 from jaxnav.models.markers import MarkerMap
-from jaxnav.models.preintegration import ImuNoise
+from jaxnav.models.preintegration import ImuNoise, Preintegrated
 from jaxnav.models.rig import CameraRig
 from jaxnav.pose.observation import Observation
 from jaxnav.simulation.corners import see
@@ -187,9 +185,15 @@ def _all_readings(
 
 @jax.jit
 def _all_frames(
-    path: HandHeld, rig: CameraRig, markers: MarkerMap, corner_noise_px: Array, rows: Any
-) -> Any:
-    def frame(t: Array, dt_s: Array, shown: Array, key: Array, imu: Any) -> Observation:
+    path: HandHeld,
+    rig: CameraRig,
+    markers: MarkerMap,
+    corner_noise_px: Array,
+    rows: tuple[Array, Array, Array, Array, Preintegrated | None],
+) -> Observation:
+    def frame(
+        t: Array, dt_s: Array, shown: Array, key: Array, imu: Preintegrated | None
+    ) -> Observation:
         T_world_vehicle = path.T_world_vehicle(t)
         corners_px, visible = see(rig, markers, T_world_vehicle)
         noise_px = corner_noise_px * jax.random.normal(key, corners_px.shape, corners_px.dtype)

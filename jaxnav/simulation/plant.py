@@ -6,7 +6,8 @@ with a first-order lag. Pure JAX functions, so that a rollout can be scanned, vm
 differentiated.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -33,6 +34,9 @@ class BaseState(eqx.Module):
 
     pose: Float[Array, "*batch 3"]  # x_m, y_m, psi_rad
     twist: Float[Array, "*batch 3"]  # v_x_mps, v_y_mps, omega_radps in its own axes
+
+
+_State = TypeVar("_State", bound=CarState | BaseState)
 
 
 class OdometryNoise(eqx.Module):
@@ -94,22 +98,33 @@ def move_base(
     return BaseState(twist_base.advance(state.pose, (state.twist + twist) / 2, dt_s), twist)
 
 
-def move(vehicle: Any, state: Any, command: Any, dt_s: Float[Array, ""]) -> Any:
+def move(
+    vehicle: Vehicle | TwistBase,
+    state: _State,
+    command: Command | TwistCommand,
+    dt_s: Float[Array, ""],
+) -> _State:
     """The state of a car or of another base after a short time."""
-    mover: Any = move_base if isinstance(vehicle, TwistBase) else move_car
-    return mover(vehicle, state, command, dt_s)
+    mover: Callable[..., Any] = move_base if isinstance(vehicle, TwistBase) else move_car
+    moved: _State = mover(vehicle, state, command, dt_s)
+    return moved
 
 
 def move_through(
-    vehicle: Any, state: Any, command: Any, dt_s: Float[Array, ""], substeps: int
-) -> Any:
+    vehicle: Vehicle | TwistBase,
+    state: _State,
+    command: Command | TwistCommand,
+    dt_s: Float[Array, ""],
+    substeps: int,
+) -> _State:
     """Its state at `substeps` evenly spaced instants up to dt, leading axis (substeps,)."""
 
-    def one(state: Any, _: None) -> tuple[Any, Any]:
+    def one(state: _State, _: None) -> tuple[_State, _State]:
         moved = move(vehicle, state, command, dt_s / substeps)
         return moved, moved
 
-    return jax.lax.scan(one, state, None, length=substeps)[1]
+    states: _State = jax.lax.scan(one, state, None, length=substeps)[1]
+    return states
 
 
 def read_odometry(

@@ -5,7 +5,7 @@ A trial is one drive of `Rollout`: the navigator's own step, plant, odometer and
 
 import dataclasses
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -255,7 +255,7 @@ def _radians(value_deg: float | None) -> float | None:
     return None if value_deg is None else float(np.deg2rad(value_deg))
 
 
-def _replaced(whole: Any, **fields: Any) -> Any:
+def _replaced(whole: Any, **fields: object) -> Any:
     """A dataclass with those fields replaced that are not None."""
     return dataclasses.replace(whole, **{k: v for k, v in fields.items() if v is not None})
 
@@ -294,7 +294,9 @@ def _fraction(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
     return np.where(count > 0, fraction, np.nan).astype(np.float32)
 
 
-def _over(statistic: Any, values: np.ndarray, frames: np.ndarray) -> np.ndarray:
+def _over(
+    statistic: Callable[..., np.ndarray], values: np.ndarray, frames: np.ndarray
+) -> np.ndarray:
     """A statistic over the selected frames of every drive; NaN for a drive without any."""
     some = frames.any(axis=1)
     chosen = np.where(frames, values, np.nan)

@@ -69,7 +69,7 @@ def test_covariance_outlives_1e5_float32_steps():
     def step(P, _):
         A = jnp.eye(6, dtype=jnp.float32) + 0.02 * jnp.eye(6, k=3, dtype=jnp.float32)
         Q = kalman.white_acceleration(jnp.full(3, 1e-8, jnp.float32), jnp.float32(0.02))
-        P = kalman.predict_covariance(P, A, Q)
+        P = kalman.replace_first(P, A) + Q
         H = jnp.eye(3, 6, dtype=jnp.float32)
         R = jnp.diag(jnp.asarray([1e-8, 1e-6, 1e-2], jnp.float32))
         _, P, _ = kalman.update(P, jnp.zeros(3, jnp.float32), H, R)
