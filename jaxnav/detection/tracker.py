@@ -30,6 +30,7 @@ _UNKNOWN_ROW_TIME_S = 2e-5  # of common sensors 5 to 30 us
 _TOLD_BY = 5  # streaks tell the exposure time
 _REMEMBERED = 31
 _LEAST_STREAK_PX = 2.0  # that tells of it
+_SAME_PX = 1.0  # two poses of one marker show it almost alike
 
 
 class Tracker:
@@ -73,7 +74,7 @@ class Tracker:
 
         Args:
             image: as in `Detector.detect`, like `camera`.
-            keys: family and id of each expected marker.
+            keys: family and id of each expected marker; one may be expected in several places.
             quads_px: its expected corners, TL TR BR BL.
             radius_px: the farthest that it may be from there.
             flow_px_s: velocity of its centre in the image; None where that is not known.
@@ -88,22 +89,21 @@ class Tracker:
             flow_px_s = self._credible(flow_px_s)
         read = set() if decoded is None else set(zip(decoded.families, decoded.ids, strict=True))
         sides_px = [mean_side_px(quad) for quad in quads_px]
-        missing = [
-            k
-            for k in np.argsort(sides_px)[::-1]
-            if keys[k] not in read and np.isfinite(sides_px[k]) and np.isfinite(radius_px[k])
-        ]
+        places: dict[tuple[str, int], list[int]] = {}  # of each marker, the largest first
+        for k in np.argsort(sides_px)[::-1]:
+            if keys[k] not in read and np.isfinite(sides_px[k]) and np.isfinite(radius_px[k]):
+                places.setdefault(keys[k], []).append(int(k))
+        missing = list(places.items())[:MOST_FOLLOWED]
         targets = []
-        for k in missing[:MOST_FOLLOWED]:
+        for (family, marker_id), at in missing:
             streak_px, sigma_px = (0.0, 0.0), np.inf
-            quad_px, within_px = quads_px[k], float(radius_px[k])
-            if flow_px_s is not None and np.all(np.isfinite(flow_px_s[k])):
-                streak_px, sigma_px = self._streak(flow_px_s[k])
-                ahead_px = flow_px_s[k] * min(max(ahead_s, -_FAR_AHEAD_S), _FAR_AHEAD_S)
-                quad_px = quad_px + ahead_px
+            quads, within_px, flow = _apart(quads_px[at]), float(np.max(radius_px[at])), at[0]
+            if flow_px_s is not None and np.all(np.isfinite(flow_px_s[flow])):
+                streak_px, sigma_px = self._streak(flow_px_s[flow])
+                ahead_px = flow_px_s[flow] * min(max(ahead_s, -_FAR_AHEAD_S), _FAR_AHEAD_S)
+                quads = quads + ahead_px
                 within_px += _AHEAD_SHARE * float(np.hypot(*ahead_px))
-            family, marker_id = keys[k]
-            targets.append(Target(family, marker_id, quad_px[None], within_px, streak_px, sigma_px))
+            targets.append(Target(family, marker_id, quads, within_px, streak_px, sigma_px))
         if not targets:
             return Detections.concatenate([])
         image = grey(image)
@@ -111,7 +111,7 @@ class Tracker:
         found = detections_of([one for one in tracks if one is not None])
         if flow_px_s is None:
             return found
-        flows_px_s = [flow_px_s[k] for k, _ in zip(missing, targets, strict=False)]
+        flows_px_s = [flow_px_s[at[0]] for _, at in missing]
         self._learn(flows_px_s, tracks)
         seen = [f for f, one in zip(flows_px_s, tracks, strict=True) if one is not None]
         return self._of_one_time(
@@ -159,6 +159,15 @@ class Tracker:
             self._exposures_s.append(abs(float(one.streak_px @ flow_px_s)) / speed**2)
         if len(self._exposures_s) >= _TOLD_BY:
             self.exposure_s = float(np.median(self._exposures_s))
+
+
+def _apart(quads_px: Float[np.ndarray, "H 4 2"]) -> Float[np.ndarray, "P 4 2"]:
+    """The quadrilaterals without those that are almost the same as an earlier one."""
+    apart = [quads_px[0]]
+    for quad in quads_px[1:]:
+        if all(np.max(np.abs(quad - other)) > _SAME_PX for other in apart):
+            apart.append(quad)
+    return np.stack(apart)
 
 
 def detections_of(tracks: Sequence[Track]) -> Detections:

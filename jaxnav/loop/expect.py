@@ -15,6 +15,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxnav.belief.bank import Bank
+from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.compiling.executables import kept
 from jaxnav.models.geometry import (
     on_last_axis,
@@ -89,6 +91,25 @@ def expect_corners(
     visible = _inside(rig, quads_px, radius_px) & _towards(rig, markers, mean)
     finite = jnp.isfinite(radius_px) & jnp.all(jnp.isfinite(covariance))
     return Expected(quads_px, visible & finite, radius_px)
+
+
+def likely_poses(
+    bank: Bank, most: int
+) -> tuple[Float[np.ndarray, "H 7"], Float[np.ndarray, "H 3 3"]]:
+    """Poses (wxyz xyz) of a vehicle's heaviest hypotheses, and the covariances of their planar
+    poses.
+
+    Args:
+        bank: its leaves are NumPy's arrays, and one hypothesis at least is initialised.
+        most: so many of them.
+    """
+    log_weight = np.where(bank.initialised, bank.log_weight, -np.inf)
+    likely = np.argsort(-log_weight, kind="stable")[: min(most, int(np.sum(bank.initialised)))]
+    poses, covariances = (np.asarray(part)[likely] for part in planar_poses(bank))
+    half, zero = poses[:, 2] / 2, np.zeros_like(poses[:, 2])
+    x_m, y_m = poses[:, 0], poses[:, 1]
+    wxyz_xyz = np.stack([np.cos(half), zero, zero, np.sin(half), x_m, y_m, zero], axis=1)
+    return wxyz_xyz, covariances
 
 
 def quads_px(navigator: Navigator, place: Place) -> Float[np.ndarray, "C M 4 2"]:

@@ -11,15 +11,13 @@ that of a paused simulation does, the command is no speed.
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnav.detection.observe import marker_keys
-from jaxnav.loop.expect import Expected, expect_corners
+from jaxnav.loop.expectation import Expectation
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import Guard
@@ -34,15 +32,11 @@ from jaxnav.loop.interfaces import (
 )
 from jaxnav.loop.pilot import Input, Outcome, Pilot
 from jaxnav.loop.priority import before_siblings
-from jaxnav.loop.seeing import Eyes, Region, group_frames
+from jaxnav.loop.seeing import Eyes, group_frames
 from jaxnav.loop.standing_clock import StandingClock
-from jaxnav.navigator import Output
 
 _THREAD = "the loop"
 _STAYS_S = 0.5  # the drive ends this long after the last waypoint is reached
-# Markers are searched for at the reported hypothesis: regions are not narrower than this.
-_APART_NS, _TOO_FAR_NS = 15_000_000, 200_000_000  # of two poses that tell a velocity
-_MIN_COVARIANCE = np.diag([0.01**2, 0.01**2, np.deg2rad(0.5) ** 2])
 
 
 class Observer(Protocol):
@@ -121,13 +115,7 @@ class Loop:
         self._due_ns = 0  # when the odometer is read next
         # Frames without markers, kept for the next tick.
         self._blank: tuple[FrameDetections, ...] = ()
-        self._belief: _Belief | None = None
-        self._expectation: tuple[_Belief, Expected, np.ndarray | None] | None = None  # of it
-        dtype = np.asarray(pilot.navigator.corner_sigma_px).dtype
-        self._min_covariance = _MIN_COVARIANCE.astype(dtype)
-        self._keys = marker_keys(pilot.navigator.markers)
-        # Compiled now: the threads that look for markers are watched.
-        self._expected(np.array([1, 0, 0, 0, 0, 0, 0], dtype), self._min_covariance)
+        self._expectation = Expectation(pilot.navigator)
 
     def run(self, duration_s: float = float("inf"), until_arrival: bool = True) -> str:
         """Drive until the last waypoint, a trip of the guard, the time limit or the vehicle's end.
@@ -138,7 +126,7 @@ class Loop:
         Returns:
             Why it ended: "arrived", "time is over", or the reason of an `Ending` vehicle or guard.
         """
-        self._eyes.expected = self._region
+        self._eyes.expected = self._expectation.region
         self._eyes.start()
         with before_siblings():  # a late image costs one image, a late command ends the drive
             return self._driven(duration_s, until_arrival)
@@ -231,9 +219,7 @@ class Loop:
                 "frame to command", (self._now_ns() - given.frames[0].stamp_ns) / 1e6
             )
         self._outcome = outcome
-        output = outcome.output
-        # One assignment: the threads that look for markers read it at any time.
-        self._belief = self._believed(output, given.now_ns) if output.decided else None
+        self._expectation.update(outcome)
         for observer in self._observers:
             observer.on_outcome(given, outcome)
 
@@ -242,52 +228,3 @@ class Loop:
         for observer in self._observers:
             faults |= observer.faults
         return faults
-
-    def _believed(self, output: Output, now_ns: int) -> "_Belief":
-        before = self._belief
-        if before is not None and before.before is not None and now_ns - before.now_ns < _APART_NS:
-            before = before.before
-        return _Belief(
-            np.asarray(output.T_world_vehicle.wxyz_xyz),
-            np.asarray(output.pose_covariance + self._min_covariance),
-            now_ns,
-            None if before is None else replace(before, before=None),
-        )
-
-    def _region(self, camera: int) -> Region | None:
-        """The region where a camera should see markers. Called by the threads that search."""
-        belief = self._belief
-        if belief is None:
-            return None
-        known = self._expectation
-        if known is None or known[0] is not belief:  # the same for all cameras of a set
-            expected = self._expected(belief.wxyz_xyz, belief.covariance)
-            known = self._expectation = belief, expected, self._flow_px_s(belief, expected)
-        quads_px, visible, radius_px = (np.asarray(part)[camera] for part in known[1])
-        flow_px_s = None if known[2] is None else known[2][camera][visible]
-        seen = tuple(key for key, sees in zip(self._keys, visible, strict=True) if sees)
-        return Region(quads_px[visible], radius_px[visible], seen, flow_px_s, belief.now_ns)
-
-    def _flow_px_s(self, belief: "_Belief", expected: Expected) -> np.ndarray | None:
-        """Velocities (C, M, 2) of the markers' centres in the images, from two poses in a row."""
-        before = belief.before
-        if before is None or not _APART_NS <= belief.now_ns - before.now_ns <= _TOO_FAR_NS:
-            return None
-        earlier = self._expected(before.wxyz_xyz, before.covariance)
-        moved_px = np.mean(expected.quads_px - earlier.quads_px, axis=-2)
-        return np.asarray(moved_px / ((belief.now_ns - before.now_ns) / 1e9))
-
-    def _expected(self, wxyz_xyz: np.ndarray, covariance: np.ndarray) -> Expected:
-        navigator = self.pilot.navigator
-        corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, covariance)
-        return Expected(*jax.device_get(corners))
-
-
-@dataclass(frozen=True)
-class _Belief:
-    """A pose (7,), its covariance (3, 3), when it holds, and the pose a little earlier."""
-
-    wxyz_xyz: np.ndarray
-    covariance: np.ndarray
-    now_ns: int
-    before: "_Belief | None"

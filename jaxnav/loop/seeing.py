@@ -56,6 +56,8 @@ class Region:
         keys: family and id of each marker; left out, none of them is followed.
         flow_px_s: (K, 2), velocities of their centres in the image; None if nobody knows them.
         stamp_ns: the time at which they are expected there; None: that of the image.
+        decided: False: they are expected by one hypothesis or another, a marker perhaps in several
+            places, and the whole image is searched as well.
     """
 
     quads_px: Float[np.ndarray, "K 4 2"]
@@ -63,6 +65,7 @@ class Region:
     keys: tuple[tuple[str, int], ...] = ()
     flow_px_s: Float[np.ndarray, "K 2"] | None = None
     stamp_ns: int | None = None
+    decided: bool = True
 
 
 class Search:
@@ -118,7 +121,7 @@ class Search:
             return FrameDetections(self._camera, frame.stamp_ns, None, Fault.FRAME_FROZEN)
         self._since_whole += 1
         detections = _NONE
-        near = region is not None and self._since_whole < WHOLE_EVERY
+        near = region is not None and region.decided and self._since_whole < WHOLE_EVERY
         if region is not None and near:
             if not len(region.quads_px):
                 return FrameDetections(self._camera, frame.stamp_ns, _NONE)

@@ -512,3 +512,31 @@ def test_a_marker_that_no_decoder_reads_is_followed_where_it_is_expected():
         assert np.max(np.abs(followed.detections.corners_px[0] - truth.corners_px)) < 0.5
         return
     raise AssertionError("every picture can be read")
+
+
+@pytest.mark.parametrize("off_px", [0.5, 2.0, 60.0])
+def test_a_marker_that_several_hypotheses_expect_is_followed_once(off_px):
+    """The other place is the same, almost the same, and another one; the larger comes first."""
+    image, truth = next(
+        (image, truth)
+        for image, truth in other_pictures("blur4")
+        if not len(make_detector("aruco", truth.family).detect(image, truth.camera))
+    )
+    detectors, key = [make_detector("aruco", truth.family)], (truth.family, truth.id)
+    middle_px = truth.corners_px.mean(axis=0)
+    other_px = middle_px + 1.05 * (truth.corners_px - middle_px) + off_px
+    places_px = np.stack([other_px, truth.corners_px + 1.0])
+    region = Region(places_px, np.array([4.0, 4.0]), (key, key), decided=False)
+    search = Search(0, image.shape[::-1], truth.camera, detectors, Tracker())
+    found = search.look(Frame(20_000_000, image), region).detections
+    assert found.ids.tolist() == [truth.id]
+    assert np.max(np.abs(found.corners_px[0] - truth.corners_px)) < 0.5
+
+
+def test_while_several_poses_are_possible_the_whole_image_is_searched():
+    image, truth = other_pictures("clean")[0]
+    detectors = [make_detector("aruco", truth.family)]
+    for decided, found in ((False, [truth.id]), (True, [])):
+        search = Search(0, image.shape[::-1], truth.camera, detectors)
+        nowhere = Region(np.zeros((0, 4, 2)), np.ones(0), decided=decided)
+        assert search.look(Frame(1, image), nowhere).detections.ids.tolist() == found
