@@ -7,16 +7,26 @@ wide-angle, and fish-eye lenses".
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from jaxnav.models.geometry import safe_norm
-from jaxnav.models.lens_parts import LEAST_RISE, Image, along, inverted, safe_length
+from jaxnav.models.lens_parts import (
+    LEAST_RISE,
+    Image,
+    Images,
+    Numbers,
+    Points,
+    Rays,
+    along,
+    inverted,
+    safe_length,
+)
 
 _LEAST_DEPTH_RATIO = -0.99  # depth over distance of the last point that can be seen
 _STOPS = 32  # on the way from the axis, where the image is asked whether it moves outwards
 
 
-def equidistant(points: Array, coefficients: Array) -> Image:
+def equidistant(points: Points, coefficients: Numbers) -> Image:
     """theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) along (x, y)."""
     x, y, z = points
     r2, squared = x**2 + y**2, jnp.sum(points**2, axis=0)
@@ -38,7 +48,7 @@ def equidistant(points: Array, coefficients: Array) -> Image:
     return points[:2] * ratio[None], slope + straight * ratio[None, None]
 
 
-def equidistant_bearing(xy: Array, coefficients: Array) -> Array:
+def equidistant_bearing(xy: Images, coefficients: Numbers) -> Rays:
     theta_bent = safe_norm(xy)
     theta = inverted(lambda t: t * _gain(t**2, coefficients), theta_bent, lambda part: np.pi * part)
     # sin(theta) / theta_bent, which tends to 1 on the axis
@@ -47,7 +57,7 @@ def equidistant_bearing(xy: Array, coefficients: Array) -> Array:
     return jnp.concatenate([xy * ratio[..., None], jnp.cos(theta)[..., None]], axis=-1)
 
 
-def equidistant_sees(points: Array, coefficients: Array) -> Array:
+def equidistant_sees(points: Points, coefficients: Numbers) -> Bool[Array, "..."]:
     theta = jnp.arctan2(safe_norm(jnp.moveaxis(points[:2], 0, -1)), points[2])
     parts = np.linspace(1 / _STOPS, 1, _STOPS).reshape(-1, *(1,) * theta.ndim)
     way = theta[None] * jnp.asarray(parts, theta.dtype)

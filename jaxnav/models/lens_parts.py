@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from jaxnav.models.geometry import on_last_axis
 
@@ -20,22 +20,26 @@ _TABLE_SIZE = 96  # of the first look at a function that is to be inverted
 _FINE = 64  # of the second, over two cells of the first
 _NEWTON_STEPS = 4
 
+Points = Float[Array, "3 ..."]
+Images = Float[Array, "*batch 2"]
+Rays = Float[Array, "*batch 3"]
+Numbers = Float[Array, "k ..."]  # coefficients; those of one lens, or of every point
 Image = tuple[Float[Array, "2 ..."], Float[Array, "3 2 ..."]]
 
 
-def along(constant: Array, points: Array) -> Array:
+def along(constant: Shaped[Array, "..."], points: Float[Array, "..."]) -> Shaped[Array, "..."]:
     """The constant with trailing axes of length 1, to broadcast over all points."""
     return constant.reshape(*constant.shape, *(1,) * (points.ndim - 1))
 
 
-def safe_length(points: Array) -> Array:
+def safe_length(points: Float[Array, "n ..."]) -> Float[Array, "..."]:
     """Lengths over the first axis; 0 has the derivative 0."""
     squared = jnp.sum(points**2, axis=0)
     nonzero = squared > 0
     return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1)), 0)
 
 
-def comes_back(rays: Array, points: Array) -> Array:
+def comes_back(rays: Rays, points: Points) -> Bool[Array, "..."]:
     """Whether rays (..., 3), through the images of points (3, ...), lead to these points.
 
     They do not where another point has the same image: beyond a fold, or off the end of a table.
@@ -45,15 +49,17 @@ def comes_back(rays: Array, points: Array) -> Array:
     return apart < float(jnp.finfo(points.dtype).eps) ** _SAME
 
 
-def towards(xy: Array) -> Array:
+def towards(xy: Images) -> Rays:
     """Unit vectors (..., 3) through images (..., 2) of a pinhole at focal length 1."""
     ray = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
     return ray / jnp.sqrt(jnp.sum(ray**2, axis=-1, keepdims=True))
 
 
 def inverted(
-    profile: Callable[[Array], Array], target: Array, place: Callable[[np.ndarray], np.ndarray]
-) -> Array:
+    profile: Callable[[Array], Array],
+    target: Float[Array, "*batch"],
+    place: Callable[[np.ndarray], np.ndarray],
+) -> Float[Array, "*batch"]:
     """The smallest x >= 0 with profile(x) = target: table look-up, then Newton in its cell.
 
     The table ends where the profile stops rising: the lens is one-to-one up to there, and a target

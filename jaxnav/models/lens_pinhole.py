@@ -9,12 +9,16 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from jaxnav.models.geometry import safe_norm
 from jaxnav.models.lens_parts import (
     MIN_DEPTH_RATIO,
     Image,
+    Images,
+    Numbers,
+    Points,
+    Rays,
     along,
     comes_back,
     inverted,
@@ -30,7 +34,7 @@ _NEWTON_STEPS = 4
 Coefficients = Array | Sequence[Array]
 
 
-def pinhole(points: Array, coefficients: Array) -> Image:
+def pinhole(points: Points, coefficients: Numbers) -> Image:
     del coefficients
     length = safe_length(points)
     nearest = MIN_DEPTH_RATIO * jnp.maximum(length, 1e-12)
@@ -45,25 +49,25 @@ def pinhole(points: Array, coefficients: Array) -> Image:
     return image, (straight - depth_slope[:, None] * image[None]) * per_depth[None, None]
 
 
-def pinhole_bearing(xy: Array, coefficients: Array) -> Array:
+def pinhole_bearing(xy: Images, coefficients: Numbers) -> Rays:
     del coefficients
     return towards(xy)
 
 
-def pinhole_sees(points: Array, coefficients: Array) -> Array:
+def pinhole_sees(points: Points, coefficients: Numbers) -> Bool[Array, "..."]:
     del coefficients
     return points[2] > MIN_DEPTH_RATIO * jnp.maximum(safe_length(points), 1e-12)
 
 
-def radtan(points: Array, coefficients: Array) -> Image:
+def radtan(points: Points, coefficients: Numbers) -> Image:
     return bent(pinhole(points, coefficients), coefficients)
 
 
-def radtan_bearing(xy: Array, coefficients: Array) -> Array:
+def radtan_bearing(xy: Images, coefficients: Numbers) -> Rays:
     return towards(unbent(xy, coefficients))
 
 
-def radtan_sees(points: Array, coefficients: Array) -> Array:
+def radtan_sees(points: Points, coefficients: Numbers) -> Bool[Array, "..."]:
     image, _ = radtan(points, coefficients)
     ray = radtan_bearing(jnp.moveaxis(image, 0, -1), coefficients)
     return pinhole_sees(points, coefficients) & comes_back(ray, points)
@@ -83,7 +87,7 @@ def bent(straight: Image, coefficients: Coefficients) -> Image:
     )
 
 
-def unbent(distorted: Array, coefficients: Coefficients) -> Array:
+def unbent(distorted: Images, coefficients: Coefficients) -> Images:
     """The image (..., 2) whose distortion is the given one."""
     radius_bent = safe_norm(distorted)
     radius = inverted(

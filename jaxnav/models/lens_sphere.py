@@ -20,12 +20,16 @@ eucm: the focal lengths of files are those of their formulas.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from jaxnav.models.lens_parts import (
     LEAST_RISE,
     MIN_DEPTH_RATIO,
     Image,
+    Images,
+    Numbers,
+    Points,
+    Rays,
     along,
     comes_back,
     safe_length,
@@ -41,38 +45,38 @@ class _Sum(NamedTuple):
     beta: Array
 
 
-def omni(points: Array, coefficients: Array) -> Image:
+def omni(points: Points, coefficients: Numbers) -> Image:
     return bent(_divided(points, *_straight(points), _of_omni(coefficients)), _brown(coefficients))
 
 
-def omni_bearing(xy: Array, coefficients: Array) -> Array:
+def omni_bearing(xy: Images, coefficients: Numbers) -> Rays:
     xy, w = _raised(unbent(xy, _brown(coefficients)), _of_omni(coefficients))
     return _unit(xy, w)
 
 
-def omni_sees(points: Array, coefficients: Array) -> Array:
+def omni_sees(points: Points, coefficients: Numbers) -> Bool[Array, "..."]:
     image, _ = omni(points, coefficients)
     ray = omni_bearing(jnp.moveaxis(image, 0, -1), coefficients)
     return _sees(points, points[2], _of_omni(coefficients)) & comes_back(ray, points)
 
 
-def eucm(points: Array, coefficients: Array) -> Image:
+def eucm(points: Points, coefficients: Numbers) -> Image:
     return _divided(points, *_straight(points), _of_eucm(coefficients))
 
 
-def eucm_bearing(xy: Array, coefficients: Array) -> Array:
+def eucm_bearing(xy: Images, coefficients: Numbers) -> Rays:
     return _unit(*_raised(xy, _of_eucm(coefficients)))
 
 
-def eucm_sees(points: Array, coefficients: Array) -> Array:
+def eucm_sees(points: Points, coefficients: Numbers) -> Bool[Array, "..."]:
     return _sees(points, points[2], _of_eucm(coefficients))
 
 
-def double_sphere(points: Array, coefficients: Array) -> Image:
+def double_sphere(points: Points, coefficients: Numbers) -> Image:
     return _divided(points, *_behind(points, coefficients[0]), _of_double_sphere(coefficients))
 
 
-def double_sphere_bearing(xy: Array, coefficients: Array) -> Array:
+def double_sphere_bearing(xy: Images, coefficients: Numbers) -> Rays:
     xi = coefficients[0]
     xy, w = _raised(xy, _of_double_sphere(coefficients))
     r2 = jnp.sum(xy**2, axis=-1)
@@ -84,7 +88,7 @@ def double_sphere_bearing(xy: Array, coefficients: Array) -> Array:
     return jnp.concatenate([xy * length[..., None], (w * length - xi)[..., None]], axis=-1)
 
 
-def double_sphere_sees(points: Array, coefficients: Array) -> Array:
+def double_sphere_sees(points: Points, coefficients: Numbers) -> Bool[Array, "..."]:
     return _sees(points, _behind(points, coefficients[0])[0], _of_double_sphere(coefficients))
 
 
