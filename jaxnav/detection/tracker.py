@@ -119,6 +119,11 @@ class Tracker:
         )
 
     @property
+    def learnt_exposure_s(self) -> float | None:
+        """The exposure time by streaks; None where it was told, or nothing has told it."""
+        return None if self._told else self.exposure_s
+
+    @property
     def _likely_exposure_s(self) -> float:
         return _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
 

@@ -244,7 +244,10 @@ def test_a_tracker_learns_the_exposure_time_from_streaks_and_leaves_decoded_mark
             assert found.ids.tolist() == [truth.id]
             assert len(tracker.follow(*given, np.array([4.5]), flow_px_s[None], decoded=found)) == 0
     assert tracker.exposure_s == pytest.approx(exposure_s, rel=0.1)
-    assert Tracker(0.004).exposure_s == 0.004
+    assert tracker.learnt_exposure_s == tracker.exposure_s
+    assert Tracker().learnt_exposure_s is None
+    told = Tracker(0.004)
+    assert (told.exposure_s, told.learnt_exposure_s) == (0.004, None)
 
 
 def test_corners_of_a_rolling_shutter_are_of_the_middle_row():

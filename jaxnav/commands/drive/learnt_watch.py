@@ -1,6 +1,7 @@
 """Tell what a drive learns of its sensors and cameras, while it is driven and in the end."""
 
 import sys
+from collections.abc import Sequence
 
 import jax
 
@@ -9,6 +10,7 @@ from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.pilot import Input, Outcome
+from jaxnav.loop.seeing import Search
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.recording.learnt import Learnt, errors_of, repeated_share
@@ -69,3 +71,38 @@ class LearntWatch:
         lines = [f"learnt: {visible(line)}" for line in self._found.values()]
         adopts = self._adopts and self._found.keys() - {_CORNERS}
         return "\n".join([*lines, _ADOPT] if adopts else lines)
+
+
+class ExposureWatch:
+    """Tells in the end how long cameras expose, by the streaks of markers; see `Onlooker`."""
+
+    faults = Fault(0)
+
+    def __init__(self, names: Sequence[str], searches: Sequence[Search]):
+        """Args:
+        names: of the cameras.
+        searches: one for each.
+        """
+        self._names, self._searches = tuple(names), tuple(searches)
+
+    def on_outcome(self, given: Input, outcome: Outcome) -> None:
+        """See `Observer`."""
+
+    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
+        """See `Observer`."""
+
+    def close(self) -> None:
+        """See `Onlooker`."""
+
+    @property
+    def closing_note(self) -> str | None:
+        """See `Onlooker`."""
+        trackers = [search.tracker for search in self._searches]
+        exposures_s = [None if one is None else one.learnt_exposure_s for one in trackers]
+        lines = [
+            f"learnt: camera {visible(name)} exposes for {1e3 * exposure_s:.1f} ms, by the streaks "
+            f"of markers: `exposure_s: {exposure_s:.2g}` in rig.yaml tells it from the start"
+            for name, exposure_s in zip(self._names, exposures_s, strict=True)
+            if exposure_s is not None
+        ]
+        return "\n".join(lines) or None

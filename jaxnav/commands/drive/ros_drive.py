@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxnav.commands.drive.arguments import Ros, Run
+from jaxnav.commands.drive.learnt_watch import ExposureWatch
 from jaxnav.commands.drive.observers import DriveRecorder
 from jaxnav.commands.drive.ros_save import LearntKeeper
 from jaxnav.commands.drive.ros_setup import (
@@ -109,7 +110,8 @@ class PreparedDrive:
         pilot.warm_up()
         reporter = _Reporter(self._publisher, self.file.base_x_m)
         keeper = LearntKeeper(self.file, setup)
-        observers: list[Any] = [reporter, keeper, *self._record()]
+        exposures = ExposureWatch(setup.rig.names, self._searches)
+        observers: list[Any] = [reporter, keeper, exposures, *self._record()]
         if self._inputs is not None:
             return _Playing(
                 self._inputs, pilot, observers, keeper, self._connection, self._args.rate, self._say

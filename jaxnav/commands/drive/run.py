@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
+from jaxnav.commands.drive.learnt_watch import ExposureWatch
 from jaxnav.commands.drive.observers import open_onlookers
 from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
@@ -73,6 +74,7 @@ def run(args: Run, signals: Signals) -> int:
         follow = args.detector == "follow"
         searches = searches_for(args.corner_backend, setup.rig, setup.markers, follow)
         onlookers = open_onlookers(args, setup, closing)
+        onlookers.append(ExposureWatch(setup.rig.names, searches))
         for onlooker in onlookers:
             signals.before_leaving(onlooker.close)
         signals.check()

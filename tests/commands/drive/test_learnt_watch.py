@@ -1,12 +1,14 @@
 """What `jaxnav run` says of the errors that a drive learns."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
 
 from jaxnav.belief.sensor_errors import SENSORS_END
-from jaxnav.commands.drive.learnt_watch import LearntWatch
+from jaxnav.commands.drive.learnt_watch import ExposureWatch, LearntWatch
+from jaxnav.detection import Tracker
 from tests.commands.calibrate.test_adopt import learnt_outcome, setup_of
 from tests.helpers.drives import make_input
 
@@ -75,3 +77,16 @@ def test_cameras_whose_names_differ_in_a_digit_are_told_apart(capsys):
     told = capsys.readouterr().err
     assert told.count("camera cam1 looks 1.20 deg too far left") == 1
     assert "camera cam2 looks" in told
+
+
+def test_exposure_times_that_streaks_tell_are_said_in_the_end():
+    searches = [
+        SimpleNamespace(tracker=tracker)
+        for tracker in (Tracker(), None, SimpleNamespace(learnt_exposure_s=0.01012), Tracker(0.01))
+    ]
+    watch = ExposureWatch(("front", "right", "rear", "left"), searches)
+    assert watch.closing_note == (
+        "learnt: camera rear exposes for 10.1 ms, by the streaks of markers: `exposure_s: 0.01` in "
+        "rig.yaml tells it from the start"
+    )
+    assert ExposureWatch(("front",), searches[:1]).closing_note is None
