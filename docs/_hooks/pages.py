@@ -101,17 +101,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     source = next((path for path, uri in SITE_OF.items() if uri == site), None)
     if source is None:
         return markdown
-    pieces, end = [], 0
-    for code in CODE.finditer(markdown):  # what stands in code is no link
-        pieces += [with_links(markdown[end : code.start()], source, site, config, files), code[0]]
-        end = code.end()
-    return "".join([*pieces, with_links(markdown[end:], source, site, config, files)])
-
-
-def with_links(text: str, source: str, site: str, config: MkDocsConfig, files: Files) -> str:
+    codes = [code.span() for code in CODE.finditer(markdown)]
     folder = PurePosixPath(source).parent
 
     def rewritten(link: re.Match[str]) -> str:
+        if any(begin <= link.start() and link.end() <= end for begin, end in codes):
+            return link[0]  # what stands in code is no link; a link's text may hold code
         picture, label, target = link.groups()
         path, _, anchor = target.partition("#")
         if not path or "://" in path or path.startswith(("mailto:", "/")):
@@ -131,4 +126,4 @@ def with_links(text: str, source: str, site: str, config: MkDocsConfig, files: F
         to = relpath(to, str(PurePosixPath(site).parent))
         return f"{picture}[{label}]({to}{'#' * bool(anchor)}{anchor})"
 
-    return LINK.sub(rewritten, text)
+    return LINK.sub(rewritten, markdown)
