@@ -7,6 +7,7 @@ tells the corners at any place, and before and after a motion.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -106,16 +107,13 @@ def likely_poses(
     log_weight = np.where(bank.initialised, bank.log_weight, -np.inf)
     likely = np.argsort(-log_weight, kind="stable")[: min(most, int(np.sum(bank.initialised)))]
     poses, covariances = (np.asarray(part)[likely] for part in planar_poses(bank))
-    half, zero = poses[:, 2] / 2, np.zeros_like(poses[:, 2])
-    x_m, y_m = poses[:, 0], poses[:, 1]
-    wxyz_xyz = np.stack([np.cos(half), zero, zero, np.sin(half), x_m, y_m, zero], axis=1)
-    return wxyz_xyz, covariances
+    return np.array([_wxyz_xyz(pose) for pose in poses], poses.dtype), covariances
 
 
 def quads_px(navigator: Navigator, place: Place) -> Float[np.ndarray, "C M 4 2"]:
     """Corners as seen from a place, px, by the program that predicts search regions."""
-    (x_m, y_m, psi_rad), dtype = place, np.asarray(navigator.corner_sigma_px).dtype
-    wxyz_xyz = np.array([math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0], dtype)
+    dtype = np.asarray(navigator.corner_sigma_px).dtype
+    wxyz_xyz = np.array(_wxyz_xyz(place), dtype)
     corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, np.zeros((3, 3), dtype))
     return np.asarray(corners.quads_px)
 
@@ -141,6 +139,11 @@ def due_px(
         before_rad,
     )
     return quads_px(navigator, before), quads_px(navigator, (x_m, y_m, psi_rad))
+
+
+def _wxyz_xyz(place: Sequence[float]) -> list[float]:
+    x_m, y_m, psi_rad = map(float, place)
+    return [math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0]
 
 
 def _axes(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
