@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.refine import mean_side_px
+from jaxnav.detection.signs_of_life import sign
 from jaxnav.detection.types import at_scale
 
 _TEXELS = 8  # of a cell, along a side
@@ -60,6 +61,7 @@ def best_match(
     image, _ = at_scale(image, 1 / shrink)
     best: Match | None = None
     for quad_px in quads_px:
+        sign()  # each place takes some 10 ms
         quad = (quad_px + 0.5) / shrink - 0.5
         paper = _paper(pattern, quad)
         if not np.ptp(paper, axis=0).max() < _MOST_PAPER * np.ptp(quad, axis=0).max():

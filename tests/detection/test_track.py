@@ -13,6 +13,7 @@ from jaxnav.detection.disturbance import find_shadow, noise_correlation
 from jaxnav.detection.image_model import expose, step_corners
 from jaxnav.detection.paper import homography
 from jaxnav.detection.signs_of_life import telling
+from jaxnav.detection.template import best_match
 from jaxnav.models.camera import Camera
 from tests.helpers.marker_images import random_scene
 from tests.helpers.other_pictures import other_pictures
@@ -156,6 +157,18 @@ def test_a_search_gives_a_sign_of_life_before_each_fit():
     assert len(signs) >= 12
     make_detector("aruco", FAMILY).detect(image)  # outside of the block nobody is told
     assert len(signs) < 40
+
+
+def test_each_place_in_which_a_marker_may_be_is_a_sign_of_life():
+    """Several hypotheses expect it in several places, each of which takes some 10 ms."""
+    image, truth = other_pictures("clean")[0]
+    places_px = truth.corners_px + 30.0 * np.arange(4)[:, None, None]
+    signs = []
+    for count in (1, 4):
+        signs.append([])
+        with telling(lambda: signs[-1].append(1)):
+            best_match(image, FAMILY, truth.id, places_px[:count], 4.0, (0.0, 0.0), 1.0)
+    assert len(signs[1]) - len(signs[0]) == 3
 
 
 def test_slopes_of_an_exposure_are_its_derivatives():
