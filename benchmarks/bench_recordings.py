@@ -19,6 +19,7 @@ from jaxnav.configuration import configure
 
 configure(float64=True)  # before the first array, as the commands do
 
+import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import jaxlie  # noqa: E402
 import numpy as np  # noqa: E402
@@ -119,6 +120,45 @@ def with_made_odometry(recording: Recording, scale: float, yaw_deg: float) -> Re
     return dataclasses.replace(recording, odometry=track)
 
 
+def print_held_out(recording: Recording, selector: str) -> None:
+    """How well poses from every second marker predict the corners of the others, in pixels.
+
+    The reference is made of all corners, so that it has a part of each frame's noise; the corners
+    of other markers have none of it.
+    """
+    assert recording.reference is not None
+    frame, camera, marker = recording.seen_at
+    by_count = np.argsort(-np.bincount(marker, minlength=len(recording.markers.ids)), kind="stable")
+    used = np.isin(marker, by_count[::2])
+    half = dataclasses.replace(
+        recording, seen_at=recording.seen_at[:, used], seen_px=recording.seen_px[used]
+    )
+    result = replay(half, make_selector(selector), one_at_a_time=False, smooth=True)
+    assert result.filtered is not None
+    compared = ~used & (result.filtered.located[:, 0] & recording.reference.valid)[frame]
+    compared &= np.isin(frame, frame[used])
+    frame, camera, marker = frame[compared], camera[compared], marker[compared]
+    corners = recording.markers.corners_world_m[marker]
+
+    @jax.jit
+    @jax.vmap
+    def predicted(pose: jax.Array, camera: jax.Array, corners: jax.Array) -> jax.Array:
+        lens, mounted = jax.tree.map(
+            lambda leaf: leaf[camera], (recording.rig.cameras, recording.rig.Ts_camera_vehicle)
+        )
+        return lens.project(jax.vmap((mounted @ jaxlie.SE3(pose).inverse()).apply)(corners))
+
+    for title, poses in {
+        "reference": recording.reference.T_world_vehicle,
+        f"{selector}, filter": result.filtered.T_world_vehicle[:, 0],
+        f"{selector}, smoothed": result.T_world_vehicle[:, 0],
+    }.items():
+        off = np.asarray(predicted(jnp.asarray(poses)[frame], camera, corners))
+        rms_px = np.sqrt(np.mean(np.sum((off - recording.seen_px[compared]) ** 2, -1), -1))
+        cells = (f"{value:.2f}" for value in np.percentile(rms_px, [50, 95]))
+        print(f"| {recording.name} | {title} | {len(rms_px)} | {' | '.join(cells)} |", flush=True)
+
+
 def print_gaps(recording: Recording, gap_s: float) -> None:
     """How the error grows while no marker is seen, and that of the odometry alone meanwhile."""
     assert recording.reference is not None
@@ -174,6 +214,8 @@ def main() -> None:
     parser.add_argument("--smooth", action="store_true", help="and the smoothed poses beside")
     parser.add_argument("--markers", type=int, help="only so many, those that are seen most")
     parser.add_argument("--all-markers", action="store_true", help="one pose from all in view")
+    parser.add_argument("--held-out", action="store_true",
+                        help="poses by half of the markers, judged by the others")  # fmt: skip
     parser.add_argument("--gap-s", type=float, help="hide all markers so long, now and then")
     args = parser.parse_args()
     head_is_printed = False
@@ -202,6 +244,9 @@ def main() -> None:
             recording = dataclasses.replace(recording, rig=rig)
         if args.gap_s is not None:
             print_gaps(recording, args.gap_s)
+            continue
+        if args.held_out:
+            print_held_out(recording, args.selectors[-1])
             continue
         for name in args.selectors:
             begin = time.perf_counter()

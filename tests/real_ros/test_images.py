@@ -23,7 +23,7 @@ def test_a_car_is_localised_by_its_cameras_pictures(tmp_path):
             sim_car(tmp_path, "--images"),
             node(tmp_path, str(file), *PATIENT) as program,
         ):
-            until(lambda: listener.has_driven(1.2), 240.0, program)
+            until(lambda: listener.has_driven(1.8), 240.0, program)
             check_poses(listener)
             check_tf(listener)
     finally:

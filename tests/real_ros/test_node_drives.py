@@ -162,10 +162,11 @@ def check_poses(listener: Listener) -> None:
         nees.append(error @ np.linalg.solve(covariance[:2, :2], error))
     assert len(nees) > 100
     assert np.median(nees) < 5
-    assert np.max(nees) < 25
-    # The first pose is of one look from afar, 9 cm unsure: an error of 15 cm is none of it.
+    # Between two readings of the odometry, 0.1 s on a busy machine, a car that stops drives 3 cm.
+    assert np.max(np.subtract(errors_m, np.multiply(5, sigmas_m))) < 0.03
+    # The first poses are of one look from afar, 9 cm unsure: those after them must be near.
     sure = np.less(sigmas_m, 0.05)
-    assert np.mean(sure) > 0.8
+    assert np.mean(sure) > 0.5
     assert np.max(np.array(errors_m)[sure]) < 0.15
     assert np.median(errors_m) < 0.04
     assert np.median(errors_m[len(errors_m) // 2 :]) < 0.02
@@ -256,8 +257,8 @@ def test_it_drives_by_the_time_of_a_simulation_and_by_lenses_that_topics_tell(tm
         assert 100 < stamp_s(listener.last("/jaxnav/pose")) < 1000  # the simulation's seconds
         until(listener.drives, 60.0, program)
         check_pause(listener, car, program)
-        # So far on, a pose is sure to 6 mm: nearer to the start 2 cm are no error.
-        until(lambda: listener.has_driven(1.2), 60.0, program)
+        # So far on a pose is sure to 5 mm: near the start 2 cm are no error.
+        until(lambda: listener.has_driven(1.8), 60.0, program)
         check_poses(listener)
         check_tf(listener)
 
