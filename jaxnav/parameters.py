@@ -81,6 +81,7 @@ TUNABLES: dict[str, Tunable] = {
         most=(0.5,),
     ),
     "motion.slip_length_m": Tunable("Q: way after which a slip has faded to 1/e", "m", 0.2),
+    "motion.gyro_slip_length_m": Tunable("Q: the same while a gyro tells the turn", "m", 0.5),
     "motion.odometry_drift": Tunable(
         "Q: random walk of a free body's odometry, per way, angle, and time",
         "m/sqrt(m), rad/sqrt(rad), m/sqrt(s), rad/sqrt(s)",

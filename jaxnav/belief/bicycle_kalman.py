@@ -94,6 +94,7 @@ class BicycleKalman(Motion):
     )  # along, across, turning: standard deviations, m/s m/s rad/s; or their covariance
     slip_sigma: float = 0.05  # of the wheels, a share of their speed; none where they are exact
     slip_length_m: float = 0.2  # way after which the correlation of a slip has fallen to 1/e
+    gyro_slip_length_m: float = 0.5  # the same while a gyro tells, which shows when a slip begins
     initial_velocity_sigma: Float[Array, " 3"] = eqx.field(
         default_factory=lambda: jnp.asarray([1.0, 1.0, 2.0])
     )  # before the first odometry, m/s m/s rad/s
@@ -329,9 +330,12 @@ class BicycleKalman(Motion):
         P = kalman.replace_first(P, A).at[:SIX, :SIX].add(Q)
         later = mean.at[:3].set(pose.at[2].set(wrap_angle(pose[2])))
         way_m = safe_norm(mean[3:5]) * dt_s
+        length_m = jnp.asarray(self.slip_length_m, dtype)
+        if turn is not None:
+            length_m = jnp.where(turn.told, jnp.asarray(self.gyro_slip_length_m, dtype), length_m)
         if self.vehicle.gyro is not None:
             P = P.at[-1, -1].add(jnp.asarray(self.vehicle.gyro.bias_walk, dtype) ** 2 * dt_s)
-        return slipped(later, P, way_m, self._slip_sigma(), jnp.asarray(self.slip_length_m, dtype))
+        return slipped(later, P, way_m, self._slip_sigma(), length_m)
 
     def _turn(self, gyro: Gyro, obs: Observation, mean: Array) -> Turn:
         density = kalman.as_matrix(self.acceleration_density)[2, 2].astype(mean.dtype)

@@ -126,6 +126,16 @@ def test_a_gyro_that_is_silent_or_saturated_changes_nothing(gyro_radps):
     np.testing.assert_allclose(bank.covariance[0, -1, -1], BIAS_SIGMA**2, rtol=1e-9)
 
 
+@pytest.mark.parametrize(("gyro_radps", "length_m"), [(np.nan, 0.1), (0.0, 0.4)])
+def test_a_slip_is_remembered_for_longer_while_a_gyro_tells(gyro_radps, length_m):
+    motion = BicycleKalman(base(GYRO, TWIST_AS_TOLD), slip_length_m=0.1, gyro_slip_length_m=0.4)
+    bank = begun(motion, [0.0, 0.0, 0.5])
+    bank = eqx.tree_at(lambda b: b.mean, bank, bank.mean.at[:, SIX].set(0.3).at[:, 3].set(1.0))
+    obs = dataclasses.replace(reading(gyro_radps=gyro_radps), has_odometry=jnp.asarray(False))
+    slip = predicted(motion, bank, obs).mean[0, SIX]
+    np.testing.assert_allclose(slip, 0.3 * np.exp(-1.0 * DT_S / length_m), rtol=1e-12)
+
+
 def test_the_heading_is_the_gyros_whatever_the_wheels_say():
     """With a bias that is constant, var psi = var psi_0 + N^2 t + sigma_b^2 t^2."""
     motion = BicycleKalman(base(GYRO, TWIST_AS_TOLD))
