@@ -31,7 +31,7 @@ _WIDTH = 3.0  # of the loss, standard deviations
 # and E[psi^2] / E[w] over E[w r^2] / E[w].
 _SLOPE, _SCORE = 0.734, 0.682
 _NOTICED = 1.3  # a smaller factor may come from so many cells by chance
-_GROUND = 0.15  # standard deviation of the ground beyond the paper, of the contrast
+_GROUND = 1.0  # standard deviation of the ground beyond the paper, of the contrast
 _LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
 _STEPS = 8
 _COARSE_STEPS = 6

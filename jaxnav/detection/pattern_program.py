@@ -59,6 +59,7 @@ class PixelFit(NamedTuple):
 
     xy: Float[Array, "2 N"]  # places on the paper
     residual: Float[Array, " N"]  # grey levels
+    deviation: Float[Array, " N"]  # standard deviation, grey levels
     marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
 
 
@@ -115,4 +116,4 @@ def follow_pattern(
         code_advantage(fit, window, codes, patch.own, patch.instants),
         alike,
     )
-    return Followed(summary, PixelFit(fit.xy, fit.residual, fit.marker), fit.y)
+    return Followed(summary, PixelFit(fit.xy, fit.residual, fit.deviation, fit.marker), fit.y)

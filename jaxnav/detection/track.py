@@ -175,7 +175,8 @@ def _undisturbed(fit: PatchFit) -> PatchFit | None:
         fit = _best([fit.anew(used=_among(used, side)) for side in sides])
     for _ in range(_ROUNDS):
         pixels_px = fit.patch.pixels[:count].astype(int)
-        clear = clear_pixels(pixels_px, fit.pixels.residual / float(fit.summary.noise))
+        seen = fit.pixels
+        clear = clear_pixels(pixels_px, seen.residual / seen.deviation)
         if np.sum(clear) < max(_LEAST_VISIBLE * count, LEAST_PIXELS):
             return None
         before, fit = fit.patch.used[:count], fit.again(used=_among(used, clear))

@@ -46,6 +46,26 @@ def test_markers_are_followed_where_another_renderer_draws_them(kind):
     assert np.sqrt(np.mean(np.square(errors))) < 0.3
 
 
+def test_a_rough_ground_beside_the_paper_moves_no_corner():
+    """Blurred by as much as the white zone is wide, it shows in the marker's outermost cells."""
+    errors, nees = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        angle_rad = rng.uniform(0, 2 * np.pi)
+        streak_px = (4 * math.cos(angle_rad), 4 * math.sin(angle_rad))
+        scene = random_scene(
+            rng, 16, marker_cells(FAMILY, 17), 0.6, optics_px=0.4, texture=60, motion_px=streak_px
+        )
+        image, quad_px = scene.render(rng), scene.corners_px()
+        there = Target(FAMILY, 17, quad_px[None] + 1.0, 4.0, streak_px, 0.7)
+        (found,) = track(image, scene.camera, [there])
+        error = (found.corners_px - quad_px).ravel()
+        errors.append(error)
+        nees.append(error @ np.linalg.solve(found.covariance_px2, error) / 4)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.038
+    assert 1.0 < np.mean(nees) < 2.3  # of two coordinates
+
+
 def test_nothing_is_followed_where_the_marker_is_not():
     for seed, (image, truth) in enumerate(other_pictures("negatives")):
         assert track(image, truth.camera, [target(truth, seed)]) == [None]
