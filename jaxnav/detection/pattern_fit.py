@@ -32,6 +32,7 @@ _WIDTH = 3.0  # of the loss, standard deviations
 _SLOPE, _SCORE = 0.734, 0.682
 _NOTICED = 1.3  # a smaller factor may come from so many cells by chance
 _GROUND = 1.0  # standard deviation of the ground beyond the paper, of the contrast
+_FAR = 0.2  # of a pixel's light from the ground: what shows more of it tells nothing of the noise
 _LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
 _STEPS = 8
 _COARSE_STEPS = 6
@@ -132,7 +133,8 @@ def fit_pattern(
     coarse = window.most_noise
     y = _nearer(window, (instants + 1) // 2) if start is None else start
     residual, _, image = _model(y, window, instants)
-    noise = jnp.maximum(_spread(residual, window.used, coarse), _LEAST_NOISE)
+    plain = window.used & (image.far < _FAR)
+    noise = jnp.maximum(_spread(residual, plain, coarse), _LEAST_NOISE)
     y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS, _SLOPE)
     return _result(y, window, instants)
 
@@ -280,7 +282,7 @@ def _spread(residual: Array, used: Array, most: Array) -> Array:
 
 def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit:
     residual, J, image = _model(y, window, instants)
-    noise = _spread(residual, window.used, window.most_noise)
+    noise = _spread(residual, window.used & (image.far < _FAR), window.most_noise)
     noise = jnp.maximum(noise, _LEAST_NOISE)
     scale = _deviation(noise, image, window)
     _, weight = _loss(residual / scale, window.used)
