@@ -68,11 +68,23 @@ def score(recording: Recording, result: Replay) -> dict[str, float]:
     }
 
 
+def by_count(recording: Recording) -> np.ndarray:
+    """Indices (M,) of the markers, those that are seen most first."""
+    seen = np.bincount(recording.seen_at[2], minlength=len(recording.markers.ids))
+    return np.argsort(-seen, kind="stable")
+
+
+def with_sightings(recording: Recording, kept: np.ndarray) -> Recording:
+    """The recording with some of its sightings alone."""
+    return dataclasses.replace(
+        recording, seen_at=recording.seen_at[:, kept], seen_px=recording.seen_px[kept]
+    )
+
+
 def of_most_seen(recording: Recording, count: int) -> Recording:
     """The recording with the markers that are seen most, in the map's order."""
-    seen = np.bincount(recording.seen_at[2], minlength=len(recording.markers.ids))
-    chosen = np.sort(np.argsort(-seen, kind="stable")[:count])
-    index = np.full(len(seen), -1)
+    chosen = np.sort(by_count(recording)[:count])
+    index = np.full(len(recording.markers.ids), -1)
     index[chosen] = np.arange(len(chosen))
     kept = index[recording.seen_at[2]] >= 0
     frame, camera, marker = recording.seen_at[:, kept]
@@ -128,11 +140,8 @@ def print_held_out(recording: Recording, selector: str) -> None:
     """
     assert recording.reference is not None
     frame, camera, marker = recording.seen_at
-    by_count = np.argsort(-np.bincount(marker, minlength=len(recording.markers.ids)), kind="stable")
-    used = np.isin(marker, by_count[::2])
-    half = dataclasses.replace(
-        recording, seen_at=recording.seen_at[:, used], seen_px=recording.seen_px[used]
-    )
+    used = np.isin(marker, by_count(recording)[::2])
+    half = with_sightings(recording, used)
     result = replay(half, make_selector(selector), one_at_a_time=False, smooth=True)
     assert result.filtered is not None
     compared = ~used & (result.filtered.located[:, 0] & recording.reference.valid)[frame]
@@ -143,10 +152,7 @@ def print_held_out(recording: Recording, selector: str) -> None:
     @jax.jit
     @jax.vmap
     def predicted(pose: jax.Array, camera: jax.Array, corners: jax.Array) -> jax.Array:
-        lens, mounted = jax.tree.map(
-            lambda leaf: leaf[camera], (recording.rig.cameras, recording.rig.Ts_camera_vehicle)
-        )
-        return lens.project(jax.vmap((mounted @ jaxlie.SE3(pose).inverse()).apply)(corners))
+        return recording.rig.project(jaxlie.SE3(pose).inverse(), corners)[camera]
 
     for title, poses in {
         "reference": recording.reference.T_world_vehicle,
@@ -166,10 +172,7 @@ def print_gaps(recording: Recording, gap_s: float) -> None:
     times_s = (recording.stamps_ns - recording.stamps_ns[0]) / 1e9
     rows = np.flatnonzero(recording.reference.valid)
     in_gap = times_s % (1.6 * gap_s) > 0.6 * gap_s
-    kept = ~in_gap[recording.seen_at[0]]
-    hidden = dataclasses.replace(
-        recording, seen_at=recording.seen_at[:, kept], seen_px=recording.seen_px[kept]
-    )
+    hidden = with_sightings(recording, ~in_gap[recording.seen_at[0]])
     found = replay(hidden, make_selector("multi-hypothesis")).T_world_vehicle[rows, 0]
     truth = recording.reference.T_world_vehicle[rows]
     stamps_ns, twists = (

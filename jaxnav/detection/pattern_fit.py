@@ -130,11 +130,9 @@ def fit_pattern(
         start: where the steps begin, near the end; None: at M = I and the expected motion, which
             may be a pixel off, so that a wide loss comes first.
     """
-    coarse = window.most_noise
     y = _nearer(window, (instants + 1) // 2) if start is None else start
     residual, _, image = _model(y, window, instants)
-    plain = window.used & (image.far < _FAR)
-    noise = jnp.maximum(_spread(residual, plain, coarse), _LEAST_NOISE)
+    noise = _noise(residual, image, window)
     y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS, _SLOPE)
     return _result(y, window, instants)
 
@@ -164,6 +162,12 @@ def _first(window: Window, count: int) -> Window:
         used=window.used[:count],
         shadow=window.shadow[:count],
     )
+
+
+def _noise(residual: Array, image: Exposure, window: Window) -> Array:
+    """Standard deviation of the pixels that fit, of those that show little of the ground."""
+    plain = window.used & (image.far < _FAR)
+    return jnp.maximum(_spread(residual, plain, window.most_noise), _LEAST_NOISE)
 
 
 def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " N"]:
@@ -282,8 +286,7 @@ def _spread(residual: Array, used: Array, most: Array) -> Array:
 
 def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit:
     residual, J, image = _model(y, window, instants)
-    noise = _spread(residual, window.used & (image.far < _FAR), window.most_noise)
-    noise = jnp.maximum(noise, _LEAST_NOISE)
+    noise = _noise(residual, image, window)
     scale = _deviation(noise, image, window)
     _, weight = _loss(residual / scale, window.used)
     _, prior_J = _prior(y, window)
