@@ -15,7 +15,7 @@ _ANGLES, _OFFSETS = 16, 9
 _SOFT = (0.03, 0.12, 0.3)  # widths of a penumbra, half sides
 _REFINED = 3  # halvings of the steps of angle and offset
 _GAINS = (0.15, 0.9)  # of a shadow's light, over that beside it
-_BETTER = 0.75  # a shadow must lower the loss to this part
+_BETTER = 0.95  # a shadow must lower the loss to this part; a fit with it decides
 _PIXELS = 256  # that are compared
 _HIDDEN = 3.5  # standard deviations
 _GRID = 192  # pixels along a side: of a marker of 120 px, turned
@@ -24,39 +24,39 @@ _GRID = 192  # pixels along a side: of a marker of 120 px, turned
 def find_shadow(
     xy: Float[np.ndarray, "2 N"],
     levels: Float[np.ndarray, " N"],
-    marker: Float[np.ndarray, " N"],
+    dark: Float[np.ndarray, " N"],
     residual: Float[np.ndarray, " N"],
     scale: float,
 ) -> Float[np.ndarray, " N"] | None:
     """Where the light is, 1, and where a shadow, 0; None if no straight edge explains the pixels.
 
-    Lines of all directions are tried, each with the two lights that suit its sides, then the best
-    one is turned, shifted and softened.
+    Lines of all directions are tried, each with the levels of paper and ink that suit its sides and
+    a gradient of the light, then the best one is turned, shifted and softened.
 
     Args:
         xy: places of the pixels on the paper.
         levels: grey levels of the pixels.
-        marker: the levels of a fit of the marker without a shadow.
-        residual: of that fit.
+        dark: the share of each pixel's light that ink takes, by a fit without a shadow.
+        residual: of that fit, grey levels.
         scale: its noise, grey levels.
     """
     within = np.flatnonzero(np.all(np.abs(xy) < 1.1, axis=0))[:_PIXELS]
-    marker, levels, at = marker[within], levels[within], xy[:, within]
+    dark, levels, at = dark[within], levels[within], xy[:, within]
+    ink = np.stack([1 - dark, dark])
 
     def losses(lines: np.ndarray) -> np.ndarray:
         """Loss (L,) of each line (angle, offset, softness), (L, 3)."""
-        lit = marker * _lit(at, lines)
-        dim = marker - lit
-        weight = np.ones_like(lit)
+        lit = _lit(at, lines)[:, None]
+        gradient = np.broadcast_to(at * ink[0], (len(lines), *at.shape))
+        basis = np.concatenate([lit * ink, (1 - lit) * ink, gradient], axis=1)
+        weight = np.ones((len(lines), len(levels)))
         for _ in range(3):
-            a, b, c = (np.sum(weight * x * y, axis=1) for x, y in
-                       ((lit, lit), (lit, dim), (dim, dim)))  # fmt: skip
-            p, q = (np.sum(weight * x * levels, axis=1) for x in (lit, dim))
-            determinant = np.maximum(a * c - b * b, 1e-9 * (a + c) ** 2 + 1e-30)
-            light, shade = (c * p - b * q) / determinant, (a * q - b * p) / determinant
-            residual = (levels - light[:, None] * lit - shade[:, None] * dim) / scale
+            weighted = basis * weight[:, None]
+            gram = weighted @ basis.transpose(0, 2, 1) + 1e-6 * len(levels) * np.eye(6)
+            light = np.linalg.solve(gram, (weighted @ levels)[..., None])
+            residual = (levels - np.sum(light * basis, axis=1)) / scale
             loss, weight = bounded_loss(residual)
-        gain = shade / np.maximum(light, 1e-6)
+        gain = light[:, 2, 0] / np.maximum(light[:, 0, 0], 1e-6)
         return np.where((gain > _GAINS[0]) & (gain < _GAINS[1]), np.sum(loss, axis=1), np.inf)
 
     without = float(np.sum(bounded_loss(residual[within] / scale)[0]))

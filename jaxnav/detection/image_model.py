@@ -229,7 +229,8 @@ def cell_disagreement(
     """
     column, row = jnp.clip(jnp.floor((xy + 1) * cells / 2) + 1, 0, cells + 1).astype(int)
     sums = jax.ops.segment_sum(scores.T, row * (cells + 2) + column, (cells + 2) ** 2)
-    return jnp.sum(sums.T * eliminate(ridged(information), sums.T)) / len(information)
+    seen = jnp.sum(jnp.diagonal(information) > 0)  # without a shadow its light is not
+    return jnp.sum(sums.T * eliminate(ridged(information), sums.T)) / seen
 
 
 def ridged(information: Float[Array, "n n"]) -> Float[Array, "n n"]:

@@ -26,7 +26,7 @@ MOST_STREAK_PX = _INSTANT_PX * _MOST_INSTANTS
 _LEAST_STREAK_PX = 0.5  # of a start: where there is no motion the image has no slope by it
 _MOST_NOISE = 0.15  # of the contrast
 # Beyond these something disturbs the picture: disagreement of the cells, mean weight of a pixel.
-_DISAGREE, _WEIGHT = 1.6, 0.78
+_DISAGREE, _WEIGHT = 1.68, 0.78
 
 _patch: Any = Patch  # here it holds NumPy's arrays
 

@@ -1,6 +1,6 @@
 """Fit of a whole marker of known pattern to the raw pixels around its predicted place.
 
-    I(u) = (1, x, y) white - (1, x, y) contrast dark + shade (shadow - 1) (white - contrast dark)
+    I(u) = (1, x, y) white - (1, x, y) contrast dark + (shadow - 1) (shade (1 - dark) + ink dark)
            + ground far + bend dark (1 - dark)
 
 dark is the image of the ink, see `image_model`: homography, motion and the lens's blur are fitted
@@ -24,13 +24,13 @@ from jaxnav.detection.paper import on_paper
 from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
 from jaxnav.numerics.small_matrices import eliminate
 
-_LIGHTS = 9
+_LIGHTS = 10
 _UNKNOWNS = 8 + 2 + 1 + _LIGHTS
 _WIDTH = 3.0  # of the loss, standard deviations
 # Of Gaussian noise under this loss: mean slope of the score over the mean weight, E[psi'] / E[w],
 # and E[psi^2] / E[w] over E[w r^2] / E[w].
 _SLOPE, _SCORE = 0.734, 0.682
-_NOTICED = 1.3  # a smaller factor may come from so many cells by chance
+_NOTICED = 1.37  # a smaller factor may come from so many cells by chance
 _GROUND = 1.0  # standard deviation of the ground beyond the paper, of the contrast
 _FAR = 0.2  # of a pixel's light from the ground: what shows more of it tells nothing of the noise
 _LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
@@ -41,8 +41,8 @@ _LENS_PX2, _LENS_SIGMA_PX2 = 0.4, 0.5
 _MOST_LENS_PX2 = 9.0
 _MOST_STEP = 0.15  # of D: half sides
 # Standard deviations of the light's coefficients, over the contrast: gradients over half a side,
-# shade, ground beyond the paper, curve of the levels (sRGB has up to 0.95).
-_LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 2.0, 0.6)
+# shade of paper and of ink, ground beyond the paper, curve of the levels (sRGB has up to 0.95).
+_LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 0.3, 2.0, 0.6)
 
 
 class Window(NamedTuple):
@@ -78,10 +78,9 @@ class PatternFit(NamedTuple):
     xy: Float[Array, "2 N"]  # places of the pixels on the paper
     covariance: Float[Array, "8 8"]  # of D in (I + D) M, by rows without the last entry
     noise: Float[Array, ""]  # standard deviation of the pixels that fit, grey levels
-    contrast: Float[Array, ""]  # white minus black, grey levels
     weight: Float[Array, " N"]  # of each pixel in the loss, 0 to 1; 0 for padding
     residual: Float[Array, " N"]  # grey levels
-    marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
+    dark: Float[Array, " N"]  # share of each pixel's light that ink takes
     white: Float[Array, " N"]  # levels as they would be without ink
     darkens: Float[Array, " N"]  # by how many levels ink darkens a pixel
     bend: Float[Array, ""]  # of levels that are half dark, grey levels
@@ -216,7 +215,8 @@ def _model(
     levels = light @ basis
     x, y_paper = on_paper(y.M, window.rays, window.rays_px)[0]
     contrast = light[3] + light[4] * x + light[5] * y_paper
-    by_dark = light[8] * (1 - 2 * image.dark) - contrast + light[6] * (1 - window.shadow)
+    by_dark = light[9] * (1 - 2 * image.dark) - contrast
+    by_dark = by_dark + (light[6] - light[7]) * (1 - window.shadow)
     J = jnp.concatenate(
         [by_dark[None] * image.by_D, by_dark[None] * image.by_motion,
          (by_dark * image.by_lens)[None], window.contrast * basis]
@@ -229,10 +229,10 @@ def _basis(y: Unknowns, window: Window, image: Exposure) -> Float[Array, "L N"]:
     # Beyond the marker gradients end: the ground there has its own light.
     x, y_paper = jnp.clip(x, -1.5, 1.5), jnp.clip(y_paper, -1.5, 1.5)
     dark = image.dark
-    shade = (window.shadow - 1) * (1 - dark)
+    shade = window.shadow - 1
     return jnp.stack(
-        [jnp.ones_like(x), x, y_paper, -dark, -dark * x, -dark * y_paper, shade, image.far,
-         dark * (1 - dark)]
+        [jnp.ones_like(x), x, y_paper, -dark, -dark * x, -dark * y_paper, shade * (1 - dark),
+         shade * dark, image.far, dark * (1 - dark)]
     )  # fmt: skip
 
 
@@ -313,8 +313,8 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit
     plain = _plain(basis[:3], window, scale)
     without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
     return PatternFit(
-        y, xy, covariance[:8, :8], noise, light[3], weight, residual, light[:6] @ basis[:6], white,
-        darkens, light[8], scale, ratio, 1 - with_marker / without, (without - with_marker) / 2,
+        y, xy, covariance[:8, :8], noise, weight, residual, image.dark, white,
+        darkens, light[9], scale, ratio, 1 - with_marker / without, (without - with_marker) / 2,
     )  # fmt: skip
 
 

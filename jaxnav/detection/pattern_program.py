@@ -45,7 +45,7 @@ class Summary(NamedTuple):
     covariance_px2: Float[Array, "8 8"]  # of the corners, u and v of each in turn
     streak_px: Float[Array, " 2"]
     noise: Float[Array, ""]  # standard deviation of the pixels that fit, grey levels
-    contrast: Float[Array, ""]  # white minus black, grey levels
+    contrast: Float[Array, ""]  # white minus black, of the pixels that fit, grey levels
     weight: Float[Array, ""]  # mean weight of the pixels that count, 0 to 1
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
@@ -60,7 +60,7 @@ class PixelFit(NamedTuple):
     xy: Float[Array, "2 N"]  # places on the paper
     residual: Float[Array, " N"]  # grey levels
     deviation: Float[Array, " N"]  # standard deviation, grey levels
-    marker: Float[Array, " N"]  # the marker's own levels, without shade and ground
+    dark: Float[Array, " N"]  # share of its light that ink takes
 
 
 class Followed(NamedTuple):
@@ -108,7 +108,7 @@ def follow_pattern(
         covariance,
         fit.y.motion_px,
         fit.noise,
-        fit.contrast,
+        jnp.sum(fit.weight * fit.darkens) / jnp.maximum(jnp.sum(fit.weight), 1),
         jnp.sum(fit.weight) / jnp.maximum(jnp.sum(window.used), 1),
         fit.disagreement,
         fit.explained,
@@ -116,4 +116,4 @@ def follow_pattern(
         code_advantage(fit, window, codes, patch.own, patch.instants),
         alike,
     )
-    return Followed(summary, PixelFit(fit.xy, fit.residual, fit.deviation, fit.marker), fit.y)
+    return Followed(summary, PixelFit(fit.xy, fit.residual, fit.deviation, fit.dark), fit.y)

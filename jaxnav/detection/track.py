@@ -32,10 +32,11 @@ _LEAST_ADVANTAGE = 70.0  # of white noise
 _MOST_MOVED = 0.25
 _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
-# What still shows more noise, of the contrast, and so much alike among neighbours, is disturbed.
+# What shows more noise, of the contrast, and so much alike among neighbours, is disturbed.
 _MOST_ROUGH, _MOST_ALIKE = 0.04, 3.0
 _PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _HALVES, _HALF = 8, 0.1  # of the marker, a little more than half
+_SHADED = 0.75  # to this part of it a shadow must lower a fit's loss
 _SAME = 0.01  # of the pixels
 _ROUNDS = 4  # of leaving out pixels that do not fit
 _LEAST_VISIBLE = 0.4  # of the pixels
@@ -109,7 +110,7 @@ def track(
     tracks: list[Track | None] = []
     for target in targets:
         fit = _first_fit(image, camera, target)
-        if fit is not None and fit.is_disturbed:
+        if fit is not None and (fit.is_disturbed or _is_stained(fit)):
             most_disturbed -= 1
             fit = _disturbed_fit(fit) if most_disturbed >= 0 else None
         tracks.append(None if fit is None else _judge(target, fit))
@@ -149,38 +150,49 @@ def _disturbed_fit(fit: PatchFit) -> PatchFit | None:
     if fit.summary.explained < _PROMISING:
         return None
     fit = _undisturbed(fit) or fit
-    rough = fit.summary.noise > _MOST_ROUGH * fit.summary.contrast
-    return None if rough and (fit.summary.alike > _MOST_ALIKE or fit.is_disturbed) else fit
+    return None if _is_stained(fit) or (_is_rough(fit) and fit.is_disturbed) else fit
 
 
-def _best(fits: Sequence[PatchFit]) -> PatchFit:
-    """The fit that explains most of all pixels."""
+def _is_rough(fit: PatchFit) -> bool:
+    return bool(fit.summary.noise > _MOST_ROUGH * fit.summary.contrast)
+
+
+def _is_stained(fit: PatchFit) -> bool:
+    """Whether what counts as noise is that of neighbours alike: a shadow, or what hides a part."""
+    return _is_rough(fit) and bool(fit.summary.alike > _MOST_ALIKE)
+
+
+def _losses(fits: Sequence[PatchFit]) -> Float[np.ndarray, " fits"]:
+    """What each fit leaves of all pixels, by the least noise among them; infinite if it failed."""
     residual = np.stack([one.pixels.residual for one in fits])
     scale = max(float(np.nanmin([one.summary.noise for one in fits])), 1.0)
     losses = np.sum(bounded_loss(residual / scale)[0], axis=1)
-    return fits[int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))]
+    return np.where(np.isfinite(losses), losses, np.inf)
 
 
 def _undisturbed(fit: PatchFit) -> PatchFit | None:
     """The fit with a shadow's edge, and without the pixels of what hides the marker."""
     count, used, seen = fit.count, fit.patch.used, fit.pixels
     scale = float(fit.summary.noise + 0.02 * fit.summary.contrast)
-    lit = find_shadow(seen.xy, fit.patch.levels[:count], seen.marker, seen.residual, scale)
+    lit = find_shadow(seen.xy, fit.patch.levels[:count], seen.dark, seen.residual, scale)
     if lit is not None:
-        fit = fit.anew(shadow=np.append(lit, fit.patch.shadow[count:]).astype(np.float32))
-    if fit.is_disturbed:
+        shaded = fit.anew(shadow=np.append(lit, fit.patch.shadow[count:]).astype(np.float32))
+        before, after = _losses([fit, shaded])
+        fit = shaded if after < _SHADED * before else fit
+    if fit.is_disturbed or _is_stained(fit):
         # Whatever hides a part leaves one of the halves.
         angles = np.arange(_HALVES) * 2 * np.pi / _HALVES
         sides = [np.cos(a) * seen.xy[0] + np.sin(a) * seen.xy[1] < _HALF for a in angles]
-        fit = _best([fit.anew(used=_among(used, side)) for side in sides])
+        halves = [fit.anew(used=_among(used, side)) for side in sides]
+        fit = halves[int(np.argmin(_losses(halves)))]
     for _ in range(_ROUNDS):
         pixels_px = fit.patch.pixels[:count].astype(int)
         seen = fit.pixels
         clear = clear_pixels(pixels_px, seen.residual / seen.deviation)
         if np.sum(clear) < max(_LEAST_VISIBLE * count, LEAST_PIXELS):
             return None
-        before, fit = fit.patch.used[:count], fit.again(used=_among(used, clear))
-        if np.mean(before != clear) < _SAME:
+        last, fit = fit.patch.used[:count], fit.again(used=_among(used, clear))
+        if np.mean(last != clear) < _SAME:
             break
     return fit
 

@@ -66,6 +66,28 @@ def test_a_rough_ground_beside_the_paper_moves_no_corner():
     assert 1.0 < np.mean(nees) < 2.3  # of two coordinates
 
 
+def test_a_shadow_across_a_marker_dims_paper_and_ink_and_costs_no_accuracy():
+    errors, nees = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        scene = random_scene(rng, 30, marker_cells(FAMILY, 17), 0.6, optics_px=0.4)
+        quad_px, angle_rad = scene.corners_px(), rng.uniform(0, 2 * np.pi)
+        lit = scene.render(rng).astype(float)
+        v, u = np.mgrid[: lit.shape[0], : lit.shape[1]]
+        middle_px = quad_px.mean(axis=0) + rng.uniform(-4, 4, 2)
+        beside_px = (u - middle_px[0]) * np.cos(angle_rad) + (v - middle_px[1]) * np.sin(angle_rad)
+        gain = (0.45, 0.6, 0.75)[seed % 3]
+        image = lit * (gain + (1 - gain) / (1 + np.exp(-4 * beside_px)))
+        there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-3, 3, 2), 4.5)
+        (found,) = track(image.astype(np.uint8), scene.camera, [there])
+        assert found is not None
+        error = (found.corners_px - quad_px).ravel()
+        errors.append(error)
+        nees.append(error @ np.linalg.solve(found.covariance_px2, error) / 4)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.035
+    assert np.mean(nees) < 2.5  # of two coordinates
+
+
 def test_nothing_is_followed_where_the_marker_is_not():
     for seed, (image, truth) in enumerate(other_pictures("negatives")):
         assert track(image, truth.camera, [target(truth, seed)]) == [None]
@@ -244,14 +266,15 @@ def test_an_exposure_is_the_mean_of_still_images():
 def test_the_edge_of_a_shadow_is_found_and_none_where_there_is_none():
     rng = np.random.default_rng(3)
     xy = rng.uniform(-1, 1, (2, 400))
-    levels = np.where(rng.uniform(size=400) < 0.5, 40.0, 180.0)
+    dark = np.where(rng.uniform(size=400) < 0.5, 1.0, 0.0)
+    levels = 180 - 140 * dark
     beside = np.cos(0.7) * xy[0] + np.sin(0.7) * xy[1] - 0.15
     noise = rng.normal(0, 3, 400)
     shaded = levels * np.where(beside > 0, 1.0, 0.45) + noise
-    lit = find_shadow(xy, shaded, levels, shaded - levels, 5.8)
+    lit = find_shadow(xy, shaded, dark, shaded - levels, 5.8)
     assert lit is not None
     assert np.mean((lit > 0.5) == (beside > 0)) > 0.97
-    assert find_shadow(xy, levels + noise, levels, noise, 5.8) is None
+    assert find_shadow(xy, levels + noise, dark, noise, 5.8) is None
 
 
 def test_noise_that_neighbours_share_counts_more_than_once():
