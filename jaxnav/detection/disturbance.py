@@ -13,9 +13,15 @@ from jaxnav.detection.pattern_fit import bounded_loss
 
 _ANGLES, _OFFSETS = 16, 9
 _SOFT = (0.03, 0.12, 0.3)  # widths of a penumbra, half sides
-_REFINED = 3  # halvings of the steps of angle and offset
+_REFINED = 3  # times: steps of angle and offset halved, a light fitted to what it explains
 _GAINS = (0.15, 0.9)  # of a shadow's light, over that beside it
-_BETTER = 0.95  # a shadow must lower the loss to this part; a fit with it decides
+_SHADES = np.geomspace(0.15, 2, 16)  # gains that are tried
+_ALIKE = 9.0  # a loss that counts as none: the most of one pixel
+_LEAST_SHADED = 0.03  # of the pixels
+_AS_MUCH = 0.6  # of the contrast that paper and ink have if a shadow dims them alike
+_LEVELS = 24  # of paper and of ink, that are tried
+_WIDTH = 0.08  # of what counts as the same level, of the contrast
+_PLAIN = 0.4  # of a pixel's light more than a half: of paper or of ink alone, nearly
 _PIXELS = 256  # that are compared
 _HIDDEN = 3.5  # standard deviations
 _GRID = 192  # pixels along a side: of a marker of 120 px, turned
@@ -25,10 +31,10 @@ def find_shadow(
     xy: Float[np.ndarray, "2 N"],
     levels: Float[np.ndarray, " N"],
     dark: Float[np.ndarray, " N"],
-    residual: Float[np.ndarray, " N"],
     scale: float,
 ) -> Float[np.ndarray, " N"] | None:
-    """Where the light is, 1, and where a shadow, 0; None if no straight edge explains the pixels.
+    """Where the light is, 1, and where a shadow, 0; None if no straight edge
+    has less light on one side.
 
     Lines of all directions are tried, each with the levels of paper and ink that suit its sides and
     a gradient of the light, then the best one is turned, shifted and softened.
@@ -37,8 +43,7 @@ def find_shadow(
         xy: places of the pixels on the paper.
         levels: grey levels of the pixels.
         dark: the share of each pixel's light that ink takes, by a fit without a shadow.
-        residual: of that fit, grey levels.
-        scale: its noise, grey levels.
+        scale: the noise of that fit, grey levels.
     """
     within = np.flatnonzero(np.all(np.abs(xy) < 1.1, axis=0))[:_PIXELS]
     dark, levels, at = dark[within], levels[within], xy[:, within]
@@ -56,10 +61,11 @@ def find_shadow(
             light = np.linalg.solve(gram, (weighted @ levels)[..., None])
             residual = (levels - np.sum(light * basis, axis=1)) / scale
             loss, weight = bounded_loss(residual)
-        gain = light[:, 2, 0] / np.maximum(light[:, 0, 0], 1e-6)
-        return np.where((gain > _GAINS[0]) & (gain < _GAINS[1]), np.sum(loss, axis=1), np.inf)
+        paper, ink_lit, paper_dim, ink_dim = light[:, :4, 0].T
+        gain = paper_dim / np.maximum(paper, 1e-6)
+        fair = (gain > _GAINS[0]) & (gain < _GAINS[1]) & (ink_lit < paper) & (ink_dim < paper_dim)
+        return np.where(fair, np.sum(loss, axis=1), np.inf)
 
-    without = float(np.sum(bounded_loss(residual[within] / scale)[0]))
     angles = np.arange(_ANGLES) * 2 * math.pi / _ANGLES
     offsets = np.linspace(-0.8, 0.8, _OFFSETS)
     lines = np.stack(np.meshgrid(angles, offsets, _SOFT[:1]), axis=-1).reshape(-1, 3)
@@ -75,7 +81,77 @@ def find_shadow(
         others = [[best[0], best[1], soft] for soft in _SOFT]
         lines = np.concatenate([best + steps, others])
         turn, shift = turn / 2, shift / 2
-    return _lit(xy, best[None])[0] if least < _BETTER * without else None
+    return _lit(xy, best[None])[0]
+
+
+def in_one_light(
+    xy: Float[np.ndarray, "2 N"],
+    levels: Float[np.ndarray, " N"],
+    dark: Float[np.ndarray, " N"],
+    contrast: float,
+) -> Bool[np.ndarray, " N"]:
+    """The most pixels that one level of paper and one of ink explain, with a gradient.
+
+    Args:
+        xy: places of the pixels on the paper.
+        levels: grey levels of the pixels.
+        dark: the share of each pixel's light that ink takes.
+        contrast: about that of the marker, grey levels.
+    """
+    width = _WIDTH * contrast
+    plain = (np.abs(dark - 0.5) > _PLAIN) & np.all(np.abs(xy) < 1.2, axis=0)
+    tried = np.linspace(levels.min(), levels.max(), _LEVELS)
+    paper, ink = np.meshgrid(tried, tried)
+    paper, ink = paper[paper - ink > 2 * width], ink[paper - ink > 2 * width]
+    near = np.zeros(len(levels), bool)
+    if not len(paper):
+        return near
+    off = levels[plain] - np.where(dark[plain] < 0.5, paper[:, None], ink[:, None])
+    votes = np.sum(np.maximum(1 - (off / width) ** 2, 0), axis=1)
+    near[plain] = np.abs(off[np.argmax(votes)]) < width
+    basis = np.stack([1 - dark, dark, *((1 - dark) * xy)])
+    for _ in range(_REFINED):
+        light = np.linalg.lstsq(basis[:, near].T, levels[near], rcond=None)[0]
+        near = np.abs(levels - light @ basis) < width
+    return near
+
+
+def find_shade(
+    levels: Float[np.ndarray, " N"], seen: Any, lit: Bool[np.ndarray, " N"]
+) -> Float[np.ndarray, " N"] | None:
+    """How far each pixel is off as if it lay in a shadow, standard deviations; None if none does.
+
+    The shadow may have any outline, and dim paper and ink by different factors. Of the lights that
+    are tried that counts which explains most of the pixels that are not lit.
+
+    Args:
+        levels: grey levels of the pixels.
+        seen: `PixelFit` of a fit to what is lit.
+        lit: the pixels that fit.
+    """
+    parts, paper, ink = np.stack([seen.lit - seen.ink, seen.ink]), seen.dark < 0.3, seen.dark > 0.7
+    white, black = (
+        float(np.median(parts[i, c])) if np.any(c) else 0.0 for i, c in enumerate((paper, ink))
+    )
+
+    def is_fair(gain: np.ndarray) -> np.ndarray:
+        contrast = gain[..., 0] * white - gain[..., 1] * black
+        return np.asarray(contrast > _AS_MUCH * gain[..., 0] * (white - black))
+
+    gains = np.stack(np.meshgrid(_SHADES, _SHADES), axis=-1).reshape(-1, 2)
+    gains = gains[is_fair(gains)]
+    if not len(gains):
+        return None
+    near = (np.abs(levels - gains @ parts) < _HIDDEN * seen.deviation) & ~lit
+    best = near[np.argmax(np.minimum(*(np.sum(near & cells, axis=1) for cells in (paper, ink))))]
+    for _ in range(_REFINED):
+        if min(np.sum(best & paper), np.sum(best & ink)) < _LEAST_SHADED * len(levels):
+            return None
+        weight = 1 / seen.deviation[best]
+        gain = np.linalg.lstsq((weight * parts[:, best]).T, weight * levels[best], rcond=None)[0]
+        off = (levels - gain @ parts) / seen.deviation
+        best = (np.abs(off) < _HIDDEN) & ~lit
+    return np.asarray(off) if _GAINS[0] < gain[0] < _GAINS[1] and is_fair(gain) else None
 
 
 def _lit(xy: np.ndarray, lines: np.ndarray) -> np.ndarray:
@@ -99,6 +175,19 @@ def clear_pixels(
     grid, at = _on_grid(pixels, np.abs(residual) > _HIDDEN, _spacing(pixels))
     lumps = grid * ((_neighbours(grid) > 0) | (grid > 1))
     return np.asarray((lumps + _neighbours(lumps))[at] == 0)
+
+
+def more_alike(
+    pixels: Int[np.ndarray, "N 2"],
+    one: Float[np.ndarray, " N"],
+    other: Float[np.ndarray, " N"],
+) -> Bool[np.ndarray, " N"]:
+    """Which pixels, with their neighbours, one of two residuals explains as well as the other."""
+    gain = bounded_loss(other)[0] - bounded_loss(one)[0]
+    grid, at = _on_grid(pixels, gain, _spacing(pixels))
+    for _ in range(2):
+        grid = grid + _neighbours(grid)
+    return np.asarray(grid[at] > -_ALIKE)
 
 
 def noise_correlation(

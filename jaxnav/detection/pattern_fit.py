@@ -83,6 +83,8 @@ class PatternFit(NamedTuple):
     dark: Float[Array, " N"]  # share of each pixel's light that ink takes
     white: Float[Array, " N"]  # levels as they would be without ink
     darkens: Float[Array, " N"]  # by how many levels ink darkens a pixel
+    lit: Float[Array, " N"]  # levels without the shadow
+    ink: Float[Array, " N"]  # what of them comes from ink
     bend: Float[Array, ""]  # of levels that are half dark, grey levels
     deviation: Float[Array, " N"]  # standard deviation of a pixel, grey levels
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
@@ -310,11 +312,14 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit
     inky = _basis(y, window, image._replace(dark=jnp.ones_like(image.dark)))
     white = light @ bright
     darkens = white - light @ inky
+    in_light = light.at[6:8].set(0)
+    ink = image.dark * (in_light @ inky)
     plain = _plain(basis[:3], window, scale)
     without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
     return PatternFit(
         y, xy, covariance[:8, :8], noise, weight, residual, image.dark, white,
-        darkens, light[9], scale, ratio, 1 - with_marker / without, (without - with_marker) / 2,
+        darkens, in_light @ basis, ink, light[9], scale, ratio, 1 - with_marker / without,
+        (without - with_marker) / 2,
     )  # fmt: skip
 
 

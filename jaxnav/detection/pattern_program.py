@@ -61,6 +61,9 @@ class PixelFit(NamedTuple):
     residual: Float[Array, " N"]  # grey levels
     deviation: Float[Array, " N"]  # standard deviation, grey levels
     dark: Float[Array, " N"]  # share of its light that ink takes
+    darkens: Float[Array, " N"]  # by how many levels ink darkens it
+    lit: Float[Array, " N"]  # its level without the shadow
+    ink: Float[Array, " N"]  # what of that comes from ink
 
 
 class Followed(NamedTuple):
@@ -116,4 +119,7 @@ def follow_pattern(
         code_advantage(fit, window, codes, patch.own, patch.instants),
         alike,
     )
-    return Followed(summary, PixelFit(fit.xy, fit.residual, fit.deviation, fit.dark), fit.y)
+    pixels = PixelFit(
+        fit.xy, fit.residual, fit.deviation, fit.dark, fit.darkens, fit.lit, fit.ink
+    )  # fmt: skip
+    return Followed(summary, pixels, fit.y)

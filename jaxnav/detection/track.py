@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxnav.detection.disturbance import clear_pixels, find_shadow
+from jaxnav.detection.disturbed_fit import fit_disturbed
 from jaxnav.detection.paper import SQUARE
-from jaxnav.detection.patch_fit import LEAST_PIXELS, MOST_STREAK_PX, PatchFit
-from jaxnav.detection.pattern_fit import bounded_loss
+from jaxnav.detection.patch_fit import MOST_STREAK_PX, PatchFit
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.detection.template import best_match
 from jaxnav.models.camera import Camera
@@ -32,14 +31,6 @@ _LEAST_ADVANTAGE = 70.0  # of white noise
 _MOST_MOVED = 0.25
 _MODEL_SIGMA_PX = 0.008
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
-# What shows more noise, of the contrast, and so much alike among neighbours, is disturbed.
-_MOST_ROUGH, _MOST_ALIKE = 0.04, 3.0
-_PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
-_HALVES, _HALF = 8, 0.1  # of the marker, a little more than half
-_SHADED = 0.75  # to this part of it a shadow must lower a fit's loss
-_SAME = 0.01  # of the pixels
-_ROUNDS = 4  # of leaving out pixels that do not fit
-_LEAST_VISIBLE = 0.4  # of the pixels
 
 
 @dataclass(frozen=True)
@@ -110,9 +101,9 @@ def track(
     tracks: list[Track | None] = []
     for target in targets:
         fit = _first_fit(image, camera, target)
-        if fit is not None and (fit.is_disturbed or _is_stained(fit)):
+        if fit is not None and (fit.is_disturbed):
             most_disturbed -= 1
-            fit = _disturbed_fit(fit) if most_disturbed >= 0 else None
+            fit = fit_disturbed(fit) if most_disturbed >= 0 else None
         tracks.append(None if fit is None else _judge(target, fit))
     return tracks
 
@@ -143,63 +134,6 @@ def _first_fit(image: np.ndarray, camera: Camera | None, target: Target) -> Patc
     streak = np.asarray(start.streak_px)
     fit = PatchFit.begin(image, camera, key, start.quad_px, streak, streak_sigma_px)
     return None if fit is None or not np.all(np.isfinite(fit.summary.corners_px)) else fit
-
-
-def _disturbed_fit(fit: PatchFit) -> PatchFit | None:
-    """The fit of a marker with something on it or in its light; None where that explains little."""
-    if fit.summary.explained < _PROMISING:
-        return None
-    fit = _undisturbed(fit) or fit
-    return None if _is_stained(fit) or (_is_rough(fit) and fit.is_disturbed) else fit
-
-
-def _is_rough(fit: PatchFit) -> bool:
-    return bool(fit.summary.noise > _MOST_ROUGH * fit.summary.contrast)
-
-
-def _is_stained(fit: PatchFit) -> bool:
-    """Whether what counts as noise is that of neighbours alike: a shadow, or what hides a part."""
-    return _is_rough(fit) and bool(fit.summary.alike > _MOST_ALIKE)
-
-
-def _losses(fits: Sequence[PatchFit]) -> Float[np.ndarray, " fits"]:
-    """What each fit leaves of all pixels, by the least noise among them; infinite if it failed."""
-    residual = np.stack([one.pixels.residual for one in fits])
-    scale = max(float(np.nanmin([one.summary.noise for one in fits])), 1.0)
-    losses = np.sum(bounded_loss(residual / scale)[0], axis=1)
-    return np.where(np.isfinite(losses), losses, np.inf)
-
-
-def _undisturbed(fit: PatchFit) -> PatchFit | None:
-    """The fit with a shadow's edge, and without the pixels of what hides the marker."""
-    count, used, seen = fit.count, fit.patch.used, fit.pixels
-    scale = float(fit.summary.noise + 0.02 * fit.summary.contrast)
-    lit = find_shadow(seen.xy, fit.patch.levels[:count], seen.dark, seen.residual, scale)
-    if lit is not None:
-        shaded = fit.anew(shadow=np.append(lit, fit.patch.shadow[count:]).astype(np.float32))
-        before, after = _losses([fit, shaded])
-        fit = shaded if after < _SHADED * before else fit
-    if fit.is_disturbed or _is_stained(fit):
-        # Whatever hides a part leaves one of the halves.
-        angles = np.arange(_HALVES) * 2 * np.pi / _HALVES
-        sides = [np.cos(a) * seen.xy[0] + np.sin(a) * seen.xy[1] < _HALF for a in angles]
-        halves = [fit.anew(used=_among(used, side)) for side in sides]
-        fit = halves[int(np.argmin(_losses(halves)))]
-    for _ in range(_ROUNDS):
-        pixels_px = fit.patch.pixels[:count].astype(int)
-        seen = fit.pixels
-        clear = clear_pixels(pixels_px, seen.residual / seen.deviation)
-        if np.sum(clear) < max(_LEAST_VISIBLE * count, LEAST_PIXELS):
-            return None
-        last, fit = fit.patch.used[:count], fit.again(used=_among(used, clear))
-        if np.mean(last != clear) < _SAME:
-            break
-    return fit
-
-
-def _among(used: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Those of some of the pixels that are no padding."""
-    return used & np.append(some, np.zeros(len(used) - len(some), bool))
 
 
 def _judge(target: Target, patch_fit: PatchFit) -> Track | None:

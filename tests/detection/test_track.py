@@ -271,10 +271,10 @@ def test_the_edge_of_a_shadow_is_found_and_none_where_there_is_none():
     beside = np.cos(0.7) * xy[0] + np.sin(0.7) * xy[1] - 0.15
     noise = rng.normal(0, 3, 400)
     shaded = levels * np.where(beside > 0, 1.0, 0.45) + noise
-    lit = find_shadow(xy, shaded, dark, shaded - levels, 5.8)
+    lit = find_shadow(xy, shaded, dark, 5.8)
     assert lit is not None
     assert np.mean((lit > 0.5) == (beside > 0)) > 0.97
-    assert find_shadow(xy, levels + noise, dark, noise, 5.8) is None
+    assert find_shadow(xy, levels + noise, dark, 5.8) is None
 
 
 def test_noise_that_neighbours_share_counts_more_than_once():
