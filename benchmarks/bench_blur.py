@@ -129,7 +129,7 @@ def predicted(picture: Picture, seed: int) -> Target:
     )
 
 
-def false_fixes(first: int, count: int) -> tuple[int, int, int]:
+def false_fixes(first: int, count: int, acquire: bool) -> tuple[int, int, int]:
     """In how many pictures without the sought marker it is followed, acquired, of how many.
 
     By turns: another marker of the family, blurred by up to 8 px; a part of a real photograph, of
@@ -176,10 +176,10 @@ def false_fixes(first: int, count: int) -> tuple[int, int, int]:
                 f"  seed {seed}: advantage {found.advantage:.0f}, explained {found.explained:.2f}"
             )
         # A photograph shows the sought marker elsewhere at times: what decoders read is no ghost.
-        acquired = Acquirer([(FAMILY, sought)]).detect(image, None)
-        if len(acquired) and sought not in ids:
-            ghosts += 1
-            print(f"  seed {seed}: acquired {sought} at {acquired.corners_px[0].mean(axis=0)}")
+        if acquire and sought not in ids:
+            for corners_px in Acquirer([(FAMILY, sought)]).detect(image, None).corners_px:
+                ghosts += 1
+                print(f"  seed {seed}: acquired {sought} at {corners_px.mean(axis=0)}")
     return wrong, ghosts, count
 
 
@@ -295,14 +295,14 @@ if __name__ == "__main__":
     parser.add_argument("--other", type=Path, help="pictures by benchmarks/other_renderer.py")
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--false", type=int, help="count false fixes in so many pictures instead")
+    parser.add_argument("--follow-only", action="store_true", help="acquire nothing in them")
     parser.add_argument("--first", type=int, default=0, help="the first of them")
     given = parser.parse_args()
     cv2.setNumThreads(1)
     jaxnav.configure(threads=1)  # as the commands that drive
     if given.false:
-        wrong, ghosts, count = false_fixes(given.first, given.false)
-        print(
-            f"of {count} pictures without it a marker is followed in {wrong}, acquired in {ghosts}"
-        )
+        wrong, ghosts, count = false_fixes(given.first, given.false, not given.follow_only)
+        acquired = "" if given.follow_only else f", acquired in {ghosts}"
+        print(f"of {count} pictures without it a marker is followed in {wrong}{acquired}")
     else:
         write_table(given.other, given.count)

@@ -114,7 +114,7 @@ def warm_up_tracks(camera: Camera | None, families: Sequence[str]) -> None:
     for family in families:
         fit = PatchFit.begin(image, camera, (family, 0), (32 + 12 * SQUARE), np.zeros(2), math.inf)
         if fit is not None:
-            fit.again()
+            fit.again().finer()
 
 
 def _first_fit(image: np.ndarray, camera: Camera | None, target: Target) -> PatchFit | None:

@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.detection import Target, Tracker, make_detector, marker_cells, track
+from jaxnav.detection import Target, Tracker, make_detector, marker_cells, patch_fit, track
 from jaxnav.detection.disturbance import find_shadow, noise_correlation
 from jaxnav.detection.image_model import expose, step_corners
 from jaxnav.detection.paper import homography
+from jaxnav.detection.pattern_program import follow_pattern
 from jaxnav.detection.signs_of_life import telling
 from jaxnav.detection.template import best_match
+from jaxnav.detection.track import warm_up_tracks
 from jaxnav.models.camera import Camera
 from tests.helpers.marker_images import random_scene
 from tests.helpers.other_pictures import other_pictures
@@ -86,6 +88,55 @@ def test_a_shadow_across_a_marker_dims_paper_and_ink_and_costs_no_accuracy():
         nees.append(error @ np.linalg.solve(found.covariance_px2, error) / 4)
     assert np.sqrt(np.mean(np.square(errors))) < 0.035
     assert np.mean(nees) < 2.5  # of two coordinates
+
+
+def test_the_shadow_of_a_finger_hides_nothing():
+    """A finger points at the middle; its shadow lies beside it, on paper and ink."""
+    errors, nees = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        scene = random_scene(rng, 34, marker_cells(FAMILY, 17), 0.6, optics_px=0.4)
+        quad_px, lit = scene.corners_px(), scene.render(rng).astype(float)
+        angle_rad = rng.uniform(0, 2 * np.pi)
+        along = np.array([np.cos(angle_rad), np.sin(angle_rad)])
+        v, u = np.mgrid[: lit.shape[0], : lit.shape[1]]
+
+        def finger(tip_px, *, along=along, v=v, u=u):
+            """How much of each pixel a finger of 12 px covers."""
+            x, y = u - tip_px[0], v - tip_px[1]
+            ahead_px, beside_px = x * along[0] + y * along[1], x * along[1] - y * along[0]
+            out_px = np.maximum(np.abs(beside_px) - 6, -ahead_px)
+            return 1 / (1 + np.exp(4 * out_px))
+
+        tip_px = quad_px.mean(axis=0) + rng.uniform(-2, 2, 2)
+        shaded = lit * (1 - 0.6 * finger(tip_px + 9 * along[::-1] * [1, -1]))
+        covered = finger(tip_px)
+        image = shaded * (1 - covered) + covered * (120 + rng.normal(0, 3, lit.shape))
+        there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-3, 3, 2), 4.5)
+        (found,) = track(image.astype(np.uint8), scene.camera, [there])
+        if found is not None:
+            error = (found.corners_px - quad_px).ravel()
+            errors.append(error)
+            nees.append(error @ np.linalg.solve(found.covariance_px2, error) / 4)
+    assert len(errors) == 10
+    assert np.sqrt(np.mean(np.square(errors))) < 0.02  # 0.03 where the shadow counts as hidden
+    assert np.mean(nees) < 2.5  # of two coordinates
+
+
+def test_a_drive_compiles_at_its_start_what_disturbed_markers_need(monkeypatch):
+    kinds = set()
+
+    def follow(camera, patch, codes, start):
+        kinds.add((len(patch.levels), start is None))
+        return follow_pattern(camera, patch, codes, start)
+
+    monkeypatch.setattr(patch_fit, "follow_pattern", follow)
+    for image, truth in other_pictures("hidden"):
+        track(image, truth.camera, [target(truth, 0)])
+    needed = frozenset(kinds)
+    kinds.clear()
+    warm_up_tracks(truth.camera, [FAMILY])
+    assert needed <= kinds
 
 
 def test_nothing_is_followed_where_the_marker_is_not():
