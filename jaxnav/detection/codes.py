@@ -9,7 +9,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxnav.detection.families import codes_of
 from jaxnav.detection.image_model import cell_shares
-from jaxnav.detection.pattern_fit import PatternFit, Window, bounded_loss
+from jaxnav.detection.pattern_fit import PatternFit, bounded_loss
+from jaxnav.detection.pattern_model import Window
 
 _NODES = 4  # images of a moving marker that are averaged, at most
 _NEAR = 96  # codes that are drawn

@@ -1,12 +1,9 @@
 """Fit of a whole marker of known pattern to the raw pixels around its predicted place.
 
-    I(u) = (1, x, y) white - (1, x, y) contrast dark + (shadow - 1) (shade (1 - dark) + ink dark)
-           + ground far + bend dark (1 - dark)
-
-dark is the image of the ink, see `image_model`: homography, motion and the lens's blur are fitted
-together with the light. The loss of a pixel is bounded, so that what hides a part of the marker
-does not move the rest. optimistix runs the Levenberg-Marquardt steps, first with a loss as wide as
-the contrast and then with one as wide as the noise.
+Homography, motion, the lens's blur and the light are fitted together, see `pattern_model`. The loss
+of a pixel is bounded, so that what hides a part of the marker does not move the rest. optimistix
+runs the Levenberg-Marquardt steps, first with a loss as wide as the contrast and then with one as
+wide as the noise.
 
 Source: Geman, McClure (1987), the loss; Madsen, Nielsen, Tingleff (2004), the damping; MacKinnon,
 White (1985), the covariance (HC3).
@@ -17,15 +14,27 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from jaxnav.detection.image_model import Exposure, cell_disagreement, expose, ridged
+from jaxnav.detection.image_model import Exposure, cell_disagreement, ridged
 from jaxnav.detection.paper import on_paper
+from jaxnav.detection.pattern_model import (
+    BEND,
+    LENS_PX2,
+    LIGHTS,
+    SHADES,
+    UNKNOWNS,
+    Unknowns,
+    Window,
+    basis_of,
+    first_light,
+    first_pixels,
+    model,
+    prior_of,
+)
 from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
 from jaxnav.numerics.small_matrices import eliminate
 
-_LIGHTS = 10
-_UNKNOWNS = 8 + 2 + 1 + _LIGHTS
 _WIDTH = 3.0  # of the loss, standard deviations
 # Of Gaussian noise under this loss: mean slope of the score over the mean weight, E[psi'] / E[w],
 # and E[psi^2] / E[w] over E[w r^2] / E[w].
@@ -37,38 +46,8 @@ _LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
 _STEPS = 8
 _COARSE_STEPS = 6
 _COARSER = 4  # at first one of so many pixels
-_LENS_PX2, _LENS_SIGMA_PX2 = 0.4, 0.5
 _MOST_LENS_PX2 = 9.0
 _MOST_STEP = 0.15  # of D: half sides
-# Standard deviations of the light's coefficients, over the contrast: gradients over half a side,
-# shade of paper and of ink, ground beyond the paper, curve of the levels (sRGB has up to 0.95).
-_LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 0.3, 2.0, 0.6)
-
-
-class Window(NamedTuple):
-    """The pixels around one marker's predicted place, and what is expected there.
-
-    M is the first guess in a basis in which it is near the identity; rays are in that basis.
-    """
-
-    rays: Float[Array, "3 N"]
-    rays_px: Float[Array, "2 3 N"]
-    levels: Float[Array, " N"]
-    real: Bool[Array, " N"]  # which pixels are no padding
-    used: Bool[Array, " N"]  # which of them count in the fit
-    K: Float[Array, "k k"]
-    shadow: Float[Array, " N"]  # 1 in the light, 0 in the shadow
-    motion_px: Float[Array, " 2"]  # the expected streak
-    motion_sigma_px: Float[Array, ""]
-    contrast: Float[Array, ""]  # about that of the marker, grey levels
-    most_noise: Float[Array, ""]  # standard deviation of pixels that fit, at most
-
-
-class Unknowns(NamedTuple):
-    M: Float[Array, "3 3"]
-    motion_px: Float[Array, " 2"]
-    lens_px2: Float[Array, ""]
-    light: Float[Array, " L"]  # over the contrast
 
 
 class PatternFit(NamedTuple):
@@ -132,7 +111,7 @@ def fit_pattern(
             may be a pixel off, so that a wide loss comes first.
     """
     y = _nearer(window, (instants + 1) // 2) if start is None else start
-    residual, _, image = _model(y, window, instants)
+    residual, _, image = model(y, window, instants)
     noise = _noise(residual, image, window)
     y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS, _SLOPE)
     return _result(y, window, instants)
@@ -141,28 +120,16 @@ def fit_pattern(
 def _nearer(window: Window, instants: Int[Array, ""]) -> Unknowns:
     """The least of a loss as wide as the contrast, over a part of the pixels."""
     dtype = window.levels.dtype
-    few = _first(window, window.levels.shape[0] // _COARSER)
+    few = first_pixels(window, window.levels.shape[0] // _COARSER)
     y = Unknowns(
         jnp.eye(3, dtype=dtype),
         window.motion_px,
-        jnp.asarray(_LENS_PX2, dtype),
-        jnp.zeros(_LIGHTS, dtype),
+        jnp.asarray(LENS_PX2, dtype),
+        jnp.zeros(LIGHTS, dtype),
     )
-    y = y._replace(light=_first_light(y, few, instants))
+    y = y._replace(light=first_light(y, few, instants))
     scale = window.most_noise * jnp.ones_like(few.levels)
     return _minimum(y, few, scale, instants, _COARSE_STEPS)
-
-
-def _first(window: Window, count: int) -> Window:
-    """The window with its first pixels alone."""
-    return window._replace(
-        rays=window.rays[:, :count],
-        rays_px=window.rays_px[:, :, :count],
-        levels=window.levels[:count],
-        real=window.real[:count],
-        used=window.used[:count],
-        shadow=window.shadow[:count],
-    )
 
 
 def _noise(residual: Array, image: Exposure, window: Window) -> Array:
@@ -193,10 +160,10 @@ def _minimum(
 
     def cost(y: Any, args: Any) -> tuple[Any, Any]:
         del args
-        residual, J, _ = _model(y, window, instants)
+        residual, J, _ = model(y, window, instants)
         loss, weight = _loss(residual / scale, window.used)
         weighted = J * (weight / scale**2)[None]
-        prior, prior_J = _prior(y, window)
+        prior, prior_J = prior_of(y, window)
         return jnp.concatenate([jnp.sqrt(loss), prior]), NormalEquations(
             slope * (weighted @ J.T) + prior_J.T @ prior_J, -weighted @ residual + prior_J.T @ prior
         )
@@ -205,55 +172,6 @@ def _minimum(
     solution: Any = optx.least_squares(cost, solver, y, has_aux=True, max_steps=steps, throw=False)
     minimum: Unknowns = solution.value
     return minimum
-
-
-def _model(
-    y: Unknowns, window: Window, instants: Int[Array, ""]
-) -> tuple[Float[Array, " N"], Float[Array, "n N"], Exposure]:
-    """Residual (N,), slopes (n, N) of the model by all unknowns, and the ink's image."""
-    image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
-    basis = _basis(y, window, image)
-    light = y.light * window.contrast
-    levels = light @ basis
-    x, y_paper = on_paper(y.M, window.rays, window.rays_px)[0]
-    contrast = light[3] + light[4] * x + light[5] * y_paper
-    by_dark = light[9] * (1 - 2 * image.dark) - contrast
-    by_dark = by_dark + (light[6] - light[7]) * (1 - window.shadow)
-    J = jnp.concatenate(
-        [by_dark[None] * image.by_D, by_dark[None] * image.by_motion,
-         (by_dark * image.by_lens)[None], window.contrast * basis]
-    )  # fmt: skip
-    return window.levels - levels, J, image
-
-
-def _basis(y: Unknowns, window: Window, image: Exposure) -> Float[Array, "L N"]:
-    (x, y_paper), _ = on_paper(y.M, window.rays, window.rays_px)
-    # Beyond the marker gradients end: the ground there has its own light.
-    x, y_paper = jnp.clip(x, -1.5, 1.5), jnp.clip(y_paper, -1.5, 1.5)
-    dark = image.dark
-    shade = window.shadow - 1
-    return jnp.stack(
-        [jnp.ones_like(x), x, y_paper, -dark, -dark * x, -dark * y_paper, shade * (1 - dark),
-         shade * dark, image.far, dark * (1 - dark)]
-    )  # fmt: skip
-
-
-def _first_light(y: Unknowns, window: Window, instants: Int[Array, ""]) -> Float[Array, " L"]:
-    image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
-    basis = _basis(y, window, image)
-    weighted = basis * window.used[None]
-    prior = jnp.asarray([1 / s**2 for s in _LIGHT_SIGMA], basis.dtype)
-    gram = weighted @ basis.T + jnp.diag(prior)
-    return eliminate(gram, (weighted @ window.levels / window.contrast)[:, None])[:, 0]
-
-
-def _prior(y: Unknowns, window: Window) -> tuple[Float[Array, " p"], Float[Array, "p n"]]:
-    """What is expected of motion, lens and light, in standard deviations, and its slopes."""
-    sigmas = jnp.asarray([_LENS_SIGMA_PX2, *_LIGHT_SIGMA], y.light.dtype)
-    sigmas = jnp.concatenate([jnp.full(2, 1, y.light.dtype) * window.motion_sigma_px, sigmas])
-    off = jnp.concatenate([y.motion_px - window.motion_px, (y.lens_px2 - _LENS_PX2)[None], y.light])
-    slopes = jnp.eye(_UNKNOWNS, dtype=y.light.dtype)[8:] / sigmas[:, None]
-    return off / sigmas, slopes
 
 
 def bounded_loss(r: Any) -> tuple[Any, Any]:
@@ -287,15 +205,15 @@ def _spread(residual: Array, used: Array, most: Array) -> Array:
 
 
 def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit:
-    residual, J, image = _model(y, window, instants)
+    residual, J, image = model(y, window, instants)
     noise = _noise(residual, image, window)
     scale = _deviation(noise, image, window)
     _, weight = _loss(residual / scale, window.used)
-    _, prior_J = _prior(y, window)
+    _, prior_J = prior_of(y, window)
     prior = prior_J.T @ prior_J
     weighted = J * (weight / scale**2)[None]
     information = weighted @ J.T
-    units = jnp.eye(_UNKNOWNS, dtype=J.dtype)
+    units = jnp.eye(UNKNOWNS, dtype=J.dtype)
     bread = eliminate(ridged(_SLOPE * information + prior), units)
     # The noise is what each pixel shows: a sensor's grows with the light. A pixel that decides
     # much draws the fit to itself: what it shows is too little by its leverage.
@@ -307,18 +225,18 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit
     score = weighted * residual[None] / jnp.sqrt(_SCORE * variance)
     ratio = cell_disagreement(xy, score, information, window.K.shape[0] - 1)
     covariance = covariance * jnp.where(ratio > _NOTICED, ratio, 1)
-    basis, light = _basis(y, window, image), y.light * window.contrast
-    bright = _basis(y, window, image._replace(dark=jnp.zeros_like(image.dark)))
-    inky = _basis(y, window, image._replace(dark=jnp.ones_like(image.dark)))
+    basis, light = basis_of(y, window, image), y.light * window.contrast
+    bright = basis_of(y, window, image._replace(dark=jnp.zeros_like(image.dark)))
+    inky = basis_of(y, window, image._replace(dark=jnp.ones_like(image.dark)))
     white = light @ bright
     darkens = white - light @ inky
-    in_light = light.at[6:8].set(0)
+    in_light = light.at[SHADES].set(0)
     ink = image.dark * (in_light @ inky)
     plain = _plain(basis[:3], window, scale)
     without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
     return PatternFit(
         y, xy, covariance[:8, :8], noise, weight, residual, image.dark, white,
-        darkens, in_light @ basis, ink, light[9], scale, ratio, 1 - with_marker / without,
+        darkens, in_light @ basis, ink, light[BEND], scale, ratio, 1 - with_marker / without,
         (without - with_marker) / 2,
     )  # fmt: skip
 
