@@ -135,7 +135,8 @@ class PatchFit:
     @property
     def is_rough(self) -> bool:
         """Whether the noise is more than a sensor's."""
-        return bool(self.summary.noise > _MOST_ROUGH * self.summary.contrast)
+        contrast = min(self.summary.contrast, self.patch.contrast)
+        return bool(self.summary.noise > _MOST_ROUGH * contrast)
 
     @property
     def is_disturbed(self) -> bool:

@@ -146,8 +146,9 @@ def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
     moved_px = np.linalg.norm(corners_px - start_px, axis=1)
     if not np.all(moved_px < max(3.0, _MOST_MOVED * side_px)):
         return None
-    # A sum of squares deviates by the root of the factor by which neighbours' noise is alike.
-    advantage = fit.advantage / np.sqrt(fit.alike)
+    # A sum of squares deviates by the root of the factor by which neighbours' noise is alike. Cells
+    # that disagree do so by more than noise.
+    advantage = fit.advantage / np.sqrt(fit.alike) / max(fit.disagreement, 1.0)
     if not (fit.explained >= _LEAST_EXPLAINED and advantage >= _LEAST_ADVANTAGE):
         return None
     streak_px = np.asarray(fit.streak_px, float)
