@@ -101,7 +101,7 @@ def track(
     tracks: list[Track | None] = []
     for target in targets:
         fit = _first_fit(image, camera, target)
-        if fit is not None and (fit.is_disturbed):
+        if fit is not None and fit.is_disturbed:
             most_disturbed -= 1
             fit = fit_disturbed(fit) if most_disturbed >= 0 else None
         tracks.append(None if fit is None else _judge(target, fit))
@@ -146,9 +146,9 @@ def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
     moved_px = np.linalg.norm(corners_px - start_px, axis=1)
     if not np.all(moved_px < max(3.0, _MOST_MOVED * side_px)):
         return None
-    # A sum of squares deviates by the root of the factor by which neighbours' noise is alike. Cells
-    # that disagree do so by more than noise.
-    advantage = fit.advantage / np.sqrt(fit.alike) / max(fit.disagreement, 1.0)
+    # A sum of squares deviates by the root of the factor by which neighbours' noise is alike. Where
+    # cells disagree that is a factor of the noise as well.
+    advantage = fit.advantage / np.sqrt(fit.alike) / max(fit.disagreement, 1.0) ** 1.5
     if not (fit.explained >= _LEAST_EXPLAINED and advantage >= _LEAST_ADVANTAGE):
         return None
     streak_px = np.asarray(fit.streak_px, float)
