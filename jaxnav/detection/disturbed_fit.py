@@ -27,6 +27,7 @@ _LEAST_SHOWN = 0.9  # of the pixels, where nothing but a shadow is on a marker
 _SAME = 0.01  # of the pixels
 _ROUNDS = 4  # of leaving out pixels that do not fit
 _LEAST_VISIBLE = 0.4  # of the pixels
+_LEAST_READ = 0.1  # of those within the frame: the frame alone is any marker's
 
 
 def fit_disturbed(fit: PatchFit) -> PatchFit | None:
@@ -38,6 +39,7 @@ def fit_disturbed(fit: PatchFit) -> PatchFit | None:
     if not fits or fits[0].is_disturbed or fits[0].share_used < _LEAST_SHOWN:
         fits.append(_without_hidden(_in_plain_view(fit).finer(), with_shade=True) or fit)
     fits = [one for one in fits if not (one.is_rough and one.is_disturbed)]
+    fits = [one for one in fits if one.share_read > _LEAST_READ]
     return max(fits, key=lambda one: float(one.summary.advantage) / one.count, default=None)
 
 

@@ -133,6 +133,12 @@ class PatchFit:
         return float(np.mean(self.patch.used[: self.count]))
 
     @property
+    def share_read(self) -> float:
+        """The part of the pixels within the frame that counts in the fit."""
+        inside = np.all(np.abs(self.pixels.xy) < 1 - 2 / (len(self.patch.K) - 1), axis=0)
+        return float(np.mean(self.patch.used[: self.count][inside])) if np.any(inside) else 0.0
+
+    @property
     def is_rough(self) -> bool:
         """Whether the noise is more than a sensor's."""
         contrast = min(self.summary.contrast, self.patch.contrast)
