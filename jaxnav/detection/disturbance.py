@@ -22,7 +22,7 @@ _AS_MUCH = 0.6  # of the contrast that paper and ink have if a shadow dims them 
 _LEVELS = 24  # of paper and of ink, that are tried
 _WIDTH = 0.08  # of what counts as the same level, of the contrast
 _PLAIN = 0.4  # of a pixel's light more than a half: of paper or of ink alone, nearly
-_PIXELS = 256  # that are compared
+_PIXELS, _FEWEST = 256, 30  # that are compared, at most and at least
 _HIDDEN = 3.5  # standard deviations
 _GRID = 192  # pixels along a side: of a marker of 120 px, turned
 
@@ -45,7 +45,9 @@ def find_shadow(
         dark: the share of each pixel's light that ink takes, by a fit without a shadow.
         scale: the noise of that fit, grey levels.
     """
-    within = np.flatnonzero(np.all(np.abs(xy) < 1.1, axis=0))[:_PIXELS]
+    within = np.flatnonzero(np.all(np.abs(xy) < 1.1, axis=0) & np.isfinite(dark))[:_PIXELS]
+    if len(within) < _FEWEST or not scale > 0:
+        return None  # a fit that failed
     dark, levels, at = dark[within], levels[within], xy[:, within]
     ink = np.stack([1 - dark, dark])
 

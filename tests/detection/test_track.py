@@ -1,6 +1,7 @@
 """Markers that no decoder reads are followed, with honest covariances, and nothing else is."""
 
 import math
+from types import SimpleNamespace
 
 import cv2
 import jax
@@ -9,7 +10,12 @@ import numpy as np
 import pytest
 
 from jaxnav.detection import Target, Tracker, make_detector, marker_cells, patch_fit, track
-from jaxnav.detection.disturbance import find_shadow, noise_correlation
+from jaxnav.detection.disturbance import (
+    find_shade,
+    find_shadow,
+    in_one_light,
+    noise_correlation,
+)
 from jaxnav.detection.image_model import expose, step_corners
 from jaxnav.detection.paper import homography
 from jaxnav.detection.pattern_program import follow_pattern
@@ -326,6 +332,24 @@ def test_the_edge_of_a_shadow_is_found_and_none_where_there_is_none():
     assert lit is not None
     assert np.mean((lit > 0.5) == (beside > 0)) > 0.97
     assert find_shadow(xy, levels + noise, dark, 5.8) is None
+
+
+@pytest.mark.parametrize("broken", ["far", "nan", "one level", "no contrast"])
+def test_what_a_failed_fit_leaves_is_no_shadow_and_no_error(broken):
+    rng = np.random.default_rng(5)
+    xy, dark = rng.uniform(-1, 1, (2, 200)), rng.uniform(0, 1, 200)
+    levels, scale = rng.uniform(0, 255, 200), 5.0
+    xy = xy + (50 if broken == "far" else 0)
+    if broken == "nan":
+        xy, dark, scale = np.full_like(xy, np.nan), np.full_like(dark, np.nan), np.nan
+    if broken == "one level":
+        levels = np.full(200, 90.0)
+    lit = levels if broken == "one level" else levels * np.nan
+    seen = SimpleNamespace(xy=xy, dark=dark, lit=lit, ink=lit * dark, deviation=np.full(200, scale))
+    assert find_shadow(xy, levels, dark, scale) is None or broken == "no contrast"
+    near = in_one_light(xy, levels, dark, 1.0 if broken == "no contrast" else 100.0)
+    assert near.shape == (200,)
+    assert find_shade(levels, seen, near) is None
 
 
 def test_noise_that_neighbours_share_counts_more_than_once():
