@@ -31,6 +31,8 @@ _DISAGREE, _WEIGHT = 1.68, 0.78
 # So does more noise, of the contrast, if that of neighbours is so much alike.
 _MOST_ROUGH, _MOST_ALIKE = 0.04, 3.0
 
+_SHORT, _EVEN = 0.5, 0.15  # a streak over a side, and the ground's deviation, see `_ground`
+
 _patch: Any = Patch  # here it holds NumPy's arrays
 
 
@@ -185,9 +187,19 @@ def _patch_of(
         motion_px=streak_px.astype(np.float32),
         motion_sigma_px=np.float32(min(streak_sigma_px, 1e3)),
         contrast=np.float32(contrast),
+        ground=np.float32(_ground(length_px / mean_side_px(quad_px))),
         most_noise=np.float32(_MOST_NOISE * contrast),
         instants=np.int32(instants),
     )
+
+
+def _ground(ratio: float) -> float:
+    """Standard deviation of the ground beside the paper, of the contrast, for a streak over a side.
+
+    It may be of any level. Where the streak mixes it into all pixels that would leave nothing to
+    see: there it is even, and the corners' own deviation grows instead, see `track`.
+    """
+    return float(np.clip((_SHORT / max(ratio, 1e-3)) ** 4, _EVEN, 1.0))
 
 
 def _of_pixels(image: np.ndarray, pixels: np.ndarray, lanes: int) -> dict[str, np.ndarray]:

@@ -40,7 +40,6 @@ _WIDTH = 3.0  # of the loss, standard deviations
 # and E[psi^2] / E[w] over E[w r^2] / E[w].
 _SLOPE, _SCORE = 0.734, 0.682
 _NOTICED = 1.37  # a smaller factor may come from so many cells by chance
-_GROUND = 1.0  # standard deviation of the ground beyond the paper, of the contrast
 _FAR = 0.2  # of a pixel's light from the ground: what shows more of it tells nothing of the noise
 _LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
 _STEPS = 8
@@ -140,7 +139,7 @@ def _noise(residual: Array, image: Exposure, window: Window) -> Array:
 
 def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " N"]:
     """Standard deviation of each pixel: its noise, and the ground's where that shows."""
-    return jnp.sqrt(noise**2 + (_GROUND * window.contrast * image.far) ** 2)
+    return jnp.sqrt(noise**2 + (window.ground * window.contrast * image.far) ** 2)
 
 
 def _minimum(

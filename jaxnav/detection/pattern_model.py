@@ -41,6 +41,7 @@ class Window(NamedTuple):
     motion_px: Float[Array, " 2"]  # the expected streak
     motion_sigma_px: Float[Array, ""]
     contrast: Float[Array, ""]  # about that of the marker, grey levels
+    ground: Float[Array, ""]  # standard deviation of the ground beyond the paper, of the contrast
     most_noise: Float[Array, ""]  # standard deviation of pixels that fit, at most
 
 

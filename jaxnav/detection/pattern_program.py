@@ -35,6 +35,7 @@ class Patch(NamedTuple):
     motion_px: Float[Array, " 2"]  # the expected streak
     motion_sigma_px: Float[Array, ""]
     contrast: Float[Array, ""]  # about that of the marker, grey levels
+    ground: Float[Array, ""]  # standard deviation of the ground beyond the paper, of the contrast
     most_noise: Float[Array, ""]  # standard deviation of pixels that fit, at most
     instants: Int[Array, ""]  # see `expose`
 
@@ -97,7 +98,7 @@ def follow_pattern(
     near = jnp.all(jnp.abs(on_paper(jnp.eye(3, dtype=f32), rays, rays_px)[0]) < zone, axis=0)
     window = Window(
         rays, rays_px, patch.levels, patch.real & near, patch.used & near, patch.K, patch.shadow,
-        patch.motion_px, patch.motion_sigma_px, patch.contrast, patch.most_noise,
+        patch.motion_px, patch.motion_sigma_px, patch.contrast, patch.ground, patch.most_noise,
     )  # fmt: skip
     fit = fit_pattern(window, patch.instants, start)
     M = fit.y.M.astype(M0.dtype) @ M0
