@@ -151,7 +151,7 @@ def test_nothing_is_followed_where_the_marker_is_not():
 
 
 def test_a_marker_is_followed_through_a_streak_as_long_as_itself():
-    """As of a base that turns at 10 rad/s, exposed for 10 ms: all of it is mixed with the ground."""
+    """As of a base that turns at 10 rad/s, exposed for 10 ms: all of it is mixed with ground."""
     nees = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
