@@ -123,11 +123,14 @@ class PatchFit:
         fine = replace(self, patch=self.patch._replace(**fields), count=count)
         return fine.again(used=fine.padded(used), shadow=fine.padded(shadow, 1.0))
 
-    def padded(self, values: np.ndarray, rest: float = 0.0) -> np.ndarray:
-        """A field of the patch, of the values of its pixels."""
-        padded = np.full(len(self.patch.real), rest, np.float32)
+    def padded(self, values: np.ndarray, rest: float | bool = False) -> np.ndarray:
+        """A field of the patch, of the values of its pixels.
+
+        Its type is that of the rest: another one would be another program, compiled in mid-drive.
+        """
+        padded = np.full(len(self.patch.real), rest, bool if rest is False else np.float32)
         padded[: self.count] = values
-        return padded.astype(bool) if values.dtype == bool else padded
+        return padded
 
     @property
     def share_used(self) -> float:

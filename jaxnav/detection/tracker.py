@@ -22,7 +22,7 @@ from jaxnav.detection.types import Detections, grey
 from jaxnav.models.camera import Camera
 
 MOST_FOLLOWED = 3  # markers of an image: each takes some milliseconds
-_MOST_DISTURBED = 1  # of them: it takes 70 ms
+_MOST_DISTURBED = 1  # of them: it takes up to 90 ms
 _UNKNOWN_EXPOSURE_S = 0.01  # and as much more or less
 _STREAK_SIGMA_PX, _STREAK_SHARE = 0.5, 0.3  # of a streak where the exposure time is known
 _FAR_AHEAD_S, _AHEAD_SHARE = 0.1, 0.1  # a flow is trusted so long, and is off by so much
