@@ -24,7 +24,7 @@ from benchmarks.bench_detection import row
 from jaxnav.detection.codes import codes_on_device
 from jaxnav.detection.patch_fit import PatchFit
 from jaxnav.detection.pattern_program import follow_pattern
-from jaxnav.detection.template import best_match
+from jaxnav.detection.track import first_fit
 
 BATCHES = (1, 64, 1024, 8192)
 PICTURES, ROUNDS = 64, 5
@@ -34,14 +34,7 @@ def patches(kind: str) -> list[PatchFit]:
     """The fit of each picture alone, which holds its patch."""
     fits = []
     for seed, picture in enumerate(drawn(kind, PICTURES)):
-        there = predicted(picture, seed)
-        key = there.family, there.marker_id
-        start = best_match(
-            picture.image, *key, there.quads_px, there.radius_px, there.streak_px, 0.7
-        )
-        assert start is not None
-        streak_px = np.asarray(start.streak_px)
-        fit = PatchFit.begin(picture.image, picture.camera, key, start.quad_px, streak_px, 0.7)
+        fit = first_fit(picture.image, picture.camera, predicted(picture, seed))
         assert fit is not None
         fits.append(fit)
     return fits

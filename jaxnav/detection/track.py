@@ -100,7 +100,7 @@ def track(
     """
     tracks: list[Track | None] = []
     for target in targets:
-        fit = _first_fit(image, camera, target)
+        fit = first_fit(image, camera, target)
         if fit is not None and fit.is_disturbed:
             most_disturbed -= 1
             fit = fit_disturbed(fit) if most_disturbed >= 0 else None
@@ -117,7 +117,7 @@ def warm_up_tracks(camera: Camera | None, families: Sequence[str]) -> None:
             fit.again().finer()
 
 
-def _first_fit(image: np.ndarray, camera: Camera | None, target: Target) -> PatchFit | None:
+def first_fit(image: np.ndarray, camera: Camera | None, target: Target) -> PatchFit | None:
     """The fit that starts where the marker's picture matches best; None where none does."""
     sides_px = [mean_side_px(quad) for quad in target.quads_px if np.all(np.isfinite(quad))]
     if not sides_px or not _SIDES_PX[0] <= max(sides_px) <= _SIDES_PX[1]:

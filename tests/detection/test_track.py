@@ -38,6 +38,12 @@ def target(truth, seed, **options):
     return Target(FAMILY, marker_id, quad_px[None], 4.5, **streak)
 
 
+def error_and_nees(found, quad_px):
+    """Errors (8,) of the corners, px, and their NEES of two coordinates."""
+    error = (found.corners_px - quad_px).ravel()
+    return error, error @ np.linalg.solve(found.covariance_px2, error) / 4
+
+
 @pytest.mark.parametrize("kind", ["blur4", "blur8", "shadow", "hidden", "clean"])
 def test_markers_are_followed_where_another_renderer_draws_them(kind):
     errors = []
@@ -67,9 +73,9 @@ def test_a_rough_ground_beside_the_paper_moves_no_corner():
         image, quad_px = scene.render(rng), scene.corners_px()
         there = Target(FAMILY, 17, quad_px[None] + 1.0, 4.0, streak_px, 0.7)
         (found,) = track(image, scene.camera, [there])
-        error = (found.corners_px - quad_px).ravel()
+        error, its_nees = error_and_nees(found, quad_px)
         errors.append(error)
-        nees.append(error @ np.linalg.solve(found.covariance_px2, error) / 4)
+        nees.append(its_nees)
     assert np.sqrt(np.mean(np.square(errors))) < 0.038
     assert 1.0 < np.mean(nees) < 2.3  # of two coordinates
 
@@ -89,9 +95,9 @@ def test_a_shadow_across_a_marker_dims_paper_and_ink_and_costs_no_accuracy():
         there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-3, 3, 2), 4.5)
         (found,) = track(image.astype(np.uint8), scene.camera, [there])
         assert found is not None
-        error = (found.corners_px - quad_px).ravel()
+        error, its_nees = error_and_nees(found, quad_px)
         errors.append(error)
-        nees.append(error @ np.linalg.solve(found.covariance_px2, error) / 4)
+        nees.append(its_nees)
     assert np.sqrt(np.mean(np.square(errors))) < 0.035
     assert np.mean(nees) < 2.5  # of two coordinates
 
@@ -120,11 +126,10 @@ def test_the_shadow_of_a_finger_hides_nothing():
         image = shaded * (1 - covered) + covered * (120 + rng.normal(0, 3, lit.shape))
         there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-3, 3, 2), 4.5)
         (found,) = track(image.astype(np.uint8), scene.camera, [there])
-        if found is not None:
-            error = (found.corners_px - quad_px).ravel()
-            errors.append(error)
-            nees.append(error @ np.linalg.solve(found.covariance_px2, error) / 4)
-    assert len(errors) == 10
+        assert found is not None
+        error, its_nees = error_and_nees(found, quad_px)
+        errors.append(error)
+        nees.append(its_nees)
     assert np.sqrt(np.mean(np.square(errors))) < 0.02  # 0.03 where the shadow counts as hidden
     assert np.mean(nees) < 2.5  # of two coordinates
 
@@ -164,8 +169,7 @@ def test_a_marker_is_followed_through_a_streak_as_long_as_itself():
         there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-2, 2, 2), 4.0, streak_px, 1.0)
         (found,) = track(image, scene.camera, [there])
         assert found is not None
-        error = (found.corners_px - quad_px).ravel()
-        nees.append(error @ np.linalg.solve(found.covariance_px2, error) / 4)
+        nees.append(error_and_nees(found, quad_px)[1])
     assert np.mean(nees) < 2.5  # of two coordinates
 
 
