@@ -114,7 +114,8 @@ class Learnt:
         if rig.extrinsics_sigma is not None:
             prior = np.asarray(rig.extrinsics_sigma, float)[:, 3:]
             turns = turned.reshape(cameras, EACH) * prior
-            turns_sigma = turned_sigma.reshape(cameras, EACH) * prior
+            # Of a camera that has seen nothing the filter's is the prior's but for rounding.
+            turns_sigma = np.minimum(turned_sigma, 1.0).reshape(cameras, EACH) * prior
         of_sensors = sensors, sensors_sigma, exact.astype(float)
         return Learnt(*of_sensors, turns, turns_sigma, prior, rig, sensor_errors(vehicle))
 

@@ -121,6 +121,13 @@ def test_the_words_are_those_of_one_who_stands_behind_the_camera(camera, axis, p
             assert np.sign(after[1] - before[1]) == -sign
 
 
+def test_a_camera_that_has_seen_nothing_is_no_less_sure_than_before():
+    e = np.zeros(4 + 3 * len(told_rig()))
+    sigma = np.nextafter(np.ones(len(e), np.float32), 2).astype(float)
+    learnt = Learnt.of(e, sigma, told_rig(), sensors_as_told())
+    assert np.all(learnt.turns_sigma_rad <= learnt.turns_prior_rad)
+
+
 def test_a_rule_that_doubts_nothing_has_learnt_nothing():
     assert Learnt.of(np.zeros(0), np.zeros(0), told_rig(), sensors_as_told()) is None
 
