@@ -133,7 +133,8 @@ def false_fixes(first: int, count: int, acquire: bool) -> tuple[int, int, int]:
     """In how many pictures without the sought marker it is followed, acquired, of how many.
 
     By turns: another marker of the family, blurred by up to 8 px; a part of a real photograph, of
-    rooms with markers of the family and of boards; a wall of rough noise.
+    rooms with markers of the family and of boards; a wall of rough noise. Every fourth is
+    overexposed.
     """
     photographs = [
         (read_image(file, cv2.IMREAD_GRAYSCALE), file.parent.name)
@@ -166,6 +167,8 @@ def false_fixes(first: int, count: int, acquire: bool) -> tuple[int, int, int]:
             quad_px = 48 + side_px / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         if seed % 3 != 2 and sought in ids:
             continue
+        if seed % 4 == 3:
+            image = cv2.convertScaleAbs(image, alpha=rng.uniform(1.2, 2.5))
         angle = rng.uniform(0, 2 * np.pi)
         streak_px = (blur_px * math.cos(angle), blur_px * math.sin(angle))
         target = Target(FAMILY, sought, quad_px[None], 8.0, streak_px, 1.0)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from jaxnav.detection.families import codes_of
 from jaxnav.detection.image_model import cell_shares
 from jaxnav.detection.pattern_fit import PatternFit, bounded_loss
-from jaxnav.detection.pattern_model import Window
+from jaxnav.detection.pattern_model import Window, tells
 
 _NODES = 4  # images of a moving marker that are averaged, at most
 _NEAR = 96  # codes that are drawn
@@ -58,7 +58,8 @@ def code_advantage(
     near = jnp.argsort(alike)[:_NEAR]  # `top_k` calls a library, and such programs can't be kept
     drawn = frame[None] + jnp.concatenate([codes[near], codes[own][None]]) @ cells
     residual = light[None] + darkens[None] * drawn - bend[None] * drawn * (1 - drawn)
-    losses = jnp.sum(bounded_loss(residual)[0], axis=1)
+    told = tells(residual, window.levels[None])
+    losses = jnp.sum(bounded_loss(residual)[0] * told, axis=1)
     return jnp.min(jnp.where(near == own, jnp.inf, losses[:-1])) - losses[-1]
 
 

@@ -19,6 +19,7 @@ from jaxnav.detection.disturbance import (
 )
 from jaxnav.detection.patch_fit import LEAST_PIXELS, PatchFit
 from jaxnav.detection.pattern_fit import bounded_loss
+from jaxnav.detection.pattern_model import tells
 
 _PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _HALVES, _HALF = 8, 0.1  # of the marker, a little more than half
@@ -109,7 +110,8 @@ def _sorted_by_light(
     pixels_px: np.ndarray, levels: np.ndarray, seen: Any
 ) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, " N"]]:
     """Which pixels are lit, and how far each is off in its light, in standard deviations."""
-    bright = (levels - seen.lit) / seen.deviation
+    bright = levels - seen.lit
+    bright = np.where(tells(bright, levels), bright / seen.deviation, 0)
     dim = find_shade(levels, seen, clear_pixels(pixels_px, bright))
     if dim is None:
         return np.ones(len(bright), bool), bright

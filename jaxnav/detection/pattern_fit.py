@@ -31,6 +31,7 @@ from jaxnav.detection.pattern_model import (
     first_pixels,
     model,
     prior_of,
+    tells,
 )
 from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
 from jaxnav.numerics.small_matrices import eliminate
@@ -133,7 +134,7 @@ def _nearer(window: Window, instants: Int[Array, ""]) -> Unknowns:
 
 def _noise(residual: Array, image: Exposure, window: Window) -> Array:
     """Standard deviation of the pixels that fit, of those that show little of the ground."""
-    plain = window.used & (image.far < _FAR)
+    plain = window.used & (image.far < _FAR) & tells(residual, window.levels)
     return jnp.maximum(_spread(residual, plain, window.most_noise), _LEAST_NOISE)
 
 
@@ -220,7 +221,8 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit
     scores = weighted * (residual / jnp.maximum(1 - leverage, 0.3))[None]
     covariance = bread @ (scores @ scores.T + prior) @ bread
     xy, _ = on_paper(y.M, window.rays, window.rays_px)
-    variance = jnp.sum(weight * (residual / scale) ** 2) / jnp.maximum(jnp.sum(weight), 1)
+    told = jnp.where(tells(residual, window.levels), weight, 0)
+    variance = jnp.sum(told * (residual / scale) ** 2) / jnp.maximum(jnp.sum(told), 1)
     score = weighted * residual[None] / jnp.sqrt(_SCORE * variance)
     ratio = cell_disagreement(xy, score, information, window.K.shape[0] - 1)
     covariance = covariance * jnp.where(ratio > _NOTICED, ratio, 1)

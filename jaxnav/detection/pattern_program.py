@@ -15,7 +15,7 @@ from jaxnav.detection.disturbance import noise_correlation
 from jaxnav.detection.lens import pixels_of, rays_through
 from jaxnav.detection.paper import SQUARE, corner_motion, homography, on_paper, rays_of
 from jaxnav.detection.pattern_fit import fit_pattern
-from jaxnav.detection.pattern_model import Unknowns, Window
+from jaxnav.detection.pattern_model import Unknowns, Window, tells
 from jaxnav.models.camera import Camera
 
 _ZONE = 1.1  # cells around the marker that count: its white zone is one wide
@@ -105,7 +105,8 @@ def follow_pattern(
     corners_px = pixels_of(camera, rays_of(M, SQUARE))
     motion = corner_motion(M, *rays_through(camera, corners_px)).astype(f32)
     # Where the ground beyond the paper shows, residuals are alike, and count little in the fit.
-    share = jnp.where(fit.weight > 0.5, fit.noise / fit.deviation, 0)
+    plain = (fit.weight > 0.5) & tells(fit.residual, patch.levels)
+    share = jnp.where(plain, fit.noise / fit.deviation, 0)
     alike = noise_correlation(patch.pixels, fit.residual / fit.deviation, share)
     covariance = motion @ (alike * (fit.covariance + fit.covariance.T) / 2) @ motion.T
     summary = Summary(

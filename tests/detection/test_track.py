@@ -1,6 +1,7 @@
 """Markers that no decoder reads are followed, with honest covariances, and nothing else is."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -78,6 +79,29 @@ def test_a_rough_ground_beside_the_paper_moves_no_corner():
         nees.append(its_nees)
     assert np.sqrt(np.mean(np.square(errors))) < 0.038
     assert 1.0 < np.mean(nees) < 2.3  # of two coordinates
+
+
+@pytest.mark.parametrize("levels", [(40, 420), (-90, 190)], ids=["paper full", "ink empty"])
+def test_light_beyond_what_a_pixel_holds_moves_no_corner(levels):
+    """Half of an edge's pixels are as full as the paper: it looks larger, or the ink does."""
+    errors, nees = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        angle_rad = rng.uniform(0, 2 * np.pi)
+        streak_px = (6 * math.cos(angle_rad), 6 * math.sin(angle_rad))
+        scene = random_scene(
+            rng, 26, marker_cells(FAMILY, 17), 0.6, optics_px=0.4, motion_px=streak_px
+        )
+        scene = replace(scene, black=levels[0], white=levels[1])
+        image, quad_px = scene.render(rng), scene.corners_px()
+        there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-3, 3, 2), 4.5, streak_px, 0.7)
+        (found,) = track(image, scene.camera, [there])
+        assert found is not None
+        error, its_nees = error_and_nees(found, quad_px)
+        errors.append(error)
+        nees.append(its_nees)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.04
+    assert np.mean(nees) < 2.3  # of two coordinates
 
 
 def test_a_shadow_across_a_marker_dims_paper_and_ink_and_costs_no_accuracy():
