@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxnav.detection.families import codes_of
-from jaxnav.detection.image_model import cell_shares
+from jaxnav.detection.image_model import cell_shares, tells
 from jaxnav.detection.pattern_fit import PatternFit, bounded_loss
-from jaxnav.detection.pattern_model import Window, tells
+from jaxnav.detection.pattern_model import Window
 
 _NODES = 4  # images of a moving marker that are averaged, at most
 _NEAR = 96  # codes that are drawn
@@ -50,16 +50,19 @@ def code_advantage(
     light, darkens, bend = (
         share * part for part in (window.levels - fit.white, fit.darkens, fit.bend)
     )
+
+    def left(drawn: Array) -> Array:
+        """What so much ink leaves of each pixel's light; nothing where the pixel does not tell."""
+        residual = light + darkens * drawn - bend * drawn * (1 - drawn)
+        return jnp.where(tells(residual, window.levels), residual, 0)
+
     # To draw all codes would take some milliseconds: those that correlate best suffice, with what
-    # remains where all cells are grey.
-    half = frame + jnp.sum(cells, axis=0) / 2
-    grey = light + darkens * half - bend * half * (1 - half)
+    # remains between no ink in the cells and ink in all of them.
+    grey = (left(frame) + left(frame + jnp.sum(cells, axis=0))) / 2
     alike = codes @ (cells @ (darkens * jnp.clip(grey, -_MOST, _MOST)))
     near = jnp.argsort(alike)[:_NEAR]  # `top_k` calls a library, and such programs can't be kept
     drawn = frame[None] + jnp.concatenate([codes[near], codes[own][None]]) @ cells
-    residual = light[None] + darkens[None] * drawn - bend[None] * drawn * (1 - drawn)
-    told = tells(residual, window.levels[None])
-    losses = jnp.sum(bounded_loss(residual)[0] * told, axis=1)
+    losses = jnp.sum(bounded_loss(jax.vmap(left)(drawn))[0], axis=1)
     return jnp.min(jnp.where(near == own, jnp.inf, losses[:-1])) - losses[-1]
 
 

@@ -17,9 +17,9 @@ from jaxnav.detection.disturbance import (
     in_one_light,
     more_alike,
 )
+from jaxnav.detection.image_model import tells
 from jaxnav.detection.patch_fit import LEAST_PIXELS, PatchFit
 from jaxnav.detection.pattern_fit import bounded_loss
-from jaxnav.detection.pattern_model import tells
 
 _PROMISING = 0.3  # explained by the first fit: what is less is no marker that is half hidden
 _HALVES, _HALF = 8, 0.1  # of the marker, a little more than half

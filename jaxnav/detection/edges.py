@@ -36,6 +36,7 @@ from jaxnav.detection.image_model import (
     cell_disagreement,
     ink,
     ridged,
+    tells,
 )
 from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
 from jaxnav.numerics.small_matrices import eliminate
@@ -45,6 +46,7 @@ _STEPS = 20
 _START_BLUR_PX2 = 0.8**2
 _BLUR_LIMITS_PX2 = (0.0, 5.0**2)
 _HUBER = 2.5  # standard deviations
+_UNTOLD = 1e-3  # weight of a pixel that does not tell: with none the light may be unknown
 # Prior of the far ground for views without it, and of the curve of the levels: within about a
 # hundred grey levels.
 _PRIOR = 1e-3
@@ -129,10 +131,12 @@ def fit_edges(
         size = jnp.max(jnp.abs(_CORNER_MOTION @ step[:8]))
         step = step * jnp.minimum(1, _MAX_STEP / jnp.maximum(size, 1e-9))
         M, blur = _moved(s.M, s.blur, step)
-        weight = used * _huber_weight(s.residual / s.scale)
+        weight = used * _weight(s.residual, s.scale, levels)
         residual, J, contrast = _linearise(M, blur, patch, weight)
         hessian, gradient = _normal_equations(residual, J, weight)
-        before, after = (_loss(r / s.scale, used) for r in (s.residual, residual))
+        before, after = (
+            _loss(r / s.scale, used & tells(r, levels)) for r in (s.residual, residual)
+        )
         better = after <= before
         scale = _rms(residual, weight)
         small = (size < _CONVERGED) | (jnp.abs(before - after) < _PLATEAU * before)
@@ -144,7 +148,7 @@ def fit_edges(
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, stayed)
 
     s = jax.lax.while_loop(lambda s: (s.steps < _STEPS) & ~s.converged, attempt, start)
-    weight = used * _huber_weight(s.residual / s.scale)
+    weight = used * _weight(s.residual, s.scale, levels)
     freedom = jnp.maximum(jnp.sum(weight) - 16, 1)
     noise = jnp.sqrt(jnp.sum(weight * s.residual**2) / freedom)
     units = jnp.eye(s.hessian.shape[0], dtype=one.dtype)
@@ -153,7 +157,8 @@ def fit_edges(
     ratio = cell_disagreement(xy, scores, s.hessian, patch.K.shape[0] - 1)
     factor = jnp.where(ratio > _NOTICED, ratio, 1)
     covariance = eliminate(ridged(s.hessian), units)[:8, :8] * noise**2 * factor
-    return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, s.residual, s.converged, s.step)
+    residual = jnp.where(tells(s.residual, levels), s.residual, 0)
+    return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, residual, s.converged, s.step)
 
 
 _CORNER_MOTION = np.moveaxis(generators(SQUARE.T), -1, 0).reshape(8, 8).astype(np.float32)
@@ -223,8 +228,10 @@ def _rms(residual: Array, weight: Array) -> Array:
     return jnp.sqrt(jnp.sum(weight * residual**2) / jnp.maximum(jnp.sum(weight), 1)) + 0.3
 
 
-def _huber_weight(r: Array) -> Array:
-    return _HUBER / jnp.maximum(jnp.abs(r), _HUBER)
+def _weight(residual: Array, scale: Array, levels: Array) -> Array:
+    """Huber's, and next to none of a pixel that does not tell of the model."""
+    huber = _HUBER / jnp.maximum(jnp.abs(residual / scale), _HUBER)
+    return jnp.where(tells(residual, levels), huber, _UNTOLD)
 
 
 def _loss(r: Array, used: Array) -> Array:

@@ -7,11 +7,14 @@
 pattern), Phi2 the integral of the blur on the paper. The blur's covariance is G (S + I/12) G' with
 G = d(x, y)/du, S that of the lens (px^2), 1/12 that of a square pixel, whose flat top is kept. A
 marker that moves during the exposure shows the mean of its images at instants t_j, evenly over it,
-each blurred by the motion between two of them.
+each blurred by the motion between two of them. A pixel that is full, or empty, tells only that
+there is no less light, or no more.
+
+Source: Tobin (1958), censored observations.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +27,8 @@ from jaxnav.numerics.small_matrices import eliminate
 PIXEL_VARIANCE_PX2 = 1 / 12  # of a square
 _MEHLER_ORDERS = 3
 _MAX_RHO = 0.95
+# Grey levels of 8 bits beyond which a pixel may be empty or full: some noise comes after that.
+_EMPTY, _FULL = 2.0, 250.0
 
 
 class Exposure(NamedTuple):
@@ -205,6 +210,13 @@ def gauss(z: Array) -> tuple[Array, Array]:
         tail = t * (tail + a)
     upper = 0.5 * tail * exponential
     return jnp.where(z < 0, upper, 1 - upper), exponential * (1 / math.sqrt(2 * math.pi))
+
+
+def tells(residual: Any, levels: Any) -> Any:
+    """Whether a pixel's residual tells of the model: that of a full one only if the model has less
+    light, that of an empty one only if it has more. Takes NumPy's and JAX's arrays.
+    """
+    return ((levels < _FULL) | (residual > 0)) & ((levels > _EMPTY) | (residual < 0))
 
 
 def cell_disagreement(

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from jaxnav.detection.image_model import Exposure, cell_disagreement, ridged
+from jaxnav.detection.image_model import Exposure, cell_disagreement, ridged, tells
 from jaxnav.detection.paper import on_paper
 from jaxnav.detection.pattern_model import (
     BEND,
@@ -31,7 +31,6 @@ from jaxnav.detection.pattern_model import (
     first_pixels,
     model,
     prior_of,
-    tells,
 )
 from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
 from jaxnav.numerics.small_matrices import eliminate

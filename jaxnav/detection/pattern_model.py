@@ -3,18 +3,14 @@
     I(u) = (1, x, y) white - (1, x, y) contrast dark + (shadow - 1) (shade (1 - dark) + ink dark)
            + ground far + bend dark (1 - dark)
 
-dark is the image of the ink and far that of the ground beyond the paper, see `image_model`. A pixel
-that is full, or empty, tells only that there is no less light, or no more.
+dark is the image of the ink and far that of the ground beyond the paper, see `image_model`."""
 
-Source: Tobin (1958), censored observations.
-"""
-
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.detection.image_model import Exposure, expose
+from jaxnav.detection.image_model import Exposure, expose, tells
 from jaxnav.detection.paper import on_paper
 from jaxnav.numerics.small_matrices import eliminate
 
@@ -26,8 +22,6 @@ LENS_PX2, _LENS_SIGMA_PX2 = 0.4, 0.5
 # Standard deviations of the light's coefficients, over the contrast: gradients over half a side,
 # shade of paper and of ink, ground beyond the paper, curve of the levels (sRGB has up to 0.95).
 _LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 0.3, 2.0, 0.6)
-# Grey levels of 8 bits beyond which a pixel may be empty or full: the sensor's noise comes after.
-_EMPTY, _FULL = 5.0, 250.0
 
 
 class Window(NamedTuple):
@@ -88,13 +82,6 @@ def model(
     residual = window.levels - levels
     told = tells(residual, window.levels)
     return jnp.where(told, residual, 0), jnp.where(told[None], J, 0), image
-
-
-def tells(residual: Any, levels: Any) -> Any:
-    """Whether a pixel's residual tells of the model: that of a full one only if the model has less
-    light, that of an empty one only if it has more. Takes NumPy's and JAX's arrays.
-    """
-    return ((levels < _FULL) | (residual > 0)) & ((levels > _EMPTY) | (residual < 0))
 
 
 def basis_of(y: Unknowns, window: Window, image: Exposure) -> Float[Array, "L N"]:

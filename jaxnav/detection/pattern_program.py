@@ -12,10 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.compiling.executables import kept
 from jaxnav.detection.codes import code_advantage
 from jaxnav.detection.disturbance import noise_correlation
+from jaxnav.detection.image_model import tells
 from jaxnav.detection.lens import pixels_of, rays_through
 from jaxnav.detection.paper import SQUARE, corner_motion, homography, on_paper, rays_of
 from jaxnav.detection.pattern_fit import fit_pattern
-from jaxnav.detection.pattern_model import Unknowns, Window, tells
+from jaxnav.detection.pattern_model import Unknowns, Window
 from jaxnav.models.camera import Camera
 
 _ZONE = 1.1  # cells around the marker that count: its white zone is one wide
