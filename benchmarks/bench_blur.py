@@ -40,6 +40,7 @@ KINDS = {
     "shadow": "20-40 px, half in shadow",
     "hidden": "20-40 px, 30 % hidden",
     "clean": "20-40 px, sharp",
+    "full": "20-40 px, blur 8 px, twice the light",
 }
 FOUND_PX = 3.0  # the largest error of a corner's coordinate that still counts as found
 
@@ -60,9 +61,12 @@ def drawn(kind: str, count: int) -> Iterable[Picture]:
     for seed in range(count):
         rng = np.random.default_rng(seed)
         side_px = rng.uniform(14, 17) if kind == "blur4" else rng.uniform(20, 40)
-        blur_px = {"blur4": 4.0, "blur8": 8.0}.get(kind, 0.0)
+        blur_px = {"blur4": 4.0, "blur8": 8.0, "full": 8.0}.get(kind, 0.0)
         marker_id = int(rng.integers(587))
         scene = _scene(rng, side_px, blur_px, marker_id)
+        if kind == "full":
+            twice = {"black": 2 * scene.black, "white": 2 * scene.white}
+            scene = replace(scene, **twice, texture=2 * scene.texture)
         corners_px = scene.corners_px()
         image = scene.render(rng)
         if kind in ("shadow", "hidden"):
@@ -284,8 +288,9 @@ def write_table(folder: Path | None, count: int) -> None:
     if folder is not None:
         lines += ["", "By Mitsuba, `benchmarks/other_renderer.py`:", *head]
         for kind, what in KINDS.items():
-            lines.append(row(what, *measure(other(kind, folder, count)).values()))
-            print(lines[-1], flush=True)
+            if (folder / kind).exists():
+                lines.append(row(what, *measure(other(kind, folder, count)).values()))
+                print(lines[-1], flush=True)
     lines += ["", row("followed", "CPU time, ms"), row("---", "---"), *times(15)]
     text = TABLE.read_text()
     turning = text[text.index("<!-- rows by bench_turning.py -->") :]

@@ -1,8 +1,10 @@
-"""Pictures of markers drawn by another renderer than the package's: by Mitsuba 3, a ray tracer.
+"""Pictures of markers drawn by another renderer than the package's: by Mitsuba 3, a ray tracer, or
+by MuJoCo, which draws with OpenGL.
 
-    pip install mitsuba
+    pip install mitsuba                                           # or mujoco
     python benchmarks/other_renderer.py --out DIR --count 60      # a folder with truth.yaml a set
-    python benchmarks/other_renderer.py --check                   # how true its edges are
+    python benchmarks/other_renderer.py --out DIR --by mujoco
+    python benchmarks/other_renderer.py --check                   # how true Mitsuba's edges are
 
 Each picture is the mean, in linear light, of sub-frames of a moving pinhole camera. The truth is
 at the middle of the exposure. Pixels: the centre of the top-left pixel is (0, 0).
@@ -11,6 +13,8 @@ at the middle of the exposure. Pixels: the centre of the top-left pixel is (0, 0
 import argparse
 import os
 import sys
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,6 +26,7 @@ import yaml
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import other_raster
 from other_draws import SETS, draw
 from other_scenes import (
     CORNERS_M,
@@ -42,12 +47,17 @@ NOISE = 3.0  # grey levels
 PIXEL_PX = 12**-0.5  # standard deviation of a square pixel
 
 
+def installed(name: str) -> Any:
+    """The other renderer's module."""
+    try:
+        return import_module(name)
+    except ImportError:
+        sys.exit(f"the other renderer is not installed: pip install {name}")
+
+
 def renderer() -> Any:
     """Mitsuba, in its plain variant."""
-    try:
-        mitsuba = import_module("mitsuba")
-    except ImportError:
-        sys.exit("the other renderer is not installed: pip install mitsuba")
+    mitsuba = installed("mitsuba")
     mitsuba.set_variant("scalar_rgb")
     import_module("drjit").set_thread_count(int(os.environ.get("OMP_NUM_THREADS", "2")))
     return mitsuba
@@ -204,7 +214,17 @@ def truth_of(scene: Scene) -> dict:
     }
 
 
-def write_set(mi: Any, kind: str, arguments: argparse.Namespace) -> None:
+def light_by(name: str, rays: int) -> Callable[[Scene], np.ndarray]:
+    """`light` of a scene by one of the renderers."""
+    if name == "mujoco":
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        return partial(other_raster.light, installed("mujoco"))
+    return partial(light, renderer(), rays=rays)
+
+
+def write_set(
+    light_of: Callable[[Scene], np.ndarray], kind: str, arguments: argparse.Namespace
+) -> None:
     """Write a set's pictures and its truth.yaml."""
     out, seed = arguments.out / kind, arguments.seed
     out.mkdir(parents=True, exist_ok=True)
@@ -212,7 +232,7 @@ def write_set(mi: Any, kind: str, arguments: argparse.Namespace) -> None:
     for index in range(arguments.count):
         scene = draw(kind, index, seed, tuple(arguments.size))
         rng = np.random.default_rng([seed, index])
-        image = picture(light(mi, scene, arguments.rays), scene.response, rng)
+        image = picture(light_of(scene), scene.response, rng)
         cv2.imwrite(str(out / f"{index:03}.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
         pictures.append({"image": f"{index:03}.png"} | truth_of(scene))
         every = {"family": FAMILY, "size_m": SIZE_M, "exposure_s": EXPOSURE_S}
@@ -230,15 +250,16 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120), help="width, height")
-    parser.add_argument("--rays", type=int, default=RAYS, help="a pixel")
+    parser.add_argument("--by", choices=("mitsuba", "mujoco"), default="mitsuba")
+    parser.add_argument("--rays", type=int, default=RAYS, help="Mitsuba's, a pixel")
     parser.add_argument("--check", action="store_true", help="print how true the edges are")
     arguments = parser.parse_args()
-    mi = renderer()
     if arguments.check:
-        import_module("other_check").check(mi)
+        import_module("other_check").check(renderer())
     if arguments.out:
+        light_of = light_by(arguments.by, arguments.rays)
         for kind in arguments.sets:
-            write_set(mi, kind, arguments)
+            write_set(light_of, kind, arguments)
 
 
 if __name__ == "__main__":

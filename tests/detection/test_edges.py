@@ -80,6 +80,17 @@ def test_corners_are_exact_unbiased_and_know_their_error(side_px, options, limit
     assert 0.7 < normalised < 1.3
 
 
+@pytest.mark.parametrize("levels", [(40, 420), (-90, 190)], ids=["paper full", "ink empty"])
+def test_light_beyond_what_a_pixel_holds_moves_no_corner(levels):
+    """Half of an edge's pixels are as full as the paper: it looks larger, or the ink does."""
+    errors, sigmas, outwards = errors_px(
+        28, 12, seed=7, optics_px=0.6, black=levels[0], white=levels[1]
+    )
+    assert np.sqrt(np.mean(errors**2)) < 0.02
+    assert abs(np.mean(np.sum(errors * outwards, axis=-1))) < 0.01
+    assert 0.6 < np.sqrt(np.mean((errors / sigmas[..., None]) ** 2)) < 1.4
+
+
 def test_the_ground_beyond_the_white_zone_does_not_pull():
     for background in (20.0, 230.0):
         errors, _, outwards = errors_px(

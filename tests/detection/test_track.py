@@ -25,7 +25,7 @@ from jaxnav.detection.template import best_match
 from jaxnav.detection.track import warm_up_tracks
 from jaxnav.models.camera import Camera
 from tests.helpers.marker_images import random_scene
-from tests.helpers.other_pictures import other_pictures
+from tests.helpers.other_pictures import RASTER, other_pictures
 
 FAMILY = "tag36h11"
 
@@ -102,6 +102,19 @@ def test_light_beyond_what_a_pixel_holds_moves_no_corner(levels):
         nees.append(its_nees)
     assert np.sqrt(np.mean(np.square(errors))) < 0.04
     assert np.mean(nees) < 2.3  # of two coordinates
+
+
+def test_a_shadow_beside_full_paper_moves_no_corner():
+    """By OpenGL, where nothing keeps the light of the room from the paper."""
+    errors, nees = [], []
+    for seed, (image, truth) in enumerate(other_pictures("shadow", RASTER)):
+        (found,) = track(image, truth.camera, [target(truth, seed)])
+        assert found is not None
+        error, its_nees = error_and_nees(found, truth.corners_px)
+        errors.append(error)
+        nees.append(its_nees)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.04
+    assert np.mean(nees) < 3.0  # of two coordinates
 
 
 def test_a_shadow_across_a_marker_dims_paper_and_ink_and_costs_no_accuracy():

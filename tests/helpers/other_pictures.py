@@ -1,4 +1,4 @@
-"""Pictures of markers by another renderer than the package's: tests/data/other_renderer."""
+"""Pictures of markers by other renderers than the package's: Mitsuba's and, by OpenGL, MuJoCo's."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +11,7 @@ import yaml
 from jaxnav.models.camera import Camera
 
 DATA = Path(__file__).parents[1] / "data/other_renderer"
+RASTER = DATA.with_name("other_rasteriser")  # `shadow` alone
 SETS = ("blur4", "blur8", "shadow", "hidden", "clean", "negatives")
 
 
