@@ -27,7 +27,7 @@ def _texture(reflectance: np.ndarray, finer: int) -> bytes:
     return bytes(cv2.imencode(".png", np.round(levels).astype(np.uint8))[1])
 
 
-def _geom(index: int, thing: Thing) -> str:
+def _geom(thing: Thing) -> str:
     """A thing, in the mean of its colours."""
     x, y, z, w = Rotation.from_matrix(thing.R).as_quat()
     half = thing.half_m if thing.kind == "box" else thing.half_m[[0, 2]]
@@ -41,7 +41,7 @@ def _geom(index: int, thing: Thing) -> str:
 def _world(mujoco: Any, scene: Scene) -> tuple[Any, float]:
     """MuJoCo's model of a scene, and the light on white paper that it draws as full."""
     pictures = {"wall.png": _texture(scene.wall, 1)}
-    surfaces, geoms = [("wall", 7.0, 4.0, -0.003)], [_geom(*one) for one in enumerate(scene.things)]
+    surfaces, geoms = [("wall", 7.0, 4.0, -0.003)], [_geom(thing) for thing in scene.things]
     if scene.panel is not None:
         pictures["panel.png"] = _texture(scene.panel, max(_TEXELS // len(scene.panel), 1))
         surfaces.append(("panel", 1.0, scene.panel_m / 2, 0.0))
@@ -90,6 +90,5 @@ def light(mujoco: Any, scene: Scene) -> np.ndarray:
             fine = renderer.render()[..., 1].reshape(height, FINER, width, FINER)
             total += fine.mean(axis=(1, 3))
     left, top, columns, rows = scene.crop_px
-    white = 1.0 if scene.panel is None else float(scene.panel.max())
     mean = total[top : top + rows, left : left + columns] / 255 / count
-    return scene.white / white * full * mean
+    return scene.signal() * full * mean

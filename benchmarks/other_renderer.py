@@ -179,8 +179,7 @@ def light(mi: Any, scene: Scene, rays: int = RAYS) -> np.ndarray:
         camera = sensor(mi, scene, float(time_s), spread)
         each = max(rays // 16, 1) if moving else rays
         total += np.array(mi.render(world, sensor=camera, spp=each, seed=k))[..., 0]
-    white = 1.0 if scene.panel is None else float(scene.panel.max())
-    return scene.white / white * total / count
+    return scene.signal() * total / count
 
 
 def picture(signal: np.ndarray, response: str, rng: np.random.Generator) -> np.ndarray:

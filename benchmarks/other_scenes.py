@@ -63,6 +63,10 @@ class Scene:
     response: str  # linear or srgb
     truth: dict = field(default_factory=dict)
 
+    def signal(self) -> float:
+        """What a white surface gives, of full scale, where nothing keeps light from it."""
+        return self.white / (1.0 if self.panel is None else float(self.panel.max()))
+
     def pose_at(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
         """(R_camera_world, t_camera_world), the time counted from the middle of the exposure."""
         # The camera's own motion moves the world the other way.

@@ -40,7 +40,8 @@ def target(truth, seed, **options):
 
 
 def error_and_nees(found, quad_px):
-    """Errors (8,) of the corners, px, and their NEES of two coordinates."""
+    """Errors (8,) of the corners, px, of a marker that is found; their NEES of two coordinates."""
+    assert found is not None
     error = (found.corners_px - quad_px).ravel()
     return error, error @ np.linalg.solve(found.covariance_px2, error) / 4
 
@@ -96,7 +97,6 @@ def test_light_beyond_what_a_pixel_holds_moves_no_corner(levels):
         image, quad_px = scene.render(rng), scene.corners_px()
         there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-3, 3, 2), 4.5, streak_px, 0.7)
         (found,) = track(image, scene.camera, [there])
-        assert found is not None
         error, its_nees = error_and_nees(found, quad_px)
         errors.append(error)
         nees.append(its_nees)
@@ -109,7 +109,6 @@ def test_a_shadow_beside_full_paper_moves_no_corner():
     errors, nees = [], []
     for seed, (image, truth) in enumerate(other_pictures("shadow", RASTER)):
         (found,) = track(image, truth.camera, [target(truth, seed)])
-        assert found is not None
         error, its_nees = error_and_nees(found, truth.corners_px)
         errors.append(error)
         nees.append(its_nees)
@@ -131,7 +130,6 @@ def test_a_shadow_across_a_marker_dims_paper_and_ink_and_costs_no_accuracy():
         image = lit * (gain + (1 - gain) / (1 + np.exp(-4 * beside_px)))
         there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-3, 3, 2), 4.5)
         (found,) = track(image.astype(np.uint8), scene.camera, [there])
-        assert found is not None
         error, its_nees = error_and_nees(found, quad_px)
         errors.append(error)
         nees.append(its_nees)
@@ -163,7 +161,6 @@ def test_the_shadow_of_a_finger_hides_nothing():
         image = shaded * (1 - covered) + covered * (120 + rng.normal(0, 3, lit.shape))
         there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-3, 3, 2), 4.5)
         (found,) = track(image.astype(np.uint8), scene.camera, [there])
-        assert found is not None
         error, its_nees = error_and_nees(found, quad_px)
         errors.append(error)
         nees.append(its_nees)
@@ -205,7 +202,6 @@ def test_a_marker_is_followed_through_a_streak_as_long_as_itself():
         image, quad_px = scene.render(rng), scene.corners_px()
         there = Target(FAMILY, 17, quad_px[None] + rng.uniform(-2, 2, 2), 4.0, streak_px, 1.0)
         (found,) = track(image, scene.camera, [there])
-        assert found is not None
         nees.append(error_and_nees(found, quad_px)[1])
     assert np.mean(nees) < 2.5  # of two coordinates
 
