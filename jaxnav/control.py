@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.models.bicycle import Vehicle, curvature_per_m, sideslip_rad
-from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
+from jaxnav.models.geometry import EVEN_RAD, safe_atan2, safe_norm, wrap_angle
 from jaxnav.models.twist_base import TwistBase
 
 Kind = TypeVar("Kind", bound="Follower")
@@ -176,6 +176,8 @@ class Follower(eqx.Module):
         distance_m = safe_norm(to_waypoint)
         bearing_rad = safe_atan2(to_waypoint[1], to_waypoint[0])
         alpha_rad = wrap_angle(bearing_rad - given.pose[2] - sideslip_rad)
+        # A waypoint straight behind is on the left, not on the side of the last bit.
+        alpha_rad = jnp.where(alpha_rad < EVEN_RAD - jnp.pi, alpha_rad + 2 * jnp.pi, alpha_rad)
         finite = jnp.isfinite(distance_m) & jnp.isfinite(alpha_rad)
         return Way(distance_m, alpha_rad, done, given.located & ~done & finite)
 
@@ -259,7 +261,7 @@ class Controller(Follower):
         explore, limit = self.exploration, self.vehicle.steering_limit_rad
         range_m = safe_norm(to_marker_m)
         bearing_rad = safe_atan2(to_marker_m[1], to_marker_m[0])
-        nearer_side = jnp.where(bearing_rad > 0, -1.0, 1.0).astype(beta_rad.dtype)
+        nearer_side = jnp.where(bearing_rad > EVEN_RAD, -1.0, 1.0).astype(beta_rad.dtype)
         side = jnp.where(state.side == 0, nearer_side, state.side)
         alpha_rad = wrap_angle(bearing_rad + side * explore.angle_rad - beta_rad)
         steering = self._steering(alpha_rad, jnp.asarray(explore.reach_m, limit.dtype), beta_rad)

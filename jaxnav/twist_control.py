@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.control import ControlInput, Controller, ControlLog, ControlState, Exploration, Follower
 from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.geometry import safe_atan2, safe_norm, wrap_angle
+from jaxnav.models.geometry import EVEN_RAD, safe_atan2, safe_norm, wrap_angle
 from jaxnav.models.twist_base import TwistBase
 
 
@@ -113,7 +113,7 @@ class TwistController(Follower):
         range_m = safe_norm(to_marker_m)
         bearing_rad = safe_atan2(to_marker_m[1], to_marker_m[0])
         left, right = (bearing_rad + side * explore.angle_rad for side in (1, -1))
-        turns_less = jnp.abs(jnp.sin(left)) < jnp.abs(jnp.sin(right))
+        turns_less = jnp.abs(jnp.sin(left)) < jnp.abs(jnp.sin(right)) + EVEN_RAD
         nearer_side = jnp.where(turns_less, 1.0, -1.0).astype(zero.dtype)
         side = jnp.where(state.side == 0, nearer_side, state.side)
         alpha_rad = wrap_angle(bearing_rad + side * explore.angle_rad)

@@ -7,11 +7,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxnav.numerics.small_matrices import first_highest
 from jaxnav.numerics.trees import where
 
 # A pause without any pose contradicts nothing: at most this much of it counts, the time after which
 # a missing marker is flagged (docs/promises.md, Missing data).
 _PAUSE_S = 1.0
+# Hypotheses that a mirror exchanges weigh the same but for rounding, 1e-4 after a second of frames
+# in float32; what tells them apart in truth soon tells more than this.
+EVEN_LOG_WEIGHT = 1e-3
+# A time is up where less than this is left: it adds up from intervals, and has their rounding.
+_NO_TIME_S = 1e-3
 
 
 class Rejections(eqx.Module):
@@ -59,8 +65,9 @@ def empty_bank(
 
 
 def heaviest(bank: Bank) -> Int[Array, ""]:
-    """Index of the most probable hypothesis."""
-    return jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
+    """Index of the most probable hypothesis; the first of those that weigh the same."""
+    log_weight = jnp.where(bank.initialised, bank.log_weight, -jnp.inf)
+    return first_highest(log_weight, EVEN_LOG_WEIGHT)
 
 
 def known_to(
@@ -110,7 +117,8 @@ def contradicted(
 ) -> Bool[Array, " K"]:
     """Whether `max_count` rejections in a row agree, or they have lasted `max_duration_s`."""
     rejections = bank.rejections
-    return (rejections.count >= max_count) | (rejections.duration_s >= max_duration_s)
+    lasted = rejections.duration_s >= max_duration_s - _NO_TIME_S
+    return (rejections.count >= max_count) | lasted
 
 
 def cleared(rejections: Rejections, over: Bool[Array, "*K"]) -> Rejections:

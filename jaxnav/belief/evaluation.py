@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.models.geometry import rotation_error_rad, safe_norm
+from jaxnav.models.geometry import EVEN_RAD, rotation_error_rad, safe_norm
 from jaxnav.pose.candidates import Candidates
 
 OUTLIER_DEG = 10.0
@@ -16,7 +16,7 @@ class Branch(eqx.Module):
     """Verdict on one choice of a candidate. At most one of `wrong` and `outlier` is True."""
 
     judged: Bool[Array, ""]  # a candidate was taken
-    wrong: Bool[Array, ""]  # another candidate is closer to the truth in angle
+    wrong: Bool[Array, ""]  # another candidate is closer to the truth in angle, by `EVEN_RAD`
     outlier: Bool[Array, ""]  # no candidate lies within 10 degrees of the truth
     ambiguous: Bool[Array, ""]  # there was more than one candidate
 
@@ -38,7 +38,8 @@ def judge_branch(
     nearest_rad = jnp.min(angles_rad)
     judged = selected >= 0
     outlier = judged & (nearest_rad > jnp.deg2rad(OUTLIER_DEG))
-    wrong = judged & ~outlier & (angles_rad[jnp.maximum(selected, 0)] > nearest_rad)
+    off_rad = angles_rad[jnp.maximum(selected, 0)]
+    wrong = judged & ~outlier & (off_rad > nearest_rad + EVEN_RAD)
     return Branch(judged, wrong, outlier, judged & (jnp.sum(candidates.valid) > 1))
 
 

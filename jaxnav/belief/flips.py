@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxnav.models.geometry import safe_norm, safe_sqrt, shift_and_turn
-from jaxnav.pose.candidates import Candidates
+from jaxnav.pose.candidates import SAME_POSE_RAD, Candidates
 
 
 def nearer_to_another(
@@ -18,7 +18,9 @@ def nearer_to_another(
 ) -> Float[Array, " K"]:
     """Probability that a candidate is nearer in angle than the selected one, for each hypothesis.
 
-    Between two candidates lies a bisector: a pose is nearer to the other one beyond it.
+    Between two candidates lies a bisector: a pose is nearer to the other one beyond it. Another one
+    is another index, and farther off than candidates that merge: of the selected one, computed
+    twice, the two roundings are a distance as well.
     """
     base = T_world_vehicle.wxyz_xyz
     other = jax.vmap(lambda T: T.inverse().wxyz_xyz)(candidates.T_vehicle_world)
@@ -26,15 +28,18 @@ def nearer_to_another(
     turns = between[..., 3:]  # (K, N, 3)
     own = turns[:, selected]
     across = turns - own[:, None]
+    is_other = candidates.valid & (jnp.arange(candidates.valid.shape[0]) != selected)
+    is_other = is_other[None] & (safe_norm(across) >= SAME_POSE_RAD)
+    across = jnp.where(is_other[..., None], across, 1)
     length = safe_norm(across)
-    direction = across / jnp.where(length > 0, length, 1)[..., None]
+    direction = across / length[..., None]
     gap = jnp.sum(turns**2, axis=2) - jnp.sum(own**2, axis=1)[:, None]
-    gap_rad = gap / jnp.where(length > 0, 2 * length, 1)
+    gap_rad = gap / (2 * length)
     P = covariance[:, None, 3:, 3:]
     variance = jnp.sum(direction[..., None] * P * direction[..., None, :], axis=(2, 3))
     sigma_rad = jnp.maximum(safe_sqrt(jnp.maximum(variance, 0)), 1e-6)
     nearer = jax.scipy.special.erfc(gap_rad / (np.sqrt(2) * sigma_rad)) / 2
-    return jnp.max(jnp.where(candidates.valid[None] & (length > 0), nearer, 0), axis=1)
+    return jnp.max(jnp.where(is_other, nearer, 0), axis=1)
 
 
 def beyond(

@@ -24,14 +24,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.belief.ambiguity import PoseBelief, PosePosterior, Selection
+from jaxnav.belief.bank import EVEN_LOG_WEIGHT
 from jaxnav.belief.branches import SecondPoses, give_slots, second_poses
 from jaxnav.belief.fan import CANDIDATES, fan, normalise
 from jaxnav.belief.flips import beyond, nearer_to_another
 from jaxnav.belief.gate import excess_of
 from jaxnav.belief.map_fit import PoseFit, fit_poses
 from jaxnav.belief.merging import find_heirs
-from jaxnav.models.geometry import rotation_error_rad, safe_norm, safe_sqrt
+from jaxnav.models.geometry import EVEN_RAD, rotation_error_rad, safe_norm, safe_sqrt
 from jaxnav.numerics.levenberg_marquardt import mark_found
+from jaxnav.numerics.small_matrices import first_highest
 from jaxnav.numerics.trees import where
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Snapshot
@@ -112,7 +114,8 @@ class MultiHypothesis(eqx.Module):
             bank = _started(starts, prior, candidates, snapshot)
         floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
         # All slots take as many steps as the slowest, so an empty slot repeats the heaviest one.
-        heaviest = jnp.argmax(jnp.where(bank.initialised, bank.log_weight, -jnp.inf))
+        alive_before = jnp.where(bank.initialised, bank.log_weight, -jnp.inf)
+        heaviest = first_highest(alive_before, EVEN_LOG_WEIGHT)
         own = jnp.arange(count)
         does_as = jnp.where(bank.initialised, own, heaviest)
         predicted = _at(_poses(bank), does_as)
@@ -143,14 +146,14 @@ class MultiHypothesis(eqx.Module):
         fitted = _poses(fits.posterior).T_world_vehicle
         of_parent = _at(_poses(fits.posterior), does_as).T_world_vehicle
         branches = branches & (jax.vmap(rotation_error_rad)(fitted, of_parent) > self.linear_rad)
-        lighter = jnp.minimum(log_evidence - log_evidence[does_as], 0)
+        lighter = jnp.minimum(log_evidence - log_evidence[does_as], -2 * EVEN_LOG_WEIGHT)
         log_weight = jnp.where(branches, log_weight[does_as] + lighter, log_weight)
         log_weight = normalise(log_weight)
         alive = (alive | branches) & (log_weight > self.forget_log_weight)
 
         # A hypothesis whose pose the gate rejects stays where it was predicted.
         after = where(passes, _poses(posteriors), predicted)
-        best = jnp.argmax(log_weight)
+        best = first_highest(log_weight, EVEN_LOG_WEIGHT)
         T_best = _at(after, best).T_world_vehicle
         apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(after.T_world_vehicle)
         sigmas_rad = safe_sqrt(jnp.trace(after.covariance[:, 3:, 3:], axis1=1, axis2=2))
@@ -161,14 +164,13 @@ class MultiHypothesis(eqx.Module):
             candidates.T_vehicle_world
         )
         costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
+        nearest = first_highest(-costs, EVEN_RAD)
         wrong = jnp.maximum(
             beyond(self.far_rad, apart_rad, sigmas_rad),
             # Candidates of a spoilt frame are of no branch.
             jnp.where(
                 fits_one,
-                nearer_to_another(
-                    after.T_world_vehicle, after.covariance, candidates, jnp.argmin(costs)
-                ),
+                nearer_to_another(after.T_world_vehicle, after.covariance, candidates, nearest),
                 0,
             ),
         )
@@ -194,7 +196,7 @@ class MultiHypothesis(eqx.Module):
             log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
             heir=mark_found(heir),
             costs=costs,
-            selected=jnp.where(jnp.any(candidates.valid) & located, jnp.argmin(costs), -1),
+            selected=jnp.where(jnp.any(candidates.valid) & located, nearest, -1),
             flip_probability=jnp.where(located, flip_probability, 0),
             decided=located & (far < self.decided_mass) & (known_rad < self.decided_sigma_rad),
             parent=jnp.where(branches & alive, does_as, own),
@@ -212,7 +214,7 @@ class MultiHypothesis(eqx.Module):
         None while the bank is open, when others stand for them, and none where all misfit.
         """
         second = second_poses(bank, heaviest, candidates, self.forget_log_weight)
-        settled = bank.log_weight[heaviest] > np.log(0.5)
+        settled = bank.log_weight[heaviest] > np.log(0.5) + EVEN_LOG_WEIGHT
         fits = _misfit(candidates, snapshot) < _TELLS_BRANCHES**2
         return second._replace(wanted=second.wanted & settled & fits)
 

@@ -22,12 +22,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.belief.bank import Bank, heaviest
+from jaxnav.belief.bank import EVEN_LOG_WEIGHT, Bank, heaviest
 from jaxnav.belief.flips import beyond
 from jaxnav.belief.gate import Moments
 from jaxnav.belief.kalman import symmetrise
 from jaxnav.belief.motion import Motion
 from jaxnav.models.geometry import rotation_error_rad, safe_sqrt
+from jaxnav.numerics.small_matrices import first_highest
 from jaxnav.numerics.trees import where
 from jaxnav.pose.observation import Observation
 
@@ -53,7 +54,7 @@ class Trail(eqx.Module):
     @property
     def best(self) -> Int[Array, ""]:
         """Which hypothesis is smoothed."""
-        return jnp.argmax(self.log_weight)
+        return first_highest(self.log_weight, EVEN_LOG_WEIGHT)
 
     def back(
         self,

@@ -14,8 +14,9 @@ from jaxnav.belief.bank import Bank, heaviest
 from jaxnav.belief.estimate import Belief, Estimate
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.smoothing import Trail, doubt
-from jaxnav.models.geometry import rotation_error_rad
+from jaxnav.models.geometry import EVEN_RAD, rotation_error_rad
 from jaxnav.navigator import Navigator
+from jaxnav.numerics.small_matrices import first_highest
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Observation
 
@@ -151,7 +152,7 @@ def _report(navigator: Navigator, trail: Trail, kept: Kept) -> Localised:
     off_rad = jax.vmap(lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T))(
         candidates.T_vehicle_world
     )
-    nearest = jnp.argmin(jnp.where(candidates.valid, off_rad, jnp.inf))
+    nearest = first_highest(-jnp.where(candidates.valid, off_rad, jnp.inf), EVEN_RAD)
     return Localised(
         T_world_vehicle=T,
         covariance=motion.error_covariance(bank, best)[:6, :6],

@@ -11,12 +11,15 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from jaxnav.numerics.small_matrices import matvec, product, sandwich
+from jaxnav.numerics.small_matrices import first_highest, matvec, product, sandwich
 
 # Columns of the identity for vectors ordered (translation, rotation), such as xi: on level ground a
 # vehicle shifts along its x and y and turns about its z.
 ON_GROUND = np.eye(6)[:, [0, 1, 5]]
 OFF_GROUND = np.eye(6)[:, [2, 3, 4]]
+# Angles that differ by less are the same where one of two is chosen: a twentieth of what lies
+# between two candidates at least, and more than the rounding of an angle in float32, 3e-4.
+EVEN_RAD = 1e-3
 _SKEW = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 1, 0).reshape(9, 3)
 
 
@@ -212,8 +215,9 @@ def rotation_error_rad(T_a_b: jaxlie.SE3, T_a_c: jaxlie.SE3) -> Float[Array, ""]
 def rotation_from_matrix(R: Float[Array, "3 3"]) -> jaxlie.SO3:
     """The rotation nearest in direction to a nearly orthonormal matrix, at any angle.
 
-    There are four formulas for the quaternion of a matrix. The one with the largest divisor is
-    used, so half turns are exact and every gradient is finite.
+    There are four formulas for the quaternion of a matrix, equal but for the sign. The first whose
+    divisor is nearly the largest is used, so half turns are exact, every gradient is finite, and no
+    rounding chooses the sign, as of an upright marker before a level camera.
 
     Source: Shepperd (1978), "Quaternion from rotation matrix".
     """
@@ -230,7 +234,7 @@ def rotation_from_matrix(R: Float[Array, "3 3"]) -> jaxlie.SO3:
             jnp.stack([m10 - m01, m02 + m20, m21 + m12, four_squares[3]]),
         ]
     )
-    row = rows[jnp.argmax(four_squares)]
+    row = rows[first_highest(four_squares, within=0.1)]
     return jaxlie.SO3(row / jnp.sqrt(jnp.sum(row**2)))
 
 

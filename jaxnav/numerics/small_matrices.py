@@ -208,10 +208,19 @@ def ranks(values: Float[Array, " n"]) -> Int[Array, " n"]:
     """
     index = jnp.arange(values.shape[0])
     earlier = index[None] < index[:, None]
-    before = (values[None] > values[:, None]) | ((values[None] == values[:, None]) & earlier)
-    return jnp.sum(before, axis=1)
+    # Of every pair one is before the other, whatever the compiler computes twice and rounds anew.
+    not_lower = values[None] >= values[:, None]
+    return jnp.sum(jnp.where(earlier, not_lower, ~not_lower.T), axis=1)
 
 
 def in_order(values: Float[Array, " n"], count: int) -> Int[Array, " count"]:
     """Indices of the `count` highest values, the highest first."""
     return jnp.argmax(ranks(values)[None] == jnp.arange(count)[:, None], axis=1)
+
+
+def first_highest(values: Float[Array, " n"], within: float) -> Int[Array, ""]:
+    """Index of the highest value; of those that equal it within a margin, the first.
+
+    Where values are equal by construction, `argmax` is the choice of the machine's rounding.
+    """
+    return jnp.argmax(values >= jnp.max(values) - within)

@@ -27,7 +27,7 @@ from jaxnav.pose.refine import refine_sightings
 from jaxnav.pose.residuals import reprojection_residuals
 
 # Two local minima this close are merged: 1.1 degrees, and 0.02 of the distance to the marker.
-_SAME_POSE_RAD = 0.02
+SAME_POSE_RAD = 0.02
 
 
 class Candidates(eqx.Module):
@@ -192,7 +192,7 @@ def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
 def _repeats(
     T_vehicle_world: jaxlie.SE3, seen: Sightings, markers: MarkerMap, valid: Bool[Array, " N"]
 ) -> Bool[Array, " N"]:
-    """Whether an earlier valid lane holds the same pose, within `_SAME_POSE_RAD`."""
+    """Whether an earlier valid lane holds the same pose, within `SAME_POSE_RAD`."""
     first_seen = seen.marker_index[jnp.argmax(seen.visible)]
     center_world = markers.Ts_world_marker.translation()[first_seen]
     centers_vehicle = jax.vmap(lambda T: transform_points(T, center_world))(T_vehicle_world)
@@ -201,6 +201,6 @@ def _repeats(
     # |R_i - R_j|_F = 2 sqrt(2) sin(angle / 2)
     turn = safe_norm((R[:, None] - R[None]).reshape(*R.shape[:1], *R.shape[:1], 9)) / jnp.sqrt(2.0)
     shift = safe_norm(centers_vehicle[:, None] - centers_vehicle[None]) / range_m[:, None]
-    same = (turn < _SAME_POSE_RAD) & (shift < _SAME_POSE_RAD)
+    same = (turn < SAME_POSE_RAD) & (shift < SAME_POSE_RAD)
     earlier = jnp.tri(same.shape[0], k=-1, dtype=bool)
     return jnp.any(same & earlier & valid[None], axis=1)
