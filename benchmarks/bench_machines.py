@@ -19,6 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxnav import configuration
+
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("JAXNAV_DATA", ROOT.parent / "shared/data")) / "tagslam"
 CLAIM = 1e-3  # a flip probability below it is a claim to be sure, as in bench_recordings.py
@@ -28,6 +30,7 @@ FUSED = "--xla_cpu_use_fusion_emitters="
 # Under these the numbers that should be equal come out most differently.
 CONTRARY = PLAIN + "1"
 FLAGS = {
+    "jaxnav's own": " ".join(f"--{name}={value}" for name, value in configuration.FLAGS.items()),
     "none": "",
     "level 0": PLAIN + "0",
     "level 1": CONTRARY,
@@ -178,6 +181,7 @@ def differences(one: Outcomes, other: Outcomes, case: str) -> dict[str, float]:
     claimed = claims(one, case), claims(other, case)
     seen = one.get(f"{case}/seen", np.ones_like(claimed[0]))
     poses = [out[f"{case}/pose"] for out in (one, other)]
+    poses = [np.where(pose[..., :1] < 0, [-1] * 4 + [1] * 3, 1) * pose for pose in poses]
     flips = [np.maximum(out[f"{case}/flip"], 1e-9) for out in (one, other)]
     found = {
         "claims %": 100 * float(np.sum(claimed[1]) / np.sum(seen)),

@@ -107,6 +107,13 @@ def test_the_arc_meets_the_waypoint(direction_deg, distance_m):
     assert misses.min() < 1e-3
 
 
+def test_a_waypoint_straight_behind_is_on_the_left_whatever_the_last_bit_says():
+    for off_rad in (-1e-9, 0.0, 1e-9):
+        _, command, _, log = act(controller([(-2.0, 0.0)]), (0.0, 0.0, off_rad), 0.0)
+        assert log.alpha_rad == pytest.approx(np.pi, abs=1e-8)
+        assert command.steering_rad == 0.5
+
+
 def test_repeated_commands_settle_on_that_arc():
     """Each command taken as the next measured angle: a contraction while L_d > l cos(theta)."""
     pose, waypoint = (0.0, 0.0, 0.0), (1.0, 0.6)

@@ -27,7 +27,7 @@ from jaxnav.models.geometry import (
     safe_norm,
     wrap_angle,
 )
-from jaxnav.numerics.small_matrices import cholesky, log_det, solve_lower
+from jaxnav.numerics.small_matrices import cholesky, first_highest, log_det, solve_lower
 from jaxnav.pose.candidates import Candidates
 from jaxnav.pose.observation import Snapshot, log_sigmas
 from jaxnav.pose.residuals import e2
@@ -295,7 +295,8 @@ def _cheapest(
         volume = _log_determinants(candidates.covariance)
         doubts = _doubt(candidates.valid, candidates.cost - volume)
     costs = jnp.where(candidates.valid, costs, jnp.inf)
-    cheapest = jnp.argmin(costs)
+    # Candidates count from the lowest e1: it is what decides between costs that are equal.
+    cheapest = first_highest(-costs, within=1e-6 * jnp.abs(jnp.min(costs)))
     misfit = jnp.where(jnp.isfinite(candidates.cost[cheapest]), candidates.cost[cheapest], 0)
     any_valid = jnp.any(candidates.valid) & accepted
     T_vehicle_world = jax.tree.map(lambda leaf: leaf[cheapest], candidates.T_vehicle_world)

@@ -218,7 +218,7 @@ def in_order(values: Float[Array, " n"], count: int) -> Int[Array, " count"]:
     return jnp.argmax(ranks(values)[None] == jnp.arange(count)[:, None], axis=1)
 
 
-def first_highest(values: Float[Array, " n"], within: float) -> Int[Array, ""]:
+def first_highest(values: Float[Array, " n"], within: Float[Array, ""] | float) -> Int[Array, ""]:
     """Index of the highest value; of those that equal it within a margin, the first.
 
     Where values are equal by construction, `argmax` is the choice of the machine's rounding.

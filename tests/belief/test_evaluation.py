@@ -43,6 +43,9 @@ TRUTH = jaxlie.SE3(turned(0.0).inverse().wxyz_xyz[0])
         ((40.0, 41.0), [True, True], 0, (True, False, True, True)),
         ((40.0, 1.0), [True, False], 0, (True, False, True, False)),
         ((3.0, 1.0), [True, False], 0, (True, False, False, False)),
+        # Equally far, but for rounding.
+        ((-7.0, 7.0), [True, True], 0, (True, False, False, True)),
+        ((-7.0, 7.0), [True, True], 1, (True, False, False, True)),
         ((1.0, 40.0), [True, True], -1, (False, False, False, False)),
         ((1.0, 40.0), [False, False], -1, (False, False, False, False)),
     ],

@@ -17,6 +17,7 @@ from jaxnav.belief.bank import Bank, empty_bank
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.belief.fan import fan
+from jaxnav.belief.flips import nearer_to_another
 from jaxnav.belief.follow_pose import follow_pose
 from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.belief.map_fit import fit_poses
@@ -801,3 +802,35 @@ def test_a_step_has_finite_gradients(precision):
             assert all(leaf.dtype == precision and np.all(np.isfinite(leaf)) for leaf in slopes)
             seen_slope = np.asarray(slopes[0])[np.asarray(obs.visible)]
             assert np.any(seen_slope != 0) == bool(jnp.any(visible))
+
+
+def test_what_is_no_other_candidate_is_no_flip():
+    """Not the selected one itself, which a compiler may compute twice, nor one that merges with it;
+    wherever it lies, the probability has a slope."""
+    yaw_deg = np.array([0.0, 0.0, 0.5, 40.0])
+    flip = jax.jit(nearer_to_another)
+
+    def probability(nudge_rad, selected: int, valid: list[bool]) -> jax.Array:
+        turns_rad = jnp.deg2rad(yaw_deg) + nudge_rad * jnp.array([0.0, 1.0, 0.0, 0.0])
+        Ts = jax.vmap(lambda psi: worlds.planar(0.0, 0.0, 0.0) @ yawed(psi))(turns_rad)
+        found = Candidates.none(4, float)
+        found = eqx.tree_at(
+            lambda c: (c.T_vehicle_world, c.valid), found, (Ts.inverse(), jnp.asarray(valid))
+        )
+        here = jaxlie.SE3(worlds.planar(0.0, 0.0, np.deg2rad(2.0)).wxyz_xyz[None])
+        return flip(here, 0.1**2 * jnp.eye(6)[None], found, jnp.asarray(selected))[0]
+
+    def yawed(psi_rad: jax.Array) -> jaxlie.SE3:
+        return jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(psi_rad))
+
+    expected = scipy.stats.norm.sf((20.0 - 2.0) / np.rad2deg(0.1))
+    for nudge_rad in (0.0, 1e-12, 1e-9, 1e-7):
+        alone = probability(nudge_rad, 0, [True, False, False, True])
+        np.testing.assert_allclose(alone, expected, rtol=0.3)
+        for selected in (0, 1, 2):
+            several = probability(nudge_rad, selected, [True] * 4)
+            assert several == pytest.approx(alone, rel=0.2), (nudge_rad, selected)
+        assert probability(nudge_rad, 0, [True, True, True, False]) == 0
+        slope = jax.grad(probability)(nudge_rad, 0, [True] * 4)
+        assert np.isfinite(slope)
+    assert probability(0.0, 3, [True] * 4) > 0.99

@@ -168,6 +168,16 @@ def test_rotation_is_read_off_any_matrix(precision, near):
     np.testing.assert_allclose(np.linalg.norm(rotations.wxyz, axis=1), 1, atol=tolerance)
 
 
+def test_no_rounding_chooses_the_sign_of_a_quaternion():
+    """Half turns about an axis between two of the frame's have two formulas that are as good."""
+    rng = np.random.default_rng(5)
+    exact = half_turns()
+    first = read_rotations(jnp.asarray(exact)).wxyz
+    for _ in range(5):
+        turned = exact @ Rotation.from_rotvec(rng.normal(0, 1e-9, (len(exact), 3))).as_matrix()
+        np.testing.assert_allclose(read_rotations(jnp.asarray(turned)).wxyz, first, atol=1e-8)
+
+
 def test_reading_a_rotation_has_finite_slopes_equal_to_differences():
     jacobian = jax.jit(jax.vmap(jax.jacrev(lambda R: geometry.rotation_from_matrix(R).wxyz)))
     assert np.all(np.isfinite(jacobian(jnp.asarray([np.eye(3), *half_turns()]))))

@@ -112,3 +112,12 @@ def test_ranks_are_those_of_a_stable_sort(values):
     np.testing.assert_array_equal(small.ranks(jnp.asarray(values))[order], np.arange(len(values)))
     for count in (1, 2, 3):
         np.testing.assert_array_equal(small.in_order(jnp.asarray(values), count), order[:count])
+
+
+def test_of_values_that_are_equal_but_for_rounding_the_first_is_the_highest():
+    below = 1 - 1e-9
+    for values, index in [
+        ([0.0, below, 1.0], 1), ([0.0, 1.0, below], 1), ([0.0, 0.9, 1.0], 2),
+        ([-np.inf] * 3, 0), ([-np.inf, 2.0, -np.inf], 1),
+    ]:  # fmt: skip
+        assert small.first_highest(jnp.asarray(values), 1e-6) == index
