@@ -90,7 +90,7 @@ class Tracker:
         read = set() if decoded is None else set(zip(decoded.families, decoded.ids, strict=True))
         sides_px = [mean_side_px(quad) for quad in quads_px]
         places: dict[tuple[str, int], list[int]] = {}  # of each marker, the largest first
-        for k in np.argsort(sides_px)[::-1]:
+        for k in np.argsort(-np.asarray(sides_px), kind="stable"):
             if keys[k] not in read and np.isfinite(sides_px[k]) and np.isfinite(radius_px[k]):
                 places.setdefault(keys[k], []).append(int(k))
         missing = list(places.items())[:MOST_FOLLOWED]
