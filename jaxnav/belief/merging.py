@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from jaxnav.belief.bank import Bank
+from jaxnav.belief.bank import EVEN_LOG_WEIGHT, Bank
 from jaxnav.models.geometry import shift_and_turn
 from jaxnav.numerics.small_matrices import cholesky, product, ranks, sandwich, solve_lower
 
@@ -86,7 +86,8 @@ def find_heirs(
     whitened = jax.vmap(lambda L, a: solve_lower(L, a.T))(factor, apart)
     close = jnp.sum(whitened**2, axis=1) < distance**2  # [receiver, other]
     close = close & alive[:, None] & alive[None]
-    rank = ranks(log_weight)
+    # In steps: of two that weigh the same the first one is the heir, not the one of the last bit.
+    rank = ranks(jnp.floor(log_weight / EVEN_LOG_WEIGHT))
     heavier = rank[:, None] < rank[None]
     # A hypothesis that receives others is not merged itself.
     takes = close & heavier
