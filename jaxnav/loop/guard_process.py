@@ -170,7 +170,7 @@ def main(commands: int, readings: int) -> None:
             factory = _factory(order["vehicle"], order["path"])
             link.tell(ready=True)
             order = {**order, **link.mapping()}
-            vehicle = _opened(factory, order)
+            vehicle = opened(factory, order)
         except CanNotMoveError as problem:
             link.tell(stays=str(problem))
             return
@@ -276,7 +276,17 @@ def _factory(name: str, path: list[str]) -> Any:
     return factory
 
 
-def _opened(factory: Any, order: dict[str, Any]) -> AnyVehicle:
+def opened(factory: Any, order: dict[str, Any]) -> AnyVehicle:
+    """Open a vehicle without the computing process.
+
+    Args:
+        order: the name under `vehicle`; under `setup` the numbers of its file, and what else
+            `Setup` has.
+
+    Raises:
+        BadInput: as `plugins.open_vehicle`.
+        CanNotMoveError: it needs that process.
+    """
     received: Any = order["setup"]
     missing: Any = _Missing
     numbers: Any = SimpleNamespace(**received["vehicle"])

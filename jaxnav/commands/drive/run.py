@@ -4,6 +4,7 @@ Every step of the start checks whether a signal has come, arming above all: see 
 """
 
 import gc
+import math
 import os
 import sys
 import time
@@ -42,6 +43,10 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import DriveSetup
 
 EXIT_STOPPED = 1  # by the watchdog, not by a person
+UNSTOPPED = (
+    "{car} does not stop by itself when all processes here are killed at once: have `jaxnav stop "
+    "--car {car}` run then, see docs/guide/drive.md, or a switch at hand"
+)
 
 
 @before_others()
@@ -208,6 +213,8 @@ class Drive:
             vehicle, guard = self._guarded(pilot.limits)
             self.guard = guard
             closing.callback(self._close, vehicle, guard)
+            if not vehicle.timeout_s < math.inf:
+                sys.stderr.write(f"{visible(UNSTOPPED.format(car=args.car))}\n")
             signals.on_signal(guard.trip)
             signals.check()
             cameras = plugins.open_cameras(args.cameras or args.car, self._setup, vehicle)

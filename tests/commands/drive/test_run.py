@@ -235,6 +235,7 @@ def test_the_end_of_the_guards_process_is_the_end_of_the_drive(workplace, tmp_pa
         ended = drive.ended()
     assert ended.code == 1
     assert ended.out.startswith("ended: the guard's process was ended by signal 9\n")
+    assert f"{plain_car.NAME} does not stop by itself when all processes here are" in ended.err
     assert ended.told[-1].throttle == 0  # by another one that was started for it
 
 
