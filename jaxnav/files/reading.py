@@ -11,8 +11,9 @@ import stat
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import yaml
 from yaml.composer import Composer
@@ -59,7 +60,7 @@ def check_regular(path: Path) -> None:
         raise BadInput(path, "is a device, a pipe or a socket: only regular files are read")
 
 
-def open_file(path: Path) -> BinaryIO:
+def open_file(path: Path) -> BufferedReader:
     """Open a regular file for reading.
 
     Raises:

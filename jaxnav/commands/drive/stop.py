@@ -51,7 +51,7 @@ def run(args: Stop) -> int:
     except CanNotMoveError as problem:
         raise BadInput(f"--car {args.car}", f"can't be opened by itself: {problem}") from None
     except BadInput as bad:
-        if not isinstance(bad.__cause__, OSError):
+        if bad.__cause__ is None or isinstance(bad.__cause__, ImportError):
             raise
         return _say(args.car, str(bad))  # another process has it, or it is not there
     finally:
